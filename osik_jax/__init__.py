@@ -1,0 +1,12 @@
+"""Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
+
+from .kinematics import Kinematics as Kinematics
+from .kinematics import center_of_mass as center_of_mass
+from .kinematics import com_jacobian as com_jacobian
+from .kinematics import difference as difference
+from .kinematics import forward_kinematics as forward_kinematics
+from .kinematics import frame_jacobian as frame_jacobian
+from .kinematics import frame_jacobians as frame_jacobians
+from .kinematics import integrate as integrate
+from .robot import Robot as Robot
+from .robot import load_robot as load_robot

@@ -1,0 +1,188 @@
+"""Forward kinematics, frame Jacobians, centre of mass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
+from ..robot import Robot
+from ._joints import dof_kinds, joint_transforms
+
+
+class Kinematics(eqx.Module):
+    """Where everything is at one configuration. All in world axes.
+
+    Attributes:
+        body_position: origin of each body [m]. (nbody, 3)
+        body_rotation: from each body's axes to the world's. (nbody, 3, 3)
+        dof_linear: direction in which each dof translates its body, 0 for rotations. (full nv, 3)
+        dof_angular: axis about which each dof turns its body, 0 for translations. (full nv, 3)
+        dof_anchor: a point on that axis [m]. (full nv, 3)
+    """
+
+    body_position: Float[Array, "nbody 3"]
+    body_rotation: Float[Array, "nbody 3 3"]
+    dof_linear: Float[Array, "nvfull 3"]
+    dof_angular: Float[Array, "nvfull 3"]
+    dof_anchor: Float[Array, "nvfull 3"]
+
+    def frame_pose(self, robot: Robot, name: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+        """Position [m] and rotation (frame axes to world axes) of a body, link, site or geom.
+
+        Raises:
+            KeyError: no such frame.
+        """
+        positions, rotations = self.frame_poses(robot, (name,))
+        return positions[0], rotations[0]
+
+    def frame_poses(self, robot: Robot, names: Sequence[str]) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
+        """Positions and rotations of several frames.
+
+        Raises:
+            KeyError: no such frame.
+        """
+        ids = np.array([robot.tree.frame(name) for name in names], int)
+        bodies = np.asarray(robot.tree.frame_bodies, int)[ids]
+        rotations = self.body_rotation[bodies]
+        positions = self.body_position[bodies] + _apply(rotations, robot.frame_position[ids])
+        return positions, _compose(rotations, robot.frame_rotation[ids])
+
+
+def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
+    """Poses of all bodies and motion axes of all dofs at configuration q. Quaternions are normalised first.
+
+    Raises:
+        ValueError: q has the wrong length, or (outside jit) is not finite or holds a quaternion of zeros.
+    """
+    robot.check_configuration(q)
+    local = joint_transforms(robot, robot.mujoco_qpos(q))
+    position, rotation = _chain(robot.tree, local.xpos, local.xmat)
+    joint_parents = np.asarray(robot.tree.body_parents, int)[np.asarray(robot.tree.joint_bodies, int)]
+    turn = rotation[joint_parents]
+    anchor = position[joint_parents] + _apply(turn, local.xanchor)
+    linear, angular = _motion_axes(robot.tree, _apply(turn, local.xaxis), rotation)
+    return Kinematics(position, rotation, linear, angular, anchor[robot.tree.dof_joint])
+
+
+def frame_jacobians(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> Float[Array, "k 6 nv"]:
+    """Jacobians of several frames: rows [linear; angular] in world axes, linear at each frame's origin.
+
+    Raises:
+        KeyError: no such frame.
+    """
+    ids = np.array([robot.tree.frame(name) for name in names], int)
+    bodies = np.asarray(robot.tree.frame_bodies, int)[ids]
+    points = kinematics.body_position[bodies] + _apply(kinematics.body_rotation[bodies], robot.frame_position[ids])
+    mask = robot.tree.moves[bodies][:, None, :]
+    linear = _velocity_at(kinematics, points[:, None, :])
+    angular = jnp.broadcast_to(kinematics.dof_angular, linear.shape)
+    return independent_columns(robot.tree, jnp.where(mask, jnp.concatenate([linear, angular], -1).mT, 0.0))
+
+
+def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Array, "6 nv"]:
+    """Jacobian of one frame: [linear; angular] velocity = J v, world axes, at the frame's origin.
+
+    Raises:
+        KeyError: no such frame.
+    """
+    return frame_jacobians(robot, kinematics, (name,))[0]
+
+
+def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3"]:
+    """Centre of mass [m] of the whole robot, or of the body ``subtree`` and all that hangs from it.
+
+    Raises:
+        KeyError: no such body.
+    """
+    mass, moment = _body_moments(robot, kinematics, subtree)
+    return jnp.sum(moment, 0) / jnp.sum(mass)
+
+
+def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3 nv"]:
+    """Jacobian of ``center_of_mass``: its velocity in world axes = J v.
+
+    Raises:
+        KeyError: no such body.
+    """
+    mass, moment = _body_moments(robot, kinematics, subtree)
+    below = jnp.asarray(robot.tree.descendants, mass.dtype)
+    mass_below = jnp.matmul(below, mass, precision="highest")[robot.tree.dof_body][:, None]
+    moment_below = jnp.matmul(below, moment, precision="highest")[robot.tree.dof_body]
+    arm = moment_below - mass_below * kinematics.dof_anchor
+    columns = mass_below * kinematics.dof_linear + jnp.cross(kinematics.dof_angular, arm)
+    return independent_columns(robot.tree, columns.T / jnp.sum(mass))
+
+
+def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"]) -> Float[Array, "... nv"]:
+    """From columns of all the model's dofs to columns of v: locked dofs drop out, followers join their leaders."""
+    (own, _), *followers = tree.dof_columns
+    reduced = jacobian if len(own) == jacobian.shape[-1] else jacobian[..., own]
+    for index, coefficient in followers:
+        reduced = reduced + jacobian[..., index] * coefficient
+    return reduced
+
+
+def _apply(rotation: Float[Array, "... 3 3"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """Rotates; written as a sum, which XLA fuses and never runs in reduced precision."""
+    return jnp.sum(rotation * vector[..., None, :], -1)
+
+
+def _compose(a: Float[Array, "... 3 3"], b: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], -2)
+
+
+def _chain(
+    tree: KinematicTree, position: Float[Array, "nbody 3"], rotation: Float[Array, "nbody 3 3"]
+) -> tuple[Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]:
+    """Composes poses in parents into poses in the world, depth by depth."""
+    parents = np.asarray(tree.body_parents, int)
+    place = np.zeros(len(parents), int)
+    levels = [(position[:1], rotation[:1])]
+    for above, bodies in zip(tree.levels, tree.levels[1:], strict=False):
+        place[above] = np.arange(len(above))
+        parent = place[parents[bodies]]
+        p, turn = jax.lax.optimization_barrier(levels[-1])  # or XLA recomputes all ancestors of every body
+        p, turn = p[parent], turn[parent]
+        levels.append((p + _apply(turn, position[bodies]), _compose(turn, rotation[bodies])))
+    order = np.argsort(np.concatenate(tree.levels))
+    positions, rotations = (jnp.concatenate(parts)[order] for parts in zip(*levels, strict=True))
+    return positions, rotations
+
+
+def _motion_axes(
+    tree: KinematicTree, axis: Float[Array, "njoint 3"], rotation: Float[Array, "nbody 3 3"]
+) -> tuple[Float[Array, "nvfull 3"], Float[Array, "nvfull 3"]]:
+    """Linear and angular direction of each dof, in the world: the tangent convention of MuJoCo."""
+    kinds, number = dof_kinds(tree)
+    hinge, slide = kinds == HINGE, kinds == SLIDE
+    translates = (kinds == FREE) & (number < 3)
+    turns = (kinds == BALL) | ((kinds == FREE) & (number >= 3))
+    own = axis[tree.dof_joint]
+    angular = jnp.where(hinge[:, None], own, 0.0)
+    linear = jnp.where(slide[:, None], own, 0.0) + np.eye(3)[number % 3] * translates[:, None]
+    if turns.any():
+        angular = jnp.where(turns[:, None], rotation[tree.dof_body, :, number % 3], angular)
+    return linear, angular
+
+
+def _velocity_at(kinematics: Kinematics, points: Float[Array, "k 1 3"]) -> Float[Array, "k nvfull 3"]:
+    """Velocity that each dof, at unit speed, gives to each point were it fixed to the moved body."""
+    return kinematics.dof_linear + jnp.cross(kinematics.dof_angular, points - kinematics.dof_anchor)
+
+
+def _body_moments(
+    robot: Robot, kinematics: Kinematics, subtree: str | None
+) -> tuple[Float[Array, " nbody"], Float[Array, "nbody 3"]]:
+    """Mass, and mass times centre of mass, of each body (0 outside the subtree)."""
+    mass = robot.body_mass
+    if subtree is not None:
+        root = robot.tree.frame_bodies[robot.tree.frame(subtree)]
+        mass = jnp.where(robot.tree.descendants[root], mass, 0.0)
+    centers = kinematics.body_position + _apply(kinematics.body_rotation, robot.body_com)
+    return mass, mass[:, None] * centers

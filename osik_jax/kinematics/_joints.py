@@ -1,0 +1,57 @@
+"""Joint maths from MJX, one level deep, so that XLA never recomputes a chain of parents.
+
+``mjx.kinematics`` on a serial chain makes XLA's CPU fusion recompute every parent of every link: thousands of
+microseconds for an arm. Here MJX sees a forest in which each body hangs from the world alone and returns what its
+joints do in the parent's frame; the tree is composed in ``_forward`` with a barrier between depths.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+from mujoco import mjx
+
+from .._tree import KinematicTree
+from ..robot import Robot
+
+
+def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
+    """MJX data in which ``xpos, xmat, xanchor, xaxis`` are in the frame of each body's parent."""
+    model, data = _forest(
+        robot.tree.joint_types, robot.tree.joint_bodies, len(robot.tree.body_names), jax.config.jax_enable_x64
+    )
+    model = model.replace(
+        body_pos=robot.body_position,
+        body_quat=robot.body_quaternion,
+        jnt_pos=robot.joint_position,
+        jnt_axis=robot.joint_axis,
+        qpos0=robot.joint_reference,
+    )
+    return mjx.kinematics(model, data.replace(qpos=qpos))
+
+
+@lru_cache(maxsize=64)
+def _forest(
+    joint_types: tuple[int, ...], joint_bodies: tuple[int, ...], bodies: int, x64: bool
+) -> tuple[mjx.Model, mjx.Data]:
+    """An MJX model with these joints and no tree, and its data; the numbers in it are replaced before use."""
+    del x64  # part of the cache key: the arrays take the precision in force when they are made
+    spec = mujoco.MjSpec()
+    for body in range(1, bodies):
+        element = spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True)
+        for joint, owner in enumerate(joint_bodies):
+            if owner == body:
+                element.add_joint(type=mujoco.mjtJoint(joint_types[joint]))
+    with jax.ensure_compile_time_eval():
+        model = mjx.put_model(spec.compile(), impl="jax")
+        return model, mjx.make_data(model, impl="jax")
+
+
+def dof_kinds(tree: KinematicTree) -> tuple[np.ndarray, np.ndarray]:
+    """Of each full dof: its joint's type, and its number within the joint."""
+    kinds = np.asarray(tree.joint_types, int)[tree.dof_joint]
+    return kinds, np.arange(len(kinds)) - tree.full_dof_address[:-1][tree.dof_joint]

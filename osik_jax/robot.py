@@ -1,0 +1,245 @@
+"""Robot: the kinematic model that everything else takes, as an immutable pytree."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from . import _loading
+from ._tree import BALL, FREE, KinematicTree, ModelHolder
+
+LockedJoints = Iterable[str] | Mapping[str, float]
+_UNIT_QUATERNION_TOLERANCE = 1e-8
+
+
+class Robot(eqx.Module):
+    """A robot's geometry, masses and limits.
+
+    Configurations ``q`` (nq,) are in MuJoCo's qpos layout (a free joint is a position in the world and a unit
+    quaternion w, x, y, z) without the entries of locked joints and mimic followers. Velocities ``v`` (nv,) live in the
+    tangent space (a free joint is a linear velocity in world axes, then an angular velocity in body axes).
+
+    All arrays are traced leaves: robots with the same tree and other link lengths, masses or limits can be stacked and
+    vmapped over. ``mj_model`` is carried along unchanged; it does not follow edits of the leaves.
+
+    Attributes:
+        tree: names and topology (static).
+        body_position: of each body in its parent [m]. (nbody, 3)
+        body_quaternion: of each body in its parent, w x y z. (nbody, 4)
+        body_mass: [kg]. (nbody,)
+        body_com: centre of mass of each body in its own frame [m]. (nbody, 3)
+        joint_position: anchor of each joint in its body [m]. (njoint, 3)
+        joint_axis: axis of each joint in its body. (njoint, 3)
+        joint_reference: MuJoCo's qpos0, the joint values at which bodies sit as described. (full nq,)
+        frame_position: of each named frame in its body [m]. (nframe, 3)
+        frame_rotation: of each named frame in its body. (nframe, 3, 3)
+        qpos_offset: values of locked joints and offsets of followers, 0 elsewhere. (full nq,)
+        position_lower: lower joint limits [rad or m], -inf where free. (nv,)
+        position_upper: upper joint limits [rad or m], inf where free. (nv,)
+        velocity_limit: greatest joint speeds [rad/s or m/s], inf where free. (nv,)
+        q0: the robot's home configuration. (nq,)
+    """
+
+    tree: KinematicTree = eqx.field(static=True)
+    body_position: Float[Array, "nbody 3"]
+    body_quaternion: Float[Array, "nbody 4"]
+    body_mass: Float[Array, " nbody"]
+    body_com: Float[Array, "nbody 3"]
+    joint_position: Float[Array, "njoint 3"]
+    joint_axis: Float[Array, "njoint 3"]
+    joint_reference: Float[Array, " nqfull"]
+    frame_position: Float[Array, "nframe 3"]
+    frame_rotation: Float[Array, "nframe 3 3"]
+    qpos_offset: Float[Array, " nqfull"]
+    position_lower: Float[Array, " nv"]
+    position_upper: Float[Array, " nv"]
+    velocity_limit: Float[Array, " nv"]
+    q0: Float[Array, " nq"]
+    holder: ModelHolder = eqx.field(static=True, repr=False)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: str | os.PathLike[str],
+        *,
+        floating_base: bool | None = None,
+        locked_joints: LockedJoints = (),
+    ) -> Robot:
+        """Loads a URDF. Mesh files are never read.
+
+        Args:
+            urdf: path of the file, or the XML text itself.
+            floating_base: put a free joint on the root link. ``None``: unless the URDF has one already
+                (``floating``), or its root link is called ``world``. Lengths in metres, angles in radians.
+            locked_joints: names or globs of joints to freeze at 0, or a mapping from them to the values to freeze at.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: the XML or the model in it is broken; the message says where.
+            KeyError: ``locked_joints`` names a joint that does not exist.
+        """
+        return cls(**_loading.from_urdf(urdf, floating_base=floating_base, locked_joints=locked_joints))
+
+    @classmethod
+    def from_mjcf(
+        cls,
+        mjcf: str | os.PathLike[str],
+        *,
+        floating_base: bool | None = None,
+        velocity_limits: Mapping[str, float] | None = None,
+        locked_joints: LockedJoints = (),
+    ) -> Robot:
+        """Loads an MJCF file or text. Joint equality constraints that are linear become exact mimic joints.
+
+        Args:
+            mjcf: path of the file, or the XML text itself.
+            floating_base: ``None``: as the file says. ``True``: put a free joint on the root body if it has no joint.
+            velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; MJCF has no field for it. A custom
+                numeric ``velocity_limit/JOINT`` in the file is read too.
+            locked_joints: as in ``from_urdf``.
+
+        Raises:
+            FileNotFoundError, ValueError, KeyError: as in ``from_urdf``.
+        """
+        return cls(**_loading.from_mjcf(
+            mjcf, floating_base=floating_base, velocity_limits=velocity_limits, locked_joints=locked_joints,
+        ))
+
+    @classmethod
+    def from_mjmodel(
+        cls,
+        model: mujoco.MjModel,
+        *,
+        velocity_limits: Mapping[str, float] | None = None,
+        locked_joints: LockedJoints = (),
+    ) -> Robot:
+        """Takes a compiled MuJoCo model.
+
+        Args:
+            model: the model.
+            velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s].
+            locked_joints: as in ``from_urdf``.
+
+        Raises:
+            ValueError: the model has no moving joint, no mass, or a range with lower > upper.
+            KeyError: a name in ``velocity_limits`` or ``locked_joints`` does not exist.
+        """
+        return cls(**_loading.from_mjmodel(model, velocity_limits=velocity_limits, locked_joints=locked_joints))
+
+    @property
+    def nq(self) -> int:
+        """Length of q."""
+        return self.tree.nq
+
+    @property
+    def nv(self) -> int:
+        """Length of v."""
+        return self.tree.nv
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Independent joints in the order of v, free joints left out."""
+        return tuple(self.tree.joint_names[j] for j in self.tree.independent if self.tree.joint_types[j] != FREE)
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Every frame that can be asked for by name: bodies, URDF links (fused or not), sites, geoms."""
+        return self.tree.frame_names
+
+    @property
+    def mimic_joints(self) -> dict[str, tuple[str, float]]:
+        """Followers: name to (leader, multiplier)."""
+        names = self.tree.joint_names
+        return {names[f]: (names[leader], m) for f, leader, m in self.tree.followers}
+
+    @property
+    def locked_joints(self) -> tuple[str, ...]:
+        """Names of the joints frozen at load time."""
+        return tuple(self.tree.joint_names[j] for j in self.tree.locked)
+
+    @property
+    def floating_base(self) -> bool:
+        """Whether the robot has a free joint."""
+        return FREE in self.tree.joint_types
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations."""
+        return self.holder.model
+
+    def joint_qpos_index(self, name: str) -> int:
+        """Where a joint's values start in q; a follower sits where its leader sits.
+
+        Raises:
+            KeyError: no such joint, or it is locked.
+        """
+        return self.tree.qpos_address[self._owner(name)]
+
+    def joint_dof_index(self, name: str) -> int:
+        """Where a joint's velocities start in v; a follower sits where its leader sits.
+
+        Raises:
+            KeyError: no such joint, or it is locked.
+        """
+        return self.tree.dof_address[self._owner(name)]
+
+    def _owner(self, name: str) -> int:
+        joint = self.tree.joint(name)
+        if joint in self.tree.locked:
+            raise KeyError(f"joint {name!r} is locked, so it has no place in q; joints: {', '.join(self.joint_names)}")
+        return {f: leader for f, leader, _ in self.tree.followers}.get(joint, joint)
+
+    def mujoco_qpos(self, q: Float[Array, " nq"]) -> Float[Array, " nqfull"]:
+        """The configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
+        index, coefficient = self.tree.qpos_source
+        return jnp.asarray(q)[index] * coefficient + self.qpos_offset
+
+    def configuration(self, joints: Mapping[str, float], *, base: Float[Array, " nq"] | None = None) -> Array:
+        """``q0`` (or ``base``) with the named hinge and slide joints set. (nq,).
+
+        Raises:
+            KeyError: no such joint.
+        """
+        q = jnp.asarray(self.q0 if base is None else base)
+        for name, value in joints.items():
+            q = q.at[self.joint_qpos_index(name)].set(value)
+        return q
+
+    def check_configuration(self, q: Float[Array, " nq"]) -> None:
+        """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion."""
+        shape = jnp.shape(q)
+        if shape != (self.nq,):
+            raise ValueError(
+                f"q has shape {shape}, this robot's configurations have shape ({self.nq},): "
+                f"{', '.join(self.tree.joint_names[j] for j in self.tree.independent)}. Batch with jax.vmap."
+            )
+        if isinstance(q, jax.core.Tracer):
+            return
+        values = np.asarray(q)
+        if not np.isfinite(values).all():
+            raise ValueError(f"q is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
+        for joint, start in self.tree.qpos_address.items():
+            kind = self.tree.joint_types[joint]
+            if kind in (FREE, BALL):
+                first = start + (3 if kind == FREE else 0)
+                if np.linalg.norm(values[first : first + 4]) < _UNIT_QUATERNION_TOLERANCE:
+                    raise ValueError(
+                        f"q[{first}:{first + 4}], the quaternion of joint {self.tree.joint_names[joint]!r}, is zero; "
+                        "the identity is (1, 0, 0, 0)"
+                    )
+
+
+def load_robot(name: str) -> Robot:
+    """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
+
+    Raises:
+        KeyError: no such robot; the message lists those that exist.
+    """
+    return Robot(**_loading.embedded(name))
