@@ -1,6 +1,6 @@
 """From files and MuJoCo models to the fields of a Robot. Host code, run once per robot."""
 
-from ._mjcf import embedded as embedded
+from ._embedded import embedded as embedded
 from ._mjcf import from_mjcf as from_mjcf
 from ._mjmodel import from_mjmodel as from_mjmodel
 from ._urdf import from_urdf as from_urdf
