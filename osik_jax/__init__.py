@@ -8,5 +8,17 @@ from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import frame_jacobian as frame_jacobian
 from .kinematics import frame_jacobians as frame_jacobians
 from .kinematics import integrate as integrate
+from .limits import ConfigurationLimit as ConfigurationLimit
+from .limits import Limit as Limit
+from .limits import VelocityLimit as VelocityLimit
+from .limits import limit_box as limit_box
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot
+from .tasks import AdaptiveGain as AdaptiveGain
+from .tasks import ComTask as ComTask
+from .tasks import FrameTask as FrameTask
+from .tasks import PostureTask as PostureTask
+from .tasks import SupportPolygon as SupportPolygon
+from .tasks import Task as Task
+from .tasks import TaskRows as TaskRows
+from .tasks import support_polygon as support_polygon

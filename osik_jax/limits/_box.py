@@ -1,0 +1,66 @@
+"""From limits to one box on the velocity."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._joint_selection import concrete
+from ..robot import Robot
+
+_ORDER = ("velocity", "position")
+
+
+class Limit(eqx.Module):
+    """Base of all limits: subclass it and write ``box`` to make your own.
+
+    Attributes:
+        kind: ``"velocity"`` limits are applied before ``"position"`` limits, whatever order they are given in. Of two
+            that have nothing in common the one applied first holds.
+    """
+
+    kind: ClassVar[Literal["velocity", "position"]] = "velocity"
+
+    @abc.abstractmethod
+    def box(
+        self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
+    ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+        """Lower and upper bounds on v [rad/s or m/s], lower <= upper, +-inf where free."""
+
+
+def limit_box(
+    robot: Robot, q: Float[Array, " nq"], limits: Sequence[Limit], dt: Float[Array, ""] | float
+) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+    """The box on v that all limits ask for over a step of dt [s]; lower <= upper always.
+
+    Velocity limits first; then each position limit is clipped into the box so far:
+    ``lower = clip((q_lower - q) / dt, v_lower, v_upper)``, ``upper = clip((q_upper - q) / dt, v_lower, v_upper)``.
+    So a joint outside its range comes back as fast as its velocity limit lets it instead of making the problem
+    infeasible. Without limits: -inf and inf.
+
+    Args:
+        robot: the robot.
+        q: configuration. (nq,)
+        limits: any number of limits.
+        dt: time until the next configuration [s], positive.
+
+    Returns:
+        lower and upper bounds on v. (nv,) each
+
+    Raises:
+        ValueError: dt is seen not to be positive.
+    """
+    seen = concrete(dt)
+    if seen is not None and not (seen > 0.0).all():
+        raise ValueError(f"dt is {dt}; it has to be positive, in seconds")
+    dtype = jnp.result_type(jnp.asarray(q), robot.q0)
+    lower, upper = jnp.full(robot.nv, -jnp.inf, dtype), jnp.full(robot.nv, jnp.inf, dtype)
+    for limit in sorted(limits, key=lambda limit: _ORDER.index(limit.kind)):
+        low, high = limit.box(robot, q, dt)
+        lower, upper = jnp.clip(low, lower, upper), jnp.clip(high, lower, upper)
+    return lower, upper

@@ -1,0 +1,47 @@
+"""Greatest joint speeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import concrete, dof_names, dof_values
+from ..robot import Robot
+from ._box import Limit
+
+
+class VelocityLimit(Limit):
+    """``-velocity <= v <= velocity``.
+
+    Args:
+        robot: the robot; its ``velocity_limit`` is the default.
+        velocity: greatest speeds [rad/s or m/s]: an array (nv,), or a mapping from joint names or globs to values that
+            replaces the robot's own for those joints. A free base takes part only when it is named (the value then
+            bounds its three linear [m/s] and three angular [rad/s] velocities) or in an array. Infinite: free.
+
+    Raises:
+        KeyError: the mapping names a joint that does not exist.
+        ValueError: a wrong shape, or a speed that is negative or not a number.
+    """
+
+    kind: ClassVar[Literal["velocity", "position"]] = "velocity"
+    velocity: Float[Array, " nv"]
+
+    def __init__(self, robot: Robot, *, velocity: ArrayLike | Array | Mapping[str, float] | None = None):
+        self.velocity = dof_values(robot, velocity, robot.velocity_limit, "velocity")
+        seen = concrete(self.velocity)
+        if seen is not None and not (seen >= 0.0).all():
+            bad = np.flatnonzero(~(seen >= 0.0))
+            names = [f"{dof_names(robot)[i]} ({seen[i]})" for i in bad]
+            raise ValueError(f"velocity limits have to be 0 or more: {', '.join(names)}")
+
+    def box(
+        self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
+    ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+        """(-velocity, velocity)."""
+        del robot, q, dt
+        return -self.velocity, self.velocity

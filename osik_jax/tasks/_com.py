@@ -1,0 +1,163 @@
+"""A task on the centre of mass."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ..kinematics import Kinematics, center_of_mass, com_jacobian
+from ..robot import Robot
+from ._gain import AdaptiveGain, Gain, as_gain
+from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, home_kinematics
+from ._polygon import SupportPolygon
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+
+
+class ComTask(Task):
+    """Brings the centre of mass to a point, or keeps it within bounds or over a support polygon.
+
+    With c (3,) the centre of mass in the world [m] and A the chosen axes:
+
+    - a target: ``e = c_A - c*_A``, ``e' = J_A v - c*'_A``, asked to be ``-gain(e) e``;
+    - bounds: ``gain (lower - c_A) <= J_A v - c*'_A <= gain (upper - c_A)``, on the coordinates themselves;
+    - a polygon: ``normals J_xy v <= gain (offsets - normals c_xy)``, one row an edge.
+
+    Args:
+        robot: the robot.
+        target: point in the world [m], (3,) or one entry for each axis; default: the centre of mass at ``robot.q0``.
+        target_velocity: velocity of the target, or of the bounds [m/s], shaped as ``target``; default 0.
+        lower: makes an inequality task: lower bounds on the coordinates [m], one for each axis, or a scalar.
+        upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
+        polygon: makes an inequality task on the ground projection instead; see ``support_polygon``.
+        axes: which of the world's axes, e.g. ``"xyz"``, ``"xy"``, ``"z"``.
+        subtree: name of a body: the centre of mass of it and all that hangs from it. Default: the whole robot.
+        weight: of each squared row.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+        priority: 1 is the most important.
+
+    Raises:
+        KeyError: no such body.
+        TypeError: arguments that exclude each other.
+        ValueError: a wrong shape, a negative weight, lower > upper, an unknown axis.
+    """
+
+    axes: str = eqx.field(static=True)
+    subtree: str | None = eqx.field(static=True)
+    priority: int = eqx.field(static=True)
+    target: Float[Array, " m"] | None
+    target_velocity: Float[Array, " m"] | None
+    lower: Float[Array, " m"] | None
+    upper: Float[Array, " m"] | None
+    polygon: SupportPolygon | None
+    weight: Float[Array, ""]
+    gain: Gain
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        target: ArrayLike | Array | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        polygon: SupportPolygon | None = None,
+        axes: str = "xyz",
+        subtree: str | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+    ):
+        _check_exclusive(target, target_velocity, lower, upper, polygon, axes)
+        if subtree is not None:
+            robot.tree.frame(subtree)
+        self.axes, self.subtree = _check_axes(axes), subtree
+        self.priority = check_priority(priority)
+        dtype = robot.q0.dtype
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+        self.lower, self.upper = as_bounds(lower, upper, len(axes), dtype)
+        self.polygon = None if polygon is None else _cast(polygon, dtype)
+        self.target = self.target_velocity = None
+        if polygon is None:
+            velocity = 0.0 if target_velocity is None else target_velocity
+            self.target_velocity = self._along_axes(velocity, "target_velocity")
+            if self.lower is None:
+                point = center_of_mass(robot, home_kinematics(robot), subtree) if target is None else target
+                self.target = self._along_axes(point, "target")
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """One row for each axis, or for each edge of the polygon."""
+        del q
+        point = center_of_mass(robot, kinematics, self.subtree)
+        jacobian = com_jacobian(robot, kinematics, self.subtree)
+        if self.polygon is not None:
+            return self._polygon_rows(self.polygon, point, jacobian)
+        axes = np.array(["xyz".index(axis) for axis in self.axes])
+        value = point[axes] if self.target is None else point[axes] - self.target
+        return task_rows(
+            value,
+            jacobian[axes],
+            gain=self.gain,
+            weight=jnp.broadcast_to(self.weight, value.shape),
+            lower=self.lower,
+            upper=self.upper,
+            feedforward=self.target_velocity,
+        )
+
+    def _polygon_rows(self, polygon: SupportPolygon, point: Array, jacobian: Array) -> TaskRows:
+        value = jnp.matmul(polygon.normals, point[:2], precision="highest")
+        return task_rows(
+            value,
+            jnp.matmul(polygon.normals, jacobian[:2], precision="highest"),
+            lower=jnp.full_like(value, -jnp.inf),
+            upper=polygon.offsets,
+            gain=self.gain,
+            weight=jnp.broadcast_to(self.weight, value.shape),
+        )
+
+    def _along_axes(self, value: Any, what: str) -> Float[Array, " m"]:
+        """One entry for each axis, from that, from a scalar, or from a vector x, y, z."""
+        value = jnp.asarray(value, self.weight.dtype)
+        if value.shape == (3,) and len(self.axes) < 3:
+            value = value[np.array(["xyz".index(axis) for axis in self.axes])]
+        return as_vector(value, (len(self.axes),), what, self.weight.dtype)
+
+    def _convert(self, name: str, value: Any) -> Any:
+        if name == "polygon":
+            if not isinstance(value, SupportPolygon):
+                raise TypeError(f"polygon is a SupportPolygon (see support_polygon), got {type(value).__name__}")
+            return _cast(value, self.weight.dtype)
+        if name in ("target", "target_velocity"):
+            return self._along_axes(value, name)
+        return super()._convert(name, value)
+
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)
+
+
+def _cast(polygon: SupportPolygon, dtype: Any) -> SupportPolygon:
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), polygon)
+
+
+def _check_axes(axes: str) -> str:
+    if not axes or len(set(axes)) != len(axes) or not set(axes) <= set("xyz"):
+        raise ValueError(f"axes is {axes!r}; it is made of x, y and z, each at most once")
+    return axes
+
+
+def _check_exclusive(target: Any, velocity: Any, lower: Any, upper: Any, polygon: Any, axes: str) -> None:
+    bounds = lower is not None or upper is not None
+    if target is not None and bounds:
+        raise TypeError("a ComTask has a target or bounds (lower, upper), not both")
+    if polygon is None:
+        return
+    if not isinstance(polygon, SupportPolygon):
+        raise TypeError(f"polygon is a SupportPolygon (see support_polygon), got {type(polygon).__name__}")
+    if target is not None or velocity is not None or bounds or axes != "xyz":
+        raise TypeError("a ComTask with a polygon takes no target, target_velocity, lower, upper or axes")

@@ -1,0 +1,136 @@
+"""A task on the joints themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import is_scalar, select_all
+from .._tree import BALL, DOF_WIDTH, FREE
+from ..kinematics import Kinematics, difference
+from ..robot import Robot
+from ._gain import AdaptiveGain, Gain, as_gain
+from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._rotation import inverse_left_jacobian
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+
+
+class PostureTask(Task):
+    """Brings joints to a configuration, or keeps them within bounds.
+
+    - A target q*: ``e = difference(q*, q)`` on the chosen joints' dofs (hinges and slides: ``q - q*``; ball and free
+      joints: the rotation vector ``log(R*' R)``, and the base's position in the world), asked to follow
+      ``e' = -gain(e) e``. The Jacobian is rows of the identity, with the inverse right Jacobian of SO(3) on rotations.
+    - Bounds: ``gain (lower - q) <= v - q*' <= gain (upper - q)``, on the joint values themselves; hinges and slides.
+
+    Args:
+        robot: the robot.
+        target: a configuration (nq,); default: ``robot.q0``. Joints that are not chosen do not matter.
+        target_velocity: of the target, or of the bounds, one entry for each row [rad/s or m/s] (rotations: angular
+            velocity in the target's axes); default 0.
+        lower: makes an inequality task: lower bounds on the joint values [rad or m], one for each row, or a scalar.
+        upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
+        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; rows are in the order of v whatever the order here.
+            Default: all but the free base, which has to be named to take part.
+        weight: of each squared row: a scalar. Several posture tasks give several weights.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+        priority: 1 is the most important.
+
+    Raises:
+        KeyError: no such joint, or it is locked or a mimic follower.
+        TypeError: arguments that exclude each other.
+        ValueError: a wrong shape, a negative weight, lower > upper, bounds on a ball or free joint.
+    """
+
+    joints: tuple[int, ...] = eqx.field(static=True)
+    priority: int = eqx.field(static=True)
+    target: Float[Array, " nq"] | None
+    target_velocity: Float[Array, " m"]
+    lower: Float[Array, " m"] | None
+    upper: Float[Array, " m"] | None
+    weight: Float[Array, ""]
+    gain: Gain
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        target: ArrayLike | Array | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        joints: Iterable[str] | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+    ):
+        self.joints = tuple(select_all(robot, joints))
+        self.priority = check_priority(priority)
+        dtype = robot.q0.dtype
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+        rows = sum(DOF_WIDTH[robot.tree.joint_types[j]] for j in self.joints)
+        velocity = 0.0 if target_velocity is None else target_velocity
+        self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
+        self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
+        self.target = None
+        if self.lower is None:
+            self.target = jnp.asarray(robot.q0 if target is None else target, dtype)
+            robot.check_configuration(self.target)
+        else:
+            _check_bounded(robot, self.joints, target)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """One row for each dof of the chosen joints, in the order of v."""
+        del kinematics
+        tree = robot.tree
+        dofs = [tree.dof_address[j] + i for j in self.joints for i in range(DOF_WIDTH[tree.joint_types[j]])]
+        jacobian = jnp.asarray(np.eye(robot.nv)[dofs], self.weight.dtype)
+        feedforward = self.target_velocity
+        if self.target is None:
+            error = q[np.array([tree.qpos_address[j] for j in self.joints])]
+        else:
+            error = difference(robot, self.target, q)[np.array(dofs)]
+            jacobian, feedforward = self._turn(robot, error, jacobian)
+        return task_rows(
+            error,
+            jacobian,
+            gain=self.gain,
+            weight=jnp.broadcast_to(self.weight, error.shape),
+            lower=self.lower,
+            upper=self.upper,
+            feedforward=feedforward,
+        )
+
+    def _turn(self, robot: Robot, error: Array, jacobian: Array) -> tuple[Float[Array, "m nv"], Float[Array, " m"]]:
+        """Jacobian and feed-forward with the rotations' blocks put in."""
+        feedforward, row = self.target_velocity, 0
+        for joint in self.joints:
+            kind = robot.tree.joint_types[joint]
+            width = DOF_WIDTH[kind]
+            if kind in (FREE, BALL):
+                at, dof = row + width - 3, robot.tree.dof_address[joint] + width - 3
+                left = inverse_left_jacobian(error[at : at + 3])
+                jacobian = jacobian.at[at : at + 3, dof : dof + 3].set(left.T)
+                turned = jnp.matmul(left, self.target_velocity[at : at + 3], precision="highest")
+                feedforward = feedforward.at[at : at + 3].set(turned)
+            row += width
+        return jacobian, feedforward
+
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)
+
+
+def _check_bounded(robot: Robot, joints: tuple[int, ...], target: Any) -> None:
+    """Raises where bounds make no sense."""
+    if target is not None:
+        raise TypeError("a PostureTask has a target or bounds (lower, upper), not both")
+    turning = [robot.tree.joint_names[j] for j in joints if not is_scalar(robot, j)]
+    if turning:
+        raise ValueError(f"bounds are on the values of hinges and slides; leave out {', '.join(turning)}")

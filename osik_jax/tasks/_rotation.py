@@ -1,0 +1,54 @@
+"""The logarithm of a rotation and the matrix that turns angular velocity into its rate."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+_SMALL_SINE_SQUARED = 1e-6
+_SMALL_ANGLE_SQUARED = 1e-2
+
+
+def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Rotation vector (axis times angle, angle in [0, pi]) [rad]. Exact derivatives at angle 0 and at pi.
+
+    ``jaxlie.SO3.log`` holds the angle constant very near pi, which makes its derivative there wrong; the quaternion is
+    taken from jaxlie, the angle from an arctangent that is smooth over the whole range. Beyond pi the vector flips to
+    the other end of the axis; the derivative is that of the side it is on.
+    """
+    wxyz = jaxlie.SO3.from_matrix(rotation).wxyz
+    wxyz = jnp.where(wxyz[0] < 0.0, -wxyz, wxyz)
+    cosine, vector = wxyz[0], wxyz[1:]
+    sine_squared = jnp.sum(vector**2)
+    small = sine_squared < _SMALL_SINE_SQUARED
+    sine = jnp.sqrt(jnp.where(small, 1.0, sine_squared))
+    safe_cosine = jnp.where(small, cosine, 1.0)
+    tangent_squared = sine_squared / safe_cosine**2
+    series = (2.0 - tangent_squared * (2.0 / 3.0 - tangent_squared * (2.0 / 5.0))) / safe_cosine
+    return jnp.where(small, series, 2.0 * jnp.arctan2(sine, cosine) / sine) * vector
+
+
+def inverse_left_jacobian(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Inverse left Jacobian of SO(3) at a rotation vector: the paper's matrix E.
+
+    With ``Q = exp(vector)`` and angular velocity w in the axes on the left (``Q' = [w] Q``), ``vector' = E w``. Its
+    transpose is the inverse right Jacobian (``Q' = Q [w]``). E = I - [e]/2 + c(angle) [e]^2 with
+    ``c = (1 - (angle/2) cot(angle/2)) / angle^2``, which is 1/12 at 0 and 1/pi^2 at pi.
+    """
+    squared = jnp.sum(vector**2)
+    small = squared < _SMALL_ANGLE_SQUARED
+    safe = jnp.where(small, 1.0, squared)
+    half = 0.5 * jnp.sqrt(safe)
+    exact = (1.0 - half * jnp.cos(half) / jnp.sin(half)) / safe
+    series = 1 / 12 + squared * (1 / 720 + squared * (1 / 30240 + squared * (1 / 1209600 + squared / 47900160)))
+    factor = jnp.where(small, series, exact)
+    square = jnp.outer(vector, vector) - squared * jnp.eye(3, dtype=vector.dtype)
+    return jnp.eye(3, dtype=vector.dtype) - 0.5 * cross_matrix(vector) + factor * square
+
+
+def cross_matrix(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """[a], the matrix with [a] b = a x b."""
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    return jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])

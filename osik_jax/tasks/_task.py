@@ -1,0 +1,138 @@
+"""What every task is, and what it hands to a solver."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..kinematics import Kinematics
+from ..robot import Robot
+from ._gain import Gain, as_gain, evaluate_gain
+from ._leaves import as_scalar, as_vector
+
+DEFAULT_GAIN = 10.0
+"""[1/s]. The error falls by 1/e in 0.1 s; Euler steps are monotone up to dt = 0.1 s and stable up to 0.2 s."""
+
+
+class TaskRows(eqx.Module):
+    """What a task asks for at one configuration: ``lower <= jacobian @ v <= upper``.
+
+    Attributes:
+        error: an equality task's ``e = x (-) x*``; an inequality task's value, the x that is bounded. (m,)
+        jacobian: ``d error / dt = jacobian @ v`` for a target that stands still. (m, nv)
+        lower: bound on ``jacobian @ v``. Equality: ``-gain e + x*'``; inequality: ``gain (lower - x) + x*'``. (m,)
+        upper: the same as ``lower`` for an equality; inequality: ``gain (upper - x) + x*'``. (m,)
+        weight: of the square of each row's residual. (m,)
+    """
+
+    error: Float[Array, " m"]
+    jacobian: Float[Array, "m nv"]
+    lower: Float[Array, " m"]
+    upper: Float[Array, " m"]
+    weight: Float[Array, " m"]
+
+
+class Task(eqx.Module):
+    """Base of all tasks: an immutable pytree. Subclass it and write ``rows`` to make your own.
+
+    Attributes:
+        priority: 1 is the most important; static.
+        weight: of the task's squared residual against others in the same weighted problem or level.
+        gain: [1/s], a constant or an ``AdaptiveGain``: the wanted error rate is ``-gain * error``.
+    """
+
+    priority: eqx.AbstractVar[int]
+    weight: eqx.AbstractVar[Float[Array, ""]]
+    gain: eqx.AbstractVar[Gain]
+
+    @abc.abstractmethod
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
+
+    def replace(self, **changes: Any) -> Self:
+        """The same task with other numbers, checked and converted as on construction.
+
+        Works inside ``jit`` and changes no structure, so nothing is compiled again:
+        ``task.replace(target=(p, R), gain=5.0)``. A batch of tasks is a vmapped replace:
+        ``jax.vmap(lambda p: task.replace(target=(p, R)))(positions)``.
+
+        Raises:
+            TypeError: a name that is not one of this task's numbers; the message lists those that are.
+            ValueError: a wrong shape or value.
+        """
+        for name in changes:
+            if name not in self.replaceable:
+                raise TypeError(
+                    f"{type(self).__name__} has no {name!r} to replace; "
+                    f"it has: {', '.join(self.replaceable)} (structure is fixed at construction)"
+                )
+        names = tuple(changes)
+        values = [self._convert(name, value) for name, value in changes.items()]
+        if not names:
+            return self
+        new = eqx.tree_at(lambda task: [getattr(task, name) for name in names], self, values)
+        new._check()
+        return new
+
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Names that ``replace`` takes: the fields that hold numbers."""
+        fields = dataclasses.fields(self)
+        return tuple(f.name for f in fields if not f.metadata.get("static") and getattr(self, f.name) is not None)
+
+    def _convert(self, name: str, value: Any) -> Any:
+        """A new value for a field, in the task's precision."""
+        dtype = self.weight.dtype
+        if name == "weight":
+            return as_scalar(value, name, dtype)
+        if name == "gain":
+            return as_gain(value, dtype)
+        return as_vector(value, getattr(self, name).shape, name, dtype)
+
+    def _check(self) -> None:
+        """Raises ValueError where fields do not fit each other."""
+
+
+def check_priority(priority: int) -> int:
+    """The priority, if it is an integer from 1 up."""
+    if isinstance(priority, bool) or not isinstance(priority, int) or priority < 1:
+        raise ValueError(f"a priority is an integer, 1 for the most important task, 2 for the next; got {priority!r}")
+    return priority
+
+
+def task_rows(
+    error: Float[Array, " m"],
+    jacobian: Float[Array, "m nv"],
+    *,
+    gain: Gain,
+    weight: Float[Array, " m"],
+    lower: Float[Array, " m"] | None = None,
+    upper: Float[Array, " m"] | None = None,
+    feedforward: Float[Array, " m"] | None = None,
+) -> TaskRows:
+    """The rows of an equality task, or with bounds of an inequality task on ``error``.
+
+    Equality: ``jacobian v = -gain(error) error + feedforward``. Inequality: ``gain (lower - error) + feedforward <=
+    jacobian v <= gain (upper - error) + feedforward``; infinite bounds stay infinite, and an adaptive gain is evaluated
+    at the distance of the value to the interval, 0 inside. Rows of weight 0 do not count for the gain.
+    """
+    shift = jnp.zeros_like(error) if feedforward is None else feedforward
+    if lower is None or upper is None:
+        wanted = shift - evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
+        return TaskRows(error, jacobian, wanted, wanted, weight)
+    outside = jnp.maximum(lower - error, 0.0) + jnp.maximum(error - upper, 0.0)
+    rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
+    low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
+    return TaskRows(error, jacobian, low, high, weight)
+
+
+def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
+    """``rate (bound - value)``; an infinite bound stays so at rate 0, and its gradients are 0."""
+    free = jnp.isinf(bound)
+    gap = jnp.where(free, 0.0, bound) - value
+    return jnp.where(free, bound, rate * gap)
