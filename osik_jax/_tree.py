@@ -9,9 +9,15 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-FREE, BALL, SLIDE, HINGE = (int(t) for t in (
-    mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE,
-))
+FREE, BALL, SLIDE, HINGE = (
+    int(t)
+    for t in (
+        mujoco.mjtJoint.mjJNT_FREE,
+        mujoco.mjtJoint.mjJNT_BALL,
+        mujoco.mjtJoint.mjJNT_SLIDE,
+        mujoco.mjtJoint.mjJNT_HINGE,
+    )
+)
 QPOS_WIDTH = {FREE: 7, BALL: 4, SLIDE: 1, HINGE: 1}
 DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
 
@@ -65,6 +71,14 @@ class KinematicTree:
     frame_bodies: tuple[int, ...]
     followers: tuple[tuple[int, int, float], ...] = ()
     locked: tuple[int, ...] = ()
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Computed once: every call of a jitted function asks for it."""
+        return hash(tuple(getattr(self, field.name) for field in dataclasses.fields(self)))
 
     @cached_property
     def independent(self) -> tuple[int, ...]:
@@ -124,19 +138,21 @@ class KinematicTree:
 
         The first pair takes each independent joint's own columns; each further pair adds one follower to its leader.
         """
-        own = np.concatenate([
-            np.arange(self.full_dof_address[j], self.full_dof_address[j + 1]) for j in self.independent
-        ]).astype(int) if self.independent else np.zeros(0, int)
+        own = (
+            np.concatenate(
+                [np.arange(self.full_dof_address[j], self.full_dof_address[j + 1]) for j in self.independent]
+            ).astype(int)
+            if self.independent
+            else np.zeros(0, int)
+        )
         terms = [(own, np.ones(self.nv))]
         for follower, leader, multiplier in self.followers:
             dof = self.dof_address[leader]
-            for index, coefficient in terms[1:]:
-                if coefficient[dof] == 0.0:
-                    break
-            else:
-                index, coefficient = np.zeros(self.nv, int), np.zeros(self.nv)
-                terms.append((index, coefficient))
-            index[dof], coefficient[dof] = self.full_dof_address[follower], multiplier
+            free = next((term for term in terms[1:] if term[1][dof] == 0.0), None)
+            if free is None:
+                free = np.zeros(self.nv, int), np.zeros(self.nv)
+                terms.append(free)
+            free[0][dof], free[1][dof] = self.full_dof_address[follower], multiplier
         return tuple(terms)
 
     @cached_property

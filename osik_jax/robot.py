@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -33,7 +34,7 @@ class Robot(eqx.Module):
         tree: names and topology (static).
         body_position: of each body in its parent [m]. (nbody, 3)
         body_quaternion: of each body in its parent, w x y z. (nbody, 4)
-        body_mass: [kg]. (nbody,)
+        body_mass: [kg]; what is fixed to the world does not count. (nbody,)
         body_com: centre of mass of each body in its own frame [m]. (nbody, 3)
         joint_position: anchor of each joint in its body [m]. (njoint, 3)
         joint_axis: axis of each joint in its body. (njoint, 3)
@@ -72,17 +73,27 @@ class Robot(eqx.Module):
         floating_base: bool | None = None,
         locked_joints: LockedJoints = (),
     ) -> Robot:
-        """Loads a URDF. Mesh files are never read.
+        """Loads a URDF. Mesh files are never read; boxes, spheres, cylinders and capsules are kept for drawing.
+
+        Every link is a frame, with or without a joint of its own. Limits come from ``<limit>``: no ``<limit>`` means
+        none, an absent ``lower`` or ``upper`` is 0 as the format has it, and a velocity of 0 or none means unknown,
+        so unlimited. ``<safety_controller>`` is not read. A ``<mimic>`` joint is no coordinate of its own: it moves
+        with its leader, whose limits its own limits narrow. Moving links without mass get 2e-15 kg in ``mj_model``, which
+        MuJoCo demands. What is fixed to the world (the root link of an arm) does not count as the robot's mass.
 
         Args:
-            urdf: path of the file, or the XML text itself.
-            floating_base: put a free joint on the root link. ``None``: unless the URDF has one already
-                (``floating``), or its root link is called ``world``. Lengths in metres, angles in radians.
-            locked_joints: names or globs of joints to freeze at 0, or a mapping from them to the values to freeze at.
+            urdf: path of the file, or the XML text itself. Lengths in metres, angles in radians.
+            floating_base: ``True``: put a free joint, ``floating_base``, on the root link unless the URDF has a
+                ``floating`` joint already (below a root link called ``world``: on the one link fixed to it).
+                ``False``: the root link is fixed to the world, and ``floating`` joints are locked. ``None``: as
+                ``True``, but a root link called ``world`` is the world and stays fixed.
+            locked_joints: names or globs of joints to freeze at 0, or a mapping from them to the values to freeze at
+                [rad or m]. A mimic joint is locked by locking its leader.
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: the XML or the model in it is broken; the message says where.
+            ValueError: the XML or the model in it is broken or cannot be represented (``planar`` joints); the message
+                says where.
             KeyError: ``locked_joints`` names a joint that does not exist.
         """
         return cls(**_loading.from_urdf(urdf, floating_base=floating_base, locked_joints=locked_joints))
@@ -96,21 +107,33 @@ class Robot(eqx.Module):
         velocity_limits: Mapping[str, float] | None = None,
         locked_joints: LockedJoints = (),
     ) -> Robot:
-        """Loads an MJCF file or text. Joint equality constraints that are linear become exact mimic joints.
+        """Loads an MJCF file or text. The first keyframe is ``q0``.
+
+        Active joint equality constraints that are linear become exact mimic joints, those without a second joint lock
+        the first; other constraints (``connect``, ``weld``, tendons) are not honoured. Where files of meshes, height
+        fields or textures cannot be read, the geoms that need them are left out.
 
         Args:
             mjcf: path of the file, or the XML text itself.
-            floating_base: ``None``: as the file says. ``True``: put a free joint on the root body if it has no joint.
+            floating_base: ``None``: as the file says. ``True``: put a free joint on the root body unless the model has
+                one. ``False``: free joints are locked where the file has them.
             velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; MJCF has no field for it. A custom
                 numeric ``velocity_limit/JOINT`` in the file is read too.
             locked_joints: as in ``from_urdf``.
 
         Raises:
-            FileNotFoundError, ValueError, KeyError: as in ``from_urdf``.
+            FileNotFoundError: no such file.
+            ValueError: the XML or the model in it is broken, or a body takes its mass from a mesh that cannot be read.
+            KeyError: ``velocity_limits`` or ``locked_joints`` names a joint that does not exist.
         """
-        return cls(**_loading.from_mjcf(
-            mjcf, floating_base=floating_base, velocity_limits=velocity_limits, locked_joints=locked_joints,
-        ))
+        return cls(
+            **_loading.from_mjcf(
+                mjcf,
+                floating_base=floating_base,
+                velocity_limits=velocity_limits,
+                locked_joints=locked_joints,
+            )
+        )
 
     @classmethod
     def from_mjmodel(
@@ -124,11 +147,12 @@ class Robot(eqx.Module):
 
         Args:
             model: the model.
-            velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s].
-            locked_joints: as in ``from_urdf``.
+            velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; wins over custom numerics
+                ``velocity_limit/JOINT`` of the model.
+            locked_joints: as in ``from_urdf``; without a value, joints freeze at ``qpos0``.
 
         Raises:
-            ValueError: the model has no moving joint, no mass, or a range with lower > upper.
+            ValueError: the model has no moving joint, no moving mass, or a range with lower > upper.
             KeyError: a name in ``velocity_limits`` or ``locked_joints`` does not exist.
         """
         return cls(**_loading.from_mjmodel(model, velocity_limits=velocity_limits, locked_joints=locked_joints))
@@ -166,8 +190,8 @@ class Robot(eqx.Module):
 
     @property
     def floating_base(self) -> bool:
-        """Whether the robot has a free joint."""
-        return FREE in self.tree.joint_types
+        """Whether the robot has a free joint that is not locked."""
+        return any(self.tree.joint_types[j] == FREE for j in self.tree.independent)
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -202,14 +226,23 @@ class Robot(eqx.Module):
         return jnp.asarray(q)[index] * coefficient + self.qpos_offset
 
     def configuration(self, joints: Mapping[str, float], *, base: Float[Array, " nq"] | None = None) -> Array:
-        """``q0`` (or ``base``) with the named hinge and slide joints set. (nq,).
+        """``q0`` (or ``base``) with the named hinge and slide joints set; setting a follower moves its leader. (nq,).
 
         Raises:
-            KeyError: no such joint.
+            KeyError: no such joint, or it is locked.
+            ValueError: a free or ball joint, which no single number sets.
         """
         q = jnp.asarray(self.q0 if base is None else base)
+        coefficient = self.tree.qpos_source[1]
         for name, value in joints.items():
-            q = q.at[self.joint_qpos_index(name)].set(value)
+            joint = self.tree.joint(name)
+            if self.tree.joint_types[joint] in (FREE, BALL):
+                raise ValueError(
+                    f"joint {name!r} is free or ball: set its entries of q, from joint_qpos_index({name!r})"
+                )
+            full = self.tree.full_qpos_address[joint]
+            index = self.joint_qpos_index(name)
+            q = q.at[index].set((value - self.qpos_offset[full]) / coefficient[full])
         return q
 
     def check_configuration(self, q: Float[Array, " nq"]) -> None:

@@ -3,18 +3,49 @@
 from __future__ import annotations
 
 import fnmatch
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._tree import DOF_WIDTH, FREE, HINGE, SLIDE, KinematicTree, ModelHolder, unknown_name
+from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder, unknown_name
 
-Follower = tuple[str, str, float, float]
-"""(follower, leader, multiplier, offset): q_follower = multiplier * q_leader + offset."""
+VELOCITY_LIMIT_PREFIX = "velocity_limit/"
+"""A custom numeric of this name and a joint's holds the joint's greatest speed [rad/s or m/s]."""
+
+_MASSLESS = 1e-14
+"""Mass per body [kg] that counts as none: MuJoCo itself demands 1e-15 of every moving body."""
+
+_LOCK_TOLERANCE = 1e-9
+"""How far the value asked of a locked follower may be from where its leader puts it [rad or m]."""
+
+
+class Follower(NamedTuple):
+    """By joint index, ``q_joint = multiplier * q_leader + offset``."""
+
+    joint: int
+    leader: int
+    multiplier: float
+    offset: float
+
+
+class Lock(NamedTuple):
+    """The qpos entries that a joint is to be locked at, and whether the user gave them."""
+
+    value: np.ndarray
+    given: bool
+
+
+class Placement(NamedTuple):
+    """The moving body (its number in the tree) that a body of the model is fixed to, and the body's pose in it."""
+
+    body: int
+    position: np.ndarray
+    rotation: np.ndarray
 
 
 def from_mjmodel(
@@ -22,53 +53,38 @@ def from_mjmodel(
     *,
     velocity_limits: Mapping[str, float] | None = None,
     locked_joints: Iterable[str] | Mapping[str, float] = (),
-    followers: Sequence[Follower] = (),
 ) -> dict[str, Any]:
-    """The fields of a Robot. Linear joint equality constraints of the model add to ``followers``."""
-    names = tuple(_name(model, mujoco.mjtObj.mjOBJ_JOINT, j, "joint") for j in range(model.njnt))
-    _check(model, names)
-    locked = _locked_values(model, names, locked_joints)
-    mimic = _resolve_followers(names, [*followers, *_equality_followers(model, names)], locked)
-    bodies, body_of, placement = _moving_bodies(model)
-    frames = _frames(model, body_of, placement)
+    """The fields of a Robot from a MuJoCo model; see ``Robot.from_mjmodel``."""
+    names = element_names(model, mujoco.mjtObj.mjOBJ_JOINT, "joint", model.njnt)
+    body_names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    _check(model, names, body_names)
+    asked = _asked_locks(model, names, as_mapping(locked_joints))
+    followers, locked = _resolve(names, *_equality_followers(model), asked)
+    bodies, placement = _moving_bodies(model)
+    frames = _frames(model, body_names, placement)
     tree = KinematicTree(
-        body_names=tuple(_name(model, mujoco.mjtObj.mjOBJ_BODY, b, "body") for b in bodies),
-        body_parents=tuple(int(body_of[model.body_parentid[b]]) if b else 0 for b in bodies),
+        body_names=tuple(body_names[b] for b in bodies),
+        body_parents=tuple(placement[model.body_parentid[b]].body for b in bodies),
         joint_names=names,
         joint_types=tuple(int(t) for t in model.jnt_type),
-        joint_bodies=tuple(int(body_of[b]) for b in model.jnt_bodyid),
+        joint_bodies=tuple(placement[b].body for b in model.jnt_bodyid),
         frame_names=tuple(frames),
-        frame_bodies=tuple(body for body, _, _ in frames.values()),
-        followers=tuple((f, leader, multiplier) for f, leader, multiplier, _ in mimic),
+        frame_bodies=tuple(frame.body for frame in frames.values()),
+        followers=tuple(follower[:3] for follower in followers),
         locked=tuple(sorted(locked)),
     )
     if tree.nv == 0:
         raise ValueError(f"the model has no joint left to move; joints: {', '.join(names)}, all locked")
-    mass, com = _body_inertia(model, bodies, body_of, placement)
-    offset = np.zeros(model.nq)
-    for joint, value in locked.items():
-        offset[model.jnt_qposadr[joint] :][: len(value)] = value
-    for follower, _, _, value in mimic:
-        offset[model.jnt_qposadr[follower]] = value
-    lower, upper, speed = _limits(model, names, tree, mimic, velocity_limits or {})
-    parent_rotation = [placement[model.body_parentid[b]][1] for b in bodies]
-    parent_position = [placement[model.body_parentid[b]][0] for b in bodies]
-    position = [p + R @ model.body_pos[b] for b, p, R in zip(bodies, parent_position, parent_rotation, strict=True)]
-    quaternion = [
-        _quaternion(R @ _matrix(model.body_quat[b])) for b, R in zip(bodies, parent_rotation, strict=True)
-    ]
+    lower, upper, speed = _limits(model, tree, followers, _speeds(model, names, velocity_limits or {}))
     home = model.key_qpos[0] if model.nkey else model.qpos0
     arrays = dict(
-        body_position=position,
-        body_quaternion=quaternion,
-        body_mass=mass,
-        body_com=com,
+        **_body_arrays(model, bodies, placement),
         joint_position=model.jnt_pos,
         joint_axis=model.jnt_axis,
         joint_reference=model.qpos0,
-        frame_position=[p for _, p, _ in frames.values()],
-        frame_rotation=[R for _, _, R in frames.values()],
-        qpos_offset=offset,
+        frame_position=[frame.position for frame in frames.values()],
+        frame_rotation=[frame.rotation for frame in frames.values()],
+        qpos_offset=_qpos_offset(model, followers, locked),
         position_lower=lower,
         position_upper=upper,
         velocity_limit=speed,
@@ -77,12 +93,40 @@ def from_mjmodel(
     return dict(tree=tree, holder=ModelHolder(model), **{k: _float_array(v) for k, v in arrays.items()})
 
 
-def _float_array(value: ArrayLike) -> Any:
-    return jnp.asarray(np.asarray(value, float))
+def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count: int) -> tuple[str, ...]:
+    """Names of a model's bodies or joints; one without a name is called by its kind and number."""
+    given = [mujoco.mj_id2name(model, kind, k) for k in range(count)]
+    out = []
+    for k, name in enumerate(given):
+        free = f"{prefix}{k}"
+        while free in given:
+            free += "_"
+        out.append(name or free)
+    return tuple(out)
 
 
-def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int, prefix: str) -> str:
-    return mujoco.mj_id2name(model, kind, index) or f"{prefix}{index}"
+def as_mapping(locked: Iterable[str] | Mapping[str, float]) -> dict[str, float | None]:
+    """Names or globs of joints to lock; None where no value is given."""
+    if isinstance(locked, str):
+        raise TypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
+    return dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked)
+
+
+def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
+    """Joints whose name is, or else matches the glob, ``pattern``; KeyError with the names where none does."""
+    if pattern in names:
+        return [names.index(pattern)]
+    found = [j for j, name in enumerate(names) if fnmatch.fnmatchcase(name, str(pattern))]
+    if not found:
+        raise unknown_name("joint", pattern, names)
+    return found
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion (w, x, y, z) of a rotation matrix."""
+    out = np.zeros(4)
+    mujoco.mju_mat2Quat(out, np.asarray(rotation, float).ravel())
+    return out
 
 
 def _matrix(quaternion: np.ndarray) -> np.ndarray:
@@ -91,192 +135,219 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
     return out.reshape(3, 3)
 
 
-def _quaternion(matrix: np.ndarray) -> np.ndarray:
-    out = np.zeros(4)
-    mujoco.mju_mat2Quat(out, matrix.ravel())
-    return out
+def _float_array(value: ArrayLike) -> Any:
+    return jnp.asarray(np.asarray(value, float))
 
 
-def _check(model: mujoco.MjModel, names: tuple[str, ...]) -> None:
+def _check(model: mujoco.MjModel, names: tuple[str, ...], body_names: tuple[str, ...]) -> None:
     if model.njnt == 0:
-        bodies = [_name(model, mujoco.mjtObj.mjOBJ_BODY, b, "body") for b in range(model.nbody)]
-        raise ValueError(f"the model has no joint, so nothing can move; bodies: {', '.join(bodies)}")
-    if not model.body_mass.sum() > 0.0:
-        raise ValueError("the model has no mass: give at least one body an inertial with a positive mass")
+        raise ValueError(f"the model has no joint, so nothing can move; bodies: {', '.join(body_names)}")
+    moving = model.body_weldid != 0
+    if not model.body_mass[moving].sum() > _MASSLESS * model.nbody:
+        moving_names = (name for name, moves in zip(body_names, moving, strict=True) if moves)
+        raise ValueError(f"nothing that moves has a mass; give one of these an inertial: {', '.join(moving_names)}")
     for joint, name in enumerate(names):
         low, high = model.jnt_range[joint]
         if model.jnt_limited[joint] and low > high:
             raise ValueError(f"joint {name!r} has limits with lower > upper: [{low}, {high}]")
 
 
-def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
-    """Joints whose name is, or matches the glob, ``pattern``; KeyError with the names where none does."""
-    found = [j for j, name in enumerate(names) if name == pattern or fnmatch.fnmatchcase(name, pattern)]
-    if not found:
-        raise unknown_name("joint", pattern, names)
-    return found
-
-
-def _locked_values(
-    model: mujoco.MjModel, names: tuple[str, ...], locked: Iterable[str] | Mapping[str, float]
-) -> dict[int, np.ndarray]:
-    """Joint index to the qpos entries that it is frozen at; without a value, the entries of qpos0."""
-    if isinstance(locked, str):
-        raise TypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
-    given = dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked)
-    out = {}
-    for pattern, value in given.items():
+def _asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[str, float | None]) -> dict[int, Lock]:
+    """Joint index to what is asked of it; without a value, a joint stays where qpos0 has it."""
+    out: dict[int, Lock] = {}
+    for pattern, value in asked.items():
         for joint in match_joints(pattern, names):
-            scalar = model.jnt_type[joint] in (HINGE, SLIDE)
-            if value is not None and not scalar:
-                raise ValueError(f"joint {names[joint]!r} is free or ball: it can only be locked where the model has it")
-            start = model.jnt_qposadr[joint]
-            width = 1 if scalar else 7 if model.jnt_type[joint] == FREE else 4
-            out[joint] = model.qpos0[start : start + width].copy() if value is None else np.array([float(value)])
+            start, kind = model.jnt_qposadr[joint], int(model.jnt_type[joint])
+            if value is None:
+                out[joint] = Lock(model.qpos0[start : start + QPOS_WIDTH[kind]].copy(), given=False)
+            elif kind in (FREE, BALL):
+                raise ValueError(
+                    f"joint {names[joint]!r} is free or ball: it can only be locked where the model has it"
+                )
+            elif not math.isfinite(value):
+                raise ValueError(f"joint {names[joint]!r} cannot be locked at {value}")
+            else:
+                out[joint] = Lock(np.array([float(value)]), given=True)
     return out
 
 
-def _equality_followers(model: mujoco.MjModel, names: tuple[str, ...]) -> list[Follower]:
-    """Mimic relations of the model's joint equality constraints (active, linear, between two joints)."""
-    out = []
-    for e in range(model.neq):
-        if model.eq_type[e] != mujoco.mjtEq.mjEQ_JOINT or not model.eq_active0[e] or model.eq_obj2id[e] < 0:
-            continue
-        constant, slope, *higher = model.eq_data[e][:5]
-        if any(higher):
-            continue
-        follower, leader = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
-        y0, x0 = (model.qpos0[model.jnt_qposadr[j]] for j in (follower, leader))
-        out.append((names[follower], names[leader], float(slope), float(y0 + constant - slope * x0)))
-    return out
+def _equality_followers(model: mujoco.MjModel) -> tuple[list[Follower], dict[int, np.ndarray]]:
+    """What the active joint equality constraints say: linear in another joint, or (second result) constant.
+
+    Those of a higher degree are left out.
+    """
+    followers, constants = [], {}
+    for e in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool)):
+        joint, leader = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        constant, slope, *higher = (float(x) for x in model.eq_data[e][:5])
+        reference = float(model.qpos0[model.jnt_qposadr[joint]])
+        if leader < 0 or not (slope or any(higher)):
+            constants[joint] = np.array([reference + constant])
+        elif not any(higher):
+            start = float(model.qpos0[model.jnt_qposadr[leader]])
+            followers.append(Follower(joint, leader, slope, reference + constant - slope * start))
+    return followers, constants
 
 
-def _resolve_followers(
-    names: tuple[str, ...], followers: Sequence[Follower], locked: dict[int, np.ndarray]
-) -> list[tuple[int, int, float, float]]:
-    """Followers by index, chains followed to their end; those that follow a locked joint become locked themselves."""
-    table = {}
-    for follower, leader, multiplier, offset in followers:
-        for name in (follower, leader):
-            if name not in names:
-                raise unknown_name("joint", name, names)
-        table[names.index(follower)] = (names.index(leader), multiplier, offset)
-    out = []
-    for follower in sorted(set(table) - set(locked)):
-        leader, multiplier, offset = table[follower]
-        seen = {follower}
-        while leader in table and leader not in locked:
-            if leader in seen:
-                raise ValueError(f"mimic joints follow each other in a circle: {', '.join(names[j] for j in seen)}")
-            seen.add(leader)
-            leader, m, o = table[leader]
-            multiplier, offset = multiplier * m, multiplier * o + offset
-        if leader == follower:
-            raise ValueError(f"joint {names[follower]!r} mimics itself")
-        if leader in locked:
-            locked[follower] = multiplier * locked[leader] + offset
-        elif multiplier == 0.0:
-            locked[follower] = np.array([offset])
+def _resolve(
+    names: tuple[str, ...],
+    relations: Sequence[Follower],
+    constants: Mapping[int, np.ndarray],
+    asked: Mapping[int, Lock],
+) -> tuple[list[Follower], dict[int, np.ndarray]]:
+    """Followers of independent joints, chains followed to their end, and the values of all locked joints.
+
+    A follower whose leader is locked is locked where the leader puts it.
+    """
+    table: dict[int, Follower] = {}
+    for relation in relations:
+        if relation.joint in table or relation.joint in constants:
+            raise ValueError(f"joint {names[relation.joint]!r} is tied by more than one joint equality")
+        table[relation.joint] = relation
+    locked = {joint: lock.value for joint, lock in asked.items() if joint not in table} | dict(constants)
+    followers = []
+    for joint in sorted(table):
+        follower = _end_of_chain(names, table, joint)
+        if follower.leader in locked:
+            locked[joint] = follower.multiplier * locked[follower.leader] + follower.offset
+            _check_lock(names, follower, asked.get(joint), locked[joint])
+        elif joint in asked:
+            raise ValueError(
+                f"joint {names[joint]!r} cannot be locked alone: it mimics {names[follower.leader]!r}, lock that one"
+            )
         else:
-            out.append((follower, leader, multiplier, offset))
+            followers.append(follower)
+    return followers, locked
+
+
+def _end_of_chain(names: tuple[str, ...], table: Mapping[int, Follower], joint: int) -> Follower:
+    """The follower in terms of a leader that follows nobody."""
+    _, leader, multiplier, offset = table[joint]
+    seen = [joint]
+    while leader in table:
+        if leader in seen:
+            raise ValueError(f"joints mimic each other in a circle: {', '.join(names[j] for j in seen)}")
+        seen.append(leader)
+        _, leader, m, o = table[leader]
+        multiplier, offset = multiplier * m, multiplier * o + offset
+    return Follower(joint, leader, multiplier, offset)
+
+
+def _check_lock(names: tuple[str, ...], follower: Follower, asked: Lock | None, value: np.ndarray) -> None:
+    if asked is not None and asked.given and abs(asked.value - value).max() > _LOCK_TOLERANCE:
+        raise ValueError(
+            f"joint {names[follower.joint]!r} cannot be locked at {asked.value[0]}: it mimics "
+            f"{names[follower.leader]!r}, which puts it at {value[0]}"
+        )
+
+
+def _qpos_offset(model: mujoco.MjModel, followers: list[Follower], locked: Mapping[int, np.ndarray]) -> np.ndarray:
+    """Values of locked joints and offsets of followers in the model's qpos, 0 elsewhere."""
+    out = np.zeros(model.nq)
+    for joint, value in locked.items():
+        out[model.jnt_qposadr[joint] :][: len(value)] = value
+    for follower in followers:
+        out[model.jnt_qposadr[follower.joint]] = follower.offset
     return out
 
 
-def _moving_bodies(model: mujoco.MjModel) -> tuple[list[int], np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-    """The world and the bodies with joints; for each body the moving body it is fixed to, and its pose there."""
-    bodies, body_of = [0], np.zeros(model.nbody, int)
-    placement = [(np.zeros(3), np.eye(3))]
+def _moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
+    """The world and the bodies with joints; where each body of the model sits on them."""
+    bodies, placement = [0], [Placement(0, np.zeros(3), np.eye(3))]
     for b in range(1, model.nbody):
         if model.body_jntnum[b]:
-            body_of[b] = len(bodies)
+            placement.append(Placement(len(bodies), np.zeros(3), np.eye(3)))
             bodies.append(b)
-            placement.append((np.zeros(3), np.eye(3)))
         else:
-            parent = model.body_parentid[b]
-            body_of[b] = body_of[parent]
-            p, R = placement[parent]
-            placement.append((p + R @ model.body_pos[b], R @ _matrix(model.body_quat[b])))
-    return bodies, body_of, placement
+            placement.append(_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]))
+    return bodies, placement
 
 
-def _frames(
-    model: mujoco.MjModel, body_of: np.ndarray, placement: list[tuple[np.ndarray, np.ndarray]]
-) -> dict[str, tuple[int, np.ndarray, np.ndarray]]:
-    """Name to (moving body, position, rotation). A site or geom that shares a name with another kind gets a prefix."""
-    out = {}
+def _placed(on: Placement, position: np.ndarray, quaternion: np.ndarray) -> Placement:
+    return Placement(on.body, on.position + on.rotation @ position, on.rotation @ _matrix(quaternion))
 
-    def add(name: str, prefix: str, body: int, position: np.ndarray, quaternion: np.ndarray) -> None:
-        p, R = placement[body]
-        key = name if name not in out else f"{prefix}:{name}"
-        out[key] = (int(body_of[body]), p + R @ position, R @ _matrix(quaternion))
 
-    for b in range(model.nbody):
-        add(_name(model, mujoco.mjtObj.mjOBJ_BODY, b, "body"), "body", b, np.zeros(3), np.array([1.0, 0, 0, 0]))
+def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[Placement]) -> dict[str, Placement]:
+    """Bodies, named sites and named geoms. A site or geom called like what came before gets its kind as a prefix."""
+    out = dict(zip(body_names, placement, strict=True))
+
+    def add(kind: str, name: str | None, body: int, position: np.ndarray, quaternion: np.ndarray) -> None:
+        if name:
+            out[name if name not in out else f"{kind}:{name}"] = _placed(placement[body], position, quaternion)
+
     for s in range(model.nsite):
-        name = _name(model, mujoco.mjtObj.mjOBJ_SITE, s, "site")
-        add(name, "site", model.site_bodyid[s], model.site_pos[s], model.site_quat[s])
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
+        add("site", name, model.site_bodyid[s], model.site_pos[s], model.site_quat[s])
     for g in range(model.ngeom):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g)
-        if name:
-            add(name, "geom", model.geom_bodyid[g], model.geom_pos[g], model.geom_quat[g])
+        add("geom", name, model.geom_bodyid[g], model.geom_pos[g], model.geom_quat[g])
     return out
 
 
-def _body_inertia(
-    model: mujoco.MjModel, bodies: list[int], body_of: np.ndarray, placement: list[tuple[np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mass and centre of mass of each moving body with all that is fixed to it; what is fixed to the world counts 0."""
+def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Placement]) -> dict[str, ArrayLike]:
+    """Poses of the moving bodies in their parents; their masses and centres with all that is fixed to them."""
     mass, moment = np.zeros(len(bodies)), np.zeros((len(bodies), 3))
-    for b in range(1, model.nbody):
-        p, R = placement[b]
-        mass[body_of[b]] += model.body_mass[b]
-        moment[body_of[b]] += model.body_mass[b] * (p + R @ model.body_ipos[b])
-    return mass, moment / np.where(mass > 0, mass, 1.0)[:, None]
+    for b, place in enumerate(placement):
+        if place.body:  # what is fixed to the world is no part of what moves
+            mass[place.body] += model.body_mass[b]
+            moment[place.body] += model.body_mass[b] * (place.position + place.rotation @ model.body_ipos[b])
+    poses = [_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]) for b in bodies]
+    return dict(
+        body_position=[pose.position for pose in poses],
+        body_quaternion=[quaternion(pose.rotation) for pose in poses],
+        body_mass=mass,
+        body_com=moment / np.where(mass > 0.0, mass, 1.0)[:, None],
+    )
+
+
+def _speeds(model: mujoco.MjModel, names: tuple[str, ...], given: Mapping[str, float]) -> np.ndarray:
+    """Greatest speed of each joint: from the model's custom numerics, then from ``given``."""
+    numerics = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_NUMERIC, n) for n in range(model.nnumeric)]
+    out = np.full(len(names), np.inf)
+    for n, numeric in enumerate(numerics):
+        if numeric.startswith(VELOCITY_LIMIT_PREFIX):
+            joint = numeric.removeprefix(VELOCITY_LIMIT_PREFIX)
+            _set_speed(out, names, joint, float(model.numeric_data[model.numeric_adr[n]]))
+    for pattern, value in given.items():
+        _set_speed(out, names, pattern, float(value))
+    return out
+
+
+def _set_speed(speeds: np.ndarray, names: tuple[str, ...], pattern: str, value: float) -> None:
+    for joint in match_joints(pattern, names):
+        if not value > 0.0:
+            raise ValueError(f"the velocity limit of joint {names[joint]!r} is {value}; it has to be positive")
+        speeds[joint] = value
 
 
 def _limits(
-    model: mujoco.MjModel,
-    names: tuple[str, ...],
-    tree: KinematicTree,
-    mimic: list[tuple[int, int, float, float]],
-    velocity_limits: Mapping[str, float],
+    model: mujoco.MjModel, tree: KinematicTree, followers: list[Follower], speed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position and velocity limits over v; a leader's are narrowed by those of its followers."""
-    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    low, high, speed = np.full(len(speed), -np.inf), np.full(len(speed), np.inf), speed.copy()
     limited = model.jnt_limited.astype(bool) & np.isin(model.jnt_type, (HINGE, SLIDE))
     low[limited], high[limited] = model.jnt_range[limited].T
-    speed = np.full(len(names), np.inf)
-    for pattern, value in velocity_limits.items():
-        for joint in match_joints(pattern, names):
-            if not value > 0.0:
-                raise ValueError(f"the velocity limit of joint {names[joint]!r} is {value}; it has to be positive")
-            speed[joint] = value
-    for follower, leader, multiplier, offset in mimic:
-        a, b = sorted(((low[follower] - offset) / multiplier, (high[follower] - offset) / multiplier))
+    for joint, leader, multiplier, offset in followers:
+        a, b = sorted(((low[joint] - offset) / multiplier, (high[joint] - offset) / multiplier))
         low[leader], high[leader] = max(low[leader], a), min(high[leader], b)
-        speed[leader] = min(speed[leader], speed[follower] / abs(multiplier))
+        speed[leader] = min(speed[leader], speed[joint] / abs(multiplier))
         if low[leader] > high[leader]:
             raise ValueError(
-                f"joint {names[leader]!r} and its follower {names[follower]!r} have no position in common: "
-                f"lower {low[leader]} > upper {high[leader]}"
+                f"joint {tree.joint_names[leader]!r} and its follower {tree.joint_names[joint]!r} have no position "
+                f"in common: lower {low[leader]} > upper {high[leader]}"
             )
-    out = np.full(tree.nv, -np.inf), np.full(tree.nv, np.inf), np.full(tree.nv, np.inf)
-    for joint, dof in tree.dof_address.items():
-        width = DOF_WIDTH[tree.joint_types[joint]]
-        for array, value in zip(out, (low, high, speed), strict=True):
-            array[dof : dof + width] = value[joint]
-    return out
+    width = [DOF_WIDTH[tree.joint_types[j]] for j in tree.independent]
+    lower, upper, velocity = (np.repeat(a[list(tree.independent)], width) for a in (low, high, speed))
+    return lower, upper, velocity
 
 
 def _home(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """The independent entries of a full qpos, hinges and slides brought inside their limits."""
     q = np.zeros(tree.nq)
     for joint, start in tree.qpos_address.items():
-        full = tree.full_qpos_address[joint]
-        width = tree.full_qpos_address[joint + 1] - full
-        value = qpos[full : full + width]
+        full, width = tree.full_qpos_address[joint], QPOS_WIDTH[tree.joint_types[joint]]
+        q[start : start + width] = qpos[full : full + width]
         if width == 1:
             dof = tree.dof_address[joint]
-            value = np.clip(value, lower[dof], upper[dof])
-        q[start : start + width] = value
+            q[start] = np.clip(q[start], lower[dof], upper[dof])
     return q
