@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
@@ -95,10 +96,14 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Arr
 
 
 def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3"]:
-    """Centre of mass [m] of the whole robot, or of the body ``subtree`` and all that hangs from it.
+    """Centre of mass [m], in the world, of the whole robot or of the body ``subtree`` and all that hangs from it.
+
+    Links that are fixed to the world (an arm's base) count as part of the whole, as they do in MuJoCo. A frame that is
+    not a body stands for the moving body that carries it.
 
     Raises:
         KeyError: no such body.
+        ValueError: the subtree has no mass.
     """
     mass, moment = _body_moments(robot, kinematics, subtree)
     return jnp.sum(moment, 0) / jnp.sum(mass)
@@ -108,7 +113,7 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
     """Jacobian of ``center_of_mass``: its velocity in world axes = J v.
 
     Raises:
-        KeyError: no such body.
+        KeyError, ValueError: as in ``center_of_mass``.
     """
     mass, moment = _body_moments(robot, kinematics, subtree)
     below = jnp.asarray(robot.tree.descendants, mass.dtype)
@@ -183,6 +188,9 @@ def _body_moments(
     mass = robot.body_mass
     if subtree is not None:
         root = robot.tree.frame_bodies[robot.tree.frame(subtree)]
-        mass = jnp.where(robot.tree.descendants[root], mass, 0.0)
+        below = robot.tree.descendants[root]
+        if not isinstance(mass, Tracer) and not np.asarray(mass)[below].sum() > 0.0:
+            raise ValueError(f"the subtree of {subtree!r} has no mass, so it has no centre of mass")
+        mass = jnp.where(below, mass, 0.0)
     centers = kinematics.body_position + _apply(kinematics.body_rotation, robot.body_com)
     return mass, mass[:, None] * centers

@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,7 +23,7 @@ from ..robot import Robot
 def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
     """MJX data in which ``xpos, xmat, xanchor, xaxis`` are in the frame of each body's parent."""
     model, data = _forest(
-        robot.tree.joint_types, robot.tree.joint_bodies, len(robot.tree.body_names), jax.config.jax_enable_x64
+        robot.tree.joint_types, robot.tree.joint_bodies, len(robot.tree.body_names), jnp.result_type(float).name
     )
     model = model.replace(
         body_pos=robot.body_position,
@@ -36,10 +37,10 @@ def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
 
 @lru_cache(maxsize=64)
 def _forest(
-    joint_types: tuple[int, ...], joint_bodies: tuple[int, ...], bodies: int, x64: bool
+    joint_types: tuple[int, ...], joint_bodies: tuple[int, ...], bodies: int, precision: str
 ) -> tuple[mjx.Model, mjx.Data]:
     """An MJX model with these joints and no tree, and its data; the numbers in it are replaced before use."""
-    del x64  # part of the cache key: the arrays take the precision in force when they are made
+    del precision  # part of the cache key: the arrays take the precision in force when they are made
     spec = mujoco.MjSpec()
     for body in range(1, bodies):
         element = spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True)

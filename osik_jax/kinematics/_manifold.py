@@ -17,8 +17,15 @@ def integrate(
     """Configuration reached from q at velocity v held for dt [s]. Quaternions come back normalised.
 
     A free joint's angular velocity is in body axes: quaternion * exp(omega dt). (nq,)
+
+    Raises:
+        ValueError: q or v has the wrong length, or (outside jit) q is not finite or holds a quaternion of zeros.
     """
-    q, step = jnp.asarray(q), jnp.asarray(v) * dt
+    robot.check_configuration(q)
+    if jnp.shape(v) != (robot.nv,):
+        raise ValueError(f"v has shape {jnp.shape(v)}, this robot's velocities have shape ({robot.nv},)")
+    step = jnp.asarray(v) * dt
+    q = jnp.asarray(q, jnp.result_type(q, step))
     scalar_q, scalar_v, quaternions = _layout(robot)
     out = q.at[scalar_q].add(step[scalar_v]) if len(scalar_q) else q
     for at, dof in quaternions:
@@ -28,10 +35,19 @@ def integrate(
 
 
 def difference(robot: Robot, qa: Float[Array, " nq"], qb: Float[Array, " nq"]) -> Float[Array, " nv"]:
-    """The velocity that goes from qa to qb in unit time: ``qb = integrate(robot, qa, difference(robot, qa, qb))``."""
-    qa, qb = jnp.asarray(qa), jnp.asarray(qb)
+    """The velocity that goes from qa to qb in unit time, so that integrating it from qa arrives at qb. (nv,).
+
+    Rotations go the short way round: no angle is greater than pi.
+
+    Raises:
+        ValueError: as in ``integrate``.
+    """
+    robot.check_configuration(qa)
+    robot.check_configuration(qb)
+    dtype = jnp.result_type(qa, qb, float)
+    qa, qb = jnp.asarray(qa, dtype), jnp.asarray(qb, dtype)
     scalar_q, scalar_v, quaternions = _layout(robot)
-    out = jnp.zeros(robot.nv, jnp.result_type(qa, qb)).at[scalar_v].set((qb - qa)[scalar_q])
+    out = jnp.zeros(robot.nv, dtype).at[scalar_v].set((qb - qa)[scalar_q])
     for at, dof in quaternions:
         a, b = (jaxlie.SO3(x[at : at + 4]).normalize() for x in (qa, qb))
         out = out.at[dof : dof + 3].set((a.inverse() @ b).log())
