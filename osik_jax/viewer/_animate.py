@@ -1,0 +1,291 @@
+"""A motion as a GIF or MP4."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import subprocess
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from ..robot import Robot
+from ._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
+from ._opengl import RendererName, make_renderer
+from ._overlay import Canvas, ComMark, CurvePanel, PlanPanel, polygon_layer
+from ._parts import RobotParts, Style, robot_parts
+from ._raycast import RayCaster
+from ._scene import BLUE, INK
+from ._shapes import robot_surface
+from ._stage import Camera, Stage
+
+Polygons = Sequence[Float[np.ndarray, "m 2"]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Curves:
+    """What a panel beside the robot shows over time.
+
+    Attributes:
+        title: its title, with the unit.
+        values: name to one value a configuration. Each (T,)
+        wanted: the same for what the controller was asked for, drawn dashed.
+    """
+
+    title: str
+    values: Mapping[str, Float[np.ndarray, " T"]]
+    wanted: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
+
+
+def animate(
+    path: str | Path,
+    robot: Robot,
+    q: Float[np.ndarray, "T nq"],
+    *,
+    dt: float,
+    frames_per_second: float = 12.5,
+    size: tuple[int, int] = (720, 405),
+    renderer: RendererName = "auto",
+    style: Style = "auto",
+    support: Polygons | Float[np.ndarray, "m 2"] | None = None,
+    trails: Sequence[str] = (),
+    curves: Curves | None = None,
+    caption: str = "",
+    azimuth: float = 28.0,
+    elevation: float = 13.0,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
+    """Films a motion. Needs no display; MuJoCo's renderer is used where OpenGL works, else rays are cast on the CPU.
+
+    Args:
+        path: a ``.gif``, or an ``.mp4`` if the program ffmpeg is installed.
+        robot: the robot.
+        q: configurations, ``dt`` apart. (T, nq)
+        dt: time between two configurations [s].
+        frames_per_second: at most so many pictures a second are taken from ``q``.
+        size: width and height [pixels].
+        renderer: ``"mujoco"`` (OpenGL), ``"raycast"`` (CPU), or ``"auto"``: the first of them that works.
+        style: ``"geoms"``, ``"sticks"``, or ``"auto"``.
+        support: vertices of the support polygon [m], one (m, 2) for all times or one a configuration. With it, the
+            centre of mass is drawn too, and a panel shows both from above.
+        trails: frames whose paths are drawn.
+        curves: a second panel.
+        caption: a line at the top.
+        azimuth: of the camera about the vertical, 0 from +x [deg].
+        elevation: of the camera above the horizon [deg].
+        progress: called with the part that is done, 0 to 1.
+
+    Returns:
+        The path written.
+
+    Raises:
+        ValueError: the suffix is neither .gif nor .mp4, or ffmpeg is missing for .mp4.
+        RuntimeError: ``renderer="mujoco"`` where OpenGL does not work.
+    """
+    path = Path(path)
+    _check_path(path)
+    stride = max(1, round(1.0 / (frames_per_second * dt)))
+    ticks = np.arange(0, len(q), stride)
+    film = _Film(
+        robot,
+        np.asarray(q),
+        ticks,
+        ticks * dt,
+        size,
+        renderer,
+        style,
+        _each(support, ticks),
+        trails,
+        curves,
+        caption,
+        azimuth,
+        elevation,
+    )
+    pictures = film.pictures(progress or (lambda done: None))
+    if path.suffix == ".gif":
+        write_gif(path, pictures, stride * dt)
+    else:
+        _write_mp4(path, pictures, size, 1.0 / (stride * dt))
+    return path
+
+
+def _check_path(path: Path) -> None:
+    if path.suffix not in (".gif", ".mp4"):
+        raise ValueError(f"cannot write {path.name!r}: the suffix has to be .gif or .mp4")
+    if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        raise ValueError(f"cannot write {path.name!r}: the program ffmpeg is not installed; write a .gif")
+
+
+def _each(support: Polygons | Float[np.ndarray, "m 2"] | None, ticks: np.ndarray) -> Polygons | None:
+    """One polygon a picture."""
+    if support is None:
+        return None
+    if isinstance(support, np.ndarray) and support.ndim == 2:
+        return [support] * len(ticks)
+    return [np.asarray(support[min(tick, len(support) - 1)]) for tick in ticks]
+
+
+def floor_height(robot: Robot, shape: RobotParts, data: mujoco.MjData) -> float:
+    """Where to put the floor [m]: under the robot's lowest point, or at 0 for a robot that is bolted down above it."""
+    lowest = float(robot_surface(shape, data, 4)[0][..., 2].min())
+    return lowest if robot.floating_base else min(0.0, lowest)
+
+
+class _Film:
+    """Everything about an animation that does not change between pictures."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        q: np.ndarray,
+        ticks: np.ndarray,
+        time: np.ndarray,
+        size: tuple[int, int],
+        renderer: RendererName,
+        style: Style,
+        support: Polygons | None,
+        trails: Sequence[str],
+        curves: Curves | None,
+        caption: str,
+        azimuth: float,
+        elevation: float,
+    ) -> None:
+        self._robot, self._q, self._size, self._time = robot, q[ticks], size, time
+        self._shape = robot_parts(robot, style=style)
+        self._support = support
+        points, com, paths = self._survey(trails)
+        self._com, self._paths = com, paths
+        panels = (support is not None) + (curves is not None)
+        self._floor = floor_height(robot, self._shape, next(mujoco_poses(robot, self._q[0])))
+        self._camera = frame_camera(points, size, azimuth, elevation, shift=0.22 if panels else 0.0)
+        self._stage = Stage([self._shape], self._camera, floor=self._floor)
+        self._renderer = make_renderer(renderer, self._stage, self._camera, size, floor=self._floor)
+        self._canvas = Canvas(size)
+        self._add_text(caption)
+        self._add_marks()
+        self._add_panels(curves, ticks)
+        self._under: tuple[Float[np.ndarray, "m 2"], np.ndarray] | None = None
+
+    def _survey(self, trails: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+        """All part positions, the centres of mass and the trails' points, over the motion."""
+        points, com, paths = [], [], []
+        for data in mujoco_poses(self._robot, self._q):
+            points.append(self._shape.poses(data)[0])
+            com.append(robot_com(self._robot, data))
+            paths.append([mujoco_frame_pose(self._robot, data, name)[0] for name in trails])
+        return np.concatenate(points), np.array(com), list(np.swapaxes(np.array(paths), 0, 1)) if trails else []
+
+    def _add_text(self, caption: str) -> None:
+        scale = self._size[1] / 450
+        self._canvas.page.text(16, 26 * scale, caption, fontsize=11 * scale, color=INK, weight="bold")
+        self._clock = self._canvas.page.text(
+            16, self._size[1] - 14 * scale, "", fontsize=9 * scale, color=INK, family="monospace"
+        )
+        self._canvas.moving(self._clock)
+
+    def _add_marks(self) -> None:
+        self._trail_lines = []
+        for path in self._paths:
+            (line,) = self._canvas.page.plot([], [], color=BLUE, lw=2.0, alpha=0.85)
+            self._canvas.moving(line)
+            self._trail_lines.append((line, self._camera.project(path, self._size)))
+        self._mark = None if self._support is None else ComMark(self._canvas, self._camera, floor=self._floor)
+
+    def _add_panels(self, curves: Curves | None, ticks: np.ndarray) -> None:
+        self._panels: list[PlanPanel | CurvePanel] = []
+        if self._support is not None:
+            self._panels.append(PlanPanel(self._canvas, (0.60, 0.53, 0.38, 0.36), self._support, self._com))
+        if curves is not None:
+            values, wanted = ({k: v[ticks] for k, v in group.items()} for group in (curves.values, curves.wanted))
+            bottom = 0.115 if self._support is not None else 0.32
+            self._panels.append(
+                CurvePanel(self._canvas, (0.60, bottom, 0.38, 0.29), curves.title, self._time, values, wanted)
+            )
+
+    def pictures(self, progress: Callable[[float], None]) -> Iterator[np.ndarray]:
+        """The pictures, (height, width, 3) uint8. The stage is drawn ahead, one picture a core."""
+        stages = (self._stage.pose([source]) for source in mujoco_poses(self._robot, self._q))
+        layers = (self._floor_layer(frame) for frame in range(len(self._q)))
+        for frame, base in enumerate(self._draw(zip(stages, layers, strict=True))):
+            self._move(frame)
+            yield paint_over(base, self._canvas.picture())
+            progress((frame + 1) / len(self._q))
+
+    def _draw(self, jobs: Iterable[tuple[mujoco.MjData, np.ndarray | None]]) -> Iterator[np.ndarray]:
+        """Pictures of the stage in order; only rays may be cast by several threads, a GL context belongs to one."""
+        if not isinstance(self._renderer, RayCaster):
+            yield from (self._renderer.image(*job) for job in jobs)
+            return
+        cores = os.cpu_count() or 1
+        with ThreadPoolExecutor(cores) as pool:
+            ahead: deque[Future[np.ndarray]] = deque()
+            for job in jobs:
+                ahead.append(pool.submit(self._renderer.image, *job))
+                if len(ahead) > cores:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+
+    def _floor_layer(self, frame: int) -> np.ndarray | None:
+        """The support polygon on the floor, drawn again only where it changed."""
+        if self._support is None:
+            return None
+        vertices = self._support[frame]
+        if self._under is None or not np.array_equal(self._under[0], vertices):
+            self._under = vertices, polygon_layer([vertices], self._camera, self._size, floor=self._floor)
+        return self._under[1]
+
+    def _move(self, frame: int) -> None:
+        self._clock.set_text(f"t = {self._time[frame]:5.2f} s")
+        for line, path in self._trail_lines:
+            line.set_data(path[: frame + 1, 0], path[: frame + 1, 1])
+        if self._mark is not None:
+            self._mark.place(self._com[frame])
+        for panel in self._panels:
+            panel.place(frame)
+
+
+def frame_camera(
+    points: Float[np.ndarray, "n 3"], size: tuple[int, int], azimuth: float, elevation: float, *, shift: float = 0.0
+) -> Camera:
+    """A camera that sees all points [m], moved so that they sit left of the middle by ``shift`` of the width."""
+    low, high = points.min(0), points.max(0)
+    extent = float(np.linalg.norm(high - low))
+    height = 1.12 * max(float(high[2] - low[2]) * 1.12, 0.62 * extent)
+    camera = Camera(tuple(0.5 * (low + high)), 3.6 * height, azimuth, elevation, height)
+    center = np.asarray(camera.center) + shift * height * size[0] / size[1] * camera.axes[0]
+    return dataclasses.replace(camera, center=tuple(float(x) for x in center))
+
+
+def paint_over(base: Float[np.ndarray, "height width 3"], layer: np.ndarray) -> np.ndarray:
+    """Puts a uint8 picture with alpha over one whose colours run from 0 to 1; uint8."""
+    below = Image.fromarray((255.0 * base + 0.5).astype(np.uint8)).convert("RGBA")
+    return np.asarray(Image.alpha_composite(below, Image.fromarray(layer)).convert("RGB"))
+
+
+def write_gif(path: Path, pictures: Iterable[np.ndarray], period: float) -> None:
+    """Writes pictures, ``period`` [s] apart, with one palette for all."""
+    images = [Image.fromarray(picture) for picture in pictures]
+    picks = [np.asarray(images[i]) for i in np.linspace(0, len(images) - 1, min(4, len(images))).astype(int)]
+    palette = Image.fromarray(np.concatenate(picks)).quantize(256, method=Image.Quantize.MEDIANCUT)
+    frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1e3 * period), loop=0, optimize=False)
+
+
+def _write_mp4(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], rate: float) -> None:
+    command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{rate:g}", "-i", "-", "-pix_fmt", "yuv420p", str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        for picture in pictures:
+            process.stdin.write(picture.tobytes())
+        process.stdin.close()
+    if process.returncode:
+        raise RuntimeError(f"ffmpeg ended with code {process.returncode}")

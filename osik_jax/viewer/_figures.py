@@ -1,0 +1,213 @@
+"""Still pictures: schemes compared over time, and robots side by side."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from ..robot import Robot
+from ._animate import floor_height, frame_camera, paint_over
+from ._mujoco import mujoco_poses, robot_com
+from ._opengl import RendererName, make_renderer
+from ._overlay import Canvas, ComMark, polygon_layer
+from ._parts import robot_parts
+from ._scene import INK
+from ._stage import Stage
+
+SCHEME_COLORS = ("#e8590c", "#8a8f98", "#1565c0", "#2a9d62", "#7b3fa0")
+_BAD = "#d7263d"
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One plot of ``compare_figure``.
+
+    Attributes:
+        title: what is shown, with its unit.
+        curves: name of a scheme to values over time. Each (T,)
+        floor: values are drawn on a logarithmic axis that ends here; ``None``: a linear axis.
+        bound: a line that should not be crossed, and
+        above: whether the good side is above it.
+        bound_label: what the line means.
+    """
+
+    title: str
+    curves: Mapping[str, Float[np.ndarray, " T"]]
+    floor: float | None = None
+    bound: float | None = None
+    above: bool = False
+    bound_label: str = ""
+
+
+def compare_figure(
+    time: Float[np.ndarray, " T"],
+    panels: Sequence[Panel],
+    *,
+    title: str = "",
+    note: str = "",
+    colors: Mapping[str, str] | None = None,
+) -> Figure:
+    """Compares schemes over time, a plot a panel, with one legend for all.
+
+    Args:
+        time: [s]. (T,)
+        panels: what to plot.
+        title: over all plots.
+        note: a line below them.
+        colors: of the schemes.
+    """
+    names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
+    palette = dict(zip(names, SCHEME_COLORS, strict=False)) | dict(colors or {})
+    columns = min(3, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.3 * columns, 2.75 * rows + 1.1), dpi=130, facecolor="white")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, panel in zip(grid, panels, strict=False):
+        _draw_panel(axes, time, panel, palette)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    _add_legend(figure, grid, palette, len(panels))
+    figure.suptitle(title, x=0.012, y=0.985, ha="left", fontsize=14, weight="bold", color=INK)
+    figure.text(0.012, 0.012, note, fontsize=8, color="#5b636d")
+    figure.tight_layout(rect=(0.0, 0.03, 1.0, 0.985 if title else 1.0), h_pad=1.6, w_pad=1.6)
+    return figure
+
+
+def _draw_panel(axes: Axes, time: np.ndarray, panel: Panel, palette: Mapping[str, str]) -> None:
+    axes.set_title(panel.title, loc="left", fontsize=10.5, color=INK)
+    for order, (name, values) in enumerate(panel.curves.items()):
+        shown = values if panel.floor is None else np.maximum(np.abs(values), panel.floor)
+        axes.plot(time[: len(shown)], shown, color=palette[name], lw=2.0, alpha=0.95, zorder=3 + order, label=name)
+    if panel.floor is not None:
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=panel.floor)
+    if panel.bound is not None:
+        _draw_bound(axes, panel)
+    axes.set_xlim(time[0], time[-1])
+    axes.set_xlabel("time [s]", fontsize=9, color=INK)
+    _tidy(axes)
+
+
+def _draw_bound(axes: Axes, panel: Panel) -> None:
+    """The line not to cross, its bad side tinted."""
+    assert panel.bound is not None
+    low, high = axes.get_ylim()
+    if panel.floor is None:
+        room = 0.08 * (max(high, panel.bound) - min(low, panel.bound))
+        low, high = min(low, panel.bound - room), max(high, panel.bound + room)
+    else:
+        high = max(high, 3.0 * panel.bound)
+    axes.set_ylim(low, high)
+    axes.axhline(panel.bound, color=_BAD, lw=1.1, ls=(0, (5, 3)), zorder=2)
+    axes.axhspan(*((low, panel.bound) if panel.above else (panel.bound, high)), color=_BAD, alpha=0.07, lw=0, zorder=1)
+    axes.annotate(
+        panel.bound_label,
+        (1.0, panel.bound),
+        xycoords=("axes fraction", "data"),
+        xytext=(-4, 3),
+        textcoords="offset points",
+        ha="right",
+        va="bottom",
+        fontsize=8,
+        color=_BAD,
+        zorder=9,
+    )
+
+
+def _tidy(axes: Axes) -> None:
+    axes.grid(color="#e3e7ec", lw=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8.5, colors=INK, length=3)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color("#9aa3ad")
+
+
+def _add_legend(figure: Figure, grid: np.ndarray, palette: Mapping[str, str], used: int) -> None:
+    """In the empty place of the grid if there is one, else at the top right."""
+    handles, labels = {}, []
+    for axes in grid[:used]:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    labels = [name for name in palette if name in handles]
+    lines = [handles[name] for name in labels]
+    if used < len(grid):
+        grid[used].legend(
+            lines, labels, loc="center left", fontsize=12, frameon=False, labelcolor=INK, handlelength=2.6
+        )
+    else:
+        figure.legend(
+            lines,
+            labels,
+            loc="upper right",
+            bbox_to_anchor=(0.995, 0.995),
+            ncols=len(lines),
+            fontsize=10,
+            frameon=False,
+            labelcolor=INK,
+        )
+
+
+def hero_picture(
+    path: str | Path,
+    robot: Robot,
+    configurations: Sequence[Float[np.ndarray, " nq"]],
+    *,
+    support: Sequence[Float[np.ndarray, "m 2"]] | None = None,
+    labels: Sequence[str] = (),
+    spacing: float | None = None,
+    size: tuple[int, int] = (1600, 720),
+    azimuth: float = 24.0,
+    elevation: float = 12.0,
+    renderer: RendererName = "raycast",
+) -> Path:
+    """Draws one robot at several instants, side by side on one floor, and saves it.
+
+    Args:
+        path: of the picture (.png).
+        robot: the robot.
+        configurations: one a figure, left to right. Each (nq,)
+        support: of each, the vertices of its support polygon [m]; with it the centre of mass is drawn.
+        labels: a line below each.
+        spacing: between neighbours [m]; ``None``: nine tenths of the robot's height.
+        size: width and height [pixels].
+        azimuth: of the camera about the vertical, 0 from +x [deg].
+        elevation: of the camera above the horizon [deg].
+        renderer: as in ``animate``.
+    """
+    shape = robot_parts(robot)
+    sources = [next(mujoco_poses(robot, q)) for q in configurations]
+    parts = [shape.poses(source)[0] for source in sources]
+    floor = floor_height(robot, shape, sources[0])
+    gap = spacing or 0.9 * float(np.ptp(np.concatenate(parts)[:, 2]))
+    right = frame_camera(np.concatenate(parts), size, azimuth, elevation).axes[0]
+    shifts = [(k - 0.5 * (len(sources) - 1)) * gap * right for k in range(len(sources))]
+    middle = np.concatenate([part - part.mean(0) * [1, 1, 0] for part in parts])
+    camera = dataclasses.replace(
+        frame_camera(middle, size, azimuth, elevation), center=(0.0, 0.0, 0.5 * float(middle[:, 2].max() + floor))
+    )
+    camera = dataclasses.replace(camera, height=1.22 * float(middle[:, 2].max() - floor + 0.05))
+    stage = Stage([shape] * len(sources), camera, floor=floor)
+    data = stage.pose(sources, np.array(shifts))
+    drawer = make_renderer(renderer, stage, camera, size, floor=floor)
+    moved = [corners + shift[:2] for corners, shift in zip(support or (), shifts, strict=False)]
+    base = drawer.image(data, polygon_layer(moved, camera, size, floor=floor))
+    canvas = Canvas(size, scale=size[1] / 450)
+    for source, shift in zip(sources if support else (), shifts, strict=False):
+        ComMark(canvas, camera, floor=floor, moving=False).place(robot_com(robot, source) + shift)
+    for label, shift in zip(labels, shifts, strict=False):
+        x, _ = camera.project(np.array([*(np.asarray(camera.center) + shift)[:2], floor]), size)
+        canvas.page.text(x, size[1] - 0.035 * size[1], label, ha="center", fontsize=10, color=INK)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(paint_over(base, canvas.picture())).save(path, optimize=True)
+    return Path(path)

@@ -1,0 +1,60 @@
+"""Where things are, as MuJoCo's own C code says: the viewer and the reports never ask our kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ..robot import Robot
+
+
+def mujoco_poses(robot: Robot, q: Float[np.ndarray, "*steps nq"]) -> Iterator[mujoco.MjData]:
+    """MuJoCo's body, site, geom and CoM positions at one configuration or along a trajectory.
+
+    Yields the same ``MjData`` each time, with new content: copy what has to last.
+    """
+    index, coefficient = robot.tree.qpos_source
+    data = mujoco.MjData(robot.mj_model)
+    for qpos in np.atleast_2d(np.asarray(q))[:, index] * coefficient + np.asarray(robot.qpos_offset):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(robot.mj_model, data)
+        mujoco.mj_comPos(robot.mj_model, data)
+        yield data
+
+
+def robot_com(robot: Robot, data: mujoco.MjData) -> Float[np.ndarray, "3"]:
+    """Centre of mass [m] of all that moves, from MuJoCo; what is fixed to the world does not count."""
+    model = robot.mj_model
+    mass = np.where(model.body_weldid != 0, model.body_mass, 0.0)
+    return mass @ data.xipos / mass.sum()
+
+
+def model_bodies(robot: Robot) -> list[int]:
+    """MuJoCo's index of each body of ``robot.tree``."""
+    model = robot.mj_model
+    names = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, b) or f"body{b}": b for b in range(model.nbody)}
+    return [names[name] for name in robot.tree.body_names]
+
+
+def mujoco_frame_pose(
+    robot: Robot, data: mujoco.MjData, name: str
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Position [m] and rotation of a frame: the model's own site or body of that name, else its place in a body.
+
+    Raises:
+        KeyError: no such frame.
+    """
+    index, model = robot.tree.frame(name), robot.mj_model
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    if body >= 0:
+        return data.xpos[body].copy(), data.xmat[body].reshape(3, 3).copy()
+    if site >= 0:
+        return data.site_xpos[site].copy(), data.site_xmat[site].reshape(3, 3).copy()
+    body = model_bodies(robot)[robot.tree.frame_bodies[index]]
+    turn = data.xmat[body].reshape(3, 3)
+    position = data.xpos[body] + turn @ np.asarray(robot.frame_position[index])
+    return position, turn @ np.asarray(robot.frame_rotation[index])

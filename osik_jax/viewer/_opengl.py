@@ -1,0 +1,76 @@
+"""Pictures by MuJoCo's own renderer, where OpenGL works, and the choice between it and the ray caster."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Literal, Protocol
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ._raycast import Image, RayCaster
+from ._stage import Camera, Stage
+
+RendererName = Literal["auto", "mujoco", "raycast"]
+
+_GL_ERRORS = (mujoco.FatalError, ImportError, AttributeError, OSError, RuntimeError)
+"""What MuJoCo's renderer raises without a GL library, without a screen, or with a broken driver."""
+
+
+class Renderer(Protocol):
+    """Draws a stage."""
+
+    def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
+        """A picture; ``under`` is painted on the floor."""
+        ...
+
+
+class GlRenderer:
+    """MuJoCo's renderer with the camera and the picture size of the ray caster."""
+
+    def __init__(self, stage: Stage, camera: Camera, size: tuple[int, int]) -> None:
+        """Opens a GL context.
+
+        Raises:
+            RuntimeError: OpenGL does not work here.
+        """
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self._renderer = mujoco.Renderer(stage.model, height=size[1], width=size[0])
+        except _GL_ERRORS as error:
+            raise RuntimeError(f"MuJoCo's renderer does not work here: {error}") from error
+        self._camera = camera.for_mujoco()
+        self._options = mujoco.MjvOption()
+        self._options.geomgroup[:] = 1
+
+    def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
+        """A picture of the stage; ``under`` is painted over the floor and the sky, behind the robots."""
+        picture = self._render(data) / 255.0
+        if under is not None:
+            self._renderer.enable_segmentation_rendering()
+            ids = self._render(data)[..., 0]
+            self._renderer.disable_segmentation_rendering()
+            alpha = under[..., 3:] * (ids <= 0)[..., None]  # the floor is geom 0, the sky is -1
+            picture += alpha * (under[..., :3] - picture)
+        return picture
+
+    def _render(self, data: mujoco.MjData) -> np.ndarray:
+        self._renderer.update_scene(data, camera=self._camera, scene_option=self._options)
+        return self._renderer.render()
+
+
+def make_renderer(name: RendererName, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float) -> Renderer:
+    """MuJoCo's renderer (``"mujoco"``), the ray caster (``"raycast"``), or the first of them that works (``"auto"``).
+
+    Raises:
+        RuntimeError: ``"mujoco"`` where OpenGL does not work.
+    """
+    if name != "raycast":
+        try:
+            return GlRenderer(stage, camera, size)
+        except RuntimeError:
+            if name == "mujoco":
+                raise
+    return RayCaster(stage, camera, size, floor=floor)

@@ -1,0 +1,179 @@
+"""Flat drawings over a picture of the stage: marks in the world, and panels with curves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from ._scene import BLUE, GREEN, INK, ORANGE
+from ._stage import Camera
+
+DPI = 100
+_CARD = (1.0, 1.0, 1.0, 0.82)
+
+
+class Canvas:
+    """A transparent picture that matplotlib draws on: a still part, and artists that move."""
+
+    def __init__(self, size: tuple[int, int], scale: float = 1.0) -> None:
+        """Takes width and height [pixels]; ``scale`` enlarges lines and text."""
+        dpi = DPI * scale
+        self.size = size
+        self.figure = Figure(figsize=(size[0] / dpi, size[1] / dpi), dpi=dpi)
+        self.figure.patch.set_alpha(0.0)
+        self._canvas = FigureCanvasAgg(self.figure)
+        self.page = self._page()
+        self._moving: list[Artist] = []
+        self._still = None
+
+    def _page(self) -> Axes:
+        axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_axis_off()
+        axes.set_xlim(0, self.size[0])
+        axes.set_ylim(self.size[1], 0)
+        return axes
+
+    def moving(self, artist: Artist) -> None:
+        """Marks an artist as one that changes between pictures."""
+        artist.set_animated(True)
+        self._moving.append(artist)
+
+    def picture(self) -> np.ndarray:
+        """Red, green, blue, alpha; alpha not multiplied in. (height, width, 4), uint8."""
+        if self._still is None:
+            self._canvas.draw()
+            self._still = self._canvas.copy_from_bbox(self.figure.bbox)
+        self._canvas.restore_region(self._still)
+        for artist in self._moving:
+            if artist.axes is not None:
+                artist.axes.draw_artist(artist)
+        return np.asarray(self._canvas.buffer_rgba()).copy()
+
+
+def polygon_layer(
+    vertices: Sequence[Float[np.ndarray, "m 2"]], camera: Camera, size: tuple[int, int], *, floor: float
+) -> Float[np.ndarray, "height width 4"]:
+    """Support polygons on the floor, to be painted under the robots."""
+    canvas = Canvas(size)
+    for corners in vertices:
+        points = camera.project(np.column_stack([corners, np.full(len(corners), floor)]), size)
+        style = {"facecolor": to_rgba(GREEN, 0.25), "edgecolor": to_rgba(GREEN, 0.95), "lw": 2.0 * size[1] / 450}
+        canvas.page.add_patch(Polygon(points, **style))
+    return canvas.picture() / np.float32(255.0)
+
+
+class ComMark:
+    """The centre of mass, its plumb line, and where that meets the floor."""
+
+    def __init__(self, canvas: Canvas, camera: Camera, *, floor: float, moving: bool = True) -> None:
+        """Adds the artists to the page of a canvas."""
+        self._camera, self._size, self._floor = camera, canvas.size, floor
+        (self._line,) = canvas.page.plot([], [], color=ORANGE, lw=1.4, ls=(0, (4, 2.5)))
+        (self._foot,) = canvas.page.plot([], [], "o", ms=6.5, mfc="white", mec=ORANGE, mew=2.0)
+        (self._ball,) = canvas.page.plot([], [], "o", ms=10, mfc=ORANGE, mec="white", mew=1.6)
+        if moving:
+            for artist in (self._line, self._foot, self._ball):
+                canvas.moving(artist)
+
+    def place(self, com: Float[np.ndarray, "3"]) -> None:
+        """Moves it to a centre of mass [m]."""
+        (x0, y0), (x1, y1) = self._camera.project(np.array([com, [com[0], com[1], self._floor]]), self._size)
+        self._line.set_data([x0, x1], [y0, y1])
+        self._ball.set_data([x0], [y0])
+        self._foot.set_data([x1], [y1])
+
+
+def card(canvas: Canvas, rectangle: tuple[float, float, float, float], title: str) -> Axes:
+    """Axes for a panel on a light card; the rectangle is left, bottom, width, height in parts of the picture."""
+    axes = canvas.figure.add_axes(rectangle)
+    axes.set_facecolor(_CARD)
+    axes.set_title(title, loc="left", fontsize=8.5, color=INK, pad=4)
+    axes.tick_params(labelsize=7, colors=INK, length=2.5, width=0.7)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color("#9aa3ad")
+        axes.spines[side].set_linewidth(0.8)
+    return axes
+
+
+class PlanPanel:
+    """The ground from above, x up and y to the left: support polygon, path of the centre of mass, where it is now."""
+
+    def __init__(
+        self,
+        canvas: Canvas,
+        rectangle: tuple[float, float, float, float],
+        support: Sequence[Float[np.ndarray, "m 2"]],
+        com: Float[np.ndarray, "frames 3"],
+    ) -> None:
+        """Draws the still part; millimetres."""
+        self._com, self._support = 1e3 * com, [1e3 * vertices for vertices in support]
+        axes = card(canvas, rectangle, "from above: centre of mass over its support [mm]")
+        points = np.concatenate([self._com[:, :2], *self._support])
+        low, high = points.min(0) - 12.0, points.max(0) + 12.0
+        axes.set_aspect("equal", adjustable="box", anchor="W")
+        axes.set_xlim(high[1], low[1])
+        axes.set_ylim(low[0], high[0])
+        self._patch = Polygon(self._flip(self._support[0]), facecolor=to_rgba(GREEN, 0.18), edgecolor=GREEN, lw=1.4)
+        axes.add_patch(self._patch)
+        canvas.moving(self._patch)
+        (self._path,) = axes.plot([], [], color=ORANGE, lw=1.3, alpha=0.8)
+        (self._dot,) = axes.plot([], [], "o", ms=6.5, mfc=ORANGE, mec="white", mew=1.2)
+        canvas.moving(self._path)
+        canvas.moving(self._dot)
+
+    @staticmethod
+    def _flip(vertices: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
+        return vertices[:, ::-1]
+
+    def place(self, frame: int) -> None:
+        """Moves the dot to a frame."""
+        self._patch.set_xy(self._flip(self._support[min(frame, len(self._support) - 1)]))
+        self._path.set_data(self._com[: frame + 1, 1], self._com[: frame + 1, 0])
+        self._dot.set_data([self._com[frame, 1]], [self._com[frame, 0]])
+
+
+class CurvePanel:
+    """Curves over time that are drawn as the motion goes; wanted ones, dashed, are there from the start."""
+
+    def __init__(
+        self,
+        canvas: Canvas,
+        rectangle: tuple[float, float, float, float],
+        title: str,
+        time: Float[np.ndarray, " frames"],
+        curves: Mapping[str, Float[np.ndarray, " frames"]],
+        wanted: Mapping[str, Float[np.ndarray, " frames"]],
+    ) -> None:
+        """Draws the still part; every curve has one value a frame."""
+        self._time, self._curves, self._lines = time, list(curves.values()), []
+        axes = card(canvas, rectangle, title)
+        values = np.concatenate([*curves.values(), *wanted.values()])
+        room = 0.08 * max(np.ptp(values), 1e-9)
+        axes.set_xlim(time[0], time[-1])
+        axes.set_ylim(values.min() - room, values.max() + room)
+        axes.set_xlabel("time [s]", fontsize=7.5, color=INK, labelpad=1)
+        for (name, values), color in zip(wanted.items(), (BLUE, GREEN, ORANGE), strict=False):
+            axes.plot(time, values, color=color, lw=1.0, ls=(0, (3, 2)), alpha=0.65, label=f"{name}, wanted")
+        for name, color in zip(curves, (BLUE, GREEN, ORANGE), strict=False):
+            (line,) = axes.plot([], [], color=color, lw=1.9, label=name)
+            (dot,) = axes.plot([], [], "o", ms=5, color=color)
+            canvas.moving(line)
+            canvas.moving(dot)
+            self._lines.append((line, dot))
+        axes.legend(fontsize=6.5, frameon=False, loc="best", labelcolor=INK, handlelength=1.8)
+
+    def place(self, frame: int) -> None:
+        """Draws the curves up to a frame."""
+        for (line, dot), values in zip(self._lines, self._curves, strict=True):
+            line.set_data(self._time[: frame + 1], values[: frame + 1])
+            dot.set_data([self._time[frame]], [values[frame]])

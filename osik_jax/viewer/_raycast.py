@@ -1,0 +1,184 @@
+"""Pictures by MuJoCo's ray casting: exact surfaces and shadows on the CPU, without GL."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from ._stage import TO_LAMP, Camera, Stage
+
+Image = Float[np.ndarray, "height width 3"]
+"""Red, green and blue from 0 to 1."""
+
+_WHITE = 1.0
+_TILES = np.array([[0.925, 0.937, 0.952], [0.968, 0.975, 0.985]])
+_SHADOW_MAP = 144
+_BLOCK = 8
+_SUBPIXELS = np.array([[0.125, 0.625], [0.375, 0.125], [0.625, 0.875], [0.875, 0.375]])
+_GROUPS = np.array([1, 1, 1, 1, 1, 0], np.uint8)
+
+
+class _Hits(NamedTuple):
+    geom: np.ndarray
+    distance: np.ndarray
+    normal: np.ndarray
+
+
+class RayCaster:
+    """Draws a stage with a fixed camera.
+
+    Attributes:
+        camera: the camera.
+        size: width and height of the pictures [pixels].
+    """
+
+    def __init__(self, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float) -> None:
+        """Draws the empty floor at height ``floor`` [m], once for all pictures."""
+        self.stage, self.camera, self.size, self._floor = stage, camera, size, floor
+        self._lamp = np.asarray(camera.center) + 6.0 * camera.height * TO_LAMP
+        self._background, self._ground = self._empty_floor()
+
+    def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
+        """A picture of the stage; ``under`` is painted on the floor, shadows included, but not on the robots.
+
+        Args:
+            data: from ``Stage.pose``.
+            under: red, green, blue and alpha from 0 to 1, alpha not multiplied in.
+        """
+        picture = self._background * self._shadow(data)[..., None]
+        if under is not None:
+            picture += under[..., 3:] * (under[..., :3] - picture)
+        rows, columns = np.nonzero(self._near_robots(data))
+        color, cover = self._robots(data, rows, columns)
+        picture[rows, columns] = (1.0 - cover[:, None]) * picture[rows, columns] + color
+        return picture
+
+    def _robots(self, data: mujoco.MjData, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colour (times cover) and cover of the robots in some pixels; edges are seen through four rays a pixel."""
+        corners = np.stack([columns, rows], -1).astype(float)
+        rays = self.camera.rays(corners + 0.5, self.size)
+        hits = self._cast(data, self.camera.eye, rays)
+        color = self._shade(data, rays, hits)
+        cover = (hits.geom >= 0).astype(float)
+        edge = np.flatnonzero(self._edges(rows, columns, hits))
+        fine = self.camera.rays((corners[edge, None] + _SUBPIXELS).reshape(-1, 2), self.size)
+        fine_hits = self._cast(data, self.camera.eye, fine)
+        color[edge] = self._shade(data, fine, fine_hits).reshape(-1, len(_SUBPIXELS), 3).mean(1)
+        cover[edge] = (fine_hits.geom >= 0).reshape(-1, len(_SUBPIXELS)).mean(1)
+        return color, cover
+
+    def _edges(self, rows: np.ndarray, columns: np.ndarray, hits: _Hits) -> np.ndarray:
+        """Which of the pixels touch another geom, or a face turned elsewhere."""
+        shape = (self.size[1], self.size[0])
+        geom, normal = np.full(shape, -1, np.int32), np.zeros((*shape, 3))
+        geom[rows, columns], normal[rows, columns] = hits.geom, hits.normal
+        return _edges(geom, normal)[rows, columns]
+
+    def _near_robots(self, data: mujoco.MjData) -> np.ndarray:
+        """Pixels, in blocks, that the geoms' bounding balls may cover. (height, width)."""
+        center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:]  # the floor is geom 0
+        middle = self.camera.project(center, self.size)
+        depth = (center - self.camera.eye) @ self.camera.axes[2]
+        reach = 1.1 * radius * self.camera.distance / depth * self.size[1] / self.camera.height + _BLOCK
+        shape = tuple(-(-n // _BLOCK) for n in (self.size[1], self.size[0]))
+        row, column = (_BLOCK * (k + 0.5) for k in np.indices(shape))
+        inside = np.zeros(shape, bool)
+        for (x, y), r in zip(middle, reach, strict=True):
+            inside |= (column - x) ** 2 + (row - y) ** 2 < r * r
+        return np.kron(inside, np.ones((_BLOCK, _BLOCK), bool))[: self.size[1], : self.size[0]]
+
+    def _cast(self, data: mujoco.MjData, origin: np.ndarray, rays: Float[np.ndarray, "n 3"]) -> _Hits:
+        n = len(rays)
+        geom, distance, normal = np.full(n, -1, np.int32), np.zeros(n), np.zeros(3 * n)
+        flat = np.ascontiguousarray(rays).ravel()
+        mujoco.mj_multiRay(
+            self.stage.model, data, origin, flat, _GROUPS, 1, -1, geom, distance, normal, n, mujoco.mjMAXVAL
+        )
+        return _Hits(geom, distance, normal.reshape(n, 3))
+
+    def _shade(self, data: mujoco.MjData, rays: Float[np.ndarray, "n 3"], hits: _Hits) -> Float[np.ndarray, "n 3"]:
+        """Colours under a bright sky and one lamp that throws shadows; 0 where a ray hits nothing."""
+        color = np.zeros((len(rays), 3))
+        seen = np.flatnonzero(hits.geom >= 0)
+        if not len(seen):
+            return color
+        n, ray = hits.normal[seen], rays[seen]
+        point = self.camera.eye + hits.distance[seen, None] * ray
+        lamp = np.clip(n @ TO_LAMP, 0.0, 1.0) * self._lit(data, point + 1e-3 * self.camera.height * n)
+        half = TO_LAMP - ray
+        half /= np.linalg.norm(half, axis=-1, keepdims=True)
+        shine = np.clip(np.sum(n * half, -1), 0.0, 1.0) ** 40 * (lamp > 0.0)
+        facing = np.clip(-np.sum(n * ray, -1), 0.0, 1.0)
+        light = 0.40 + 0.13 * n[:, 2] + 0.40 * lamp + 0.14 * facing
+        color[seen] = np.clip(self.stage.colors[hits.geom[seen] - 1] * light[:, None] + 0.16 * shine[:, None], 0.0, 1.0)
+        return color
+
+    def _lit(self, data: mujoco.MjData, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
+        """Whether the lamp sees each point."""
+        way = points - self._lamp
+        length = np.linalg.norm(way, axis=-1)
+        hits = self._cast(data, self._lamp, way / length[:, None])
+        return (hits.geom < 0) | (hits.distance > length)
+
+    def _shadow(self, data: mujoco.MjData) -> Float[np.ndarray, "height width"]:
+        """How much of the light each pixel of the floor keeps; shadows have soft edges."""
+        center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:, None]
+        way = center - self._lamp
+        foot = self._lamp + way * ((self._floor - self._lamp[2]) / way[:, 2:])
+        low, high = (foot[:, :2] - 2.5 * radius).min(0), (foot[:, :2] + 2.5 * radius).max(0)
+        step = (high - low) / (_SHADOW_MAP - 1)
+        i, j = np.mgrid[:_SHADOW_MAP, :_SHADOW_MAP]
+        grid = np.stack([low[0] + i * step[0], low[1] + j * step[1], np.full(i.shape, self._floor)], -1)
+        dark = 1.0 - self._lit(data, grid.reshape(-1, 3)).reshape(i.shape)
+        soft = ndimage.gaussian_filter(dark, 0.012 * self.camera.height / step)
+        place = np.moveaxis((self._ground - low) / step, -1, 0)
+        keep = np.ones(self._ground.shape[:2], np.float32)
+        under = ((place > 0.0) & (place < _SHADOW_MAP - 1.0)).all(0)
+        keep[under] -= 0.30 * ndimage.map_coordinates(soft, place[:, under], order=1)
+        return keep
+
+    def _empty_floor(self) -> tuple[Image, Float[np.ndarray, "height width 2"]]:
+        """The chequered floor, fading into white, and where each pixel meets it [m] (far away for the sky)."""
+        y, x = np.mgrid[: self.size[1], : self.size[0]]
+        pixels = np.stack([x, y], -1).reshape(-1, 2).astype(float)
+        samples = [self._floor_color(self._floor_point(pixels + shift)) for shift in _SUBPIXELS]
+        shape = (self.size[1], self.size[0])
+        ground = self._floor_point(pixels + 0.5)
+        return np.mean(samples, 0).reshape(*shape, 3).astype(np.float32), ground.reshape(*shape, 2)
+
+    def _floor_point(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        rays = self.camera.rays(pixels, self.size)
+        down = np.minimum(rays[:, 2:], -1e-6)
+        far = 1e3 * self.camera.height
+        reach = np.where(rays[:, 2:] < 0.0, (self._floor - self.camera.eye[2]) / down, far)
+        return self.camera.eye[:2] + np.minimum(reach, far) * rays[:, :2]
+
+    def _floor_color(self, point: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+        tile = np.floor(point / _round_length(0.2 * self.camera.height)).astype(int).sum(-1) % 2
+        distance = np.linalg.norm(point - np.asarray(self.camera.center[:2]), axis=-1) / self.camera.height
+        fade = np.clip(distance / 2.2, 0.0, 1.0)[:, None]
+        return _TILES[tile] + fade * (_WHITE - _TILES[tile])
+
+
+def _round_length(value: float) -> float:
+    """The nearest of ..., 0.1, 0.2, 0.5, 1, ... from below, so that a tile is a length that one can name."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(m for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-9)))
+
+
+def _edges(geom: np.ndarray, normal: Float[np.ndarray, "h w 3"]) -> np.ndarray:
+    """Pixels next to another geom, or to a face turned elsewhere."""
+    edge = np.zeros(geom.shape, bool)
+    for axis in (0, 1):
+        a, b = (np.take(geom, np.arange(k, geom.shape[axis] - 1 + k), axis) for k in (0, 1))
+        m, n = (np.take(normal, np.arange(k, geom.shape[axis] - 1 + k), axis) for k in (0, 1))
+        differs = (a != b) | ((a >= 0) & (np.sum(m * n, -1) < 0.8))
+        first, second = [slice(None)] * 2, [slice(None)] * 2
+        first[axis], second[axis] = slice(None, -1), slice(1, None)
+        edge[tuple(first)] |= differs
+        edge[tuple(second)] |= differs
+    return edge

@@ -1,0 +1,117 @@
+"""Low-poly surfaces of MuJoCo's primitive geoms: quads, counter-clockwise seen from outside, in the geom's frame."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull
+
+from ._parts import Part, RobotParts
+
+Quads = Float[np.ndarray, "faces 4 3"]
+"""Corners of quads; a triangle is a quad whose last two corners coincide."""
+
+_GEOM = mujoco.mjtGeom
+_MESH_FACES = 600
+
+
+def revolve(profile: Float[np.ndarray, "k 2"], segments: int) -> Quads:
+    """The surface that a profile of (radius, z), z rising, sweeps about the z axis."""
+    angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
+    ring = np.stack([np.cos(angle), np.sin(angle)], -1)
+    radius, height = profile[:, 0], profile[:, 1]
+    points = np.empty((len(profile), segments + 1, 3))
+    points[..., :2] = radius[:, None, None] * ring
+    points[..., 2] = height[:, None]
+    low, high = points[:-1], points[1:]
+    return np.stack([low[:, :-1], low[:, 1:], high[:, 1:], high[:, :-1]], 2).reshape(-1, 4, 3)
+
+
+def _arc(radius: float, start: float, stop: float, steps: int, shift: float = 0.0) -> np.ndarray:
+    """Points (radius, z) of an arc between two latitudes, moved along z."""
+    latitude = np.linspace(start, stop, steps + 1)
+    return np.stack([radius * np.cos(latitude), radius * np.sin(latitude) + shift], -1)
+
+
+def sphere(radius: float, detail: int) -> Quads:
+    """A sphere of 4 * detail meridians."""
+    return revolve(_arc(radius, -np.pi / 2, np.pi / 2, 2 * detail), 4 * detail)
+
+
+def capsule(radius: float, half_length: float, detail: int) -> Quads:
+    """A cylinder along z with half spheres on its ends, ``half_length`` from the middle to each sphere's centre."""
+    bottom = _arc(radius, -np.pi / 2, 0.0, detail, -half_length)
+    top = _arc(radius, 0.0, np.pi / 2, detail, half_length)
+    return revolve(np.concatenate([bottom, _inner_rings(radius, half_length, detail), top]), 4 * detail)
+
+
+def cylinder(radius: float, half_length: float, detail: int) -> Quads:
+    """A closed cylinder along z."""
+    ends = np.array([[0.0, half_length]])
+    side = _inner_rings(radius, half_length, detail)
+    rim = np.array([[radius, half_length]])
+    flip = np.array([1.0, -1.0])
+    return revolve(np.concatenate([ends * flip, rim * flip, side, rim, ends]), 4 * detail)
+
+
+def _inner_rings(radius: float, half_length: float, detail: int) -> np.ndarray:
+    """Rings between the ends of a long cylinder: quads that are not too long sort well by depth."""
+    count = min(detail, int(half_length / max(radius, 1e-9)))
+    height = np.linspace(-half_length, half_length, count + 2)[1:-1]
+    return np.stack([np.full_like(height, radius), height], -1)
+
+
+def box(half_sizes: Float[np.ndarray, "3"], detail: int) -> Quads:
+    """A box whose faces are split into a few quads, so that they sort well by depth."""
+    grid = np.linspace(-1.0, 1.0, max(detail, 2))
+    u, v = (a.ravel() for a in np.meshgrid(grid[:-1], grid[:-1], indexing="ij"))
+    step = grid[1] - grid[0]
+    corners = [(u, v), (u + step, v), (u + step, v + step), (u, v + step)]
+    top = np.stack([np.stack([a, b, np.ones_like(a)], -1) for a, b in corners], 1)
+    faces = []
+    for axis in range(3):
+        side = np.roll(top, axis + 1, axis=-1)
+        faces += [side, -side[:, ::-1]]
+    return np.concatenate(faces) * np.asarray(half_sizes)
+
+
+def mesh(vertices: Float[np.ndarray, "k 3"], faces: np.ndarray) -> Quads:
+    """A triangle mesh; its convex hull where it has too many faces to draw one by one."""
+    if len(faces) > _MESH_FACES:
+        hull = ConvexHull(vertices[:: max(1, len(vertices) // 2000)])
+        corners = hull.points[hull.simplices]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        inward = np.sum(normals * hull.equations[:, :3], -1) < 0.0
+        corners[inward] = corners[inward][:, ::-1]
+    else:
+        corners = vertices[faces]
+    return np.concatenate([corners, corners[:, 2:]], 1)
+
+
+def part_surface(part: Part, detail: int) -> Quads:
+    """Surface of one part in its own frame."""
+    size = part.size
+    match part.kind:
+        case _GEOM.mjGEOM_SPHERE:
+            return sphere(size[0], detail)
+        case _GEOM.mjGEOM_ELLIPSOID:
+            return sphere(1.0, detail) * size
+        case _GEOM.mjGEOM_CAPSULE:
+            return capsule(size[0], size[1], detail)
+        case _GEOM.mjGEOM_CYLINDER:
+            return cylinder(size[0], size[1], detail)
+        case _GEOM.mjGEOM_BOX:
+            return box(size, detail)
+        case _:
+            return np.zeros((0, 4, 3)) if part.mesh is None else mesh(*part.mesh)
+
+
+def robot_surface(shape: RobotParts, data: mujoco.MjData, detail: int) -> tuple[Quads, Float[np.ndarray, "faces 4"]]:
+    """Faces of a robot in the world [m], and their colours."""
+    surfaces = [part_surface(part, detail) for part in shape.parts]
+    placed = [
+        quads @ rotation.T + position for quads, position, rotation in zip(surfaces, *shape.poses(data), strict=True)
+    ]
+    colors = np.repeat([part.color for part in shape.parts], [len(quads) for quads in surfaces], axis=0)
+    return np.concatenate(placed), colors

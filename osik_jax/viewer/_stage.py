@@ -1,0 +1,164 @@
+"""A camera, and the MuJoCo model of what it sees: copies of robots' shapes that can be put anywhere."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ._parts import Part, RobotParts
+
+FLOOR_GROUP = 5
+"""The floor's geom group: MuJoCo's renderer shows it, the ray caster draws its own."""
+
+TO_LAMP = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A pinhole camera that looks at a point.
+
+    Attributes:
+        center: what it looks at [m]. (3,)
+        distance: from there to the lens [m].
+        azimuth: of the lens about the vertical, 0 from +x [deg].
+        elevation: of the lens above the horizon [deg].
+        height: of what it sees at the centre, top to bottom of the picture [m].
+    """
+
+    center: tuple[float, float, float]
+    distance: float
+    azimuth: float
+    elevation: float
+    height: float
+
+    @property
+    def view_angle(self) -> float:
+        """Vertical field of view [deg]."""
+        return float(2.0 * np.rad2deg(np.arctan2(0.5 * self.height, self.distance)))
+
+    @property
+    def axes(self) -> Float[np.ndarray, "3 3"]:
+        """Rows: right, up and forward in the world."""
+        azimuth, elevation = np.deg2rad([self.azimuth, self.elevation])
+        forward = -np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        return np.stack([right, np.cross(right, forward), forward])
+
+    @property
+    def eye(self) -> Float[np.ndarray, "3"]:
+        """Where the lens is [m]."""
+        return np.asarray(self.center) - self.distance * self.axes[2]
+
+    def rays(self, pixels: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> Float[np.ndarray, "n 3"]:
+        """Unit directions through points of a picture of (width, height); x to the right, y down, in pixels."""
+        width, height = size
+        scale = self.height / height
+        right = (pixels[:, 0] - 0.5 * width) * scale
+        up = (0.5 * height - pixels[:, 1]) * scale
+        rays = np.stack([right, up, np.full_like(right, self.distance)], -1) @ self.axes
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+    def project(self, points: Float[np.ndarray, "*n 3"], size: tuple[int, int]) -> Float[np.ndarray, "*n 2"]:
+        """Where points of the world [m] appear in a picture of (width, height), in pixels."""
+        width, height = size
+        right, up, depth = np.moveaxis((np.asarray(points) - self.eye) @ self.axes.T, -1, 0)
+        scale = self.distance / depth * height / self.height
+        return np.stack([0.5 * width + right * scale, 0.5 * height - up * scale], -1)
+
+    def for_mujoco(self) -> mujoco.MjvCamera:
+        """The same camera for MuJoCo's renderer (the model's ``vis.global_.fovy`` has to be ``view_angle``)."""
+        camera = mujoco.MjvCamera()
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.lookat[:] = self.center
+        camera.distance, camera.azimuth, camera.elevation = self.distance, self.azimuth + 180.0, -self.elevation
+        return camera
+
+
+class Stage:
+    """Copies of robots' shapes on mocap bodies, a floor and a lamp.
+
+    Attributes:
+        model: the MuJoCo model.
+        colors: of each geom but the floor, red, green and blue. (geoms, 3)
+    """
+
+    def __init__(self, robots: Sequence[RobotParts], camera: Camera, *, floor: float) -> None:
+        """Builds the model; ``floor`` is the height of the floor [m]."""
+        spec = mujoco.MjSpec()
+        for robot in robots:
+            for part in robot.parts:
+                _add_part(spec, part)
+        _add_surroundings(spec, camera, floor)
+        self._robots = tuple(robots)
+        self.model = spec.compile()
+        self.model.vis.global_.fovy = camera.view_angle
+        self.colors = np.array([part.color[:3] for robot in robots for part in robot.parts])
+
+    def pose(
+        self, poses: Sequence[mujoco.MjData], offsets: Float[np.ndarray, "robots 3"] | None = None
+    ) -> mujoco.MjData:
+        """Places every robot as its own ``mj_kinematics`` says, moved by its offset [m]."""
+        data = mujoco.MjData(self.model)
+        shift = np.zeros((len(self._robots), 3)) if offsets is None else offsets
+        start = 0
+        for robot, source, move in zip(self._robots, poses, shift, strict=True):
+            for position, rotation in zip(*robot.poses(source), strict=True):
+                data.mocap_pos[start] = position + move
+                mujoco.mju_mat2Quat(data.mocap_quat[start], rotation.ravel())
+                start += 1
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        return data
+
+
+def _add_part(spec: mujoco.MjSpec, part: Part) -> None:
+    body = spec.worldbody.add_body(mocap=True)
+    if part.mesh is None:
+        body.add_geom(type=part.kind, size=part.size, rgba=part.color)
+        return
+    name = f"mesh{len(spec.meshes)}"
+    vertices, faces = part.mesh
+    spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
+    body.add_geom(type=part.kind, meshname=name, rgba=part.color)
+
+
+def _add_surroundings(spec: mujoco.MjSpec, camera: Camera, floor: float) -> None:
+    """Floor, lamp and sky for MuJoCo's renderer; it needs room for pictures of any sensible size."""
+    spec.add_texture(
+        name="tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.90, 0.91, 0.93],
+        rgb2=[0.96, 0.965, 0.975],
+        width=512,
+        height=512,
+    )
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[1.0, 1.0, 1.0],
+        rgb2=[1.0, 1.0, 1.0],
+        width=64,
+        height=384,
+    )
+    material = spec.add_material(name="floor", texrepeat=[2.5 / camera.height, 2.5 / camera.height], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0.0, 0.0, 1.0],
+        pos=[*camera.center[:2], floor],
+        material="floor",
+        group=FLOOR_GROUP,
+    )
+    lamp = np.asarray(camera.center) + 4.0 * camera.height * TO_LAMP
+    spec.worldbody.add_light(pos=lamp, dir=-TO_LAMP, diffuse=[0.5, 0.5, 0.5])
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 2560, 1440
+    spec.visual.headlight.ambient[:] = 0.45
+    spec.visual.headlight.diffuse[:] = 0.35
