@@ -78,8 +78,8 @@ class Robot(eqx.Module):
         Every link is a frame, with or without a joint of its own. Limits come from ``<limit>``: no ``<limit>`` means
         none, an absent ``lower`` or ``upper`` is 0 as the format has it, and a velocity of 0 or none means unknown,
         so unlimited. ``<safety_controller>`` is not read. A ``<mimic>`` joint is no coordinate of its own: it moves
-        with its leader, whose limits its own limits narrow. Moving links without mass get 2e-15 kg in ``mj_model``, which
-        MuJoCo demands. What is fixed to the world (the root link of an arm) does not count as the robot's mass.
+        with its leader, whose limits its own limits narrow. Moving links without mass get 2e-15 kg in ``mj_model``:
+        MuJoCo demands some. What is fixed to the world (the root link of an arm) does not count as the robot's mass.
 
         Args:
             urdf: path of the file, or the XML text itself. Lengths in metres, angles in radians.
