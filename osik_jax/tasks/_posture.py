@@ -123,6 +123,14 @@ class PostureTask(Task):
             row += width
         return jacobian, feedforward
 
+    def _convert(self, name: str, value: Any) -> Any:
+        if name != "target" or self.target is None:
+            return super()._convert(name, value)
+        target = jnp.asarray(value, self.weight.dtype)
+        if target.shape != self.target.shape:
+            raise ValueError(f"target has shape {target.shape}, expected {self.target.shape}. Batch with jax.vmap.")
+        return target
+
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
 
