@@ -30,11 +30,11 @@ class SupportPolygon(eqx.Module):
     offsets: Float[Array, " m"]
     vertices: Float[Array, "m 2"]
 
-    def distance(self, xy: Float[Array, "... 2"]) -> Float[Array, "..."]:
+    def distance(self, xy: Float[Array, "... 2"] | ArrayLike) -> Float[Array, "..."]:
         """Distance [m] to the nearest edge, positive inside; outside, minus the largest violation of an edge's line."""
         return jnp.min(self.offsets - jnp.sum(self.normals * jnp.asarray(xy)[..., None, :], -1), -1)
 
-    def contains(self, xy: Float[Array, "... 2"]) -> Bool[Array, "..."]:
+    def contains(self, xy: Float[Array, "... 2"] | ArrayLike) -> Bool[Array, "..."]:
         """Whether points lie inside or on the edge."""
         return self.distance(xy) >= 0.0
 
