@@ -148,7 +148,7 @@ def _check(model: mujoco.MjModel, names: tuple[str, ...], body_names: tuple[str,
         raise ValueError(f"nothing that moves has a mass; give one of these an inertial: {', '.join(moving_names)}")
     for joint, name in enumerate(names):
         low, high = model.jnt_range[joint]
-        if model.jnt_limited[joint] and low > high:
+        if low > high:  # which MuJoCo may take for "no limit"
             raise ValueError(f"joint {name!r} has limits with lower > upper: [{low}, {high}]")
 
 
