@@ -38,7 +38,7 @@ class FrameTask(Task):
       ``e' = [R' (J_lin + [p - p*] J_ang); E R' J_ang] v - [R' v*; E R' w*]``, with E the inverse right Jacobian at
       ``log(R*' R)``. Leaving a row out frees, for instance, the rotation of a tool about its own z axis.
 
-    The task asks for ``e' = -gain(e) e`` (Ramos, eq. 2, and eq. 3 for the adaptive gain). As an inequality
+    The task asks for ``e' = -gain(e) e`` (``AdaptiveGain`` is Ramos, eq. 3). As an inequality
     (``lower``, ``upper``) it keeps the same e, the pose relative to the target, within bounds:
     ``gain (lower - e) <= e' <= gain (upper - e)``. Rows are metres and radians; angles up to pi.
 
@@ -55,8 +55,9 @@ class FrameTask(Task):
         rows: ``"pose"``, ``"position"``, ``"orientation"``, or six booleans (x, y, z, rotation about x, y, z): the rows
             that the task has. Static; weights are not.
         axes: ``"world"`` or ``"frame"``.
-        orientation_jacobian: ``"analytic"`` (exact), or ``"geometric"``: E = I, whose motion towards the target is
-            the same when nothing competes, and slower or faster by up to pi/2 across the axis of a large error.
+        orientation_jacobian: ``"analytic"`` (exact), or ``"geometric"``: E = I. Both ask for the same motion where
+            the task can be met; where it cannot, they weigh the residual across the error's axis differently, by a
+            factor (angle/2) / sin(angle/2), at most pi/2.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
 
