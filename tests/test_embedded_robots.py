@@ -4,6 +4,7 @@ import json
 from importlib import resources
 from importlib.metadata import files
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -136,7 +137,9 @@ def test_contact_corners_go_round_each_sole_counter_clockwise(nao, nao_poses):
     for side in "lr":
         x, y = np.array([positions[nao.frame_names.index(f"{side}_sole_corner_{k}")] for k in range(4)])[:, :2].T
         area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-        assert area == pytest.approx(0.0051096, abs=1e-6)  # of the quadrilateral of published force sensor positions, m^2
+        assert area == pytest.approx(
+            0.0051096, abs=1e-6
+        )  # of the quadrilateral of published force sensor positions, m^2
 
 
 @pytest.mark.parametrize(("name", "drift"), [("nao", 0.03), ("arm7", 0.02)])
@@ -196,7 +199,7 @@ def test_arm7_flange_equals_the_denavit_hartenberg_product(arm7_flange, arm7_q):
 def test_arm7_flange_equals_the_public_panda_urdf(arm7_flange, arm7_q):
     """Pytorch-kinematics on the panda.urdf of example-robot-data; its Jacobian is in the base's axes as ours is."""
     urdf = next(f for f in files("example-robot-data") or () if f.match("panda_description/urdf/panda.urdf"))
-    chain = pytorch_kinematics.build_serial_chain_from_urdf(urdf.read_binary(), "panda_link8")
+    chain: Any = pytorch_kinematics.build_serial_chain_from_urdf(urdf.read_binary(), "panda_link8")
     chain = chain.to(dtype=torch.float64)
     angles = torch.tensor(arm7_q)
     pose = chain.forward_kinematics(angles).get_matrix().numpy()

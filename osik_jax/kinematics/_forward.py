@@ -98,8 +98,8 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Arr
 def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3"]:
     """Centre of mass [m], in the world, of the whole robot or of the body ``subtree`` and all that hangs from it.
 
-    Links that are fixed to the world (an arm's base) count as part of the whole, as they do in MuJoCo. A frame that is
-    not a body stands for the moving body that carries it.
+    What is fixed to the world (an arm's base) does not count, as in Pinocchio and unlike MuJoCo. A frame that is not a
+    body stands for the moving body that carries it.
 
     Raises:
         KeyError: no such body.

@@ -46,7 +46,7 @@ def _forest(
         element = spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True)
         for joint, owner in enumerate(joint_bodies):
             if owner == body:
-                element.add_joint(type=mujoco.mjtJoint(joint_types[joint]))
+                element.add_joint(type=mujoco.mjtJoint(joint_types[joint]), armature=1.0)  # or MuJoCo warns
     with jax.ensure_compile_time_eval():
         model = mjx.put_model(spec.compile(), impl="jax")
         return model, mjx.make_data(model, impl="jax")
