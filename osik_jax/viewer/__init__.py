@@ -9,6 +9,7 @@ from ._mujoco import mujoco_frame_pose as mujoco_frame_pose
 from ._mujoco import mujoco_poses as mujoco_poses
 from ._mujoco import robot_com as robot_com
 from ._opengl import RendererName as RendererName
+from ._opengl import check_opengl as check_opengl
 from ._scene import Surface as Surface
 from ._scene import draw_com as draw_com
 from ._scene import draw_ground as draw_ground

@@ -74,3 +74,13 @@ def make_renderer(name: RendererName, stage: Stage, camera: Camera, size: tuple[
             if name == "mujoco":
                 raise
     return RayCaster(stage, camera, size, floor=floor)
+
+
+def check_opengl() -> None:
+    """Tries MuJoCo's renderer on an empty scene.
+
+    Raises:
+        RuntimeError: OpenGL does not work here.
+    """
+    camera = Camera((0.0, 0.0, 0.0), 1.0, 0.0, 0.0, 1.0)
+    GlRenderer(Stage((), camera, floor=0.0), camera, (16, 16))

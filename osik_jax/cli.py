@@ -1,0 +1,260 @@
+"""The command line: ``osik demo`` and ``osik info``."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    from .demo import Motion
+    from .robot import Robot
+
+_DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
+_EMBEDDED = ("nao", "arm7")
+_USER_ERRORS = (OSError, KeyError, ValueError)
+
+
+class CommandError(Exception):
+    """Something that the user can set right; told in one line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Moves a robot with each scheme, and writes a film, a figure, the motion and a report to a folder.
+
+    NAO sways over both feet (double-support), or lifts one (single-support). With --robot, the base or the tip of your
+    own robot goes 5 cm to its left and back.
+    """
+
+    motion: Literal["double-support", "single-support"] = "double-support"
+    """What NAO does."""
+    robot: str | None = None
+    """A URDF or MJCF file (or nao, arm7) to move instead."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """With --robot: whether its root moves freely. auto: as the file says; a URDF without feet is fixed."""
+    frame: str | None = None
+    """With --robot: the frame that moves. Default: the floating base, or the tip of a robot that is bolted down."""
+    support: tuple[str, ...] = ()
+    """With --robot: frames that stand on the ground. Default: those that look like feet."""
+    duration: float = 8.0
+    """Length of the motion [s]."""
+    frequency: float = 200.0
+    """Control ticks a second [Hz]."""
+    schemes: tuple[Literal["weighted", "null-space", "hierarchical"], ...] = ("weighted", "null-space", "hierarchical")
+    """Which schemes to run, one after the other; the film shows the last."""
+    out: Path = Path("osik-demo")
+    """Folder to write to."""
+    animation: bool = True
+    """Write the film (motion.gif; motion.mp4 too where the program ffmpeg is installed)."""
+    picture: bool = False
+    """Write picture.png as well: three instants side by side."""
+    renderer: Literal["auto", "mujoco", "raycast"] = "auto"
+    """mujoco needs OpenGL; raycast runs anywhere; auto takes the first that works."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Prints a robot's joints with their limits, its frames and its mass."""
+
+    robot: Annotated[str, tyro.conf.Positional]
+    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF says nothing, and floats."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit code: 0, or 2 after a mistake of the user's (told on stderr)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments == ["--version"]:
+        print(f"osik-jax {importlib.metadata.version('osik-jax')}")
+        return 0
+    command = tyro.extras.subcommand_cli_from_dict(
+        {"demo": Demo, "info": Info}, prog="osik", description=_DESCRIPTION, args=arguments or ["--help"]
+    )
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    try:
+        if isinstance(command, Info):
+            _info(command)
+        else:
+            _demo(command)
+    except CommandError as error:
+        print(f"osik: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Turns the exceptions of wrong input into a one-line message."""
+    try:
+        yield
+    except _USER_ERRORS as error:
+        text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+        raise CommandError(" ".join(text.split())) from error
+
+
+def read_robot(source: str, base: str = "auto") -> Robot:
+    """An embedded robot by name, or a URDF or MJCF file, told apart by what is in it.
+
+    Args:
+        source: name or path.
+        base: ``"floating"``, ``"fixed"``, or ``"auto"``.
+
+    Raises:
+        CommandError: no such file, or what is in it is broken.
+    """
+    from .robot import Robot, load_robot
+
+    with _told():
+        if source in _EMBEDDED and not os.path.exists(source):
+            return load_robot(source)
+        path = Path(source)
+        if not path.is_file():
+            raise FileNotFoundError(f"no such file: {source} (embedded robots: {', '.join(_EMBEDDED)})")
+        text = path.read_text(encoding="utf-8", errors="replace")
+        floating = {"auto": None, "floating": True, "fixed": False}[base]
+        if "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]:
+            return Robot.from_mjcf(path, floating_base=floating)
+        return Robot.from_urdf(path, floating_base=floating)
+
+
+def _read_demo_robot(command: Demo, source: str) -> Robot:
+    """The robot to move; a URDF that was let float only by default, and has no feet, is bolted down."""
+    from .demo import guess_feet
+
+    robot = read_robot(source, command.base)
+    guessed = command.base == "auto" and source not in _EMBEDDED and not command.support
+    if guessed and robot.floating_base and not guess_feet(robot):
+        return read_robot(source, "fixed")
+    return robot
+
+
+def _info(command: Info) -> None:
+    from rich.console import Console
+
+    robot = read_robot(command.robot, command.base)
+    console = Console()
+    base = "floating base" if robot.floating_base else "bolted down"
+    mass = float(robot.body_mass.sum())
+    size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {mass:.3f} kg"
+    console.print(f"[bold]{command.robot}[/bold]: {size}")
+    console.print(_joint_table(robot))
+    for follower, (leader, multiplier) in robot.mimic_joints.items():
+        console.print(f"{follower} follows {leader}, times {multiplier:g}")
+    console.print(f"[bold]{len(robot.frame_names)} frames[/bold]: {', '.join(robot.frame_names)}")
+
+
+def _joint_table(robot: Robot) -> Table:
+    from rich.table import Table
+
+    table = Table("joint", *(_right(name) for name in ("in q", "in v", "lower", "upper", "top speed")))
+    for name in robot.joint_names:
+        dof = robot.joint_dof_index(name)
+        limits = (robot.position_lower[dof], robot.position_upper[dof], robot.velocity_limit[dof])
+        numbers = (f"{float(value):.4f}".rstrip("0").rstrip(".") for value in limits)
+        table.add_row(name, str(robot.joint_qpos_index(name)), str(dof), *numbers)
+    return table
+
+
+def _right(header: str) -> Column:
+    from rich.table import Column
+
+    return Column(header, justify="right")
+
+
+def _demo(command: Demo) -> None:
+    from rich.console import Console
+
+    from . import demo
+
+    console = Console()
+    motion = _motion(command)
+    for note in motion.notes:
+        console.print(f"[yellow]note:[/yellow] {note}")
+    with _progress(console) as announce:
+        summary, runs = demo.run_demo(
+            motion,
+            _folder(command.out),
+            schemes=command.schemes,
+            dt=1.0 / command.frequency,
+            animation=command.animation,
+            renderer=command.renderer,
+            announce=announce,
+        )
+    if command.picture:
+        demo.draw_picture(motion, runs[-1], command.out / "picture.png")
+    console.print(demo.table(summary))
+    console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
+
+
+def _motion(command: Demo) -> Motion:
+    """The motion that the options ask for."""
+    from . import demo
+
+    _check(command)
+    if command.robot is not None:
+        robot = _read_demo_robot(command, command.robot)
+        with _told():
+            return demo.file_motion(
+                robot,
+                name=Path(command.robot).stem,
+                frame=command.frame,
+                support=command.support,
+                duration=command.duration,
+            )
+    make = demo.double_support if command.motion == "double-support" else demo.single_support
+    return make(command.duration)
+
+
+def _check(command: Demo) -> None:
+    """Options that exclude each other, and values out of range."""
+    if command.robot is None and (command.frame is not None or command.support):
+        raise CommandError("--frame and --support go with --robot FILE; NAO's motions choose their own")
+    if not command.frequency > 0.0:
+        raise CommandError(f"--frequency is {command.frequency:g}; it has to be positive")
+    if not command.duration * command.frequency >= 2.0:
+        raise CommandError(f"--duration is {command.duration:g} s; it has to last two control ticks at least")
+    if not command.schemes:
+        raise CommandError("--schemes is empty; name at least one of: weighted, null-space, hierarchical")
+    if command.renderer == "mujoco" and command.animation:
+        from .viewer import check_opengl
+
+        try:
+            check_opengl()
+        except RuntimeError as error:
+            raise CommandError(f"--renderer mujoco: {' '.join(str(error).split())}; use auto or raycast") from error
+
+
+def _folder(path: Path) -> Path:
+    """Makes the folder to write to."""
+    with _told():
+        path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[str, float], None]]:
+    """A progress bar over the stages; yields what to tell it."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (BarColumn(bar_width=30), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    with Progress(*columns, TextColumn("{task.description}"), console=console) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda stage, done: bar.update(task, description=stage, completed=done)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

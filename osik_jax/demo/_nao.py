@@ -1,0 +1,136 @@
+"""NAO's two motions: the waist swings over both feet, and one foot is lifted (Ramos, Fig. 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..kinematics import forward_kinematics
+from ..limits import ConfigurationLimit, VelocityLimit
+from ..robot import Robot, load_robot
+from ..tasks import ComTask, PostureTask, Task, support_polygon
+from ._motion import GAIN, Goal, Motion, Stance, along, blended, circumscribed, contact_corners, tracking
+from ._references import Path, Stroke, minimum_jerk
+
+FEET = ("l_sole", "r_sole")
+WAIST, HANDS = "torso", ("l_gripper", "r_gripper")
+SWAY = 0.05
+"""How far the waist goes to its left [m]."""
+MARGIN = 0.01
+"""How far inside the edge of the support polygon the centre of mass is asked to stay [m]."""
+WEIGHTS = {"feet": 1e4, "com": 1e3, "foot": 1e3, "waist": 1e2, "hands": 1e1, "posture": 1e-2}
+"""For the weighted scheme; the hierarchical ones rank by priority and need none."""
+
+
+def double_support(duration: float = 8.0) -> Motion:
+    """Both feet stay; the centre of mass stays over them; the waist goes 5 cm to its left and back."""
+    robot = load_robot("nao")
+    paths = _home_paths(robot, (*FEET, WAIST))
+    u = duration / 8.0
+    waist = Goal(
+        WAIST, _with(paths[WAIST], [(0.5 * u, 3.0 * u, (0.0, SWAY, 0.0)), (4.5 * u, 7.0 * u, (0.0, -SWAY, 0.0))])
+    )
+    feet = {foot: tracking(robot, Goal(foot, paths[foot]), weight=WEIGHTS["feet"], priority=1) for foot in FEET}
+    still = {
+        "left_foot": feet["l_sole"],
+        "right_foot": feet["r_sole"],
+        "com": ComTask(
+            robot,
+            polygon=support_polygon(robot, robot.q0, FEET, margin=MARGIN),
+            weight=WEIGHTS["com"],
+            gain=GAIN,
+            priority=2,
+        ),
+        "posture": PostureTask(robot, weight=WEIGHTS["posture"], gain=1.0, priority=4),
+    }
+    moving = tracking(robot, waist, weight=WEIGHTS["waist"], priority=3)
+    return Motion(
+        name="double-support",
+        title="NAO in double support",
+        robot=robot,
+        q0=robot.q0,
+        tasks=lambda t: still | {"waist": along(moving, waist, t)},
+        duration=duration,
+        stances=tuple(Stance(foot, contact_corners(robot, foot)) for foot in FEET),
+        goals={"waist": waist},
+        limits=(ConfigurationLimit(robot), VelocityLimit(robot)),
+    )
+
+
+def single_support(duration: float = 8.0) -> Motion:
+    """The weight goes onto the left foot, the right foot is lifted while the arms open, and all goes back."""
+    robot = load_robot("nao")
+    u = duration / 8.0
+    paths = _home_paths(robot, (*FEET, WAIST, *HANDS))
+    goals = {
+        "waist": Goal(WAIST, _with(paths[WAIST], _there_and_back(u, 0.25, 2.0, 5.75, 7.75, (0.0, SWAY, -0.01)))),
+        "foot": Goal("r_sole", _swing(paths["r_sole"], u)),
+        "left_hand": Goal(HANDS[0], _with(paths[HANDS[0]], _reach(u, 1.0)), "position"),
+        "right_hand": Goal(HANDS[1], _with(paths[HANDS[1]], _reach(u, -1.0)), "position"),
+    }
+    moving = {
+        "right_foot": (tracking(robot, goals["foot"], weight=WEIGHTS["feet"], priority=1), goals["foot"]),
+        "waist": (tracking(robot, goals["waist"], weight=WEIGHTS["waist"], priority=3), goals["waist"]),
+        "left_hand": (tracking(robot, goals["left_hand"], weight=WEIGHTS["hands"], priority=4), goals["left_hand"]),
+        "right_hand": (tracking(robot, goals["right_hand"], weight=WEIGHTS["hands"], priority=4), goals["right_hand"]),
+    }
+    stance = tracking(robot, Goal("l_sole", paths["l_sole"]), weight=WEIGHTS["feet"], priority=1)
+    posture = PostureTask(robot, weight=WEIGHTS["posture"], gain=1.0, priority=5)
+    tight = support_polygon(robot, robot.q0, ("l_sole",), margin=MARGIN)
+    wide = circumscribed(tight.normals, support_polygon(robot, robot.q0, FEET, margin=MARGIN))
+    com = ComTask(robot, polygon=wide, weight=WEIGHTS["com"], gain=GAIN, priority=2)
+
+    def tasks(t: Any) -> Mapping[str, Task]:
+        onto, _ = minimum_jerk(t, 0.25 * u, 1.75 * u)
+        back, _ = minimum_jerk(t, 5.75 * u, 2.0 * u)
+        return {
+            "left_foot": stance,
+            "com": com.replace(polygon=blended(wide, tight, onto - back)),
+            "posture": posture,
+        } | {name: along(task, goal, t) for name, (task, goal) in moving.items()}
+
+    return Motion(
+        name="single-support",
+        title="NAO lifts a foot",
+        robot=robot,
+        q0=robot.q0,
+        tasks=tasks,
+        duration=duration,
+        stances=(
+            Stance("l_sole", contact_corners(robot, "l_sole")),
+            Stance("r_sole", contact_corners(robot, "r_sole"), lifted=(2.25 * u, 5.5 * u)),
+        ),
+        goals=goals,
+        limits=(ConfigurationLimit(robot), VelocityLimit(robot)),
+    )
+
+
+def _home_paths(robot: Robot, frames: tuple[str, ...]) -> dict[str, Path]:
+    """Of each frame, a path that stays where it is at ``q0``."""
+    kinematics = forward_kinematics(robot, robot.q0)
+    positions, rotations = kinematics.frame_poses(robot, frames)
+    return {name: Path(np.asarray(p), np.asarray(R)) for name, p, R in zip(frames, positions, rotations, strict=True)}
+
+
+def _with(path: Path, moves: list[tuple[float, float, tuple[float, float, float]]], **changes: Any) -> Path:
+    return Path(path.position, path.rotation, tuple(Stroke(*move) for move in moves), **changes)
+
+
+def _there_and_back(
+    u: float, start: float, there: float, leave: float, end: float, by: tuple[float, float, float]
+) -> list[tuple[float, float, tuple[float, float, float]]]:
+    """Strokes by a vector and back; times in units of u [s]."""
+    return [(start * u, there * u, by), (leave * u, end * u, (-by[0], -by[1], -by[2]))]
+
+
+def _swing(path: Path, u: float) -> Path:
+    """The right foot goes up, back and a little in, flat: with one motor for both hip yaw-pitch joints it cannot tip."""
+    return _with(path, _there_and_back(u, 2.25, 3.5, 4.25, 5.5, (-0.045, 0.01, 0.055)))
+
+
+def _reach(u: float, side: float) -> list[tuple[float, float, tuple[float, float, float]]]:
+    """A hand moves with the waist, then opens out and up to its side (+1 left, -1 right), and returns."""
+    with_waist = _there_and_back(u, 0.25, 2.0, 5.75, 7.75, (0.0, SWAY, -0.01))
+    return with_waist + _there_and_back(u, 1.5, 3.25, 4.5, 6.25, (0.0, 0.07 * side, 0.08))

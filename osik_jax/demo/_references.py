@@ -1,0 +1,86 @@
+"""Smooth references: sums of minimum-jerk strokes, with their velocities."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+
+def minimum_jerk(t: ArrayLike | Array, start: float, duration: float) -> tuple[Array, Array]:
+    """From 0 at ``start`` to 1 at ``start + duration`` [s], at rest at both ends; the value and its rate [1/s]."""
+    s = jnp.clip((jnp.asarray(t) - start) / duration, 0.0, 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 30.0 * s**2 * (1.0 - s) ** 2 / duration
+
+
+@dataclasses.dataclass(frozen=True)
+class Stroke:
+    """A move by ``amount`` between two times.
+
+    Attributes:
+        start: when it starts [s].
+        end: when it ends [s].
+        amount: how far, one number for each coordinate.
+    """
+
+    start: float
+    end: float
+    amount: tuple[float, ...]
+
+
+def follow(strokes: Sequence[Stroke], t: ArrayLike | Array, size: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Sum of the strokes at time t [s], and its velocity. (size,) each."""
+    value = rate = jnp.zeros(size)
+    for stroke in strokes:
+        s, speed = minimum_jerk(t, stroke.start, stroke.end - stroke.start)
+        amount = jnp.asarray(stroke.amount)
+        value, rate = value + s * amount, rate + speed * amount
+    return value, rate
+
+
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """Where a frame should be over time: strokes from a start, turned about one axis of the world.
+
+    Attributes:
+        position: at the start [m]. (3,)
+        rotation: at the start, frame axes to world axes. (3, 3)
+        moves: strokes of the position [m].
+        turns: strokes of the angle about ``axis`` [rad].
+        axis: unit vector in the world. (3,)
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+    moves: tuple[Stroke, ...] = ()
+    turns: tuple[Stroke, ...] = ()
+    axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
+
+    def at(self, t: ArrayLike | Array) -> tuple[tuple[Float[Array, "3"], Float[Array, "3 3"]], Float[Array, "6"]]:
+        """Pose (p, R) and velocity [linear; angular], world axes, at time t [s]."""
+        shift, velocity = follow(self.moves, t, 3)
+        angle, speed = follow(self.turns, t, 1)
+        axis = jnp.asarray(self.axis)
+        pose = (jnp.asarray(self.position) + shift, _rotation(axis, angle[0]) @ jnp.asarray(self.rotation))
+        return pose, jnp.concatenate([velocity, speed * axis])
+
+    def still(self, t: np.ndarray) -> np.ndarray:
+        """Whether the path has moved before, and stands at each time [s] of an array."""
+        strokes = (*self.moves, *self.turns)
+        begun = np.zeros(len(t), bool)
+        moving = np.zeros(len(t), bool)
+        for stroke in strokes:
+            begun |= t >= stroke.end
+            moving |= (t > stroke.start) & (t < stroke.end)
+        return begun & ~moving
+
+
+def _rotation(axis: Float[Array, "3"], angle: Array) -> Float[Array, "3 3"]:
+    """Rodrigues' formula."""
+    x, y, z = axis
+    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * cross @ cross

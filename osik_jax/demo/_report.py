@@ -1,0 +1,237 @@
+"""The figures of a demonstration: as JSON for programs and as a table for people."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+from rich.table import Table
+
+from ..solvers import Status
+from ._measure import TOLERANCE, Measurement, Track
+from ._motion import Motion
+from ._schemes import PROMISES_LIMITS, TITLES
+
+DRIFT_POSITION, DRIFT_ORIENTATION, PATH_ERROR = 1e-4, 1e-4, 1e-3
+"""What the hierarchical scheme has to reach: [m] and [rad] for the standing feet, [m] for the first goal."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a solver said along a motion, and how long it took.
+
+    Attributes:
+        compile_seconds: tracing and compiling the whole loop [s].
+        run_seconds: running it once [s].
+        status: of each tick. (steps,)
+        iterations: of each tick. (steps,)
+        kkt_residual: of each tick. (steps,)
+    """
+
+    compile_seconds: float
+    run_seconds: float
+    status: Int[np.ndarray, " steps"]
+    iterations: Int[np.ndarray, " steps"]
+    kkt_residual: Float[np.ndarray, " steps"]
+
+
+def report(
+    motion: Motion,
+    results: Mapping[str, tuple[Outcome, Measurement]],
+    *,
+    dt: float,
+    files: Sequence[str] = (),
+) -> dict[str, Any]:
+    """All figures of a demonstration; lengths in mm, angles in mrad."""
+    return {
+        "motion": motion.name,
+        "title": motion.title,
+        "settings": _settings(motion, dt),
+        "schemes": {name: _scheme(motion, name, *result) for name, result in results.items()},
+        "checked_with": "MuJoCo's mj_kinematics and mj_comPos, from the configurations alone",
+        "versions": _versions(),
+        "files": [*files, "report.json"],
+        "notes": list(motion.notes),
+    }
+
+
+def write_report(summary: Mapping[str, Any], path: Path) -> None:
+    """Writes strict JSON."""
+    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _settings(motion: Motion, dt: float) -> dict[str, Any]:
+    tasks = motion.tasks(0.0)
+    return {
+        "duration_s": motion.duration,
+        "dt_s": dt,
+        "steps": round(motion.duration / dt),
+        "joints": len(motion.robot.joint_names),
+        "precision": str(motion.robot.q0.dtype),
+        "tasks": {
+            name: {
+                "kind": type(task).__name__,
+                "priority": task.priority,
+                "weight": float(np.asarray(task.weight)),
+                "gain_per_s": float(np.asarray(task.gain)),
+            }
+            for name, task in tasks.items()
+        },
+        "limits": [type(limit).__name__ for limit in motion.limits],
+        "violation_tolerance": TOLERANCE,
+    }
+
+
+def _versions() -> dict[str, str]:
+    packages = ("osik-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "numpy", "scipy", "matplotlib")
+    found = {name: importlib.metadata.version(name) for name in packages}
+    return found | {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "device": str(jax.devices()[0]),
+        "cores": str(os.cpu_count()),
+    }
+
+
+def _scheme(motion: Motion, name: str, outcome: Outcome, m: Measurement) -> dict[str, Any]:
+    out = {
+        "title": TITLES[name],
+        "standing": {frame: _drift(track) for frame, track in m.stances.items()},
+        "goals": {label: _error(track) for label, track in m.goals.items()},
+        "limits": {
+            "promised": name in PROMISES_LIMITS,
+            "position_violations": m.position_violations,
+            "velocity_violations": m.velocity_violations,
+            "least_position_margin": float(m.position_margin.min()),
+            "least_velocity_margin": float(m.velocity_margin.min()),
+        },
+        "solver": _solver(outcome),
+    }
+    if motion.balanced:
+        out["balance"] = {
+            "least_margin_mm": 1e3 * float(m.com_margin.min()),
+            "ticks_outside": int((m.com_margin < 0.0).sum()),
+        }
+    return out | {"reached": _reached(motion, m)}
+
+
+def _drift(track: Track) -> dict[str, float]:
+    return {
+        "position_mm": 1e3 * float(np.nanmax(track.position)),
+        "orientation_mrad": 1e3 * float(np.nanmax(track.orientation)),
+    }
+
+
+def _error(track: Track) -> dict[str, float | None]:
+    """Greatest errors over all times, and over those when the path stands again."""
+    out: dict[str, float | None] = {"position_mm": 1e3 * float(track.position.max())}
+    out["settled_position_mm"] = 1e3 * float(track.position[track.settled].max()) if track.settled.any() else None
+    if not np.isnan(track.orientation).all():
+        out["orientation_mrad"] = 1e3 * float(np.nanmax(track.orientation))
+    return out
+
+
+def _solver(outcome: Outcome) -> dict[str, Any]:
+    steps = len(outcome.status)
+    return {
+        "status": {status.name: int((outcome.status == status).sum()) for status in Status},
+        "iterations_mean": float(outcome.iterations.mean()),
+        "iterations_max": int(outcome.iterations.max()),
+        "kkt_residual_max": _finite(outcome.kkt_residual.max()),
+        "compile_s": outcome.compile_seconds,
+        "run_s": outcome.run_seconds,
+        "microseconds_per_tick": 1e6 * outcome.run_seconds / steps,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _reached(motion: Motion, m: Measurement) -> dict[str, bool]:
+    """What the hierarchical scheme has to reach; told of every scheme."""
+    first = next(iter(m.goals.values()))
+    settled = first.position[first.settled]
+    out = {"first_goal": bool(len(settled) and settled.max() <= PATH_ERROR)}
+    if motion.stances:
+        out["standing"] = all(
+            np.nanmax(t.position) <= DRIFT_POSITION and np.nanmax(t.orientation) <= DRIFT_ORIENTATION
+            for t in m.stances.values()
+        )
+    if motion.balanced:
+        out["balance"] = bool((m.com_margin >= 0.0).all())
+    return out | {"limits": m.position_violations == 0 and m.velocity_violations == 0}
+
+
+def table(summary: Mapping[str, Any]) -> Table:
+    """The same for people: what each scheme reached."""
+    schemes = list(summary["schemes"].values())
+    out = Table(title=summary["title"], title_justify="left", title_style="bold")
+    out.add_column("")
+    for scheme in schemes:
+        out.add_column(scheme["title"], justify="right")
+    for label, cell in _rows(schemes[0]):
+        out.add_row(label, *(cell(scheme) for scheme in schemes))
+    return out
+
+
+def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Labels, and functions from a scheme's figures to what its cell says."""
+    rows: list[tuple[str, Any]] = []
+    if example["standing"]:
+        rows.append(("standing feet, drift [mm]", lambda s: _number(_worst(s["standing"], "position_mm"), 0.1)))
+        rows.append(("standing feet, turn [mrad]", lambda s: _number(_worst(s["standing"], "orientation_mrad"), 0.1)))
+    if "balance" in example:
+        rows.append(("centre of mass inside by [mm]", lambda s: _inside(s["balance"]["least_margin_mm"])))
+    first = next(iter(example["goals"]))
+    for label in example["goals"]:
+        limit = 1.0 if label == first else None
+        rows.append(
+            (
+                f"{label.replace('_', ' ')}, from path [mm]",
+                lambda s, k=label: _number(s["goals"][k]["position_mm"], None),
+            )
+        )
+        rows.append(
+            ("  once there [mm]", lambda s, k=label, top=limit: _number(s["goals"][k]["settled_position_mm"], top))
+        )
+    rows.append(("position limits broken", lambda s: _count(s["limits"]["position_violations"])))
+    rows.append(("velocity limits broken", lambda s: _count(s["limits"]["velocity_violations"])))
+    rows.append(("ticks solved", lambda s: _solved(s["solver"]["status"])))
+    rows.append(("compile [s]", lambda s: f"{s['solver']['compile_s']:.1f}"))
+    rows.append(("a tick [µs]", lambda s: f"{s['solver']['microseconds_per_tick']:.0f}"))
+    return rows
+
+
+def _worst(standing: Mapping[str, Mapping[str, float]], key: str) -> float:
+    return max(figures[key] for figures in standing.values())
+
+
+def _number(value: float | None, limit: float | None) -> str:
+    if value is None:
+        return "-"
+    text = f"{value:.2g}" if value < 10 else f"{value:.1f}"
+    return text if limit is None or value <= limit else f"[red]{text}[/red]"
+
+
+def _inside(value: float) -> str:
+    return f"{value:.1f}" if value >= 0.0 else f"[red]{value:.1f}[/red]"
+
+
+def _count(value: int) -> str:
+    return "0" if value == 0 else f"[red]{value}[/red]"
+
+
+def _solved(status: Mapping[str, int]) -> str:
+    total = sum(status.values())
+    solved = status[Status.SOLVED.name]
+    return f"{solved}/{total}" if solved == total else f"[red]{solved}/{total}[/red]"

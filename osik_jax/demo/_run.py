@@ -1,0 +1,224 @@
+"""Runs a motion with each scheme and writes what came of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..control import rollout
+from ..viewer import Curves, Panel, RendererName, animate, compare_figure, hero_picture
+from ._measure import Measurement, measure
+from ._motion import Motion
+from ._report import Outcome, report, write_report
+from ._schemes import TITLES, make_scheme
+
+Announce = Callable[[str, float], None]
+"""Called with the stage that runs and the part of the whole that is done, 0 to 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One scheme's motion.
+
+    Attributes:
+        scheme: its name.
+        q: configurations, the first one is the start. (steps + 1, nq)
+        v: velocities. (steps, nv)
+        outcome: what the solver said, and how long it took.
+        measurement: what came of it.
+    """
+
+    scheme: str
+    q: Float[np.ndarray, "T nq"]
+    v: Float[np.ndarray, "steps nv"]
+    outcome: Outcome
+    measurement: Measurement
+
+
+def run_scheme(motion: Motion, scheme: str, *, dt: float) -> Run:
+    """Compiles the closed loop, runs it once, and measures the motion."""
+    steps = round(motion.duration / dt)
+
+    def loop(q0):
+        return rollout(
+            motion.robot, q0, motion.tasks, scheme=make_scheme(scheme), limits=motion.limits, dt=dt, steps=steps
+        )
+
+    start = time.perf_counter()
+    program = jax.jit(loop).lower(motion.q0).compile()
+    compiled = time.perf_counter()
+    trajectory = jax.block_until_ready(program(motion.q0))
+    done = time.perf_counter()
+    solution = trajectory.solution
+    outcome = Outcome(
+        compile_seconds=compiled - start,
+        run_seconds=done - compiled,
+        status=np.asarray(solution.status),
+        iterations=np.asarray(solution.iterations),
+        kkt_residual=np.asarray(solution.kkt_residual),
+    )
+    q = np.asarray(trajectory.q)
+    return Run(scheme, q, np.asarray(solution.velocity), outcome, measure(motion, q, dt))
+
+
+def run_demo(
+    motion: Motion,
+    out: str | Path,
+    *,
+    schemes: Sequence[str],
+    dt: float = 0.005,
+    animation: bool = True,
+    renderer: RendererName = "auto",
+    announce: Announce | None = None,
+) -> tuple[dict, list[Run]]:
+    """Runs the schemes one after the other, and writes ``comparison.png``, ``motion.npz``, ``report.json`` and a film.
+
+    Args:
+        motion: what to do.
+        out: folder to write to; made if need be.
+        schemes: names from ``SCHEMES``.
+        dt: control period [s].
+        animation: whether to write ``motion.gif`` (and ``motion.mp4`` where the program ffmpeg is installed) of the
+            last scheme.
+        renderer: for the film, as in ``viewer.animate``.
+        announce: told which stage runs.
+
+    Returns:
+        The report, as it is in ``report.json``, and the runs.
+
+    Raises:
+        KeyError: no such scheme.
+        RuntimeError: ``renderer="mujoco"`` where OpenGL does not work.
+    """
+    tell = announce or (lambda stage, done: None)
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    share = (0.6 if animation else 0.9) / len(schemes)
+    runs = []
+    for number, scheme in enumerate(schemes):
+        tell(f"{TITLES.get(scheme, scheme)}: compiling and running", share * number)
+        runs.append(run_scheme(motion, scheme, dt=dt))
+    tell("drawing the comparison", share * len(schemes))
+    files = [_save_figure(motion, runs, folder), _save_arrays(runs, folder)]
+    if animation:
+        start = share * len(schemes) + 0.05
+        files += _film(motion, runs[-1], folder, dt, renderer, lambda x: tell("filming", start + (0.99 - start) * x))
+    summary = report(motion, {run.scheme: (run.outcome, run.measurement) for run in runs}, dt=dt, files=files)
+    write_report(summary, folder / "report.json")
+    tell("done", 1.0)
+    return summary, runs
+
+
+def _save_arrays(runs: Sequence[Run], folder: Path) -> str:
+    """time, q_SCHEME (steps + 1, nq) and v_SCHEME (steps, nv)."""
+    arrays = {"time": runs[0].measurement.time}
+    for run in runs:
+        key = run.scheme.replace("-", "_")
+        arrays |= {f"q_{key}": run.q, f"v_{key}": run.v}
+    np.savez_compressed(folder / "motion.npz", **arrays)
+    return "motion.npz"
+
+
+def _save_figure(motion: Motion, runs: Sequence[Run], folder: Path) -> str:
+    """The comparison, panels that say nothing about this robot left out."""
+    figure = compare_figure(
+        runs[0].measurement.time,
+        comparison_panels(motion, {TITLES[run.scheme]: run.measurement for run in runs}),
+        title=f"{motion.title}: {'the same tasks, ' if len(runs) > 1 else ''}{len(runs)} scheme{'s'[: len(runs) > 1]}",
+        note="All figures are recomputed from the configurations by MuJoCo's C code.",
+        colors={TITLES["weighted"]: "#e8590c", TITLES["null-space"]: "#8a8f98", TITLES["hierarchical"]: "#1565c0"},
+    )
+    figure.savefig(folder / "comparison.png")
+    return "comparison.png"
+
+
+def comparison_panels(motion: Motion, measured: dict[str, Measurement]) -> list[Panel]:
+    """What the comparison shows of each scheme; lengths in millimetres."""
+    label, goal = next(iter(motion.goals.items()))
+    panels = []
+    if motion.stances:
+        drift = {name: 1e3 * _worst_drift(m) for name, m in measured.items()}
+        panels.append(
+            Panel("drift of the standing feet [mm]", drift, floor=1e-7, bound=0.1, bound_label="0.1 mm wanted")
+        )
+    error = {name: 1e3 * m.goals[label].position for name, m in measured.items()}
+    title = f"{label.replace('_', ' ')} ({goal.frame}) from its path [mm]"
+    panels.append(Panel(title, error, floor=1e-5, bound=1.0, bound_label="1 mm wanted"))
+    if motion.balanced:
+        margin = {name: 1e3 * m.com_margin for name, m in measured.items()}
+        panels.append(
+            Panel(
+                "centre of mass inside its support [mm]",
+                margin,
+                bound=0.0,
+                above=True,
+                bound_label="edge of the polygon",
+            )
+        )
+    for title, values in (
+        ("joint nearest to a position limit (1: mid-range)", {n: m.position_margin for n, m in measured.items()}),
+        ("joint nearest to its top speed (1: at rest)", {n: m.velocity_margin for n, m in measured.items()}),
+    ):
+        panels.append(Panel(title, values, bound=0.0, above=True, bound_label="limit"))
+    return panels
+
+
+def _worst_drift(m: Measurement) -> np.ndarray:
+    """Over the frames that stand at each time [m]."""
+    return np.nanmax(np.stack([track.position for track in m.stances.values()]), 0)
+
+
+def _film(
+    motion: Motion, run: Run, folder: Path, dt: float, renderer: RendererName, progress: Callable[[float], None]
+) -> list[str]:
+    """The last scheme's motion; what each goal moves most along is drawn beside it."""
+    names = ["motion.gif"] + (["motion.mp4"] if shutil.which("ffmpeg") else [])
+    for name in names:
+        animate(
+            folder / name,
+            motion.robot,
+            run.q,
+            dt=dt,
+            renderer=renderer,
+            support=run.measurement.support or None,
+            trails=[goal.frame for label, goal in motion.goals.items() if label != "waist"],
+            curves=_film_curves(run.measurement),
+            caption=f"{motion.title}: {TITLES[run.scheme]}",
+            progress=progress,
+        )
+    return names
+
+
+def draw_picture(motion: Motion, run: Run, path: str | Path, instants: Sequence[float] = (0.0, 0.4, 0.47)) -> Path:
+    """Three instants of a motion side by side, as a .png.
+
+    Args:
+        motion: the motion.
+        run: the scheme's motion to show.
+        path: the file to write.
+        instants: as parts of the duration, 0 to 1.
+    """
+    ticks = [round(part * (len(run.q) - 1)) for part in instants]
+    support = [run.measurement.support[k] for k in ticks] if run.measurement.support else None
+    labels = [f"{run.measurement.time[k]:.1f} s" for k in ticks]
+    return hero_picture(path, motion.robot, [run.q[k] for k in ticks], support=support, labels=labels)
+
+
+_DIRECTIONS = ("forward", "to the left", "up")
+
+
+def _film_curves(m: Measurement) -> Curves:
+    """Of up to two goals, the coordinate that moves most [mm]."""
+    values, wanted = {}, {}
+    for label in list(m.goals)[:2]:
+        axis = int(np.argmax(np.ptp(m.wanted[label], axis=0)))
+        name = f"{label.replace('_', ' ')} {_DIRECTIONS[axis]}"
+        values[name], wanted[name] = 1e3 * m.displacement[label][:, axis], 1e3 * m.wanted[label][:, axis]
+    return Curves("moved from the start [mm]; dashed: wanted", values, wanted)

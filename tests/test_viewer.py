@@ -1,0 +1,365 @@
+"""The viewer against MuJoCo: where faces, cameras, rays and pictures put a robot."""
+
+import subprocess
+import sys
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+from PIL import Image
+
+import osik_jax as osik
+from osik_jax import viewer
+from osik_jax.viewer import _animate, _opengl
+from osik_jax.viewer._parts import robot_parts
+from osik_jax.viewer._raycast import RayCaster
+from osik_jax.viewer._shapes import robot_surface
+from osik_jax.viewer._stage import Camera, Stage
+
+SHAPES = """<mujoco><worldbody><body name="base" pos="0.1 0.2 1">
+<joint name="yaw" axis="0 0 1"/><geom type="sphere" size="0.1"/>
+<body name="a" pos="0.5 0 0"><joint name="ja" axis="1 2 3"/>
+<geom type="capsule" size="0.05 0.2" euler="10 20 30"/></body>
+<body name="b" pos="0 0.5 0"><joint name="jb" axis="3 1 0"/><geom type="cylinder" size="0.07 0.1" pos="0.1 0 0"/></body>
+<body name="c" pos="0 -0.5 0"><joint name="jc" axis="0 1 0"/>
+<geom type="box" size="0.05 0.1 0.2" euler="0 40 0"/></body>
+<body name="d" pos="-0.5 0 0"><joint name="jd" axis="0 1 0"/><geom type="ellipsoid" size="0.05 0.1 0.2"/></body>
+</body></worldbody></mujoco>"""
+
+BARE = """<mujoco><worldbody><body name="base" pos="0 0 1"><freejoint/>
+<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
+<body name="upper" pos="0.3 0 0"><joint name="j1" axis="0 1 0"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
+<body name="lower" pos="0 0 -0.4"><joint name="j2" axis="0 1 0"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
+<site name="tip" pos="0 0 -0.2"/></body></body></body></worldbody></mujoco>"""
+
+BALL = """<mujoco><worldbody><body name="ball" pos="0 0 0.5"><joint name="j" axis="0 0 1"/>
+<geom type="sphere" size="0.2" rgba="1 0 0 1"/></body></worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def nao():
+    return osik.load_robot("nao")
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    return osik.Robot.from_mjcf(SHAPES)
+
+
+def random_configurations(robot, count, seed=0):
+    """Joints anywhere in their ranges; the base at home."""
+    rng = np.random.default_rng(seed)
+    q = np.tile(np.asarray(robot.q0), (count, 1))
+    for name in robot.joint_names:
+        dof, at = robot.joint_dof_index(name), robot.joint_qpos_index(name)
+        low, high = np.clip([robot.position_lower[dof], robot.position_upper[dof]], -3.0, 3.0)
+        q[:, at] = rng.uniform(low, high, count)
+    return q
+
+
+def mujoco_data(robot, q):
+    data = mujoco.MjData(robot.mj_model)
+    data.qpos[:] = np.asarray(robot.mujoco_qpos(q))
+    mujoco.mj_kinematics(robot.mj_model, data)
+    mujoco.mj_comPos(robot.mj_model, data)
+    return data
+
+
+def surface_distance(kind, size, p):
+    """How far points (k, 3) in a geom's frame are from its surface, negative inside; ellipsoids up to scale."""
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return np.linalg.norm(p, axis=-1) - size[0]
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return np.linalg.norm(p / size, axis=-1) - 1.0
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        axis = np.clip(p[:, 2], -size[1], size[1])
+        return np.linalg.norm(p - np.outer(axis, [0, 0, 1]), axis=-1) - size[0]
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return np.maximum(np.linalg.norm(p[:, :2], axis=-1) - size[0], np.abs(p[:, 2]) - size[1])
+    return np.max(np.abs(p) - size, axis=-1)
+
+
+def signed_volume(quads):
+    """Positive where faces run counter-clockwise seen from outside."""
+    a, b, c, d = np.moveaxis(quads, 1, 0)
+    return (np.sum(a * np.cross(b, c), -1) + np.sum(a * np.cross(c, d), -1)).sum() / 6.0
+
+
+def test_faces_lie_on_mujocos_geoms(shapes):
+    q = random_configurations(shapes, 1)[0]
+    data = mujoco_data(shapes, q)
+    quads, _ = robot_surface(robot_parts(shapes), data, 6)
+    model, start = shapes.mj_model, 0
+    per_geom = [len(robot_surface_of(shapes, data, g)) for g in range(model.ngeom)]
+    for geom, count in enumerate(per_geom):
+        points = quads[start : start + count].reshape(-1, 3)
+        local = (points - data.geom_xpos[geom]) @ data.geom_xmat[geom].reshape(3, 3)
+        np.testing.assert_allclose(
+            surface_distance(model.geom_type[geom], model.geom_size[geom], local), 0.0, atol=1e-12
+        )
+        start += count
+    assert start == len(quads)
+
+
+def robot_surface_of(robot, data, geom):
+    shape = robot_parts(robot)
+    one = type(shape)(shape.model, shape.style, (shape.parts[geom],), shape.tips)
+    return robot_surface(one, data, 6)[0]
+
+
+@pytest.mark.parametrize(
+    ("geom", "volume"),
+    [
+        (0, 4 / 3 * np.pi * 0.1**3),
+        (1, np.pi * 0.05**2 * 0.4 + 4 / 3 * np.pi * 0.05**3),
+        (2, np.pi * 0.07**2 * 0.2),
+        (3, 0.1 * 0.2 * 0.4),
+        (4, 4 / 3 * np.pi * 0.05 * 0.1 * 0.2),
+    ],
+)
+def test_faces_close_and_point_outward(shapes, geom, volume):
+    data = mujoco_data(shapes, shapes.q0)
+    assert signed_volume(robot_surface_of(shapes, data, geom)) == pytest.approx(volume, rel=0.04)
+
+
+def test_draw_robot_returns_the_faces_it_draws(shapes):
+    q = random_configurations(shapes, 1, seed=1)[0]
+    figure = Figure(figsize=(3, 3), dpi=50)
+    FigureCanvasAgg(figure)
+    axes = viewer.scene_axes(figure, center=(0.1, 0.2, 1.0), radius=0.8)
+    assert isinstance(axes, Axes3D)
+    surface = viewer.draw_robot(axes, shapes, q, shadow=0.0)
+    expected, _ = robot_surface(robot_parts(shapes), mujoco_data(shapes, q), 5)
+    np.testing.assert_allclose(surface.quads, expected, atol=1e-12)
+    figure.canvas.draw()
+    seen = len(surface.get_facecolor())
+    assert 0.3 * len(expected) < seen < 0.7 * len(expected)  # about half of closed surfaces looks at the camera
+
+
+def test_nao_com_and_frames_are_mujocos(nao):
+    for q, data in zip(
+        random_configurations(nao, 3), viewer.mujoco_poses(nao, random_configurations(nao, 3)), strict=True
+    ):
+        reference = mujoco_data(nao, q)
+        np.testing.assert_allclose(viewer.robot_com(nao, data), reference.subtree_com[1], atol=1e-12)
+        kinematics = osik.forward_kinematics(nao, q)
+        for name in ("torso", "l_sole", "r_sole_corner_2", "l_gripper"):
+            p, R = viewer.mujoco_frame_pose(nao, data, name)
+            p_ours, R_ours = kinematics.frame_pose(nao, name)
+            np.testing.assert_allclose(p, p_ours, atol=1e-12)
+            np.testing.assert_allclose(R, R_ours, atol=1e-12)
+
+
+def test_frame_of_a_fused_link_follows_its_body():
+    urdf = """<robot name="r"><link name="base"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1"
+    iyz="0" izz="1"/></inertial></link><link name="arm"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0"
+    iyy="1" iyz="0" izz="1"/></inertial></link><link name="tool"/>
+    <joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+    <joint name="f" type="fixed"><parent link="arm"/><child link="tool"/><origin xyz="0.5 0 0"/></joint></robot>"""
+    robot = osik.Robot.from_urdf(urdf, floating_base=False)
+    data = next(viewer.mujoco_poses(robot, robot.configuration({"j": 0.5})))
+    p, _ = viewer.mujoco_frame_pose(robot, data, "tool")
+    np.testing.assert_allclose(p, [0.5 * np.cos(0.5), 0.5 * np.sin(0.5), 0.0], atol=1e-12)
+    with pytest.raises(KeyError, match="tool"):
+        viewer.mujoco_frame_pose(robot, data, "tol")
+
+
+def test_sticks_where_there_is_no_geom():
+    robot = osik.Robot.from_mjcf(BARE)
+    shape = robot_parts(robot)
+    assert shape.style == "sticks"
+    data = mujoco_data(robot, robot.configuration({"j1": 0.3, "j2": -0.7}))
+    positions, rotations = shape.poses(data)
+    dots = [k for k, part in enumerate(shape.parts) if part.kind == mujoco.mjtGeom.mjGEOM_SPHERE]
+    links = [k for k in range(len(shape.parts)) if k not in dots]
+    np.testing.assert_allclose(positions[dots], data.xpos[1:], atol=1e-12)
+    ends = np.array([data.xpos[2], data.xpos[3], data.site_xpos[0]])
+    half = np.array([shape.parts[k].size[1] for k in links])[:, None]
+    np.testing.assert_allclose(positions[links] + half * rotations[links][:, :, 2], ends, atol=1e-12)
+    np.testing.assert_allclose(positions[links] - half * rotations[links][:, :, 2], data.xpos[1:], atol=1e-12)
+    with pytest.raises(ValueError, match="sticks"):
+        robot_parts(robot, style="geoms")
+
+
+def test_camera_is_mujocos_camera(nao):
+    camera = Camera((0.1, -0.2, 0.3), 2.0, 35.0, 20.0, 0.8)
+    scene = mujoco.MjvScene(nao.mj_model, maxgeom=10)
+    nao.mj_model.vis.global_.fovy = camera.view_angle
+    options = mujoco.MjvOption()
+    mujoco.mjv_updateScene(
+        nao.mj_model,
+        mujoco_data(nao, nao.q0),
+        options,
+        mujoco.MjvPerturb(),
+        camera.for_mujoco(),
+        mujoco.mjtCatBit.mjCAT_STATIC,
+        scene,
+    )
+    eyes = [(np.asarray(c.pos), np.asarray(c.forward), np.asarray(c.up)) for c in scene.camera]
+    position, forward, up = (np.mean(part, 0) for part in zip(*eyes, strict=True))
+    np.testing.assert_allclose(position, camera.eye, atol=1e-6)
+    np.testing.assert_allclose(forward, camera.axes[2], atol=1e-6)
+    np.testing.assert_allclose(up, camera.axes[1], atol=1e-6)
+    top, near = scene.camera[0].frustum_top, scene.camera[0].frustum_near
+    assert top / near == pytest.approx(0.5 * camera.height / camera.distance, rel=1e-5)
+
+
+def test_rays_and_projection_undo_each_other():
+    camera, size = Camera((0.1, -0.2, 0.3), 2.0, 35.0, 20.0, 0.8), (320, 240)
+    pixels = np.random.default_rng(0).uniform(0, 240, (50, 2))
+    depth = np.random.default_rng(1).uniform(0.5, 5.0, (50, 1))
+    np.testing.assert_allclose(camera.project(camera.eye + depth * camera.rays(pixels, size), size), pixels, atol=1e-9)
+
+
+def test_ray_caster_covers_what_a_ball_covers():
+    robot = osik.Robot.from_mjcf(BALL)
+    camera, size = Camera((0.0, 0.0, 0.5), 20.0, 10.0, 0.0, 1.0), (200, 200)
+    stage = Stage([robot_parts(robot)], camera, floor=0.0)
+    caster = RayCaster(stage, camera, size, floor=0.0)
+    picture = caster.image(stage.pose([mujoco_data(robot, robot.q0)]))
+    red = np.clip(picture[..., 0] - picture[..., 1], 0.0, None)
+    rows, columns = np.nonzero(red > 0.05)
+    assert (rows.mean(), columns.mean()) == pytest.approx((99.5, 99.5), abs=0.5)
+    assert np.ptp(columns) + 1 == pytest.approx(80, abs=2)  # 0.4 m of 1 m in 200 pixels
+    assert len(rows) == pytest.approx(np.pi * 40**2, rel=0.02)
+
+
+def test_what_lies_on_the_floor_is_behind_the_robot():
+    robot = osik.Robot.from_mjcf(BALL)
+    camera, size = Camera((0.0, 0.0, 0.5), 20.0, 10.0, 0.0, 1.0), (100, 100)
+    stage = Stage([robot_parts(robot)], camera, floor=0.0)
+    caster = RayCaster(stage, camera, size, floor=0.0)
+    blue = np.tile(np.array([0.0, 0.0, 1.0, 1.0]), (100, 100, 1))
+    picture = caster.image(stage.pose([mujoco_data(robot, robot.q0)]), blue)
+    np.testing.assert_allclose(picture[5, 5], [0.0, 0.0, 1.0], atol=1e-6)
+    assert picture[50, 50, 0] > 0.5 > picture[50, 50, 2]
+
+
+def test_gif_has_its_frames(tmp_path, nao):
+    q = np.tile(np.asarray(nao.q0), (41, 1))
+    q[:, 1] += 0.05 * np.sin(np.linspace(0.0, 3.0, 41))
+    support = np.asarray(osik.support_polygon(nao, nao.q0, ("l_sole", "r_sole")).vertices)
+    done = []
+    path = viewer.animate(
+        tmp_path / "m.gif",
+        nao,
+        q,
+        dt=0.02,
+        frames_per_second=12.5,
+        size=(240, 136),
+        renderer="raycast",
+        support=support,
+        trails=("l_gripper",),
+        curves=viewer.Curves("y [mm]", {"waist": 1e3 * q[:, 1]}, {"waist": 1e3 * q[:, 1]}),
+        caption="sways",
+        progress=done.append,
+    )
+    with Image.open(path) as film:
+        assert film.size == (240, 136)
+        assert getattr(film, "n_frames", 1) == 11  # ticks 0, 4, ..., 40
+        assert film.info["duration"] == 80
+        film.seek(5)
+        assert len(np.unique(np.asarray(film.convert("RGB")).reshape(-1, 3), axis=0)) > 30
+    np.testing.assert_allclose(done, np.arange(1, 12) / 11)
+
+
+def test_film_of_another_kind_is_refused(tmp_path, nao, monkeypatch):
+    q = np.asarray(nao.q0)[None]
+    with pytest.raises(ValueError, match=r"\.gif or \.mp4"):
+        viewer.animate(tmp_path / "m.avi", nao, q, dt=0.01)
+    monkeypatch.setattr(_animate.shutil, "which", lambda name: None)
+    with pytest.raises(ValueError, match="ffmpeg"):
+        viewer.animate(tmp_path / "m.mp4", nao, q, dt=0.01)
+
+
+def test_without_opengl_rays_are_cast(nao, monkeypatch):
+    def broken(*args, **kwargs):
+        raise mujoco.FatalError("no OpenGL context")
+
+    monkeypatch.setattr(_opengl.mujoco, "Renderer", broken)
+    camera = Camera((0.0, 0.0, 0.3), 2.0, 30.0, 10.0, 0.8)
+    stage = Stage([robot_parts(nao)], camera, floor=0.0)
+    assert isinstance(_opengl.make_renderer("auto", stage, camera, (32, 32), floor=0.0), RayCaster)
+    with pytest.raises(RuntimeError, match="no OpenGL context"):
+        _opengl.make_renderer("mujoco", stage, camera, (32, 32), floor=0.0)
+    with pytest.raises(RuntimeError, match="no OpenGL context"):
+        viewer.check_opengl()
+
+
+def test_with_opengl_mujocos_renderer_draws(nao, monkeypatch):
+    """The same calls that MuJoCo's renderer gets, on one that answers without a screen."""
+
+    class Recorder:
+        segments = False
+
+        def __init__(self, model, height, width):
+            self.shape = (height, width)
+
+        def update_scene(self, data, camera, scene_option):
+            assert camera.distance == 2.0 and scene_option.geomgroup.all()
+
+        def enable_segmentation_rendering(self):
+            self.segments = True
+
+        def disable_segmentation_rendering(self):
+            self.segments = False
+
+        def render(self):
+            if not self.segments:
+                return np.full((*self.shape, 3), 51, np.uint8)
+            ids = np.full((*self.shape, 2), -1, np.int32)
+            ids[2:] = 0  # the floor
+            ids[4:] = 7  # a part of the robot
+            return ids
+
+    monkeypatch.setattr(_opengl.mujoco, "Renderer", Recorder)
+    camera = Camera((0.0, 0.0, 0.3), 2.0, 30.0, 10.0, 0.8)
+    stage = Stage([robot_parts(nao)], camera, floor=0.0)
+    renderer = _opengl.make_renderer("auto", stage, camera, (6, 8), floor=0.0)
+    picture = renderer.image(stage.pose([mujoco_data(nao, nao.q0)]), np.tile(np.array([1.0, 0.0, 0.0, 0.5]), (8, 6, 1)))
+    np.testing.assert_allclose(picture[:4], np.broadcast_to([0.6, 0.1, 0.1], (4, 6, 3)), atol=1e-12)
+    np.testing.assert_allclose(picture[4:], 0.2, atol=1e-12)
+
+
+def test_comparison_draws_the_curves_it_gets(tmp_path):
+    time = np.linspace(0.0, 1.0, 11)
+    curves = {"one": 1e-3 * (1.0 + time), "two": 1e-6 * (1.0 + time)}
+    figure = viewer.compare_figure(
+        time,
+        [viewer.Panel("drift [mm]", curves, floor=1e-5, bound=0.1), viewer.Panel("margin [mm]", curves, bound=0.0)],
+    )
+    log, linear = figure.axes
+    np.testing.assert_allclose(np.asarray(log.lines[0].get_ydata()), curves["one"])
+    np.testing.assert_allclose(np.asarray(log.lines[1].get_ydata()), 1e-5)
+    np.testing.assert_allclose(np.asarray(linear.lines[1].get_ydata()), curves["two"])
+    assert log.get_yscale() == "log" and log.get_ylim()[1] > 0.1
+    assert linear.get_ylim()[0] < 0.0
+    figure.savefig(tmp_path / "f.png")
+    with Image.open(tmp_path / "f.png") as picture:
+        assert picture.size == tuple(int(x) for x in figure.get_size_inches() * figure.dpi)
+
+
+def test_hero_picture_shows_every_instant(tmp_path, nao):
+    path = viewer.hero_picture(tmp_path / "h.png", nao, [nao.q0] * 3, labels=("a", "b", "c"), size=(300, 135))
+    pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    orange = (pixels[..., 0] - pixels[..., 2]) > 90
+    counts = [orange[:, 100 * k : 100 * (k + 1)].sum() for k in range(3)]
+    assert min(counts) > 0.6 * max(counts) > 20
+
+
+def test_importing_the_library_loads_no_drawing():
+    heavy = ("matplotlib", "tyro", "rich", "osik_jax.viewer", "osik_jax.demo", "osik_jax.cli")
+    code = f"import sys, osik_jax; print([m for m in sys.modules if m.startswith({heavy})])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip().splitlines()[-1] == "[]"
+
+
+def test_drawing_leaves_pyplot_alone():
+    code = "import sys, osik_jax.viewer; print('matplotlib.pyplot' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip().splitlines()[-1] == "False"
