@@ -1,5 +1,9 @@
 """Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
 
+from ._runtime import disable_cpu_thread_pool as _disable_cpu_thread_pool
+
+_disable_cpu_thread_pool()
+
 from .kinematics import Kinematics as Kinematics
 from .kinematics import center_of_mass as center_of_mass
 from .kinematics import com_jacobian as com_jacobian
@@ -22,3 +26,4 @@ from .tasks import SupportPolygon as SupportPolygon
 from .tasks import Task as Task
 from .tasks import TaskRows as TaskRows
 from .tasks import support_polygon as support_polygon
+from .tasks import task_rows as task_rows

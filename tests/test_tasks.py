@@ -1,7 +1,9 @@
 """Tasks against central differences, mink, Pinocchio, SciPy and numbers worked out by hand."""
 
+import dataclasses
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mink
@@ -9,6 +11,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
@@ -483,6 +486,32 @@ class TestBatchesAndCompilation:
             for ours, theirs in zip(jax.tree.leaves(batch), expected, strict=True):
                 np.testing.assert_allclose(ours[i], theirs, atol=1e-12)
 
+    def test_a_batch_of_robots(self, arm):
+        """Tasks and limits made and used inside vmap, for arms of three sizes: the rows of the arms one by one."""
+
+        def at(scale):
+            position = arm.body_position * scale
+            return dataclasses.replace(arm, body_position=position)
+
+        def rows(scale):
+            robot = at(scale)
+            tasks = {
+                "home": osik.FrameTask(robot, "hand"),
+                "frame": osik.FrameTask(robot, "hand", target=(jnp.full(3, 0.1), jnp.eye(3)), axes="frame"),
+                "com": osik.ComTask(robot, axes="xy", lower=0.1),
+                "posture": osik.PostureTask(robot, target=robot.q0 + 0.1),
+            }
+            limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))
+            return _rows(robot, tasks, robot.q0), osik.limit_box(robot, robot.q0, limits, 0.01)
+
+        scales = jnp.array([0.5, 1.0, 1.5])
+        batch, _ = jax.jit(jax.vmap(rows))(scales)
+        np.testing.assert_allclose(batch["home"].error, 0.0, atol=1e-14)
+        positions = [_kinematics(at(scale), arm.q0).frame_pose(arm, "hand") for scale in scales]
+        expected = [R.T @ (p - 0.1) for p, R in positions]
+        np.testing.assert_allclose(batch["frame"].error[:, :3], expected, atol=1e-13)
+        assert np.linalg.norm(positions[0][0] - positions[2][0]) > 0.1
+
     def test_changing_any_number_compiles_nothing(self, arm):
         traces = []
 
@@ -521,6 +550,32 @@ class TestBatchesAndCompilation:
         assert task.replace(gain=3.0).gain == 3.0
         assert task.gain == 2.0
         assert task.replace() is task
+
+
+class HeightTask(osik.Task):
+    """A user's own task: a body's height."""
+
+    body: str = eqx.field(static=True)
+    height: Float[Array, ""]
+
+    def rows(self, robot, kinematics, q):
+        p, _ = kinematics.frame_pose(robot, self.body)
+        jacobian = osik.frame_jacobian(robot, kinematics, self.body)[2:3]
+        return osik.task_rows(p[2:] - self.height, jacobian, gain=self.gain, weight=self.weight[None])
+
+
+def test_an_own_task(arm):
+    task = HeightTask("hand", jnp.asarray(1.0))
+    assert (task.priority, float(task.weight), task.gain) == (1, 1.0, 10.0)
+    assert HeightTask("hand", jnp.asarray(1.0), priority=2).priority == 2
+    new = task.replace(height=2, gain=3)
+    assert set(task.replaceable) == {"height", "weight", "gain"}
+    theirs = osik.FrameTask(arm, "hand", target=([0, 0, 2.0], np.eye(3)), rows=[i == 2 for i in range(6)], gain=3)
+    rows = _rows(arm, {"own": new, "frame": theirs}, arm.q0)
+    for ours, expected in zip(jax.tree.leaves(rows["own"]), jax.tree.leaves(rows["frame"]), strict=True):
+        np.testing.assert_allclose(ours, expected, atol=1e-15)
+    with pytest.raises(TypeError, match=r"HeightTask has no 'body' to replace; it has: .*height"):
+        task.replace(body="link1")
 
 
 class TestMistakes:

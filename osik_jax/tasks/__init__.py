@@ -8,3 +8,4 @@ from ._polygon import support_polygon as support_polygon
 from ._posture import PostureTask as PostureTask
 from ._task import Task as Task
 from ._task import TaskRows as TaskRows
+from ._task import task_rows as task_rows

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..kinematics import Kinematics, center_of_mass, com_jacobian
 from ..robot import Robot
-from ._gain import AdaptiveGain, Gain, as_gain
+from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, home_kinematics
 from ._polygon import SupportPolygon
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
@@ -49,14 +49,11 @@ class ComTask(Task):
 
     axes: str = eqx.field(static=True)
     subtree: str | None = eqx.field(static=True)
-    priority: int = eqx.field(static=True)
     target: Float[Array, " m"] | None
     target_velocity: Float[Array, " m"] | None
     lower: Float[Array, " m"] | None
     upper: Float[Array, " m"] | None
     polygon: SupportPolygon | None
-    weight: Float[Array, ""]
-    gain: Gain
 
     def __init__(
         self,

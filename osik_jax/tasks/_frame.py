@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from .._tree import unknown_name
 from ..kinematics import Kinematics, frame_jacobian
 from ..robot import Robot
-from ._gain import AdaptiveGain, Gain, as_gain
+from ._gain import AdaptiveGain, as_gain
 from ._leaves import Pose, as_bounds, as_pose, as_scalar, as_vector, check_bounds, check_not_negative, home_kinematics
 from ._rotation import cross_matrix, inverse_left_jacobian, rotation_log
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
@@ -70,15 +70,12 @@ class FrameTask(Task):
     kept: tuple[bool, ...] = eqx.field(static=True)
     axes: str = eqx.field(static=True)
     orientation_jacobian: str = eqx.field(static=True)
-    priority: int = eqx.field(static=True)
     target: Pose
     target_velocity: Float[Array, "6"]
     lower: Float[Array, " m"] | None
     upper: Float[Array, " m"] | None
     position_weight: Float[Array, "3"]
     orientation_weight: Float[Array, "3"]
-    weight: Float[Array, ""]
-    gain: Gain
 
     def __init__(
         self,

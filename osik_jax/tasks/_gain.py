@@ -52,9 +52,11 @@ Gain = Float[Array, ""] | AdaptiveGain
 """A task's gain as it is stored: a constant [1/s], or an AdaptiveGain."""
 
 
-def as_gain(value: Any, dtype: Any) -> Gain:
-    """A constant or an AdaptiveGain in the given precision."""
+def as_gain(value: Any, dtype: Any = None) -> Gain:
+    """A constant or an AdaptiveGain in the given precision; ``None``: in its own."""
     if isinstance(value, AdaptiveGain):
+        if dtype is None:
+            return value
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), value)
     return as_scalar(value, "gain", dtype)
 

@@ -28,12 +28,15 @@ def home_kinematics(robot: Robot) -> Kinematics:
     return compiled_kinematics(robot, robot.q0)
 
 
-def as_scalar(value: Any, what: str, dtype: Any = float) -> Float[Array, ""]:
-    """A finite number that is not negative: a gain, a weight.
+def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
+    """A finite number that is not negative: a gain, a weight. ``dtype=None``: an array's own, else JAX's default.
 
     Raises:
         ValueError: it is not, or not a scalar.
     """
+    if dtype is None:
+        own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
+        dtype = value.dtype if own else float
     out = as_vector(value, (), what, dtype)
     check_not_negative(out, what)
     return out

@@ -15,7 +15,7 @@ from .._joint_selection import is_scalar, select_all
 from .._tree import BALL, DOF_WIDTH, FREE
 from ..kinematics import Kinematics, difference
 from ..robot import Robot
-from ._gain import AdaptiveGain, Gain, as_gain
+from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
 from ._rotation import inverse_left_jacobian
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
@@ -49,13 +49,10 @@ class PostureTask(Task):
     """
 
     joints: tuple[int, ...] = eqx.field(static=True)
-    priority: int = eqx.field(static=True)
     target: Float[Array, " nq"] | None
     target_velocity: Float[Array, " m"]
     lower: Float[Array, " m"] | None
     upper: Float[Array, " m"] | None
-    weight: Float[Array, ""]
-    gain: Gain
 
     def __init__(
         self,

@@ -38,7 +38,7 @@ class TaskRows(eqx.Module):
 
 
 class Task(eqx.Module):
-    """Base of all tasks: an immutable pytree. Subclass it and write ``rows`` to make your own.
+    """Base of all tasks: an immutable pytree. Make your own: subclass it, add fields, write ``rows`` (``task_rows``).
 
     Attributes:
         priority: 1 is the most important; static.
@@ -46,9 +46,9 @@ class Task(eqx.Module):
         gain: [1/s], a constant or an ``AdaptiveGain``: the wanted error rate is ``-gain * error``.
     """
 
-    priority: eqx.AbstractVar[int]
-    weight: eqx.AbstractVar[Float[Array, ""]]
-    gain: eqx.AbstractVar[Gain]
+    weight: Float[Array, ""] = eqx.field(default=1.0, converter=lambda value: as_scalar(value, "weight"), kw_only=True)
+    gain: Gain = eqx.field(default=DEFAULT_GAIN, converter=lambda value: as_gain(value), kw_only=True)
+    priority: int = eqx.field(default=1, static=True, kw_only=True)
 
     @abc.abstractmethod
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
@@ -115,7 +115,7 @@ def task_rows(
     upper: Float[Array, " m"] | None = None,
     feedforward: Float[Array, " m"] | None = None,
 ) -> TaskRows:
-    """The rows of an equality task, or with bounds of an inequality task on ``error``.
+    """The rows of an equality task, or with bounds of an inequality task on ``error``: what ``Task.rows`` returns.
 
     Equality: ``jacobian v = -gain(error) error + feedforward``. Inequality: ``gain (lower - error) + feedforward <=
     jacobian v <= gain (upper - error) + feedforward``; infinite bounds stay infinite, and an adaptive gain is evaluated
