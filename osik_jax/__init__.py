@@ -1,9 +1,5 @@
 """Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
 
-from ._runtime import disable_cpu_thread_pool as _disable_cpu_thread_pool
-
-_disable_cpu_thread_pool()
-
 from .kinematics import Kinematics as Kinematics
 from .kinematics import center_of_mass as center_of_mass
 from .kinematics import com_jacobian as com_jacobian
