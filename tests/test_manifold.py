@@ -186,10 +186,10 @@ def test_derivative_of_difference_equals_central_differences(robot, difference, 
 @pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-16, np.pi - 1e-12, np.pi, np.pi + 1e-12])
 def test_gradients_are_finite_and_bounded_where_rotations_are_singular(robot, angle):
     """The derivative of the logarithm by the quaternion grows to pi at half a turn, and no further."""
-    qa = np.asarray(robot.q0)
-    qb = jnp.asarray(turned(robot, turned(robot, qa, "root", angle), "shoulder", angle))
+    qa = robot.q0
+    qb = jnp.asarray(turned(robot, turned(robot, np.asarray(qa), "root", angle), "shoulder", angle))
     for derivative in (jax.jacfwd, jax.jacrev):
-        jacobian = derivative(lambda q: osik.difference(robot, q, qb))(jnp.asarray(qa))
+        jacobian = derivative(lambda q: osik.difference(robot, q, qb))(qa)
         assert np.abs(jacobian).max() < np.pi + 1e-6
         jacobian = derivative(lambda v: osik.integrate(robot, qa, v))(osik.difference(robot, qa, qb))
         assert np.abs(jacobian).max() < 1.0 + 1e-6
@@ -226,8 +226,7 @@ def test_followers_and_locked_joints_have_no_entries(rng):
 
 
 def test_precision_and_integers(robot):
-    q = np.asarray(robot.q0)
-    still = osik.integrate(robot, q.astype(np.float32), np.zeros(robot.nv))
+    still = osik.integrate(robot, robot.q0.astype(jnp.float32), jnp.zeros(robot.nv))
     assert still.dtype == jnp.float64
     whole = [0, 0, 1, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0]
     moved = osik.integrate(robot, jnp.array(whole), jnp.full(robot.nv, 0.25))
