@@ -141,12 +141,12 @@ def test_draw_robot_returns_the_faces_it_draws(shapes):
 
 
 def test_nao_com_and_frames_are_mujocos(nao):
-    for q, data in zip(
-        random_configurations(nao, 3), viewer.mujoco_poses(nao, random_configurations(nao, 3)), strict=True
-    ):
+    configurations = random_configurations(nao, 3)
+    forward = jax.jit(lambda q: osik.forward_kinematics(nao, q))
+    for q, data in zip(configurations, viewer.mujoco_poses(nao, configurations), strict=True):
         reference = mujoco_data(nao, q)
         np.testing.assert_allclose(viewer.robot_com(nao, data), reference.subtree_com[1], atol=1e-12)
-        kinematics = osik.forward_kinematics(nao, q)
+        kinematics = forward(q)
         for name in ("torso", "l_sole", "r_sole_corner_2", "l_gripper"):
             p, R = viewer.mujoco_frame_pose(nao, data, name)
             p_ours, R_ours = kinematics.frame_pose(nao, name)

@@ -140,9 +140,10 @@ def _track(poses: _Poses, wanted: _Poses, settled: np.ndarray, *, turns: bool) -
 
 def _drift(poses: _Poses, standing: np.ndarray) -> Track:
     """Against the first pose, nan in the air."""
-    first = tuple(np.broadcast_to(part[:1], part.shape) for part in poses)
+    first = np.broadcast_to(poses[0][:1], poses[0].shape), np.broadcast_to(poses[1][:1], poses[1].shape)
     track = _track(poses, first, standing, turns=True)
-    return Track(*(np.where(standing, x, np.nan) for x in (track.position, track.orientation)), standing)
+    position, orientation = (np.where(standing, x, np.nan) for x in (track.position, track.orientation))
+    return Track(position, orientation, standing)
 
 
 def _support(motion: Motion, poses: dict[str, _Poses], time: np.ndarray) -> list[np.ndarray]:

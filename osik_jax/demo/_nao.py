@@ -126,7 +126,7 @@ def _there_and_back(
 
 
 def _swing(path: Path, u: float) -> Path:
-    """The right foot goes up, back and a little in, flat: with one motor for both hip yaw-pitch joints it cannot tip."""
+    """The right foot goes up, back and a little in, flat: one motor turns both hip yaw-pitch joints, so no tip."""
     return _with(path, _there_and_back(u, 2.25, 3.5, 4.25, 5.5, (-0.045, 0.01, 0.055)))
 
 

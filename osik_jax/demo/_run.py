@@ -122,7 +122,7 @@ def _save_arrays(runs: Sequence[Run], folder: Path) -> str:
     for run in runs:
         key = run.scheme.replace("-", "_")
         arrays |= {f"q_{key}": run.q, f"v_{key}": run.v}
-    np.savez_compressed(folder / "motion.npz", **arrays)
+    np.savez_compressed(folder / "motion.npz", allow_pickle=False, **arrays)
     return "motion.npz"
 
 

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ..robot import Robot
 
 
-def mujoco_poses(robot: Robot, q: Float[np.ndarray, "*steps nq"]) -> Iterator[mujoco.MjData]:
-    """MuJoCo's body, site, geom and CoM positions at one configuration or along a trajectory.
+def mujoco_poses(robot: Robot, q: ArrayLike | Array) -> Iterator[mujoco.MjData]:
+    """MuJoCo's body, site, geom and CoM positions at one configuration (nq,) or along a trajectory (T, nq).
 
     Yields the same ``MjData`` each time, with new content: copy what has to last.
     """

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d import Axes3D, proj3d
-from mpl_toolkits.mplot3d.art3d import Line3D, Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..robot import Robot
 from ._mujoco import mujoco_poses, robot_com
@@ -48,9 +49,9 @@ class Surface(Poly3DCollection):
         quads: all faces [m]. (faces, 4, 3)
     """
 
-    def __init__(self, quads: Quads, colors: Float[np.ndarray, "faces 4"], **style: float) -> None:
+    def __init__(self, quads: Quads, colors: Float[np.ndarray, "faces 4"], *, zorder: float = _ROBOT_LAYER) -> None:
         """Takes the faces and their unlit colours."""
-        super().__init__(quads, closed=False, linewidths=0.35, **style)
+        super().__init__(quads, closed=False, linewidths=0.35, zorder=zorder)
         self.place(quads, colors)
 
     def place(self, quads: Quads, colors: Float[np.ndarray, "faces 4"]) -> None:
@@ -59,11 +60,14 @@ class Surface(Poly3DCollection):
 
     def do_3d_projection(self) -> float:
         """Keeps the faces turned to the camera; matplotlib calls this as it draws."""
-        seen = _faces_camera(self.quads, self.axes.get_proj())
-        self.set_verts(self.quads[seen], closed=False)
+        if isinstance(self.axes, Axes3D):
+            self._show(_faces_camera(self.quads, self.axes.get_proj()))
+        return super().do_3d_projection()
+
+    def _show(self, seen: np.ndarray) -> None:
+        self.set_verts(list(self.quads[seen]), closed=False)
         self.set_facecolor(self._lit[seen])
         self.set_edgecolor(self._lit[seen])
-        return super().do_3d_projection()
 
 
 def _faces_camera(quads: Quads, projection: Float[np.ndarray, "4 4"]) -> np.ndarray:
@@ -199,7 +203,7 @@ def draw_polygon(
 
 def draw_com(
     axes: Axes3D, com: Float[np.ndarray, "3"], *, height: float = 0.0, color: str = ORANGE
-) -> tuple[Line3D, Line3D, Line3D]:
+) -> tuple[Line2D, Line2D, Line2D]:
     """The centre of mass [m], the plumb line below it, and where that meets the ground."""
     x, y, z = (float(value) for value in com)
     (line,) = axes.plot([x, x], [y, y], [z, height], color=color, lw=1.3, ls=(0, (4, 3)), zorder=_FRONT_LAYER)
@@ -212,7 +216,7 @@ def draw_com(
     return ball, line, foot
 
 
-def draw_target(axes: Axes3D, position: Float[np.ndarray, "3"], *, color: str = BLUE) -> Line3D:
+def draw_target(axes: Axes3D, position: Float[np.ndarray, "3"], *, color: str = BLUE) -> Line2D:
     """A cross where something should be [m]."""
     x, y, z = (float(value) for value in position)
     (mark,) = axes.plot(
@@ -221,7 +225,7 @@ def draw_target(axes: Axes3D, position: Float[np.ndarray, "3"], *, color: str = 
     return mark
 
 
-def draw_trail(axes: Axes3D, points: Float[np.ndarray, "k 3"], *, color: str = BLUE, width: float = 1.8) -> Line3D:
+def draw_trail(axes: Axes3D, points: Float[np.ndarray, "k 3"], *, color: str = BLUE, width: float = 1.8) -> Line2D:
     """A path [m]."""
     (trail,) = axes.plot(*np.asarray(points).T, color=color, lw=width, alpha=0.9, zorder=_FRONT_LAYER)
     return trail
