@@ -137,9 +137,7 @@ def test_contact_corners_go_round_each_sole_counter_clockwise(nao, nao_poses):
     for side, expected in (("l", 0.0051096), ("r", 0.0051108)):
         x, y = np.array([positions[nao.frame_names.index(f"{side}_sole_corner_{k}")] for k in range(4)])[:, :2].T
         area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-        assert area == pytest.approx(
-            0.0051096, abs=1e-6
-        )  # of the quadrilateral of published force sensor positions, m^2
+        assert area == pytest.approx(expected, abs=1e-7)  # m^2, of the published force sensor positions
 
 
 @pytest.mark.parametrize(("name", "drift"), [("nao", 0.03), ("arm7", 0.02)])
