@@ -1,5 +1,9 @@
 """Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
 
+from ._runtime import widen_cpu_pool as _widen_cpu_pool
+
+_widen_cpu_pool()
+
 from .kinematics import Kinematics as Kinematics
 from .kinematics import center_of_mass as center_of_mass
 from .kinematics import com_jacobian as com_jacobian

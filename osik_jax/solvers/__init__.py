@@ -1,7 +1,11 @@
-"""Array-level solvers (no robot inside) and the three schemes built on them."""
+"""Array-level solvers, no robot inside: quadratic programs, hierarchies, null-space projection."""
 
 from ._status import Status as Status
 from ._status import raise_if_failed as raise_if_failed
+from .hqp import HQPSolution as HQPSolution
+from .hqp import Level as Level
+from .hqp import Tolerances as Tolerances
+from .hqp import solve_hqp as solve_hqp
 from .qp import QPSolution as QPSolution
 from .qp import solve_least_squares_qp as solve_least_squares_qp
 from .qp import solve_qp as solve_qp

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._dense import apply, product
 from ._problem import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, QP
 
 
@@ -69,11 +70,12 @@ def _unconstrained(qp: QP) -> _State:
     n, m = qp.hessian.shape[0], qp.lower.shape[0]
     normals = jnp.concatenate([jnp.eye(n, dtype=qp.hessian.dtype), qp.rows])
     factor = jnp.linalg.cholesky(qp.hessian)
-    half = jax.scipy.linalg.solve_triangular(factor, normals.T, lower=True)
-    offset = jax.scipy.linalg.solve_triangular(factor, qp.gradient, lower=True)
+    sides = jnp.concatenate([normals.T, qp.gradient[:, None]], 1)  # one triangular solve for both
+    solved = jax.scipy.linalg.solve_triangular(factor, sides, lower=True)
+    half, offset = solved[:, :-1], solved[:, -1]
     return _State(
-        tableau=jnp.matmul(half.T, half, precision="highest"),
-        value=-jnp.matmul(half.T, offset, precision="highest"),
+        tableau=product(half.T, half),
+        value=-apply(half.T, offset),
         multiplier=jnp.zeros(m, qp.hessian.dtype),
         active=jnp.full(m, INACTIVE, jnp.int32),
         impossible=jnp.zeros(m, bool),

@@ -43,6 +43,8 @@ def solve_active_set(
         schur = jnp.matmul(rows, through, precision="highest")
         ridge = 10.0 * jnp.finfo(x.dtype).eps * jnp.diagonal(schur)
         schur_factor = jax.scipy.linalg.cho_factor(schur + jnp.diag(jnp.where(held, ridge, 1.0)), lower=True)
+        # one LAPACK call after another: see osik_jax/_runtime.py
+        x, schur_factor = jax.lax.optimization_barrier((x, schur_factor))
     for _ in range(1 + refinements):
         stationarity = jnp.where(free, -cost_gradient(x) + qp.rows.T @ jnp.where(held, y, 0.0), 0.0)
         step = jax.scipy.linalg.cho_solve(factor, stationarity)

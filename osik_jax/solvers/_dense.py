@@ -1,0 +1,16 @@
+"""Products of small dense matrices, in full precision on every device (GPUs default to TF32)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def product(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
+    """a b."""
+    return jnp.matmul(a, b, precision="highest")
+
+
+def apply(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """a x."""
+    return jnp.matmul(a, x, precision="highest")

@@ -1,0 +1,6 @@
+"""Hierarchical quadratic programs at the array level: no robot inside."""
+
+from ._cascade import solve_hqp as solve_hqp
+from ._level import Tolerances as Tolerances
+from ._problem import HQPSolution as HQPSolution
+from ._problem import Level as Level
