@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..kinematics import forward_kinematics, integrate
+from .._tree import HINGE, SLIDE
+from ..kinematics import forward_kinematics, frame_jacobian, integrate
 from ..limits import ConfigurationLimit, VelocityLimit
 from ..robot import Robot
 from ..tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
@@ -81,20 +82,18 @@ def file_motion(
 
 
 def guess_moving_frame(robot: Robot) -> str:
-    """The body of the free joint; without one, the frame on the longest chain that sounds most like a hand."""
+    """The free joint's body; without one, the deepest frame that sounds like a tool or hand, else the last body."""
     tree = robot.tree
     if robot.floating_base:
         return tree.body_names[tree.body_parents.index(0, 1)]
     depth = [0] * len(tree.body_parents)
     for body, parent in enumerate(tree.body_parents[1:], 1):
         depth[body] = depth[parent] + 1
-    tip = depth.index(max(depth))
-    frames = [name for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body == tip]
     for pattern in _HANDS:
-        for name in frames:
-            if re.search(pattern, name, re.IGNORECASE):
-                return name
-    return frames[0]
+        found = [k for k, name in enumerate(tree.frame_names) if re.search(pattern, name, re.IGNORECASE)]
+        if found:
+            return tree.frame_names[max(found, key=lambda k: depth[tree.frame_bodies[k]])]
+    return tree.body_names[depth.index(max(depth))]
 
 
 def guess_feet(robot: Robot) -> tuple[str, ...]:
@@ -168,51 +167,77 @@ def _sway(robot: Robot, q0: Array, frame: str, duration: float) -> Path:
 def _start(robot: Robot, moving: str, standing: Sequence[str]) -> Float[Array, " nq"]:
     """Home, away from joint limits and stretched limbs: the waist sinks a little, or the arm bends."""
     if not standing:
-        return _bent(robot, 0.15)
+        return _dexterous(robot, moving)
     home = forward_kinematics(robot, robot.q0)
     targets = {foot: home.frame_pose(robot, foot) for foot in standing}
     p, R = home.frame_pose(robot, moving)
     ground = min(float(pose[0][2]) for pose in targets.values())
     targets[moving] = (p - jnp.array([0.0, 0.0, _SINK * (float(p[2]) - ground)]), R)
-    return _settled(robot, _bent(robot, 0.05), targets, _foot_rows(standing))
+    return _settled(robot, _bent(robot), targets, _foot_rows(standing))
 
 
-def _bent(robot: Robot, part: float) -> Float[Array, " nq"]:
-    """Home with every limited joint moved towards the middle of its range by a part of it, at most that far."""
+def _bent(robot: Robot) -> Float[Array, " nq"]:
+    """Home with every limited joint moved towards the middle of its range, by a twentieth of the range at most."""
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
-    limited = np.isfinite(upper - lower)
-    q0 = np.asarray(robot.q0)
-    step = np.zeros(robot.nv)
+    q0, step = np.asarray(robot.q0), np.zeros(robot.nv)
     for joint, dof in robot.tree.dof_address.items():
-        if limited[dof]:
+        if np.isfinite(upper[dof] - lower[dof]):
             away = 0.5 * (lower[dof] + upper[dof]) - q0[robot.tree.qpos_address[joint]]
-            step[dof] = np.clip(away, -part * (upper[dof] - lower[dof]), part * (upper[dof] - lower[dof]))
+            step[dof] = np.clip(away, -0.05 * (upper[dof] - lower[dof]), 0.05 * (upper[dof] - lower[dof]))
     return integrate(robot, robot.q0, jnp.asarray(step, robot.q0.dtype), 1.0)
 
 
+def _dexterous(robot: Robot, frame: str, count: int = 64, reach: float = 0.8) -> Float[Array, " nq"]:
+    """Home, unless a configuration near it moves the frame twice as well in its worst direction."""
+    steps = np.random.default_rng(0).uniform(-reach, reach, (count, robot.nv)) * (np.arange(count) > 0)[:, None]
+    rows = 6 if robot.nv >= 6 else 3
+
+    def judged(step: Array) -> tuple[Array, Array]:
+        q = _inside(robot, integrate(robot, robot.q0, step, 1.0))
+        J = frame_jacobian(robot, forward_kinematics(robot, q), frame)[:rows]
+        return q, jnp.linalg.svd(J, compute_uv=False)[-1]
+
+    configurations, worst = jax.jit(jax.vmap(judged))(jnp.asarray(steps, robot.q0.dtype))
+    best = jnp.argmax(worst)
+    return configurations[jnp.where(2.0 * worst[0] >= worst[best], 0, best)]
+
+
 def _settled(
-    robot: Robot, q: Array, targets: dict[str, tuple[Array, Array]], rows: Literal["pose", "position"], steps: int = 60
+    robot: Robot, q: Array, targets: dict[str, tuple[Array, Array]], rows: Literal["pose", "position"]
 ) -> Float[Array, " nq"]:
-    """Damped Gauss-Newton steps to the poses; limits are kept by clipping."""
+    """Damped Gauss-Newton steps to the poses, the last of which counts least, from q and a few nudged starts.
+
+    A leg that is stretched at q, with no limit to tell which way its knee bends, only bends from a nudged one.
+    """
+    last = len(targets) - 1
     tasks = [
-        FrameTask(robot, frame, target=pose, rows="pose" if k == len(targets) - 1 else rows)
+        FrameTask(robot, frame, target=pose, rows="pose" if k == last else rows, weight=1e-4 if k == last else 1.0)
         for k, (frame, pose) in enumerate(targets.items())
     ]
 
-    def step(q: Array) -> Array:
+    def step(q: Array) -> tuple[Array, Array]:
         kinematics = forward_kinematics(robot, q)
         parts = [task.rows(robot, kinematics, q) for task in tasks]
-        e, J = jnp.concatenate([part.error for part in parts]), jnp.concatenate([part.jacobian for part in parts])
-        v = -J.T @ jnp.linalg.solve(J @ J.T + 1e-8 * jnp.eye(len(e)), e)
-        return _inside(robot, integrate(robot, q, v, 1.0))
+        scale = jnp.sqrt(jnp.concatenate([part.weight for part in parts]))
+        e = scale * jnp.concatenate([part.error for part in parts])
+        J = scale[:, None] * jnp.concatenate([part.jacobian for part in parts])
+        v = -J.T @ jnp.linalg.solve(J @ J.T + 1e-7 * jnp.eye(len(e)), e)
+        return _inside(robot, integrate(robot, q, v, 1.0)), jnp.sum(e**2)
 
-    return jax.jit(lambda q: jax.lax.fori_loop(0, steps, lambda _, x: step(x), q))(q)
+    def settle(nudge: Array) -> tuple[Array, Array]:
+        start = _inside(robot, integrate(robot, q, nudge, 1.0))
+        ends, errors = jax.lax.scan(lambda x, _: step(x), start, length=100)
+        return ends, errors[-1]
+
+    nudges = np.random.default_rng(0).uniform(-0.4, 0.4, (8, robot.nv))
+    nudges[0], nudges[:, :6] = 0.0, 0.0  # the base stays
+    ends, errors = jax.jit(jax.vmap(settle))(jnp.asarray(nudges, q.dtype))
+    return ends[jnp.argmin(jnp.where(errors < 0.5 * errors[0], errors, errors[0]))]
 
 
 def _inside(robot: Robot, q: Array) -> Array:
     """Clips hinges and slides to their limits."""
-    for joint, dof in robot.tree.dof_address.items():
-        at = robot.tree.qpos_address[joint]
-        if np.isfinite(float(np.asarray(robot.position_upper)[dof])):
-            q = q.at[at].set(jnp.clip(q[at], robot.position_lower[dof], robot.position_upper[dof]))
-    return q
+    single = [j for j in robot.tree.dof_address if robot.tree.joint_types[j] in (HINGE, SLIDE)]
+    at = np.array([robot.tree.qpos_address[j] for j in single], int)
+    dof = np.array([robot.tree.dof_address[j] for j in single], int)
+    return q.at[at].set(jnp.clip(q[at], robot.position_lower[dof], robot.position_upper[dof]))
