@@ -1,9 +1,10 @@
 """Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
 
-from ._runtime import widen_cpu_pool as _widen_cpu_pool
-
-_widen_cpu_pool()
-
+from . import _runtime as _runtime  # first: it sets up XLA's CPU client
+from .control import Solution as Solution
+from .control import Trajectory as Trajectory
+from .control import rollout as rollout
+from .control import solve as solve
 from .kinematics import Kinematics as Kinematics
 from .kinematics import center_of_mass as center_of_mass
 from .kinematics import com_jacobian as com_jacobian
@@ -18,6 +19,11 @@ from .limits import VelocityLimit as VelocityLimit
 from .limits import limit_box as limit_box
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot
+from .schemes import HierarchicalQP as HierarchicalQP
+from .schemes import NullSpace as NullSpace
+from .schemes import Scheme as Scheme
+from .schemes import WeightedQP as WeightedQP
+from .solvers import Status as Status
 from .tasks import AdaptiveGain as AdaptiveGain
 from .tasks import ComTask as ComTask
 from .tasks import FrameTask as FrameTask

@@ -18,3 +18,6 @@ def widen_cpu_pool() -> None:
     client, so import this package before the first computation.
     """
     os.environ.setdefault(_WORKERS, str(max(_MINIMUM, os.cpu_count() or 1)))
+
+
+widen_cpu_pool()

@@ -1,5 +1,7 @@
 """Array-level solvers, no robot inside: quadratic programs, hierarchies, null-space projection."""
 
+from ._null_space import NullSpaceSolution as NullSpaceSolution
+from ._null_space import solve_nullspace as solve_nullspace
 from ._status import Status as Status
 from ._status import raise_if_failed as raise_if_failed
 from .hqp import HQPSolution as HQPSolution

@@ -36,6 +36,11 @@ class TaskRows(eqx.Module):
     upper: Float[Array, " m"]
     weight: Float[Array, " m"]
 
+    @property
+    def is_equality(self) -> bool:
+        """Whether the two bounds are one array (known while tracing): all rows are equalities."""
+        return self.lower is self.upper
+
 
 class Task(eqx.Module):
     """Base of all tasks: an immutable pytree. Make your own: subclass it, add fields, write ``rows`` (``task_rows``).

@@ -137,9 +137,9 @@ class _Cascade(eqx.Module):
         floor = scale * rounding(scale, end.x, slack, tolerances)
         tight = (end.side != 0) & (pressure > tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + floor)
         rows = jnp.argsort(~tight, stable=True)[:n]
-        to_freeze = jnp.concatenate([
-            jnp.where(tight[rows][:, None], hard.matrix[rows], 0.0), jnp.where(counts[:, None], level.matrix, 0.0)
-        ])
+        to_freeze = jnp.concatenate(
+            [jnp.where(tight[rows][:, None], hard.matrix[rows], 0.0), jnp.where(counts[:, None], level.matrix, 0.0)]
+        )
         basis = row_space(to_freeze, self.projector, tolerances.rank)
         side = jnp.concatenate([jnp.where(tight, 0, end.side), jnp.zeros(len(slack), jnp.int32)])
         return _Cascade(

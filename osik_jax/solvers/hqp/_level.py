@@ -211,8 +211,10 @@ def _line_search(value: Array, rate: Array, lower: Array, upper: Array) -> Float
     """Exact minimiser t >= 0 of |dist(value + t rate, [lower, upper])|^2, a convex piecewise quadratic."""
     moving = rate != 0.0
     safe = jnp.where(moving, rate, 1.0)
-    ends = [jnp.where(moving & jnp.isfinite(b), (jnp.where(jnp.isfinite(b), b, 0.0) - value) / safe, 1.0)
-            for b in (lower, upper)]
+    ends = [
+        jnp.where(moving & jnp.isfinite(b), (jnp.where(jnp.isfinite(b), b, 0.0) - value) / safe, 1.0)
+        for b in (lower, upper)
+    ]
     knots = jnp.maximum(jnp.concatenate([*ends, jnp.ones(1, value.dtype), jnp.zeros(1, value.dtype)]), 0.0)
 
     def slope(t: Array) -> Array:

@@ -42,7 +42,7 @@ def solve_active_set(
         through = jax.scipy.linalg.cho_solve(factor, rows.T)
         schur = jnp.matmul(rows, through, precision="highest")
         ridge = 10.0 * jnp.finfo(x.dtype).eps * jnp.diagonal(schur)
-        schur_factor = jax.scipy.linalg.cho_factor(schur + jnp.diag(jnp.where(held, ridge, 1.0)), lower=True)
+        schur_factor = jnp.linalg.cholesky(schur + jnp.diag(jnp.where(held, ridge, 1.0)))
         # one LAPACK call after another: see osik_jax/_runtime.py
         x, schur_factor = jax.lax.optimization_barrier((x, schur_factor))
     for _ in range(1 + refinements):
@@ -50,7 +50,7 @@ def solve_active_set(
         step = jax.scipy.linalg.cho_solve(factor, stationarity)
         if p:
             gap = jnp.where(held, target[n:] - qp.rows @ (x + step), 0.0)
-            dy = jax.scipy.linalg.cho_solve(schur_factor, gap)
+            dy = jax.scipy.linalg.cho_solve((schur_factor, True), gap)
             step, y = step + through @ dy, y + dy
         x = x + step
     return x, y

@@ -107,12 +107,16 @@ def _problem(
         rows, rows_lower, rows_upper = jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
     if rows_lower is None or rows_upper is None:
         raise ValueError("rows need rows_lower and rows_upper; use -inf or inf for a side without bound")
-    stack = [jnp.concatenate([jnp.asarray(a, dtype), jnp.asarray(b, dtype)])
-             for a, b in ((lower, rows_lower), (upper, rows_upper))]
+    stack = [
+        jnp.concatenate([jnp.asarray(a, dtype), jnp.asarray(b, dtype)])
+        for a, b in ((lower, rows_lower), (upper, rows_upper))
+    ]
     rows = jnp.asarray(rows, dtype)
     if stack[0].shape != (n + rows.shape[0],) or stack[1].shape != stack[0].shape:
-        raise ValueError(f"bounds do not fit: {n} variables, {rows.shape[0]} rows, {stack[0].shape[0]} lower bounds "
-                         f"and {stack[1].shape[0]} upper bounds")
+        raise ValueError(
+            f"bounds do not fit: {n} variables, {rows.shape[0]} rows, {stack[0].shape[0]} lower bounds "
+            f"and {stack[1].shape[0]} upper bounds"
+        )
     return QP(hessian, gradient, rows, *stack)
 
 

@@ -1,0 +1,247 @@
+"""The loop: one tick, and many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ._joint_selection import scalar_layout
+from .kinematics import forward_kinematics, integrate
+from .limits import ConfigurationLimit, Limit, limit_box
+from .robot import Robot
+from .schemes import Scheme, VelocityProblem
+from .tasks import Task
+
+Tasks = Mapping[str, Task]
+Targets = Mapping[str, Any]
+Feedback = Callable[[Array, Array], Array]
+
+
+class Solution(eqx.Module):
+    """Answer of one tick (or, with a leading axis, of many).
+
+    Attributes:
+        velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. (nv,)
+        status: a ``Status`` code.
+        iterations: changes of the active set, all levels together.
+        kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``).
+        box_violation: how far v leaves its box [rad/s or m/s]; 0 but for ``NullSpace``.
+        slack: of each task, J v minus the nearest point of its interval: what the task did not get. {name: (m,)}
+        error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
+    """
+
+    velocity: Float[Array, " nv"]
+    status: Int[Array, ""]
+    iterations: Int[Array, ""]
+    kkt_residual: Float[Array, ""]
+    box_violation: Float[Array, ""]
+    slack: dict[str, Float[Array, " m"]]
+    error: dict[str, Float[Array, " m"]]
+
+
+class Trajectory(eqx.Module):
+    """What a rollout went through.
+
+    Attributes:
+        time: at the start of each tick [s]. (steps,)
+        q: configurations, the start first; ``q[k + 1]`` is where tick k led. (steps + 1, nq)
+        solution: of each tick; every leaf has a leading axis. (steps, ...)
+    """
+
+    time: Float[Array, " steps"]
+    q: Float[Array, "steps_1 nq"]
+    solution: Solution
+
+
+def solve(
+    robot: Robot,
+    q: Float[Array, " nq"],
+    tasks: Tasks,
+    *,
+    scheme: Scheme,
+    limits: Sequence[Limit] = (),
+    dt: Float[Array, ""] | float = 0.005,
+) -> Solution:
+    """The velocity that serves the tasks best at configuration q.
+
+    Compiled on first use; changing any number (target, weight, gain, limit, dt, link length) compiles nothing. Pure,
+    so it can be used inside ``jit`` and batched by ``vmap`` over q and over any leaf of robot, tasks, scheme and limits.
+
+    Args:
+        robot: the robot.
+        q: configuration. (nq,)
+        tasks: by name; the names come back in ``slack`` and ``error``.
+        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
+        limits: joint position and velocity limits.
+        dt: time until the next tick [s].
+
+    Returns:
+        The answer; never raises inside jit: look at ``status``, or call ``osik_jax.solvers.raise_if_failed`` outside.
+
+    Raises:
+        ValueError: outside jit: q of the wrong length, not finite or with a quaternion of zeros; no task.
+    """
+    robot.check_configuration(q)
+    _check_tasks(tasks)
+    return _solve(robot, jnp.asarray(q), dict(tasks), scheme, tuple(limits), dt)
+
+
+@jax.jit
+def _solve(
+    robot: Robot, q: Array, tasks: dict[str, Task], scheme: Scheme, limits: tuple[Limit, ...], dt: Array | float
+) -> Solution:
+    kinematics = forward_kinematics(robot, q)
+    problem = _velocity_problem(
+        robot, q, {k: t.rows(robot, kinematics, q) for k, t in tasks.items()}, tasks, limits, dt
+    )
+    answer = scheme.solve(problem)
+    v = answer.velocity
+    return Solution(
+        velocity=v,
+        status=answer.status,
+        iterations=answer.iterations,
+        kkt_residual=answer.kkt_residual,
+        box_violation=jnp.max(jnp.maximum(jnp.maximum(problem.lower - v, v - problem.upper), 0.0)),
+        slack=problem.slack(v),
+        error={name: rows.error for name, rows in problem.rows.items()},
+    )
+
+
+def rollout(
+    robot: Robot,
+    q0: Float[Array, " nq"],
+    tasks: Tasks | Callable[[Array], Tasks],
+    *,
+    scheme: Scheme,
+    limits: Sequence[Limit] = (),
+    dt: Float[Array, ""] | float = 0.005,
+    steps: int,
+    targets: Targets | None = None,
+    feedback: Feedback | Float[Array, "steps nq"] | None = None,
+) -> Trajectory:
+    """The closed loop: solve, integrate, repeat, in one compiled scan.
+
+    Args:
+        robot: the robot.
+        q0: start. (nq,)
+        tasks: by name, or a function from time [s] to tasks (the same ones each time, with other numbers). A function
+            that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers without compiling.
+        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
+        limits: joint position and velocity limits.
+        dt: time of one tick [s].
+        steps: number of ticks (static).
+        targets: targets of some tasks at each tick, by task name: what ``replace(target=...)`` takes, with a leading
+            axis of length ``steps`` on every array.
+        feedback: measured configurations: an array with one for each tick (steps, nq), or a function of time [s] and of
+            the configuration that the last tick led to, which returns the one measured. Default: no feedback.
+
+    Returns:
+        The trajectory. A failed tick moves nothing it should not: look at ``solution.status``.
+
+    Raises:
+        ValueError, KeyError: outside jit: q0 as in ``solve``; ``targets`` or ``feedback`` do not fit.
+    """
+    robot.check_configuration(q0)
+    if not callable(tasks):
+        _check_tasks(tasks)
+        _check_targets(tasks, targets, steps)
+    elif targets is not None:
+        raise ValueError("targets go with a dict of tasks; a function of time sets them itself")
+    if feedback is not None and not callable(feedback) and jnp.shape(feedback) != (steps, robot.nq):
+        raise ValueError(
+            f"feedback has shape {jnp.shape(feedback)}; it is one configuration a tick, {(steps, robot.nq)}"
+        )
+    numbers, structure = eqx.partition((tasks if callable(tasks) else dict(tasks), feedback), eqx.is_array)
+    leaves, treedef = jax.tree.flatten(structure)
+    return _rollout(
+        robot,
+        jnp.asarray(q0),
+        numbers,
+        scheme,
+        tuple(limits),
+        dt,
+        targets,
+        static=(tuple(leaves), treedef),
+        steps=steps,
+    )
+
+
+@partial(jax.jit, static_argnames=("static", "steps"))
+def _rollout(
+    robot: Robot,
+    q0: Array,
+    numbers: Any,
+    scheme: Scheme,
+    limits: tuple[Limit, ...],
+    dt: Array | float,
+    targets: Targets | None,
+    *,
+    static: tuple[tuple[Any, ...], Any],
+    steps: int,
+) -> Trajectory:
+    tasks, feedback = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
+    time = jnp.arange(steps) * jnp.asarray(dt, q0.dtype)
+    measured = None if callable(feedback) else feedback
+
+    def tick(q: Array, now: tuple[Array, Targets | None, Array | None]) -> tuple[Array, tuple[Array, Solution]]:
+        t, target, sensed = now
+        if callable(feedback):
+            q = feedback(t, q)
+        elif sensed is not None:
+            q = sensed
+        todo = dict(tasks(t)) if callable(tasks) else _aim(tasks, target)
+        solution = _solve(robot, q, todo, scheme, limits, dt)
+        q = integrate(robot, q, solution.velocity, dt)
+        return q, (q, solution)
+
+    _, (q, solution) = jax.lax.scan(tick, q0, (time, targets, measured), length=steps)
+    return Trajectory(time, jnp.concatenate([q0[None], q]), solution)
+
+
+def _aim(tasks: dict[str, Task], targets: Targets | None) -> dict[str, Task]:
+    """The tasks with this tick's targets."""
+    aimed = {name: tasks[name].replace(target=target) for name, target in (targets or {}).items()}
+    return {**tasks, **aimed}
+
+
+def _velocity_problem(
+    robot: Robot, q: Array, rows: dict[str, Any], tasks: dict[str, Task], limits: tuple[Limit, ...], dt: Array | float
+) -> VelocityProblem:
+    lower, upper = limit_box(robot, q, limits, dt)
+    scalar, index = scalar_layout(robot)
+    low, high = jnp.full_like(lower, -jnp.inf), jnp.full_like(upper, jnp.inf)
+    for limit in limits:
+        if isinstance(limit, ConfigurationLimit):
+            low, high = jnp.maximum(low, limit.lower), jnp.minimum(high, limit.upper)
+    return VelocityProblem(
+        rows=rows,
+        priorities=tuple((name, task.priority) for name, task in tasks.items()),
+        lower=lower,
+        upper=upper,
+        position=jnp.where(scalar, q[index], 0.0),
+        position_lower=jnp.where(scalar, low, -jnp.inf),
+        position_upper=jnp.where(scalar, high, jnp.inf),
+    )
+
+
+def _check_tasks(tasks: Tasks) -> None:
+    if not tasks:
+        raise ValueError("there is no task: give at least one, such as a PostureTask")
+    for name, task in tasks.items():
+        if not isinstance(task, Task):
+            raise TypeError(f"tasks[{name!r}] is a {type(task).__name__}, not a Task")
+
+
+def _check_targets(tasks: Tasks, targets: Targets | None, steps: int) -> None:
+    for name, target in (targets or {}).items():
+        if name not in tasks:
+            raise KeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(tasks)}")
+        for leaf in jax.tree.leaves(target):
+            if jnp.shape(leaf)[:1] != (steps,):
+                raise ValueError(f"targets[{name!r}] has shape {jnp.shape(leaf)}; its first axis is the ticks, {steps}")

@@ -1,0 +1,27 @@
+"""Strict priorities: no task gives way to one below it (eq. 9)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+
+from ..solvers import solve_hqp
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem
+
+
+class HierarchicalQP(Scheme):
+    """Lexicographic least squares over the priorities, inside the box at every level.
+
+    Equality and inequality tasks may stand at any level; weights trade off tasks of the same priority. Where a level
+    cannot be met it is missed by as little as possible, and the levels below use what freedom is left.
+
+    Attributes:
+        max_iterations: cap on the active-set iterations of one level (static).
+    """
+
+    max_iterations: int | None = eqx.field(default=None, static=True)
+
+    def solve(self, problem: VelocityProblem) -> SchemeAnswer:
+        """The velocity of one tick."""
+        levels = [problem.level(names) for names in problem.by_priority()]
+        answer = solve_hqp(levels, problem.lower, problem.upper, max_iterations=self.max_iterations)
+        return SchemeAnswer(answer.x, answer.status, answer.iterations, answer.kkt_residual)

@@ -1,0 +1,62 @@
+"""Prioritised projection with a joint-limit potential in the last null space (eqs. 7 and 8)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..solvers import solve_nullspace
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf
+
+
+class NullSpace(Scheme):
+    """Each priority in the null space of those above it; what is left descends a joint-limit potential.
+
+    The potential f = 1/(2 n) sum r_i / ((u_i - q_i)(q_i - l_i)), r_i = u_i - l_i, repels the n limited joints from
+    their limits; the motion is -potential_gain df/dq. Limits are not hard: the answer may leave its box, and
+    ``Solution.box_violation`` says by how much. Inequality rows count only while the levels above leave them violated.
+
+    Attributes:
+        damping: of each priority's motion: s / (s^2 + damping) stands for 1 / s; 0 allowed.
+        potential_gain: alpha [rad^2/s]; 0 turns the potential off. It needs a ``ConfigurationLimit`` among the limits.
+        margin: joints are taken to be at least this share of their range away from either limit.
+        rank_tolerance: singular values under this share of a level's largest count as zero.
+    """
+
+    damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf)
+    potential_gain: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf)
+    margin: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf)
+    rank_tolerance: Float[Array, ""] = eqx.field(default=1e-5, converter=as_leaf)
+
+    def solve(self, problem: VelocityProblem) -> SchemeAnswer:
+        """The velocity of one tick."""
+        levels = [problem.level(names) for names in problem.by_priority()]
+        descent = -self.potential_gain * limit_potential_gradient(
+            problem.position, problem.position_lower, problem.position_upper, self.margin
+        )
+        answer = solve_nullspace(levels, secondary=descent, damping=self.damping, rank_tolerance=self.rank_tolerance)
+        first = levels[0].scaled()
+        gradient = first.matrix.T @ first.distance(answer.x)
+        return SchemeAnswer(answer.x, answer.status, jnp.asarray(len(levels)), jnp.max(jnp.abs(gradient)))
+
+
+def limit_potential_gradient(
+    position: Float[Array, " nv"],
+    lower: Float[Array, " nv"],
+    upper: Float[Array, " nv"],
+    margin: Float[Array, ""] | float = 0.01,
+) -> Float[Array, " nv"]:
+    """df/dq of the joint-limit potential (eq. 8), 0 for joints without two finite limits.
+
+    r_i (2 q_i - u_i - l_i) / (2 n (u_i - q_i)^2 (q_i - l_i)^2): negative near the lower limit, positive near the upper,
+    so that descending it leads away from both. q is clamped ``margin`` of the range inside the limits, where the
+    potential is finite. (nv,)
+    """
+    limited = jnp.isfinite(lower) & jnp.isfinite(upper) & (upper > lower)
+    low, high = jnp.where(limited, lower, -1.0), jnp.where(limited, upper, 1.0)
+    span = high - low
+    q = jnp.clip(position, low + margin * span, high - margin * span)
+    count = jnp.maximum(jnp.sum(limited), 1)
+    slope = span * (2.0 * q - high - low) / (2.0 * count * (high - q) ** 2 * (q - low) ** 2)
+    return jnp.where(limited, slope, 0.0)

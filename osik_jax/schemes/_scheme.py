@@ -1,0 +1,76 @@
+"""What a scheme is given and what it answers."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..solvers import Level
+from ..tasks import TaskRows
+
+
+class VelocityProblem(eqx.Module):
+    """One tick: what the tasks ask of the velocity, and its box.
+
+    Attributes:
+        rows: of each task, by name.
+        priorities: of each task, by name; 1 first (static).
+        lower: of v, -inf where free. (nv,)
+        upper: of v, inf where free. (nv,)
+        position: of each dof [rad or m], 0 for ball and free joints. (nv,)
+        position_lower: of each dof, -inf where free or no ``ConfigurationLimit`` was given. (nv,)
+        position_upper: likewise, inf where free. (nv,)
+    """
+
+    rows: dict[str, TaskRows]
+    priorities: tuple[tuple[str, int], ...] = eqx.field(static=True)
+    lower: Float[Array, " nv"]
+    upper: Float[Array, " nv"]
+    position: Float[Array, " nv"]
+    position_lower: Float[Array, " nv"]
+    position_upper: Float[Array, " nv"]
+
+    def by_priority(self) -> list[list[str]]:
+        """Names of the tasks of each priority, most important first."""
+        ranks = sorted({rank for _, rank in self.priorities})
+        return [[name for name, own in self.priorities if own == rank] for rank in ranks]
+
+    def level(self, names: list[str]) -> Level:
+        """The rows of some tasks as one level."""
+        rows = [self.rows[name] for name in names]
+        return Level(
+            *(jnp.concatenate([getattr(r, field) for r in rows]) for field in ("jacobian", "lower", "upper", "weight"))
+        )
+
+    def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
+        """Of each task, J v minus the nearest point of its interval."""
+        out = {}
+        for name, rows in self.rows.items():
+            value = rows.jacobian @ velocity
+            out[name] = value - jnp.clip(value, rows.lower, rows.upper)
+        return out
+
+
+class SchemeAnswer(eqx.Module):
+    """What a scheme says of one tick; see ``Solution`` for the fields."""
+
+    velocity: Float[Array, " nv"]
+    status: Int[Array, ""]
+    iterations: Int[Array, ""]
+    kkt_residual: Float[Array, ""]
+
+
+class Scheme(eqx.Module):
+    """Base of the schemes: how tasks that cannot all be met share the robot."""
+
+    @abc.abstractmethod
+    def solve(self, problem: VelocityProblem) -> SchemeAnswer:
+        """The velocity of one tick."""
+
+
+def as_leaf(value: Array | float) -> Float[Array, ""]:
+    """A scheme's number as a traced leaf."""
+    return jnp.asarray(value, float)
