@@ -120,6 +120,8 @@ def read_robot(source: str, base: str = "auto") -> Robot:
 
     with _told():
         if source in _EMBEDDED and not os.path.exists(source):
+            if base != "auto":
+                raise ValueError(f"--base goes with a file; {source} is what it is")
             return load_robot(source)
         path = Path(source)
         if not path.is_file():
@@ -181,13 +183,13 @@ def _demo(command: Demo) -> None:
     from . import demo
 
     console = Console()
-    motion = _motion(command)
+    motion, out = _motion(command), _folder(command.out)
     for note in motion.notes:
         console.print(f"[yellow]note:[/yellow] {note}")
     with _progress(console) as announce:
         summary, runs = demo.run_demo(
             motion,
-            _folder(command.out),
+            out,
             schemes=command.schemes,
             dt=1.0 / command.frequency,
             animation=command.animation,

@@ -133,4 +133,4 @@ def _swing(path: Path, u: float) -> Path:
 def _reach(u: float, side: float) -> list[tuple[float, float, tuple[float, float, float]]]:
     """A hand moves with the waist, then opens out and up to its side (+1 left, -1 right), and returns."""
     with_waist = _there_and_back(u, 0.25, 2.0, 5.75, 7.75, (0.0, SWAY, -0.01))
-    return with_waist + _there_and_back(u, 1.5, 3.25, 4.5, 6.25, (0.0, 0.07 * side, 0.08))
+    return with_waist + _there_and_back(u, 1.5, 3.25, 4.5, 6.25, (-0.02, 0.055 * side, 0.08))

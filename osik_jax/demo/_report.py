@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import Float, Int
+from rich.markup import escape
 from rich.table import Table
 
 from ..solvers import Status
@@ -180,7 +181,7 @@ def table(summary: Mapping[str, Any]) -> Table:
     for scheme in schemes:
         out.add_column(scheme["title"], justify="right")
     for label, cell in _rows(schemes[0]):
-        out.add_row(label, *(cell(scheme) for scheme in schemes))
+        out.add_row(escape(label), *(cell(scheme) for scheme in schemes))
     return out
 
 

@@ -131,9 +131,9 @@ def _save_figure(motion: Motion, runs: Sequence[Run], folder: Path) -> str:
     figure = compare_figure(
         runs[0].measurement.time,
         comparison_panels(motion, {TITLES[run.scheme]: run.measurement for run in runs}),
-        title=f"{motion.title}: {'the same tasks, ' if len(runs) > 1 else ''}{len(runs)} scheme{'s'[: len(runs) > 1]}",
+        title=f"{motion.title}: {', '.join(TITLES[run.scheme] for run in runs)}",
         note="All figures are recomputed from the configurations by MuJoCo's C code.",
-        colors={TITLES["weighted"]: "#e8590c", TITLES["null-space"]: "#8a8f98", TITLES["hierarchical"]: "#1565c0"},
+        colors={TITLES["weighted"]: "#f08c3a", TITLES["null-space"]: "#4d5561", TITLES["hierarchical"]: "#1565c0"},
     )
     figure.savefig(folder / "comparison.png")
     return "comparison.png"
@@ -196,7 +196,7 @@ def _film(
     return names
 
 
-def draw_picture(motion: Motion, run: Run, path: str | Path, instants: Sequence[float] = (0.0, 0.4, 0.47)) -> Path:
+def draw_picture(motion: Motion, run: Run, path: str | Path, instants: Sequence[float] = (0.0, 0.26, 0.45)) -> Path:
     """Three instants of a motion side by side, as a .png.
 
     Args:
@@ -221,4 +221,4 @@ def _film_curves(m: Measurement) -> Curves:
         axis = int(np.argmax(np.ptp(m.wanted[label], axis=0)))
         name = f"{label.replace('_', ' ')} {_DIRECTIONS[axis]}"
         values[name], wanted[name] = 1e3 * m.displacement[label][:, axis], 1e3 * m.wanted[label][:, axis]
-    return Curves("moved from the start [mm]; dashed: wanted", values, wanted)
+    return Curves("moved from the start [mm], dashed: wanted", values, wanted)

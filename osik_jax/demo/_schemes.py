@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .._tree import unknown_name
-from ..control import HierarchicalQP, NullSpace, WeightedQP
+from ..schemes import HierarchicalQP, NullSpace, WeightedQP
 
 SCHEMES = ("weighted", "null-space", "hierarchical")
 TITLES = {"weighted": "Weighted QP", "null-space": "Null space", "hierarchical": "Hierarchical QP"}

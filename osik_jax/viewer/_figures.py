@@ -22,7 +22,7 @@ from ._parts import robot_parts
 from ._scene import INK
 from ._stage import Stage
 
-SCHEME_COLORS = ("#e8590c", "#8a8f98", "#1565c0", "#2a9d62", "#7b3fa0")
+SCHEME_COLORS = ("#f08c3a", "#8a8f98", "#1565c0", "#2a9d62", "#7b3fa0")
 _BAD = "#d7263d"
 
 
@@ -86,7 +86,8 @@ def _draw_panel(axes: Axes, time: np.ndarray, panel: Panel, palette: Mapping[str
     axes.set_title(panel.title, loc="left", fontsize=10.5, color=INK)
     for order, (name, values) in enumerate(panel.curves.items()):
         shown = values if panel.floor is None else np.maximum(np.abs(values), panel.floor)
-        axes.plot(time[: len(shown)], shown, color=palette[name], lw=2.0, alpha=0.95, zorder=3 + order, label=name)
+        width = max(3.8 - 1.2 * order, 1.3)  # curves that coincide stay visible
+        axes.plot(time[: len(shown)], shown, color=palette[name], lw=width, zorder=3 + order, label=name)
     if panel.floor is not None:
         axes.set_yscale("log")
         axes.set_ylim(bottom=panel.floor)
@@ -103,7 +104,7 @@ def _draw_bound(axes: Axes, panel: Panel) -> None:
     low, high = axes.get_ylim()
     if panel.floor is None:
         room = 0.08 * (max(high, panel.bound) - min(low, panel.bound))
-        low, high = min(low, panel.bound - room), max(high, panel.bound + room)
+        low, high = min(low, panel.bound - room), max(high, panel.bound) + room
     else:
         high = max(high, 3.0 * panel.bound)
     axes.set_ylim(low, high)
@@ -167,8 +168,8 @@ def hero_picture(
     labels: Sequence[str] = (),
     spacing: float | None = None,
     size: tuple[int, int] = (1600, 720),
-    azimuth: float = 24.0,
-    elevation: float = 12.0,
+    azimuth: float = 20.0,
+    elevation: float = 14.0,
     renderer: RendererName = "raycast",
 ) -> Path:
     """Draws one robot at several instants, side by side on one floor, and saves it.

@@ -17,6 +17,7 @@ from ._scene import BLUE, GREEN, INK, ORANGE
 from ._stage import Camera
 
 DPI = 100
+_CURVE_COLORS = (BLUE, GREEN, ORANGE)
 _CARD = (1.0, 1.0, 1.0, 0.82)
 
 
@@ -117,7 +118,7 @@ class PlanPanel:
     ) -> None:
         """Draws the still part; millimetres."""
         self._com, self._support = 1e3 * com, [1e3 * vertices for vertices in support]
-        axes = card(canvas, rectangle, "from above: centre of mass over its support [mm]")
+        axes = card(canvas, rectangle, "support and centre of mass from above [mm]")
         points = np.concatenate([self._com[:, :2], *self._support])
         low, high = points.min(0) - 12.0, points.max(0) + 12.0
         axes.set_aspect("equal", adjustable="box", anchor="W")
@@ -158,19 +159,21 @@ class CurvePanel:
         self._time, self._curves, self._lines = time, list(curves.values()), []
         axes = card(canvas, rectangle, title)
         values = np.concatenate([*curves.values(), *wanted.values()])
-        room = 0.08 * max(np.ptp(values), 1e-9)
+        room = max(np.ptp(values), 1e-9)
         axes.set_xlim(time[0], time[-1])
-        axes.set_ylim(values.min() - room, values.max() + room)
+        axes.set_ylim(values.min() - 0.08 * room, values.max() + 0.42 * room)
         axes.set_xlabel("time [s]", fontsize=7.5, color=INK, labelpad=1)
-        for (name, values), color in zip(wanted.items(), (BLUE, GREEN, ORANGE), strict=False):
-            axes.plot(time, values, color=color, lw=1.0, ls=(0, (3, 2)), alpha=0.65, label=f"{name}, wanted")
-        for name, color in zip(curves, (BLUE, GREEN, ORANGE), strict=False):
+        for values, color in zip(wanted.values(), _CURVE_COLORS, strict=False):
+            axes.plot(time, values, color=color, lw=1.0, ls=(0, (3, 2)), alpha=0.65)
+        for name, color in zip(curves, _CURVE_COLORS, strict=False):
             (line,) = axes.plot([], [], color=color, lw=1.9, label=name)
             (dot,) = axes.plot([], [], "o", ms=5, color=color)
             canvas.moving(line)
             canvas.moving(dot)
             self._lines.append((line, dot))
-        axes.legend(fontsize=6.5, frameon=False, loc="best", labelcolor=INK, handlelength=1.8)
+        axes.legend(
+            fontsize=7, frameon=False, loc="upper right", ncols=2, labelcolor=INK, handlelength=1.4, borderaxespad=0.1
+        )
 
     def place(self, frame: int) -> None:
         """Draws the curves up to a frame."""

@@ -1,0 +1,154 @@
+"""The command line: what it prints, and how it refuses."""
+
+import json
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax import cli
+from osik_jax.viewer import _opengl
+
+ARM = """<mujoco><worldbody><body name="base"><geom type="box" size=".1 .1 .1"/>
+<body name="a" pos="0 0 .1"><joint name="j1" axis="0 0 1" range="-90 90"/>
+<geom type="capsule" size=".03 .1" pos="0 0 .1"/>
+<body name="b" pos="0 0 .2"><joint name="j2" axis="0 1 0" range="-90 90"/>
+<geom type="capsule" size=".03 .1" pos="0 0 .1"/>
+<body name="c" pos="0 0 .2"><joint name="j3" axis="0 1 0" range="-90 90"/>
+<geom type="capsule" size=".03 .1" pos="0 0 .1"/>
+<site name="tool" pos="0 0 .2"/></body></body></body></body></worldbody></mujoco>"""
+
+
+@pytest.fixture
+def arm_file(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM)
+    return path
+
+
+def run(*arguments):
+    return subprocess.run([sys.executable, "-m", "osik_jax.cli", *arguments], capture_output=True, text=True)
+
+
+def refused(capsys, *arguments):
+    """The one line that a mistake gets."""
+    assert cli.main(arguments) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("osik: ")
+    assert captured.out == ""
+    return lines[0]
+
+
+def test_help_names_commands_and_options():
+    everything, demo = run("--help"), run("demo", "--help")
+    assert everything.returncode == demo.returncode == 0
+    assert "demo" in everything.stdout and "info" in everything.stdout
+    for option in ("--motion", "--robot", "--frame", "--support", "--duration", "--frequency", "--schemes", "--out"):
+        assert option in demo.stdout
+    assert "--no-animation" in demo.stdout and "--renderer" in demo.stdout
+
+
+def test_version_is_the_packages(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("osik-jax 0.")
+
+
+@pytest.mark.parametrize("arguments", [["dmo"], ["demo", "--motion", "jump"], ["demo", "--schemes", "magic"], ["info"]])
+def test_unknown_words_exit_with_2(arguments, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main(arguments)
+    assert exit_info.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_missing_and_broken_files_are_named(capsys, tmp_path):
+    assert "no such file: gone.urdf" in refused(capsys, "info", "gone.urdf")
+    assert "gone.xml" in refused(capsys, "demo", "--robot", "gone.xml")
+    broken = tmp_path / "broken.urdf"
+    broken.write_text("<robot name='x'><link")
+    assert "broken.urdf" in refused(capsys, "info", str(broken))
+    assert "mjcf" in refused(capsys, "info", str(_written(tmp_path / "mjcf.xml", "<mujoco><worldbody><bod"))).lower()
+
+
+def _written(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_unknown_frames_are_listed(capsys, arm_file):
+    line = refused(capsys, "demo", "--robot", str(arm_file), "--frame", "tol")
+    assert "'tol'" in line and "did you mean 'tool'" in line and "base, a, b, c" in line
+    assert "'foot'" in refused(capsys, "demo", "--robot", str(arm_file), "--support", "foot")
+    assert "both move and stand" in refused(capsys, "demo", "--robot", str(arm_file), "--frame", "c", "--support", "c")
+
+
+def test_options_that_make_no_sense_are_explained(capsys, arm_file):
+    assert "--robot" in refused(capsys, "demo", "--frame", "torso")
+    assert "--frequency is 0" in refused(capsys, "demo", "--frequency", "0")
+    assert "two control ticks" in refused(capsys, "demo", "--duration", "0")
+    assert "--base goes with a file" in refused(capsys, "info", "nao", "--base", "fixed")
+
+
+def test_a_renderer_that_does_not_work_is_explained(capsys, monkeypatch):
+    def broken(*args, **kwargs):
+        raise mujoco.FatalError("no\nOpenGL context")
+
+    monkeypatch.setattr(_opengl.mujoco, "Renderer", broken)
+    assert "no OpenGL context; use auto or raycast" in refused(capsys, "demo", "--renderer", "mujoco")
+
+
+def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path, arm_file):
+    blocked = _written(tmp_path / "file", "")
+    line = refused(capsys, "demo", "--robot", str(arm_file), "--out", str(blocked / "out"))
+    assert str(blocked) in line
+
+
+def test_info_lists_joints_limits_frames_and_mass(capsys):
+    assert cli.main(["info", "nao"]) == 0
+    out = capsys.readouterr().out
+    robot = osik.load_robot("nao")
+    words = out.replace("\n", " ").replace(",", " ").split()
+    for name in (*robot.joint_names, *robot.frame_names):
+        assert name in words
+    assert f"{mujoco.mj_getTotalmass(robot.mj_model):.3f}" in words
+    row = next(line for line in out.splitlines() if " LKneePitch " in line)
+    dof = robot.joint_dof_index("LKneePitch")
+    numbers = [float(cell) for cell in row.strip("│").split("│")[1:]]
+    expected = [robot.joint_qpos_index("LKneePitch"), dof, robot.position_lower[dof], robot.position_upper[dof]]
+    np.testing.assert_allclose(numbers[:4], np.asarray(expected, float), atol=5e-5)
+    assert numbers[4] == pytest.approx(float(robot.velocity_limit[dof]), abs=5e-5)
+
+
+def test_demo_of_a_file_writes_its_folder(capsys, tmp_path, arm_file):
+    out = tmp_path / "out"
+    arguments = [
+        "demo",
+        "--robot",
+        str(arm_file),
+        "--duration",
+        "1.0",
+        "--frequency",
+        "50",
+        "--schemes",
+        "hierarchical",
+    ]
+    assert cli.main([*arguments, "--out", str(out), "--picture"]) == 0
+    assert {path.name for path in out.iterdir()} >= {
+        "motion.gif",
+        "comparison.png",
+        "motion.npz",
+        "report.json",
+        "picture.png",
+    }
+    summary = json.loads((out / "report.json").read_text())
+    assert summary["settings"]["steps"] == 50
+    assert list(summary["goals"] if "goals" in summary else summary["schemes"]["hierarchical"]["goals"]) == ["hand"]
+    limits = summary["schemes"]["hierarchical"]["limits"]
+    assert limits["position_violations"] == limits["velocity_violations"] == 0
+    printed = capsys.readouterr().out
+    assert "Hierarchical QP" in printed and "hand" in printed

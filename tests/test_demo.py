@@ -1,0 +1,240 @@
+"""The demonstration: references, measurement by MuJoCo C, and the numbers that the motions have to reach."""
+
+import json
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull, Delaunay
+from scipy.spatial.transform import Rotation
+
+import osik_jax as osik
+from osik_jax import demo
+from osik_jax.demo._motion import blended, circumscribed
+
+DT = 0.005
+
+
+@pytest.fixture(scope="module")
+def nao():
+    return osik.load_robot("nao")
+
+
+@pytest.fixture(scope="module")
+def sway():
+    """The double-support motion of 8 s at 200 Hz under the hierarchical scheme."""
+    motion = demo.double_support()
+    return motion, demo.run_scheme(motion, "hierarchical", dt=DT)
+
+
+@pytest.fixture(scope="module")
+def lift():
+    """The single-support motion of 8 s at 200 Hz under the hierarchical scheme."""
+    motion = demo.single_support()
+    return motion, demo.run_scheme(motion, "hierarchical", dt=DT)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A demonstration of half a second: its folder, report and runs."""
+    folder = tmp_path_factory.mktemp("demo")
+    summary, runs = demo.run_demo(demo.double_support(0.5), folder, schemes=("weighted",), dt=DT, renderer="raycast")
+    return folder, summary, runs
+
+
+def look(robot, q):
+    """MuJoCo's data at one configuration."""
+    return next(look_all(robot, q[None]))
+
+
+def look_all(robot, q):
+    """MuJoCo's data at every configuration of a trajectory."""
+    for qpos in np.asarray(jax.vmap(robot.mujoco_qpos)(q)):
+        data = mujoco.MjData(robot.mj_model)
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(robot.mj_model, data)
+        mujoco.mj_comPos(robot.mj_model, data)
+        yield data
+
+
+def corners(data, *feet):
+    return np.array([data.site(f"{foot}_corner_{k}").xpos[:2] for foot in feet for k in range(4)])
+
+
+def turn(a, b):
+    return np.linalg.norm(Rotation.from_matrix(a.reshape(3, 3) @ b.reshape(3, 3).T).as_rotvec())
+
+
+def test_minimum_jerk_starts_and_ends_at_rest():
+    t = np.linspace(0.0, 4.0, 401)
+    value, rate = map(np.asarray, demo.minimum_jerk(t, 1.0, 2.0))
+    assert value[0] == value[100] == 0.0 and value[300] == value[-1] == 1.0
+    assert rate[100] == rate[300] == 0.0
+    np.testing.assert_allclose(rate[1:-1], (value[2:] - value[:-2]) / 0.02, atol=2e-4)
+    assert rate.max() == pytest.approx(1.875 / 2.0)
+
+
+def test_path_velocity_is_the_rate_of_its_pose():
+    path = demo.Path(
+        np.array([0.1, 0.2, 0.3]),
+        Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_matrix(),
+        moves=(demo.Stroke(0.0, 2.0, (0.1, -0.2, 0.3)), demo.Stroke(1.0, 3.0, (0.0, 0.1, 0.0))),
+        turns=(demo.Stroke(0.5, 2.5, (0.8,)),),
+        axis=(0.6, 0.0, 0.8),
+    )
+    h = 1e-5
+    at = jax.jit(path.at)
+    for t in (0.7, 1.5, 2.2):
+        (before, R0), _ = at(t - h)
+        (after, R1), _ = at(t + h)
+        _, velocity = at(t)
+        np.testing.assert_allclose(velocity[:3], (after - before) / (2 * h), atol=1e-8)
+        spin = Rotation.from_matrix(np.asarray(R1) @ np.asarray(R0).T).as_rotvec() / (2 * h)
+        np.testing.assert_allclose(velocity[3:], spin, atol=1e-8)
+    times = np.array([0.0, 1.0, 2.9, 3.0, 4.0])
+    np.testing.assert_array_equal(path.still(times), [False, False, False, True, True])
+
+
+def test_polygons_blend_from_a_cover_to_the_foot(nao):
+    both = osik.support_polygon(nao, nao.q0, ("l_sole", "r_sole"))
+    foot = osik.support_polygon(nao, nao.q0, ("l_sole",))
+    cover = circumscribed(foot.normals, both)
+    inside = Delaunay(np.asarray(cover.vertices) * (1.0 + 1e-9)).find_simplex(np.asarray(both.vertices))
+    assert (inside >= 0).all()
+    np.testing.assert_allclose((np.asarray(both.vertices) @ np.asarray(foot.normals).T).max(0), cover.offsets)
+    half = blended(cover, foot, 0.5)
+    before, edge = np.roll(np.asarray(half.normals), 1, 0), np.asarray(half.normals)
+    np.testing.assert_allclose(np.sum(edge * np.asarray(half.vertices), -1), half.offsets, atol=1e-12)
+    np.testing.assert_allclose(
+        np.sum(before * np.asarray(half.vertices), -1), np.roll(np.asarray(half.offsets), 1), atol=1e-12
+    )
+    np.testing.assert_allclose(blended(cover, foot, 1.0).vertices, foot.vertices, atol=1e-12)
+
+
+def test_measurement_of_a_motion_made_by_hand(nao):
+    """The whole robot slides and one knee goes past its limit: every number is known beforehand."""
+    motion = demo.double_support(1.0)
+    q = np.tile(np.asarray(nao.q0), (11, 1))
+    q[:, 0] += 0.001 * np.arange(11)
+    knee, dof = nao.joint_qpos_index("LKneePitch"), nao.joint_dof_index("LKneePitch")
+    top = float(nao.position_upper[dof])
+    q[10, knee] = top + 0.1
+    m = demo.measure(motion, q, 0.1)
+    np.testing.assert_allclose(m.stances["r_sole"].position, 0.001 * np.arange(11), atol=1e-12)
+    np.testing.assert_allclose(m.stances["r_sole"].orientation, 0.0, atol=1e-12)
+    wanted = jax.jit(jax.vmap(motion.goals["waist"].path.at))(0.1 * np.arange(11))[0][0]
+    np.testing.assert_allclose(m.goals["waist"].position, np.linalg.norm(q[:, :3] - wanted, axis=1), atol=1e-12)
+    hull = corners(look(nao, q[0]), "l_sole", "r_sole")
+    hull = hull[ConvexHull(hull).vertices]
+    equations = ConvexHull(hull).equations
+    for k in (0, 5, 10):
+        com = look(nao, q[k]).subtree_com[1]
+        np.testing.assert_allclose(m.com[k], com, atol=1e-12)
+        assert m.com_margin[k] == pytest.approx(-np.max(equations[:, :2] @ com[:2] + equations[:, 2]), abs=1e-12)
+    assert m.position_violations == 1
+    low = float(nao.position_lower[dof])
+    assert m.position_margin[10] == pytest.approx(-0.2 / (top - low))
+    fast = abs(q[10, knee] - q[9, knee]) / 0.1
+    assert m.velocity_violations == int(fast > float(nao.velocity_limit[dof]))
+    assert m.velocity_margin[9] == pytest.approx(1.0 - fast / float(nao.velocity_limit[dof]))
+    np.testing.assert_allclose(m.velocity_margin[:9], 1.0)
+
+
+def check_requirements(motion, run, lifted=None):
+    """What issue 2 asks of the hierarchical scheme, from MuJoCo C alone; ``lifted``: ticks with the right foot up."""
+    robot = motion.robot
+    first = look(robot, run.q[0])
+    hulls = {feet: ConvexHull(corners(first, *feet)).equations for feet in (("l_sole", "r_sole"), ("l_sole",))}
+    paths = jax.jit(jax.vmap(motion.goals["waist"].path.at))(DT * np.arange(len(run.q)))[0][0]
+    for k, data in enumerate(look_all(robot, run.q)):
+        feet = ("l_sole",) if lifted is not None and lifted[0] < DT * k < lifted[1] else ("l_sole", "r_sole")
+        for foot in feet:
+            assert np.linalg.norm(data.site(foot).xpos - first.site(foot).xpos) <= 1e-4, (k, foot)
+            assert turn(data.site(foot).xmat, first.site(foot).xmat) <= 1e-4, (k, foot)
+        com = data.subtree_com[1][:2]
+        assert np.max(hulls[feet][:, :2] @ com + hulls[feet][:, 2]) <= 0.0, k
+        assert np.linalg.norm(data.body("torso").xpos - np.asarray(paths[k])) <= 1e-3, k
+    qpos = np.asarray(jax.vmap(robot.mujoco_qpos)(run.q))
+    limited = robot.mj_model.jnt_limited.astype(bool)
+    joints = qpos[:, robot.mj_model.jnt_qposadr[limited]]
+    low, high = robot.mj_model.jnt_range[limited].T
+    assert (joints >= low - 1e-9).all() and (joints <= high + 1e-9).all()
+    assert (np.abs(run.v) <= np.asarray(robot.velocity_limit)).all()
+    assert (run.outcome.status == osik.solvers.Status.SOLVED).all()
+
+
+def test_double_support_reaches_its_numbers(sway):
+    motion, run = sway
+    assert len(run.q) == 1601
+    check_requirements(motion, run)
+    waist = run.measurement.displacement["waist"]
+    assert waist[700, 1] == pytest.approx(0.05, abs=1e-3)
+    assert waist[-1, 1] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_single_support_reaches_its_numbers(lift):
+    motion, run = lift
+    check_requirements(motion, run, lifted=motion.stances[1].lifted)
+    height = run.measurement.displacement["foot"][:, 2]
+    assert height[780] == pytest.approx(0.055, abs=1e-3)
+    assert run.measurement.displacement["left_hand"][780, 2] > 0.05
+
+
+def test_own_figures_agree_with_the_measurement(sway):
+    """Velocities integrate to the configurations, by MuJoCo's own integration."""
+    motion, run = sway
+    model = motion.robot.mj_model
+    own, _ = motion.robot.tree.dof_columns[0]
+    for k in (0, 300, 900):
+        full = np.zeros(model.nv)
+        a, b = (np.asarray(motion.robot.mujoco_qpos(run.q[i])) for i in (k, k + 1))
+        mujoco.mj_differentiatePos(model, full, DT, a, b)
+        np.testing.assert_allclose(full[own], run.v[k], atol=1e-9)
+
+
+def test_demo_writes_every_file(short):
+    folder, summary, _ = short
+    assert {p.name for p in folder.iterdir()} >= {"motion.gif", "comparison.png", "motion.npz", "report.json"}
+    assert json.loads((folder / "report.json").read_text()) == summary
+    assert set(summary["files"]) <= {p.name for p in folder.iterdir()}
+    assert summary["versions"]["mujoco"] == mujoco.__version__
+
+
+def test_report_agrees_with_mujoco(short, nao):
+    folder, summary, _ = short
+    arrays = np.load(folder / "motion.npz")
+    q, v = arrays["q_weighted"], arrays["v_weighted"]
+    assert q.shape == (101, nao.nq) and v.shape == (100, nao.nv)
+    data = list(look_all(nao, q))
+    figures = summary["schemes"]["weighted"]
+    for foot in ("l_sole", "r_sole"):
+        drift = max(np.linalg.norm(d.site(foot).xpos - data[0].site(foot).xpos) for d in data)
+        assert figures["standing"][foot]["position_mm"] == pytest.approx(1e3 * drift, rel=1e-9, abs=1e-12)
+    hull = ConvexHull(corners(data[0], "l_sole", "r_sole")).equations
+    margin = min(-np.max(hull[:, :2] @ d.subtree_com[1][:2] + hull[:, 2]) for d in data)
+    assert figures["balance"]["least_margin_mm"] == pytest.approx(1e3 * margin, rel=1e-9)
+    assert figures["balance"]["ticks_outside"] == 0
+    assert figures["limits"]["position_violations"] == figures["limits"]["velocity_violations"] == 0
+    limit = np.asarray(nao.velocity_limit)
+    margin = 1.0 - np.max(np.abs(v[:, np.isfinite(limit)]) / limit[np.isfinite(limit)])
+    assert figures["limits"]["least_velocity_margin"] == pytest.approx(margin, abs=1e-6)
+
+
+def test_table_tells_violations(short):
+    _, summary, _ = short
+    broken = json.loads(json.dumps(summary))
+    broken["schemes"]["weighted"]["limits"]["position_violations"] = 7
+    cells = [cell for column in demo.table(broken).columns for cell in column.cells]
+    assert "[red]7[/red]" in cells
+
+
+def test_feet_and_hands_are_guessed(nao):
+    assert demo.guess_feet(nao) == ("l_sole", "r_sole")
+    assert demo.guess_moving_frame(nao) == "torso"
+    assert demo.guess_moving_frame(osik.load_robot("arm7")) == "hand"
+
+
+def test_unknown_schemes_are_refused():
+    with pytest.raises(KeyError, match="hierarchical"):
+        demo.make_scheme("magic")
