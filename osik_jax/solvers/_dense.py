@@ -7,10 +7,10 @@ from jaxtyping import Array, Float
 
 
 def product(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
-    """a b."""
+    """The matrix a b."""
     return jnp.matmul(a, b, precision="highest")
 
 
 def apply(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """a x."""
+    """The vector a x."""
     return jnp.matmul(a, x, precision="highest")

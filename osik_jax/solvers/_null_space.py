@@ -2,8 +2,8 @@
 
     v_k = v_{k-1} + (J_k P_{k-1})^+ (b_k - J_k v_{k-1}),    P_k = P_{k-1} - (J_k P_{k-1})^+ (J_k P_{k-1})
 
-with the Moore-Penrose inverse, singular values below a relative tolerance cut off. Damping acts on the motion term
-alone; in the projector it would break idempotency, and lower levels would leak into higher ones.
+with the Moore-Penrose inverse, singular values below a share of the level's own size cut off. Damping acts on the
+motion term alone; in the projector it would break idempotency, and lower levels would leak into higher ones.
 
 When not to use it: where bounds or inequalities have to hold (``solve_hqp``). An inequality row takes part only
 while the levels above it leave it violated, and nothing keeps lower levels from violating it again.
@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.scipy.linalg
 from jaxtyping import Array, Float, Int
@@ -41,6 +42,7 @@ class NullSpaceSolution(eqx.Module):
     projector: Float[Array, "n n"]
 
 
+@jax.jit
 def solve_nullspace(
     levels: Sequence[Level],
     *,
@@ -48,14 +50,17 @@ def solve_nullspace(
     damping: Float[Array, ""] | float = 0.0,
     rank_tolerance: Float[Array, ""] | float | None = None,
 ) -> NullSpaceSolution:
-    """Each level as nearly as the null space of the levels before it allows; pure, batched by ``vmap``.
+    """Each level as nearly as the null space of the levels before it allows.
+
+    Pure, compiled on first use, batched by ``vmap``.
 
     Args:
         levels: highest priority first. A row with lower < upper counts only where the levels before leave it violated.
         secondary: motion projected onto the null space of all levels, such as a potential's descent. (n,)
         damping: of the motion of each level, in squared singular values: s / (s^2 + damping) stands for 1 / s.
-        rank_tolerance: singular values under this share of a level's largest count as zero; default 1e-10
-            (1e-5 in float32).
+        rank_tolerance: singular values of A P under this share of the Frobenius norm of A (P projects onto what the
+            levels before leave free) count as zero; default 1e-10 (1e-5 in float32). Against A and not A P, so that
+            a level which repeats one above it has rank 0, not the rank of its rounding.
     """
     n = levels[0].matrix.shape[1]
     dtype = jnp.result_type(*(level.matrix for level in levels))
@@ -83,10 +88,30 @@ def _project(
     value = apply(level.matrix, x)
     wanted = jnp.clip(value, level.lower, level.upper) - value
     counts = (level.lower == level.upper) | (wanted != 0.0)
-    restricted = product(jnp.where(counts[:, None], level.matrix, 0.0), projector)
-    inverse = jnp.linalg.pinv(restricted, rtol=cut)
+    rows = jnp.where(counts[:, None], level.matrix, 0.0)
+    restricted = product(rows, projector)
+    inverse = _pseudo_inverse(restricted, cut * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2)))
     motion = apply(inverse, wanted)
     # (I + damping X X')^-1 X has singular values s / (s^2 + damping), and damping may be 0
     shrink = jnp.eye(len(x), dtype=x.dtype) + damping * product(inverse, inverse.T)
     motion = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shrink, lower=True), motion)
     return x + motion, projector - product(inverse, restricted)
+
+
+@jax.custom_jvp
+def _pseudo_inverse(matrix: Float[Array, "m n"], cutoff: Float[Array, ""]) -> Float[Array, "n m"]:
+    """Moore-Penrose inverse, singular values up to the cutoff left out. Derivatives are those at constant rank."""
+    u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
+    inverse = jnp.where(s > cutoff, 1.0 / jnp.where(s > cutoff, s, 1.0), 0.0)
+    return product(vt.T * inverse, u.T)
+
+
+@_pseudo_inverse.defjvp
+def _pseudo_inverse_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    """G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973."""
+    (a, cutoff), (da, _) = primals, tangents
+    inverse = _pseudo_inverse(a, cutoff)
+    wide = product(inverse, product(inverse.T, da.T))
+    tall = product(product(da.T, inverse.T), inverse)
+    out = wide - product(product(wide, a), inverse) + tall - product(inverse, product(a, tall))
+    return inverse, out - product(product(inverse, da), inverse)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._dense import apply, product
 from .._status import Status
@@ -20,10 +21,11 @@ _DEFAULTS = {
 }
 
 
+@partial(jax.jit, static_argnames="max_iterations")
 def solve_hqp(
     levels: Sequence[Level],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
+    lower: Float[ArrayLike, " n"],
+    upper: Float[ArrayLike, " n"],
     *,
     max_iterations: int | None = None,
     tolerances: Tolerances | None = None,
@@ -32,7 +34,7 @@ def solve_hqp(
 
     w_k is the (weighted) distance of the level's rows A_k x to their intervals [lower_k, upper_k]; the box
     ``lower <= x <= upper`` is hard at every level. What freedom is left after the last level goes into the smallest
-    |x|, so that the answer is unique. Pure, and batched by ``vmap``.
+    |x|, so that the answer is unique. Pure, compiled on first use, and batched by ``vmap``.
 
     A row violated at its optimum, and every hard row with a nonzero multiplier, is tight on the whole face of
     minimisers: it is frozen as an equality before the next level and eliminated by its null space.

@@ -72,7 +72,9 @@ def solve_level(
     """Minimises the distance of the level's rows to their intervals, from a feasible start.
 
     Args:
-        matrix, lower, upper: the level's rows, weights multiplied in.
+        matrix: the level's rows, weights multiplied in.
+        lower: of the rows.
+        upper: of the rows.
         hard: rows that must stay in their intervals.
         projector: onto the null space of the frozen rows.
         start: feasible x, and hard rows held at the start (independent of each other and of the frozen ones).
@@ -111,7 +113,9 @@ def rounding(
     return tolerances.step * (scale * jnp.max(jnp.abs(x)) + jnp.sqrt(jnp.sum(slack**2)))
 
 
-def independent(hard: Hard, side: Int[Array, " h"], projector: Float[Array, "n n"], rank: Array) -> Int[Array, " h"]:
+def independent(
+    hard: Hard, side: Int[Array, " h"], projector: Float[Array, "n n"], rank: Array | float
+) -> Int[Array, " h"]:
     """``side`` without the rows that depend on frozen rows or on held rows before them."""
     held = _factor_held(hard, side, projector)
     length = jnp.sqrt(jnp.sum(hard.matrix[held.rows] ** 2, -1))
@@ -119,7 +123,7 @@ def independent(hard: Hard, side: Int[Array, " h"], projector: Float[Array, "n n
     return jnp.zeros_like(side).at[held.rows].set(jnp.where(keep, side[held.rows], 0))
 
 
-def row_space(rows: Float[Array, "m n"], projector: Float[Array, "n n"], rank: Array) -> Float[Array, "n k"]:
+def row_space(rows: Float[Array, "m n"], projector: Float[Array, "n n"], rank: Array | float) -> Float[Array, "n k"]:
     """Orthonormal basis (0 columns beyond the rank) of what the rows span inside the projector's range."""
     length = jnp.sqrt(jnp.sum(rows**2, -1, keepdims=True))
     unit = rows / jnp.where(length > 0.0, length, 1.0)
@@ -145,7 +149,7 @@ def _least_squares_step(
     projector: Float[Array, "n n"],
     threshold: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """d in the projector's range that minimises |A d + slack| over the rows that count; small pivots are cut off."""
+    """Minimises |A d + slack| over d in the projector's range and the rows that count; small pivots are cut off."""
     n = projector.shape[0]
     if not matrix.shape[0]:
         return jnp.zeros(n, projector.dtype)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 
 class Level(eqx.Module):
@@ -22,7 +23,13 @@ class Level(eqx.Module):
     upper: Float[Array, " m"]
     weight: Float[Array, " m"] | None = None
 
-    def __init__(self, matrix: ArrayLike, lower: ArrayLike, upper: ArrayLike, weight: ArrayLike | None = None):
+    def __init__(
+        self,
+        matrix: ArrayLike | Array,
+        lower: ArrayLike | Array,
+        upper: ArrayLike | Array,
+        weight: ArrayLike | Array | None = None,
+    ):
         self.matrix = jnp.asarray(matrix)
         self.lower = jnp.asarray(lower, self.matrix.dtype)
         self.upper = jnp.asarray(upper, self.matrix.dtype)

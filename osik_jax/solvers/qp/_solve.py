@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._status import Status
 from ._dual_active_set import ActiveSet, find_active_set
@@ -15,22 +17,23 @@ _VIOLATION = {jnp.dtype("float64"): 1e-12, jnp.dtype("float32"): 1e-6}
 _FEASIBLE = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
 
 
+@partial(jax.jit, static_argnames="max_iterations")
 def solve_qp(
-    hessian: Float[Array, "n n"],
-    gradient: Float[Array, " n"],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
-    rows: Float[Array, "p n"] | None = None,
-    rows_lower: Float[Array, " p"] | None = None,
-    rows_upper: Float[Array, " p"] | None = None,
+    hessian: Float[ArrayLike, "n n"],
+    gradient: Float[ArrayLike, " n"],
+    lower: Float[ArrayLike, " n"],
+    upper: Float[ArrayLike, " n"],
+    rows: Float[ArrayLike, "p n"] | None = None,
+    rows_lower: Float[ArrayLike, " p"] | None = None,
+    rows_upper: Float[ArrayLike, " p"] | None = None,
     *,
     max_iterations: int | None = None,
     tolerance: float | None = None,
 ) -> QPSolution:
-    """min 1/2 x'Hx + g'x  subject to  lower <= x <= upper,  rows_lower <= rows x <= rows_upper.
+    """Minimises 1/2 x'Hx + g'x  subject to  lower <= x <= upper,  rows_lower <= rows x <= rows_upper.
 
-    Pure, and batched by ``vmap``. Derivatives with respect to every array, in both modes, are those of the solution
-    map at its active set.
+    Pure, compiled on first use, and batched by ``vmap``. Derivatives with respect to every array, in both modes, are
+    those of the solution map at its active set.
 
     Args:
         hessian: H, symmetric positive definite. (n, n)
@@ -51,21 +54,22 @@ def solve_qp(
     return _solve(qp, lambda x: qp.hessian @ x + qp.gradient, max_iterations, tolerance)
 
 
+@partial(jax.jit, static_argnames="max_iterations")
 def solve_least_squares_qp(
-    matrix: Float[Array, "m n"],
-    target: Float[Array, " m"],
-    weight: Float[Array, " m"],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
-    rows: Float[Array, "p n"] | None = None,
-    rows_lower: Float[Array, " p"] | None = None,
-    rows_upper: Float[Array, " p"] | None = None,
+    matrix: Float[ArrayLike, "m n"],
+    target: Float[ArrayLike, " m"],
+    weight: Float[ArrayLike, " m"],
+    lower: Float[ArrayLike, " n"],
+    upper: Float[ArrayLike, " n"],
+    rows: Float[ArrayLike, "p n"] | None = None,
+    rows_lower: Float[ArrayLike, " p"] | None = None,
+    rows_upper: Float[ArrayLike, " p"] | None = None,
     *,
-    damping: Float[Array, ""] | float = 1e-9,
+    damping: Float[ArrayLike, "..."] = 1e-9,
     max_iterations: int | None = None,
     tolerance: float | None = None,
 ) -> QPSolution:
-    """min 1/2 sum_i weight_i (matrix_i x - target_i)^2 + 1/2 damping |x|^2  under the constraints of ``solve_qp``.
+    """Minimises 1/2 sum_i weight_i (matrix_i x - target_i)^2 + 1/2 damping |x|^2, constrained as in ``solve_qp``.
 
     The factored form: the answer is refined against residuals of the matrix itself, so that small weights survive
     beside large ones.
@@ -75,7 +79,13 @@ def solve_least_squares_qp(
         target: b. (m,)
         weight: of the squared residuals, >= 0. (m,)
         damping: > 0; makes the answer unique. A scalar or one per variable (n,).
-        lower, upper, rows, rows_lower, rows_upper, max_iterations, tolerance: as in ``solve_qp``.
+        lower: as in ``solve_qp``, and so are the following.
+        upper: of the box. (n,)
+        rows: general constraints. (p, n)
+        rows_lower: of the rows. (p,)
+        rows_upper: of the rows. (p,)
+        max_iterations: cap on changes of the active set (static).
+        tolerance: relative violation that counts as none.
     """
     matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)
     diagonal = jnp.broadcast_to(jnp.asarray(damping, matrix.dtype), matrix.shape[1:])
@@ -93,11 +103,11 @@ def solve_least_squares_qp(
 def _problem(
     hessian: Array,
     gradient: Array,
-    lower: Array,
-    upper: Array,
-    rows: Array | None,
-    rows_lower: Array | None,
-    rows_upper: Array | None,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    rows: ArrayLike | None,
+    rows_lower: ArrayLike | None,
+    rows_upper: ArrayLike | None,
 ) -> QP:
     """The problem as one stack of constraints; shapes are checked here."""
     n, dtype = gradient.shape[0], hessian.dtype
@@ -122,11 +132,11 @@ def _problem(
 
 def _solve(qp: QP, cost_gradient: Gradient, max_iterations: int | None, tolerance: float | None) -> QPSolution:
     n, m = qp.gradient.shape[0], qp.lower.shape[0]
-    tolerance = jnp.asarray(_VIOLATION[qp.hessian.dtype] if tolerance is None else tolerance, qp.hessian.dtype)
+    allowed = jnp.asarray(_VIOLATION[qp.hessian.dtype] if tolerance is None else tolerance, qp.hessian.dtype)
     sane = _finite(qp)
     safe = _replace_where(~sane, qp)
     found = jax.lax.stop_gradient(
-        find_active_set(jax.lax.stop_gradient(safe), 10 * m if max_iterations is None else max_iterations, tolerance)
+        find_active_set(jax.lax.stop_gradient(safe), 10 * m if max_iterations is None else max_iterations, allowed)
     )
     x, y = solve_active_set(safe, found.active, cost_gradient)
     finite = sane & jnp.isfinite(x).all() & jnp.isfinite(y).all()

@@ -1,0 +1,61 @@
+"""Recorded problems with oracle answers: a subset in tests/data, or all of them from the folder in OSIK_REFERENCE."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+DATA = Path(__file__).parent / "data"
+FULL = os.environ.get("OSIK_REFERENCE")
+QP_DAMPING = 1e-9
+
+
+class RecordedQPs(NamedTuple):
+    """Whole-body QPs, min 1/2 |A x - b|^2 + damping/2 |x|^2 in a box, solved by daqp and polished in float64."""
+
+    A: np.ndarray
+    b: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    solution: np.ndarray
+    regime: np.ndarray  # 0 standard run, 1 tight velocity limits, 2 near joint limits, 3 stretched legs
+
+
+def recorded_qps(robot: str) -> RecordedQPs:
+    """128 problems of ``robot`` ("g1" or "nao"), or all 1,024."""
+    if FULL:
+        z = np.load(Path(FULL) / f"qps_{robot}.npz")
+        return RecordedQPs(*(z[k] for k in ("A", "b", "lb", "ub", "solution", "regime")))
+    z = np.load(DATA / f"qps_{robot}.npz")
+    count, _, n = z["A"].shape
+    posture = np.zeros((n - 6, n))
+    posture[:, 6:] = 0.05 * np.eye(n - 6)
+    A = np.concatenate([z["A"], np.broadcast_to(posture, (count, *posture.shape))], 1)
+    return RecordedQPs(A, *(z[k] for k in ("b", "lb", "ub", "solution", "regime")))
+
+
+class RecordedHierarchies(NamedTuple):
+    """NAO's feet, CoM (inequality), hand and posture; residual norms of each level certified in float64."""
+
+    levels: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # matrix, lower, upper, batched
+    lower: np.ndarray
+    upper: np.ndarray
+    residual_norm: np.ndarray  # (256, 4)
+    kind: np.ndarray  # 0 easy, 1 conflicting, 2 near-singular stretched legs, 3 unreachable
+
+
+def recorded_hierarchies(unit_rows: bool) -> RecordedHierarchies:
+    """All 256 hierarchies, rows as they are or scaled to unit length."""
+    z = np.load(DATA / "hqp_nao.npz")
+    posture = np.zeros((26, 32))
+    posture[:, 6:] = np.eye(26)
+    matrices = [z["A1"], z["A2"], z["A3"], np.broadcast_to(posture, (len(z["lb"]), 26, 32))]
+    levels = []
+    for k, A in enumerate(matrices, 1):
+        length = np.linalg.norm(A, axis=2) if unit_rows else np.ones(A.shape[:2])
+        levels.append((A / length[..., None], z[f"lower{k}"] / length, z[f"upper{k}"] / length))
+    norm = z["residual_norm_unit_rows" if unit_rows else "residual_norm"]
+    return RecordedHierarchies(levels, z["lb"], z["ub"], norm, z["kind"])

@@ -1,0 +1,137 @@
+"""The array-level hierarchy against certified level norms, quadprog, and its own lexicographic promise."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import quadprog
+from recorded import recorded_hierarchies
+
+from osik_jax.solvers import Level, Status, solve_hqp
+
+batched_hqp = jax.jit(jax.vmap(lambda levels, lower, upper: solve_hqp([Level(*a) for a in levels], lower, upper)))
+IMPROVED = 239
+"""A recorded hierarchy whose second level is not at its optimum; see the last assertion of the test."""
+
+
+@pytest.mark.parametrize("unit_rows", [False, True])
+def test_recorded_hierarchies(unit_rows):
+    r = recorded_hierarchies(unit_rows)
+    s = batched_hqp(r.levels, r.lower, r.upper)
+    assert (s.status == Status.SOLVED).all()
+    assert ((r.lower <= s.x) & (s.x <= r.upper)).all()
+    norms = np.stack([np.linalg.norm(w, axis=1) for w in s.slacks], 1)
+    off = np.abs(norms - r.residual_norm).max(1) > 1e-7
+    assert off.sum() == (0 if unit_rows else 1)
+    if not unit_rows:
+        assert off[IMPROVED]
+        assert abs(norms[IMPROVED, 0] - r.residual_norm[IMPROVED, 0]) < 1e-12
+        assert norms[IMPROVED, 1] < r.residual_norm[IMPROVED, 1] - 1e-5
+        x = np.asarray(s.x)[IMPROVED]
+        np.testing.assert_allclose(norms[IMPROVED, 1], second_level_by_quadprog(r, IMPROVED, x), atol=2e-8)
+
+
+def second_level_by_quadprog(r, i, x):
+    """Smallest |w_2| over the box and {A_1 y = A_1 x}."""
+    (A1, *_), (A2, low, high) = (tuple(a[i] for a in level) for level in r.levels[:2])
+    n, m = A1.shape[1], len(A2)
+    bounded = np.isfinite(r.lower[i])
+    E = np.eye(n)[bounded]
+    pad = np.zeros((len(E), m))
+    G = np.vstack(
+        [
+            np.hstack([A1, np.zeros((len(A1), m))]),
+            np.hstack([E, pad]),
+            np.hstack([-E, pad]),
+            np.hstack([A2, np.eye(m)]),
+            np.hstack([-A2, -np.eye(m)]),
+        ]
+    )
+    h = np.concatenate([A1 @ x, r.lower[i][bounded] - 1e-12, -r.upper[i][bounded] - 1e-12, low, -high])
+    H = np.diag(np.r_[np.full(n, 1e-9), np.ones(m)])
+    y = quadprog.solve_qp(H, np.zeros(n + m), G.T, h, len(A1))[0]
+    return np.linalg.norm(y[n:])
+
+
+def pinv_cascade(levels):
+    """Eq. 7 in NumPy, for equality levels without bounds."""
+    n = levels[0][0].shape[1]
+    x, P = np.zeros(n), np.eye(n)
+    for A, b in levels:
+        inverse = np.linalg.pinv(A @ P, rcond=1e-9)
+        x, P = x + inverse @ (b - A @ x), P - inverse @ (A @ P)
+    return x
+
+
+def test_equalities_without_active_bounds_are_the_null_space_cascade(rng):
+    n, sizes = 14, (4, 3, 5)
+    solve = jax.jit(lambda ls: solve_hqp([Level(A, b, b) for A, b in ls], jnp.full(n, -jnp.inf), jnp.full(n, jnp.inf)))
+    for _ in range(30):
+        levels = [(rng.normal(size=(m, n)), rng.normal(size=m)) for m in sizes]
+        levels[1][0][2] = levels[0][0][0] + levels[0][0][1]  # a row that conflicts with the first level
+        s = solve(levels)
+        np.testing.assert_allclose(s.x, pinv_cascade(levels), atol=1e-9)
+        for (A, b), w in zip(levels, s.slacks, strict=True):
+            np.testing.assert_allclose(w, A @ s.x - b, atol=1e-12)
+
+
+def test_no_feasible_step_improves_a_level_without_hurting_a_higher_one(rng):
+    r = recorded_hierarchies(False)
+    take = np.arange(3, 256, 16)
+    s = batched_hqp([tuple(a[take] for a in level) for level in r.levels], r.lower[take], r.upper[take])
+
+    def costs(i, x):
+        out = []
+        for A, low, high in r.levels:
+            value = A[i] @ x
+            out.append(np.sum((value - np.clip(value, low[i], high[i])) ** 2))
+        return np.array(out)
+
+    for k, i in enumerate(take):
+        x = np.asarray(s.x)[k]
+        base = costs(i, x)
+        for _ in range(200):
+            step = rng.normal(size=32) * 10 ** rng.uniform(-6, -2)
+            y = np.clip(x + step, r.lower[i], r.upper[i])
+            change = costs(i, y) - base
+            worse = np.flatnonzero(np.abs(change) > 1e-13)
+            assert len(worse) == 0 or change[worse[0]] > 0
+
+
+def test_inequalities_at_any_level_and_weights_inside_a_level():
+    box = jnp.full(2, 5.0)
+    inequality_first = [Level([[1.0, 1.0]], [-jnp.inf], [1.0]), Level(jnp.eye(2), [2.0, 2.0], [2.0, 2.0])]
+    np.testing.assert_allclose(solve_hqp(inequality_first, -box, box).x, [0.5, 0.5], atol=1e-12)
+    inequality_last = [Level([[1.0, 0.0]], [2.0], [2.0]), Level([[1.0, 1.0], [0.0, 1.0]], [-jnp.inf, -1.0], [1.0, 3.0])]
+    s = solve_hqp(inequality_last, -box, box)
+    np.testing.assert_allclose(s.x, [2.0, -1.0], atol=1e-12)
+    np.testing.assert_allclose(s.slacks[1], [0.0, 0.0], atol=1e-12)
+    conflict = [Level([[1.0], [1.0]], [0.0, 1.0], [0.0, 1.0], weight=[1.0, 3.0])]
+    np.testing.assert_allclose(solve_hqp(conflict, -box[:1], box[:1]).x, [0.75], atol=1e-12)
+    off = [Level([[1.0], [1.0]], [0.0, 1.0], [0.0, 1.0], weight=[1.0, 0.0])]
+    np.testing.assert_allclose(solve_hqp(off, -box[:1], box[:1]).x, [0.0], atol=1e-12)
+
+
+def test_level_without_rows_and_pinned_variables():
+    levels = [Level(jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0)), Level(jnp.ones((1, 3)), [6.0], [6.0])]
+    s = solve_hqp(levels, jnp.array([1.0, -jnp.inf, -10.0]), jnp.array([1.0, jnp.inf, 2.0]))
+    np.testing.assert_allclose(s.x, [1.0, 3.0, 2.0], atol=1e-12)
+    assert s.x[0] == 1.0 and s.active[0] == 2 and s.active[2] == 1
+
+
+def test_a_bad_lane_leaves_its_neighbours_alone():
+    r = recorded_hierarchies(False)
+    take = np.arange(0, 256, 16)
+    levels = [[a[take].copy() for a in level] for level in r.levels]
+    good = batched_hqp([tuple(level) for level in levels], r.lower[take], r.upper[take])
+    levels[2][1][4, 0] = levels[2][2][4, 0] = np.nan
+    s = batched_hqp([tuple(level) for level in levels], r.lower[take], r.upper[take])
+    assert s.status[4] == Status.NUMERICAL_ERROR
+    assert np.isfinite(s.x[4]).all() and ((r.lower[take][4] <= s.x[4]) & (s.x[4] <= r.upper[take][4])).all()
+    others = np.arange(len(take)) != 4
+    np.testing.assert_array_equal(np.asarray(s.x)[others], np.asarray(good.x)[others])
+
+
+def test_shapes_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match=r"lower has shape \(3,\)"):
+        Level(jnp.ones((2, 4)), jnp.zeros(3), jnp.zeros(2))

@@ -1,0 +1,167 @@
+"""The array-level QP against recorded daqp answers, quadprog, daqp and KKT conditions recomputed in NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import quadprog
+from recorded import QP_DAMPING, recorded_qps
+
+from osik_jax.solvers import Status, raise_if_failed, solve_least_squares_qp, solve_qp
+
+batched_qp = jax.jit(jax.vmap(solve_qp))
+batched_rows = jax.jit(jax.vmap(lambda *a: solve_qp(*a)))
+batched_least_squares = jax.jit(
+    jax.vmap(lambda A, b, w, lo, hi: solve_least_squares_qp(A, b, w, lo, hi, damping=QP_DAMPING))
+)
+
+
+def kkt(H, g, lower, upper, x, C=None, row_lower=None, row_upper=None, y=None):
+    """Largest violation of the optimality conditions, recomputed: feasibility, stationarity, signs."""
+    normals = np.eye(len(x)) if C is None else np.vstack([np.eye(len(x)), C])
+    low = lower if row_lower is None else np.concatenate([lower, row_lower])
+    high = upper if row_upper is None else np.concatenate([upper, row_upper])
+    z = H @ x + g if C is None else np.concatenate([H @ x + g - C.T @ y, y])
+    s = normals @ x
+    stationarity = np.abs(H @ x + g - normals.T @ z).max()
+    pushed_up = np.where((z > 0) & (s > low + 1e-8), z, 0.0)  # a multiplier where the lower bound is not active
+    pushed_down = np.where((z < 0) & (s < high - 1e-8), -z, 0.0)
+    return max(stationarity, (low - s).max(), (s - high).max(), pushed_up.max(), pushed_down.max())
+
+
+@pytest.mark.parametrize("robot", ["g1", "nao"])
+def test_recorded_qps_in_both_forms(robot):
+    p = recorded_qps(robot)
+    H = np.einsum("bmi,bmj->bij", p.A, p.A) + QP_DAMPING * np.eye(p.A.shape[2])
+    g = -np.einsum("bmi,bm->bi", p.A, p.b)
+    answers = (
+        batched_qp(H, g, p.lower, p.upper),
+        batched_least_squares(p.A, p.b, np.ones_like(p.b), p.lower, p.upper),
+    )
+    for s in answers:
+        assert (s.status == Status.SOLVED).all()
+        np.testing.assert_allclose(s.x, p.solution, atol=1e-9)
+        assert ((p.lower <= s.x) & (s.x <= p.upper)).all()
+        x = np.asarray(s.x)
+        assert max(kkt(*args) for args in zip(H, g, p.lower, p.upper, x, strict=True)) < 1e-9
+        assert (np.asarray(s.iterations)[p.regime == 0] == 0).all()  # no active bound: the first guess is the answer
+
+
+def planted(rng, n, p, equalities):
+    """A strictly convex QP whose solution and multipliers are drawn first."""
+    B = rng.normal(size=(n, n))
+    H = B @ B.T + 0.1 * np.eye(n)
+    x = rng.normal(size=n)
+    C = rng.normal(size=(p, n))
+    z = rng.normal(size=n) * (rng.random(n) < 0.3)
+    y = rng.normal(size=p) * (rng.random(p) < 0.4)
+    y[:equalities] = rng.normal(size=equalities)
+    lower = np.where(z > 0, x, x - rng.exponential(size=n))
+    upper = np.where(z < 0, x, x + rng.exponential(size=n))
+    lower[rng.random(n) < 0.2] = -np.inf
+    lower = np.where(z > 0, x, lower)
+    s = C @ x
+    row_lower = np.where(y > 0, s, s - rng.exponential(size=p))
+    row_upper = np.where(y < 0, s, s + rng.exponential(size=p))
+    row_lower[:equalities] = row_upper[:equalities] = s[:equalities]
+    g = -(H @ x) + z + C.T @ y
+    return H, g, lower, upper, C, row_lower, row_upper, x
+
+
+def test_planted_solutions_with_equalities_and_two_sided_rows(rng):
+    n, p = 12, 8
+    problems = [planted(rng, n, p, equalities=3) for _ in range(300)]
+    *data, x = (np.stack(a) for a in zip(*problems, strict=True))
+    s = batched_rows(*data)
+    raise_if_failed(s)
+    np.testing.assert_allclose(s.x, x, atol=1e-8)
+    y = np.asarray(s.row_multipliers)
+    for i, (H, g, lower, upper, C, row_lower, row_upper, _) in enumerate(problems):
+        assert kkt(H, g, lower, upper, np.asarray(s.x)[i], C, row_lower, row_upper, y[i]) < 1e-8
+
+
+def test_random_inequalities_against_quadprog(rng):
+    n, p = 12, 8
+    for _ in range(40):
+        H, g, lower, upper, C, _, _, _ = planted(rng, n, p, equalities=0)
+        lower, upper = np.full(n, -3.0), np.full(n, 3.0)
+        G = np.vstack([np.eye(n), -np.eye(n), C])
+        h = np.concatenate([lower, -upper, np.full(p, -0.5)])
+        expected = quadprog.solve_qp(H, -g, G.T, h)[0]
+        s = solve_qp(H, g, lower, upper, C, jnp.full(p, -0.5), jnp.full(p, jnp.inf))
+        assert s.status == Status.SOLVED
+        np.testing.assert_allclose(s.x, expected, atol=1e-8)
+
+
+def test_pinned_variables_and_duplicated_rows(rng):
+    H, g, *_ = planted(rng, 6, 0, 0)
+    lower = np.full(6, -np.inf)
+    lower[2] = 0.7
+    upper = np.where(np.arange(6) == 2, 0.7, np.inf)
+    C = np.vstack([np.ones(6), np.ones(6), 2 * np.ones(6)])
+    s = solve_qp(H, g, lower, upper, C, jnp.array([1.0, 1.0, 2.0]), jnp.array([1.0, 1.0, 2.0]))
+    assert s.status == Status.SOLVED
+    K = np.zeros((8, 8))
+    K[:6, :6], K[6, :6], K[:6, 6], K[7, 2], K[2, 7] = H, 1.0, 1.0, 1.0, 1.0
+    expected = np.linalg.solve(K, np.concatenate([-g, [1.0, 0.7]]))[:6]
+    np.testing.assert_allclose(s.x, expected, atol=1e-9)
+    assert s.x[2] == 0.7
+
+
+def test_contradictions_are_infeasible_and_leave_the_box_alone(rng):
+    H, g, *_ = planted(rng, 6, 0, 0)
+    C = np.ones((2, 6))
+    s = solve_qp(H, g, -np.ones(6), np.ones(6), C, jnp.array([1.0, 2.0]), jnp.array([1.0, 2.0]))
+    assert s.status == Status.INFEASIBLE
+    assert np.isfinite(s.x).all() and (np.abs(s.x) <= 1.0).all()
+    with pytest.raises(RuntimeError, match="INFEASIBLE in 1 of 1 lanes"):
+        raise_if_failed(s)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_lane_leaves_its_neighbours_alone(bad):
+    p = recorded_qps("nao")
+    A, b = p.A[:64:9].copy(), p.b[:64:9]
+    args = (b, np.ones_like(b), p.lower[:64:9], p.upper[:64:9])
+    good = batched_least_squares(A, *args)
+    A[3, 5, 2] = bad
+    s = batched_least_squares(A, *args)
+    assert s.status[3] == Status.NUMERICAL_ERROR
+    assert np.isfinite(s.x[3]).all() and ((args[2][3] <= s.x[3]) & (s.x[3] <= args[3][3])).all()
+    others = np.arange(len(A)) != 3
+    np.testing.assert_array_equal(np.asarray(s.x)[others], np.asarray(good.x)[others])
+    with pytest.raises(RuntimeError, match=r"NUMERICAL_ERROR in 1 of 8 lanes \(\(3,\)\)"):
+        raise_if_failed(s)
+
+
+def test_derivatives_are_those_of_the_solution_map(rng):
+    H, g, lower, upper, C, row_lower, row_upper, _ = planted(rng, 8, 4, equalities=2)
+    a = (H, g, lower, upper, C, row_lower, row_upper)
+    weights = rng.normal(size=8)
+    loss = jax.jit(lambda args: jnp.dot(weights, jnp.sin(solve_qp(*args).x)))
+    reverse = jax.jit(jax.grad(loss))(a)
+    for k in range(len(a)):
+        direction = rng.normal(size=a[k].shape)
+        if k == 0:
+            direction = direction + direction.T
+        if k in (3, 6):  # keep equalities equal: move both bounds together
+            continue
+        tangents = [np.zeros_like(x) for x in a]
+        tangents[k] = np.where(np.isfinite(a[k]), direction, 0.0)
+        if k == 5:
+            tangents[6] = np.where(row_lower == row_upper, tangents[5], 0.0)
+        moved = [tuple(x + sign * 1e-6 * t for x, t in zip(a, tangents, strict=True)) for sign in (1, -1)]
+        expected = (loss(moved[0]) - loss(moved[1])) / 2e-6
+        forward = jax.jvp(loss, (a,), (tuple(tangents),))[1]
+        backward = sum(np.vdot(r, t) for r, t in zip(reverse, tangents, strict=True))
+        np.testing.assert_allclose(forward, expected, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(backward, forward, rtol=1e-9, atol=1e-12)
+
+
+def test_shapes_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match="rows_lower and rows_upper"):
+        solve_qp(jnp.eye(2), jnp.zeros(2), -jnp.ones(2), jnp.ones(2), jnp.ones((1, 2)))
+    with pytest.raises(ValueError, match=r"hessian has shape \(2, 2\)"):
+        solve_qp(jnp.eye(2), jnp.zeros(3), -jnp.ones(3), jnp.ones(3))
+    with pytest.raises(ValueError, match="bounds do not fit"):
+        solve_qp(jnp.eye(2), jnp.zeros(2), -jnp.ones(3), jnp.ones(2))
