@@ -14,10 +14,22 @@ IMPROVED = 239
 """A recorded hierarchy whose second level is not at its optimum; see the last assertion of the test."""
 
 
+def solved(r):
+    return batched_hqp(r.levels, r.lower, r.upper)
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    r = recorded_hierarchies(unit_rows=False)
+    return r, solved(r)
+
+
 @pytest.mark.parametrize("unit_rows", [False, True])
-def test_recorded_hierarchies(unit_rows):
-    r = recorded_hierarchies(unit_rows)
-    s = batched_hqp(r.levels, r.lower, r.upper)
+def test_recorded_hierarchies(unit_rows, recorded):
+    r, s = recorded
+    if unit_rows:
+        r = recorded_hierarchies(unit_rows)
+        s = solved(r)
     assert (s.status == Status.SOLVED).all()
     assert ((r.lower <= s.x) & (s.x <= r.upper)).all()
     norms = np.stack([np.linalg.norm(w, axis=1) for w in s.slacks], 1)
@@ -75,10 +87,8 @@ def test_equalities_without_active_bounds_are_the_null_space_cascade(rng):
             np.testing.assert_allclose(w, A @ s.x - b, atol=1e-12)
 
 
-def test_no_feasible_step_improves_a_level_without_hurting_a_higher_one(rng):
-    r = recorded_hierarchies(False)
-    take = np.arange(3, 256, 16)
-    s = batched_hqp([tuple(a[take] for a in level) for level in r.levels], r.lower[take], r.upper[take])
+def test_no_feasible_step_improves_a_level_without_hurting_a_higher_one(rng, recorded):
+    r, s = recorded
 
     def costs(i, x):
         out = []
@@ -87,8 +97,8 @@ def test_no_feasible_step_improves_a_level_without_hurting_a_higher_one(rng):
             out.append(np.sum((value - np.clip(value, low[i], high[i])) ** 2))
         return np.array(out)
 
-    for k, i in enumerate(take):
-        x = np.asarray(s.x)[k]
+    for i in range(3, 256, 16):
+        x = np.asarray(s.x)[i]
         base = costs(i, x)
         for _ in range(200):
             step = rng.normal(size=32) * 10 ** rng.uniform(-6, -2)
@@ -119,16 +129,14 @@ def test_level_without_rows_and_pinned_variables():
     assert s.x[0] == 1.0 and s.active[0] == 2 and s.active[2] == 1
 
 
-def test_a_bad_lane_leaves_its_neighbours_alone():
-    r = recorded_hierarchies(False)
-    take = np.arange(0, 256, 16)
-    levels = [[a[take].copy() for a in level] for level in r.levels]
-    good = batched_hqp([tuple(level) for level in levels], r.lower[take], r.upper[take])
+def test_a_bad_lane_leaves_its_neighbours_alone(recorded):
+    r, good = recorded
+    levels = [tuple(a.copy() for a in level) for level in r.levels]
     levels[2][1][4, 0] = levels[2][2][4, 0] = np.nan
-    s = batched_hqp([tuple(level) for level in levels], r.lower[take], r.upper[take])
+    s = batched_hqp(levels, r.lower, r.upper)
     assert s.status[4] == Status.NUMERICAL_ERROR
-    assert np.isfinite(s.x[4]).all() and ((r.lower[take][4] <= s.x[4]) & (s.x[4] <= r.upper[take][4])).all()
-    others = np.arange(len(take)) != 4
+    assert np.isfinite(s.x[4]).all() and ((r.lower[4] <= s.x[4]) & (s.x[4] <= r.upper[4])).all()
+    others = np.arange(len(r.lower)) != 4
     np.testing.assert_array_equal(np.asarray(s.x)[others], np.asarray(good.x)[others])
 
 

@@ -19,8 +19,8 @@ batched_least_squares = jax.jit(
 def kkt(H, g, lower, upper, x, C=None, row_lower=None, row_upper=None, y=None):
     """Largest violation of the optimality conditions, recomputed: feasibility, stationarity, signs."""
     normals = np.eye(len(x)) if C is None else np.vstack([np.eye(len(x)), C])
-    low = lower if row_lower is None else np.concatenate([lower, row_lower])
-    high = upper if row_upper is None else np.concatenate([upper, row_upper])
+    low = lower if row_lower is None else np.r_[lower, row_lower]
+    high = upper if row_upper is None else np.r_[upper, row_upper]
     z = H @ x + g if C is None else np.concatenate([H @ x + g - C.T @ y, y])
     s = normals @ x
     stationarity = np.abs(H @ x + g - normals.T @ z).max()
