@@ -9,13 +9,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._joint_selection import scalar_layout
+from ._joint_selection import concrete, scalar_layout
 from .kinematics import forward_kinematics, integrate
 from .limits import ConfigurationLimit, Limit, limit_box
 from .robot import Robot
 from .schemes import Scheme, VelocityProblem
+from .solvers import Status
 from .tasks import Task
 
 Tasks = Mapping[str, Task]
@@ -30,10 +32,13 @@ class Solution(eqx.Module):
         velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. (nv,)
         status: a ``Status`` code.
         iterations: changes of the active set, all levels together.
-        kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``).
+        kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``); the
+            largest finite number where the status is NUMERICAL_ERROR.
         box_violation: how far v leaves its box [rad/s or m/s]; 0 but for ``NullSpace``.
         slack: of each task, J v minus the nearest point of its interval: what the task did not get. {name: (m,)}
         error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
+
+    All numbers are finite: what a NaN in the input spoils is 0, and the status says so.
     """
 
     velocity: Float[Array, " nv"]
@@ -70,8 +75,8 @@ def solve(
 ) -> Solution:
     """The velocity that serves the tasks best at configuration q.
 
-    Compiled on first use; changing any number (target, weight, gain, limit, dt, link length) compiles nothing. Pure,
-    so it can be used inside ``jit`` and batched by ``vmap`` over q and over any leaf of robot, tasks, scheme and limits.
+    Compiled on first use; changing any number (target, weight, gain, limit, dt, link length) compiles nothing. Pure, so
+    it can be used inside ``jit`` and batched by ``vmap`` over q and over any leaf of robot, tasks, scheme and limits.
 
     Args:
         robot: the robot.
@@ -85,11 +90,12 @@ def solve(
         The answer; never raises inside jit: look at ``status``, or call ``osik_jax.solvers.raise_if_failed`` outside.
 
     Raises:
-        ValueError: outside jit: q of the wrong length, not finite or with a quaternion of zeros; no task.
+        TypeError: something that is no task, scheme or limit.
+        ValueError: outside jit: q of the wrong length, not finite or with a quaternion of zeros; no task; dt <= 0.
     """
-    robot.check_configuration(q)
     _check_tasks(tasks)
-    return _solve(robot, jnp.asarray(q), dict(tasks), scheme, tuple(limits), dt)
+    _check_settings(scheme, limits, dt)
+    return _solve(robot, _configuration(robot, q), dict(tasks), scheme, tuple(limits), dt)
 
 
 @jax.jit
@@ -102,15 +108,20 @@ def _solve(
     )
     answer = scheme.solve(problem)
     v = answer.velocity
+    failed = answer.status == Status.NUMERICAL_ERROR
     return Solution(
         velocity=v,
         status=answer.status,
         iterations=answer.iterations,
-        kkt_residual=answer.kkt_residual,
-        box_violation=jnp.max(jnp.maximum(jnp.maximum(problem.lower - v, v - problem.upper), 0.0)),
-        slack=problem.slack(v),
-        error={name: rows.error for name, rows in problem.rows.items()},
+        kkt_residual=jnp.where(failed, jnp.finfo(v.dtype).max, answer.kkt_residual),
+        box_violation=jnp.max(_finite(jnp.maximum(jnp.maximum(problem.lower - v, v - problem.upper), 0.0))),
+        slack={name: _finite(slack) for name, slack in problem.slack(v).items()},
+        error={name: _finite(rows.error) for name, rows in problem.rows.items()},
     )
+
+
+def _finite(x: Array) -> Array:
+    return jnp.where(jnp.isfinite(x), x, 0.0)
 
 
 def rollout(
@@ -131,7 +142,8 @@ def rollout(
         robot: the robot.
         q0: start. (nq,)
         tasks: by name, or a function from time [s] to tasks (the same ones each time, with other numbers). A function
-            that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers without compiling.
+            that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers (arrays and
+            floats; integers are static) without compiling; any other function compiles once for each object.
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
         limits: joint position and velocity limits.
         dt: time of one tick [s].
@@ -139,29 +151,34 @@ def rollout(
         targets: targets of some tasks at each tick, by task name: what ``replace(target=...)`` takes, with a leading
             axis of length ``steps`` on every array.
         feedback: measured configurations: an array with one for each tick (steps, nq), or a function of time [s] and of
-            the configuration that the last tick led to, which returns the one measured. Default: no feedback.
+            the configuration that the last tick led to, which returns the one measured. Default: no feedback. The
+            trajectory holds where the ticks led, not what was measured.
 
     Returns:
-        The trajectory. A failed tick moves nothing it should not: look at ``solution.status``.
+        The trajectory. A tick that failed on a NaN moves nothing: look at ``solution.status``.
 
     Raises:
-        ValueError, KeyError: outside jit: q0 as in ``solve``; ``targets`` or ``feedback`` do not fit.
+        TypeError, ValueError: as in ``solve``; ``targets``, ``feedback`` or ``steps`` do not fit.
+        KeyError: ``targets`` names a task that does not exist.
     """
-    robot.check_configuration(q0)
+    _check_settings(scheme, limits, dt)
+    _check_steps(steps)
     if not callable(tasks):
         _check_tasks(tasks)
         _check_targets(tasks, targets, steps)
     elif targets is not None:
         raise ValueError("targets go with a dict of tasks; a function of time sets them itself")
-    if feedback is not None and not callable(feedback) and jnp.shape(feedback) != (steps, robot.nq):
-        raise ValueError(
-            f"feedback has shape {jnp.shape(feedback)}; it is one configuration a tick, {(steps, robot.nq)}"
-        )
-    numbers, structure = eqx.partition((tasks if callable(tasks) else dict(tasks), feedback), eqx.is_array)
+    if feedback is not None and not callable(feedback):
+        feedback = jnp.asarray(feedback)
+        if feedback.shape != (steps, robot.nq):
+            raise ValueError(
+                f"feedback has shape {feedback.shape}; it is one configuration a tick, {(steps, robot.nq)}"
+            )
+    numbers, structure = eqx.partition((tasks if callable(tasks) else dict(tasks), feedback), eqx.is_inexact_array_like)
     leaves, treedef = jax.tree.flatten(structure)
     return _rollout(
         robot,
-        jnp.asarray(q0),
+        _configuration(robot, q0),
         numbers,
         scheme,
         tuple(limits),
@@ -192,10 +209,10 @@ def _rollout(
     def tick(q: Array, now: tuple[Array, Targets | None, Array | None]) -> tuple[Array, tuple[Array, Solution]]:
         t, target, sensed = now
         if callable(feedback):
-            q = feedback(t, q)
+            q = _configuration(robot, feedback(t, q))
         elif sensed is not None:
-            q = sensed
-        todo = dict(tasks(t)) if callable(tasks) else _aim(tasks, target)
+            q = sensed.astype(q.dtype)
+        todo = _checked(tasks(t)) if callable(tasks) else _aim(tasks, target)
         solution = _solve(robot, q, todo, scheme, limits, dt)
         q = integrate(robot, q, solution.velocity, dt)
         return q, (q, solution)
@@ -230,12 +247,41 @@ def _velocity_problem(
     )
 
 
-def _check_tasks(tasks: Tasks) -> None:
+def _configuration(robot: Robot, q: Any) -> Float[Array, " nq"]:
+    """q, checked, as floats at least as precise as the robot's."""
+    robot.check_configuration(q)
+    q = jnp.asarray(q)
+    return q.astype(jnp.result_type(q, robot.q0))
+
+
+def _checked(tasks: Any) -> dict[str, Task]:
+    _check_tasks(tasks)
+    return dict(tasks)
+
+
+def _check_tasks(tasks: Any) -> None:
+    if not isinstance(tasks, Mapping):
+        raise TypeError(f"tasks is a {type(tasks).__name__}; it is a dict from names to tasks")
     if not tasks:
         raise ValueError("there is no task: give at least one, such as a PostureTask")
     for name, task in tasks.items():
         if not isinstance(task, Task):
             raise TypeError(f"tasks[{name!r}] is a {type(task).__name__}, not a Task")
+
+
+def _check_settings(scheme: Any, limits: Any, dt: Any) -> None:
+    if not isinstance(scheme, Scheme):
+        raise TypeError(f"scheme is {scheme!r}; it is a WeightedQP(), a NullSpace() or a HierarchicalQP()")
+    if isinstance(limits, Limit) or not all(isinstance(limit, Limit) for limit in limits):
+        raise TypeError(f"limits is {limits!r}; it is a sequence, such as (ConfigurationLimit(robot),)")
+    seen = concrete(dt)
+    if seen is not None and not ((seen > 0.0) & np.isfinite(seen)).all():
+        raise ValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
+
+
+def _check_steps(steps: Any) -> None:
+    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 0:
+        raise ValueError(f"steps is {steps!r}; it is the number of ticks, an integer")
 
 
 def _check_targets(tasks: Tasks, targets: Targets | None, steps: int) -> None:

@@ -21,13 +21,14 @@ class NullSpace(Scheme):
         damping: of each priority's motion: s / (s^2 + damping) stands for 1 / s; 0 allowed.
         potential_gain: alpha [rad^2/s]; 0 turns the potential off. It needs a ``ConfigurationLimit`` among the limits.
         margin: joints are taken to be at least this share of their range away from either limit.
-        rank_tolerance: singular values under this share of a level's largest count as zero.
+        rank_tolerance: singular values under this share of the size (Frobenius norm) of a level's weighted rows count
+            as zero.
     """
 
-    damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf)
-    potential_gain: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf)
-    margin: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf)
-    rank_tolerance: Float[Array, ""] = eqx.field(default=1e-5, converter=as_leaf)
+    damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
+    potential_gain: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("potential_gain"))
+    margin: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("margin"))
+    rank_tolerance: Float[Array, ""] = eqx.field(default=1e-5, converter=as_leaf("rank_tolerance"))
 
     def solve(self, problem: VelocityProblem) -> SchemeAnswer:
         """The velocity of one tick."""

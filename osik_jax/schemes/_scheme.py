@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..solvers import Level
 from ..tasks import TaskRows
+from ..tasks._leaves import as_scalar
 
 
 class VelocityProblem(eqx.Module):
@@ -71,6 +73,6 @@ class Scheme(eqx.Module):
         """The velocity of one tick."""
 
 
-def as_leaf(value: Array | float) -> Float[Array, ""]:
-    """A scheme's number as a traced leaf."""
-    return jnp.asarray(value, float)
+def as_leaf(name: str) -> Callable[[ArrayLike | Array], Float[Array, ""]]:
+    """Converter of a scheme's number to a traced leaf; negative or not finite raises ValueError with its name."""
+    return lambda value: as_scalar(value, name)

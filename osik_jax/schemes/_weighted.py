@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._joint_selection import concrete
 from ..solvers import solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf
@@ -23,8 +24,13 @@ class WeightedQP(Scheme):
         max_iterations: cap on changes of the active set (static).
     """
 
-    damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf)
+    damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
     max_iterations: int | None = eqx.field(default=None, static=True)
+
+    def __check_init__(self) -> None:
+        seen = concrete(self.damping)
+        if seen is not None and not (seen > 0.0).all():
+            raise ValueError(f"damping is {seen}; a WeightedQP needs it positive, or the velocity is not unique")
 
     def solve(self, problem: VelocityProblem) -> SchemeAnswer:
         """The velocity of one tick."""
@@ -34,7 +40,7 @@ class WeightedQP(Scheme):
         answer = solve_least_squares_qp(
             **_stack(equalities, intervals, n, problem.lower.dtype),
             **_bounds(intervals, problem),
-            damping=self.damping.astype(problem.lower.dtype),
+            damping=_damping(self.damping, intervals, n, problem.lower.dtype),
             max_iterations=self.max_iterations,
         )
         return SchemeAnswer(answer.x[:n], answer.status, answer.iterations, answer.kkt_residual)
@@ -53,6 +59,12 @@ def _stack(equalities: list[TaskRows], intervals: list[TaskRows], n: int, dtype:
     )
 
 
+def _damping(damping: Array, intervals: list[TaskRows], n: int, dtype: jnp.dtype) -> Array:
+    """Of v; slacks have a cost of their own, but for those of weight 0, which nothing moves from 0."""
+    slacks = [jnp.where(r.weight > 0.0, 0.0, 1.0).astype(dtype) for r in intervals]
+    return jnp.concatenate([jnp.full(n, damping, dtype), *slacks])
+
+
 def _bounds(intervals: list[TaskRows], problem: VelocityProblem) -> dict[str, Array]:
     """The box on v, and J v - s within the intervals."""
     if not intervals:
@@ -60,10 +72,11 @@ def _bounds(intervals: list[TaskRows], problem: VelocityProblem) -> dict[str, Ar
     slacks = sum(r.weight.shape[0] for r in intervals)
     free = jnp.full(slacks, jnp.inf, problem.lower.dtype)
     jacobian = jnp.concatenate([r.jacobian for r in intervals])
+    counts = jnp.concatenate([r.weight > 0.0 for r in intervals])
     return dict(
         lower=jnp.concatenate([problem.lower, -free]),
         upper=jnp.concatenate([problem.upper, free]),
         rows=jnp.concatenate([jacobian, -jnp.eye(slacks, dtype=jacobian.dtype)], 1),
-        rows_lower=jnp.concatenate([r.lower for r in intervals]),
-        rows_upper=jnp.concatenate([r.upper for r in intervals]),
+        rows_lower=jnp.where(counts, jnp.concatenate([r.lower for r in intervals]), -free),
+        rows_upper=jnp.where(counts, jnp.concatenate([r.upper for r in intervals]), free),
     )

@@ -12,11 +12,11 @@ while the levels above it leave it violated, and nothing keeps lower levels from
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.scipy.linalg
 from jaxtyping import Array, Float, Int
 
 from ._dense import apply, product
@@ -90,28 +90,32 @@ def _project(
     counts = (level.lower == level.upper) | (wanted != 0.0)
     rows = jnp.where(counts[:, None], level.matrix, 0.0)
     restricted = product(rows, projector)
-    inverse = _pseudo_inverse(restricted, cut * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2)))
-    motion = apply(inverse, wanted)
-    # (I + damping X X')^-1 X has singular values s / (s^2 + damping), and damping may be 0
-    shrink = jnp.eye(len(x), dtype=x.dtype) + damping * product(inverse, inverse.T)
-    motion = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shrink, lower=True), motion)
-    return x + motion, projector - product(inverse, restricted)
+    cutoff = cut * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2))
+    inverse, damped = _inverses(restricted, cutoff, damping)
+    return x + apply(damped, wanted), projector - product(inverse, restricted)
 
 
 @jax.custom_jvp
-def _pseudo_inverse(matrix: Float[Array, "m n"], cutoff: Float[Array, ""]) -> Float[Array, "n m"]:
-    """Moore-Penrose inverse, singular values up to the cutoff left out. Derivatives are those at constant rank."""
+def _inverses(matrix: Float[Array, "m n"], cutoff: Array, damping: Array) -> tuple[Array, Array]:
+    """Moore-Penrose inverse and damped inverse (n, m), singular values up to the cutoff left out of both.
+
+    Their derivatives are those at constant rank.
+    """
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    inverse = jnp.where(s > cutoff, 1.0 / jnp.where(s > cutoff, s, 1.0), 0.0)
-    return product(vt.T * inverse, u.T)
+    real = s > cutoff
+    s = jnp.where(real, s, 1.0)
+    plain, damped = (product(vt.T * jnp.where(real, f, 0.0), u.T) for f in (1.0 / s, s / (s**2 + damping)))
+    return plain, damped
 
 
-@_pseudo_inverse.defjvp
-def _pseudo_inverse_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973."""
-    (a, cutoff), (da, _) = primals, tangents
-    inverse = _pseudo_inverse(a, cutoff)
-    wide = product(inverse, product(inverse.T, da.T))
-    tall = product(product(da.T, inverse.T), inverse)
-    out = wide - product(product(wide, a), inverse) + tall - product(inverse, product(a, tall))
-    return inverse, out - product(product(inverse, da), inverse)
+@_inverses.defjvp
+def _inverses_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Any, Any]:
+    """G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973, for X; D solves (I + d X X') D = X."""
+    (a, cutoff, d), (da, _, dd) = primals, tangents
+    X, D = _inverses(a, cutoff, d)
+    wide = product(X, product(X.T, da.T))
+    tall = product(product(da.T, X.T), X)
+    dX = wide - product(product(wide, a), X) + tall - product(X, product(a, tall)) - product(product(X, da), X)
+    moved = dd * product(X, product(X.T, D)) + d * (product(dX, product(X.T, D)) + product(X, product(dX.T, D)))
+    dD = dX - moved
+    return (X, D), (dX, dD - d * product(D, product(X.T, dD)))  # (I + d X X')^-1 = I - d D X'

@@ -1,0 +1,272 @@
+"""The projection of eqs. 6 and 7 against NumPy's pseudo-inverse, and the joint-limit potential of eq. 8."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from osik_jax.schemes import limit_potential_gradient
+from osik_jax.solvers import Level, Status, solve_nullspace
+
+N = 8
+ROWS = (3, 2, 2)
+TIGHT = 1e-10
+
+
+@jax.jit
+def solve(levels, secondary, damping):
+    return solve_nullspace(levels, secondary=secondary, damping=damping)
+
+
+def equality(matrix, wanted, weight=None):
+    return Level(matrix, wanted, wanted, weight)
+
+
+def random_levels(rng, rows=ROWS):
+    return [(rng.normal(size=(m, N)), rng.normal(size=m), rng.uniform(0.5, 2.0, m)) for m in rows]
+
+
+def as_levels(data):
+    return [equality(*level) for level in data]
+
+
+def recursion(data, secondary, damping=0.0):
+    """Eq. 7 as printed, in NumPy; damped through the singular values."""
+    x, projector = np.zeros(N), np.eye(N)
+    for matrix, wanted, weight in data:
+        root = np.sqrt(weight)
+        scaled, target = root[:, None] * matrix, root * wanted
+        restricted = scaled @ projector
+        u, s, vt = np.linalg.svd(restricted, full_matrices=False)
+        real = s > 1e-10 * np.linalg.norm(scaled)
+        damped = (vt.T * np.where(real, s / np.where(real, s**2 + damping, 1.0), 0.0)) @ u.T
+        x = x + damped @ (target - scaled @ x)
+        projector = projector - np.linalg.pinv(restricted, rcond=1e-10) @ restricted
+    return x + projector @ secondary, projector
+
+
+class TestEquationSeven:
+    @pytest.mark.parametrize("damping", [0.0, 1e-8, 0.1])
+    def test_agrees_with_numpy(self, rng, damping):
+        for _ in range(5):
+            data, secondary = random_levels(rng), rng.normal(size=N)
+            ours = solve(as_levels(data), secondary, damping)
+            x, projector = recursion(data, secondary, damping)
+            np.testing.assert_allclose(ours.x, x, rtol=0, atol=TIGHT)
+            np.testing.assert_allclose(ours.projector, projector, rtol=0, atol=TIGHT)
+            assert int(ours.status) == Status.SOLVED
+
+    def test_one_level_is_the_moore_penrose_inverse(self, rng):
+        for rows in (3, N, 12):
+            (matrix, wanted, _), *_ = random_levels(rng, (rows,))
+            x = solve([equality(matrix, wanted)], np.zeros(N), 0.0).x
+            np.testing.assert_allclose(x, np.linalg.pinv(matrix) @ wanted, rtol=0, atol=TIGHT)
+
+    def test_the_projector_is_one_and_kills_every_level(self, rng):
+        data = random_levels(rng)
+        for damping in (0.0, 0.1):
+            P = np.asarray(solve(as_levels(data), np.zeros(N), damping).projector)
+            np.testing.assert_allclose(P @ P, P, rtol=0, atol=1e-13)
+            np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-13)
+            assert np.trace(P) == pytest.approx(N - sum(ROWS), abs=1e-12)
+            for matrix, _, _ in data:
+                np.testing.assert_allclose(matrix @ P, 0.0, rtol=0, atol=1e-13)
+
+    def test_lower_levels_and_the_secondary_motion_do_not_disturb_higher_ones(self, rng):
+        """In rows that cannot all be met, too, and with damping."""
+        data = random_levels(rng, (3, 4, 3, 2))
+        for damping in (0.0, 0.1):
+            for count in range(1, len(data)):
+                few = np.asarray(solve(as_levels(data[:count]), np.zeros(N), damping).x)
+                all_of_them = np.asarray(solve(as_levels(data), rng.normal(size=N), damping).x)
+                for matrix, _, _ in data[:count]:
+                    np.testing.assert_allclose(matrix @ all_of_them, matrix @ few, rtol=0, atol=TIGHT)
+
+    def test_weights_matter_only_where_rows_of_a_level_conflict(self, rng):
+        matrix, wanted, weight = random_levels(rng, (3,))[0]
+        plain, weighted = (solve([equality(matrix, wanted, w)], np.zeros(N), 0.0).x for w in (None, weight))
+        np.testing.assert_allclose(plain, weighted, rtol=0, atol=TIGHT)
+        row = rng.normal(size=N)
+        x = solve([equality(np.stack([row, row]), np.array([1.0, 4.0]), np.array([1.0, 2.0]))], np.zeros(N), 0.0).x
+        assert row @ x == pytest.approx(3.0, abs=1e-12)
+
+    def test_a_weight_of_zero_removes_a_row(self, rng):
+        matrix, wanted, _ = random_levels(rng, (3,))[0]
+        x = solve([equality(matrix, wanted, np.array([1.0, 0.0, 1.0]))], np.zeros(N), 0.0).x
+        np.testing.assert_allclose(x, np.linalg.pinv(matrix[[0, 2]]) @ wanted[[0, 2]], rtol=0, atol=TIGHT)
+
+
+class TestDeficientRank:
+    def test_a_repeated_level_has_nothing_left_to_ask(self, rng):
+        """Its rows in the null space are rounding, which must not be taken for directions to move in."""
+        (matrix, wanted, _), (below, low, _) = random_levels(rng, (3, 2))
+        apart = [equality(matrix, wanted), equality(below, low)]
+        repeated = [apart[0], equality(matrix, wanted + 1.0), apart[1]]
+        a, b = (solve(levels, np.zeros(N), 0.0) for levels in (apart, repeated))
+        np.testing.assert_allclose(a.x, b.x, rtol=0, atol=TIGHT)
+        np.testing.assert_allclose(a.projector, b.projector, rtol=0, atol=TIGHT)
+
+    def test_dependent_rows_in_a_level(self, rng):
+        matrix = rng.normal(size=(2, N))
+        level = np.concatenate([matrix, matrix[:1] + matrix[1:]])
+        wanted = np.array([1.0, 2.0, 0.0])
+        x = solve([equality(level, wanted)], np.zeros(N), 0.0).x
+        np.testing.assert_allclose(x, np.linalg.pinv(level, rcond=1e-10) @ wanted, rtol=0, atol=TIGHT)
+
+    def test_a_level_of_zeros_and_one_without_rows(self, rng):
+        matrix, wanted, _ = random_levels(rng, (3,))[0]
+        alone = solve([equality(matrix, wanted)], np.zeros(N), 0.0).x
+        nothing = equality(np.zeros((2, N)), np.ones(2)), equality(np.zeros((0, N)), np.zeros(0))
+        x = solve([nothing[0], equality(matrix, wanted), nothing[1]], np.zeros(N), 0.0).x
+        np.testing.assert_allclose(x, alone, rtol=0, atol=TIGHT)
+
+    @pytest.mark.parametrize("size", [1e-2, 1e-4, 1e-6, 0.0])
+    def test_damping_bounds_the_motion_near_a_singularity(self, rng, size):
+        """s / (s^2 + d) <= 1 / (2 sqrt d) for every singular value s."""
+        u, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        v, _ = np.linalg.qr(rng.normal(size=(N, 3)))
+        matrix, wanted = u * [1.0, 0.5, size] @ v.T, rng.normal(size=3)
+        damping = 1e-4
+        damped, plain = (solve([equality(matrix, wanted)], np.zeros(N), d).x for d in (damping, 0.0))
+        bound = np.linalg.norm(wanted) / (2.0 * np.sqrt(damping))
+        assert np.linalg.norm(damped) <= bound
+        exact = np.linalg.solve(matrix.T @ matrix + damping * np.eye(N), matrix.T @ wanted)
+        np.testing.assert_allclose(damped, exact, rtol=1e-9, atol=1e-9)
+        if 0.0 < size < 1e-3:
+            assert np.linalg.norm(plain) > 10.0 * bound
+
+    def test_rank_tolerance_is_a_share_of_the_level(self, rng):
+        v, _ = np.linalg.qr(rng.normal(size=(N, 2)))
+        for scale in (1e-6, 1.0, 1e6):
+            level = equality(scale * np.array([[1.0, 0.0], [0.0, 1e-4]]) @ v.T, scale * np.ones(2))
+            kept, cut = (solve_nullspace([level], rank_tolerance=t).x for t in (1e-5, 1e-3))
+            np.testing.assert_allclose(kept, v @ [1.0, 1e4], rtol=1e-9)
+            np.testing.assert_allclose(cut, v @ [1.0, 0.0], rtol=0, atol=1e-9)
+
+
+class TestInequalities:
+    def test_a_row_takes_part_only_where_it_is_violated(self, rng):
+        (first, wanted, _), (second, _, _) = random_levels(rng, (2, 3))
+        x = np.linalg.pinv(first) @ wanted
+        value = second @ x
+        held = Level(second, value - 1.0, value + 1.0)
+        np.testing.assert_allclose(solve([equality(first, wanted), held], np.zeros(N), 0.0).x, x, rtol=0, atol=TIGHT)
+        low, high = value - 1.0, value + np.array([1.0, -0.5, 1.0])
+        ours = solve([equality(first, wanted), Level(second, low, high)], np.zeros(N), 0.0)
+        only = recursion([(first, wanted, np.ones(2)), (second[1:2], high[1:2], np.ones(1))], np.zeros(N))[0]
+        np.testing.assert_allclose(ours.x, only, rtol=0, atol=TIGHT)
+        assert second[1] @ np.asarray(ours.x) == pytest.approx(high[1], abs=TIGHT)
+
+    def test_an_infinite_side_never_counts(self, rng):
+        matrix = random_levels(rng, (3,))[0][0]
+        free = Level(matrix, np.full(3, -np.inf), np.full(3, np.inf))
+        np.testing.assert_array_equal(solve([free], np.zeros(N), 0.0).x, np.zeros(N))
+        ours = solve([Level(matrix, np.array([1.0, -np.inf, -1.0]), np.full(3, np.inf))], np.zeros(N), 0.0).x
+        np.testing.assert_allclose(ours, np.linalg.pinv(matrix[:1])[:, 0], rtol=0, atol=TIGHT)
+
+    def test_slacks_say_what_a_level_did_not_get(self, rng):
+        data = random_levels(rng, (5, 6))
+        ours = solve(as_levels(data), np.zeros(N), 0.0)
+        for (matrix, wanted, _), slack in zip(data, ours.slacks, strict=True):
+            np.testing.assert_allclose(slack, matrix @ np.asarray(ours.x) - wanted, rtol=0, atol=TIGHT)
+        assert np.abs(ours.slacks[0]).max() < TIGHT < np.abs(ours.slacks[1]).max()
+
+
+class TestBatchesAndDerivatives:
+    def test_vmap_equals_a_loop_over_everything(self, rng):
+        data = [random_levels(rng) for _ in range(4)]
+        levels = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(as_levels(d) for d in data))
+        secondary, damping, tolerance = rng.normal(size=(4, N)), np.array([0.0, 1e-8, 0.1, 1.0]), np.full(4, 1e-9)
+
+        def one(levels, secondary, damping, tolerance):
+            return solve_nullspace(levels, secondary=secondary, damping=damping, rank_tolerance=tolerance).x
+
+        batch = jax.jit(jax.vmap(one))(levels, secondary, damping, tolerance)
+        for k in range(4):
+            alone = one(as_levels(data[k]), secondary[k], damping[k], tolerance[k])
+            np.testing.assert_allclose(batch[k], alone, rtol=0, atol=1e-12)
+
+    def test_nan_stays_in_its_lane(self, rng):
+        wanted = rng.normal(size=(3, 3))
+        matrix = rng.normal(size=(3, N))
+        spoiled = wanted.copy()
+        spoiled[1, 2] = np.nan
+        run = jax.jit(jax.vmap(lambda b: solve_nullspace([equality(matrix, b)])))
+        good, bad = run(wanted), run(spoiled)
+        np.testing.assert_array_equal(bad.status, [Status.SOLVED, Status.NUMERICAL_ERROR, Status.SOLVED])
+        np.testing.assert_array_equal(bad.x[1], np.zeros(N))
+        for lane in (0, 2):
+            np.testing.assert_array_equal(good.x[lane], bad.x[lane])
+
+    @pytest.mark.parametrize("damping", [0.0, 0.05])
+    def test_gradients_are_central_differences_in_both_modes(self, rng, damping):
+        """In matrices, targets and weights, with a level whose rank is not full and one that is overdetermined."""
+        data = random_levels(rng, (3, 2, 5))
+        data[1] = (rng.normal(size=2)[:, None] * rng.normal(size=N), data[1][1], data[1][2])
+        direction, secondary = random_levels(rng, (3, 2, 5)), rng.normal(size=N)
+        along = rng.normal(size=2)[:, None] * data[1][0]  # keeps the rank
+        direction[1] = (along, direction[1][1], direction[1][2])
+
+        @jax.jit
+        def cost(t):
+            moved = jax.tree.map(lambda a, b: a + t * b, data, direction)
+            return jnp.sum(jnp.sin(solve_nullspace(as_levels(moved), secondary=secondary, damping=damping).x))
+
+        h = 1e-5
+        expected = (cost(h) - cost(-h)) / (2.0 * h)
+        forward = jax.jvp(cost, (0.0,), (1.0,))[1]
+        reverse = jax.grad(cost)(0.0)
+        assert float(forward) == pytest.approx(float(expected), rel=1e-6)
+        assert float(reverse) == pytest.approx(float(forward), rel=1e-10)
+
+
+class TestPotential:
+    LOWER, UPPER = np.array([-1.0, 0.0, -np.inf, -2.0]), np.array([2.0, 0.5, np.inf, np.inf])
+
+    @staticmethod
+    def potential(q, lower, upper):
+        """Eq. 8 over the joints with two limits."""
+        r = upper - lower
+        return np.sum(r / ((upper - q) * (q - lower))) / (2.0 * len(q))
+
+    def test_against_finite_differences(self, rng):
+        both = np.isfinite(self.LOWER) & np.isfinite(self.UPPER)
+        low, high = self.LOWER[both], self.UPPER[both]
+        for _ in range(10):
+            q = np.zeros(4)
+            q[both] = low + rng.uniform(0.05, 0.95, 2) * (high - low)
+            gradient = limit_potential_gradient(jnp.asarray(q), jnp.asarray(self.LOWER), jnp.asarray(self.UPPER))
+            for k, joint in enumerate(np.flatnonzero(both)):
+                h = 1e-6 * np.eye(2)[k]
+                ends = (self.potential(q[both] + s * h, low, high) for s in (1.0, -1.0))
+                ahead, behind = ends
+                assert float(gradient[joint]) == pytest.approx((ahead - behind) / 2e-6, rel=1e-6, abs=1e-7)
+            np.testing.assert_array_equal(np.asarray(gradient)[~both], 0.0)
+
+    def test_descending_it_leads_away_from_both_limits_from_wherever_one_is(self):
+        """Outside the range too, where eq. 8 as printed has the other sign."""
+        low, high = jnp.array([-1.0]), jnp.array([2.0])
+        for q, sign in ((-3.0, -1), (-1.0, -1), (-0.9, -1), (0.4, -1), (0.6, 1), (1.9, 1), (2.0, 1), (7.0, 1)):
+            gradient = float(limit_potential_gradient(jnp.array([q]), low, high)[0])
+            assert np.isfinite(gradient)
+            assert np.sign(gradient) == sign
+        assert float(limit_potential_gradient(jnp.array([0.5]), low, high)[0]) == 0.0
+
+    def test_the_margin_caps_it(self):
+        low, high, margin = jnp.array([-1.0]), jnp.array([2.0]), 0.05
+        edge = -1.0 + margin * 3.0
+        h = 1e-6
+        slope = (self.potential(np.array([edge + h]), -1.0, 2.0) - self.potential(np.array([edge - h]), -1.0, 2.0)) / (
+            2 * h
+        )
+        for q in (edge, -1.0, -5.0):
+            gradient = float(limit_potential_gradient(jnp.array([q]), low, high, margin)[0])
+            assert gradient == pytest.approx(slope, rel=1e-6)
+
+    def test_no_limits_or_empty_ranges_give_zero_and_finite_derivatives(self):
+        low, high = jnp.array([-jnp.inf, 1.0, 0.0]), jnp.array([jnp.inf, 1.0, jnp.inf])
+        gradient, rates = jax.jvp(
+            lambda *args: limit_potential_gradient(*args), (jnp.ones(3), low, high), (jnp.ones(3),) * 3
+        )
+        np.testing.assert_array_equal(gradient, np.zeros(3))
+        assert np.isfinite(np.asarray(rates)).all()
