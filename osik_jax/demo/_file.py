@@ -62,7 +62,8 @@ def file_motion(
         raise ValueError(f"frame {moving!r} cannot both move and stand; choose another --frame or --support")
     q0 = _start(robot, moving, standing)
     polygon, notes = _polygon(robot, q0, standing)
-    stances = tuple(Stance(foot, _corners(robot, foot)) for foot in standing)
+    flat = _foot_rows(standing) == "pose"
+    stances = tuple(Stance(foot, _corners(robot, foot), flat=flat) for foot in standing)
     goal = Goal(moving, _sway(robot, q0, moving, duration), "pose" if robot.nv >= 6 else "position")
     still, follower = _tasks(robot, q0, goal, standing, polygon)
     label = "waist" if robot.floating_base else "hand"
@@ -193,7 +194,7 @@ def _dexterous(robot: Robot, frame: str, count: int = 64, reach: float = 0.8) ->
     rows = 6 if robot.nv >= 6 else 3
 
     def judged(step: Array) -> tuple[Array, Array]:
-        q = _inside(robot, integrate(robot, robot.q0, step, 1.0))
+        q = _inside(robot, integrate(robot, robot.q0, step, 1.0), margin=0.1)
         J = frame_jacobian(robot, forward_kinematics(robot, q), frame)[:rows]
         return q, jnp.linalg.svd(J, compute_uv=False)[-1]
 
@@ -235,9 +236,11 @@ def _settled(
     return ends[jnp.argmin(jnp.where(errors < 0.5 * errors[0], errors, errors[0]))]
 
 
-def _inside(robot: Robot, q: Array) -> Array:
-    """Clips hinges and slides to their limits."""
+def _inside(robot: Robot, q: Array, *, margin: float = 0.0) -> Array:
+    """Clips hinges and slides to their limits, drawn in by a part of their range."""
     single = [j for j in robot.tree.dof_address if robot.tree.joint_types[j] in (HINGE, SLIDE)]
     at = np.array([robot.tree.qpos_address[j] for j in single], int)
     dof = np.array([robot.tree.dof_address[j] for j in single], int)
-    return q.at[at].set(jnp.clip(q[at], robot.position_lower[dof], robot.position_upper[dof]))
+    lower, upper = robot.position_lower[dof], robot.position_upper[dof]
+    room = margin * jnp.where(jnp.isfinite(upper - lower), upper - lower, 0.0)
+    return q.at[at].set(jnp.clip(q[at], lower + room, upper - room))

@@ -74,7 +74,7 @@ def measure(motion: Motion, q: Float[np.ndarray, "T nq"], dt: float) -> Measurem
     robot, time = motion.robot, dt * np.arange(len(q))
     frames = list(dict.fromkeys([s.frame for s in motion.stances] + [g.frame for g in motion.goals.values()]))
     poses, com, qpos = _look(robot, q, frames)
-    stances = {s.frame: _drift(poses[s.frame], s.on_ground(time)) for s in motion.stances}
+    stances = {s.frame: _drift(poses[s.frame], s.on_ground(time), flat=s.flat) for s in motion.stances}
     paths = {label: _path(goal.path, time) for label, goal in motion.goals.items()}
     goals = {
         label: _track(poses[goal.frame], paths[label], goal.path.still(time), turns=goal.rows == "pose")
@@ -138,10 +138,10 @@ def _track(poses: _Poses, wanted: _Poses, settled: np.ndarray, *, turns: bool) -
     )
 
 
-def _drift(poses: _Poses, standing: np.ndarray) -> Track:
+def _drift(poses: _Poses, standing: np.ndarray, *, flat: bool) -> Track:
     """Against the first pose, nan in the air."""
     first = np.broadcast_to(poses[0][:1], poses[0].shape), np.broadcast_to(poses[1][:1], poses[1].shape)
-    track = _track(poses, first, standing, turns=True)
+    track = _track(poses, first, standing, turns=flat)
     position, orientation = (np.where(standing, x, np.nan) for x in (track.position, track.orientation))
     return Track(position, orientation, standing)
 

@@ -41,11 +41,13 @@ class Stance:
         frame: its name.
         corners: its contact corners in the frame [m]; none: it takes no part in the support polygon. (k, 3)
         lifted: from when to when it is in the air [s]; ``None``: never.
+        flat: whether it may not turn either; a foot that is a point may.
     """
 
     frame: str
     corners: np.ndarray
     lifted: tuple[float, float] | None = None
+    flat: bool = True
 
     def on_ground(self, t: np.ndarray) -> np.ndarray:
         """For each time [s], whether it stands."""

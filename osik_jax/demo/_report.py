@@ -126,19 +126,21 @@ def _scheme(motion: Motion, name: str, outcome: Outcome, m: Measurement) -> dict
 
 
 def _drift(track: Track) -> dict[str, float]:
-    return {
-        "position_mm": 1e3 * float(np.nanmax(track.position)),
-        "orientation_mrad": 1e3 * float(np.nanmax(track.orientation)),
-    }
+    out = {"position_mm": 1e3 * float(np.nanmax(track.position))}
+    return out | _turn(track)
+
+
+def _turn(track: Track) -> dict[str, float]:
+    """The greatest angle, where one counts."""
+    angle = track.orientation[~np.isnan(track.orientation)]
+    return {"orientation_mrad": 1e3 * float(angle.max())} if len(angle) else {}
 
 
 def _error(track: Track) -> dict[str, float | None]:
     """Greatest errors over all times, and over those when the path stands again."""
     out: dict[str, float | None] = {"position_mm": 1e3 * float(track.position.max())}
     out["settled_position_mm"] = 1e3 * float(track.position[track.settled].max()) if track.settled.any() else None
-    if not np.isnan(track.orientation).all():
-        out["orientation_mrad"] = 1e3 * float(np.nanmax(track.orientation))
-    return out
+    return out | _turn(track)
 
 
 def _solver(outcome: Outcome) -> dict[str, Any]:
@@ -165,7 +167,7 @@ def _reached(motion: Motion, m: Measurement) -> dict[str, bool]:
     out = {"first_goal": bool(len(settled) and settled.max() <= PATH_ERROR)}
     if motion.stances:
         out["standing"] = all(
-            np.nanmax(t.position) <= DRIFT_POSITION and np.nanmax(t.orientation) <= DRIFT_ORIENTATION
+            np.nanmax(t.position) <= DRIFT_POSITION and not (t.orientation > DRIFT_ORIENTATION).any()
             for t in m.stances.values()
         )
     if motion.balanced:
@@ -190,6 +192,7 @@ def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
     rows: list[tuple[str, Any]] = []
     if example["standing"]:
         rows.append(("standing feet, drift [mm]", lambda s: _number(_worst(s["standing"], "position_mm"), 0.1)))
+    if any("orientation_mrad" in figures for figures in example["standing"].values()):
         rows.append(("standing feet, turn [mrad]", lambda s: _number(_worst(s["standing"], "orientation_mrad"), 0.1)))
     if "balance" in example:
         rows.append(("centre of mass inside by [mm]", lambda s: _inside(s["balance"]["least_margin_mm"])))

@@ -24,7 +24,7 @@ from ._parts import RobotParts, Style, robot_parts
 from ._raycast import RayCaster
 from ._scene import BLUE, INK
 from ._shapes import robot_surface
-from ._stage import Camera, Stage
+from ._stage import Stage, frame_camera
 
 Polygons = Sequence[Float[np.ndarray, "m 2"]]
 
@@ -164,7 +164,9 @@ class _Film:
         self._com, self._paths = com, paths
         panels = (support is not None) + (curves is not None)
         self._floor = floor_height(robot, self._shape, next(mujoco_poses(robot, self._q[0])))
-        self._camera = frame_camera(points, size, azimuth, elevation, shift=0.22 if panels else 0.0)
+        window = (0.04, 0.56 if panels else 0.96, 0.06, 0.95)
+        radii = np.tile(self._shape.radii, len(self._q))
+        self._camera = frame_camera(points, radii, size, azimuth, elevation, window)
         self._stage = Stage([self._shape], self._camera, floor=self._floor)
         self._renderer = make_renderer(renderer, self._stage, self._camera, size, floor=self._floor)
         self._canvas = Canvas(size)
@@ -250,18 +252,6 @@ class _Film:
             self._mark.place(self._com[frame])
         for panel in self._panels:
             panel.place(frame)
-
-
-def frame_camera(
-    points: Float[np.ndarray, "n 3"], size: tuple[int, int], azimuth: float, elevation: float, *, shift: float = 0.0
-) -> Camera:
-    """A camera that sees all points [m], moved so that they sit left of the middle by ``shift`` of the width."""
-    low, high = points.min(0), points.max(0)
-    extent = float(np.linalg.norm(high - low))
-    height = 1.12 * max(float(high[2] - low[2]) * 1.12, 0.62 * extent)
-    camera = Camera(tuple(0.5 * (low + high)), 3.6 * height, azimuth, elevation, height)
-    center = np.asarray(camera.center) + shift * height * size[0] / size[1] * camera.axes[0]
-    return dataclasses.replace(camera, center=tuple(float(x) for x in center))
 
 
 def paint_over(base: Float[np.ndarray, "height width 3"], layer: np.ndarray) -> np.ndarray:

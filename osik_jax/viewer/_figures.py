@@ -14,13 +14,13 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ..robot import Robot
-from ._animate import floor_height, frame_camera, paint_over
+from ._animate import floor_height, paint_over
 from ._mujoco import mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._overlay import Canvas, ComMark, polygon_layer
 from ._parts import robot_parts
 from ._scene import INK
-from ._stage import Stage
+from ._stage import Camera, Stage, frame_camera
 
 SCHEME_COLORS = ("#f08c3a", "#8a8f98", "#1565c0", "#2a9d62", "#7b3fa0")
 _BAD = "#d7263d"
@@ -180,7 +180,7 @@ def hero_picture(
         configurations: one a figure, left to right. Each (nq,)
         support: of each, the vertices of its support polygon [m]; with it the centre of mass is drawn.
         labels: a line below each.
-        spacing: between neighbours [m]; ``None``: nine tenths of the robot's height.
+        spacing: between neighbours' middles [m]; ``None``: a little more than the widest is wide.
         size: width and height [pixels].
         azimuth: of the camera about the vertical, 0 from +x [deg].
         elevation: of the camera above the horizon [deg].
@@ -188,27 +188,34 @@ def hero_picture(
     """
     shape = robot_parts(robot)
     sources = [next(mujoco_poses(robot, q)) for q in configurations]
-    parts = [shape.poses(source)[0] for source in sources]
     floor = floor_height(robot, shape, sources[0])
-    gap = spacing or 0.9 * float(np.ptp(np.concatenate(parts)[:, 2]))
-    right = frame_camera(np.concatenate(parts), size, azimuth, elevation).axes[0]
-    shifts = [(k - 0.5 * (len(sources) - 1)) * gap * right for k in range(len(sources))]
-    middle = np.concatenate([part - part.mean(0) * [1, 1, 0] for part in parts])
-    camera = dataclasses.replace(
-        frame_camera(middle, size, azimuth, elevation), center=(0.0, 0.0, 0.5 * float(middle[:, 2].max() + floor))
-    )
-    camera = dataclasses.replace(camera, height=1.22 * float(middle[:, 2].max() - floor + 0.05))
+    shifts = _side_by_side([shape.poses(source)[0] for source in sources], shape.radii, azimuth, spacing)
+    balls = np.concatenate([shape.poses(source)[0] + shift for source, shift in zip(sources, shifts, strict=True)])
+    window = (0.03, 0.97, 0.05, 0.90 if labels else 0.95)
+    camera = frame_camera(balls, np.tile(shape.radii, len(sources)), size, azimuth, elevation, window)
     stage = Stage([shape] * len(sources), camera, floor=floor)
-    data = stage.pose(sources, np.array(shifts))
+    data = stage.pose(sources, shifts)
     drawer = make_renderer(renderer, stage, camera, size, floor=floor)
     moved = [corners + shift[:2] for corners, shift in zip(support or (), shifts, strict=False)]
     base = drawer.image(data, polygon_layer(moved, camera, size, floor=floor))
     canvas = Canvas(size, scale=size[1] / 450)
     for source, shift in zip(sources if support else (), shifts, strict=False):
         ComMark(canvas, camera, floor=floor, moving=False).place(robot_com(robot, source) + shift)
-    for label, shift in zip(labels, shifts, strict=False):
-        x, _ = camera.project(np.array([*(np.asarray(camera.center) + shift)[:2], floor]), size)
+    for label, source, shift in zip(labels, sources, shifts, strict=False):
+        x, _ = camera.project(shape.poses(source)[0].mean(0) * [1.0, 1.0, 0.0] + shift, size)
         canvas.page.text(x, size[1] - 0.035 * size[1], label, ha="center", fontsize=10, color=INK)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(paint_over(base, canvas.picture())).save(path, optimize=True)
     return Path(path)
+
+
+def _side_by_side(
+    instants: Sequence[Float[np.ndarray, "n 3"]], radii: Float[np.ndarray, " n"], azimuth: float, spacing: float | None
+) -> Float[np.ndarray, "k 3"]:
+    """Moves on the floor that put robots in a row across the camera's view, their middles evenly spaced."""
+    right = Camera((0.0, 0.0, 0.0), 1.0, azimuth, 0.0, 1.0).axes[0]
+    low = np.array([(points @ right - radii).min() for points in instants])
+    high = np.array([(points @ right + radii).max() for points in instants])
+    gap = spacing or 1.04 * float((high - low).max())
+    places = gap * (np.arange(len(instants)) - 0.5 * (len(instants) - 1))
+    return (places - 0.5 * (low + high))[:, None] * right

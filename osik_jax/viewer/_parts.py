@@ -52,6 +52,23 @@ class Part:
     color: np.ndarray
     mesh: tuple[np.ndarray, np.ndarray] | None = None
 
+    @property
+    def radius(self) -> float:
+        """Of a ball about its origin that holds it [m]."""
+        if self.mesh is not None:
+            return float(np.linalg.norm(self.mesh[0], axis=-1).max())
+        match self.kind:
+            case _GEOM.mjGEOM_SPHERE:
+                return float(self.size[0])
+            case _GEOM.mjGEOM_CAPSULE:
+                return float(self.size[0] + self.size[1])
+            case _GEOM.mjGEOM_ELLIPSOID:
+                return float(self.size.max())
+            case _GEOM.mjGEOM_CYLINDER:
+                return float(np.hypot(self.size[0], self.size[1]))
+            case _:
+                return float(np.linalg.norm(self.size))
+
 
 @dataclasses.dataclass(frozen=True)
 class RobotParts:
@@ -68,6 +85,11 @@ class RobotParts:
     style: Literal["geoms", "sticks"]
     parts: tuple[Part, ...]
     tips: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def radii(self) -> Float[np.ndarray, " parts"]:
+        """Of balls about the parts' origins that hold them [m]."""
+        return np.array([part.radius for part in self.parts])
 
     def poses(self, data: mujoco.MjData) -> tuple[Float[np.ndarray, "parts 3"], Float[np.ndarray, "parts 3 3"]]:
         """Positions [m] and rotations of the parts in the world, as ``mj_kinematics`` left them in ``data``."""
@@ -87,19 +109,26 @@ def robot_parts(robot: Robot, *, style: Style = "auto") -> RobotParts:
     Args:
         robot: the robot.
         style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``:
-            sticks where the model has no visible geom.
+            geoms where most of the bodies that move have a visible one.
 
     Raises:
         ValueError: ``style="geoms"`` of a model that has no visible geom.
     """
     model = robot.mj_model
     geoms = () if style == "sticks" else tuple(_geom_part(model, g) for g in _visible_geoms(model))
-    if geoms:
+    if geoms and (style == "geoms" or _cover(model, geoms)):
         return RobotParts(model, "geoms", geoms, _tips(robot))
     if style == "geoms":
         raise ValueError("the model has no geom to draw; use style='sticks'")
     tips = _tips(robot)
     return RobotParts(model, "sticks", _sticks(robot, tips), tips)
+
+
+def _cover(model: mujoco.MjModel, geoms: tuple[Part, ...]) -> bool:
+    """Whether two thirds of the bodies with joints have a geom, on themselves or on what is fixed to them."""
+    drawn = {int(model.body_weldid[model.geom_bodyid[part.index]]) for part in geoms}
+    moving = {int(body) for body in np.flatnonzero(model.body_jntnum)}
+    return 3 * len(drawn & moving) >= 2 * len(moving)
 
 
 def _visible_geoms(model: mujoco.MjModel) -> list[int]:
@@ -132,7 +161,8 @@ def _sticks(robot: Robot, tips: tuple[np.ndarray, np.ndarray]) -> tuple[Part, ..
     start, end = _stick_ends(data, model.body_parentid, tips)
     length = np.linalg.norm(end - start, axis=-1)
     length[: model.nbody][model.body_parentid == 0] = 0.0
-    radius = 0.13 * float(np.median(length[length > 1e-6])) if np.any(length > 1e-6) else 0.02
+    extent = float(np.linalg.norm(np.ptp(np.concatenate([start, end]), axis=0)))
+    radius = min(0.13 * float(np.median(length[length > 1e-6])), 0.02 * extent) if np.any(length > 1e-6) else 0.02
     dots = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
     return (
         *(Part(body, _GEOM.mjGEOM_SPHERE, np.array([radius, 0.0, 0.0]), _JOINT) for body in dots),

@@ -80,6 +80,27 @@ class Camera:
         return camera
 
 
+def frame_camera(
+    points: Float[np.ndarray, "n 3"],
+    radii: Float[np.ndarray, " n"],
+    size: tuple[int, int],
+    azimuth: float,
+    elevation: float,
+    window: tuple[float, float, float, float] = (0.04, 0.96, 0.06, 0.94),
+) -> Camera:
+    """A camera that sees all balls [m] within a window: left, right, top and bottom as parts of the picture."""
+    left, right, top, bottom = window
+    axes = Camera((0.0, 0.0, 0.0), 1.0, azimuth, elevation, 1.0).axes
+    across, up, deep = axes @ points.T
+    low = np.array([(across - radii).min(), (up - radii).min()])
+    high = np.array([(across + radii).max(), (up + radii).max()])
+    aspect = size[0] / size[1]
+    height = float(max((high - low) / ((right - left) * aspect, bottom - top)))
+    x, y = 0.5 * (low + high) + height * np.array([(0.5 - 0.5 * (left + right)) * aspect, 0.5 * (top + bottom) - 0.5])
+    center = np.array([x, y, 0.5 * (deep.min() + deep.max())]) @ axes
+    return Camera((float(center[0]), float(center[1]), float(center[2])), 3.6 * height, azimuth, elevation, height)
+
+
 class Stage:
     """Copies of robots' shapes on mocap bodies, a floor and a lamp.
 
