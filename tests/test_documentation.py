@@ -1,0 +1,137 @@
+"""The README and the pages say what is true: their code runs, their links lead somewhere, every name is documented."""
+
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+TEXTS = [*PAGES, *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "mkdocs.yml"))]
+PACKAGES = ("osik_jax", "osik_jax.solvers", "osik_jax.schemes", "osik_jax.demo", "osik_jax.viewer")
+OPTIONAL = ("matplotlib", "tyro", "rich", "torch", "PIL", "pinocchio", "mink", "mediapy", "osik_jax.viewer")
+
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+UNFINISHED = re.compile(r"\b(TODO|FIXME|TBD|WIP|coming soon|to be written|lorem ipsum)\b", re.IGNORECASE)
+ABSOLUTE_PATH = re.compile(r"(?<![\w.:/<`)*])/[a-z_]+/[\w.]+")
+NAMED = re.compile(r"^::: (\S+)$", re.MULTILINE)
+
+
+def relative(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def public_names(package: str) -> dict[str, Any]:
+    """What a package offers: names without an underscore that are not modules."""
+    found = vars(importlib.import_module(package))
+    return {k: v for k, v in found.items() if not k.startswith("_") and not inspect.ismodule(v) and k != "annotations"}
+
+
+def resolve(path: str) -> Any:
+    package, _, name = path.rpartition(".")
+    return getattr(importlib.import_module(package), name)
+
+
+def heading_anchors(page: Path) -> set[str]:
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if BLOCK.search(page.read_text())], ids=relative)
+def test_code_runs(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, namespace = page.read_text(), {"__name__": "documentation"}
+    try:
+        for block in BLOCK.finditer(text):
+            line = text[: block.start(1)].count("\n")
+            exec(compile("\n" * line + block.group(1), str(page), "exec"), namespace)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    if page == README:
+        assert capsys.readouterr().out.startswith("(201, 32) 0 [")
+        reached = namespace["motion"].solution.error["hand"][-1]
+        assert abs(reached).max() < 1e-4  # metres, of 10 cm, after one second at a gain of 10 / s
+        assert namespace["velocities"].shape == (8, 31)
+
+
+def test_readme_is_short() -> None:
+    assert len(README.read_text().splitlines()) <= 120
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=relative)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in LINK.findall(page.read_text()):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        there = (page.parent / path).resolve() if path else page
+        assert there.exists(), f"{target} does not exist"
+        if anchor:
+            assert anchor in heading_anchors(there), f"{target}: no such heading"
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=relative)
+def test_nothing_is_unfinished(text: Path) -> None:
+    content = text.read_text()
+    assert not UNFINISHED.findall(content)
+    assert not ABSOLUTE_PATH.findall(re.sub(r"\w+://\S+", "", content)), "paths of one machine"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_has_a_docstring(package: str) -> None:
+    code = {k: v for k, v in public_names(package).items() if inspect.isclass(v) or inspect.isfunction(v)}
+    assert code
+    bare = [name for name, value in code.items() if not (vars(value).get("__doc__") or "").strip()]
+    bare += [
+        f"{name}.{method}"
+        for name, value in code.items()
+        if inspect.isclass(value)
+        for method, member in vars(value).items()
+        if inspect.isfunction(member) and not method.startswith("_") and not inspect.getdoc(member)
+    ]
+    assert not bare
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_is_in_the_reference(package: str) -> None:
+    paths = NAMED.findall((ROOT / "docs" / "api.md").read_text())
+    documented = [resolve(path) for path in paths]
+    missing = [
+        name
+        for name, value in public_names(package).items()
+        if f"{package}.{name}" not in paths and not any(value is other for other in documented)
+    ]
+    assert not missing
+    assert len(paths) == len(set(paths))
+
+
+def test_reference_names_nothing_twice() -> None:
+    paths = NAMED.findall((ROOT / "docs" / "api.md").read_text())
+    assert len({id(resolve(path)) for path in paths}) == len(paths)
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    navigation = re.findall(r"^\s+- .*?([\w]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(navigation) == sorted(page.name for page in PAGES if page != README)
+
+
+def test_one_version_everywhere() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {project['version']}\n" in citation
+    assert f"\nlicense: {project['license']}\n" in citation
+    assert project["version"] in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_import_is_light() -> None:
+    code = f"import osik_jax, sys; print(*(m for m in {OPTIONAL!r} if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.splitlines()[-1:] in ([], [""])
