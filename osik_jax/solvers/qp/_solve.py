@@ -158,11 +158,11 @@ def _solve(qp: QP, cost_gradient: Gradient, max_iterations: int | None, toleranc
 
 
 def _status(qp: QP, finite: Bool[Array, ""], found: ActiveSet, x: Float[Array, " n"]) -> Array:
-    """The verdict; a constraint that could not be met counts only where a gap is left."""
+    """The verdict; a constraint that could not be met counts only where a gap is left, there or in another."""
     values = qp.values(x)
     gap = jnp.maximum(qp.lower - values, values - qp.upper)
     allowed = _FEASIBLE[qp.hessian.dtype] * (1.0 + jnp.abs(values))
-    contradicts = ((found.impossible & (gap > allowed)) | (qp.lower > qp.upper)).any()
+    contradicts = (found.impossible.any() & (gap > allowed).any()) | (qp.lower > qp.upper).any()
     verdict = jnp.where(found.settled, jnp.where(contradicts, Status.INFEASIBLE, Status.SOLVED), Status.MAX_ITERATIONS)
     return jnp.where(finite, verdict, Status.NUMERICAL_ERROR)
 
