@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import types
 
 import jax
 import mujoco
@@ -299,6 +300,7 @@ def test_with_opengl_mujocos_renderer_draws(nao, monkeypatch):
 
         def __init__(self, model, height, width):
             self.shape = (height, width)
+            self.scene = types.SimpleNamespace(flags=np.zeros(len(mujoco.mjtRndFlag.__members__), bool))
 
         def update_scene(self, data, camera, scene_option):
             assert camera.distance == 2.0 and scene_option.geomgroup.all()

@@ -58,6 +58,7 @@ class GlRenderer:
 
     def _render(self, data: mujoco.MjData) -> np.ndarray:
         self._renderer.update_scene(data, camera=self._camera, scene_option=self._options)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = True
         return self._renderer.render()
 
 

@@ -16,7 +16,7 @@ Image = Float[np.ndarray, "height width 3"]
 
 _WHITE = 1.0
 _TILES = np.array([[0.925, 0.937, 0.952], [0.968, 0.975, 0.985]])
-_SHADOW_MAP = 144
+_SHADOW_MAP = 112
 _BLOCK = 8
 _SUBPIXELS = np.array([[0.125, 0.625], [0.375, 0.125], [0.625, 0.875], [0.875, 0.375]])
 _GROUPS = np.array([1, 1, 1, 1, 1, 0], np.uint8)
@@ -73,10 +73,13 @@ class RayCaster:
 
     def _edges(self, rows: np.ndarray, columns: np.ndarray, hits: _Hits) -> np.ndarray:
         """Which of the pixels touch another geom, or a face turned elsewhere."""
-        shape = (self.size[1], self.size[0])
+        if not len(rows):
+            return np.zeros(0, bool)
+        y, x = rows - rows.min(), columns - columns.min()
+        shape = (y.max() + 1, x.max() + 1)
         geom, normal = np.full(shape, -1, np.int32), np.zeros((*shape, 3))
-        geom[rows, columns], normal[rows, columns] = hits.geom, hits.normal
-        return _edges(geom, normal)[rows, columns]
+        geom[y, x], normal[y, x] = hits.geom, hits.normal
+        return _edges(geom, normal)[y, x]
 
     def _near_robots(self, data: mujoco.MjData) -> np.ndarray:
         """Pixels, in blocks, that the geoms' bounding balls may cover. (height, width)."""
@@ -108,7 +111,9 @@ class RayCaster:
             return color
         n, ray = hits.normal[seen], rays[seen]
         point = self.camera.eye + hits.distance[seen, None] * ray
-        lamp = np.clip(n @ TO_LAMP, 0.0, 1.0) * self._lit(data, point + 1e-3 * self.camera.height * n)
+        lamp = np.clip(n @ TO_LAMP, 0.0, 1.0)
+        turned = np.flatnonzero(lamp)  # only these faces can be in another part's shadow
+        lamp[turned] *= self._lit(data, (point + 1e-3 * self.camera.height * n)[turned])
         half = TO_LAMP - ray
         half /= np.linalg.norm(half, axis=-1, keepdims=True)
         shine = np.clip(np.sum(n * half, -1), 0.0, 1.0) ** 40 * (lamp > 0.0)
@@ -173,12 +178,10 @@ def _round_length(value: float) -> float:
 def _edges(geom: np.ndarray, normal: Float[np.ndarray, "h w 3"]) -> np.ndarray:
     """Pixels next to another geom, or to a face turned elsewhere."""
     edge = np.zeros(geom.shape, bool)
-    for axis in (0, 1):
-        a, b = (np.take(geom, np.arange(k, geom.shape[axis] - 1 + k), axis) for k in (0, 1))
-        m, n = (np.take(normal, np.arange(k, geom.shape[axis] - 1 + k), axis) for k in (0, 1))
-        differs = (a != b) | ((a >= 0) & (np.sum(m * n, -1) < 0.8))
-        first, second = [slice(None)] * 2, [slice(None)] * 2
-        first[axis], second[axis] = slice(None, -1), slice(1, None)
-        edge[tuple(first)] |= differs
-        edge[tuple(second)] |= differs
+    halves = (np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])
+    for first, second in halves:
+        crease = np.einsum("ijk,ijk->ij", normal[first], normal[second]) < 0.5
+        differs = (geom[first] != geom[second]) | (crease & (geom[first] >= 0))
+        edge[first] |= differs
+        edge[second] |= differs
     return edge

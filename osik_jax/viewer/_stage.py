@@ -135,6 +135,7 @@ class Stage:
                 start += 1
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
+        mujoco.mj_camlight(self.model, data)
         return data
 
 
@@ -169,7 +170,9 @@ def _add_surroundings(spec: mujoco.MjSpec, camera: Camera, floor: float) -> None
         width=64,
         height=384,
     )
-    material = spec.add_material(name="floor", texrepeat=[2.5 / camera.height, 2.5 / camera.height], texuniform=True)
+    material = spec.add_material(
+        name="floor", emission=0.1, specular=0.0, texrepeat=[2.5 / camera.height, 2.5 / camera.height], texuniform=True
+    )
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -179,7 +182,19 @@ def _add_surroundings(spec: mujoco.MjSpec, camera: Camera, floor: float) -> None
         group=FLOOR_GROUP,
     )
     lamp = np.asarray(camera.center) + 4.0 * camera.height * TO_LAMP
-    spec.worldbody.add_light(pos=lamp, dir=-TO_LAMP, diffuse=[0.5, 0.5, 0.5])
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=lamp,
+        dir=-TO_LAMP,
+        diffuse=[0.45, 0.45, 0.45],
+        specular=[0.2, 0.2, 0.2],
+        castshadow=True,
+    )
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 2560, 1440
-    spec.visual.headlight.ambient[:] = 0.45
-    spec.visual.headlight.diffuse[:] = 0.35
+    spec.visual.headlight.ambient[:] = 0.42
+    spec.visual.headlight.diffuse[:] = 0.28
+    spec.visual.headlight.specular[:] = 0.0
+    spec.visual.quality.shadowsize, spec.visual.map.shadowclip = 4096, 4.0 * camera.height
+    spec.visual.map.fogstart, spec.visual.map.fogend = 4.5 * camera.height, 11.0 * camera.height
+    spec.visual.rgba.fog[:] = 1.0
+    spec.stat.extent = 1.0  # the lengths of visual.map are multiples of it
