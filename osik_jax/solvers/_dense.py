@@ -1,7 +1,10 @@
-"""Products of small dense matrices, in full precision on every device (GPUs default to TF32)."""
+"""Small dense matrices: products in full precision on every device (GPUs default to TF32), and a pseudo-inverse."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -14,3 +17,29 @@ def product(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n
 def apply(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
     """The vector a x."""
     return jnp.matmul(a, x, precision="highest")
+
+
+@jax.custom_jvp
+def pseudo_inverses(matrix: Float[Array, "m n"], cutoff: Array, damping: Array) -> tuple[Array, Array]:
+    """Moore-Penrose inverse and damped inverse (n, m), singular values up to the cutoff left out of both.
+
+    Their derivatives are those at constant rank.
+    """
+    u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
+    real = s > cutoff
+    s = jnp.where(real, s, 1.0)
+    plain, damped = (product(vt.T * jnp.where(real, f, 0.0), u.T) for f in (1.0 / s, s / (s**2 + damping)))
+    return plain, damped
+
+
+@pseudo_inverses.defjvp
+def _pseudo_inverses_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Any, Any]:
+    """G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973, for X; D solves (I + d X X') D = X."""
+    (a, cutoff, d), (da, _, dd) = primals, tangents
+    X, D = pseudo_inverses(a, cutoff, d)
+    wide = product(X, product(X.T, da.T))
+    tall = product(product(da.T, X.T), X)
+    dX = wide - product(product(wide, a), X) + tall - product(X, product(a, tall)) - product(product(X, da), X)
+    moved = dd * product(X, product(X.T, D)) + d * (product(dX, product(X.T, D)) + product(X, product(dX.T, D)))
+    dD = dX - moved
+    return (X, D), (dX, dD - d * product(D, product(X.T, dD)))  # (I + d X X')^-1 = I - d D X'

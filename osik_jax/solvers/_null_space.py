@@ -12,14 +12,12 @@ while the levels above it leave it violated, and nothing keeps lower levels from
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ._dense import apply, product
+from ._dense import apply, product, pseudo_inverses
 from ._status import Status
 from .hqp import Level
 
@@ -91,31 +89,5 @@ def _project(
     rows = jnp.where(counts[:, None], level.matrix, 0.0)
     restricted = product(rows, projector)
     cutoff = cut * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2))
-    inverse, damped = _inverses(restricted, cutoff, damping)
+    inverse, damped = pseudo_inverses(restricted, cutoff, damping)
     return x + apply(damped, wanted), projector - product(inverse, restricted)
-
-
-@jax.custom_jvp
-def _inverses(matrix: Float[Array, "m n"], cutoff: Array, damping: Array) -> tuple[Array, Array]:
-    """Moore-Penrose inverse and damped inverse (n, m), singular values up to the cutoff left out of both.
-
-    Their derivatives are those at constant rank.
-    """
-    u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    real = s > cutoff
-    s = jnp.where(real, s, 1.0)
-    plain, damped = (product(vt.T * jnp.where(real, f, 0.0), u.T) for f in (1.0 / s, s / (s**2 + damping)))
-    return plain, damped
-
-
-@_inverses.defjvp
-def _inverses_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Any, Any]:
-    """G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973, for X; D solves (I + d X X') D = X."""
-    (a, cutoff, d), (da, _, dd) = primals, tangents
-    X, D = _inverses(a, cutoff, d)
-    wide = product(X, product(X.T, da.T))
-    tall = product(product(da.T, X.T), X)
-    dX = wide - product(product(wide, a), X) + tall - product(X, product(a, tall)) - product(product(X, da), X)
-    moved = dd * product(X, product(X.T, D)) + d * (product(dX, product(X.T, D)) + product(X, product(dX.T, D)))
-    dD = dX - moved
-    return (X, D), (dX, dD - d * product(D, product(X.T, dD)))  # (I + d X X')^-1 = I - d D X'

@@ -14,6 +14,7 @@ from .._dense import apply, product
 from .._status import Status
 from ._level import Hard, LevelState, Tolerances, independent, rounding, row_space, solve_level
 from ._problem import HQPSolution, Level
+from ._replay import Decision, with_derivative
 
 _DEFAULTS = {
     jnp.dtype("float64"): Tolerances(rank=1e-10, step=1e-13, multiplier=1e-10),
@@ -57,11 +58,15 @@ def solve_hqp(
     sane = _finite(levels, lower, upper)
     safe_lower, safe_upper = jnp.where(sane, lower, -1.0), jnp.where(sane, upper, 1.0)
     scaled = [jax.tree.map(lambda leaf: jnp.where(sane, leaf, 0.0), level.scaled()) for level in levels]
-    cascade = _Cascade.start(safe_lower, safe_upper, dtype)
-    for level in [*scaled, _smallest(lower.shape[0], dtype)]:
+    scaled.append(_smallest(lower.shape[0], dtype))
+    cascade = _Cascade.start(*jax.lax.stop_gradient((safe_lower, safe_upper)), dtype)
+    decisions = []
+    for level in scaled:
         cap = 10 * (lower.shape[0] + level.matrix.shape[0]) if max_iterations is None else max_iterations
-        cascade = cascade.descend(level, tolerances, cap)
-    return _answer(levels, cascade, sane, lower, upper)
+        cascade, decision = cascade.descend(jax.lax.stop_gradient(level), tolerances, cap)
+        decisions.append(decision)
+    x = with_derivative(cascade.x, decisions, scaled, safe_lower, safe_upper, tolerances.rank)
+    return _answer(levels, cascade, x, sane, lower, upper)
 
 
 def _smallest(n: int, dtype: jnp.dtype) -> Level:
@@ -102,7 +107,7 @@ class _Cascade(eqx.Module):
             done=jnp.asarray(True),
         )
 
-    def descend(self, level: Level, tolerances: Tolerances, cap: int) -> _Cascade:
+    def descend(self, level: Level, tolerances: Tolerances, cap: int) -> tuple[_Cascade, Decision]:
         """Solves one more level and freezes what it decides."""
         bounded = jnp.isfinite(self.lower) | jnp.isfinite(self.upper)
         hard = Hard(self.matrix, self.lower, self.upper, ~self.frozen & bounded)
@@ -126,7 +131,9 @@ class _Cascade(eqx.Module):
         )
         return self._freeze(level, hard, end, tolerances)
 
-    def _freeze(self, level: Level, hard: Hard, end: LevelState, tolerances: Tolerances) -> _Cascade:
+    def _freeze(
+        self, level: Level, hard: Hard, end: LevelState, tolerances: Tolerances
+    ) -> tuple[_Cascade, Decision]:
         n = self.x.shape[0]
         value = apply(level.matrix, end.x)
         slack = value - jnp.clip(value, level.lower, level.upper)
@@ -144,7 +151,8 @@ class _Cascade(eqx.Module):
         )
         basis = row_space(to_freeze, self.projector, tolerances.rank)
         side = jnp.concatenate([jnp.where(tight, 0, end.side), jnp.zeros(len(slack), jnp.int32)])
-        return _Cascade(
+        decision = Decision(jnp.where(tight, end.side, 0), jnp.where(counts, jnp.where(slack > 0.0, 1, -1), 0))
+        cascade = _Cascade(
             x=end.x,
             matrix=jnp.concatenate([self.matrix, level.matrix]),
             lower=jnp.concatenate([self.lower, jnp.minimum(level.lower, value)]),
@@ -157,6 +165,7 @@ class _Cascade(eqx.Module):
             iterations=self.iterations + end.iterations,
             done=self.done & end.done,
         )
+        return cascade, decision
 
 
 def _finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:
@@ -167,9 +176,11 @@ def _finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, 
     return jnp.stack([*checks, (lower <= upper).all()]).all()
 
 
-def _answer(levels: Sequence[Level], cascade: _Cascade, sane: Array, lower: Array, upper: Array) -> HQPSolution:
-    at_bound = jnp.where(cascade.box < 0, lower, jnp.where(cascade.box > 0, upper, cascade.x))
-    good = sane & jnp.isfinite(cascade.x).all()
+def _answer(
+    levels: Sequence[Level], cascade: _Cascade, x: Array, sane: Array, lower: Array, upper: Array
+) -> HQPSolution:
+    at_bound = jnp.where(cascade.box < 0, lower, jnp.where(cascade.box > 0, upper, x))
+    good = sane & jnp.isfinite(x).all()
     low, high = (jnp.where(jnp.isnan(b), fill, b) for b, fill in ((lower, -jnp.inf), (upper, jnp.inf)))
     x = jnp.clip(jnp.where(good, at_bound, 0.0), low, high)
     status = jnp.where(cascade.done, Status.SOLVED, Status.MAX_ITERATIONS)

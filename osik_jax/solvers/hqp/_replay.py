@@ -1,0 +1,93 @@
+"""The derivative of a hierarchy: the cascade replayed at the active sets of its solution.
+
+Where no active set is about to change, the solution map is that of a cascade of equality-constrained least squares:
+at each level the hard rows that became tight sit at their bounds, and the rows that count sit as near to theirs as the
+levels above allow. Replaying it takes one pseudo-inverse a block of rows, whose derivative at constant rank is known in
+closed form; nothing of the search is differentiated, so memory does not grow with its iterations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._dense import apply, product, pseudo_inverses
+from ._problem import Level
+
+
+class Decision(NamedTuple):
+    """What one level decided: 0 for rows without a part in it, -1 at the lower bound, 1 at the upper."""
+
+    tight: Int[Array, " h"]  # hard rows (box, then rows of the levels before) frozen with a multiplier
+    counts: Int[Array, " m"]  # the level's own rows that count in its cost
+
+
+class _Data(NamedTuple):
+    levels: tuple[Level, ...]
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+
+
+def with_derivative(
+    x: Float[Array, " n"],
+    decisions: Sequence[Decision],
+    levels: Sequence[Level],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    rank: Array | float,
+) -> Float[Array, " n"]:
+    """``x`` as it is, with the derivatives of the replayed cascade with respect to levels and box."""
+    return _attach(jax.lax.stop_gradient(x), tuple(decisions), jnp.asarray(rank), _Data(tuple(levels), lower, upper))
+
+
+@jax.custom_jvp
+def _attach(x: Array, decisions: tuple[Decision, ...], rank: Array, data: _Data) -> Array:
+    return x
+
+
+@_attach.defjvp
+def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    x, decisions, rank, data = primals
+    *_, rates = tangents
+    _, dx = jax.jvp(lambda d: _replay(decisions, rank, d), (data,), (rates,))
+    return x, dx
+
+
+def _replay(decisions: tuple[Decision, ...], rank: Array, data: _Data) -> Float[Array, " n"]:
+    n = data.lower.shape[0]
+    matrix, lower, upper = jnp.eye(n, dtype=data.lower.dtype), data.lower, data.upper
+    pinned = jnp.where(data.lower == data.upper, -1, 0)
+    x, projector = jnp.zeros_like(data.lower), matrix
+    x, projector = _block(matrix, lower, upper, pinned, x, projector, rank)
+    for level, decision in zip(data.levels, decisions, strict=True):
+        x, projector = _block(matrix, lower, upper, decision.tight, x, projector, rank)
+        x, projector = _block(level.matrix, level.lower, level.upper, decision.counts, x, projector, rank)
+        matrix = jnp.concatenate([matrix, level.matrix])
+        lower, upper = jnp.concatenate([lower, level.lower]), jnp.concatenate([upper, level.upper])
+    return x
+
+
+def _block(
+    matrix: Array, lower: Array, upper: Array, side: Array, x: Array, projector: Array, rank: Array
+) -> tuple[Array, Array]:
+    """Moves x in the projector's range so that the chosen rows come as near to their bounds as they can."""
+    n = x.shape[0]
+    if not matrix.shape[0]:
+        return x, projector
+    rows = jnp.argsort(side == 0, stable=True)[:n] if matrix.shape[0] > n else jnp.arange(matrix.shape[0])
+    on = side[rows] != 0
+    target = jnp.where(side[rows] < 0, _finite(lower[rows], side[rows] < 0), _finite(upper[rows], side[rows] > 0))
+    chosen = jnp.where(on[:, None], matrix[rows], 0.0)
+    restricted = product(chosen, projector)
+    length = jnp.max(jnp.sum(jax.lax.stop_gradient(chosen) ** 2, -1), initial=0.0)
+    inverse, _ = pseudo_inverses(restricted, rank * jnp.sqrt(length), jnp.zeros_like(length))
+    gap = jnp.where(on, target - apply(chosen, x), 0.0)
+    return x + apply(inverse, gap), projector - product(inverse, restricted)
+
+
+def _finite(bound: Array, used: Array) -> Array:
+    return jnp.where(used, bound, 0.0)
