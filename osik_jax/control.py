@@ -95,7 +95,8 @@ def solve(
     """
     _check_tasks(tasks)
     _check_settings(scheme, limits, dt)
-    return _solve(robot, _configuration(robot, q), dict(tasks), scheme, tuple(limits), dt)
+    q = _configuration(robot, q)
+    return _solve(robot, q, dict(tasks), scheme, tuple(limits), _tick(dt, q))
 
 
 @jax.jit
@@ -174,19 +175,25 @@ def rollout(
             raise ValueError(
                 f"feedback has shape {feedback.shape}; it is one configuration a tick, {(steps, robot.nq)}"
             )
-    numbers, structure = eqx.partition((tasks if callable(tasks) else dict(tasks), feedback), eqx.is_inexact_array_like)
+    numbers, structure = eqx.partition((tasks if callable(tasks) else dict(tasks), feedback), _is_number)
     leaves, treedef = jax.tree.flatten(structure)
+    q0 = _configuration(robot, q0)
     return _rollout(
         robot,
-        _configuration(robot, q0),
+        q0,
         numbers,
         scheme,
         tuple(limits),
-        dt,
+        _tick(dt, q0),
         targets,
         static=(tuple(leaves), treedef),
         steps=steps,
     )
+
+
+def _is_number(leaf: Any) -> bool:
+    """Whether a leaf is traced: arrays, tracers among them, and Python floats; all else is structure."""
+    return eqx.is_array(leaf) or isinstance(leaf, float | np.ndarray | np.generic)
 
 
 @partial(jax.jit, static_argnames=("static", "steps"))
@@ -203,7 +210,7 @@ def _rollout(
     steps: int,
 ) -> Trajectory:
     tasks, feedback = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
-    time = jnp.arange(steps) * jnp.asarray(dt, q0.dtype)
+    time = jnp.arange(steps) * dt
     measured = None if callable(feedback) else feedback
 
     def tick(q: Array, now: tuple[Array, Targets | None, Array | None]) -> tuple[Array, tuple[Array, Solution]]:
@@ -252,6 +259,11 @@ def _configuration(robot: Robot, q: Any) -> Float[Array, " nq"]:
     robot.check_configuration(q)
     q = jnp.asarray(q)
     return q.astype(jnp.result_type(q, robot.q0))
+
+
+def _tick(dt: Any, q: Array) -> Any:
+    """The tick in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
+    return dt.astype(q.dtype) if isinstance(dt, jax.Array) else np.asarray(dt, q.dtype)
 
 
 def _checked(tasks: Any) -> dict[str, Task]:

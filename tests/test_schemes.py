@@ -1,0 +1,483 @@
+"""The three schemes against least squares whose optimality the test itself certifies, daqp, mink and NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+from pathlib import Path
+
+import daqp
+import jax
+import jax.numpy as jnp
+import mink
+import mujoco
+import numpy as np
+import pytest
+import scipy.optimize
+
+import osik_jax as osik
+from osik_jax.schemes import limit_potential_gradient
+
+DT = 0.005
+DAMPING = 1e-4
+LANES = 6
+G1 = "g1_description/urdf/g1_29dof_rev_1_0.urdf"
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    robot: osik.Robot
+    tasks: dict[str, osik.Task]
+    limits: tuple[osik.Limit, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Numbers:
+    """One tick's problem in NumPy: rows stacked, one entry of ``names`` for each row."""
+
+    names: np.ndarray
+    jacobian: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    weight: np.ndarray
+    box: tuple[np.ndarray, np.ndarray]
+
+
+def g1_path() -> Path:
+    files = importlib.metadata.files("example-robot-data") or []
+    (found,) = [file for file in files if str(file).endswith(G1)]
+    return Path(str(found.locate()))
+
+
+def at_home(robot, frame):
+    kinematics = jax.jit(osik.forward_kinematics)(robot, robot.q0)
+    return tuple(map(np.asarray, kinematics.frame_pose(robot, frame)))
+
+
+def whole_body(robot, feet, hand, com, tight):
+    """Feet, an inequality on the centre of mass, a hand that has far to go, posture; speeds that bind."""
+    p, R = at_home(robot, hand)
+    tasks = {
+        **{foot: osik.FrameTask(robot, foot, weight=1e4) for foot in feet},
+        "com": osik.ComTask(robot, **com, weight=1e-2, priority=2),
+        "hand": osik.FrameTask(
+            robot, hand, target=(p + np.array([0.2, 0.1, 0.1]), R), orientation_weight=0.1, priority=3
+        ),
+        "posture": osik.PostureTask(robot, weight=1e-2, gain=2.0, priority=4),
+    }
+    return Case(robot, tasks, (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot, velocity={"*": tight})))
+
+
+@pytest.fixture(scope="module")
+def nao():
+    robot = osik.load_robot("nao")
+    polygon = osik.support_polygon(robot, robot.q0, ("l_sole", "r_sole"), margin=0.04)
+    return whole_body(robot, ("l_sole", "r_sole"), "l_gripper", {"polygon": polygon}, 1.0)
+
+
+@pytest.fixture(scope="module")
+def g1():
+    robot = osik.Robot.from_urdf(g1_path(), floating_base=True)
+    feet = ("left_ankle_roll_link", "right_ankle_roll_link")
+    bounds = {"axes": "xy", "lower": [0.02, -0.01], "upper": [0.05, 0.01]}
+    return whole_body(robot, feet, "left_wrist_yaw_link", bounds, 1.5)
+
+
+def arm_tasks(robot, priorities, weights=(1.0, 1.0, 1.0)):
+    """A pose that contradicts a position."""
+    p, R = at_home(robot, "hand")
+    first, second, third = ({"priority": k, "weight": w} for k, w in zip(priorities, weights, strict=True))
+    return {
+        "position": osik.FrameTask(robot, "hand", target=(p + np.array([0.1, 0.2, -0.1]), R), rows="position", **first),
+        "pose": osik.FrameTask(robot, "hand", target=(p + np.array([-0.1, 0.1, 0.2]), R), **second),
+        "posture": osik.PostureTask(robot, **third),
+    }
+
+
+@pytest.fixture(scope="module")
+def arm():
+    robot = osik.load_robot("arm7")
+    limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot, velocity={"*": 1.0})
+    return Case(robot, arm_tasks(robot, (1, 2, 3)), limits)
+
+
+def configurations(case, rng, spread=0.3):
+    """Around home, inside the joints' ranges, some joints on their limits."""
+    robot = case.robot
+    moves = rng.uniform(-spread, spread, (LANES, robot.nv))
+    moves[0] = 0.0
+    if robot.floating_base:
+        moves[:, :6] *= 0.1
+    q = np.array(jax.vmap(lambda v: osik.integrate(robot, robot.q0, v))(jnp.asarray(moves)))
+    joints = q[:, 7 * robot.floating_base :]
+    low, high = (np.asarray(b)[6 * robot.floating_base :] for b in (robot.position_lower, robot.position_upper))
+    np.clip(joints, low, high, out=joints)
+    return q
+
+
+@jax.jit
+def rows_and_box(robot, tasks, limits, q, dt):
+    kinematics = osik.forward_kinematics(robot, q)
+    return {k: t.rows(robot, kinematics, q) for k, t in tasks.items()}, osik.limit_box(robot, q, limits, dt)
+
+
+def numbers(case, q, names=None):
+    rows, box = rows_and_box(case.robot, case.tasks, case.limits, q, DT)
+    names = list(rows) if names is None else names
+    fields = ("jacobian", "lower", "upper", "weight")
+    stack = {f: np.concatenate([np.asarray(getattr(rows[n], f)) for n in names]) for f in fields}
+    labels = np.concatenate([[n] * len(rows[n].weight) for n in names])
+    return Numbers(names=labels, box=(np.asarray(box[0]), np.asarray(box[1])), **stack)
+
+
+@jax.jit
+def compiled_lanes(robot, q, tasks, scheme, limits):
+    return jax.vmap(lambda q: osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=DT))(q)
+
+
+def solve_lanes(case, q, scheme):
+    """One program for all configurations, and for all cases with the same tasks."""
+    return jax.tree.map(np.asarray, compiled_lanes(case.robot, jnp.asarray(q), case.tasks, scheme, case.limits))
+
+
+def gap(value, lower, upper):
+    return value - np.clip(value, lower, upper)
+
+
+def weighted_qp(problem: Numbers, damping: float) -> np.ndarray:
+    """min 1/2 sum w dist(J v, [l, u])^2 + 1/2 damping |v|^2 in the box: daqp's active set, solved anew and certified.
+
+    daqp sees the textbook form over (v, s), with J v - s in its interval. Its active set then gives a least-squares
+    problem without constraints, solved from the factors; the signs of the multipliers prove the optimum.
+    """
+    n, m = problem.jacobian.shape[1], len(problem.weight)
+    H = np.diag(np.concatenate([np.full(n, damping), problem.weight]))
+    A = np.concatenate([problem.jacobian, -np.eye(m)], 1)
+    wide = np.full(m, 1e30)
+    upper = np.nan_to_num(np.concatenate([problem.box[1], wide, problem.upper]), posinf=1e30)
+    lower = np.nan_to_num(np.concatenate([problem.box[0], -wide, problem.lower]), neginf=-1e30)
+    sense = np.where(upper == lower, 5, 0).astype(np.int32)
+    x, _, flag, info = daqp.solve(H, np.zeros(n + m), A, upper, lower, sense, iter_limit=10000)
+    assert flag == 1
+    active = np.abs(info["lam"]) > 1e-9
+    held = active[:n]
+    v = np.where(held, np.where(np.abs(x[:n] - lower[:n]) < np.abs(x[:n] - upper[:n]), lower[:n], upper[:n]), 0.0)
+    counts = (problem.lower == problem.upper) | active[n + m :]
+    value = problem.jacobian @ x[:n]
+    wanted = np.where(value < 0.5 * (problem.lower + problem.upper), problem.lower, problem.upper)
+    wanted = np.where(np.isinf(problem.lower), problem.upper, np.where(np.isinf(problem.upper), problem.lower, wanted))
+    root = np.where(counts, np.sqrt(problem.weight), 0.0)
+    stacked = np.concatenate([root[:, None] * problem.jacobian, np.sqrt(damping) * np.eye(n)])
+    target = np.concatenate([root * np.where(counts, wanted, 0.0), np.zeros(n)])
+    v[~held] = np.linalg.lstsq(stacked[:, ~held], target - stacked @ v, rcond=None)[0]
+    certify(problem, damping, v)
+    return v
+
+
+def certify(problem: Numbers, damping: float, v: np.ndarray) -> None:
+    """v is in the box, and the cost falls in no direction that leads into it."""
+    slack = gap(problem.jacobian @ v, problem.lower, problem.upper)
+    gradient = problem.jacobian.T @ (problem.weight * slack) + damping * v
+    small = 1e-10 * np.abs(problem.jacobian.T * problem.weight).max() * max(1.0, np.abs(v).max())
+    low, high = problem.box
+    assert (v >= low).all()
+    assert (v <= high).all()
+    assert (np.abs(gradient[(v > low) & (v < high)]) <= small).all()
+    assert (gradient[(v == low) & (v < high)] >= -small).all()
+    assert (gradient[(v == high) & (v > low)] <= small).all()
+
+
+class TestWeightedQP:
+    @pytest.mark.parametrize("name", ["nao", "g1"])
+    def test_agrees_with_the_textbook_qp(self, name, request, rng):
+        case = request.getfixturevalue(name)
+        q = configurations(case, rng)
+        ours = solve_lanes(case, q, osik.WeightedQP(damping=DAMPING))
+        np.testing.assert_array_equal(ours.status, osik.Status.SOLVED)
+        bounded = violated = 0
+        for k in range(LANES):
+            problem = numbers(case, q[k])
+            expected = weighted_qp(problem, DAMPING)
+            np.testing.assert_allclose(ours.velocity[k], expected, rtol=0, atol=1e-8)
+            assert (ours.velocity[k] >= problem.box[0]).all()
+            assert (ours.velocity[k] <= problem.box[1]).all()
+            slack = gap(problem.jacobian @ expected, problem.lower, problem.upper)
+            for task, own in ours.slack.items():
+                np.testing.assert_allclose(own[k], slack[problem.names == task], rtol=0, atol=1e-8)
+            bounded += np.sum((expected == problem.box[0]) | (expected == problem.box[1]))
+            violated += np.sum(np.abs(slack[problem.names == "com"]) > 1e-6)
+        assert ours.box_violation.max() == 0.0
+        assert bounded > 10
+        assert violated > 0
+
+    def test_a_row_of_weight_zero_costs_nothing(self, arm):
+        """An inequality that is violated however the arm moves, and no other task of weight: nothing moves."""
+        tasks = {"position": osik.FrameTask(arm.robot, "hand", rows="position", lower=1.0, weight=0.0)}
+        ours = osik.solve(arm.robot, arm.robot.q0, tasks, scheme=osik.WeightedQP(damping=1e-6), dt=DT)
+        np.testing.assert_allclose(ours.velocity, 0.0, rtol=0, atol=1e-12)
+        assert int(ours.status) == osik.Status.SOLVED
+
+    def test_the_closed_loop_is_minks(self, g1):
+        """Error and Jacobian of a FrameTask are mink's to second order in the error: the feet stay, the rest moves."""
+        robot, gain, ticks = g1.robot, 8.0, 60
+        feet = ("left_ankle_roll_link", "right_ankle_roll_link")
+        c = np.asarray(osik.center_of_mass(robot, osik.forward_kinematics(robot, robot.q0)))
+        goal, turn = c + np.array([0.02, 0.03, -0.08]), "right_wrist_yaw_link"
+        R = at_home(robot, turn)[1] @ mink.SO3.exp(np.array([0.5, -0.4, 0.3])).as_matrix()
+        posture = np.array(robot.q0)
+        posture[robot.joint_qpos_index("left_shoulder_pitch_joint")] -= 0.8
+        ours = {
+            **{foot: osik.FrameTask(robot, foot, axes="frame", weight=25.0, gain=gain) for foot in feet},
+            "com": osik.ComTask(robot, target=goal, weight=4.0, gain=gain),
+            "turn": osik.FrameTask(
+                robot, turn, target=(np.zeros(3), R), axes="frame", rows="orientation", weight=0.25, gain=gain
+            ),
+            "posture": osik.PostureTask(robot, target=posture, weight=0.01, gain=gain),
+        }
+        fast = osik.VelocityLimit(robot, velocity={"*": 1.2})
+        trajectory = osik.rollout(
+            robot,
+            robot.q0,
+            ours,
+            scheme=osik.WeightedQP(damping=1e-4),
+            limits=(osik.ConfigurationLimit(robot), fast),
+            dt=DT,
+            steps=ticks,
+        )
+        theirs = mink_loop(robot, feet, goal, (turn, R), posture, gain * DT, ticks)
+        np.testing.assert_array_equal(trajectory.solution.status, osik.Status.SOLVED)
+        np.testing.assert_allclose(trajectory.q, theirs, rtol=0, atol=1e-6)
+        assert np.abs(theirs[-1] - theirs[0]).max() > 0.2
+        assert (np.abs(np.abs(trajectory.solution.velocity[:, 6:]) - 1.2) < 1e-9).any()
+
+
+def mink_loop(robot, feet, com, turn, posture, gain, ticks):
+    model = robot.mj_model
+    configuration = mink.Configuration(model, q=np.array(robot.q0))
+    tasks: list = [mink.FrameTask(foot, "body", 5.0, 5.0, gain=gain) for foot in feet]
+    tasks += [mink.ComTask(2.0, gain=gain), mink.FrameTask(turn[0], "body", 0.0, 0.5, gain=gain)]
+    tasks += [mink.PostureTask(model, 0.1, gain=gain)]
+    for foot in tasks[:2]:
+        foot.set_target_from_configuration(configuration)
+    tasks[2].set_target(com)
+    rotation = mink.SO3.from_matrix(turn[1])
+    tasks[4].set_target(posture)
+    limits = [
+        mink.ConfigurationLimit(model, gain=1.0),
+        mink.VelocityLimit(model, {name: 1.2 for name in robot.joint_names}),
+    ]
+    out = [configuration.q.copy()]
+    for _ in range(ticks):
+        here = configuration.get_transform_frame_to_world(turn[0], "body").translation()
+        tasks[3].set_target(mink.SE3.from_rotation_and_translation(rotation, here))
+        v = mink.solve_ik(configuration, tasks, DT, "daqp", damping=1e-4, limits=limits)
+        configuration.integrate_inplace(v, DT)
+        out.append(configuration.q.copy())
+    return np.array(out)
+
+
+def levels(case, q):
+    """By priority: weighted rows and their bounds."""
+    for rank in sorted({task.priority for task in case.tasks.values()}):
+        problem = numbers(case, q, [name for name, task in case.tasks.items() if task.priority == rank])
+        root = np.sqrt(problem.weight)
+        yield root[:, None] * problem.jacobian, root * problem.lower, root * problem.upper
+
+
+def projected(stack, n, secondary):
+    """Eq. 7 with NumPy's pseudo-inverse."""
+    x, P = np.zeros(n), np.eye(n)
+    for A, b, _ in stack:
+        inverse = np.linalg.pinv(A @ P, rcond=1e-9 * np.linalg.norm(A) / max(np.linalg.norm(A @ P), 1e-300))
+        x, P = x + inverse @ (b - A @ x), P - inverse @ (A @ P)
+    return x + P @ secondary
+
+
+def standing(case):
+    """NAO without the inequality, no limits: what the two hierarchical schemes have in common."""
+    tasks = {name: task for name, task in case.tasks.items() if name != "com"}
+    return dataclasses.replace(case, tasks=tasks, limits=())
+
+
+def undamped(gain=0.0):
+    return osik.NullSpace(damping=0.0, potential_gain=gain, rank_tolerance=1e-9)
+
+
+class TestNullSpace:
+    def test_agrees_with_numpy(self, arm, rng):
+        """Equality tasks and the potential's descent in what is left."""
+        tasks = {name: arm.tasks[name] for name in ("position",)}
+        case = dataclasses.replace(arm, tasks=tasks)
+        q = configurations(case, rng)
+        ours = solve_lanes(case, q, undamped(0.02))
+        for k in range(LANES):
+            slope = limit_potential_gradient(jnp.asarray(q[k]), case.robot.position_lower, case.robot.position_upper)
+            expected = projected(levels(case, q[k]), case.robot.nv, -0.02 * np.asarray(slope))
+            np.testing.assert_allclose(ours.velocity[k], expected, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(ours.slack["position"][k], 0.0, rtol=0, atol=1e-10)
+
+    def test_added_levels_leave_the_first_alone(self, arm, rng):
+        q = configurations(arm, rng)
+        first = dataclasses.replace(arm, tasks={"position": arm.tasks["position"]})
+        alone, together = (solve_lanes(case, q, undamped()) for case in (first, arm))
+        for k in range(LANES):
+            J = numbers(first, q[k]).jacobian
+            np.testing.assert_allclose(J @ together.velocity[k], J @ alone.velocity[k], rtol=0, atol=1e-10)
+            assert np.abs(together.velocity[k] - alone.velocity[k]).max() > 1e-2
+
+    def test_the_potential_leads_away_from_limits_and_keeps_the_task(self, arm):
+        robot = arm.robot
+        q0 = robot.configuration({"joint1": 2.6, "joint3": -2.6, "joint5": 2.6})
+        p = np.asarray(osik.forward_kinematics(robot, q0).frame_pose(robot, "hand")[0])
+        tasks = {"position": osik.FrameTask(robot, "hand", target=(p, np.eye(3)), rows="position")}
+        run = {
+            gain: osik.rollout(robot, q0, tasks, scheme=undamped(gain), limits=arm.limits, dt=0.01, steps=100)
+            for gain in (0.0, 2.0)
+        }
+        middle = 0.5 * (robot.position_lower + robot.position_upper)
+        span = robot.position_upper - robot.position_lower
+        room = {gain: 0.5 - np.max(np.abs((t.q - middle) / span), 1) for gain, t in run.items()}
+        np.testing.assert_allclose(run[0.0].q, np.broadcast_to(q0, (101, 7)), rtol=0, atol=1e-12)
+        assert (np.diff(room[2.0]) > -1e-12).all()
+        assert room[2.0][-1] > 1.5 * room[2.0][0]
+        assert np.abs(run[2.0].solution.error["position"]).max() < 1e-3
+
+    def test_says_by_how_much_it_leaves_the_box(self, arm, rng):
+        q = configurations(arm, rng)
+        ours = solve_lanes(arm, q, undamped())
+        for k in range(LANES):
+            low, high = numbers(arm, q[k]).box
+            expected = np.max(np.maximum(np.maximum(low - ours.velocity[k], ours.velocity[k] - high), 0.0))
+            assert ours.box_violation[k] == expected
+        assert ours.box_violation.max() > 0.1
+
+
+def lexicographic_residual(case, q, v, active=1e-9):
+    """How far v is from the lexicographic optimum: 0 proves it, for the problem of each level is convex.
+
+    Level by level, the gradient of half the squared distance must be a combination of the normals of what must not be
+    touched: the box, and the rows above (as equalities where they are equalities or missed, else as inequalities),
+    with multipliers of the right sign. The smallest norm comes last.
+    """
+    n = len(v)
+    low, high = numbers(case, q).box
+    hard = [(np.eye(n), low, high)]
+    worst = 0.0
+    for A, lower, upper in [*levels(case, q), (np.eye(n), np.zeros(n), np.zeros(n))]:
+        slack = gap(A @ v, lower, upper)
+        gradient = A.T @ slack
+        rows, lows, highs = (np.concatenate(parts) for parts in zip(*hard, strict=True))
+        value = rows @ v
+        at_low, at_high = value - lows <= active, highs - value <= active
+        both = at_low & at_high
+        directions = np.concatenate(
+            [rows[at_low], -rows[at_high & ~both], -rows[both]]
+        )  # gradient = directions' y, y >= 0
+        rest = (
+            scipy.optimize.nnls(directions.T, gradient, maxiter=10000)[1] if len(directions) else np.abs(gradient).max()
+        )
+        worst = max(worst, rest / max(1.0, np.abs(A).max() * np.abs(slack).max()))
+        missed = np.abs(slack) > active
+        hard.append((A, np.where(missed, A @ v, lower), np.where(missed, A @ v, upper)))
+    return worst
+
+
+class TestHierarchicalQP:
+    @pytest.mark.parametrize("name", ["arm", "nao"])
+    def test_is_the_lexicographic_optimum_and_keeps_its_box_exactly(self, name, request, rng):
+        """The arm: the second level contradicts the first. NAO: an inequality at the second. Speeds bind in both."""
+        case = request.getfixturevalue(name)
+        q = configurations(case, rng)
+        ours = solve_lanes(case, q, osik.HierarchicalQP())
+        np.testing.assert_array_equal(ours.status, osik.Status.SOLVED)
+        bounded = 0
+        for k in range(LANES):
+            low, high = numbers(case, q[k]).box
+            v = ours.velocity[k]
+            assert (v >= low).all()
+            assert (v <= high).all()
+            assert lexicographic_residual(case, q[k], v) < 1e-9
+            assert lexicographic_residual(case, q[k], np.clip(v + 1e-5, low, high)) > 1e-7
+            bounded += np.sum((v == low) | (v == high))
+        assert ours.box_violation.max() == 0.0
+        assert bounded > 5
+
+    def test_a_contradicting_level_does_not_hurt_those_above(self, arm, rng):
+        q = configurations(arm, rng)
+        first = dataclasses.replace(arm, tasks={"position": arm.tasks["position"]})
+        alone, together = (solve_lanes(case, q, osik.HierarchicalQP()) for case in (first, arm))
+        np.testing.assert_allclose(together.slack["position"], alone.slack["position"], rtol=0, atol=1e-10)
+        assert np.abs(together.slack["pose"]).max() > 0.1
+        assert np.abs(together.velocity - alone.velocity).max() > 1e-2
+
+    def test_equals_the_null_space_where_no_bound_is_active(self, nao, rng):
+        case = standing(nao)
+        q = configurations(case, rng)
+        ours, projection = (solve_lanes(case, q, scheme) for scheme in (osik.HierarchicalQP(), undamped()))
+        np.testing.assert_allclose(ours.velocity, projection.velocity, rtol=0, atol=1e-8)
+        for k in range(LANES):
+            expected = projected(levels(case, q[k]), case.robot.nv, np.zeros(case.robot.nv))
+            np.testing.assert_allclose(ours.velocity[k], expected, rtol=0, atol=1e-8)
+
+    def test_one_level_equals_the_weighted_qp(self, arm, rng):
+        case = dataclasses.replace(arm, tasks=arm_tasks(arm.robot, (1, 1, 1), (5.0, 2.0, 0.1)))
+        q = configurations(case, rng)
+        schemes = osik.HierarchicalQP(), osik.WeightedQP(damping=1e-11)
+        hierarchical, weighted = (solve_lanes(case, q, scheme) for scheme in schemes)
+        np.testing.assert_allclose(hierarchical.velocity, weighted.velocity, rtol=0, atol=1e-8)
+
+    def test_growing_weights_tend_to_it(self, arm, rng):
+        q = configurations(arm, rng)
+        strict = solve_lanes(arm, q, osik.HierarchicalQP()).velocity
+        apart = []
+        for k in (1, 2, 3):
+            ratio = 10.0 ** (2 * k)
+            tasks = {name: t.replace(weight=ratio ** (2 - i)) for i, (name, t) in enumerate(arm.tasks.items())}
+            case = dataclasses.replace(arm, tasks=tasks)
+            apart.append(np.abs(solve_lanes(case, q, osik.WeightedQP(damping=1e-10)).velocity - strict).max())
+        assert apart[1] < 0.1 * apart[0]
+        assert apart[2] < 0.1 * apart[1]
+        assert apart[2] < 1e-3
+
+
+class TestCentreOfMass:
+    def test_is_kept_over_the_feet_while_the_waist_pulls(self, nao):
+        """MuJoCo C says where the centre of mass and the feet are. Without the task it would leave the polygon."""
+        robot, feet = nao.robot, ("l_sole", "r_sole")
+        polygon = osik.support_polygon(robot, robot.q0, feet, margin=0.03)
+        p, R = at_home(robot, "torso")
+        com = osik.ComTask(robot, polygon=polygon, gain=50.0, priority=2)
+        tasks = {
+            **{foot: osik.FrameTask(robot, foot, gain=50.0) for foot in feet},
+            "waist": osik.FrameTask(robot, "torso", target=(p + np.array([0.0, 0.1, -0.02]), R), gain=2.0, priority=3),
+            "posture": osik.PostureTask(robot, gain=1.0, priority=4),
+        }
+        limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))
+        outside = {}
+        for weight in (0.0, 1.0):
+            now = {**tasks, "com": com.replace(weight=weight)}
+            run = osik.rollout(robot, robot.q0, now, scheme=osik.HierarchicalQP(), limits=limits, dt=0.01, steps=150)
+            np.testing.assert_array_equal(run.solution.status, osik.Status.SOLVED)
+            com_at, feet_at = mujoco_path(robot, np.asarray(run.q), feet)
+            beyond = com_at[:, :2] @ np.asarray(polygon.normals).T - np.asarray(polygon.offsets)
+            outside[weight] = beyond.max(1)
+            assert np.abs(feet_at - feet_at[0]).max() < 1e-4
+            joints = np.asarray(run.q)[:, 7:]
+            assert (joints >= np.asarray(robot.position_lower)[6:]).all()
+            assert (joints <= np.asarray(robot.position_upper)[6:]).all()
+        assert outside[0.0][-1] > 2e-3
+        assert outside[1.0].max() < 1e-5
+        assert outside[1.0][-1] > -1e-4  # it got as far as it may
+
+
+def mujoco_path(robot, qs, sites):
+    model = robot.mj_model
+    data = mujoco.MjData(model)
+    com, places = [], []
+    for q in qs:
+        data.qpos[:] = np.asarray(robot.mujoco_qpos(q))
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        com.append(data.subtree_com[0].copy())
+        places.append([data.site(site).xpos.copy() for site in sites])
+    return np.array(com), np.array(places)
