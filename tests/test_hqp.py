@@ -143,3 +143,35 @@ def test_a_bad_lane_leaves_its_neighbours_alone(recorded):
 def test_shapes_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match=r"lower has shape \(3,\)"):
         Level(jnp.ones((2, 4)), jnp.zeros(3), jnp.zeros(2))
+
+
+def test_derivatives_are_those_of_the_solution_map(rng, recorded):
+    """Along a random change of all data (zeros by structure kept): forward, reverse, central differences."""
+    r, _ = recorded
+    direction = rng.normal(size=32)
+
+    def loss(data):
+        levels, lower, upper = data
+        return direction @ solve_hqp([Level(*level) for level in levels], lower, upper).x
+
+    def change(a):
+        return np.where(np.isfinite(a) & (a != 0.0), 0.01 * rng.normal(size=a.shape), 0.0)
+
+    data = ([tuple(a[::4] for a in level) for level in r.levels], r.lower[::4], r.upper[::4])
+    rates = jax.tree.map(change, data)
+    for k, (A, low, high) in enumerate(rates[0]):
+        rates[0][k] = (A, low, np.where(data[0][k][1] == data[0][k][2], low, high))  # equalities stay equalities
+    value = jax.jit(jax.vmap(loss))
+    forward = jax.jit(lambda d, t: jax.jvp(jax.vmap(loss), (d,), (t,))[1])(data, rates)
+    gradient = jax.jit(jax.grad(lambda d: jnp.sum(jax.vmap(loss)(d))))(data)
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradient))
+    products = jax.tree.map(lambda g, t: np.sum(g * t, axis=tuple(range(1, t.ndim))), gradient, rates)
+    np.testing.assert_allclose(sum(jax.tree.leaves(products)), forward, rtol=1e-9, atol=1e-11)
+
+    def moved(h):
+        return np.asarray(value(jax.tree.map(lambda a, t: np.where(np.isfinite(a), a + h * t, a), data, rates)))
+
+    ahead, here, behind = moved(1e-6), moved(0.0), moved(-1e-6)
+    smooth = np.abs(ahead - 2 * here + behind) < 1e-9  # no active set changes on the way
+    assert smooth.sum() >= 30
+    np.testing.assert_allclose(forward[smooth], (ahead - behind)[smooth] / 2e-6, rtol=1e-6, atol=1e-8)
