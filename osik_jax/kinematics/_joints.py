@@ -7,6 +7,7 @@ joints do in the parent's frame; the tree is composed in ``_forward`` with a bar
 
 from __future__ import annotations
 
+import contextlib
 from functools import lru_cache
 
 import jax
@@ -14,10 +15,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from .._tree import KinematicTree
 from ..robot import Robot
+
+with contextlib.redirect_stdout(None):  # it prints which of its optional back ends are missing
+    from mujoco import mjx
 
 
 def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
