@@ -12,6 +12,7 @@ while the levels above it leave it violated, and nothing keeps lower levels from
 from __future__ import annotations
 
 from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -131,9 +131,7 @@ class _Cascade(eqx.Module):
         )
         return self._freeze(level, hard, end, tolerances)
 
-    def _freeze(
-        self, level: Level, hard: Hard, end: LevelState, tolerances: Tolerances
-    ) -> tuple[_Cascade, Decision]:
+    def _freeze(self, level: Level, hard: Hard, end: LevelState, tolerances: Tolerances) -> tuple[_Cascade, Decision]:
         n = self.x.shape[0]
         value = apply(level.matrix, end.x)
         slack = value - jnp.clip(value, level.lower, level.upper)
