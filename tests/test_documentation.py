@@ -54,7 +54,8 @@ def heading_anchors(page: Path) -> set[str]:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if BLOCK.search(page.read_text())], ids=relative)
 def test_code_runs(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text, namespace = page.read_text(), {"__name__": "documentation"}
+    text = page.read_text()
+    namespace: dict[str, Any] = {"__name__": "documentation"}
     try:
         for block in BLOCK.finditer(text):
             line = text[: block.start(1)].count("\n")
