@@ -1,5 +1,7 @@
 """The array-level QP against recorded daqp answers, quadprog, daqp and KKT conditions recomputed in NumPy."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,7 @@ batched_least_squares = jax.jit(
 )
 
 
-def kkt(H, g, lower, upper, x, C=None, row_lower=None, row_upper=None, y=None):
+def kkt(H, g, lower, upper, x, C=None, row_lower=None, row_upper=None, y: Any = None):
     """Largest violation of the optimality conditions, recomputed: feasibility, stationarity, signs."""
     normals = np.eye(len(x)) if C is None else np.vstack([np.eye(len(x)), C])
     low = lower if row_lower is None else np.r_[lower, row_lower]
