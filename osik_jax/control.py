@@ -256,8 +256,8 @@ def _velocity_problem(
 
 def _configuration(robot: Robot, q: Any) -> Float[Array, " nq"]:
     """q, checked, as floats at least as precise as the robot's."""
-    robot.check_configuration(q)
     q = jnp.asarray(q)
+    robot.check_configuration(q)
     return q.astype(jnp.result_type(q, robot.q0))
 
 
