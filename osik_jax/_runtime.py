@@ -1,15 +1,20 @@
-"""Settings of the XLA runtime that the library needs, made before the first computation."""
+"""Settings of the CPU runtime that the library needs, made on import and before the first computation.
+
+Each leaves alone what the user has set: ``PJRT_NPROC`` for the first, ``OPENBLAS_NUM_THREADS`` for the second.
+"""
 
 from __future__ import annotations
 
 import os
 
-_WORKERS = "PJRT_NPROC"
-_MINIMUM = 8
+import scipy.linalg  # loads the OpenBLAS that jaxlib calls, so that it can be found below
+import threadpoolctl
+
+_MINIMUM_WORKERS = 8
 
 
 def widen_cpu_pool() -> None:
-    """Gives XLA's CPU client at least 8 workers, unless ``PJRT_NPROC`` says otherwise.
+    """Gives XLA's CPU client at least 8 workers.
 
     jaxlib's batched LAPACK kernels (QR, triangular solve, Cholesky; seen with 0.10.2) wait for their own tasks inside a
     worker of the pool that has to run them, so as many of them at once as there are workers wait for ever: on two
@@ -17,7 +22,24 @@ def widen_cpu_pool() -> None:
     another; this keeps derivatives and a caller's own code safe too. It has no effect once JAX has made its CPU
     client, so import this package before the first computation.
     """
-    os.environ.setdefault(_WORKERS, str(max(_MINIMUM, os.cpu_count() or 1)))
+    os.environ.setdefault("PJRT_NPROC", str(max(_MINIMUM_WORKERS, os.cpu_count() or 1)))
+
+
+def single_threaded_lapack() -> None:
+    """Keeps SciPy's OpenBLAS, which jaxlib takes its LAPACK from, to one thread a call.
+
+    Its own threads win nothing on matrices of 50 rows, and calls from several XLA workers queue for them: on two busy
+    cores a batch of QPs took 20 times as long, and a tick of the weighted scheme 3 to 80 times. NumPy has an OpenBLAS
+    of its own, which this does not touch.
+    """
+    if "OPENBLAS_NUM_THREADS" in os.environ:
+        return
+    home = os.path.dirname(os.path.dirname(scipy.linalg.__file__))
+    libraries = threadpoolctl.ThreadpoolController().select(internal_api="openblas")
+    for library in libraries.lib_controllers:
+        if os.path.realpath(library.filepath).startswith((home, f"{home}.libs")):
+            library.set_num_threads(1)
 
 
 widen_cpu_pool()
+single_threaded_lapack()

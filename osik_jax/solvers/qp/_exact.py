@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._dense import apply, product
 from ._problem import AT_UPPER, INACTIVE, QP
 
 Gradient = Callable[[Float[Array, " n"]], Float[Array, " n"]]
@@ -34,26 +35,31 @@ def solve_active_set(
     free = active[:n] == INACTIVE
     held = active[n:] != INACTIVE
     hessian = jnp.where(free[:, None] & free[None, :], qp.hessian, jnp.diag(jnp.where(free, 0.0, 1.0)))
-    factor = jax.scipy.linalg.cho_factor(hessian, lower=True)
+    half = _half_inverse(hessian)
     rows = jnp.where(held[:, None] & free[None, :], qp.rows, 0.0)
     x = jnp.where(free, 0.0, target[:n])
     y = jnp.zeros(p, x.dtype)
     if p:
-        through = jax.scipy.linalg.cho_solve(factor, rows.T)
-        schur = jnp.matmul(rows, through, precision="highest")
+        reach = product(half, rows.T)
+        through = product(half.T, reach)
+        schur = product(reach.T, reach)
         ridge = 10.0 * jnp.finfo(x.dtype).eps * jnp.diagonal(schur)
-        schur_factor = jnp.linalg.cholesky(schur + jnp.diag(jnp.where(held, ridge, 1.0)))
-        # one LAPACK call after another: see osik_jax/_runtime.py
-        x, schur_factor = jax.lax.optimization_barrier((x, schur_factor))
+        schur_half = _half_inverse(schur + jnp.diag(jnp.where(held, ridge, 1.0)))
     for _ in range(1 + refinements):
-        stationarity = jnp.where(free, -cost_gradient(x) + qp.rows.T @ jnp.where(held, y, 0.0), 0.0)
-        step = jax.scipy.linalg.cho_solve(factor, stationarity)
+        stationarity = jnp.where(free, -cost_gradient(x) + apply(qp.rows.T, jnp.where(held, y, 0.0)), 0.0)
+        step = apply(half.T, apply(half, stationarity))
         if p:
-            gap = jnp.where(held, target[n:] - qp.rows @ (x + step), 0.0)
-            dy = jax.scipy.linalg.cho_solve((schur_factor, True), gap)
-            step, y = step + through @ dy, y + dy
+            gap = jnp.where(held, target[n:] - apply(qp.rows, x + step), 0.0)
+            dy = apply(schur_half.T, apply(schur_half, gap))
+            step, y = step + apply(through, dy), y + dy
         x = x + step
     return x, y
+
+
+def _half_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """F with matrix^-1 = F'F: two LAPACK calls once, and products for every solve after that."""
+    factor = jnp.linalg.cholesky(matrix)
+    return jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(matrix), dtype=matrix.dtype), lower=True)
 
 
 def active_targets(qp: QP, active: Int[Array, " m"]) -> Float[Array, " m"]:
