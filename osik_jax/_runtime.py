@@ -6,8 +6,9 @@ Each leaves alone what the user has set: ``PJRT_NPROC`` for the first, ``OPENBLA
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 
-import scipy.linalg  # loads the OpenBLAS that jaxlib calls, so that it can be found below
+import scipy.linalg as _  # loads the OpenBLAS that jaxlib calls, so that it can be found below
 import threadpoolctl
 
 _MINIMUM_WORKERS = 8
@@ -34,10 +35,11 @@ def single_threaded_lapack() -> None:
     """
     if "OPENBLAS_NUM_THREADS" in os.environ:
         return
-    home = os.path.dirname(os.path.dirname(scipy.linalg.__file__))
+    spec = find_spec("scipy")
+    homes = [os.path.realpath(place) for place in (spec and spec.submodule_search_locations) or ()]
     libraries = threadpoolctl.ThreadpoolController().select(internal_api="openblas")
     for library in libraries.lib_controllers:
-        if os.path.realpath(library.filepath).startswith((home, f"{home}.libs")):
+        if library.filepath.startswith(tuple(homes)):  # in scipy/ or, beside it, scipy.libs/
             library.set_num_threads(1)
 
 
