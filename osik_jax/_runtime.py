@@ -6,9 +6,8 @@ Each leaves alone what the user has set: ``PJRT_NPROC`` for the first, ``OPENBLA
 from __future__ import annotations
 
 import os
-from importlib.util import find_spec
+from importlib import import_module
 
-import scipy.linalg as _  # loads the OpenBLAS that jaxlib calls, so that it can be found below
 import threadpoolctl
 
 _MINIMUM_WORKERS = 8
@@ -35,11 +34,11 @@ def single_threaded_lapack() -> None:
     """
     if "OPENBLAS_NUM_THREADS" in os.environ:
         return
-    spec = find_spec("scipy")
-    homes = [os.path.realpath(place) for place in (spec and spec.submodule_search_locations) or ()]
+    linalg = import_module("scipy.linalg")  # loads it, so that it can be found
+    home = os.path.dirname(os.path.realpath(linalg.__path__[0]))
     libraries = threadpoolctl.ThreadpoolController().select(internal_api="openblas")
     for library in libraries.lib_controllers:
-        if library.filepath.startswith(tuple(homes)):  # in scipy/ or, beside it, scipy.libs/
+        if library.filepath.startswith(home):  # in scipy/ or, beside it, scipy.libs/
             library.set_num_threads(1)
 
 
