@@ -36,12 +36,7 @@ def home(arm):
 
 @pytest.fixture(scope="module")
 def tasks(arm, home):
-    p, R = home
-    return {
-        "hand": osik.FrameTask(arm, "hand", target=(p + np.array([0.1, 0.2, -0.1]), R)),
-        "elbow": osik.FrameTask(arm, "link4", rows="position", upper=[np.inf, 0.02, np.inf], priority=2),
-        "posture": osik.PostureTask(arm, weight=1e-2, gain=2.0, priority=3),
-    }
+    return lane(arm, home, "nothing", "weighted")[2]
 
 
 @pytest.fixture(scope="module")
@@ -121,13 +116,6 @@ class TestRollout:
         run = osik.rollout(arm, arm.q0, tasks, **options, feedback=lambda t, q: 0.9 * q + 0.01 * t)
         q, _ = loop(arm, arm.q0, lambda k: tasks, scheme, limits, measured=lambda k, q: 0.9 * q + 0.01 * DT * k)
         np.testing.assert_allclose(run.q, q, rtol=0, atol=1e-12)
-
-    def test_error_falls_as_the_gain_says(self, arm, home):
-        """One task, no limits, errors that the Jacobian follows: e <- (1 - gain dt) e, to second order in the step."""
-        far = osik.FrameTask(arm, "hand", target=(home[0] + 1e-4, home[1]), rows="position", gain=20.0)
-        run = osik.rollout(arm, arm.q0, {"hand": far}, scheme=osik.WeightedQP(damping=1e-12), dt=DT, steps=STEPS)
-        expected = -1e-4 * (1.0 - 20.0 * DT) ** np.arange(STEPS)
-        np.testing.assert_allclose(run.solution.error["hand"], np.tile(expected[:, None], 3), rtol=0, atol=1e-8)
 
     def test_a_start_of_integers_and_of_less_precision(self, arm, tasks, limits):
         q0 = np.array([0, -1, 0, -2, 0, 2, 1])
@@ -319,7 +307,6 @@ class TestDerivatives:
         elbow = osik.FrameTask(arm, "link4", rows="position", upper=[np.inf, -0.002, np.inf], priority=2)
         posture = osik.PostureTask(arm, priority=3)
 
-        @jax.jit
         def f(x):
             tasks = {
                 "hand": hand.replace(target=(x["target"], R), gain=x["gain"], weight=x["weight"]),
@@ -341,33 +328,33 @@ class TestDerivatives:
     def test_one_tick_in_both_modes(self, arm, home, limits, name):
         f, x = self.cost(arm, home, limits, name)
         flat, restore = ravel_pytree(x)
-        reverse = np.asarray(ravel_pytree(jax.jit(jax.grad(f))(x))[0])
+        run = jax.jit(jax.value_and_grad(lambda flat: f(restore(flat))))
         pushed = jax.jit(lambda direction: jax.jvp(f, (x,), (restore(direction),))[1])
-        h = 1e-6
+        reverse, h = np.asarray(run(flat)[1]), 1e-6
         for k, unit in enumerate(np.eye(len(flat))):
-            expected = (f(restore(flat + h * unit)) - f(restore(flat - h * unit))) / (2.0 * h)
-            scale = max(1.0, abs(float(expected)))
-            assert float(reverse[k]) == pytest.approx(float(expected), abs=1e-6 * scale), k
+            expected = float(run(flat + h * unit)[0] - run(flat - h * unit)[0]) / (2.0 * h)
+            scale = max(1.0, abs(expected))
+            assert float(reverse[k]) == pytest.approx(expected, abs=1e-6 * scale), k
             assert float(pushed(unit)) == pytest.approx(float(reverse[k]), abs=1e-9 * scale), k
         assert (np.abs(reverse) > 1e-4).sum() >= 10
 
     def test_through_a_rollout(self, arm, home, limits):
-        """Reverse mode through the scan: the final place of the hand with respect to a gain and a weight."""
+        """Reverse mode through the scan: a cost of the whole path with respect to a gain and a weight."""
         p, R = home
         hand = osik.FrameTask(arm, "hand", rows="position", target=(p + np.array([0.1, 0.2, -0.1]), R))
         posture = osik.PostureTask(arm, target=np.asarray(arm.q0) + 0.5)
 
-        @jax.jit
         def f(x):
             tasks = {"hand": hand.replace(gain=x[0]), "posture": posture.replace(weight=x[1])}
-            run = osik.rollout(arm, arm.q0, tasks, scheme=osik.WeightedQP(), limits=limits, dt=DT, steps=STEPS)
-            return jnp.sum(run.solution.error["hand"] ** 2) + 1e-2 * jnp.sum(run.solution.velocity**2)
+            path = osik.rollout(arm, arm.q0, tasks, scheme=osik.WeightedQP(), limits=limits, dt=DT, steps=STEPS)
+            return jnp.sum(path.solution.error["hand"] ** 2) + 1e-2 * jnp.sum(path.solution.velocity**2)
 
-        x, h = np.array([9.0, 0.02]), np.array([1e-5, 1e-7])
-        gradient = jax.jit(jax.grad(f))(x)
+        run, x, h = jax.jit(jax.value_and_grad(f)), np.array([9.0, 0.02]), np.array([1e-5, 1e-7])
+        gradient = run(x)[1]
         for k in range(2):
             step = h[k] * np.eye(2)[k]
-            assert float(gradient[k]) == pytest.approx(float((f(x + step) - f(x - step)) / (2 * h[k])), rel=1e-5)
+            expected = float(run(x + step)[0] - run(x - step)[0]) / (2.0 * h[k])
+            assert float(gradient[k]) == pytest.approx(expected, rel=1e-5)
 
 
 class TestStatus:

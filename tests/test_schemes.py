@@ -321,7 +321,7 @@ class TestNullSpace:
         first = dataclasses.replace(arm, tasks={"position": arm.tasks["position"]})
         alone, together = (solve_lanes(case, q, undamped()) for case in (first, arm))
         for k in range(LANES):
-            J = numbers(first, q[k]).jacobian
+            J = numbers(arm, q[k], ["position"]).jacobian
             np.testing.assert_allclose(J @ together.velocity[k], J @ alone.velocity[k], rtol=0, atol=1e-10)
             assert np.abs(together.velocity[k] - alone.velocity[k]).max() > 1e-2
 
@@ -403,10 +403,12 @@ class TestHierarchicalQP:
         assert bounded > 5
 
     def test_a_contradicting_level_does_not_hurt_those_above(self, arm, rng):
+        """The first level misses as much as if it were alone."""
         q = configurations(arm, rng)
         first = dataclasses.replace(arm, tasks={"position": arm.tasks["position"]})
-        alone, together = (solve_lanes(case, q, osik.HierarchicalQP()) for case in (first, arm))
-        np.testing.assert_allclose(together.slack["position"], alone.slack["position"], rtol=0, atol=1e-10)
+        alone = solve_lanes(first, q, osik.WeightedQP(damping=1e-12))
+        together = solve_lanes(arm, q, osik.HierarchicalQP())
+        np.testing.assert_allclose(together.slack["position"], alone.slack["position"], rtol=0, atol=1e-9)
         assert np.abs(together.slack["pose"]).max() > 0.1
         assert np.abs(together.velocity - alone.velocity).max() > 1e-2
 
