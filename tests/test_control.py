@@ -89,37 +89,49 @@ class TestRollout:
         np.testing.assert_array_equal(run.solution.status, osik.Status.SOLVED)
         assert np.abs(q[-1] - q[0]).max() > 0.05
 
-    def test_arrays_functions_and_modules_say_the_same(self, arm, home, tasks, limits):
+    def test_functions_of_time_for_tasks_and_feedback(self, arm, home, tasks, limits):
+        """Feedback: the configuration that the last tick led to comes back changed."""
         p, R = paths(home)
-        options = {"scheme": SCHEMES["weighted"], "limits": limits, "dt": DT, "steps": STEPS}
-        by_array = osik.rollout(arm, arm.q0, tasks, **options, targets={"hand": (p, R)})
 
         def at(t):
             k = jnp.round(t / DT).astype(int)
             return {**tasks, "hand": tasks["hand"].replace(target=(jnp.asarray(p)[k], jnp.asarray(R)[k]))}
 
-        by_function = osik.rollout(arm, arm.q0, at, **options)
-        by_module = osik.rollout(arm, arm.q0, Wave(tasks, home[0], home[1], speed=0.2), **options)
-        assert_same(by_function, by_array, 1e-12)
-        assert_same(by_module, by_array, 1e-12)
-
-    def test_feedback_as_an_array_and_as_a_function(self, arm, tasks, limits, rng):
-        """The measured configuration takes the place of the one that the last tick led to."""
-        noise = 0.05 * rng.normal(size=(STEPS, arm.nq))
-        measured = np.asarray(arm.q0) + noise
-        scheme = SCHEMES["weighted"]
-        options = {"scheme": scheme, "limits": limits, "dt": DT, "steps": STEPS}
-        run = osik.rollout(arm, arm.q0, tasks, **options, feedback=measured)
-        q, solution = loop(arm, arm.q0, lambda k: tasks, scheme, limits, measured=lambda k, q: measured[k])
+        options = {"scheme": SCHEMES["weighted"], "limits": limits, "dt": DT, "steps": STEPS}
+        run = osik.rollout(arm, arm.q0, at, **options, feedback=lambda t, q: 0.9 * q + 0.01 * t)
+        q, solution = loop(
+            arm,
+            arm.q0,
+            lambda k: {**tasks, "hand": tasks["hand"].replace(target=(p[k], R[k]))},
+            SCHEMES["weighted"],
+            limits,
+            measured=lambda k, q: 0.9 * q + 0.01 * DT * k,
+        )
         np.testing.assert_allclose(run.q, q, rtol=0, atol=1e-12)
         assert_same(run.solution, solution, 1e-10)
-        run = osik.rollout(arm, arm.q0, tasks, **options, feedback=lambda t, q: 0.9 * q + 0.01 * t)
-        q, _ = loop(arm, arm.q0, lambda k: tasks, scheme, limits, measured=lambda k, q: 0.9 * q + 0.01 * DT * k)
+
+    def test_a_module_for_tasks_and_an_array_for_feedback(self, arm, home, tasks, limits, rng):
+        p, R = paths(home)
+        measured = np.asarray(arm.q0) + 0.05 * rng.normal(size=(STEPS, arm.nq))
+        options = {"scheme": SCHEMES["weighted"], "limits": limits, "dt": DT, "steps": STEPS}
+        run = osik.rollout(
+            arm, arm.q0, Wave(tasks, jnp.asarray(home[0]), jnp.asarray(home[1]), 0.2), **options, feedback=measured
+        )
+        q, solution = loop(
+            arm,
+            arm.q0,
+            lambda k: {**tasks, "hand": tasks["hand"].replace(target=(p[k], R[k]))},
+            SCHEMES["weighted"],
+            limits,
+            measured=lambda k, q: measured[k],
+        )
         np.testing.assert_allclose(run.q, q, rtol=0, atol=1e-12)
+        assert_same(run.solution, solution, 1e-10)
 
     def test_a_start_of_integers_and_of_less_precision(self, arm, tasks, limits):
         q0 = np.array([0, -1, 0, -2, 0, 2, 1])
         options = {"scheme": SCHEMES["weighted"], "limits": limits, "dt": DT, "steps": STEPS}
+        options["targets"] = {"hand": same(tasks)}
         starts: tuple[Any, ...] = (q0.astype(float), q0, q0.astype(np.float32), q0.tolist())
         runs = [osik.rollout(arm, q, tasks, **options) for q in starts]
         for run in runs[1:]:
@@ -271,8 +283,9 @@ class TestBatches:
         places = np.asarray(tasks["hand"].target[0]) + 0.1 * rng.normal(size=(3, 3))
 
         def run(q0, p):
-            aimed = {**tasks, "hand": tasks["hand"].replace(target=(p, tasks["hand"].target[1]))}
-            return osik.rollout(arm, q0, aimed, scheme=SCHEMES["weighted"], limits=limits, dt=DT, steps=STEPS)
+            path = (jnp.tile(p, (STEPS, 1)), same(tasks)[1])
+            options = {"scheme": SCHEMES["weighted"], "limits": limits, "dt": DT, "steps": STEPS}
+            return osik.rollout(arm, q0, tasks, **options, targets={"hand": path})
 
         together = jax.jit(jax.vmap(run))(starts, places)
         for k in range(3):

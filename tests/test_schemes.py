@@ -293,10 +293,11 @@ def projected(stack, n, secondary):
     return x + P @ secondary
 
 
-def standing(case):
-    """NAO without the inequality, no limits: what the two hierarchical schemes have in common."""
-    tasks = {name: task for name, task in case.tasks.items() if name != "com"}
-    return dataclasses.replace(case, tasks=tasks, limits=())
+def unlimited(case):
+    """The same limits, at infinity."""
+    free = np.full(case.robot.nv, np.inf)
+    limits = osik.ConfigurationLimit(case.robot, lower=-free, upper=free), osik.VelocityLimit(case.robot, velocity=free)
+    return dataclasses.replace(case, limits=limits)
 
 
 def undamped(gain=0.0):
@@ -412,8 +413,9 @@ class TestHierarchicalQP:
         assert np.abs(together.slack["pose"]).max() > 0.1
         assert np.abs(together.velocity - alone.velocity).max() > 1e-2
 
-    def test_equals_the_null_space_where_no_bound_is_active(self, nao, rng):
-        case = standing(nao)
+    def test_equals_the_null_space_where_no_bound_is_active(self, arm, rng):
+        """Both are eq. 7, though the second level contradicts the first."""
+        case = unlimited(arm)
         q = configurations(case, rng)
         ours, projection = (solve_lanes(case, q, scheme) for scheme in (osik.HierarchicalQP(), undamped()))
         np.testing.assert_allclose(ours.velocity, projection.velocity, rtol=0, atol=1e-8)
