@@ -16,8 +16,8 @@ class WeightedQP(Scheme):
     """min 1/2 sum_i weight_i |J_i v - wanted_i|^2 + 1/2 damping |v|^2  subject to the box.
 
     Weights multiply squared residuals (pink and mink: ``weight = cost**2``). Rows of inequality tasks cost the square
-    of their distance to the interval. Priorities are ignored. Smooth where tasks
-    conflict; no task is met exactly while another pulls against it.
+    of their distance to the interval. Priorities are ignored. Smooth where tasks conflict; no task is met exactly while
+    another pulls against it.
 
     Attributes:
         damping: of the velocity, in the units of weight times J^2; > 0.
