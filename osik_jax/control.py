@@ -38,7 +38,7 @@ class Solution(eqx.Module):
         slack: of each task, J v minus the nearest point of its interval: what the task did not get. {name: (m,)}
         error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
 
-    All numbers are finite: what a NaN in the input spoils is 0, its derivatives too, and the status says so.
+    All numbers are finite: what a NaN in the input spoils is 0, and the status says so.
     """
 
     velocity: Float[Array, " nv"]
@@ -103,7 +103,6 @@ def solve(
 def _solve(
     robot: Robot, q: Array, tasks: dict[str, Task], scheme: Scheme, limits: tuple[Limit, ...], dt: Array | float
 ) -> Solution:
-    robot, q, tasks, scheme, limits, dt = _shielded((robot, q, tasks, scheme, limits, dt))
     kinematics = forward_kinematics(robot, q)
     problem = _velocity_problem(
         robot, q, {k: t.rows(robot, kinematics, q) for k, t in tasks.items()}, tasks, limits, dt
@@ -124,14 +123,6 @@ def _solve(
 
 def _finite(x: Array) -> Array:
     return jnp.where(jnp.isfinite(x), x, 0.0)
-
-
-def _shielded(inputs: Any) -> Any:
-    """The same numbers; derivatives with respect to them are 0 where any is NaN, so that no NaN leaves its lane."""
-    numbers, rest = eqx.partition(inputs, eqx.is_inexact_array)
-    spoiled = jnp.stack([jnp.isnan(x).any() for x in jax.tree.leaves(numbers)]).any()
-    shielded = jax.tree.map(lambda x: jnp.where(spoiled, jax.lax.stop_gradient(x), x), numbers)
-    return eqx.combine(shielded, rest)
 
 
 def rollout(

@@ -351,22 +351,6 @@ class TestDerivatives:
             assert float(pushed(unit)) == pytest.approx(float(reverse[k]), abs=1e-9 * scale), k
         assert (np.abs(reverse) > 1e-4).sum() >= 10
 
-    def test_a_lane_of_nan_gives_shared_numbers_no_gradient(self, arm, home, limits):
-        """The gradient of a batch is that of its other lanes; the lane's own is 0."""
-        f, x = self.cost(arm, home, limits, "weighted")
-
-        def total(shared, q, target, mask):
-            one = jax.vmap(lambda q, target: f({**shared, "q": q, "target": target}))
-            return jnp.sum(mask * one(q, target))
-
-        run = jax.jit(jax.grad(total, argnums=(0, 1, 2)))
-        q, target = (jnp.stack([x[key] + 0.01 * k for k in range(3)]) for key in ("q", "target"))
-        shared = {"gain": x["gain"], "weight": x["weight"]}
-        expected = run(shared, q, target, jnp.array([1.0, 0.0, 1.0]))
-        assert abs(float(expected[0]["gain"])) > 1e-3
-        for bad in ((q.at[1, 3].set(jnp.nan), target), (q, target.at[1].set(jnp.nan))):
-            assert_same(run(shared, *bad, jnp.ones(3)), expected, 1e-12)
-
     def test_through_a_rollout(self, arm, home, limits):
         """Reverse mode through the scan: a cost of the whole path with respect to a gain and a weight."""
         p, R = home
