@@ -1,0 +1,160 @@
+"""Hundreds of hard QPs a family: known optimum, optimality recomputed in NumPy, daqp, quadprog and SciPy beside it."""
+
+import jax
+import numpy as np
+import pytest
+from optimality import by_daqp, by_quadprog, kkt_residual
+from problem_families import (
+    PLANTED,
+    WHOLE_BODY_DAMPING,
+    QPs,
+    boxes,
+    mixed,
+    redundant,
+    whole_body,
+)
+from scipy.optimize import lsq_linear
+
+from osik_jax.solvers import Status, solve_least_squares_qp, solve_qp
+
+COUNT = 1000
+batched_qp = jax.jit(jax.vmap(solve_qp))
+batched_least_squares = jax.jit(
+    jax.vmap(lambda A, b, w, lo, hi: solve_least_squares_qp(A, b, w, lo, hi, damping=WHOLE_BODY_DAMPING))
+)
+UNSOLVED = ("duplicated_rows", "degenerate", "pinned", "nearly_singular")
+"""Families of which a few in a thousand fail."""
+
+
+def solved(p: QPs):
+    s = batched_qp(*p.data)
+    x = np.asarray(s.x)
+    assert np.isfinite(x).all()
+    assert ((p.lower <= x) & (x <= p.upper)).all()
+    return s, x
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("family", [f for f in PLANTED if f not in UNSOLVED])
+def test_planted_solutions(family, seed):
+    p = PLANTED[family](np.random.default_rng(seed), COUNT)
+    s, x = solved(p)
+    assert (np.asarray(s.status) == Status.SOLVED).all()
+    assert np.abs((x - p.x) / p.unit).max() < 1e-9
+    y = np.asarray(s.row_multipliers)
+    assert kkt_residual(p, x, y).max() < 1e-9
+    z = np.einsum("bij,bj->bi", p.H, x) + p.g - np.einsum("bpn,bp->bn", p.C, y)
+    size = np.einsum("bij,bj->bi", np.abs(p.H), np.abs(x)) + np.abs(p.g) + np.abs(z)
+    assert (np.abs(z - s.multipliers) / size).max() < 1e-9
+
+
+@pytest.mark.parametrize("family", [f for f in PLANTED if "scaled" not in f and f != "nearly_singular"])
+def test_daqp_and_quadprog_agree(family, rng):
+    p = PLANTED[family](rng, COUNT)
+    _, x = solved(p)
+    claims = 0
+    for i in range(0, COUNT, 20):
+        for expected in (by_daqp(p, i), by_quadprog(p, i)):
+            if expected is not None:
+                claims += 1
+                np.testing.assert_allclose(x[i], expected, atol=1e-7)
+    assert claims >= 40
+
+
+def least_squares_residual(p, x):
+    """Slope of the cost against the box, as a share of the terms that the slope is made of."""
+    residual = np.einsum("bmn,bn->bm", p.A, x) - p.b
+    slope = np.einsum("bmn,bm->bn", p.A, p.weight * residual) + WHOLE_BODY_DAMPING * x
+    terms = np.abs(p.b) + np.einsum("bmn,bn->bm", np.abs(p.A), np.abs(x))
+    size = np.einsum("bmn,bm->bn", np.abs(p.A), p.weight * terms) + WHOLE_BODY_DAMPING * np.abs(x)
+    share = slope / np.where(size > 0.0, size, 1.0)
+    gaps = np.minimum(share, x - p.lower), np.minimum(-share, p.upper - x)
+    return np.maximum(*gaps).max(1)
+
+
+def by_bounded_least_squares(p, i):
+    root = np.sqrt(p.weight[i])
+    n = p.A.shape[2]
+    A = np.vstack([root[:, None] * p.A[i], np.sqrt(WHOLE_BODY_DAMPING) * np.eye(n)])
+    b = np.concatenate([root * p.b[i], np.zeros(n)])
+    free = p.lower[i] < p.upper[i]
+    x = p.lower[i].copy()
+    box = (p.lower[i][free], p.upper[i][free])
+    x[free] = lsq_linear(A[:, free], b - A[:, ~free] @ x[~free], box, method="bvls", tol=1e-15, max_iter=1000).x
+    return x
+
+
+@pytest.mark.parametrize("family", [whole_body, redundant])
+def test_whole_body_least_squares(family, rng):
+    p = family(rng, COUNT)
+    s = batched_least_squares(p.A, p.b, p.weight, p.lower, p.upper)
+    x = np.asarray(s.x)
+    assert (np.asarray(s.status) == Status.SOLVED).all()
+    assert ((p.lower <= x) & (x <= p.upper)).all()
+    assert least_squares_residual(p, x).max() < 1e-14
+    if family is whole_body:
+        np.testing.assert_allclose(x, p.x, atol=1e-9)
+    for i in range(0, COUNT, 20):
+        np.testing.assert_allclose(x[i], by_bounded_least_squares(p, i), atol=1e-9)
+
+
+def spoiled(p: QPs, argument: int, bad: float) -> QPs:
+    """One number of the argument replaced in lane 3 and one in lane 8."""
+    data = [a.copy() for a in p.data]
+    for lane in (3, 8):
+        entry = np.unravel_index((7 * lane) % data[argument][lane].size, data[argument][lane].shape)
+        data[argument][(lane, *entry)] = bad
+    return QPs(*data, x=p.x, unit=p.unit)
+
+
+@pytest.fixture(scope="module")
+def healthy():
+    p = mixed(np.random.default_rng(5), COUNT)
+    return p, batched_qp(*p.data)
+
+
+BAD = [(name, np.nan) for name in QPs._fields[:7]] + [(name, bad) for name in "HgC" for bad in (np.inf, -np.inf)]
+
+
+@pytest.mark.parametrize(("name", "bad"), BAD)
+def test_a_bad_number_harms_its_lane_alone(name, bad, healthy):
+    p, good = healthy
+    q = spoiled(p, QPs._fields.index(name), bad)
+    s = batched_qp(*q.data)
+    status = np.asarray(s.status)[[3, 8]]
+    assert (status == Status.NUMERICAL_ERROR).all()
+    others = np.setdiff1d(np.arange(COUNT), [3, 8])
+    for mine, before in zip(jax.tree.leaves(s), jax.tree.leaves(good), strict=True):
+        np.testing.assert_array_equal(np.asarray(mine)[others], np.asarray(before)[others])
+    x = np.asarray(s.x)[[3, 8]]
+    assert np.isfinite(x).all()
+    assert np.isfinite(s.multipliers).all() and np.isfinite(s.row_multipliers).all()
+    low, high = q.lower[[3, 8]], q.upper[[3, 8]]
+    assert (~(x < low) & ~(x > high)).all()  # nothing to say of a NaN bound
+
+
+@pytest.mark.parametrize("argument", range(5), ids=["A", "b", "weight", "lower", "upper"])
+def test_a_bad_number_in_factored_form(argument):
+    p = whole_body(np.random.default_rng(6), COUNT)
+    good = batched_least_squares(*p[:5])
+    data = [a.copy() for a in p[:5]]
+    data[argument][3].flat[11] = np.nan
+    s = batched_least_squares(*data)
+    assert s.status[3] == Status.NUMERICAL_ERROR
+    x = np.asarray(s.x)
+    assert np.isfinite(x[3]).all()
+    assert (~(x[3] < data[3][3]) & ~(x[3] > data[4][3])).all()
+    others = np.arange(COUNT) != 3
+    for mine, before in zip(jax.tree.leaves(s), jax.tree.leaves(good), strict=True):
+        np.testing.assert_array_equal(np.asarray(mine)[others], np.asarray(before)[others])
+
+
+def test_crossed_bounds_are_infeasible_and_finite():
+    p = boxes(np.random.default_rng(7), COUNT)
+    lower, upper = p.lower.copy(), p.upper.copy()
+    lower[::2, 4], upper[::2, 4] = 1.0, -1.0
+    s = batched_qp(p.H, p.g, lower, upper, *p.data[4:])
+    status = np.asarray(s.status)
+    assert (status[::2] == Status.INFEASIBLE).all() and (status[1::2] == Status.SOLVED).all()
+    assert np.isfinite(s.x).all()
+    np.testing.assert_allclose(np.asarray(s.x)[1::2], p.x[1::2], atol=1e-9)
