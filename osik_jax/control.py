@@ -32,11 +32,13 @@ class Solution(eqx.Module):
         velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. (nv,)
         status: a ``Status`` code.
         iterations: changes of the active set, all levels together.
+        factorizations: systems factored, all levels together; 1 in ``WeightedQP`` where the warm start was right.
         kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``); the
             largest finite number where the status is NUMERICAL_ERROR.
         box_violation: how far v leaves its box [rad/s or m/s]; 0 but for ``NullSpace``.
         slack: of each task, J v minus the nearest point of its interval: what the task did not get. {name: (m,)}
         error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
+        warm_start: for the next tick: the active set, as a pytree of integers; None for ``NullSpace``.
 
     All numbers are finite: what a NaN in the input spoils is 0, and the status says so.
     """
@@ -44,10 +46,12 @@ class Solution(eqx.Module):
     velocity: Float[Array, " nv"]
     status: Int[Array, ""]
     iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
     kkt_residual: Float[Array, ""]
     box_violation: Float[Array, ""]
     slack: dict[str, Float[Array, " m"]]
     error: dict[str, Float[Array, " m"]]
+    warm_start: Any
 
 
 class Trajectory(eqx.Module):
@@ -72,6 +76,7 @@ def solve(
     scheme: Scheme,
     limits: Sequence[Limit] = (),
     dt: Float[Array, ""] | float = 0.005,
+    warm_start: Any = None,
 ) -> Solution:
     """The velocity that serves the tasks best at configuration q.
 
@@ -85,6 +90,8 @@ def solve(
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
         limits: joint position and velocity limits.
         dt: time until the next tick [s].
+        warm_start: that of the tick before (``Solution.warm_start``), with the same tasks, scheme and limits. It saves
+            time and does not change the answer; a wrong one costs time only.
 
     Returns:
         The answer; never raises inside jit: look at ``status``, or call ``osik_jax.solvers.raise_if_failed`` outside.
@@ -96,28 +103,36 @@ def solve(
     _check_tasks(tasks)
     _check_settings(scheme, limits, dt)
     q = _configuration(robot, q)
-    return _solve(robot, q, dict(tasks), scheme, tuple(limits), _tick(dt, q))
+    return _solve(robot, q, dict(tasks), scheme, tuple(limits), _tick(dt, q), warm_start)
 
 
 @jax.jit
 def _solve(
-    robot: Robot, q: Array, tasks: dict[str, Task], scheme: Scheme, limits: tuple[Limit, ...], dt: Array | float
+    robot: Robot,
+    q: Array,
+    tasks: dict[str, Task],
+    scheme: Scheme,
+    limits: tuple[Limit, ...],
+    dt: Array | float,
+    warm_start: Any = None,
 ) -> Solution:
     kinematics = forward_kinematics(robot, q)
     problem = _velocity_problem(
         robot, q, {k: t.rows(robot, kinematics, q) for k, t in tasks.items()}, tasks, limits, dt
     )
-    answer = scheme.solve(problem)
+    answer = scheme.solve(problem, warm_start)
     v = answer.velocity
     failed = answer.status == Status.NUMERICAL_ERROR
     return Solution(
         velocity=v,
         status=answer.status,
         iterations=answer.iterations,
+        factorizations=answer.factorizations,
         kkt_residual=jnp.where(failed, jnp.finfo(v.dtype).max, answer.kkt_residual),
         box_violation=jnp.max(_finite(jnp.maximum(jnp.maximum(problem.lower - v, v - problem.upper), 0.0))),
         slack={name: _finite(slack) for name, slack in problem.slack(v).items()},
         error={name: _finite(rows.error) for name, rows in problem.rows.items()},
+        warm_start=answer.warm_start,
     )
 
 
@@ -213,19 +228,29 @@ def _rollout(
     time = jnp.arange(steps) * dt
     measured = None if callable(feedback) else feedback
 
-    def tick(q: Array, now: tuple[Array, Targets | None, Array | None]) -> tuple[Array, tuple[Array, Solution]]:
-        t, target, sensed = now
+    def tick(
+        state: tuple[Array, Any], now: tuple[Array, Targets | None, Array | None]
+    ) -> tuple[tuple[Array, Any], tuple[Array, Solution]]:
+        (q, warm_start), (t, target, sensed) = state, now
         if callable(feedback):
             q = _configuration(robot, feedback(t, q))
         elif sensed is not None:
             q = sensed.astype(q.dtype)
         todo = _checked(tasks(t)) if callable(tasks) else _aim(tasks, target)
-        solution = _solve(robot, q, todo, scheme, limits, dt)
+        solution = _solve(robot, q, todo, scheme, limits, dt, warm_start)
         q = integrate(robot, q, solution.velocity, dt)
-        return q, (q, solution)
+        return (q, solution.warm_start), (q, solution)
 
-    _, (q, solution) = jax.lax.scan(tick, q0, (time, targets, measured), length=steps)
+    ticks = (time, targets, measured)
+    cold = _cold_start(lambda now: tick((q0, None), now)[0][1], ticks)
+    _, (q, solution) = jax.lax.scan(tick, (q0, cold), ticks, length=steps)
     return Trajectory(time, jnp.concatenate([q0[None], q]), solution)
+
+
+def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:
+    """Zeros in the shape of a warm start, from a tick that is traced and not run."""
+    one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), jax.tree.map(jnp.asarray, ticks))
+    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, one))
 
 
 def _aim(tasks: dict[str, Task], targets: Targets | None) -> dict[str, Task]:

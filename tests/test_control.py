@@ -54,10 +54,11 @@ def paths(home):
 
 def loop(robot, q, tasks_at, scheme, limits, dt=DT, steps=STEPS, measured=None):
     """The rollout in Python."""
-    qs, solutions = [np.asarray(q)], []
+    qs, solutions, warm_start = [np.asarray(q)], [], None
     for k in range(steps):
         q = q if measured is None else measured(k, q)
-        solutions.append(osik.solve(robot, q, tasks_at(k), scheme=scheme, limits=limits, dt=dt))
+        solutions.append(osik.solve(robot, q, tasks_at(k), scheme=scheme, limits=limits, dt=dt, warm_start=warm_start))
+        warm_start = solutions[-1].warm_start
         q = osik.integrate(robot, q, solutions[-1].velocity, dt)
         qs.append(np.asarray(q))
     return np.array(qs), jax.tree.map(lambda *leaves: np.stack(leaves), *solutions)

@@ -20,8 +20,8 @@ class HierarchicalQP(Scheme):
 
     max_iterations: int | None = eqx.field(default=None, static=True)
 
-    def solve(self, problem: VelocityProblem) -> SchemeAnswer:
+    def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
         """The velocity of one tick."""
         levels = [problem.level(names) for names in problem.by_priority()]
         answer = solve_hqp(levels, problem.lower, problem.upper, max_iterations=self.max_iterations)
-        return SchemeAnswer(answer.x, answer.status, answer.iterations, answer.kkt_residual)
+        return SchemeAnswer(answer.x, answer.status, answer.iterations, answer.iterations, answer.kkt_residual)

@@ -30,7 +30,7 @@ class NullSpace(Scheme):
     margin: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("margin"))
     rank_tolerance: Float[Array, ""] = eqx.field(default=1e-5, converter=as_leaf("rank_tolerance"))
 
-    def solve(self, problem: VelocityProblem) -> SchemeAnswer:
+    def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
         """The velocity of one tick."""
         levels = [problem.level(names) for names in problem.by_priority()]
         descent = -self.potential_gain * limit_potential_gradient(
@@ -39,7 +39,8 @@ class NullSpace(Scheme):
         answer = solve_nullspace(levels, secondary=descent, damping=self.damping, rank_tolerance=self.rank_tolerance)
         first = levels[0].scaled()
         gradient = first.matrix.T @ first.distance(answer.x)
-        return SchemeAnswer(answer.x, answer.status, jnp.asarray(len(levels)), jnp.max(jnp.abs(gradient)))
+        count = jnp.asarray(len(levels))
+        return SchemeAnswer(answer.x, answer.status, count, count, jnp.max(jnp.abs(gradient)))
 
 
 def limit_potential_gradient(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -62,15 +63,23 @@ class SchemeAnswer(eqx.Module):
     velocity: Float[Array, " nv"]
     status: Int[Array, ""]
     iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
     kkt_residual: Float[Array, ""]
+    warm_start: Any = None
 
 
 class Scheme(eqx.Module):
     """Base of the schemes: how tasks that cannot all be met share the robot."""
 
     @abc.abstractmethod
-    def solve(self, problem: VelocityProblem) -> SchemeAnswer:
-        """The velocity of one tick."""
+    def solve(self, problem: VelocityProblem, warm_start: Any = None) -> SchemeAnswer:
+        """The velocity of one tick.
+
+        Args:
+            problem: the tick.
+            warm_start: what the answer to a tick nearby had in ``warm_start``; integers, all zeros for a cold start. It
+                changes the time that the answer takes, and not the answer.
+        """
 
 
 def as_leaf(name: str) -> Callable[[ArrayLike | Array], Float[Array, ""]]:

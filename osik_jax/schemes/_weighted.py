@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._joint_selection import concrete
 from ..solvers import solve_least_squares_qp
@@ -32,51 +32,44 @@ class WeightedQP(Scheme):
         if seen is not None and not (seen > 0.0).all():
             raise ValueError(f"damping is {seen}; a WeightedQP needs it positive, or the velocity is not unique")
 
-    def solve(self, problem: VelocityProblem) -> SchemeAnswer:
-        """The velocity of one tick."""
+    def solve(self, problem: VelocityProblem, warm_start: Int[Array, " m"] | None = None) -> SchemeAnswer:
+        """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.rows.values() if rows.is_equality]
         intervals = [rows for rows in problem.rows.values() if not rows.is_equality]
-        n = problem.lower.shape[0]
         answer = solve_least_squares_qp(
-            **_stack(equalities, intervals, n, problem.lower.dtype),
-            **_bounds(intervals, problem),
-            damping=_damping(self.damping, intervals, n, problem.lower.dtype),
+            *_stack(equalities, problem),
+            problem.lower,
+            problem.upper,
+            **_soft_rows(intervals),
+            damping=self.damping,
+            warm_start=warm_start,
             max_iterations=self.max_iterations,
         )
-        return SchemeAnswer(answer.x[:n], answer.status, answer.iterations, answer.kkt_residual)
+        return SchemeAnswer(
+            answer.x, answer.status, answer.iterations, answer.factorizations, answer.kkt_residual, answer.active
+        )
 
 
-def _stack(equalities: list[TaskRows], intervals: list[TaskRows], n: int, dtype: jnp.dtype) -> dict[str, Array]:
-    """Least squares over [v; s], where s are the slacks of the interval rows."""
-    rows = sum(r.weight.shape[0] for r in equalities)
-    slacks = sum(r.weight.shape[0] for r in intervals)
-    matrix = jnp.concatenate([r.jacobian for r in equalities] + [jnp.zeros((slacks, n), dtype)])
-    extra = jnp.concatenate([jnp.zeros((rows, slacks), dtype), jnp.eye(slacks, dtype=dtype)])
-    return dict(
-        matrix=jnp.concatenate([matrix, extra], 1),
-        target=jnp.concatenate([r.lower for r in equalities] + [jnp.zeros(slacks, dtype)]),
-        weight=jnp.concatenate([r.weight for r in [*equalities, *intervals]]),
+def _stack(equalities: list[TaskRows], problem: VelocityProblem) -> tuple[Array, Array, Array]:
+    """Matrix, target and weight of all equality rows."""
+    nothing = jnp.zeros((0, problem.lower.shape[0]), problem.lower.dtype)
+    none = nothing[:, 0]
+    return (
+        jnp.concatenate([nothing, *(r.jacobian for r in equalities)]),
+        jnp.concatenate([none, *(r.lower for r in equalities)]),
+        jnp.concatenate([none, *(r.weight for r in equalities)]),
     )
 
 
-def _damping(damping: Array, intervals: list[TaskRows], n: int, dtype: jnp.dtype) -> Array:
-    """Of v; slacks have a cost of their own, but for those of weight 0, which nothing moves from 0."""
-    slacks = [jnp.where(r.weight > 0.0, 0.0, 1.0).astype(dtype) for r in intervals]
-    return jnp.concatenate([jnp.full(n, damping, dtype), *slacks])
-
-
-def _bounds(intervals: list[TaskRows], problem: VelocityProblem) -> dict[str, Array]:
-    """The box on v, and J v - s within the intervals."""
+def _soft_rows(intervals: list[TaskRows]) -> dict[str, Array]:
+    """Inequality rows, which give way at the price of their weight; a row of weight 0 has no bounds."""
     if not intervals:
-        return dict(lower=problem.lower, upper=problem.upper)
-    slacks = sum(r.weight.shape[0] for r in intervals)
-    free = jnp.full(slacks, jnp.inf, problem.lower.dtype)
-    jacobian = jnp.concatenate([r.jacobian for r in intervals])
-    counts = jnp.concatenate([r.weight > 0.0 for r in intervals])
+        return {}
+    weight = jnp.concatenate([r.weight for r in intervals])
+    counts = weight > 0.0
     return dict(
-        lower=jnp.concatenate([problem.lower, -free]),
-        upper=jnp.concatenate([problem.upper, free]),
-        rows=jnp.concatenate([jacobian, -jnp.eye(slacks, dtype=jacobian.dtype)], 1),
-        rows_lower=jnp.where(counts, jnp.concatenate([r.lower for r in intervals]), -free),
-        rows_upper=jnp.where(counts, jnp.concatenate([r.upper for r in intervals]), free),
+        rows=jnp.concatenate([r.jacobian for r in intervals]),
+        rows_lower=jnp.where(counts, jnp.concatenate([r.lower for r in intervals]), -jnp.inf),
+        rows_upper=jnp.where(counts, jnp.concatenate([r.upper for r in intervals]), jnp.inf),
+        rows_compliance=1.0 / jnp.where(counts, weight, 1.0),
     )

@@ -19,6 +19,11 @@ def apply(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
     return jnp.matmul(a, x, precision="highest")
 
 
+def clip_to_box(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
+    """x in [lower, upper]; a bound that is none (NaN, an infinity on the wrong side) is passed over."""
+    return jnp.clip(x, jnp.where(lower < jnp.inf, lower, -jnp.inf), jnp.where(upper > -jnp.inf, upper, jnp.inf))
+
+
 @jax.custom_jvp
 def pseudo_inverses(matrix: Float[Array, "m n"], cutoff: Array, damping: Array) -> tuple[Array, Array]:
     """Moore-Penrose inverse and damped inverse (n, m), singular values up to the cutoff left out of both.

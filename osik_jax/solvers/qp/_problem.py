@@ -6,23 +6,25 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ._cost import LeastSquares, Quadratic
+
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 
 
 class QP(eqx.Module):
-    """min 1/2 x'Hx + g'x  over  lower <= [x; C x] <= upper.
+    """min cost(x) + 1/2 sum_i t_i^2 / compliance_i  over  lower <= [x; C x + t] <= upper.
 
     Attributes:
-        hessian: H, symmetric positive definite. (n, n)
-        gradient: g. (n,)
+        cost: of x, strictly convex.
         rows: C; p may be 0. (p, n)
+        compliance: of the rows; 0 for a hard row (t = 0), 1 / weight for one that gives way at that price. (p,)
         lower: lower bounds of x, then of the rows; -inf allowed. (n + p,)
         upper: upper bounds; inf allowed, equal to the lower for an equality. (n + p,)
     """
 
-    hessian: Float[Array, "n n"]
-    gradient: Float[Array, " n"]
+    cost: Quadratic | LeastSquares
     rows: Float[Array, "p n"]
+    compliance: Float[Array, " p"]
     lower: Float[Array, " n+p"]
     upper: Float[Array, " n+p"]
 
@@ -30,10 +32,6 @@ class QP(eqx.Module):
     def equality(self) -> Bool[Array, " n+p"]:
         """Constraints whose bounds are equal."""
         return self.lower == self.upper
-
-    def values(self, x: Float[Array, " n"]) -> Float[Array, " n+p"]:
-        """[x; C x]."""
-        return jnp.concatenate([x, self.rows @ x])
 
 
 class QPSolution(eqx.Module):
@@ -43,17 +41,28 @@ class QPSolution(eqx.Module):
         x: the minimiser; inside its box exactly, whatever the status. (n,)
         status: a ``Status`` code.
         iterations: constraints added to or dropped from the active set.
+        factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search.
         kkt_residual: the largest of: stationarity (infinity norm), violated rows, multipliers of the wrong sign.
+        slack: of the rows, C x minus the nearest point of its interval; 0 for a row that holds. (p,)
         multipliers: of the box: gradient of the cost = multipliers + C' row_multipliers; positive at a lower bound,
             negative at an upper. (n,)
         row_multipliers: of the rows, same signs. (p,)
-        active: -1 at the lower bound, 1 at the upper, 2 equality, 0 free; of x, then of the rows. (n + p,)
+        active: -1 at the lower bound, 1 at the upper, 2 equality, 0 free; of x, then of the rows. What
+            ``warm_start`` takes. (n + p,)
     """
 
     x: Float[Array, " n"]
     status: Int[Array, ""]
     iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
     kkt_residual: Float[Array, ""]
+    slack: Float[Array, " p"]
     multipliers: Float[Array, " n"]
     row_multipliers: Float[Array, " p"]
     active: Int[Array, " n+p"]
+
+
+def active_targets(qp: QP, active: Int[Array, " n+p"]) -> Float[Array, " n+p"]:
+    """The bound that each active constraint sits at, 0 for the others (never infinite)."""
+    at_lower = (active != INACTIVE) & (active != AT_UPPER)
+    return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)

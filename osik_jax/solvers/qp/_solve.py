@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from .._dense import apply, clip_to_box
 from .._status import Status
-from ._dual_active_set import ActiveSet, find_active_set
-from ._exact import Gradient, solve_active_set
+from ._cost import LeastSquares, Quadratic
+from ._derivative import differentiable
 from ._problem import AT_LOWER, AT_UPPER, INACTIVE, QP, QPSolution
+from ._search import Found, searcher
 
-_VIOLATION = {jnp.dtype("float64"): 1e-12, jnp.dtype("float32"): 1e-6}
-_FEASIBLE = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
+_TOLERANCE = {jnp.dtype("float64"): 1e-12, jnp.dtype("float32"): 1e-7}
 
 
 @partial(jax.jit, static_argnames="max_iterations")
@@ -27,13 +29,15 @@ def solve_qp(
     rows_lower: Float[ArrayLike, " p"] | None = None,
     rows_upper: Float[ArrayLike, " p"] | None = None,
     *,
+    rows_compliance: Float[ArrayLike, " p"] | None = None,
+    warm_start: Int[ArrayLike, " n+p"] | None = None,
     max_iterations: int | None = None,
-    tolerance: float | None = None,
+    tolerance: Float[ArrayLike, ""] | None = None,
 ) -> QPSolution:
     """Minimises 1/2 x'Hx + g'x  subject to  lower <= x <= upper,  rows_lower <= rows x <= rows_upper.
 
-    Pure, compiled on first use, and batched by ``vmap``. Derivatives with respect to every array, in both modes, are
-    those of the solution map at its active set.
+    Pure, compiled on first use, and batched by ``vmap``. Derivatives with respect to every array, in both modes and to
+    any order, are those of the solution map at its active set.
 
     Args:
         hessian: H, symmetric positive definite. (n, n)
@@ -43,15 +47,22 @@ def solve_qp(
         rows: general constraints. (p, n)
         rows_lower: lower bounds of the rows; equal bounds make an equality. (p,)
         rows_upper: upper bounds of the rows. (p,)
-        max_iterations: cap on changes of the active set (static); default 10 (n + p).
-        tolerance: relative violation that counts as none; default 1e-12 (1e-6 in float32).
+        rows_compliance: 0 (the default) for a hard row; a row of compliance c > 0 gives way by t at a cost of
+            t^2 / (2 c). (p,)
+        warm_start: ``active`` of the solution of a problem nearby. It changes the time, not the answer. (n + p,)
+        max_iterations: cap on changes of the active set (static); default 20 (n + p).
+        tolerance: violation that counts as none, relative to the scale of the constraint; default 1e-12 (1e-7 in
+            float32).
 
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
     """
-    hessian, gradient = jnp.asarray(hessian), jnp.asarray(gradient)
-    qp = _problem(hessian, gradient, lower, upper, rows, rows_lower, rows_upper)
-    return _solve(qp, lambda x: qp.hessian @ x + qp.gradient, max_iterations, tolerance)
+    cost = Quadratic(jnp.asarray(hessian), jnp.asarray(gradient))
+    n, found = cost.linear.shape[0], cost.matrix.shape
+    if found != (n, n):
+        raise ValueError(f"hessian has shape {found}, gradient has length {n}")
+    qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
+    return _solve(qp, warm_start, max_iterations, tolerance)
 
 
 @partial(jax.jit, static_argnames="max_iterations")
@@ -66,8 +77,10 @@ def solve_least_squares_qp(
     rows_upper: Float[ArrayLike, " p"] | None = None,
     *,
     damping: Float[ArrayLike, "..."] = 1e-9,
+    rows_compliance: Float[ArrayLike, " p"] | None = None,
+    warm_start: Int[ArrayLike, " n+p"] | None = None,
     max_iterations: int | None = None,
-    tolerance: float | None = None,
+    tolerance: Float[ArrayLike, ""] | None = None,
 ) -> QPSolution:
     """Minimises 1/2 sum_i weight_i (matrix_i x - target_i)^2 + 1/2 damping |x|^2, constrained as in ``solve_qp``.
 
@@ -84,35 +97,30 @@ def solve_least_squares_qp(
         rows: general constraints. (p, n)
         rows_lower: of the rows. (p,)
         rows_upper: of the rows. (p,)
+        rows_compliance: of the rows; 0 where hard. (p,)
+        warm_start: ``active`` of the solution of a problem nearby. (n + p,)
         max_iterations: cap on changes of the active set (static).
         tolerance: relative violation that counts as none.
     """
     matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)
-    diagonal = jnp.broadcast_to(jnp.asarray(damping, matrix.dtype), matrix.shape[1:])
-    hessian = jnp.matmul(matrix.T * weight, matrix, precision="highest") + jnp.diag(diagonal)
-    gradient = -jnp.matmul(matrix.T, weight * target, precision="highest")
-    qp = _problem(hessian, gradient, lower, upper, rows, rows_lower, rows_upper)
-
-    def cost_gradient(x: Float[Array, " n"]) -> Float[Array, " n"]:
-        residual = weight * (jnp.matmul(matrix, x, precision="highest") - target)
-        return jnp.matmul(matrix.T, residual, precision="highest") + diagonal * x
-
-    return _solve(qp, cost_gradient, max_iterations, tolerance)
+    n = matrix.shape[1]
+    cost = LeastSquares(matrix, target, weight, jnp.broadcast_to(jnp.asarray(damping, matrix.dtype), (n,)))
+    qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
+    return _solve(qp, warm_start, max_iterations, tolerance)
 
 
 def _problem(
-    hessian: Array,
-    gradient: Array,
+    cost: Quadratic | LeastSquares,
+    n: int,
     lower: ArrayLike,
     upper: ArrayLike,
     rows: ArrayLike | None,
     rows_lower: ArrayLike | None,
     rows_upper: ArrayLike | None,
+    compliance: ArrayLike | None,
 ) -> QP:
     """The problem as one stack of constraints; shapes are checked here."""
-    n, dtype = gradient.shape[0], hessian.dtype
-    if hessian.shape != (n, n):
-        raise ValueError(f"hessian has shape {hessian.shape}, gradient has length {n}")
+    dtype = cost.matrix.dtype
     if rows is None:
         rows, rows_lower, rows_upper = jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
     if rows_lower is None or rows_upper is None:
@@ -122,79 +130,86 @@ def _problem(
         for a, b in ((lower, rows_lower), (upper, rows_upper))
     ]
     rows = jnp.asarray(rows, dtype)
-    if stack[0].shape != (n + rows.shape[0],) or stack[1].shape != stack[0].shape:
+    p = rows.shape[0]
+    if stack[0].shape != (n + p,) or stack[1].shape != stack[0].shape:
         raise ValueError(
-            f"bounds do not fit: {n} variables, {rows.shape[0]} rows, {stack[0].shape[0]} lower bounds "
+            f"bounds do not fit: {n} variables, {p} rows, {stack[0].shape[0]} lower bounds "
             f"and {stack[1].shape[0]} upper bounds"
         )
-    return QP(hessian, gradient, rows, *stack)
+    compliance = jnp.zeros(p, dtype) if compliance is None else jnp.asarray(compliance, dtype)
+    if compliance.shape != (p,):
+        raise ValueError(f"rows_compliance has shape {compliance.shape}; there are {p} rows")
+    return QP(cost, rows, compliance, *stack)
 
 
-def _solve(qp: QP, cost_gradient: Gradient, max_iterations: int | None, tolerance: float | None) -> QPSolution:
-    n, m = qp.gradient.shape[0], qp.lower.shape[0]
-    allowed = jnp.asarray(_VIOLATION[qp.hessian.dtype] if tolerance is None else tolerance, qp.hessian.dtype)
+def _solve(qp: QP, guess: ArrayLike | None, max_iterations: int | None, tolerance: ArrayLike | None) -> QPSolution:
+    m, p = qp.lower.shape[0], qp.rows.shape[0]
+    n, dtype = m - p, qp.lower.dtype
+    allowed = jnp.asarray(_TOLERANCE[dtype] if tolerance is None else tolerance, dtype)
     sane = _finite(qp)
     safe = _replace_where(~sane, qp)
-    found = jax.lax.stop_gradient(
-        find_active_set(jax.lax.stop_gradient(safe), 10 * m if max_iterations is None else max_iterations, allowed)
-    )
-    x, y = solve_active_set(safe, found.active, cost_gradient)
+    safe, crossed = _uncrossed(safe)
+    cold = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
+    search = searcher(20 * m if max_iterations is None else max_iterations)
+    found = search(*jax.lax.stop_gradient((safe, cold, allowed)))
+    solved = replace(safe, compliance=jnp.where(found.infeasible, found.compliance, safe.compliance))
+    x, y = differentiable(found.x, found.row_multipliers, found.active, solved)
     finite = sane & jnp.isfinite(x).all() & jnp.isfinite(y).all()
     x, y = jnp.where(finite, x, 0.0), jnp.where(finite, y, 0.0)
-    x = jnp.clip(x, _not_nan(qp.lower[:n], -jnp.inf), _not_nan(qp.upper[:n], jnp.inf))
-    slope = jnp.where(finite, cost_gradient(x), 0.0) - safe.rows.T @ y
+    x = clip_to_box(x, *(jnp.where(sane, b, raw)[:n] for b, raw in ((safe.lower, qp.lower), (safe.upper, qp.upper))))
+    slope = jnp.where(finite, safe.cost.gradient(x), 0.0) - apply(safe.rows.T, y)
     multipliers = jnp.where(found.active[:n] != INACTIVE, slope, 0.0)
-    everything = jnp.concatenate([multipliers, y])
-    residual = _kkt_residual(safe, x, everything, slope - multipliers, found.active)
+    value = apply(safe.rows, x)
     return QPSolution(
         x=x,
-        status=_status(safe, finite, found, x),
+        status=_status(finite, crossed, found),
         iterations=found.iterations,
-        kkt_residual=residual,
+        factorizations=found.factorizations,
+        kkt_residual=_kkt_residual(safe, x, multipliers, y, slope - multipliers, found.active),
+        slack=value - jnp.clip(value, safe.lower[n:], safe.upper[n:]),
         multipliers=multipliers,
         row_multipliers=y,
         active=found.active,
     )
 
 
-def _status(qp: QP, finite: Bool[Array, ""], found: ActiveSet, x: Float[Array, " n"]) -> Array:
-    """The verdict; a constraint that could not be met counts only where a gap is left, there or in another."""
-    values = qp.values(x)
-    gap = jnp.maximum(qp.lower - values, values - qp.upper)
-    allowed = _FEASIBLE[qp.hessian.dtype] * (1.0 + jnp.abs(values))
-    contradicts = (found.impossible.any() & (gap > allowed).any()) | (qp.lower > qp.upper).any()
-    verdict = jnp.where(found.settled, jnp.where(contradicts, Status.INFEASIBLE, Status.SOLVED), Status.MAX_ITERATIONS)
+def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found) -> Array:
+    verdict = jnp.where(found.optimal, Status.SOLVED, Status.MAX_ITERATIONS)
+    verdict = jnp.where(found.infeasible | crossed, Status.INFEASIBLE, verdict)
     return jnp.where(finite, verdict, Status.NUMERICAL_ERROR)
 
 
+def _uncrossed(qp: QP) -> tuple[QP, Bool[Array, ""]]:
+    """Crossed bounds as an equality halfway, which is as near to both as can be, and whether there were any."""
+    crossed = qp.lower > qp.upper
+    middle = 0.5 * jnp.where(crossed, qp.lower + qp.upper, 0.0)
+    bounds = dict(lower=jnp.where(crossed, middle, qp.lower), upper=jnp.where(crossed, middle, qp.upper))
+    return replace(qp, **bounds), crossed.any()
+
+
 def _finite(qp: QP) -> Bool[Array, ""]:
-    """Whether the numbers can be computed with: no NaN anywhere, no infinity but in bounds."""
-    data = (qp.hessian, qp.gradient, qp.rows)
+    """Whether the numbers can be computed with: no NaN anywhere, no infinity but as no bound."""
+    data = jax.tree.leaves((qp.cost, qp.rows, qp.compliance))
     finite = jnp.stack([jnp.isfinite(a).all() for a in data]).all()
-    return finite & ~jnp.isnan(qp.lower).any() & ~jnp.isnan(qp.upper).any()
+    return finite & jnp.all(qp.lower < jnp.inf) & jnp.all(qp.upper > -jnp.inf)
 
 
 def _replace_where(bad: Bool[Array, ""], qp: QP) -> QP:
     """A harmless problem in the place of a bad one, so that derivatives stay finite too."""
-    eye = jnp.eye(qp.hessian.shape[0], dtype=qp.hessian.dtype)
-    return QP(
-        jnp.where(bad, eye, qp.hessian),
-        jnp.where(bad, 0.0, qp.gradient),
-        jnp.where(bad, 0.0, qp.rows),
-        jnp.where(bad, -jnp.inf, qp.lower),
-        jnp.where(bad, jnp.inf, qp.upper),
+    harmless = QP(
+        qp.cost.harmless(),
+        jnp.zeros_like(qp.rows),
+        jnp.ones_like(qp.compliance),
+        jnp.full_like(qp.lower, -jnp.inf),
+        jnp.full_like(qp.upper, jnp.inf),
     )
+    return jax.tree.map(lambda a, b: jnp.where(bad, a, b), harmless, qp)
 
 
-def _not_nan(bound: Float[Array, " n"], otherwise: float) -> Float[Array, " n"]:
-    return jnp.where(jnp.isnan(bound), otherwise, bound)
-
-
-def _kkt_residual(
-    qp: QP, x: Float[Array, " n"], multipliers: Float[Array, " m"], stationarity: Float[Array, " n"], active: Array
-) -> Float[Array, ""]:
+def _kkt_residual(qp: QP, x: Array, box: Array, rows: Array, stationarity: Array, active: Array) -> Float[Array, ""]:
     """Largest violation of the optimality conditions; multipliers are of the box, then of the rows."""
-    values = qp.values(x)
+    values = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * rows])
+    multipliers = jnp.concatenate([box, rows])
     outside = jnp.maximum(jnp.maximum(qp.lower - values, values - qp.upper), 0.0)
     wrong_sign = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, 0.0))
     return jnp.max(jnp.concatenate([jnp.abs(stationarity), outside, wrong_sign]))

@@ -1,0 +1,72 @@
+"""Batches of problems, seen as one array of lanes by code that stops early, branches or works in blocks.
+
+Under plain ``vmap`` a ``while_loop`` selects its whole carry at every iteration and a ``cond`` runs both branches. Code
+that sees the lanes decides itself: a branch that no lane needs is not run, and on a CPU a batch goes through in blocks
+that stay in the cache, each of which stops when its own slowest lane is done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+
+_BLOCK = 16
+"""Lanes that a CPU core takes at a time: 64 matrices of 35 x 35 doubles fill a third of its second cache."""
+
+
+def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
+    """One problem at a time, from a function of many.
+
+    Args:
+        solve: takes and returns pytrees whose arrays have a leading axis, the lanes.
+
+    Returns:
+        The function of pytrees without that axis. ``vmap`` of it, however deeply nested, calls ``solve`` on all lanes
+        (on a CPU: on blocks of them). It is not differentiable: stop gradients at its inputs.
+    """
+
+    @custom_vmap
+    def lanes(*args: Any) -> Any:
+        return _in_blocks(solve, args)
+
+    @lanes.def_vmap
+    def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
+        wide = jax.tree.map(
+            lambda a, batched: a if batched else jnp.broadcast_to(a, (axis_size, *a.shape)), args, tuple(in_batched)
+        )
+        merged = jax.tree.map(_merge, wide)
+        out = jax.tree.map(lambda a: a.reshape(axis_size, a.shape[0] // axis_size, *a.shape[1:]), lanes(*merged))
+        return out, jax.tree.map(lambda _: True, out)
+
+    def one(*args: Any) -> Any:
+        return jax.tree.map(lambda a: a[0], lanes(*jax.tree.map(lambda a: jnp.asarray(a)[None], args)))
+
+    return one
+
+
+def _in_blocks(solve: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    count = jax.tree.leaves(args)[0].shape[0]
+    if count <= _BLOCK or jax.default_backend() != "cpu":
+        return solve(*args)
+    blocks = -(-count // _BLOCK)
+    padding = blocks * _BLOCK - count
+
+    def split(a: jax.Array) -> jax.Array:
+        filled = jnp.concatenate([a, jnp.broadcast_to(a[:1], (padding, *a.shape[1:]))]) if padding else a
+        return filled.reshape(blocks, _BLOCK, *a.shape[1:])
+
+    out = jax.lax.map(lambda block: solve(*block), jax.tree.map(split, args))
+    return jax.tree.map(lambda a: _merge(a)[:count], out)
+
+
+def _merge(a: jax.Array) -> jax.Array:
+    return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
+
+
+def choose(where: jax.Array, new: Any, old: Any) -> Any:
+    """``new`` in the lanes where the flag (one a lane) is set, ``old`` in the others."""
+    return jax.tree.map(lambda a, b: jnp.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

@@ -1,0 +1,66 @@
+"""Convex quadratic costs, in the two forms that they come in."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._dense import apply, product
+
+
+class Quadratic(eqx.Module):
+    """1/2 x'Hx + g'x."""
+
+    matrix: Float[Array, "n n"]
+    linear: Float[Array, " n"]
+
+    def hessian(self) -> Float[Array, "n n"]:
+        """H."""
+        return self.matrix
+
+    def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """H x + g."""
+        return apply(self.matrix, x) + self.linear
+
+    def curvature(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """H x."""
+        return apply(self.matrix, x)
+
+    def harmless(self) -> Quadratic:
+        """A cost of the same shape that can always be minimised."""
+        return Quadratic(jnp.eye(len(self.linear), dtype=self.matrix.dtype), jnp.zeros_like(self.linear))
+
+
+class LeastSquares(eqx.Module):
+    """1/2 sum_i weight_i (A x - b)_i^2 + 1/2 sum_j damping_j x_j^2.
+
+    Products go through A: what forming H = A'WA rounds away (small weights beside large ones) is kept.
+    """
+
+    matrix: Float[Array, "m n"]
+    target: Float[Array, " m"]
+    weight: Float[Array, " m"]
+    damping: Float[Array, " n"]
+
+    def hessian(self) -> Float[Array, "n n"]:
+        """A'WA + D, rounded."""
+        return product(self.matrix.T * self.weight, self.matrix) + jnp.diag(self.damping)
+
+    def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """A'W(A x - b) + D x."""
+        residual = self.weight * (apply(self.matrix, x) - self.target)
+        return apply(self.matrix.T, residual) + self.damping * x
+
+    def curvature(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """A'WA x + D x."""
+        return apply(self.matrix.T, self.weight * apply(self.matrix, x)) + self.damping * x
+
+    def harmless(self) -> LeastSquares:
+        """A cost of the same shape that can always be minimised."""
+        return LeastSquares(
+            matrix=jnp.zeros_like(self.matrix),
+            target=jnp.zeros_like(self.target),
+            weight=jnp.zeros_like(self.weight),
+            damping=jnp.ones_like(self.damping),
+        )

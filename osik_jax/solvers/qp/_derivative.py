@@ -1,0 +1,74 @@
+"""The derivative of the solution map, forward and reverse, to any order.
+
+Where no constraint is about to enter or leave the active set, the answer solves a linear system that is smooth in all
+data. Its derivative is one more solution of that system; the search is not differentiated.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._dense import apply
+from ._factor import factorize, solve_system
+from ._problem import INACTIVE, QP, active_targets
+
+
+class _Point(NamedTuple):
+    x: Float[Array, " n"]
+    y: Float[Array, " p"]
+
+
+@jax.custom_jvp
+def differentiable(x: Array, y: Array, active: Int[Array, " m"], qp: QP) -> tuple[Array, Array]:
+    """x and y as they are, with the derivatives of the minimiser and its row multipliers with respect to ``qp``."""
+    return x, y
+
+
+@differentiable.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    x, y, active, qp = primals
+    rates = tangents[3]
+    x, y = differentiable(x, y, active, qp)
+    n = x.shape[0]
+    free, held = active[:n] == INACTIVE, active[n:] != INACTIVE
+
+    def conditions(data: QP) -> tuple[Array, Array]:
+        slope = apply(data.rows.T, y) - data.cost.gradient(x)
+        gap = active_targets(data, active)[n:] - apply(data.rows, x) - data.compliance * y
+        return slope, gap
+
+    _, (slope, gap) = jax.jvp(conditions, (qp,), (rates,))
+    pinned = jnp.where(free, 0.0, jax.jvp(lambda data: active_targets(data, active)[:n], (qp,), (rates,))[1])
+    slope = jnp.where(free, slope - qp.cost.curvature(pinned), 0.0)
+    gap = jnp.where(held, gap - apply(qp.rows, pinned), 0.0)
+    dx, dy = _linear_solve(qp, active, slope, gap)
+    return (x, y), (dx + pinned, dy)
+
+
+def _linear_solve(qp: QP, active: Int[Array, " m"], slope: Array, gap: Array) -> tuple[Array, Array]:
+    n = slope.shape[0]
+    free, held = active[:n] == INACTIVE, active[n:] != INACTIVE
+
+    def conditions(point: tuple[Array, Array]) -> tuple[Array, Array]:
+        x, y = jnp.where(free, point[0], 0.0), jnp.where(held, point[1], 0.0)
+        top = qp.cost.curvature(x) - apply(qp.rows.T, y)
+        bottom = -apply(qp.rows, x) - qp.compliance * y
+        return jnp.where(free, top, point[0]), jnp.where(held, bottom, point[1])
+
+    still = jax.lax.stop_gradient(qp)
+    factor = factorize(still, still.cost.hessian(), active)
+
+    def solve(matvec, right):
+        """One refinement: products with A keep what the factor of A'WA has lost."""
+        dx, dy = jnp.where(free, 0.0, right[0]), jnp.where(held, 0.0, right[1])
+        for _ in range(2):
+            top, bottom = matvec((dx, dy))
+            sx, sy = solve_system(factor, right[0] - top, bottom - right[1])
+            dx, dy = dx + sx, dy + jnp.where(held, sy, 0.0)
+        return dx, dy
+
+    return jax.lax.custom_linear_solve(conditions, (slope, -gap), solve, symmetric=True)

@@ -1,0 +1,193 @@
+"""Active set found and certified: guess, factor, check; where the check fails, pivot on from there, and again.
+
+The guess is the warm start, or no active bound at all; where it is right, one factorisation is all there is. The
+answer always comes from a fresh factorisation at the final active set, never from the tableau that found it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._dense import apply
+from .._lanes import choose, in_lanes
+from ._factor import factorize, minimize_on
+from ._pivots import NO_GAP, Noise, find
+from ._problem import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, QP
+
+_ROUNDS = 30
+_NEARLY = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
+"""Noises; an answer that the search does not change is accepted with violations up to this."""
+_PATIENCE = 5
+"""Searches that end at a contradiction before it is believed; one that does not move from fresh factors is enough."""
+_HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
+_SOFT = {jnp.dtype("float64"): (1e-6, 1e-12), jnp.dtype("float32"): (1e-3, 1e-4)}
+"""Compliance of rows that contradict, first and last, as a share of their own; each stage starts where one ended."""
+
+
+class Found(NamedTuple):
+    """The end of a search. As an iterate it has a leading axis, the lanes."""
+
+    x: Float[Array, " n"]
+    row_multipliers: Float[Array, " p"]
+    active: Int[Array, " m"]
+    implied: Bool[Array, " m"]  # equalities that the active constraints imply
+    iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
+    done: Bool[Array, ""]
+    optimal: Bool[Array, ""]
+    contradictions: Int[Array, ""]  # searches that ended at one
+    infeasible: Bool[Array, ""]  # some rows contradict each other or the box: all of them have been made to give way
+    compliance: Float[Array, " p"]  # of the rows in the problem that ``x`` solves
+
+
+class Scales(NamedTuple):
+    """Rounding in the values and multipliers of the constraints is this large, times a tolerance."""
+
+    value: Float[Array, " m"]
+    multiplier: Float[Array, " m"]
+
+
+@cache
+def searcher(max_iterations: int) -> Callable[[QP, Array, Array], Found]:
+    """The search for one problem, with a cap on the changes of the active set."""
+    return in_lanes(lambda qp, guess, tolerance: _search(qp, guess, tolerance, max_iterations))
+
+
+def _search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Found:
+    lanes, n = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1]
+    hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
+    nothing = jnp.zeros(lanes, jnp.int32)
+    start = Found(
+        x=jnp.zeros((lanes, n), hessian.dtype),
+        row_multipliers=jnp.zeros(qp.rows.shape[:2], hessian.dtype),
+        active=jax.vmap(_possible)(qp, guess),
+        implied=jnp.zeros(guess.shape, bool),
+        iterations=nothing,
+        factorizations=nothing,
+        done=jnp.zeros(lanes, bool),
+        optimal=jnp.zeros(lanes, bool),
+        contradictions=nothing,
+        infeasible=jnp.zeros(lanes, bool),
+        compliance=qp.compliance,
+    )
+
+    def go_on(state: tuple[Found, Array]) -> Bool[Array, ""]:
+        found, rounds = state
+        return (rounds < _ROUNDS) & ~jnp.all(found.done)
+
+    def body(state: tuple[Found, Array]) -> tuple[Found, Array]:
+        found, rounds = state
+        return choose(~found.done, _round(qp, hessian, found, tolerance, max_iterations), found), rounds + 1
+
+    return jax.lax.while_loop(go_on, body, (start, jnp.asarray(0)))[0]
+
+
+def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Float[Array, " B"], cap: int) -> Found:
+    stiff, qp = qp, replace(qp, compliance=found.compliance)
+    factor = jax.vmap(factorize)(qp, hessian, found.active)
+    x, y = minimize_on(qp, factor, found.active)
+    scales = jax.vmap(_scales)(qp, hessian, x, y)
+    noise = Noise(*(tolerance[:, None] * a for a in scales))
+    optimal = jax.vmap(_optimal)(qp, found, x, y, noise)
+    more = Noise(*(_NEARLY[hessian.dtype] * a for a in noise))
+    nearly = jax.vmap(_optimal)(qp, found, x, y, more)
+    exhausted = found.iterations >= cap
+    searching = ~(found.done | optimal | exhausted)
+
+    def look() -> Found:
+        end = find(
+            *(qp, hessian, factor, found.active, noise, x, y),
+            searching=searching,
+            iterations=found.iterations,
+            max_iterations=cap,
+        )
+        return found._replace(
+            active=end.active,
+            implied=end.implied,
+            iterations=end.iterations,
+            contradictions=found.contradictions
+            + end.contradicted * jnp.where(jnp.all(end.active == found.active, 1), _PATIENCE, 1),
+        )
+
+    after = jax.lax.cond(jnp.any(searching), lambda: choose(searching, look(), found), lambda: found)
+    same = jnp.all(after.active == found.active, 1)
+    end = after._replace(
+        x=x,
+        row_multipliers=y,
+        factorizations=found.factorizations + 1,
+        done=exhausted | (nearly & same & (after.contradictions == found.contradictions)),
+        optimal=nearly & same,
+    )
+    return jax.vmap(_give_way)(stiff, hessian, end, scales) if qp.rows.shape[1] else end
+
+
+def _give_way(stiff: QP, hessian: Float[Array, "n n"], found: Found, scales: Scales) -> Found:
+    """Where rows contradict, begins anew with all of them soft, and stiffens them; where they then hold, for good."""
+    softens = (found.contradictions >= _PATIENCE) & ~found.infeasible
+    gap = _gaps(stiff, found.x, jnp.zeros_like(found.row_multipliers))
+    hardens = found.infeasible & found.done & jnp.all(gap <= _HOLDS[hessian.dtype] * scales.value)
+    in_box = jnp.arange(len(found.active)) < len(found.x)
+    pinned = jnp.where(stiff.equality & in_box, EQUALITY, INACTIVE)
+    reach = apply(stiff.rows**2, 1.0 / jnp.where(jnp.diagonal(hessian) > 0.0, jnp.diagonal(hessian), 1.0))
+    first, last = (jnp.maximum(share * jnp.max(reach), stiff.compliance) for share in _SOFT[hessian.dtype])
+    stiffer = jnp.maximum(1e-3 * found.compliance, last)
+    stiffens = found.infeasible & found.done & ~hardens & jnp.any(stiffer < found.compliance)
+    return found._replace(
+        active=jnp.where(softens, pinned, found.active).astype(jnp.int32),
+        implied=found.implied & ~(softens | hardens | stiffens),
+        done=found.done & ~hardens & ~stiffens,
+        contradictions=jnp.where(hardens, -_ROUNDS * _PATIENCE, found.contradictions),
+        infeasible=(found.infeasible | softens) & ~hardens,
+        compliance=jnp.select([softens, hardens, stiffens], [first, stiff.compliance, stiffer], found.compliance),
+    )
+
+
+def _possible(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
+    """The guess, where the bounds that it names exist; equal bounds of the box are active from the start."""
+    n = qp.lower.shape[0] - qp.rows.shape[0]
+    named = jnp.where(guess == AT_UPPER, qp.upper, qp.lower)
+    one_sided = jnp.where(guess == AT_UPPER, AT_UPPER, AT_LOWER)
+    label = jnp.where((guess != INACTIVE) & jnp.isfinite(named), one_sided, INACTIVE)
+    in_box = jnp.arange(len(guess)) < n
+    pinned = qp.equality & (in_box | (guess != INACTIVE))
+    return jnp.where(pinned, EQUALITY, label).astype(jnp.int32)
+
+
+def _scales(qp: QP, hessian: Float[Array, "n n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
+    """Invariant to the units of the variables: each is measured by the root of its curvature."""
+    diagonal = jnp.diagonal(hessian)
+    root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
+    reach = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
+    span = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])
+    floor = jnp.minimum(jnp.max(jnp.abs(x) * root) * reach, jnp.max(jnp.abs(x)) * span)
+    values = jnp.concatenate([x, apply(qp.rows, x)])
+    bounds = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (qp.lower, qp.upper)]
+    nearest = jnp.minimum(*bounds)
+    value = floor + jnp.abs(values) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
+    pull = jnp.concatenate([1e-3 * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
+    return Scales(value, value / jnp.maximum(reach, jnp.finfo(x.dtype).tiny) ** 2 + pull)
+
+
+def _optimal(qp: QP, found: Found, x: Float[Array, " n"], y: Float[Array, " p"], noise: Noise) -> Bool[Array, ""]:
+    """Whether the minimiser on the active set is the minimiser: others hold, multipliers have their signs."""
+    active = found.active
+    slope = qp.cost.gradient(x) - apply(qp.rows.T, y)
+    multipliers = jnp.concatenate([slope, y])
+    gap = _gaps(qp, x, y)
+    open_equality = qp.equality & (active == INACTIVE) & ~found.implied
+    violated = gap > jnp.where(found.implied, NO_GAP[x.dtype], 1.0) * noise.value
+    wrong = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, -jnp.inf))
+    return ~jnp.any(violated | open_equality | (wrong > noise.multiplier))
+
+
+def _gaps(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " m"]:
+    """How far each constraint is outside its interval; negative inside."""
+    values = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * y])
+    return jnp.maximum(qp.lower - values, values - qp.upper)
