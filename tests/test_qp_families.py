@@ -3,13 +3,16 @@
 import jax
 import numpy as np
 import pytest
-from optimality import by_daqp, by_quadprog, kkt_residual
+from optimality import by_daqp, by_quadprog, kkt_residual, least_violation, least_violation_residual
 from problem_families import (
     PLANTED,
     WHOLE_BODY_DAMPING,
     QPs,
     boxes,
+    inconsistent_equalities,
+    inconsistent_rows,
     mixed,
+    nearly_dependent_rows,
     redundant,
     whole_body,
 )
@@ -22,8 +25,10 @@ batched_qp = jax.jit(jax.vmap(solve_qp))
 batched_least_squares = jax.jit(
     jax.vmap(lambda A, b, w, lo, hi: solve_least_squares_qp(A, b, w, lo, hi, damping=WHOLE_BODY_DAMPING))
 )
-UNSOLVED = ("duplicated_rows", "degenerate", "pinned", "nearly_singular")
-"""Families of which a few in a thousand fail."""
+SOLUTION_ERROR = {"nearly_singular": 1e-4}
+"""Where H has condition 1e10, rounding the data in their last digit moves the solution by up to 1e-5."""
+SOLVED_SHARE = {"nearly_singular": 0.995}
+"""There the search starts 1e10 away and may end without an answer, but never claims a wrong one."""
 
 
 def solved(p: QPs):
@@ -35,17 +40,27 @@ def solved(p: QPs):
 
 
 @pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("family", [f for f in PLANTED if f not in UNSOLVED])
+@pytest.mark.parametrize("family", PLANTED)
 def test_planted_solutions(family, seed):
     p = PLANTED[family](np.random.default_rng(seed), COUNT)
     s, x = solved(p)
-    assert (np.asarray(s.status) == Status.SOLVED).all()
-    assert np.abs((x - p.x) / p.unit).max() < 1e-9
     y = np.asarray(s.row_multipliers)
-    assert kkt_residual(p, x, y).max() < 1e-9
+    claimed = np.asarray(s.status) == Status.SOLVED
+    assert claimed.mean() >= SOLVED_SHARE.get(family, 1.0)
+    assert np.abs((x - p.x) / p.unit)[claimed].max() < SOLUTION_ERROR.get(family, 1e-9)
+    assert kkt_residual(p, x, y)[claimed].max() < 1e-9
     z = np.einsum("bij,bj->bi", p.H, x) + p.g - np.einsum("bpn,bp->bn", p.C, y)
     size = np.einsum("bij,bj->bi", np.abs(p.H), np.abs(x)) + np.abs(p.g) + np.abs(z)
-    assert (np.abs(z - s.multipliers) / size).max() < 1e-9
+    assert (np.abs(z - s.multipliers) / size)[claimed].max() < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nearly_dependent_rows_are_solved_or_said_not_to_be(seed):
+    p = nearly_dependent_rows(np.random.default_rng(seed), COUNT)
+    s, x = solved(p)
+    claimed = np.asarray(s.status) == Status.SOLVED
+    assert claimed.mean() > 0.9  # daqp: three quarters
+    assert kkt_residual(p, x, np.asarray(s.row_multipliers))[claimed].max() < 1e-7
 
 
 @pytest.mark.parametrize("family", [f for f in PLANTED if "scaled" not in f and f != "nearly_singular"])
@@ -59,6 +74,19 @@ def test_daqp_and_quadprog_agree(family, rng):
                 claims += 1
                 np.testing.assert_allclose(x[i], expected, atol=1e-7)
     assert claims >= 40
+
+
+@pytest.mark.parametrize("family", [inconsistent_equalities, inconsistent_rows])
+def test_contradictions_get_the_least_violating_answer(family, rng):
+    """|distance of C x to its intervals| first, to nine digits; then the cost among all x as near as that, to five."""
+    p = family(rng, COUNT)
+    s, x = solved(p)
+    assert (np.asarray(s.status) == Status.INFEASIBLE).all()
+    values = np.einsum("bpn,bn->bp", p.C, x)
+    distance = np.linalg.norm(values - np.clip(values, p.row_lower, p.row_upper), axis=1)
+    for i in range(0, COUNT, 20):
+        np.testing.assert_allclose(distance[i], least_violation(p, i), rtol=1e-9, atol=1e-8)
+    assert max(least_violation_residual(p, i, x[i]) for i in range(COUNT)) < 1e-5
 
 
 def least_squares_residual(p, x):
@@ -113,7 +141,8 @@ def healthy():
     return p, batched_qp(*p.data)
 
 
-BAD = [(name, np.nan) for name in QPs._fields[:7]] + [(name, bad) for name in "HgC" for bad in (np.inf, -np.inf)]
+LEGAL = {("lower", -np.inf), ("row_lower", -np.inf), ("upper", np.inf), ("row_upper", np.inf)}
+BAD = [(name, bad) for name in QPs._fields[:7] for bad in (np.nan, np.inf, -np.inf) if (name, bad) not in LEGAL]
 
 
 @pytest.mark.parametrize(("name", "bad"), BAD)
@@ -122,7 +151,10 @@ def test_a_bad_number_harms_its_lane_alone(name, bad, healthy):
     q = spoiled(p, QPs._fields.index(name), bad)
     s = batched_qp(*q.data)
     status = np.asarray(s.status)[[3, 8]]
-    assert (status == Status.NUMERICAL_ERROR).all()
+    if np.isinf(bad) and name.endswith(("lower", "upper")):
+        assert np.isin(status, (Status.INFEASIBLE, Status.NUMERICAL_ERROR)).all()
+    else:
+        assert (status == Status.NUMERICAL_ERROR).all()
     others = np.setdiff1d(np.arange(COUNT), [3, 8])
     for mine, before in zip(jax.tree.leaves(s), jax.tree.leaves(good), strict=True):
         np.testing.assert_array_equal(np.asarray(mine)[others], np.asarray(before)[others])
@@ -130,7 +162,8 @@ def test_a_bad_number_harms_its_lane_alone(name, bad, healthy):
     assert np.isfinite(x).all()
     assert np.isfinite(s.multipliers).all() and np.isfinite(s.row_multipliers).all()
     low, high = q.lower[[3, 8]], q.upper[[3, 8]]
-    assert (~(x < low) & ~(x > high)).all()  # nothing to say of a NaN bound
+    possible = ~(low > high) & ~(low == np.inf) & ~(high == -np.inf)
+    assert (~(x < low) & ~(x > high))[possible].all()  # nothing to say of a NaN bound
 
 
 @pytest.mark.parametrize("argument", range(5), ids=["A", "b", "weight", "lower", "upper"])
