@@ -6,20 +6,15 @@ data. Its derivative is one more solution of that system; the search is not diff
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .._dense import apply
 from ._factor import factorize, solve_system
 from ._problem import INACTIVE, QP, active_targets
-
-
-class _Point(NamedTuple):
-    x: Float[Array, " n"]
-    y: Float[Array, " p"]
 
 
 @jax.custom_jvp
@@ -50,25 +45,28 @@ def _(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array
 
 
 def _linear_solve(qp: QP, active: Int[Array, " m"], slope: Array, gap: Array) -> tuple[Array, Array]:
+    """dx, dy with H dx - C'dy = slope over the free variables and C dx + D dy = gap over the held rows, 0 elsewhere."""
     n = slope.shape[0]
     free, held = active[:n] == INACTIVE, active[n:] != INACTIVE
+    counts = jnp.concatenate([free, held])
 
-    def conditions(point: tuple[Array, Array]) -> tuple[Array, Array]:
-        x, y = jnp.where(free, point[0], 0.0), jnp.where(held, point[1], 0.0)
+    def symmetric(point: Array) -> Array:
+        x, y = jnp.where(free, point[:n], 0.0), jnp.where(held, point[n:], 0.0)
         top = qp.cost.curvature(x) - apply(qp.rows.T, y)
         bottom = -apply(qp.rows, x) - qp.compliance * y
-        return jnp.where(free, top, point[0]), jnp.where(held, bottom, point[1])
+        return jnp.where(counts, jnp.concatenate([top, bottom]), point)
 
     still = jax.lax.stop_gradient(qp)
     factor = factorize(still, still.cost.hessian(), active)
 
-    def solve(matvec, right):
+    def solve(matvec: Callable[[Array], Array], right: Array) -> Array:
         """One refinement: products with A keep what the factor of A'WA has lost."""
-        dx, dy = jnp.where(free, 0.0, right[0]), jnp.where(held, 0.0, right[1])
+        point = jnp.where(counts, 0.0, right)
         for _ in range(2):
-            top, bottom = matvec((dx, dy))
-            sx, sy = solve_system(factor, right[0] - top, bottom - right[1])
-            dx, dy = dx + sx, dy + jnp.where(held, sy, 0.0)
-        return dx, dy
+            rest = jnp.where(counts, right - matvec(point), 0.0)
+            point = point + jnp.concatenate(solve_system(factor, rest[:n], -rest[n:]))
+        return point
 
-    return jax.lax.custom_linear_solve(conditions, (slope, -gap), solve, symmetric=True)
+    # one vector: a transposition wants all of the right side or nothing of it
+    point = jax.lax.custom_linear_solve(symmetric, jnp.concatenate([slope, -gap]), solve, symmetric=True)
+    return point[:n], point[n:]
