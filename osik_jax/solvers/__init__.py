@@ -1,13 +1,13 @@
 """Array-level solvers, no robot inside: quadratic programs, hierarchies, null-space projection."""
 
-from ._null_space import NullSpaceSolution as NullSpaceSolution
-from ._null_space import solve_nullspace as solve_nullspace
 from ._status import Status as Status
 from ._status import raise_if_failed as raise_if_failed
 from .hqp import HQPSolution as HQPSolution
 from .hqp import Level as Level
 from .hqp import Tolerances as Tolerances
 from .hqp import solve_hqp as solve_hqp
+from .null_space import NullSpaceSolution as NullSpaceSolution
+from .null_space import solve_nullspace as solve_nullspace
 from .qp import QPSolution as QPSolution
 from .qp import solve_least_squares_qp as solve_least_squares_qp
 from .qp import solve_qp as solve_qp

@@ -1,0 +1,54 @@
+"""The classical order (eqs. 6 and 7): from the highest level to the lowest, each in the null space of those before it.
+
+    v_k = v_{k-1} + (J_k P_{k-1})^+ (b_k - J_k v_{k-1}),    P_k = P_{k-1} - (J_k P_{k-1})^+ (J_k P_{k-1})
+
+with the Moore-Penrose inverse, singular values below a share of the level's own size cut off. Damping acts on the
+motion term alone; in the projector it would break idempotency, and lower levels would leak into higher ones.
+
+When not to use it: where bounds have to hold (``_saturation.py``), or inequalities (``solve_hqp``): an inequality row
+takes part only while the levels above it leave it violated, and nothing keeps lower levels from violating it again.
+Where a level loses rank against those above it, the levels below jump (``_reverse.py`` does not).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._dense import apply, product, pseudo_inverses
+from ..hqp import Level
+from ._problem import Demand
+
+
+def solve_forward(
+    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Array, rank: Array | float
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """The answer, and the projector onto what no level asks for."""
+    x, projector = jnp.zeros_like(secondary), jnp.eye(len(secondary), dtype=secondary.dtype)
+    for level in levels:
+        motion, projector = level_motion(level, x, projector, damping, rank)
+        x = x + motion
+    return x + apply(projector, secondary), projector
+
+
+def level_motion(
+    level: Level, x: Float[Array, " n"], projector: Float[Array, "n n"], damping: Array, rank: Array | float
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """What one level adds to x, and the projector for the next."""
+    if not level.matrix.shape[0]:
+        return jnp.zeros_like(x), projector
+    demand = Demand.of(level, x, rank)
+    restricted = product(demand.rows, projector)
+    inverse, damped = pseudo_inverses(restricted, demand.cutoff, damping)
+    return apply(damped, demand.wanted), _purified(projector - product(inverse, restricted))
+
+
+def _purified(projector: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """3 P^2 - 2 P^3: eigenvalues at a distance e from 0 or 1 come as near as 3 e^2.
+
+    Where singular values are small the difference leaves rounding that large targets would take for freedom.
+    """
+    square = product(projector, projector)
+    return 3.0 * square - 2.0 * product(square, projector)

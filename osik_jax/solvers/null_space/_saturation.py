@@ -1,0 +1,138 @@
+"""Saturation in the null space: hard bounds for the projection.
+
+F. Flacco, A. De Luca, O. Khatib, "Motion control of redundant robots under joint constraints: saturation in the null
+space", ICRA 2012, and "Control of redundant robots under hard joint constraints: saturation in the null space", IEEE
+Transactions on Robotics 31(3), 2015. Level k asks for the motion of eq. 7,
+
+    d = (J_k P_{k-1})^+ (b_k - J_k x_{k-1})
+
+and gets s d: s is the largest scale in [0, 1] for which some x in the box has the rows of the levels above where they
+are and its own at J_k (x_{k-1} + s d); x_k is the smallest such x. So a level is met exactly if the box and the levels
+above allow, and otherwise the direction of what it still lacks is kept. For the first level and a box around 0 that is
+the direction of the task. Two things differ from the papers. They scale b_k itself, also at the lower levels, which may
+have no admissible scale and then drops the task whole; what is scaled here always has one. And where a level is scaled
+down, the joints that stop it can move no more whatever comes after: they leave the null space of the levels below,
+which would otherwise be stopped by them whole.
+
+When not to use it: where half a task along the wrong direction is better than little along the right one, and where
+rows are inequalities. One unreachable row scales its whole level down; ``solve_hqp`` misses it by least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._dense import product
+from ..hqp import Level
+from ._projection import level_motion
+from ._search import Found, Room, blocked_scale, dual_basis, search, settle
+
+
+class Saturated(NamedTuple):
+    """What the levels came to inside the box."""
+
+    x: Float[Array, " n"]
+    projector: Float[Array, "n n"]
+    scales: Float[Array, " k"]
+    active: Int[Array, " n"]
+    iterations: Int[Array, ""]
+    done: Bool[Array, ""]
+
+
+def solve_saturated(
+    levels: Sequence[Level],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    secondary: Float[Array, " n"] | None,
+    damping: Array,
+    rank: Array | float,
+    max_iterations: int,
+) -> Saturated:
+    """Level after level; then as near to the secondary motion as they leave room."""
+    x = _nearest_to_zero(lower, upper)
+    projector = jnp.diag(jnp.where(lower == upper, 0.0, 1.0).astype(x.dtype))
+    nowhere = jnp.zeros_like(x)
+    fixed = jnp.where(lower == upper, 2, 0)
+    ends = []
+    for level in levels:
+        motion, projector = level_motion(level, x, projector, damping, rank)
+        end = _descend(Room(x, motion, nowhere, projector, lower, upper), fixed, max_iterations)
+        ends.append(end)
+        x, projector, fixed = end.x, end.projector, end.fixed
+    if secondary is not None:
+        ends.append(_descend(Room(x, nowhere, secondary, projector, lower, upper), fixed, max_iterations))
+    return Saturated(
+        x=ends[-1].x,
+        projector=projector,
+        scales=jnp.stack([end.scale for end in ends[: len(levels)]]),
+        active=ends[-1].active,
+        iterations=jnp.sum(jnp.stack([end.iterations for end in ends])),
+        done=jnp.stack([end.done for end in ends]).all(),
+    )
+
+
+def _nearest_to_zero(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.where(lower > 0.0, lower, jnp.where(upper < 0.0, upper, jnp.where(lower == upper, lower, 0.0)))
+
+
+class _End(NamedTuple):
+    """What one level came to."""
+
+    x: Float[Array, " n"]
+    scale: Float[Array, ""]
+    projector: Float[Array, "n n"]  # without the joints that can move no more
+    fixed: Int[Array, " n"]  # those, at their side; 2 for the pinned ones
+    active: Int[Array, " n"]
+    iterations: Int[Array, ""]
+    done: Bool[Array, ""]
+
+
+def _descend(room: Room, fixed: Int[Array, " n"], max_iterations: int) -> _End:
+    """What the search decides, and from that the answer anew, which is differentiable; the start where it fails."""
+    found = jax.lax.stop_gradient(search(jax.lax.stop_gradient(room), max_iterations))
+    scale, projector, stopped = _stop(room, found)
+    # one factorisation after another: see osik_jax/_runtime.py
+    scale, side = jax.lax.optimization_barrier((scale, jnp.where(found.done, found.side, 0)))
+    x, _ = settle(room, scale, side, dual_basis(room.projector, side))
+    x = jnp.where(side != 0, room.bound(side), x)
+    x = _inside(jnp.where(found.done, x, room.start), room.lower, room.upper)
+    fixed = jnp.where((fixed == 0) & stopped, found.blocking, fixed)
+    active = jnp.where(fixed != 0, fixed, side)
+    return _End(x, jnp.where(found.done, scale, 0.0), projector, fixed, active, found.iterations, found.done)
+
+
+def _stop(room: Room, found: Found) -> tuple[Float[Array, ""], Float[Array, "n n"], Bool[Array, " n"]]:
+    """The scale, and the projector without the joints that stop the motion, and which these are.
+
+    The blocker's column of the projector is the sum of the others' with their shares, so that the same combination of
+    x does not depend on what the null space does.
+    """
+    others = found.blocking.at[found.blocker].set(0)
+    dual = dual_basis(room.projector, others)
+    shares = product(dual, room.projector[:, found.blocker][:, None])[:, 0]
+    normal = (-shares).at[found.blocker].set(1.0)
+    scale = jnp.where(found.blocked, blocked_scale(room, found.blocking, normal), 1.0)
+    matters = jnp.abs(normal) > jnp.sqrt(jnp.finfo(normal.dtype).eps)
+    stopped = jax.lax.stop_gradient(found.blocked & found.done & (found.blocking != 0) & matters)
+    frozen = jnp.where(stopped, others, 0)
+    frozen, dual = jax.lax.optimization_barrier((frozen, dual))
+    columns = jnp.where(frozen != 0, room.projector, 0.0)
+    reduced = room.projector - product(columns, dual_basis(room.projector, frozen))
+    keep = ~stopped[:, None] & ~stopped[None, :]
+    return scale, jnp.where(keep, reduced, 0.0), stopped
+
+
+@jax.custom_jvp
+def _inside(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Takes rounding away; what is on a bound moves with x, not half with x and half with the bound."""
+    return jnp.clip(x, lower, upper)
+
+
+@_inside.defjvp
+def _inside_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+    return _inside(*primals), tangents[0]
