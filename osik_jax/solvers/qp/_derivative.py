@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._dense import apply
+from .._pivots import INACTIVE
 from ._factor import factorize, solve_system
-from ._problem import INACTIVE, QP, active_targets
+from ._problem import QP, active_targets
 
 
 @jax.custom_jvp

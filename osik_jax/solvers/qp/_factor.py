@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply, product
-from ._problem import INACTIVE, QP, active_targets
+from .._pivots import INACTIVE
+from ._problem import QP, active_targets
 
 _LAST_CORRECTION = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}
 """A correction by this share of the answer is the last; the next would be its square, or rounding."""

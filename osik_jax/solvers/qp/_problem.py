@@ -6,9 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._pivots import AT_UPPER, INACTIVE
 from ._cost import LeastSquares, Quadratic
-
-INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 
 
 class QP(eqx.Module):

@@ -17,9 +17,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply
 from .._lanes import choose, in_lanes
+from .._pivots import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, NO_GAP, Noise
 from ._factor import factorize, minimize_on
-from ._pivots import NO_GAP, Noise, find
-from ._problem import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, QP
+from ._problem import QP
+from ._tableau import find
 
 _ROUNDS = 30
 _NEARLY = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}

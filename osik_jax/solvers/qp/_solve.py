@@ -10,10 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._dense import apply, clip_to_box
+from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._derivative import differentiable
-from ._problem import AT_LOWER, AT_UPPER, INACTIVE, QP, QPSolution
+from ._problem import QP, QPSolution
 from ._search import Found, searcher
 
 _TOLERANCE = {jnp.dtype("float64"): 1e-12, jnp.dtype("float32"): 1e-7}

@@ -6,7 +6,7 @@ that constraint holds or the multiplier of an active one reaches zero. The dual 
 returns and there is no cycling (D. Goldfarb, A. Idnani, "A numerically stable dual method for solving strictly convex
 quadratic programs", Mathematical Programming 27, 1983).
 
-State is one matrix over the m = n + p constraints. Inactive constraints have a value s and no multiplier, active ones a
+State is one matrix over the m constraints, whatever they are rows of. Inactive constraints have a value s and no multiplier, active ones a
 multiplier y and a given value; s and y of all are an affine function of what is given, whose matrix is the tableau.
 Making constraint k active or inactive exchanges s_k and y_k: one principal pivot, a rank-1 update, whatever the active
 set. Static shapes, and no factorisation to redo.
@@ -26,11 +26,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._dense import apply, product
-from ._factor import Factor, half_inverse
-from ._problem import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, QP
+INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 
-_DEPENDENT = 100.0
+DEPENDENT = 100.0
 """Roundings; a constraint that the active ones leave less of itself than this depends on them."""
 
 NO_GAP = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
@@ -44,17 +42,17 @@ class Noise(NamedTuple):
     multiplier: Float[Array, " m"]
 
 
-class _Limits(NamedTuple):
+class Limits(NamedTuple):
     """What the constraints ask for, in the units of the search: each constraint scaled to a unit diagonal."""
 
     lower: Float[Array, " m"]
     upper: Float[Array, " m"]
     equality: Bool[Array, " m"]
     noise: Noise
-    scale: Float[Array, " m"]  # of the diagonal with no row active: what a dependent row's falls below
+    scale: Float[Array, " m"]  # of the diagonal at first: what a dependent constraint's falls below
 
 
-class _Step(NamedTuple):
+class Step(NamedTuple):
     """A decided step: z += length column, then the pivot, T -= left right'."""
 
     index: Int[Array, ""]  # the constraint whose given quantity changes by ``length``
@@ -78,41 +76,45 @@ class Dual(NamedTuple):
     entering: Int[Array, ""]  # the constraint being activated, -1 for none
     iterations: Int[Array, ""]
     searching: Bool[Array, ""]
-    step: _Step
+    step: Step
 
 
-def find(
-    qp: QP,
-    hessian: Float[Array, "B n n"],
-    factor: Factor,
-    active: Int[Array, "B m"],
-    noise: Noise,
-    x: Float[Array, "B n"],
-    y: Float[Array, "B p"],
+def begin(
+    tableau: Float[Array, "m m"], value: Float[Array, " m"], multiplier: Float[Array, " m"], active: Int[Array, " m"]
+) -> Dual:
+    """The state at a known point, in the units of the search."""
+    zero, nothing = jnp.asarray(0, jnp.int32), jnp.zeros_like(value)
+    return Dual(
+        tableau=tableau,
+        value=value,
+        multiplier=multiplier,
+        active=active,
+        implied=jnp.zeros(len(value), bool),
+        contradicted=jnp.asarray(False),
+        entering=zero - 1,
+        iterations=zero,
+        searching=jnp.asarray(True),
+        step=Step(zero, jnp.zeros((), value.dtype), nothing, zero - 1, zero, nothing, nothing),
+    )
+
+
+def search(
+    limits: Limits,
+    start: Dual,
     *,
     searching: Bool[Array, " B"],
     iterations: Int[Array, " B"],
     max_iterations: int,
 ) -> Dual:
-    """The active sets of the lanes that search.
+    """The active sets of the lanes that search; every argument has a leading axis, the lanes.
 
     Args:
-        qp: the problems; every argument has a leading axis, the lanes.
-        hessian: of their costs.
-        factor: at ``active``.
-        active: where the search begins.
-        noise: of their values and multipliers.
-        x: the minimisers for ``active``.
-        y: their row multipliers.
+        limits: of the constraints.
+        start: where the search begins.
         searching: lanes to work on.
         iterations: changes of the active set so far.
         max_iterations: cap on the changes of the active set.
     """
-    tableau = _tableau(qp, hessian, factor)
-    start, limits = jax.vmap(_start)(qp, hessian, tableau, factor.free, active, noise, x, y)
-    if qp.rows.shape[1]:
-        start, consistent = jax.vmap(_hold_rows)(qp, limits, start, active)
-        searching = searching & consistent
 
     def go_on(state: Dual) -> Bool[Array, ""]:
         return jnp.any(state.searching & (state.iterations < max_iterations))
@@ -127,95 +129,7 @@ def find(
     return jax.vmap(_apply)(limits, found)
 
 
-def _tableau(qp: QP, hessian: Float[Array, "B n n"], factor: Factor) -> Float[Array, "B m m"]:
-    """At the active bounds of the boxes, with no row active."""
-    inverse = jax.vmap(_inverse)(factor)
-    if qp.rows.shape[1]:
-        return jax.vmap(_sweep_with_rows)(qp, hessian, inverse, factor.free)
-    return jax.lax.cond(jnp.all(factor.free), lambda: inverse, lambda: jax.vmap(_sweep)(hessian, inverse, factor.free))
-
-
-def _inverse(factor: Factor) -> Float[Array, "n n"]:
-    """Of the Hessian over the free variables, 0 elsewhere."""
-    half = half_inverse(factor.lower)
-    return jnp.where(factor.free[:, None] & factor.free[None, :], product(half.T, half), 0.0)
-
-
-def _sweep(whole: Float[Array, "m m"], inverse: Float[Array, "m m"], free: Bool[Array, " m"]) -> Float[Array, "m m"]:
-    """The tableau in which the free variables have been exchanged, from their inverse block."""
-    forth, back = product(whole, inverse), product(inverse, whole)
-    down, across = free[:, None], free[None, :]
-    return jnp.where(down, jnp.where(across, inverse, -back), jnp.where(across, forth, whole - product(forth, whole)))
-
-
-def _sweep_with_rows(
-    qp: QP, hessian: Float[Array, "n n"], inverse: Float[Array, "n n"], free: Bool[Array, " n"]
-) -> Float[Array, "m m"]:
-    p = qp.rows.shape[0]
-    whole = jnp.block([[hessian, -qp.rows.T], [qp.rows, jnp.diag(qp.compliance)]])
-    return _sweep(whole, jnp.pad(inverse, (0, p)), jnp.pad(free, (0, p)))
-
-
-def _start(
-    qp: QP,
-    hessian: Float[Array, "n n"],
-    tableau: Float[Array, "m m"],
-    free: Bool[Array, " n"],
-    active: Int[Array, " m"],
-    noise: Noise,
-    x: Float[Array, " n"],
-    y: Float[Array, " p"],
-) -> tuple[Dual, _Limits]:
-    n, p = len(x), len(y)
-    own = jnp.abs(jnp.diagonal(tableau))
-    intrinsic = apply(qp.rows**2, 1.0 / jnp.where(jnp.diagonal(hessian) > 0.0, jnp.diagonal(hessian), 1.0))
-    scale = jnp.concatenate([own[:n], jnp.maximum(own[n:], intrinsic)])
-    root = jnp.sqrt(jnp.where(scale > 0.0, scale, 1.0))
-    unit = jnp.concatenate([jnp.where(free, 1.0 / root[:n], root[:n]), 1.0 / root[n:]])
-    slope = qp.cost.gradient(x) - apply(qp.rows.T, y)
-    zero, nothing = jnp.asarray(0, jnp.int32), jnp.zeros_like(own)
-    limits = _Limits(
-        lower=qp.lower * unit,
-        upper=qp.upper * unit,
-        equality=qp.equality,
-        noise=Noise(noise.value * unit, noise.multiplier / unit),
-        scale=scale / root**2,
-    )
-    start = Dual(
-        tableau=tableau / root[:, None] / root[None, :],
-        value=jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * y]) * unit,
-        multiplier=jnp.where(active == INACTIVE, 0.0, jnp.concatenate([slope, y]) / unit),
-        active=active,
-        implied=jnp.zeros(n + p, bool),
-        contradicted=jnp.asarray(False),
-        entering=zero - 1,
-        iterations=zero,
-        searching=jnp.asarray(True),
-        step=_Step(zero, jnp.zeros((), x.dtype), nothing, zero - 1, zero, nothing, nothing),
-    )
-    return start, limits
-
-
-def _hold_rows(qp: QP, limits: _Limits, s: Dual, active: Int[Array, " m"]) -> tuple[Dual, Bool[Array, ""]]:
-    """Pivots the active rows in; those that depend on others become inactive, and the state is then not consistent."""
-    m, p = len(active), qp.rows.shape[0]
-    order = jnp.arange(m)
-
-    def hold(j: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        tableau, held = state
-        k = m - p + j
-        fits = tableau[k, k] > _DEPENDENT * jnp.finfo(tableau.dtype).eps * limits.scale[k]
-        moves = (active[k] != INACTIVE) & fits
-        left, right = _exchange(tableau, k, held, moves)
-        return tableau - left[:, None] * right[None, :], held | ((order == k) & moves)
-
-    in_box = (active != INACTIVE) & (order < m - p)
-    tableau, held = jax.lax.fori_loop(0, p, hold, (s.tableau, in_box))
-    left_out = (active != INACTIVE) & ~held
-    return s._replace(tableau=tableau, active=jnp.where(left_out, INACTIVE, active)), ~left_out.any()
-
-
-def _apply(limits: _Limits, s: Dual) -> Dual:
+def _apply(limits: Limits, s: Dual) -> Dual:
     """Takes the decided step."""
     step, order = s.step, jnp.arange(len(s.value))
     held = s.active != INACTIVE
@@ -234,7 +148,7 @@ def _apply(limits: _Limits, s: Dual) -> Dual:
     )
 
 
-def _drop_wrong(limits: _Limits, s: Dual) -> Dual:
+def _drop_wrong(limits: Limits, s: Dual) -> Dual:
     """Makes inactive the constraint whose multiplier has the wrong sign, the worst if there are several."""
     pressure = jnp.where(s.active == AT_LOWER, s.multiplier, jnp.where(s.active == AT_UPPER, -s.multiplier, 0.0))
     wrong = jnp.where(pressure < -limits.noise.multiplier, pressure, 0.0)
@@ -243,18 +157,18 @@ def _drop_wrong(limits: _Limits, s: Dual) -> Dual:
     held = s.active != INACTIVE
     row = s.tableau[j]
     length = jnp.where(moves, -s.multiplier[j] / jnp.where(moves, row[j], 1.0), 0.0)
-    step = _Step(
+    step = Step(
         j,
         length,
         jnp.where(held == held[j], row, -row),
         jnp.where(moves, j, -1),
         jnp.asarray(INACTIVE, jnp.int32),
-        *_exchange(s.tableau, j, held, moves),
+        *exchange(s.tableau, j, held, moves),
     )
     return s._replace(step=step, iterations=s.iterations + moves, searching=moves)
 
 
-def _add_violated(limits: _Limits, s: Dual) -> Dual:
+def _add_violated(limits: Limits, s: Dual) -> Dual:
     """One dual step towards a violated constraint, kept until it holds; equalities come first."""
     unit = jnp.finfo(s.value.dtype).eps
     below_by, above_by = limits.lower - s.value, s.value - limits.upper
@@ -273,7 +187,7 @@ def _add_violated(limits: _Limits, s: Dual) -> Dual:
     below = below_by[k] > 0.0
     sign = jnp.where(below, 1.0, -1.0).astype(row.dtype)
     gap = jnp.maximum(below_by[k], above_by[k])
-    independent = row[k] > _DEPENDENT * unit * limits.scale[k]
+    independent = row[k] > DEPENDENT * unit * limits.scale[k]
     full = jnp.where(independent, jnp.maximum(gap, 0.0) / jnp.where(independent, row[k], 1.0), jnp.inf)
 
     side = jnp.where(s.active == AT_LOWER, 1.0, jnp.where(s.active == AT_UPPER, -1.0, 0.0)).astype(row.dtype)
@@ -288,13 +202,13 @@ def _add_violated(limits: _Limits, s: Dual) -> Dual:
     implied = gap <= NO_GAP[row.dtype] * limits.noise.value[k]
     pivot = jnp.where(drops, leaving, k)
     label = jnp.where(drops, INACTIVE, jnp.where(limits.equality[k], EQUALITY, jnp.where(below, AT_LOWER, AT_UPPER)))
-    step = _Step(
+    step = Step(
         k,
         jnp.where(moves, sign * length, 0.0),
         column,
         jnp.where(moves, pivot, -1),
         label.astype(jnp.int32),
-        *_exchange(s.tableau, pivot, held, moves),
+        *exchange(s.tableau, pivot, held, moves),
     )
     return s._replace(
         step=step,
@@ -306,7 +220,7 @@ def _add_violated(limits: _Limits, s: Dual) -> Dual:
     )
 
 
-def _exchange(
+def exchange(
     tableau: Float[Array, "m m"], k: Int[Array, ""], held: Bool[Array, " m"], moves: Bool[Array, ""]
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Exchanges value and multiplier of constraint k: left and right of (T e_k + e_k)(e_k' T - e_k') / T_kk.
