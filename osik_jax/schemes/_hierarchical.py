@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 
-from ..solvers import solve_hqp
+from ..solvers import WorkingSet, solve_hqp
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem
 
 
@@ -20,8 +20,17 @@ class HierarchicalQP(Scheme):
 
     max_iterations: int | None = eqx.field(default=None, static=True)
 
-    def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
-        """The velocity of one tick."""
+    def solve(self, problem: VelocityProblem, warm_start: WorkingSet | None = None) -> SchemeAnswer:
+        """The velocity of one tick; the warm start is the working set of every level."""
         levels = [problem.level(names) for names in problem.by_priority()]
-        answer = solve_hqp(levels, problem.lower, problem.upper, max_iterations=self.max_iterations)
-        return SchemeAnswer(answer.x, answer.status, answer.iterations, answer.iterations, answer.kkt_residual)
+        answer = solve_hqp(
+            levels, problem.lower, problem.upper, warm_start=warm_start, max_iterations=self.max_iterations
+        )
+        return SchemeAnswer(
+            answer.x,
+            answer.status,
+            answer.iterations,
+            answer.factorizations,
+            answer.kkt_residual,
+            answer.warm_start,
+        )

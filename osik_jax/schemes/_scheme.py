@@ -44,9 +44,10 @@ class VelocityProblem(eqx.Module):
     def level(self, names: list[str]) -> Level:
         """The rows of some tasks as one level."""
         rows = [self.rows[name] for name in names]
-        return Level(
-            *(jnp.concatenate([getattr(r, field) for r in rows]) for field in ("jacobian", "lower", "upper", "weight"))
+        matrix, lower, upper, weight = (
+            jnp.concatenate([getattr(r, field) for r in rows]) for field in ("jacobian", "lower", "upper", "weight")
         )
+        return Level(matrix, lower, None if all(r.is_equality for r in rows) else upper, weight)
 
     def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
         """Of each task, J v minus the nearest point of its interval."""

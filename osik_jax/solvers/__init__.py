@@ -5,6 +5,7 @@ from ._status import raise_if_failed as raise_if_failed
 from .hqp import HQPSolution as HQPSolution
 from .hqp import Level as Level
 from .hqp import Tolerances as Tolerances
+from .hqp import WorkingSet as WorkingSet
 from .hqp import solve_hqp as solve_hqp
 from .null_space import NullSpaceSolution as NullSpaceSolution
 from .null_space import solve_nullspace as solve_nullspace

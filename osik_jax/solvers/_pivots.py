@@ -6,7 +6,7 @@ that constraint holds or the multiplier of an active one reaches zero. The dual 
 returns and there is no cycling (D. Goldfarb, A. Idnani, "A numerically stable dual method for solving strictly convex
 quadratic programs", Mathematical Programming 27, 1983).
 
-State is one matrix over the m constraints, whatever they are rows of. Inactive constraints have a value s and no multiplier, active ones a
+State is one matrix over the m constraints. Inactive constraints have a value s and no multiplier, active ones a
 multiplier y and a given value; s and y of all are an affine function of what is given, whose matrix is the tableau.
 Making constraint k active or inactive exchanges s_k and y_k: one principal pivot, a rank-1 update, whatever the active
 set. Static shapes, and no factorisation to redo.

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._dense import apply, product
+from .._dense import apply, clip_to_box, product
+from .._lanes import choose, in_lanes
 from .._status import Status
-from ._level import Hard, LevelState, Tolerances, independent, rounding, row_space, solve_level
-from ._problem import HQPSolution, Level
+from ._held import independent
+from ._landing import Landing, land, noise
+from ._primal import LevelState, solve_level
+from ._problem import HQPSolution, Level, Tolerances, WorkingSet
+from ._proposal import propose
 from ._replay import Decision, with_derivative
+from ._stack import Layout, Stack, Task, stacked
 
 _DEFAULTS = {
-    jnp.dtype("float64"): Tolerances(rank=1e-10, step=1e-13, multiplier=1e-10),
-    jnp.dtype("float32"): Tolerances(rank=1e-5, step=1e-6, multiplier=1e-5),
+    jnp.dtype("float64"): Tolerances(rank=1e-10, step=1e-13, multiplier=1e-10, feasible=1e-11),
+    jnp.dtype("float32"): Tolerances(rank=1e-5, step=1e-7, multiplier=1e-6, feasible=1e-5),
 }
 
 
@@ -28,6 +33,7 @@ def solve_hqp(
     lower: Float[ArrayLike, " n"],
     upper: Float[ArrayLike, " n"],
     *,
+    warm_start: WorkingSet | None = None,
     max_iterations: int | None = None,
     tolerances: Tolerances | None = None,
 ) -> HQPSolution:
@@ -37,13 +43,16 @@ def solve_hqp(
     ``lower <= x <= upper`` is hard at every level. What freedom is left after the last level goes into the smallest
     |x|, so that the answer is unique. Pure, compiled on first use, and batched by ``vmap``.
 
-    A row violated at its optimum, and every hard row with a nonzero multiplier, is tight on the whole face of
-    minimisers: it is frozen as an equality before the next level and eliminated by its null space.
+    Each level tries the working set of the warm start, then one that a dual method proposes, and judges the exact
+    solution on it by its multipliers; where neither is the optimum, a primal active set goes on by hand. A row
+    violated at its optimum, and every hard row with a nonzero multiplier, is tight on the whole face of minimisers: it
+    is frozen as an equality before the next level and eliminated by its null space.
 
     Args:
         levels: highest priority first; any number, each an equality or inequality level or a mixture.
         lower: box, -inf where unbounded. (n,)
         upper: box, inf where unbounded. (n,)
+        warm_start: that of the solution of a problem nearby with the same levels. It changes the time, not the answer.
         max_iterations: cap on the active-set iterations of one level (static); default 10 (n + rows of the level).
         tolerances: what counts as zero; the default depends on the precision.
 
@@ -56,30 +65,25 @@ def solve_hqp(
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
     tolerances = _DEFAULTS[dtype] if tolerances is None else tolerances
     sane = _finite(levels, lower, upper)
-    safe_lower, safe_upper = jnp.where(sane, lower, -1.0), jnp.where(sane, upper, 1.0)
+    low, high = (jnp.where(sane, b, side).astype(dtype) for b, side in ((lower, -1.0), (upper, 1.0)))
     scaled = [jax.tree.map(lambda leaf: jnp.where(sane, leaf, 0.0), level.scaled()) for level in levels]
-    scaled.append(_smallest(lower.shape[0], dtype))
-    cascade = _Cascade.start(*jax.lax.stop_gradient((safe_lower, safe_upper)), dtype)
-    decisions = []
-    for level in scaled:
-        cap = 10 * (lower.shape[0] + level.matrix.shape[0]) if max_iterations is None else max_iterations
-        cascade, decision = cascade.descend(jax.lax.stop_gradient(level), tolerances, cap)
-        decisions.append(decision)
-    x = with_derivative(cascade.x, decisions, scaled, safe_lower, safe_upper, tolerances.rank)
-    return _answer(levels, cascade, x, sane, lower, upper)
+    layout, stack = stacked([*scaled, _smallest(lower.shape[0], dtype)], low, high)
+    traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
+    end = _descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start)))
+    x = with_derivative(end.cascade.x, end.decisions, stack, traced.rank)
+    return _answer(levels, layout, end, x, sane, lower, upper)
 
 
 def _smallest(n: int, dtype: jnp.dtype) -> Level:
     """The last level: what freedom is left goes into the smallest norm."""
-    return Level(jnp.eye(n, dtype=dtype), jnp.zeros(n, dtype), jnp.zeros(n, dtype))
+    return Level(jnp.eye(n, dtype=dtype), jnp.zeros(n, dtype))
 
 
-class _Cascade(eqx.Module):
+class _Cascade(NamedTuple):
     """What the levels so far have fixed."""
 
     x: Float[Array, " n"]
-    matrix: Float[Array, "h n"]  # box, then rows of the levels so far
-    lower: Float[Array, " h"]
+    lower: Float[Array, " h"]  # of the hard rows: those of levels done are widened to the values reached
     upper: Float[Array, " h"]
     frozen: Bool[Array, " h"]
     side: Int[Array, " h"]  # held and not frozen
@@ -87,106 +91,230 @@ class _Cascade(eqx.Module):
     box: Int[Array, " n"]  # active bounds, frozen or held
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
     done: Bool[Array, ""]
 
-    @classmethod
-    def start(cls, lower: Float[Array, " n"], upper: Float[Array, " n"], dtype: jnp.dtype) -> _Cascade:
-        n = lower.shape[0]
-        pinned = lower == upper
-        return cls(
-            x=jnp.clip(jnp.zeros(n, dtype), lower, upper),
-            matrix=jnp.eye(n, dtype=dtype),
-            lower=lower.astype(dtype),
-            upper=upper.astype(dtype),
-            frozen=pinned,
-            side=jnp.zeros(n, jnp.int32),
-            projector=jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(dtype)),
-            box=jnp.where(pinned, 2, 0),
-            residual=jnp.zeros((), dtype),
-            iterations=jnp.asarray(0),
-            done=jnp.asarray(True),
-        )
 
-    def descend(self, level: Level, tolerances: Tolerances, cap: int) -> tuple[_Cascade, Decision]:
-        """Solves one more level and freezes what it decides."""
-        bounded = jnp.isfinite(self.lower) | jnp.isfinite(self.upper)
-        hard = Hard(self.matrix, self.lower, self.upper, ~self.frozen & bounded)
-        end = solve_level(
-            level.matrix,
-            level.lower,
-            level.upper,
-            hard,
-            self.projector,
-            LevelState(
-                x=self.x,
-                side=independent(hard, self.side, self.projector, tolerances.rank),
-                multiplier=jnp.zeros_like(self.lower),
-                residual=jnp.zeros_like(self.residual),
-                stalled=jnp.asarray(0),
-                iterations=jnp.asarray(0),
-                done=jnp.asarray(False),
-            ),
-            tolerances,
-            cap,
-        )
-        return self._freeze(level, hard, end, tolerances)
+class _End(NamedTuple):
+    """The cascade after its last level, and what each level decided."""
 
-    def _freeze(self, level: Level, hard: Hard, end: LevelState, tolerances: Tolerances) -> tuple[_Cascade, Decision]:
-        n = self.x.shape[0]
-        value = apply(level.matrix, end.x)
-        slack = value - jnp.clip(value, level.lower, level.upper)
-        length = jnp.sqrt(jnp.sum(level.matrix**2, -1))
-        noise = tolerances.multiplier * (length * jnp.max(jnp.abs(end.x)) + jnp.sqrt(jnp.sum(slack**2)))
-        counts = (level.lower == level.upper) | (jnp.abs(slack) > noise)
-        gradient = apply(level.matrix.T, jnp.where(counts, slack, 0.0))
-        pressure = jnp.abs(end.multiplier) * jnp.sqrt(jnp.sum(hard.matrix**2, -1))
-        scale = jnp.max(length, initial=0.0)
-        floor = scale * rounding(scale, end.x, slack, tolerances)
-        tight = (end.side != 0) & (pressure > tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + floor)
-        rows = jnp.argsort(~tight, stable=True)[:n]
-        to_freeze = jnp.concatenate(
-            [jnp.where(tight[rows][:, None], hard.matrix[rows], 0.0), jnp.where(counts[:, None], level.matrix, 0.0)]
-        )
-        basis = row_space(to_freeze, self.projector, tolerances.rank)
-        side = jnp.concatenate([jnp.where(tight, 0, end.side), jnp.zeros(len(slack), jnp.int32)])
-        decision = Decision(jnp.where(tight, end.side, 0), jnp.where(counts, jnp.where(slack > 0.0, 1, -1), 0))
-        cascade = _Cascade(
-            x=end.x,
-            matrix=jnp.concatenate([self.matrix, level.matrix]),
-            lower=jnp.concatenate([self.lower, jnp.minimum(level.lower, value)]),
-            upper=jnp.concatenate([self.upper, jnp.maximum(level.upper, value)]),
-            frozen=jnp.concatenate([self.frozen | tight, counts]),
-            side=side,
-            projector=self.projector - product(basis, basis.T),
-            box=jnp.where(end.side[:n] != 0, end.side[:n], jnp.where(self.frozen[:n], self.box, 0)),
-            residual=jnp.maximum(self.residual, end.residual),
-            iterations=self.iterations + end.iterations,
-            done=self.done & end.done,
-        )
-        return cascade, decision
+    cascade: _Cascade
+    decisions: Decision  # with a leading axis, the levels, and so the following
+    working: WorkingSet
+    multipliers: Float[Array, "L h"]
+
+
+@cache
+def _descender(layout: Layout, max_iterations: int | None) -> Callable[..., _End]:
+    cap = 10 * (layout.variables + layout.rows) if max_iterations is None else max_iterations
+    return in_lanes(partial(_descend_all, layout, cap))
+
+
+def _descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None) -> _End:
+    """All levels, all lanes: every array has a leading axis, the lanes, and then perhaps one of levels."""
+
+    def descend(cascade: _Cascade, now: tuple[Array, Any, WorkingSet | None]) -> tuple[_Cascade, _Outcome]:
+        k, level, guess = now
+        task = jax.vmap(partial(_task, layout, k))(stack, level, cascade)
+        free = jnp.trace(cascade.projector, axis1=1, axis2=2) > 0.5
+        as_it_is = _skip(cascade, task)
+
+        def solve() -> tuple[_Cascade, _Outcome]:
+            return choose(free, _descend(cascade, task, free, tolerances=tolerances, guess=guess, cap=cap), as_it_is)
+
+        return jax.lax.cond(jnp.any(free), solve, lambda: as_it_is)
+
+    first = jax.vmap(_start)(stack)
+    levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (stack.levels, warm))
+    numbers = jnp.arange(layout.levels)
+    cascade, outcomes = jax.lax.scan(descend, first, (numbers, levels, guesses))
+    return _End(cascade, *jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes))
+
+
+def _start(stack: Stack) -> _Cascade:
+    h, n = stack.hard.shape
+    dtype = stack.hard.dtype
+    lower, upper = stack.hard_lower[:n], stack.hard_upper[:n]
+    pinned = lower == upper
+    nothing = jnp.asarray(0, jnp.int32)
+    return _Cascade(
+        x=jnp.clip(jnp.zeros(n, dtype), lower, upper),
+        lower=stack.hard_lower,
+        upper=stack.hard_upper,
+        frozen=jnp.pad(pinned, (0, h - n)),
+        side=jnp.zeros(h, jnp.int32),
+        projector=jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(dtype)),
+        box=jnp.where(pinned, 2, 0).astype(jnp.int32),
+        residual=jnp.zeros((), dtype),
+        iterations=nothing,
+        factorizations=nothing,
+        done=jnp.asarray(True),
+    )
+
+
+_Outcome = tuple[Decision, WorkingSet, Float[Array, "B h"]]
+
+
+def _task(layout: Layout, k: Int[Array, ""], stack: Stack, level: Level, cascade: _Cascade) -> Task:
+    """Level k, and the rows that it must not touch."""
+    of = jnp.asarray(layout.level_of_hard)
+    bounded = jnp.isfinite(cascade.lower) | jnp.isfinite(cascade.upper)
+    return Task(
+        level=level,
+        matrix=stack.hard,
+        lower=cascade.lower,
+        upper=cascade.upper,
+        free=~cascade.frozen & bounded & (of < k),
+        own=of == k,
+        place=jnp.asarray(layout.place_of_row)[k],
+        projector=cascade.projector,
+        x=cascade.x,
+    )
+
+
+def _descend(
+    cascade: _Cascade,
+    task: Task,
+    wanted: Bool[Array, " B"],
+    *,
+    tolerances: Tolerances,
+    guess: WorkingSet | None,
+    cap: int,
+) -> tuple[_Cascade, _Outcome]:
+    """Solves one more level in the lanes that want it, and freezes what it decides."""
+    first = jax.vmap(_first_guess)(task, guess)
+    landed = jax.vmap(land)(task, task.x, first, tolerances)
+    landed = landed._replace(optimal=landed.optimal | ~wanted)
+    none = jnp.zeros_like(cascade.iterations)
+
+    def try_again() -> tuple[Landing, Array]:
+        x, working, changes = propose(task, ~landed.optimal, cap)
+        second = jax.vmap(land)(task, x, working, tolerances)
+        return choose(landed.optimal, (landed, none), (second, changes))
+
+    def by_hand() -> tuple[LevelState, Array]:
+        start = jax.vmap(_by_hand_from)(task, cascade.side, best, tolerances)
+        end = jax.vmap(partial(solve_level, max_iterations=cap))(task, start, tolerances)
+        return end, end.iterations
+
+    best, changes = jax.lax.cond(jnp.all(landed.optimal), lambda: (landed, none), try_again)
+    end, more = jax.lax.cond(jnp.all(best.optimal), lambda: (jax.vmap(_at)(best), none), by_hand)
+    factorizations = cascade.factorizations + 3 + jnp.where(landed.optimal, 0, 3) + 2 * more
+    counted = cascade._replace(iterations=cascade.iterations + changes + more, factorizations=factorizations)
+    return jax.vmap(_freeze)(counted, task, end, tolerances)
+
+
+def _first_guess(task: Task, warm: WorkingSet | None) -> WorkingSet:
+    """The warm start as far as the bounds that it names exist; without one, rows that miss their interval now."""
+    level, value = task.level, apply(task.level.matrix, task.x)
+    own = jnp.where(value < level.lower, -1, jnp.where(value > level.upper, 1, 0))
+    side = jnp.zeros(task.lower.shape, jnp.int32)
+    if warm is not None:
+        own = jnp.sign(warm.own)
+        own = jnp.where(jnp.isfinite(jnp.where(own < 0, level.lower, level.upper)), own, 0)
+        side = jnp.sign(warm.hard)
+        side = jnp.where(task.free & jnp.isfinite(jnp.where(side < 0, task.lower, task.upper)), side, 0)
+    own = jnp.where(level.lower == level.upper, 2, own)
+    return WorkingSet(side.astype(jnp.int32), own.astype(jnp.int32))
+
+
+def _at(landing: Landing) -> LevelState:
+    """The state of a level that ended where it landed."""
+    nothing = jnp.asarray(0, jnp.int32)
+    return LevelState(landing.x, landing.side, landing.multiplier, landing.residual, nothing, nothing, landing.optimal)
+
+
+def _by_hand_from(task: Task, side: Int[Array, " h"], landing: Landing, tolerances: Tolerances) -> LevelState:
+    """Where the landing is feasible, from there; else from where the level above ended."""
+    before = _at(landing)._replace(
+        x=task.x,
+        side=independent(task, side, tolerances.rank),
+        multiplier=jnp.zeros_like(landing.multiplier),
+        residual=jnp.zeros_like(landing.residual),
+    )
+    return jax.tree.map(lambda a, b: jnp.where(landing.feasible, a, b), _at(landing), before)
+
+
+def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Tolerances) -> tuple[_Cascade, _Outcome]:
+    n, level = len(task.x), task.level
+    value = apply(level.matrix, end.x)
+    slack = value - jnp.clip(value, level.lower, level.upper)
+    small = tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + jnp.sqrt(jnp.sum(slack**2)))
+    counts = (level.lower == level.upper) | (jnp.abs(slack) > small)
+    gradient = apply(level.matrix.T, jnp.where(counts, slack, 0.0))
+    pressure = jnp.abs(end.multiplier) * task.length
+    floor = tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + noise(level, end.x, slack, tolerances)
+    tight = (end.side != 0) & (pressure > floor)
+    rows = jnp.argsort(~tight, stable=True)[:n]
+    to_freeze = jnp.concatenate(
+        [jnp.where(tight[rows][:, None], task.matrix[rows], 0.0), jnp.where(counts[:, None], level.matrix, 0.0)]
+    )
+    basis = _row_space(to_freeze, task.projector, tolerances.rank)
+    missed = jnp.where(counts, jnp.where(slack > 0.0, 1, -1), 0).astype(jnp.int32)
+    reached = apply(task.matrix, end.x)
+    after = cascade._replace(
+        x=end.x,
+        lower=jnp.where(task.own, jnp.minimum(task.lower, reached), task.lower),
+        upper=jnp.where(task.own, jnp.maximum(task.upper, reached), task.upper),
+        frozen=cascade.frozen | tight | task.spread(counts),
+        side=jnp.where(tight, 0, end.side),
+        projector=task.projector - product(basis, basis.T),
+        box=jnp.where(end.side[:n] != 0, end.side[:n], jnp.where(cascade.frozen[:n], cascade.box, 0)),
+        residual=jnp.maximum(cascade.residual, end.residual),
+        done=cascade.done & end.done,
+    )
+    own = jnp.where(level.lower == level.upper, 2, missed).astype(jnp.int32)
+    return after, (Decision(jnp.where(tight, end.side, 0), missed), WorkingSet(end.side, own), end.multiplier)
+
+
+def _skip(cascade: _Cascade, task: Task) -> tuple[_Cascade, _Outcome]:
+    """A level that finds no freedom decides nothing."""
+    none, own = jnp.zeros_like(cascade.side), jnp.zeros(task.level.lower.shape, jnp.int32)
+    return cascade, (Decision(none, own), WorkingSet(none, own), jnp.zeros_like(cascade.lower))
+
+
+def _row_space(rows: Float[Array, "m n"], projector: Float[Array, "n n"], rank: Array | float) -> Float[Array, "n k"]:
+    """Orthonormal basis (0 columns beyond the rank) of what the rows span inside the projector's range."""
+    length = jnp.sqrt(jnp.sum(rows**2, -1, keepdims=True))
+    unit = rows / jnp.where(length > 0.0, length, 1.0)
+    basis, triangle, _ = jax.scipy.linalg.qr(product(unit, projector).T, mode="economic", pivoting=True)
+    basis = product(projector, jnp.where(jnp.abs(jnp.diagonal(triangle)) > rank, basis, 0.0))
+    for _ in range(
+        2
+    ):  # a column from a small pivot has left the range by rounding over that pivot: back, and orthonormal
+        basis = 1.5 * basis - 0.5 * product(basis, product(basis.T, basis))
+    return basis
 
 
 def _finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:
-    """Whether the numbers can be computed with: no NaN anywhere, no infinity but in bounds, and a box that exists."""
+    """Whether the numbers can be computed with: no NaN, no infinity but as no bound, and a box that exists."""
     checks = [jnp.isfinite(level.matrix).all() for level in levels]
-    checks += [~jnp.isnan(b).any() for level in levels for b in (level.lower, level.upper)]
+    checks += [(low < jnp.inf).all() & (high > -jnp.inf).all() for low, high in _bounds(levels, lower, upper)]
     checks += [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
     return jnp.stack([*checks, (lower <= upper).all()]).all()
 
 
+def _bounds(levels: Sequence[Level], lower: Array, upper: Array) -> list[tuple[Array, Array]]:
+    return [(lower, upper), *((level.lower, level.upper) for level in levels)]
+
+
 def _answer(
-    levels: Sequence[Level], cascade: _Cascade, x: Array, sane: Array, lower: Array, upper: Array
+    levels: Sequence[Level], layout: Layout, end: _End, x: Array, sane: Array, lower: Array, upper: Array
 ) -> HQPSolution:
+    cascade = end.cascade
     at_bound = jnp.where(cascade.box < 0, lower, jnp.where(cascade.box > 0, upper, x))
     good = sane & jnp.isfinite(x).all()
-    low, high = (jnp.where(jnp.isnan(b), fill, b) for b, fill in ((lower, -jnp.inf), (upper, jnp.inf)))
-    x = jnp.clip(jnp.where(good, at_bound, 0.0), low, high)
+    x = clip_to_box(jnp.where(good, at_bound, 0.0), lower, upper)
     status = jnp.where(cascade.done, Status.SOLVED, Status.MAX_ITERATIONS)
     return HQPSolution(
         x=x,
         slacks=tuple(jnp.where(good, level.distance(x), 0.0) for level in levels),
         status=jnp.where(good, status, Status.NUMERICAL_ERROR),
         iterations=cascade.iterations,
+        factorizations=cascade.factorizations,
         kkt_residual=jnp.where(good, cascade.residual, jnp.inf),
         active=cascade.box,
+        active_rows=tuple(end.working.own[k, : len(level.lower)] for k, level in enumerate(levels)),
+        multipliers=jnp.where(good, end.multipliers[:-1], 0.0),
+        warm_start=end.working,
     )

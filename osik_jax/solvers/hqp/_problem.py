@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
+
+
+class Tolerances(NamedTuple):
+    """What counts as zero, relative to the scale of the quantity at hand."""
+
+    rank: Float[Array, ""] | float  # part of a row outside the span of others, relative to the row
+    step: Float[Array, ""] | float  # change of the level's rows by a step, relative to their scale
+    multiplier: Float[Array, ""] | float  # multiplier, relative to the level's gradient
+    feasible: Float[Array, ""] | float  # violation of a row, relative to its scale
 
 
 class Level(eqx.Module):
@@ -14,30 +25,44 @@ class Level(eqx.Module):
     Attributes:
         matrix: A. (m, n); m may be 0.
         lower: of A x; equal to ``upper`` for an equality, -inf for none. (m,)
-        upper: of A x; inf for none. (m,)
+        upper: of A x; inf for none. Leave it out where all rows are equalities: it is then ``lower``, and the solver
+            need not look for the rows that are not. (m,)
         weight: of the squared distances of the rows to their intervals, >= 0; None for ones. (m,)
+        equality: whether ``upper`` was left out (static).
     """
 
     matrix: Float[Array, "m n"]
     lower: Float[Array, " m"]
     upper: Float[Array, " m"]
-    weight: Float[Array, " m"] | None = None
+    weight: Float[Array, " m"] | None
+    equality: bool = eqx.field(static=True)
 
     def __init__(
         self,
         matrix: ArrayLike | Array,
         lower: ArrayLike | Array,
-        upper: ArrayLike | Array,
+        upper: ArrayLike | Array | None = None,
         weight: ArrayLike | Array | None = None,
     ):
         self.matrix = jnp.asarray(matrix)
         self.lower = jnp.asarray(lower, self.matrix.dtype)
-        self.upper = jnp.asarray(upper, self.matrix.dtype)
+        self.equality = upper is None
+        self.upper = self.lower if upper is None else jnp.asarray(upper, self.matrix.dtype)
         self.weight = None if weight is None else jnp.asarray(weight, self.matrix.dtype)
         rows = self.matrix.shape[:-1]
         for name, array in (("lower", self.lower), ("upper", self.upper), ("weight", self.weight)):
             if array is not None and array.shape != rows:
                 raise ValueError(f"{name} has shape {array.shape}; the matrix {self.matrix.shape} asks for {rows}")
+
+    @property
+    def length(self) -> Float[Array, " m"]:
+        """Euclidean norm of each row."""
+        return jnp.sqrt(jnp.sum(self.matrix**2, -1))
+
+    @property
+    def size(self) -> Float[Array, ""]:
+        """Of the longest row."""
+        return jnp.max(self.length, initial=0.0)
 
     def scaled(self) -> Level:
         """The same level with the square roots of the weights multiplied in; a weight of 0 removes its row."""
@@ -45,8 +70,11 @@ class Level(eqx.Module):
             return self
         positive = self.weight > 0.0
         root = jnp.where(positive, jnp.sqrt(jnp.where(positive, self.weight, 1.0)), 0.0)
+        matrix = root[:, None] * self.matrix
+        if self.equality:
+            return Level(matrix, jnp.where(positive, self.lower * root, 0.0))
         return Level(
-            root[:, None] * self.matrix,
+            matrix,
             jnp.where(positive, self.lower * jnp.where(positive, root, 1.0), -jnp.inf),
             jnp.where(positive, self.upper * jnp.where(positive, root, 1.0), jnp.inf),
         )
@@ -57,21 +85,42 @@ class Level(eqx.Module):
         return value - jnp.clip(value, self.lower, self.upper)
 
 
+class WorkingSet(NamedTuple):
+    """What is taken for active in a level: 0 for no, -1 at the lower bound, 1 at the upper (2: an equality)."""
+
+    hard: Int[Array, " h"]  # rows that the level leaves alone, held at a bound
+    own: Int[Array, " m"]  # the level's own rows that miss their interval on that side: they count in its cost
+
+
 class HQPSolution(eqx.Module):
     """Answer of a hierarchy.
+
+    The hard rows are those of the box and then those of every level that may hold inequalities (not
+    ``Level.equality``), h of them.
 
     Attributes:
         x: the answer; inside its box exactly, whatever the status. (n,)
         slacks: of each level, A x minus the nearest point of its interval (unweighted). ((m,), ...)
         status: a ``Status`` code.
-        iterations: of the active sets of all levels together.
+        iterations: changes of the active sets of all levels together.
+        factorizations: systems factored, all levels together.
         kkt_residual: the largest stationarity residual of a level.
         active: of the box, -1 at the lower bound, 1 at the upper, 2 equality, 0 free. (n,)
+        active_rows: of each level, its rows that miss their interval: -1 below it, 1 above, 2 equality; 0 for those
+            that hold. ((m,), ...)
+        multipliers: of each level, the forces of the hard rows, in the units of its weighted cost: the downhill
+            direction of the cost, within what the levels above leave free, is their combination with these; positive
+            at an upper bound, negative at a lower. (levels, h)
+        warm_start: the working sets, for the next problem nearby. A pytree of integers.
     """
 
     x: Float[Array, " n"]
     slacks: tuple[Float[Array, " m"], ...]
     status: Int[Array, ""]
     iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
     kkt_residual: Float[Array, ""]
     active: Int[Array, " n"]
+    active_rows: tuple[Int[Array, " m"], ...]
+    multipliers: Float[Array, "L h"]
+    warm_start: WorkingSet

@@ -8,7 +8,6 @@ closed form; nothing of the search is differentiated, so memory does not grow wi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,58 +16,47 @@ from jaxtyping import Array, Float, Int
 
 from .._dense import apply, product, pseudo_inverses
 from ._problem import Level
+from ._stack import Stack
 
 
 class Decision(NamedTuple):
     """What one level decided: 0 for rows without a part in it, -1 at the lower bound, 1 at the upper."""
 
-    tight: Int[Array, " h"]  # hard rows (box, then rows of the levels before) frozen with a multiplier
+    tight: Int[Array, " h"]  # hard rows frozen with a multiplier
     counts: Int[Array, " m"]  # the level's own rows that count in its cost
 
 
-class _Data(NamedTuple):
-    levels: tuple[Level, ...]
-    lower: Float[Array, " n"]
-    upper: Float[Array, " n"]
-
-
-def with_derivative(
-    x: Float[Array, " n"],
-    decisions: Sequence[Decision],
-    levels: Sequence[Level],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
-    rank: Array | float,
-) -> Float[Array, " n"]:
+def with_derivative(x: Float[Array, " n"], decisions: Decision, stack: Stack, rank: Array) -> Float[Array, " n"]:
     """``x`` as it is, with the derivatives of the replayed cascade with respect to levels and box."""
-    return _attach(jax.lax.stop_gradient(x), tuple(decisions), jnp.asarray(rank), _Data(tuple(levels), lower, upper))
+    return _attach(jax.lax.stop_gradient(x), decisions, rank, stack)
 
 
 @jax.custom_jvp
-def _attach(x: Array, decisions: tuple[Decision, ...], rank: Array, data: _Data) -> Array:
+def _attach(x: Array, decisions: Decision, rank: Array, stack: Stack) -> Array:
     return x
 
 
 @_attach.defjvp
 def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    x, decisions, rank, data = primals
+    x, decisions, rank, stack = primals
     *_, rates = tangents
-    _, dx = jax.jvp(lambda d: _replay(decisions, rank, d), (data,), (rates,))
+    _, dx = jax.jvp(lambda s: _replay(decisions, rank, s), (stack,), (rates,))
     return x, dx
 
 
-def _replay(decisions: tuple[Decision, ...], rank: Array, data: _Data) -> Float[Array, " n"]:
-    n = data.lower.shape[0]
-    matrix, lower, upper = jnp.eye(n, dtype=data.lower.dtype), data.lower, data.upper
-    pinned = jnp.where(data.lower == data.upper, -1, 0)
-    x, projector = jnp.zeros_like(data.lower), matrix
-    x, projector = _block(matrix, lower, upper, pinned, x, projector, rank)
-    for level, decision in zip(data.levels, decisions, strict=True):
-        x, projector = _block(matrix, lower, upper, decision.tight, x, projector, rank)
-        x, projector = _block(level.matrix, level.lower, level.upper, decision.counts, x, projector, rank)
-        matrix = jnp.concatenate([matrix, level.matrix])
-        lower, upper = jnp.concatenate([lower, level.lower]), jnp.concatenate([upper, level.upper])
-    return x
+def _replay(decisions: Decision, rank: Array, stack: Stack) -> Float[Array, " n"]:
+    h, n = stack.hard.shape
+    hard = (stack.hard, stack.hard_lower, stack.hard_upper)
+    pinned = jnp.pad(jnp.where(stack.hard_lower == stack.hard_upper, -1, 0)[:n], (0, h - n))
+    eye = jnp.eye(n, dtype=stack.hard.dtype)
+
+    def descend(state: tuple[Array, Array], now: tuple[Decision, Level]) -> tuple[tuple[Array, Array], None]:
+        decision, level = now
+        state = _block(*hard, decision.tight, *state, rank)
+        return _block(level.matrix, level.lower, level.upper, decision.counts, *state, rank), None
+
+    start = _block(*hard, pinned, jnp.zeros_like(eye[0]), eye, rank)
+    return jax.lax.scan(descend, start, (decisions, stack.levels))[0][0]
 
 
 def _block(

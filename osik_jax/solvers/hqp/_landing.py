@@ -1,0 +1,126 @@
+"""The optimum of a level on a given active set, and whether it is the optimum of the level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._dense import apply, product
+from ._held import Held, hold, multipliers, restoring_step
+from ._problem import Level, Tolerances, WorkingSet
+from ._stack import Task
+
+_ROUNDS = {jnp.dtype("float64"): 2, jnp.dtype("float32"): 3}
+"""Corrections against exact residuals, the first solution among them."""
+
+
+class Landing(NamedTuple):
+    """The minimiser of the level's cost with the working set kept, and the verdict on it."""
+
+    x: Float[Array, " n"]
+    side: Int[Array, " h"]  # rows really held: those that depend on others are left out
+    multiplier: Float[Array, " h"]
+    residual: Float[Array, ""]  # stationarity
+    feasible: Bool[Array, ""]
+    optimal: Bool[Array, ""]
+
+
+def land(task: Task, x: Float[Array, " n"], working: WorkingSet, tolerances: Tolerances) -> Landing:
+    """From a point with the frozen rows at their values to the minimiser on the working set.
+
+    Args:
+        task: the level.
+        x: the point; what freedom the working set and the level leave keeps its place there.
+        working: rows held, and rows that count.
+        tolerances: what counts as zero.
+    """
+    level = task.level
+    held = hold(task, working.hard, tolerances.rank)
+    held = jax.lax.optimization_barrier(held)  # one LAPACK call after another: see osik_jax/_runtime.py
+    side = jnp.zeros_like(working.hard).at[held.rows].set(jnp.where(held.valid, working.hard[held.rows], 0))
+    counts = working.own != 0
+    goal = jnp.where(counts, jnp.where(working.own == 1, level.upper, level.lower), 0.0)
+    descend = least_squares(level, counts, held, tolerances)
+    for _ in range(_ROUNDS[x.dtype]):
+        x = x + apply(task.projector, restoring_step(task, held, side, x))
+        x = x + apply(task.projector, descend(jnp.where(counts, apply(level.matrix, x) - goal, 0.0)))
+    slack = jnp.where(counts, apply(level.matrix, x) - goal, 0.0)
+    gradient = apply(level.matrix.T, slack)
+    multiplier = multipliers(task, held, -apply(task.projector, gradient))
+    feasible = _feasible(task, side, x, tolerances) & jnp.isfinite(x).all()
+    signs = ~jnp.any(wrong_signs(task, side, multiplier, gradient, noise(level, x, slack, tolerances), tolerances))
+    return Landing(
+        x=x,
+        side=side,
+        multiplier=multiplier,
+        residual=jnp.max(jnp.abs(apply(held.projector, gradient))),
+        feasible=feasible,
+        optimal=feasible & signs & _consistent(level, working.own, x, tolerances),
+    )
+
+
+def least_squares(
+    level: Level, counts: Bool[Array, " m"], held: Held, tolerances: Tolerances
+) -> Callable[[Float[Array, " m"]], Float[Array, " n"]]:
+    """From a slack, the step that makes |A step + slack| least over the rows that count and moves no held row."""
+    n, m = held.projector.shape[0], level.matrix.shape[0]
+    if not m:
+        return lambda slack: jnp.zeros(n, held.projector.dtype)
+    rows = jnp.where(counts[:, None], product(level.matrix, held.projector), 0.0)
+    basis, triangle, order = jax.scipy.linalg.qr(rows, mode="economic", pivoting=True)
+    k = min(rows.shape)
+    keep = jnp.abs(jnp.diagonal(triangle)) > tolerances.rank * level.size
+    square = jnp.where(keep[:, None] & keep[None, :], triangle[:, :k], jnp.eye(k, dtype=rows.dtype))
+
+    def step(slack: Float[Array, " m"]) -> Float[Array, " n"]:
+        right = jnp.where(keep, -apply(basis.T, slack), 0.0)
+        out = jnp.zeros(n, rows.dtype).at[order[:k]].set(jax.scipy.linalg.solve_triangular(square, right))
+        return apply(held.projector, out)
+
+    return step
+
+
+def wrong_signs(
+    task: Task,
+    side: Int[Array, " h"],
+    multiplier: Float[Array, " h"],
+    gradient: Float[Array, " n"],
+    floor: Float[Array, ""],
+    tolerances: Tolerances,
+) -> Bool[Array, " h"]:
+    """Held rows that pull and do not push, by more than rounding."""
+    pressure = multiplier * side * task.length
+    return (side != 0) & (pressure < -tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) - floor)
+
+
+def noise(level: Level, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances) -> Float[Array, ""]:
+    """Slopes of the level's cost under this are rounding."""
+    return level.size * rounding(level.size, x, slack, tolerances)
+
+
+def rounding(
+    scale: Float[Array, ""], x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances
+) -> Float[Array, ""]:
+    """Changes of the level's rows under this are noise."""
+    return tolerances.step * (scale * jnp.max(jnp.abs(x)) + jnp.sqrt(jnp.sum(slack**2)))
+
+
+def _feasible(task: Task, side: Int[Array, " h"], x: Float[Array, " n"], tolerances: Tolerances) -> Bool[Array, ""]:
+    value = apply(task.matrix, x)
+    gap = jnp.maximum(task.lower - value, value - task.upper)
+    near = tolerances.feasible * (task.length * jnp.max(jnp.abs(x)) + jnp.abs(value))
+    return ~jnp.any(task.free & (side == 0) & (gap > near))
+
+
+def _consistent(level: Level, own: Int[Array, " m"], x: Float[Array, " n"], tolerances: Tolerances) -> Bool[Array, ""]:
+    """Whether the rows that count are those that miss their interval, and on that side."""
+    value = apply(level.matrix, x)
+    near = tolerances.feasible * (level.length * jnp.max(jnp.abs(x)) + jnp.abs(value))
+    below, above = level.lower - value, value - level.upper
+    held = (own == 0) & (jnp.maximum(below, above) <= near)
+    missed = ((own == -1) & (below >= -near)) | ((own == 1) & (above >= -near))
+    return jnp.all(held | missed | (own == 2))
