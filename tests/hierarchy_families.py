@@ -119,8 +119,8 @@ def scaled_inside(rng: np.random.Generator, count: int) -> Hierarchies:
     return rescaled(p, [10.0 ** rng.uniform(-2, 2, r.lower.shape) for r in p.levels])
 
 
-def scaled_within_reach(rng: np.random.Generator, count: int, decades: float = 6.0) -> Hierarchies:
-    """Rows 1e-6 to 1e6 long in one level, but all of the first two levels can hold: their lengths do not matter."""
+def scaled_within_reach(rng: np.random.Generator, count: int, decades: float = 2.0) -> Hierarchies:
+    """Rows 1e-2 to 1e2 long in one level, but all of the first two levels can hold: their lengths do not matter."""
     p = drawn(rng, count, inequalities=0.4, box=3.0)
     x = np.clip(0.3 * rng.normal(size=(count, VARIABLES)), p.lower, p.upper)
     levels = []

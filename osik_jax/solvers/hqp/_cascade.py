@@ -205,13 +205,15 @@ def _descend(
 
 
 def _first_guess(task: Task, warm: WorkingSet | None) -> WorkingSet:
-    """The warm start as far as the bounds that it names exist; without one, rows that miss their interval now."""
+    """The warm start as far as its bounds exist; without one, or all zeros, rows that miss their interval now."""
     level, value = task.level, apply(task.level.matrix, task.x)
     own = jnp.where(value < level.lower, -1, jnp.where(value > level.upper, 1, 0))
     side = jnp.zeros(task.lower.shape, jnp.int32)
     if warm is not None:
-        own = jnp.sign(warm.own)
-        own = jnp.where(jnp.isfinite(jnp.where(own < 0, level.lower, level.upper)), own, 0)
+        known = jnp.any(warm.hard != 0) | jnp.any(warm.own != 0)
+        named = jnp.sign(warm.own)
+        named = jnp.where(jnp.isfinite(jnp.where(named < 0, level.lower, level.upper)), named, 0)
+        own = jnp.where(known, named, own)
         side = jnp.sign(warm.hard)
         side = jnp.where(task.free & jnp.isfinite(jnp.where(side < 0, task.lower, task.upper)), side, 0)
     own = jnp.where(level.lower == level.upper, 2, own)
