@@ -39,12 +39,21 @@ def pseudo_inverses(matrix: Float[Array, "m n"], cutoff: Array, damping: Array) 
 
 @pseudo_inverses.defjvp
 def _pseudo_inverses_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Any, Any]:
-    """G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973, for X; D solves (I + d X X') D = X."""
-    (a, cutoff, d), (da, _, dd) = primals, tangents
-    X, D = pseudo_inverses(a, cutoff, d)
+    (a, cutoff, damping), (da, _, d_damping) = primals, tangents
+    inverses = pseudo_inverses(a, cutoff, damping)
+    return inverses, inverse_rates(a, *inverses, damping, da, d_damping)
+
+
+def inverse_rates(
+    a: Float[Array, "m n"], X: Float[Array, "n m"], D: Float[Array, "n m"], d: Array, da: Array, dd: Array
+) -> tuple[Float[Array, "n m"], Float[Array, "n m"]]:
+    """Rates of the Moore-Penrose inverse X of a and of the damped inverse D, at constant rank.
+
+    G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973, for X; D solves (I + d X X') D = X.
+    """
     wide = product(X, product(X.T, da.T))
     tall = product(product(da.T, X.T), X)
     dX = wide - product(product(wide, a), X) + tall - product(X, product(a, tall)) - product(product(X, da), X)
     moved = dd * product(X, product(X.T, D)) + d * (product(dX, product(X.T, D)) + product(X, product(dX.T, D)))
     dD = dX - moved
-    return (X, D), (dX, dD - d * product(D, product(X.T, dD)))  # (I + d X X')^-1 = I - d D X'
+    return dX, dD - d * product(D, product(X.T, dD))  # (I + d X X')^-1 = I - d D X'

@@ -17,8 +17,9 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._dense import apply, product, pseudo_inverses
+from .._dense import apply, product
 from ..hqp import Level
+from ._inverses import row_space_and_inverse
 from ._problem import Demand
 
 
@@ -40,15 +41,7 @@ def level_motion(
     if not level.matrix.shape[0]:
         return jnp.zeros_like(x), projector
     demand = Demand.of(level, x, rank)
-    restricted = product(demand.rows, projector)
-    inverse, damped = pseudo_inverses(restricted, demand.cutoff, damping)
-    return apply(damped, demand.wanted), _purified(projector - product(inverse, restricted))
-
-
-def _purified(projector: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """3 P^2 - 2 P^3: eigenvalues at a distance e from 0 or 1 come as near as 3 e^2.
-
-    Where singular values are small the difference leaves rounding that large targets would take for freedom.
-    """
-    square = product(projector, projector)
-    return 3.0 * square - 2.0 * product(square, projector)
+    space, damped = row_space_and_inverse(product(demand.rows, projector), demand.cutoff, damping)
+    # what rounding adds outside the projector's range, as much more as singular values are small, is taken off again
+    motion = apply(projector, apply(damped, demand.wanted))
+    return motion, projector - product(projector, product(space, projector))

@@ -21,14 +21,14 @@ hard bounds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._dense import apply, product, pseudo_inverses
+from .._dense import apply, product
 from ..hqp import Level
+from ._inverses import regularised_inverse, row_space_and_inverse
 from ._problem import Demand
 
 
@@ -43,12 +43,12 @@ def solve_reverse(
         if not level.matrix.shape[0]:
             continue
         demand = Demand.of(level, x, rank)
-        inverse, damped = pseudo_inverses(demand.rows, demand.cutoff, damping)
+        space, damped = row_space_and_inverse(demand.rows, demand.cutoff, damping)
         own = apply(damped, demand.wanted)
-        x = x + own - _correction(below, own, eye - product(inverse, demand.rows), damping, rank)
+        x = x + own - _correction(below, own, eye - space, damping, rank)
         below = jnp.concatenate([below, demand.rows])
-    inverse, _ = pseudo_inverses(below, _cutoff(below, rank), damping) if len(below) else (below.T, None)
-    return x, eye - product(inverse, below)
+    space, _ = row_space_and_inverse(below, _cutoff(below, rank), damping) if len(below) else (0.0 * eye, None)
+    return x, eye - space
 
 
 def _correction(
@@ -63,34 +63,3 @@ def _correction(
 
 def _cutoff(rows: Float[Array, "m n"], rank: Array | float) -> Float[Array, ""]:
     return rank * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2))
-
-
-@jax.custom_jvp
-def regularised_inverse(
-    matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
-) -> Float[Array, "n m"]:
-    """(A'A + damping I)^-1 A', nothing cut off; for a damping of 0 the Moore-Penrose inverse, with the cutoff."""
-    return _with_gram(matrix, cutoff, damping)[0]
-
-
-def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array]:
-    """The inverse D, and K with D = K A': (A'A + damping I)^-1, or (A'A)^+ for a damping of 0."""
-    u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    damped = damping > 0.0
-    kept = damped | (s > cutoff)
-    square = jnp.where(kept, s**2 + damping, 1.0)
-    inverse = product(vt.T * jnp.where(kept, s / square, 0.0), u.T)
-    outside = jnp.where(damped, 1.0 / jnp.where(damped, damping, 1.0), 0.0)
-    gram = product(vt.T * (jnp.where(kept, 1.0 / square, 0.0) - outside), vt)
-    return inverse, gram + outside * jnp.eye(matrix.shape[1], dtype=matrix.dtype)
-
-
-@regularised_inverse.defjvp
-def _regularised_inverse_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-    """Of K A' where it is damped; of the Moore-Penrose inverse at constant rank (Golub, Pereyra 1973) where not."""
-    (a, cutoff, damping), (da, _, d_damping) = primals, tangents
-    D, K = _with_gram(a, cutoff, damping)
-    rest = da.T - product(product(da.T, a), D)  # da' (I - A D)
-    turned = product(da.T, product(D.T, D))
-    turn = jnp.where(damping > 0.0, 0.0, turned - product(D, product(a, turned)))  # (I - D A) da' D' D
-    return D, product(K, rest) - product(D, product(da, D)) + turn - d_damping * product(K, D)

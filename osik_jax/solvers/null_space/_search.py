@@ -154,7 +154,7 @@ def _choose(
 def _move(room: Room, found: Found, excess: Float[Array, ""], dual: Float[Array, "n n"]) -> Found:
     """Takes the joint towards its bound until it is there or a saturated one lets go; where neither, the scale."""
     joint, sign, side = found.joint, found.sign, found.side
-    tiny = jnp.sqrt(jnp.finfo(dual.dtype).eps)
+    tiny = dependence(dual.dtype)
     column = room.projector[:, joint]
     shares = apply(dual, column)
     outside = column - apply(room.projector, shares)
@@ -197,6 +197,14 @@ def blocked_scale(room: Room, blocking: Int[Array, " n"], normal: Float[Array, "
     gap = jnp.sum(normal * jnp.where(blocking != 0, room.bound(blocking) - room.start, 0.0))
     rate = jnp.sum(normal * room.motion)
     return jnp.clip(jnp.where(rate != 0.0, gap / jnp.where(rate != 0.0, rate, 1.0), 1.0), 0.0, 1.0)
+
+
+def dependence(dtype: Any) -> float:
+    """Part of a joint's unit vector, in the null space and outside the span of others, under which it depends on them.
+
+    Well above the rounding that the factors of joints as dependent as that amplify, which is eps over this.
+    """
+    return float(jnp.finfo(dtype).eps) ** 0.4
 
 
 def _select(condition: Array, yes: Found, no: Found) -> Found:
