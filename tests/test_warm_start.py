@@ -1,0 +1,102 @@
+"""A warm start saves time and changes no answer, however wrong it is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problem_families import PLANTED
+from recorded import QP_DAMPING, recorded_hierarchies, recorded_qps
+
+import osik_jax as osik
+from osik_jax.solvers import Level, Status, WorkingSet, solve_hqp, solve_least_squares_qp, solve_qp
+
+DT = 0.005
+
+
+@jax.jit
+@jax.vmap
+def warm_least_squares(A, b, lower, upper, active):
+    return solve_least_squares_qp(A, b, jnp.ones_like(b), lower, upper, damping=QP_DAMPING, warm_start=active)
+
+
+@pytest.fixture(scope="module")
+def qps():
+    p = recorded_qps("nao")
+    cold = warm_least_squares(p.A, p.b, p.lower, p.upper, np.zeros(p.lower.shape, np.int32))
+    return p, cold
+
+
+def test_the_right_active_set_takes_one_factorisation(qps):
+    p, cold = qps
+    warm = warm_least_squares(p.A, p.b, p.lower, p.upper, cold.active)
+    assert (np.asarray(warm.factorizations) == 1).all() and (np.asarray(warm.iterations) == 0).all()
+    assert np.asarray(cold.factorizations).max() <= 3
+    np.testing.assert_allclose(warm.x, cold.x, rtol=0, atol=1e-13)
+
+
+def test_a_random_active_set_costs_time_only(qps, rng):
+    p, cold = qps
+    warm = warm_least_squares(p.A, p.b, p.lower, p.upper, rng.integers(-1, 3, p.lower.shape))
+    assert (np.asarray(warm.status) == Status.SOLVED).all()
+    np.testing.assert_allclose(warm.x, p.solution, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(warm.active, cold.active)
+
+
+@pytest.mark.parametrize("family", ["mixed", "duplicated_rows", "pinned", "scaled_altogether"])
+def test_random_active_sets_with_rows(family, rng):
+    p = PLANTED[family](rng, 500)
+    guess = rng.integers(-1, 3, (500, p.x.shape[1] + p.row_lower.shape[1]))
+    warm = jax.jit(jax.vmap(lambda *data: solve_qp(*data[:-1], warm_start=data[-1])))(*p.data, guess)
+    assert (np.asarray(warm.status) == Status.SOLVED).all()
+    np.testing.assert_allclose((warm.x - p.x) / p.unit, 0.0, atol=1e-9)
+
+
+@jax.jit
+@jax.vmap
+def warm_hierarchy(levels, lower, upper, working):
+    (A1, b1, _), ineq, (A3, b3, _), (A4, b4, _) = levels
+    return solve_hqp([Level(A1, b1), Level(*ineq), Level(A3, b3), Level(A4, b4)], lower, upper, warm_start=working)
+
+
+def norms(s):
+    return np.stack([np.linalg.norm(w, axis=1) for w in s.slacks], 1)
+
+
+def test_hierarchies(rng):
+    r = recorded_hierarchies(unit_rows=False)
+    none = WorkingSet(np.zeros((256, 5, 34), np.int32), np.zeros((256, 5, 32), np.int32))
+    cold = warm_hierarchy(r.levels, r.lower, r.upper, none)
+    warm = warm_hierarchy(r.levels, r.lower, r.upper, cold.warm_start)
+    assert np.mean(warm.factorizations) < 0.8 * np.mean(cold.factorizations)
+    wrong = WorkingSet(rng.integers(-1, 2, none.hard.shape), rng.integers(-1, 3, none.own.shape))
+    lost = warm_hierarchy(r.levels, r.lower, r.upper, wrong)
+    for other in (warm, lost):
+        assert (np.asarray(other.status) == Status.SOLVED).all()
+        np.testing.assert_allclose(norms(other), norms(cold), rtol=0, atol=1e-7)
+
+
+@pytest.fixture(scope="module")
+def reaching():
+    """A hand that is told to go faster than its joints can."""
+    arm = osik.load_robot("arm7")
+    kinematics = osik.forward_kinematics(arm, arm.q0)
+    frame = arm.frame_names[-1]
+    p, R = kinematics.frame_pose(arm, frame)
+    hand = osik.FrameTask(arm, frame, target=(p + jnp.array([-0.3, 0.3, 0.2]), R), gain=20.0, priority=1)
+    tasks = {"hand": hand, "posture": osik.PostureTask(arm, weight=1e-3, priority=2)}
+    limits = (osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": 0.5}))
+    return arm, tasks, limits
+
+
+@pytest.mark.parametrize("scheme", [osik.WeightedQP(), osik.HierarchicalQP()], ids=["weighted", "hierarchical"])
+def test_the_closed_loop(scheme, reaching):
+    """Each tick starts from the one before: the same motion as from cold starts, in one or two factorisations."""
+    arm, tasks, limits = reaching
+    steps = 150
+    warm = osik.rollout(arm, arm.q0, tasks, scheme=scheme, limits=limits, dt=DT, steps=steps)
+    cold = jax.jit(jax.vmap(lambda q: osik.solve(arm, q, tasks, scheme=scheme, limits=limits, dt=DT)))(warm.q[:-1])
+    np.testing.assert_allclose(warm.solution.velocity, cold.velocity, rtol=0, atol=1e-9)
+    assert (np.asarray(cold.warm_start if isinstance(scheme, osik.WeightedQP) else cold.warm_start.hard) != 0).any()
+    assert np.mean(warm.solution.iterations) < 0.2 * np.mean(cold.iterations)
+    if isinstance(scheme, osik.WeightedQP):
+        assert np.median(warm.solution.factorizations) <= 2
