@@ -1,12 +1,14 @@
-"""Prioritised projection with a joint-limit potential in the last null space (eqs. 7 and 8)."""
+"""Prioritised projection with a joint-limit potential in the last null space (eqs. 7 and 8); two variants of it."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..solvers import solve_nullspace
+from ..solvers import Level, NullSpaceSolution, solve_nullspace
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf
 
 
@@ -17,7 +19,17 @@ class NullSpace(Scheme):
     their limits; the motion is -potential_gain df/dq. Limits are not hard: the answer may leave its box, and
     ``Solution.box_violation`` says by how much. Inequality rows count only while the levels above leave them violated.
 
+    ``saturate=True`` makes the limits hard (saturation in the null space): joints at their limits leave the work to
+    the others, a priority that cannot be met inside the limits is scaled down, keeping its direction, and the potential
+    is followed as nearly as the limits allow.
+
+    ``order="reverse"`` builds the motion from the potential and the lowest priority up: the first is exact however the
+    others conflict with it, and nothing jumps where a priority comes to depend on those above. Limits are not hard
+    there, and inequality rows count while what comes before them, the lower priorities, leaves them violated.
+
     Attributes:
+        order: "forward" or "reverse" (static).
+        saturate: whether the limits are hard (static); needs the forward order.
         damping: of each priority's motion: s / (s^2 + damping) stands for 1 / s; 0 allowed.
         potential_gain: alpha [rad^2/s]; 0 turns the potential off. It needs a ``ConfigurationLimit`` among the limits.
         margin: joints are taken to be at least this share of their range away from either limit.
@@ -25,10 +37,20 @@ class NullSpace(Scheme):
             as zero.
     """
 
+    order: Literal["forward", "reverse"] = eqx.field(default="forward", static=True, kw_only=True)
+    saturate: bool = eqx.field(default=False, static=True, kw_only=True)
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
     potential_gain: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("potential_gain"))
     margin: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("margin"))
     rank_tolerance: Float[Array, ""] = eqx.field(default=1e-5, converter=as_leaf("rank_tolerance"))
+
+    def __check_init__(self):
+        if self.order not in ("forward", "reverse"):
+            raise ValueError(f"order is {self.order!r}; orders: forward, reverse")
+        if not isinstance(self.saturate, bool):
+            raise ValueError(f"saturate is {self.saturate!r}; it is True or False")
+        if self.saturate and self.order == "reverse":
+            raise ValueError("saturate needs order='forward': saturation goes from the first priority down")
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
         """The velocity of one tick."""
@@ -36,11 +58,27 @@ class NullSpace(Scheme):
         descent = -self.potential_gain * limit_potential_gradient(
             problem.position, problem.position_lower, problem.position_upper, self.margin
         )
-        answer = solve_nullspace(levels, secondary=descent, damping=self.damping, rank_tolerance=self.rank_tolerance)
-        first = levels[0].scaled()
+        answer = solve_nullspace(
+            levels,
+            *((problem.lower, problem.upper) if self.saturate else ()),
+            order=self.order,
+            secondary=descent,
+            damping=self.damping,
+            rank_tolerance=self.rank_tolerance,
+        )
+        first, count = levels[0].scaled(), jnp.asarray(len(levels))
+        if self.saturate:
+            residual = _first_residual(first, answer, problem)
+            return SchemeAnswer(answer.x, answer.status, answer.iterations, count + answer.iterations, residual)
         gradient = first.matrix.T @ first.distance(answer.x)
-        count = jnp.asarray(len(levels))
         return SchemeAnswer(answer.x, answer.status, count, count, jnp.max(jnp.abs(gradient)))
+
+
+def _first_residual(first: Level, answer: NullSpaceSolution, problem: VelocityProblem) -> Float[Array, ""]:
+    """What the first priority misses of its scaled motion, as a gradient over the joints that can move."""
+    start = jnp.clip(jnp.zeros_like(answer.x), problem.lower, problem.upper)
+    left = first.matrix @ (answer.x - start) + answer.scales[0] * first.distance(start)
+    return jnp.max(jnp.abs(jnp.where(problem.lower == problem.upper, 0.0, first.matrix.T @ left)))
 
 
 def limit_potential_gradient(

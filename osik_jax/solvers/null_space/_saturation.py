@@ -99,11 +99,18 @@ def _descend(room: Room, fixed: Int[Array, " n"], max_iterations: int) -> _End:
     # one factorisation after another: see osik_jax/_runtime.py
     scale, side = jax.lax.optimization_barrier((scale, jnp.where(found.done, found.side, 0)))
     x, _ = settle(room, scale, side, dual_basis(room.projector, side))
-    x = jnp.where(side != 0, room.bound(side), x)
-    x = _inside(jnp.where(found.done, x, room.start), room.lower, room.upper)
-    fixed = jnp.where((fixed == 0) & stopped, found.blocking, fixed)
-    active = jnp.where(fixed != 0, fixed, side)
-    return _End(x, jnp.where(found.done, scale, 0.0), projector, fixed, active, found.iterations, found.done)
+    x = _inside(jnp.where(side != 0, room.bound(side), x), room.lower, room.upper)
+    done = found.done & jax.lax.stop_gradient(room.holds(x, scale))
+    fixed = jnp.where((fixed == 0) & stopped & done, found.blocking, fixed)
+    return _End(
+        x=jnp.where(done, x, room.start),
+        scale=jnp.where(done, scale, 0.0),
+        projector=projector,
+        fixed=fixed,
+        active=jnp.where(fixed != 0, fixed, jnp.where(done, side, 0)),
+        iterations=found.iterations,
+        done=done,
+    )
 
 
 def _stop(room: Room, found: Found) -> tuple[Float[Array, ""], Float[Array, "n n"], Bool[Array, " n"]]:

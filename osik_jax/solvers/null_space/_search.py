@@ -41,6 +41,16 @@ class Room(NamedTuple):
         """The answer without bounds."""
         return self.start + scale * self.motion + apply(self.projector, self.target - self.start)
 
+    def size(self, scale: Array) -> Float[Array, ""]:
+        """Of the numbers that x is made of."""
+        return jnp.max(jnp.abs(self.start) + scale * jnp.abs(self.motion) + jnp.abs(self.target))
+
+    def holds(self, x: Float[Array, " n"], scale: Array) -> Bool[Array, ""]:
+        """Whether x has the rows of all levels so far where they should be, but for rounding."""
+        change = x - self.unsaturated(scale)
+        left = jnp.max(jnp.abs(change - apply(self.projector, change)))
+        return left <= dependence(x.dtype) * self.size(scale)
+
     def bound(self, side: Int[Array, " n"]) -> Float[Array, " n"]:
         """The bound that each saturated joint sits on, 0 for the free ones."""
         return jnp.where(side > 0, self.upper, jnp.where(side < 0, self.lower, 0.0))
@@ -143,8 +153,7 @@ def _choose(
     others = found.blocking.at[found.blocker].set(0)
     implied = found.blocked & ((others == 0) | (found.side == others)).all() & (found.blocking != 0)
     beyond = jnp.where((found.side != 0) | implied, 0.0, jnp.maximum(x - room.upper, room.lower - x))
-    terms = jnp.abs(room.start) + found.scale * jnp.abs(room.motion) + jnp.abs(room.target)
-    noise = _NOISE * jnp.finfo(x.dtype).eps * (jnp.max(terms) + apply(jnp.abs(dual).T, jnp.abs(x)))
+    noise = _NOISE * jnp.finfo(x.dtype).eps * (room.size(found.scale) + apply(jnp.abs(dual).T, jnp.abs(x)))
     joint = jnp.where(found.sign != 0, found.joint, jnp.argmax(beyond - noise))
     sign = jnp.where(found.sign != 0, found.sign, jnp.where(x[joint] > room.upper[joint], 1, -1))
     done = (found.sign == 0) & (beyond[joint] <= noise[joint])
