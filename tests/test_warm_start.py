@@ -64,11 +64,11 @@ def norms(s):
 
 def test_hierarchies(rng):
     r = recorded_hierarchies(unit_rows=False)
-    none = WorkingSet(np.zeros((256, 5, 34), np.int32), np.zeros((256, 5, 32), np.int32))
+    none = WorkingSet(jnp.zeros((256, 5, 34), jnp.int32), jnp.zeros((256, 5, 32), jnp.int32))
     cold = warm_hierarchy(r.levels, r.lower, r.upper, none)
     warm = warm_hierarchy(r.levels, r.lower, r.upper, cold.warm_start)
     assert np.mean(warm.factorizations) < 0.8 * np.mean(cold.factorizations)
-    wrong = WorkingSet(rng.integers(-1, 2, none.hard.shape), rng.integers(-1, 3, none.own.shape))
+    wrong = WorkingSet(*(jnp.asarray(rng.integers(-1, 3, a.shape)) for a in none))
     lost = warm_hierarchy(r.levels, r.lower, r.upper, wrong)
     for other in (warm, lost):
         assert (np.asarray(other.status) == Status.SOLVED).all()
