@@ -4,18 +4,20 @@ F. Flacco, A. De Luca, "A reverse priority approach to multi-task control of red
 
     v_k = v_{k+1} + T_k (J_k T_k)^+ (b_k - J_k v_{k+1}),    T_k: the last columns of [J_l; ...; J_{k+1}; J_k]^+
 
-The change of step k is, of all that fulfil level k as nearly as its own J_k allows, the one that moves the rows of the
-levels below least, and the smallest of these; it is computed as such,
+So the change of step k is, of all that fulfil level k as nearly as its own J_k allows, the one that moves the rows of
+the levels below least, and of these the smallest. The highest level comes last and gets all that J_1 alone can give,
+however the others depend on it. The change is computed as such, with one addition: the paper takes the rows of all
+levels below together, where a posture, which asks something of every joint, outweighs what stands between it and
+level k. Here level k + 1 is moved least, then k + 2 in what that leaves free, and so on; with two levels, or where at
+most one of those below has to give way, that is the same. The two highest levels then get what the forward order and a
+hierarchical QP give them.
 
-    d = J_k^+ r - N D B J_k^+ r,    N = I - J_k^+ J_k,    B = [J_l; ...; J_{k+1}],    D = (B N)^+
+With damping no rank is decided between levels: in the null space N of level k, (N B' B N + damping I)^-1 N B' stands
+for (B N)^+, for the levels below in the projector too, which so are kept in the measure of the damping. The answer is
+then bounded and smooth wherever each J_k by itself keeps its rank.
 
-which needs no inverse of an inverse. With damping, D = (N B' B N + damping I)^-1 N B': the one place where levels meet
-takes no rank decision, so that the answer is a smooth function of the data where each J_k by itself keeps its rank,
-and bounded. The highest level comes last and therefore gets all that J_1 alone can give, dependent levels or not.
-
-When not to use it: three or more levels whose middle one has to come before the lowest in all it can get (where levels
-contradict each other, the least squares of B mixes the levels below; the forward order and ``solve_hqp`` do not);
-hard bounds.
+When not to use it: from the third level down the sum of least changes is not the least in all, as it is in the forward
+order and in ``solve_hqp``; hard bounds (``_saturation.py``).
 """
 
 from __future__ import annotations
@@ -36,29 +38,31 @@ def solve_reverse(
     levels: Sequence[Level], secondary: Float[Array, " n"], damping: Array, rank: Array | float
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The answer, and the projector onto what no level asks for. The secondary motion comes first of all."""
-    x = secondary
-    eye = jnp.eye(len(x), dtype=x.dtype)
-    below = jnp.zeros((0, len(x)), x.dtype)
+    x, eye = secondary, jnp.eye(len(secondary), dtype=secondary.dtype)
+    below: list[Array] = []
     for level in reversed(levels):
         if not level.matrix.shape[0]:
             continue
         demand = Demand.of(level, x, rank)
         space, damped = row_space_and_inverse(demand.rows, demand.cutoff, damping)
-        own = apply(damped, demand.wanted)
-        x = x + own - _correction(below, own, eye - space, damping, rank)
-        below = jnp.concatenate([below, demand.rows])
-    space, _ = row_space_and_inverse(below, _cutoff(below, rank), damping) if len(below) else (0.0 * eye, None)
-    return x, eye - space
+        x = x + _least_disturbing(apply(damped, demand.wanted), eye - space, below, damping, rank)
+        below.append(demand.rows)
+    if not below:
+        return x, eye
+    rows = jnp.concatenate(below)
+    return x, eye - row_space_and_inverse(rows, _cutoff(rows, rank), damping)[0]
 
 
-def _correction(
-    below: Float[Array, "b n"], own: Float[Array, " n"], free: Float[Array, "n n"], damping: Array, rank: Array | float
+def _least_disturbing(
+    change: Float[Array, " n"], free: Float[Array, "n n"], below: Sequence[Array], damping: Array, rank: Array | float
 ) -> Float[Array, " n"]:
-    """What the level's null space can undo of what its motion does to the levels below."""
-    if not len(below):
-        return jnp.zeros_like(own)
-    inverse = regularised_inverse(product(below, free), _cutoff(below, rank), damping)
-    return apply(free, apply(inverse, apply(below, own)))
+    """The change of a level with what its null space can do for the rows below, the highest of them first."""
+    for rows in reversed(below):
+        restricted = product(rows, free)
+        inverse = regularised_inverse(restricted, _cutoff(rows, rank), damping)
+        change = change - apply(free, apply(inverse, apply(rows, change)))
+        free = free - product(free, product(inverse, restricted))
+    return change
 
 
 def _cutoff(rows: Float[Array, "m n"], rank: Array | float) -> Float[Array, ""]:

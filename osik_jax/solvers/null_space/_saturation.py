@@ -21,6 +21,7 @@ rows are inequalities. One unreachable row scales its whole level down; ``solve_
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -28,6 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import product
+from .._lanes import in_lanes
 from ..hqp import Level
 from ._projection import level_motion
 from ._search import Found, Room, blocked_scale, dependence, dual_basis, search, settle
@@ -94,7 +96,8 @@ class _End(NamedTuple):
 
 def _descend(room: Room, fixed: Int[Array, " n"], max_iterations: int) -> _End:
     """What the search decides, and from that the answer anew, which is differentiable; the start where it fails."""
-    found = jax.lax.stop_gradient(search(jax.lax.stop_gradient(room), max_iterations))
+    found = in_lanes(jax.vmap(partial(search, max_iterations=max_iterations)))(jax.lax.stop_gradient(room))
+    found = jax.lax.stop_gradient(found)
     scale, projector, stopped = _stop(room, found)
     # one factorisation after another: see osik_jax/_runtime.py
     scale, side = jax.lax.optimization_barrier((scale, jnp.where(found.done, found.side, 0)))
