@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._status import Status
 from ..hqp import Level
-from ._problem import RANK, NullSpaceSolution, sane
+from ._problem import RANK, NullSpaceSolution, sane, weighted
 from ._projection import solve_forward
 from ._reverse import solve_reverse
 from ._saturation import Saturated, solve_saturated
@@ -72,7 +72,7 @@ def solve_nullspace(
     pull = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
     good = sane(levels, pull, jnp.asarray(damping, dtype)) & (True if box is None else _exists(*box))
     clean, pull, damped = _where(good, (list(levels), pull, jnp.asarray(damping, dtype)))
-    scaled = [level.scaled() for level in clean]
+    scaled = [weighted(level) for level in clean]
     rank = RANK[dtype] if rank_tolerance is None else rank_tolerance
     if box is None:
         method = solve_forward if order == "forward" else solve_reverse
