@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._dense import apply, clip_to_box
+from .._box import inside
+from .._dense import apply
 from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
@@ -157,7 +158,7 @@ def _solve(qp: QP, guess: ArrayLike | None, max_iterations: int | None, toleranc
     x, y = differentiable(found.x, found.row_multipliers, found.active, solved)
     finite = sane & jnp.isfinite(x).all() & jnp.isfinite(y).all()
     x, y = jnp.where(finite, x, 0.0), jnp.where(finite, y, 0.0)
-    x = clip_to_box(x, *(jnp.where(sane, b, raw)[:n] for b, raw in ((safe.lower, qp.lower), (safe.upper, qp.upper))))
+    x = inside(x, *(jnp.where(sane, b, raw)[:n] for b, raw in ((safe.lower, qp.lower), (safe.upper, qp.upper))))
     slope = jnp.where(finite, safe.cost.gradient(x), 0.0) - apply(safe.rows.T, y)
     multipliers = jnp.where(found.active[:n] != INACTIVE, slope, 0.0)
     value = apply(safe.rows, x)
