@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._joint_selection import concrete, scalar_layout
+from ._sanity import cleaned
 from .kinematics import forward_kinematics, integrate
 from .limits import ConfigurationLimit, Limit, limit_box
 from .robot import Robot
@@ -40,7 +42,7 @@ class Solution(eqx.Module):
         error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
         warm_start: for the next tick: the active set, as a pytree of integers; None for ``NullSpace``.
 
-    All numbers are finite: what a NaN in the input spoils is 0, and the status says so.
+    All numbers are finite: what a NaN in the input spoils is 0, its derivatives too, and the status says so.
     """
 
     velocity: Float[Array, " nv"]
@@ -116,11 +118,20 @@ def _solve(
     dt: Array | float,
     warm_start: Any = None,
 ) -> Solution:
+    raw_box = jax.lax.stop_gradient(limit_box(robot, q, limits, dt))
+    (robot, q), posed = cleaned((robot, q))
+    (scheme, limits, dt), set_up = cleaned((scheme, limits, dt))
+    looked_at = {name: cleaned(task) for name, task in tasks.items()}
+    tasks, sound = (
+        {k: task for k, (task, _) in looked_at.items()},
+        {k: posed & own for k, (_, own) in looked_at.items()},
+    )
     kinematics = forward_kinematics(robot, q)
     problem = _velocity_problem(
         robot, q, {k: t.rows(robot, kinematics, q) for k, t in tasks.items()}, tasks, limits, dt
     )
-    answer = scheme.solve(problem, warm_start)
+    given = _spoiled(problem, raw_box, jnp.stack([set_up, *sound.values()]).all())
+    answer = scheme.solve(given, warm_start)
     v = answer.velocity
     failed = answer.status == Status.NUMERICAL_ERROR
     return Solution(
@@ -129,11 +140,26 @@ def _solve(
         iterations=answer.iterations,
         factorizations=answer.factorizations,
         kkt_residual=jnp.where(failed, jnp.finfo(v.dtype).max, answer.kkt_residual),
-        box_violation=jnp.max(_finite(jnp.maximum(jnp.maximum(problem.lower - v, v - problem.upper), 0.0))),
-        slack={name: _finite(slack) for name, slack in problem.slack(v).items()},
-        error={name: _finite(rows.error) for name, rows in problem.rows.items()},
+        box_violation=jnp.max(_finite(jnp.maximum(jnp.maximum(given.lower - v, v - given.upper), 0.0))),
+        slack={name: _finite(jnp.where(sound[name], slack, 0.0)) for name, slack in problem.slack(v).items()},
+        error={name: _finite(jnp.where(sound[name], rows.error, 0.0)) for name, rows in problem.rows.items()},
         warm_start=answer.warm_start,
     )
+
+
+def _spoiled(problem: VelocityProblem, raw_box: tuple[Array, Array], fine: Array) -> VelocityProblem:
+    """The problem with NaN back where its numbers are not to be had from: the solver says so, in every scheme.
+
+    It comes in through a select, so that derivatives with respect to what the problem was made of are 0 in that lane.
+    """
+    rows = {
+        name: replace(r, jacobian=jnp.where(fine, r.jacobian, jnp.nan), weight=jnp.where(fine, r.weight, jnp.nan))
+        for name, r in problem.rows.items()
+    }
+    lower, upper = (
+        jnp.where(jnp.isnan(raw), raw, b) for raw, b in zip(raw_box, (problem.lower, problem.upper), strict=True)
+    )
+    return replace(problem, rows=rows, lower=lower, upper=upper)
 
 
 def _finite(x: Array) -> Array:
@@ -153,6 +179,9 @@ def rollout(
     feedback: Feedback | Float[Array, "steps nq"] | None = None,
 ) -> Trajectory:
     """The closed loop: solve, integrate, repeat, in one compiled scan.
+
+    Differentiable in both modes. The reverse mode keeps the state of each tick alone, a configuration and an active
+    set, and solves each tick again on its way back: a long path costs little memory.
 
     Args:
         robot: the robot.
@@ -238,13 +267,20 @@ def _rollout(
             q = sensed.astype(q.dtype)
         todo = _checked(tasks(t)) if callable(tasks) else _aim(tasks, target)
         solution = _solve(robot, q, todo, scheme, limits, dt, warm_start)
-        q = integrate(robot, q, solution.velocity, dt)
+        q = _move(robot, q, solution.velocity, dt)
         return (q, solution.warm_start), (q, solution)
 
     ticks = (time, targets, measured)
     cold = _cold_start(lambda now: tick((q0, None), now)[0][1], ticks)
-    _, (q, solution) = jax.lax.scan(tick, (q0, cold), ticks, length=steps)
+    thrifty = jax.checkpoint(tick, prevent_cse=False)
+    _, (q, solution) = jax.lax.scan(thrifty, (q0, cold), ticks, length=steps)
     return Trajectory(time, jnp.concatenate([q0[None], q]), solution)
+
+
+def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
+    """Where a tick leads; nowhere if q or dt is NaN."""
+    (clean, tick), fine = cleaned((q, jnp.asarray(dt)))
+    return jnp.where(fine, integrate(robot, clean, v, tick), q)
 
 
 def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:

@@ -1,0 +1,47 @@
+"""Numbers that can be computed with: what is NaN is taken out before the first operation and remembered.
+
+A select after the fact keeps a NaN out of an answer, and not out of a derivative: reverse mode multiplies the zero that
+the select sends back by coefficients that are NaN, and the sum over lanes carries that into every number they share.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+_NEVER_INFINITE = {"weight", "position_weight", "orientation_weight", "gain", "target", "target_velocity"}
+"""Fields of a task that bound nothing."""
+
+
+def cleaned(tree: Any) -> tuple[Any, Bool[Array, ""]]:
+    """The tree with 1 in the place of what cannot be computed with, and whether there was nothing of it.
+
+    Each array is selected from by itself, so that one which the lanes of a batch share stays shared. NaN is never
+    right; an infinity is, where it can mean no bound: not in a bare array, nor in the weights, gain and target of a
+    task.
+    """
+    numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
+    clean = jax.tree_util.tree_map_with_path(lambda path, a: jnp.where(_unusable(path, a), 1.0, a), numbers)
+    kinds: dict[bool, list[Array]] = {True: [], False: []}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(numbers):
+        kinds[_never_infinite(path)].append(jnp.ravel(jax.lax.stop_gradient(leaf)))
+    flags = [~jnp.isnan(_joined(kinds[False])).any(), jnp.isfinite(_joined(kinds[True])).all()]
+    return eqx.combine(clean, rest), flags[0] & flags[1]
+
+
+def _joined(arrays: list[Array]) -> Array:
+    """One array, to be looked at by one operation."""
+    return jnp.concatenate(arrays) if arrays else jnp.zeros(0)
+
+
+def _unusable(path: tuple[Any, ...], leaf: Array) -> Bool[Array, "..."]:
+    return ~jnp.isfinite(leaf) if _never_infinite(path) else jnp.isnan(leaf)
+
+
+def _never_infinite(path: tuple[Any, ...]) -> bool:
+    names = {key.name for key in path if isinstance(key, jax.tree_util.GetAttrKey)}
+    return not names or bool(names & _NEVER_INFINITE)
