@@ -1,0 +1,102 @@
+"""Second derivatives through a tick, derivatives through a rollout, and what they keep in memory."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from arm_setting import DT, SCHEMES, arm_setting, solve, with_numbers
+from derivative_checks import COMPILE_FAST
+from jax.flatten_util import ravel_pytree
+
+import osik_jax as osik
+
+all_schemes = pytest.mark.parametrize("name", SCHEMES)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+class TestHessian:
+    def test_of_a_weighted_tick(self, arm, rng):
+        """Forward over reverse, with speeds at their bounds, against central differences of the gradient; symmetric."""
+        setting = arm_setting(arm, SCHEMES["weighted"])
+        place = setting[2]["hand"].target[0]
+
+        def loss(x):
+            s = solve(with_numbers(setting, x[:7], x[7:10], x[10]))
+            return jnp.sum(jnp.sin(s.velocity)), s.warm_start
+
+        x = jnp.concatenate([arm.q0 + 0.3 * rng.normal(size=7), place + 0.2 * rng.normal(size=3), jnp.array([2.0])])
+        hessian = np.asarray(jax.jit(jax.hessian(lambda x: loss(x)[0]), compiler_options=COMPILE_FAST)(x))
+        gradient = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)), compiler_options=COMPILE_FAST)
+        h = 1e-4 * np.eye(11)
+        (_, active), slopes = gradient(np.concatenate([x + h, x - h, x + 2 * h, x - 2 * h]))
+        assert (np.asarray(active) == np.asarray(active)[0]).all() and (np.asarray(active)[0, :7] != 0).any()
+        one, back, two, far = np.split(np.asarray(slopes), 4)
+        expected = (8.0 * (one - back) - (two - far)) / 12e-4
+        assert np.abs(hessian - expected).max() < 1e-6 * np.abs(expected).max()
+        assert np.abs(hessian - hessian.T).max() < 1e-9 * np.abs(hessian).max()
+
+
+def path_cost(setting, steps):
+    """A cost of a path with respect to start, target, gain, speeds and dt."""
+    robot, _, tasks, scheme, limits, _ = setting
+
+    def cost(x):
+        hand = tasks["hand"].replace(target=(x["target"], tasks["hand"].target[1]))
+        now = {**tasks, "hand": hand, "mass": tasks["mass"].replace(gain=x["gain"])}
+        bounds = limits[0], eqx.tree_at(lambda limit: limit.velocity, limits[1], x["speed"])
+        path = osik.rollout(robot, x["q"], now, scheme=scheme, limits=bounds, dt=x["dt"], steps=steps)
+        return jnp.mean(path.solution.error["hand"] ** 2) + 1e-2 * jnp.mean(jnp.cos(path.q)), path.solution.warm_start
+
+    x = {
+        "q": robot.q0,
+        "target": tasks["hand"].target[0] + jnp.array([0.1, 0.2, -0.1]),
+        "gain": jnp.asarray(2.0),
+        "speed": limits[1].velocity,
+        "dt": jnp.asarray(DT),
+    }
+    return cost, x
+
+
+class TestRollout:
+    @all_schemes
+    def test_over_two_hundred_ticks(self, arm, rng, name):
+        """Both modes against central differences, through changes of the active set along the way."""
+        cost, x = path_cost(arm_setting(arm, SCHEMES[name]), 200)
+        flat, restore = ravel_pytree(x)
+        run = jax.jit(lambda flat: jax.value_and_grad(cost, has_aux=True)(restore(flat)), compiler_options=COMPILE_FAST)
+        push = jax.jit(
+            lambda d: jax.jvp(lambda f: cost(restore(f))[0], (flat,), (d,))[1], compiler_options=COMPILE_FAST
+        )
+        (_, active), gradient = run(flat)
+        reverse = ravel_pytree(gradient)[0]
+        if name != "null-space":
+            sets = np.concatenate([np.asarray(a).reshape(200, -1) for a in jax.tree.leaves(active)], 1)
+            assert len(np.unique(sets, axis=0)) > 1
+        for _ in range(3):
+            d = rng.normal(size=len(flat)) * np.where(flat == 0.0, 0.1, np.abs(flat))
+            (a, _), _ = run(flat + 1e-6 * d)
+            (b, _), _ = run(flat - 1e-6 * d)
+            expected = float(a - b) / 2e-6
+            assert float(reverse @ d) == pytest.approx(expected, rel=1e-5)
+            assert float(push(d)) == pytest.approx(float(reverse @ d), rel=1e-9)
+
+    @all_schemes
+    def test_memory_of_the_gradient(self, arm, name):
+        """A tick more keeps the state of a tick, not what its solver went through."""
+
+        def temporary(steps):
+            cost, x = path_cost(arm_setting(arm, SCHEMES[name]), steps)
+            compiled = jax.jit(jax.grad(cost, has_aux=True), compiler_options=COMPILE_FAST).lower(x).compile()
+            analysis = compiled.memory_analysis()
+            assert analysis is not None
+            return analysis.temp_size_in_bytes
+
+        a_tick = (temporary(300) - temporary(100)) / 200
+        assert a_tick < 1000, f"{a_tick} bytes a tick"
