@@ -159,6 +159,17 @@ class TestSwitches:
         assert errors.min(1).max() < 1e-6
         assert (errors.max(1) > 1e-3).mean() > 0.9  # the other side has another
 
+    @pytest.mark.parametrize("column", [3e-12, 9e-11, 1.2e-10, 4e-10, 1e-8])
+    def test_a_column_at_the_rank_tolerance_stopped_by_its_bound(self, column):
+        """The next level keeps x at that bound; the pseudo-inverse of the column alone would be 1e10."""
+
+        def answer(column):
+            levels = [Level(jnp.diag(jnp.array([1.0, column])), [5.0, 0.5]), Level([[0.0, 1.0]], [2.0])]
+            return solve_hqp(levels, [-1.0, -0.3], [1.0, 0.3]).x
+
+        np.testing.assert_array_equal(answer(column), [1.0, 0.3])
+        np.testing.assert_allclose(jax.jacfwd(answer)(column), 0.0, rtol=0, atol=1e-9)
+
     def test_contradictions_have_finite_derivatives(self, rng):
         """Infeasible lanes, forward and reverse, of every output."""
         H, g, *box, C, low, high = quadratic_programs(rng, rows=4)[0]

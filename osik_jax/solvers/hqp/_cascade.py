@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._dense import apply, clip_to_box, product
+from .._box import inside
+from .._dense import apply, product
 from .._lanes import choose, in_lanes
 from .._status import Status
 from ._held import independent
@@ -25,6 +26,9 @@ _DEFAULTS = {
     jnp.dtype("float64"): Tolerances(rank=1e-10, step=1e-13, multiplier=1e-10, feasible=1e-11),
     jnp.dtype("float32"): Tolerances(rank=1e-5, step=1e-7, multiplier=1e-6, feasible=1e-5),
 }
+
+_NOTHING = 1e-2
+"""Share of the rank tolerance up to which a pivot is none, whatever the rank that another factorisation found."""
 
 
 @partial(jax.jit, static_argnames="max_iterations")
@@ -70,7 +74,7 @@ def solve_hqp(
     layout, stack = stacked([*scaled, _smallest(lower.shape[0], dtype)], low, high)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
     end = _descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start)))
-    x = with_derivative(end.cascade.x, end.decisions, stack, traced.rank)
+    x = with_derivative(end.cascade.x, end.decisions, stack, _NOTHING * traced.rank)
     return _answer(levels, layout, end, x, sane, lower, upper)
 
 
@@ -223,7 +227,7 @@ def _first_guess(task: Task, warm: WorkingSet | None) -> WorkingSet:
 def _at(landing: Landing) -> LevelState:
     """The state of a level that ended where it landed."""
     nothing = jnp.asarray(0, jnp.int32)
-    return LevelState(landing.x, landing.side, landing.multiplier, landing.residual, nothing, nothing, landing.optimal)
+    return LevelState(*landing[:-2], nothing, nothing, landing.optimal)
 
 
 def _by_hand_from(task: Task, side: Int[Array, " h"], landing: Landing, tolerances: Tolerances) -> LevelState:
@@ -232,6 +236,8 @@ def _by_hand_from(task: Task, side: Int[Array, " h"], landing: Landing, toleranc
         x=task.x,
         side=independent(task, side, tolerances.rank),
         multiplier=jnp.zeros_like(landing.multiplier),
+        counts=jnp.zeros_like(landing.counts),
+        rank=jnp.zeros_like(landing.rank),
         residual=jnp.zeros_like(landing.residual),
     )
     return jax.tree.map(lambda a, b: jnp.where(landing.feasible, a, b), _at(landing), before)
@@ -248,10 +254,17 @@ def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Toleranc
     floor = tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + noise(level, end.x, slack, tolerances)
     tight = (end.side != 0) & (pressure > floor)
     rows = jnp.argsort(~tight, stable=True)[:n]
+    length = jnp.where(tight, task.length, 1.0)[rows]
     to_freeze = jnp.concatenate(
-        [jnp.where(tight[rows][:, None], task.matrix[rows], 0.0), jnp.where(counts[:, None], level.matrix, 0.0)]
+        [
+            jnp.where(tight[rows], 1.0 / length, 0.0)[:, None] * task.matrix[rows],
+            jnp.where(counts[:, None], level.matrix, 0.0) / jnp.where(level.size > 0.0, level.size, 1.0),
+        ]
     )
-    basis = _row_space(to_freeze, task.projector, tolerances.rank)
+    bounds = jnp.sum(tight, dtype=jnp.int32)
+    same = jnp.all(counts == end.counts)
+    decided = jnp.where(same & jnp.all(tight == (end.side != 0)), bounds + end.rank, -1)
+    basis, rank = _row_space(to_freeze, task.projector, decided, tolerances.rank)
     missed = jnp.where(counts, jnp.where(slack > 0.0, 1, -1), 0).astype(jnp.int32)
     reached = apply(task.matrix, end.x)
     after = cascade._replace(
@@ -266,26 +279,34 @@ def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Toleranc
         done=cascade.done & end.done,
     )
     own = jnp.where(level.lower == level.upper, 2, missed).astype(jnp.int32)
-    return after, (Decision(jnp.where(tight, end.side, 0), missed), WorkingSet(end.side, own), end.multiplier)
+    # rows held without a multiplier decide nothing, unless more of the level would count without them (a tie)
+    tie = same & (rank - bounds != end.rank)
+    decision = Decision(jnp.where(tight | tie, end.side, 0), missed, jnp.where(tie, end.rank, rank - bounds))
+    return after, (decision, WorkingSet(end.side, own), end.multiplier)
 
 
 def _skip(cascade: _Cascade, task: Task) -> tuple[_Cascade, _Outcome]:
     """A level that finds no freedom decides nothing."""
     none, own = jnp.zeros_like(cascade.side), jnp.zeros(task.level.lower.shape, jnp.int32)
-    return cascade, (Decision(none, own), WorkingSet(none, own), jnp.zeros_like(cascade.lower))
+    decision = Decision(none, own, jnp.zeros_like(cascade.iterations))
+    return cascade, (decision, WorkingSet(none, own), jnp.zeros_like(cascade.lower))
 
 
-def _row_space(rows: Float[Array, "m n"], projector: Float[Array, "n n"], rank: Array | float) -> Float[Array, "n k"]:
-    """Orthonormal basis (0 columns beyond the rank) of what the rows span inside the projector's range."""
-    length = jnp.sqrt(jnp.sum(rows**2, -1, keepdims=True))
-    unit = rows / jnp.where(length > 0.0, length, 1.0)
-    basis, triangle, _ = jax.scipy.linalg.qr(product(unit, projector).T, mode="economic", pivoting=True)
-    basis = product(projector, jnp.where(jnp.abs(jnp.diagonal(triangle)) > rank, basis, 0.0))
-    for _ in range(
-        2
-    ):  # a column from a small pivot has left the range by rounding over that pivot: back, and orthonormal
+def _row_space(
+    rows: Float[Array, "m n"], projector: Float[Array, "n n"], decided: Int[Array, ""], rank: Array | float
+) -> tuple[Float[Array, "n k"], Int[Array, ""]]:
+    """Orthonormal basis (0 columns beyond the rank) of what the rows span inside the projector's range, and its size.
+
+    The rank is what is decided; where that is negative, the number of pivots above the tolerance.
+    """
+    basis, triangle, _ = jax.scipy.linalg.qr(product(rows, projector).T, mode="economic", pivoting=True)
+    pivots = jnp.abs(jnp.diagonal(triangle))
+    known = (jnp.arange(len(pivots)) < decided) & (pivots > _NOTHING * rank)
+    keep = jnp.where(decided < 0, pivots > rank, known)
+    basis = product(projector, jnp.where(keep, basis, 0.0))
+    for _ in range(2):  # a column from a small pivot left the range by rounding over that pivot: back, and orthonormal
         basis = 1.5 * basis - 0.5 * product(basis, product(basis.T, basis))
-    return basis
+    return basis, jnp.sum(keep, dtype=jnp.int32)
 
 
 def _finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:
@@ -306,7 +327,7 @@ def _answer(
     cascade = end.cascade
     at_bound = jnp.where(cascade.box < 0, lower, jnp.where(cascade.box > 0, upper, x))
     good = sane & jnp.isfinite(x).all()
-    x = clip_to_box(jnp.where(good, at_bound, 0.0), lower, upper)
+    x = inside(jnp.where(good, at_bound, 0.0), lower, upper)
     status = jnp.where(cascade.done, Status.SOLVED, Status.MAX_ITERATIONS)
     return HQPSolution(
         x=x,

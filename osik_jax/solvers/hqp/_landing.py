@@ -24,6 +24,8 @@ class Landing(NamedTuple):
     x: Float[Array, " n"]
     side: Int[Array, " h"]  # rows really held: those that depend on others are left out
     multiplier: Float[Array, " h"]
+    counts: Bool[Array, " m"]  # the level's rows that were taken to miss their interval, or are equalities
+    rank: Int[Array, ""]  # of those, within what the held rows leave free
     residual: Float[Array, ""]  # stationarity
     feasible: Bool[Array, ""]
     optimal: Bool[Array, ""]
@@ -44,7 +46,7 @@ def land(task: Task, x: Float[Array, " n"], working: WorkingSet, tolerances: Tol
     side = jnp.zeros_like(working.hard).at[held.rows].set(jnp.where(held.valid, working.hard[held.rows], 0))
     counts = working.own != 0
     goal = jnp.where(counts, jnp.where(working.own == 1, level.upper, level.lower), 0.0)
-    descend = least_squares(level, counts, held, tolerances)
+    descend, rank = least_squares(level, counts, held, tolerances)
     for _ in range(_ROUNDS[x.dtype]):
         x = x + apply(task.projector, restoring_step(task, held, side, x))
         x = x + apply(task.projector, descend(jnp.where(counts, apply(level.matrix, x) - goal, 0.0)))
@@ -57,6 +59,8 @@ def land(task: Task, x: Float[Array, " n"], working: WorkingSet, tolerances: Tol
         x=x,
         side=side,
         multiplier=multiplier,
+        counts=counts,
+        rank=rank,
         residual=jnp.max(jnp.abs(apply(held.projector, gradient))),
         feasible=feasible,
         optimal=feasible & signs & _consistent(level, working.own, x, tolerances),
@@ -65,11 +69,12 @@ def land(task: Task, x: Float[Array, " n"], working: WorkingSet, tolerances: Tol
 
 def least_squares(
     level: Level, counts: Bool[Array, " m"], held: Held, tolerances: Tolerances
-) -> Callable[[Float[Array, " m"]], Float[Array, " n"]]:
-    """From a slack, the step that makes |A step + slack| least over the rows that count and moves no held row."""
-    n, m = held.projector.shape[0], level.matrix.shape[0]
-    if not m:
-        return lambda slack: jnp.zeros(n, held.projector.dtype)
+) -> tuple[Callable[[Float[Array, " m"]], Float[Array, " n"]], Int[Array, ""]]:
+    """From a slack, the step that makes |A step + slack| least over the rows that count and moves no held row.
+
+    And the rank of those rows among such steps.
+    """
+    n = held.projector.shape[0]
     rows = jnp.where(counts[:, None], product(level.matrix, held.projector), 0.0)
     basis, triangle, order = jax.scipy.linalg.qr(rows, mode="economic", pivoting=True)
     k = min(rows.shape)
@@ -81,7 +86,7 @@ def least_squares(
         out = jnp.zeros(n, rows.dtype).at[order[:k]].set(jax.scipy.linalg.solve_triangular(square, right))
         return apply(held.projector, out)
 
-    return step
+    return step, jnp.sum(keep, dtype=jnp.int32)
 
 
 def wrong_signs(

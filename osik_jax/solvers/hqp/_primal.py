@@ -32,6 +32,8 @@ class LevelState(NamedTuple):
     x: Float[Array, " n"]
     side: Int[Array, " h"]  # of each hard row: -1 held at its lower bound, 1 at its upper, 0 not held
     multiplier: Float[Array, " h"]
+    counts: Bool[Array, " m"]  # the level's rows that miss their interval, or are equalities
+    rank: Int[Array, ""]  # of those, within what the held rows leave free
     residual: Float[Array, ""]  # stationarity
     stalled: Int[Array, ""]  # steps of zero length in a row
     iterations: Int[Array, ""]
@@ -54,14 +56,15 @@ def solve_level(task: Task, start: LevelState, tolerances: Tolerances, max_itera
         slack = value - jnp.clip(value, level.lower, level.upper)
         counts = (slack != 0.0) | (level.lower == level.upper)
         held = jax.lax.optimization_barrier(hold(task, s.side, tolerances.rank))
-        step = apply(task.projector, least_squares(level, counts, held, tolerances)(slack))
+        descend, rank = least_squares(level, counts, held, tolerances)
+        step = apply(task.projector, descend(slack))
         change = jnp.where(counts, apply(level.matrix, step), 0.0)
         floor = rounding(level.size, s.x, slack, tolerances)
         still = jnp.sqrt(jnp.sum(change**2)) <= floor
         at_rest = _drop(task, s, apply(level.matrix.T, slack), floor * level.size, held, tolerances)
         moved = _advance(task, s, step, tolerances)
         out = jax.tree.map(lambda a, b: jnp.where(still, a, b), at_rest, moved)
-        return out._replace(iterations=s.iterations + 1)
+        return out._replace(counts=counts, rank=rank, iterations=s.iterations + 1)
 
     def go_on(s: LevelState) -> Bool[Array, ""]:
         return ~s.done & (s.iterations < max_iterations)

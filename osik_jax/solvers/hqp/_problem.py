@@ -73,11 +73,7 @@ class Level(eqx.Module):
         matrix = root[:, None] * self.matrix
         if self.equality:
             return Level(matrix, jnp.where(positive, self.lower * root, 0.0))
-        return Level(
-            matrix,
-            jnp.where(positive, self.lower * jnp.where(positive, root, 1.0), -jnp.inf),
-            jnp.where(positive, self.upper * jnp.where(positive, root, 1.0), jnp.inf),
-        )
+        return Level(matrix, _scaled_bound(self.lower, root, -jnp.inf), _scaled_bound(self.upper, root, jnp.inf))
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """A x minus the nearest point of its interval: the slack, 0 where the row holds."""
@@ -90,6 +86,12 @@ class WorkingSet(NamedTuple):
 
     hard: Int[Array, " h"]  # rows that the level leaves alone, held at a bound
     own: Int[Array, " m"]  # the level's own rows that miss their interval on that side: they count in its cost
+
+
+def _scaled_bound(bound: Float[Array, " m"], root: Float[Array, " m"], none: float) -> Float[Array, " m"]:
+    """root times bound, ``none`` where root is 0; the rate of an infinite bound with respect to its weight is 0."""
+    finite = jnp.where(jnp.isinf(bound), 0.0, bound)
+    return jnp.where(root > 0.0, jnp.where(jnp.isinf(bound), bound, root * finite), none)
 
 
 class HQPSolution(eqx.Module):

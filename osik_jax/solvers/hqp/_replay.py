@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._dense import apply, product, pseudo_inverses
+from .._dense import apply, product
+from .._inverses import row_space_and_inverse
 from ._problem import Level
 from ._stack import Stack
 
@@ -22,29 +23,33 @@ from ._stack import Stack
 class Decision(NamedTuple):
     """What one level decided: 0 for rows without a part in it, -1 at the lower bound, 1 at the upper."""
 
-    tight: Int[Array, " h"]  # hard rows frozen with a multiplier
+    tight: Int[Array, " h"]  # hard rows that stop the level at a bound
     counts: Int[Array, " m"]  # the level's own rows that count in its cost
+    rank: Int[Array, ""]  # of the rows that count, within what frozen and tight rows leave free
 
 
-def with_derivative(x: Float[Array, " n"], decisions: Decision, stack: Stack, rank: Array) -> Float[Array, " n"]:
-    """``x`` as it is, with the derivatives of the replayed cascade with respect to levels and box."""
-    return _attach(jax.lax.stop_gradient(x), decisions, rank, stack)
+def with_derivative(x: Float[Array, " n"], decisions: Decision, stack: Stack, nothing: Array) -> Float[Array, " n"]:
+    """``x`` as it is, with the derivatives of the replayed cascade with respect to levels and box.
+
+    ``nothing`` is the share of the longest row up to which a singular value is none, whatever the decided rank.
+    """
+    return _attach(jax.lax.stop_gradient(x), decisions, nothing, stack)
 
 
 @jax.custom_jvp
-def _attach(x: Array, decisions: Decision, rank: Array, stack: Stack) -> Array:
+def _attach(x: Array, decisions: Decision, nothing: Array, stack: Stack) -> Array:
     return x
 
 
 @_attach.defjvp
 def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    x, decisions, rank, stack = primals
+    x, decisions, nothing, stack = primals
     *_, rates = tangents
-    _, dx = jax.jvp(lambda s: _replay(decisions, rank, s), (stack,), (rates,))
+    _, dx = jax.jvp(lambda s: _replay(decisions, nothing, s), (stack,), (rates,))
     return x, dx
 
 
-def _replay(decisions: Decision, rank: Array, stack: Stack) -> Float[Array, " n"]:
+def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, " n"]:
     h, n = stack.hard.shape
     hard = (stack.hard, stack.hard_lower, stack.hard_upper)
     pinned = jnp.pad(jnp.where(stack.hard_lower == stack.hard_upper, -1, 0)[:n], (0, h - n))
@@ -52,29 +57,34 @@ def _replay(decisions: Decision, rank: Array, stack: Stack) -> Float[Array, " n"
 
     def descend(state: tuple[Array, Array], now: tuple[Decision, Level]) -> tuple[tuple[Array, Array], None]:
         decision, level = now
-        state = _block(*hard, decision.tight, *state, rank)
-        return _block(level.matrix, level.lower, level.upper, decision.counts, *state, rank), None
+        state = _block(*hard, decision.tight, n, *state, nothing)
+        return _block(level.matrix, level.lower, level.upper, decision.counts, decision.rank, *state, nothing), None
 
-    start = _block(*hard, pinned, jnp.zeros_like(eye[0]), eye, rank)
+    start = _block(*hard, pinned, n, jnp.zeros_like(eye[0]), eye, nothing)
     return jax.lax.scan(descend, start, (decisions, stack.levels))[0][0]
 
 
 def _block(
-    matrix: Array, lower: Array, upper: Array, side: Array, x: Array, projector: Array, rank: Array
+    matrix: Array,
+    lower: Array,
+    upper: Array,
+    side: Array,
+    rank: Array | int,
+    x: Array,
+    projector: Array,
+    nothing: Array,
 ) -> tuple[Array, Array]:
-    """Moves x in the projector's range so that the chosen rows come as near to their bounds as they can."""
+    """Moves x in the projector's range so that the chosen rows, of that rank at most, come nearest to their bounds."""
     n = x.shape[0]
-    if not matrix.shape[0]:
-        return x, projector
     rows = jnp.argsort(side == 0, stable=True)[:n] if matrix.shape[0] > n else jnp.arange(matrix.shape[0])
     on = side[rows] != 0
     target = jnp.where(side[rows] < 0, _finite(lower[rows], side[rows] < 0), _finite(upper[rows], side[rows] > 0))
     chosen = jnp.where(on[:, None], matrix[rows], 0.0)
-    restricted = product(chosen, projector)
-    length = jnp.max(jnp.sum(jax.lax.stop_gradient(chosen) ** 2, -1), initial=0.0)
-    inverse, _ = pseudo_inverses(restricted, rank * jnp.sqrt(length), jnp.zeros_like(length))
+    longest = jnp.sqrt(jnp.max(jnp.sum(jax.lax.stop_gradient(chosen) ** 2, -1)))
+    space, inverse = row_space_and_inverse(product(chosen, projector), nothing * longest, rank, 0.0)
     gap = jnp.where(on, target - apply(chosen, x), 0.0)
-    return x + apply(inverse, gap), projector - product(inverse, restricted)
+    # as in the projection (eq. 7): rounding over small singular values has left the projector's range
+    return x + apply(projector, apply(inverse, gap)), projector - product(projector, product(space, projector))
 
 
 def _finite(bound: Array, used: Array) -> Array:

@@ -65,12 +65,3 @@ def sane(levels: Sequence[Level], *more: Array) -> Bool[Array, ""]:
     checks += [((level.lower < jnp.inf) & (level.upper > -jnp.inf)).all() for level in levels]
     checks += [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
     return jnp.stack([*checks, *(jnp.isfinite(array).all() for array in more)]).all()
-
-
-def weighted(level: Level) -> Level:
-    """The level with the square roots of its weights multiplied in; infinite bounds have no part in the derivatives."""
-    bounds = level.lower, level.upper
-    finite = eqx.tree_at(lambda one: (one.lower, one.upper), level, [jnp.where(jnp.isinf(b), 0.0, b) for b in bounds])
-    scaled = finite.scaled()
-    infinite = [jnp.where(jnp.isinf(b), b, s) for b, s in zip(bounds, (scaled.lower, scaled.upper), strict=True)]
-    return eqx.tree_at(lambda one: (one.lower, one.upper), scaled, infinite)

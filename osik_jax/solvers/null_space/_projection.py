@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._dense import apply, product
+from .._inverses import row_space_and_inverse
 from ..hqp import Level
-from ._inverses import row_space_and_inverse
 from ._problem import Demand
 
 
@@ -41,7 +41,7 @@ def level_motion(
     if not level.matrix.shape[0]:
         return jnp.zeros_like(x), projector
     demand = Demand.of(level, x, rank)
-    space, damped = row_space_and_inverse(product(demand.rows, projector), demand.cutoff, damping)
+    space, damped = row_space_and_inverse(product(demand.rows, projector), demand.cutoff, len(x), damping)
     # what rounding adds outside the projector's range, as much more as singular values are small, is taken off again
     motion = apply(projector, apply(damped, demand.wanted))
     return motion, projector - product(projector, product(space, projector))

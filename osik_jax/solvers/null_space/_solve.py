@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from .._dense import clip_to_box
 from .._status import Status
 from ..hqp import Level
-from ._problem import RANK, NullSpaceSolution, sane, weighted
+from ._problem import RANK, NullSpaceSolution, sane
 from ._projection import solve_forward
 from ._reverse import solve_reverse
 from ._saturation import Saturated, solve_saturated
@@ -72,7 +73,7 @@ def solve_nullspace(
     pull = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
     good = sane(levels, pull, jnp.asarray(damping, dtype)) & (True if box is None else _exists(*box))
     clean, pull, damped = _where(good, (list(levels), pull, jnp.asarray(damping, dtype)))
-    scaled = [weighted(level) for level in clean]
+    scaled = [level.scaled() for level in clean]
     rank = RANK[dtype] if rank_tolerance is None else rank_tolerance
     if box is None:
         method = solve_forward if order == "forward" else solve_reverse
@@ -81,7 +82,7 @@ def solve_nullspace(
     cap = 10 * (n + 2) if max_iterations is None else max_iterations
     safe = jnp.where(good, box[0], -1.0), jnp.where(good, box[1], 1.0)
     answer = solve_saturated(scaled, *safe, None if secondary is None else pull, damped, rank, cap)
-    return _solution(clean, answer, good, _clip_zero(*box))
+    return _solution(clean, answer, good, clip_to_box(jnp.zeros(n, dtype), *box))
 
 
 def _where(good: Array, tree: Any) -> Any:
@@ -104,12 +105,6 @@ def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] |
 
 def _exists(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Bool[Array, ""]:
     return ((lower <= upper) & (lower < jnp.inf) & (upper > -jnp.inf)).all()
-
-
-def _clip_zero(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
-    """0, inside what there is of a box."""
-    low, high = (jnp.where(jnp.isnan(b), none, b) for b, none in ((lower, -jnp.inf), (upper, jnp.inf)))
-    return jnp.clip(jnp.zeros_like(lower), low, high)
 
 
 def _free(x: Float[Array, " n"], projector: Float[Array, "n n"], *, count: int) -> Saturated:

@@ -6,27 +6,28 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._dense import inverse_rates, product
+from ._dense import product
 
 
 @jax.custom_jvp
 def row_space_and_inverse(
-    matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
+    matrix: Float[Array, "m n"], cutoff: Array | float, most: Int[Array, ""] | int, damping: Array | float
 ) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
-    """Orthogonal projector onto what the rows span, and damped inverse; singular values up to the cutoff left out.
+    """Orthogonal projector onto what the rows span, and damped inverse, of the largest singular values.
 
-    The projector comes from singular vectors and not from an inverse, so that it is one to the last digit however
-    small the singular values are. Derivatives are those at constant rank.
+    Those up to the cutoff are left out, and those beyond the first ``most``. The projector comes from singular vectors
+    and not from an inverse, so that it is one to the last digit however small the singular values are. Derivatives are
+    those at constant rank.
     """
-    space, _, damped = _factors(matrix, cutoff, damping)
+    space, _, damped = _factors(matrix, cutoff, most, damping)
     return space, damped
 
 
-def _factors(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
+def _factors(matrix: Array, cutoff: Array, most: Array, damping: Array) -> tuple[Array, Array, Array]:
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    real = s > cutoff
+    real = (s > cutoff) & (jnp.arange(len(s)) < most)
     vt, s = jnp.where(real[:, None], vt, 0.0), jnp.where(real, s, 1.0)
     plain, damped = (product(vt.T * factor, u.T) for factor in (1.0 / s, s / (s**2 + damping)))
     return product(vt.T, vt), plain, damped
@@ -34,12 +35,28 @@ def _factors(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array
 
 @row_space_and_inverse.defjvp
 def _row_space_and_inverse_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    (a, cutoff, damping), (da, _, d_damping) = primals, tangents
-    space, plain, damped = _factors(a, cutoff, damping)
+    (a, cutoff, most, damping), (da, *_, d_damping) = primals, tangents
+    space, plain, damped = _factors(a, cutoff, most, damping)
     turn = product(plain, da)
     turn = turn - product(turn, space)
-    _, d_damped = inverse_rates(a, plain, damped, damping, da, d_damping)
+    d_damped = _damped_rate(a, plain, damped, damping, da, d_damping)
     return (space, damped), (turn + turn.T, d_damped)
+
+
+def _damped_rate(
+    a: Float[Array, "m n"], X: Float[Array, "n m"], D: Float[Array, "n m"], d: Array, da: Array, dd: Array
+) -> Float[Array, "n m"]:
+    """Rate of the damped inverse D of a, at constant rank, X being the Moore-Penrose inverse.
+
+    D solves (I + d X X') D = X, whose rate is from
+    G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973.
+    """
+    wide = product(X, product(X.T, da.T))
+    tall = product(product(da.T, X.T), X)
+    dX = wide - product(product(wide, a), X) + tall - product(X, product(a, tall)) - product(product(X, da), X)
+    moved = dd * product(X, product(X.T, D)) + d * (product(dX, product(X.T, D)) + product(X, product(dX.T, D)))
+    dD = dX - moved
+    return dD - d * product(D, product(X.T, dD))  # (I + d X X')^-1 = I - d D X'
 
 
 @jax.custom_jvp

@@ -1,0 +1,491 @@
+"""Saturation in the null space against linear programs (the scale), NNLS (the smallest answer) and the projection."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+from optimality import outside_cone
+
+import osik_jax as osik
+from osik_jax.solvers import Level, Status, solve_nullspace
+
+N, ROWS, LANES = 10, (3, 2, 3), 200
+FAMILIES = ("easy", "tight", "small targets", "box beside zero", "pinned", "conflicting", "near-dependent", "ties")
+
+
+class Problems(NamedTuple):
+    """A batch: levels as (matrix, wanted) pairs, a box, and a secondary motion."""
+
+    levels: list
+    lower: np.ndarray
+    upper: np.ndarray
+    secondary: np.ndarray
+
+
+class Answers(NamedTuple):
+    """Of the first level alone, of the first two, of all, and of all with the secondary motion."""
+
+    partial: list
+    full: osik.solvers.NullSpaceSolution
+
+
+def drawn(rng, count=LANES, spread=1.5, box=1.0, infinite=0.15):
+    levels = [(rng.normal(size=(count, m, N)), spread * rng.normal(size=(count, m))) for m in ROWS]
+    shape = (count, N)
+    lower = np.where(rng.random(shape) < infinite, -np.inf, -rng.exponential(box, shape))
+    upper = np.where(rng.random(shape) < infinite, np.inf, rng.exponential(box, shape))
+    return Problems(levels, lower, upper, rng.normal(size=shape))
+
+
+def family(name, rng):
+    p = drawn(
+        rng, spread={"tight": 5.0, "small targets": 0.3}.get(name, 1.5), infinite=0.0 if name == "tight" else 0.15
+    )
+    if name in ("box beside zero", "pinned"):
+        move = 0.5 * rng.normal(size=p.lower.shape)
+        p = p._replace(lower=p.lower + move, upper=p.upper + move)
+    if name == "pinned":
+        pin, place = rng.random(p.lower.shape) < 0.25, rng.normal(size=p.lower.shape)
+        p = p._replace(lower=np.where(pin, place, p.lower), upper=np.where(pin, place, p.upper))
+    if name == "conflicting":
+        p.levels[1][0][:] = p.levels[0][0][:, :2]
+        p.levels[2][0][:, 0] = p.levels[0][0].sum(1)
+    if name == "near-dependent":
+        p.levels[0][0][:, 2] = p.levels[0][0][:, 0] + 1e-5 * p.levels[0][0][:, 2]
+    if name == "ties":
+        levels = [
+            (rng.integers(-1, 2, A.shape).astype(float), rng.integers(-3, 4, b.shape).astype(float))
+            for A, b in p.levels
+        ]
+        p = Problems(levels, -np.ones_like(p.lower), np.ones_like(p.upper), np.round(p.secondary))
+    return p
+
+
+def as_levels(pairs):
+    return [Level(matrix, wanted, wanted) for matrix, wanted in pairs]
+
+
+@jax.jit
+@jax.vmap
+def solve_all(p):
+    partial = [solve_nullspace(as_levels(p.levels[: k + 1]), p.lower, p.upper) for k in range(len(p.levels))]
+    return Answers(partial, solve_nullspace(as_levels(p.levels), p.lower, p.upper, secondary=p.secondary))
+
+
+@jax.jit
+@jax.vmap
+def solve_full(p):
+    return solve_nullspace(as_levels(p.levels), p.lower, p.upper, secondary=p.secondary)
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """Of each family, the problems and the answers, in one compiled program."""
+    out = {}
+    for k, name in enumerate(FAMILIES):
+        p = family(name, np.random.default_rng(100 + k))
+        out[name] = p, jax.tree.map(np.asarray, solve_all(p))
+    return out
+
+
+every_family = pytest.mark.parametrize("name", FAMILIES)
+
+
+def stages(p, answers, i):
+    """Level after level of a lane: rows of the levels above, own rows and targets, x before, x after, scale, space."""
+    above, x = np.zeros((0, N)), np.clip(np.zeros(N), p.lower[i], p.upper[i])
+    space = np.diag((p.lower[i] != p.upper[i]).astype(float))
+    for k, (A, b) in enumerate(p.levels):
+        after = answers.partial[k]
+        yield above, A[i], b[i], x, after.x[i], after.scales[i, k], space
+        above, x, space = np.vstack([above, A[i]]), after.x[i], after.projector[i]
+
+
+def motion(A, b, x, space):
+    """Eq. 7 with NumPy's pseudo-inverse."""
+    restricted = A @ space
+    share = 1e-10 * np.linalg.norm(A) / max(np.linalg.norm(restricted, 2), 1e-300)
+    return np.linalg.pinv(restricted, rcond=min(share, 1.0)) @ (b - A @ x)
+
+
+def largest_scale(above, A, x, d, lower, upper):
+    """By a linear program over (y, s): rows above stay, A y = A (x + s d), y in the box, s <= 1."""
+    equal = np.vstack([np.hstack([above, np.zeros((len(above), 1))]), np.hstack([A, -(A @ d)[:, None]])])
+    answer = scipy.optimize.linprog(
+        np.r_[np.zeros(N), -1.0],
+        A_eq=equal,
+        b_eq=np.r_[above @ x, A @ x],
+        bounds=[*zip(lower, upper, strict=True), (0.0, 1.0)],
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )
+    assert answer.status == 0
+    return answer.x[-1]
+
+
+class TestProperties:
+    @every_family
+    def test_every_answer_is_in_its_box_to_the_last_bit(self, solved, name):
+        p, answers = solved[name]
+        for answer in (*answers.partial, answers.full):
+            assert (answer.x >= p.lower).all()
+            assert (answer.x <= p.upper).all()
+            np.testing.assert_array_equal(answer.status, Status.SOLVED)
+
+    @every_family
+    def test_the_scale_is_the_largest_there_is(self, solved, name):
+        """Of each level, given what the levels above fixed; where it is 1 nothing is lost to the bounds."""
+        p, answers = solved[name]
+        scaled = 0
+        for i in range(40):
+            for above, A, b, x, after, scale, space in stages(p, answers, i):
+                d = motion(A, b, x, space)
+                expected = largest_scale(above, A, x, d, p.lower[i], p.upper[i])
+                assert scale == pytest.approx(expected, abs=1e-7)
+                np.testing.assert_allclose(A @ after, A @ (x + scale * d), rtol=0, atol=1e-9)
+                scaled += scale < 1.0
+        assert scaled > (0 if name == "small targets" else 10)
+
+    @every_family
+    def test_the_first_level_is_exact_where_a_linear_program_finds_it_feasible(self, solved, name):
+        p, answers = solved[name]
+        first = answers.partial[0]
+        exact = 0
+        for i in range(100):
+            A, b = (leaf[i] for leaf in p.levels[0])
+            bounds = [*zip(p.lower[i], p.upper[i], strict=True)]
+            feasible = scipy.optimize.linprog(np.zeros(N), A_eq=A, b_eq=b, bounds=bounds).status == 0
+            error = np.abs(A @ first.x[i] - b).max()
+            assert (error < 1e-9) == feasible
+            exact += feasible
+        assert exact > (0 if name == "near-dependent" else 10)
+
+    @pytest.mark.parametrize("name", ["easy", "tight", "small targets", "near-dependent"])
+    def test_the_first_level_keeps_its_direction(self, solved, name):
+        """The box holds 0: A x = s b."""
+        p, answers = solved[name]
+        A, b = p.levels[0]
+        first = answers.partial[0]
+        value = np.einsum("imn,in->im", A, first.x)
+        np.testing.assert_allclose(value, first.scales * b, rtol=0, atol=1e-9)
+
+    @every_family
+    def test_lower_levels_do_not_disturb_higher_ones(self, solved, name):
+        p, answers = solved[name]
+        for k, (A, _) in enumerate(p.levels):
+            kept = np.einsum("imn,in->im", A, answers.partial[k].x)
+            for later in (*answers.partial[k + 1 :], answers.full):
+                np.testing.assert_allclose(np.einsum("imn,in->im", A, later.x), kept, rtol=0, atol=1e-9)
+
+    @every_family
+    def test_of_all_such_answers_it_is_the_smallest_or_the_nearest_to_the_secondary_motion(self, solved, name):
+        """The gradient is held by rows and by bounds with multipliers of the right sign."""
+        p, answers = solved[name]
+        eye = np.eye(N)
+        for i in range(60):
+            low, high = p.lower[i], p.upper[i]
+            pinned = low == high
+            ends = [(answer.x[i], 0.0) for answer in answers.partial] + [(answers.full.x[i], p.secondary[i])]
+            rows = [A[i] for A, _ in p.levels]
+            for k, (x, target) in enumerate(ends):
+                equal = np.vstack([*rows[: k + 1], eye[pinned]])
+                at_low, at_high = ~pinned & (x <= low + 1e-9), ~pinned & (x >= high - 1e-9)
+                assert outside_cone(x - target, equal, eye[at_low], eye[at_high]) < 1e-8
+
+    @every_family
+    def test_joints_that_stop_a_level_can_move_no_more(self, solved, name):
+        """What the projector leaves out beside the rows: linear programs find no way to move it."""
+        p, answers = solved[name]
+        first = answers.partial[0]
+        lanes = [i for i in range(LANES) if first.scales[i, 0] < 1.0][:8]
+        for i in lanes:
+            x, low, high = first.x[i], p.lower[i], p.upper[i]
+            equal = p.levels[0][0][i]
+            stopped = (first.active[i] != 0) & (low != high) & (np.abs(first.projector[i]).max(1) == 0.0)
+            assert stopped.any()
+            for joint in np.flatnonzero(stopped):
+                for sign in (-1.0, 1.0):
+                    move = scipy.optimize.linprog(
+                        sign * np.eye(N)[joint], A_eq=equal, b_eq=equal @ x, bounds=[*zip(low, high, strict=True)]
+                    )
+                    assert move.status == 0
+                    assert move.x[joint] == pytest.approx(x[joint], abs=1e-6)
+
+    def test_is_the_projection_where_nothing_saturates(self, solved):
+        """With bounds that are far, and with bounds that are near but not reached."""
+        p = solved["easy"][0]
+        wide = p._replace(lower=np.full_like(p.lower, -np.inf), upper=np.full_like(p.upper, np.inf))
+        free = jax.vmap(lambda q: solve_nullspace(as_levels(q.levels), secondary=q.secondary))(p)
+        near = p._replace(
+            lower=np.minimum(np.asarray(free.x) - 1e-3, -1e3), upper=np.maximum(np.asarray(free.x) + 1e-3, 1e3)
+        )
+        for bounds in (wide, near):
+            answers = solve_full(bounds)
+            np.testing.assert_allclose(answers.x, free.x, rtol=0, atol=1e-10)
+            np.testing.assert_allclose(answers.projector, free.projector, rtol=0, atol=1e-10)
+            np.testing.assert_array_equal(answers.scales, 1.0)
+            np.testing.assert_array_equal(answers.active, 0)
+
+    def test_permuting_the_joints_permutes_the_answer(self, solved, rng):
+        p, answers = solved["tight"]
+        order = rng.permutation(N)
+        mixed = Problems(
+            [(A[..., order], b) for A, b in p.levels], p.lower[:, order], p.upper[:, order], p.secondary[:, order]
+        )
+        np.testing.assert_allclose(solve_full(mixed).x, answers.full.x[:, order], rtol=0, atol=1e-9)
+
+
+class TestByHand:
+    def test_one_joint_saturates_and_another_takes_over(self):
+        answer = solve_nullspace([Level([[1.0, 1.0]], [2.0])], jnp.array([-0.5, -3.0]), jnp.array([0.5, 3.0]))
+        np.testing.assert_allclose(answer.x, [0.5, 1.5], rtol=0, atol=1e-15)
+        assert answer.active.tolist() == [1, 0]
+        assert answer.scales.tolist() == [1.0]
+
+    def test_a_task_out_of_reach_is_scaled(self):
+        """(3, 1) with three joints of one metre a second: two pull in x, one in y."""
+        rows = jnp.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        answer = solve_nullspace([Level(rows, [3.0, 1.0])], -jnp.ones(3), jnp.ones(3))
+        np.testing.assert_allclose(answer.x, [1.0, 1.0, 2.0 / 3.0], rtol=0, atol=1e-15)
+        assert float(answer.scales[0]) == pytest.approx(2.0 / 3.0, abs=1e-15)
+        np.testing.assert_allclose(answer.slacks[0], [-1.0, -1.0 / 3.0], rtol=0, atol=1e-15)
+
+    def test_saturated_joints_are_released_for_a_larger_scale(self):
+        """A search that only saturates, the most critical joint first, ends at a scale of 0.75 here."""
+        rows, wanted = np.array([[0.0, 1.0, -2.0, -2.0], [-2.0, 1.0, 0.0, 1.0]]), np.array([4.0, 2.0])
+        lower, upper = np.full(4, -0.5), np.array([0.5, 1.5, 0.5, 0.5])
+        answer = solve_nullspace([Level(rows, wanted)], jnp.asarray(lower), jnp.asarray(upper))
+        d = np.linalg.pinv(rows) @ wanted
+        best = scipy.optimize.linprog(
+            np.r_[np.zeros(4), -1.0],
+            A_eq=np.hstack([rows, -(rows @ d)[:, None]]),
+            b_eq=np.zeros(2),
+            bounds=[*zip(lower, upper, strict=True), (0.0, 1.0)],
+        )
+        assert best.x[-1] == pytest.approx(0.875, abs=1e-12)
+        assert float(answer.scales[0]) == pytest.approx(0.875, abs=1e-14)
+        np.testing.assert_allclose(rows @ np.asarray(answer.x), 0.875 * wanted, rtol=0, atol=1e-14)
+
+    def test_what_pins_a_joint_leaves_the_others_to_do_the_work(self):
+        """A pinned joint moves as its bounds say, and does not scale the level that would need it elsewhere."""
+        rows = jnp.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        low, high = jnp.array([0.3, -5.0, 0.0]), jnp.array([0.3, 5.0, 0.0])
+        answer = solve_nullspace([Level(rows, [1.0, 1.0])], low, high)
+        np.testing.assert_allclose(answer.x, [0.3, 0.7, 0.0], rtol=0, atol=1e-15)
+        assert answer.active.tolist() == [2, 0, 2]
+        assert answer.scales.tolist() == [1.0]
+
+    def test_a_joint_outside_its_range_comes_back_and_the_task_goes_on(self):
+        """Joint 0 has to move at 0.4 at least."""
+        answer = solve_nullspace([Level([[1.0, 1.0]], [0.0])], jnp.array([0.4, -1.0]), jnp.array([1.0, 1.0]))
+        np.testing.assert_allclose(answer.x, [0.4, -0.4], rtol=0, atol=1e-15)
+
+    def test_one_sided_bounds(self):
+        level = [Level([[1.0, 1.0]], [-4.0])]
+        np.testing.assert_allclose(solve_nullspace(level, lower=[-1.0, -9.0]).x, [-1.0, -3.0], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(solve_nullspace(level, upper=[1.0, -3.0]).x, [-1.0, -3.0], rtol=0, atol=1e-14)
+
+    def test_the_secondary_motion_goes_as_far_as_bounds_and_levels_allow(self):
+        answer = solve_nullspace(
+            [Level([[1.0, 1.0, 1.0]], [0.0])], -jnp.ones(3), jnp.ones(3), secondary=jnp.array([3.0, 1.0, -1.0])
+        )
+        np.testing.assert_allclose(answer.x, [1.0, 0.0, -1.0], rtol=0, atol=1e-15)
+
+
+class TestBatchesAndFailures:
+    def test_vmap_equals_a_loop(self, solved):
+        p, answers = solved["pinned"]
+        one = jax.jit(lambda q: solve_nullspace(as_levels(q.levels), q.lower, q.upper, secondary=q.secondary))
+        for i in range(10):
+            alone = one(jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), p))
+            for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(answers.full), strict=True):
+                np.testing.assert_allclose(a, b[i], rtol=0, atol=1e-12)
+
+    def test_a_bad_lane_stays_in_its_lane(self, solved):
+        """NaN and infinity in matrix, target and secondary motion; a NaN bound; bounds that cross."""
+        p, answers = solved["tight"]
+        p = jax.tree.map(np.copy, p)
+        p.levels[1][0][1, 0, 0] = np.nan
+        p.levels[0][1][2, 1] = np.inf
+        p.secondary[3, 0] = np.nan
+        p.lower[4, 0], p.lower[4, 1] = np.nan, 0.25
+        p.lower[5, 2], p.upper[5, 2] = 1.0, 0.5
+        p.upper[6, 3] = -np.inf
+        got = jax.tree.map(np.asarray, solve_full(p))
+        bad = np.arange(1, 7)
+        assert (got.status[bad] == Status.NUMERICAL_ERROR).all()
+        low, high = p.lower[bad[:3]], p.upper[bad[:3]]
+        np.testing.assert_array_equal(got.x[bad[:3]], np.clip(0.0, low, high))
+        assert got.x[4, 1] == 0.25
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(got))
+        others = np.setdiff1d(np.arange(LANES), bad)
+        np.testing.assert_array_equal(got.status[others], Status.SOLVED)
+        np.testing.assert_array_equal(got.x[others], answers.full.x[others])
+
+    def test_a_search_that_is_cut_short_says_so_and_keeps_box_and_levels_above(self, solved):
+        """Levels that were not finished do nothing; those before them stay."""
+        p, answers = solved["tight"]
+        cut = jax.jit(jax.vmap(lambda q: solve_nullspace(as_levels(q.levels[:2]), q.lower, q.upper, max_iterations=6)))(
+            p
+        )
+        unfinished = np.asarray(cut.status) == Status.MAX_ITERATIONS
+        assert 20 < unfinished.sum() < LANES
+        assert ((cut.x >= p.lower) & (cut.x <= p.upper)).all()
+        second = unfinished & (np.asarray(cut.scales)[:, 0] > 0.0)
+        assert second.any()
+        np.testing.assert_allclose(cut.x[second], answers.partial[0].x[second], rtol=0, atol=1e-12)
+
+    def test_single_precision(self, solved):
+        """In its box to the last bit there too, the first level at its scale of A d."""
+        for name in ("easy", "tight", "small targets", "pinned"):
+            p, answers = solved[name]
+            with jax.enable_x64(False):
+                narrow = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), p)
+                got = jax.tree.map(np.asarray, solve_full(narrow))
+            assert got.x.dtype == np.float32
+            assert (got.x >= narrow.lower).all()
+            assert (got.x <= narrow.upper).all()
+            good = got.status == Status.SOLVED
+            assert good.mean() > 0.98
+            np.testing.assert_allclose(got.scales[good, 0], answers.full.scales[good, 0], rtol=0, atol=1e-4)
+            value, expected = (np.einsum("imn,in->im", p.levels[0][0], x)[good] for x in (got.x, answers.full.x))
+            np.testing.assert_allclose(value, expected, rtol=0, atol=3e-3)
+
+    def test_mistakes(self):
+        level, wrong = [Level(np.ones((1, 3)), np.ones(1))], cast(Any, "backward")
+        with pytest.raises(ValueError, match="order is 'backward'; orders: forward, reverse"):
+            solve_nullspace(level, order=wrong)
+        with pytest.raises(ValueError, match="bounds need order='forward'"):
+            solve_nullspace(level, -np.ones(3), np.ones(3), order="reverse")
+        with pytest.raises(ValueError, match=r"upper has shape \(2,\); the levels ask for \(3,\)"):
+            solve_nullspace(level, -np.ones(3), np.ones(2))
+
+
+class TestDerivatives:
+    """300 random cases, most of them saturated and scaled: two levels and a secondary motion."""
+
+    MIX = np.random.default_rng(8).normal(size=N)
+
+    @classmethod
+    def cost(cls, data):
+        p, weights, damping = data
+        levels = [Level(A, b, b, w) for (A, b), w in zip(p.levels, weights, strict=True)]
+        answer = solve_nullspace(levels, p.lower, p.upper, secondary=p.secondary, damping=damping)
+        value = jnp.sum(jnp.sin(cls.MIX * answer.x)) + jnp.sum(answer.scales)
+        return value, (answer.active, answer.scales < 1.0)
+
+    @pytest.fixture(scope="class")
+    def data(self):
+        rng = np.random.default_rng(7)
+        p = drawn(rng, 300)
+        move = 0.3 * rng.normal(size=p.lower.shape)
+        pin = rng.random(p.lower.shape) < 0.1
+        low, high = p.lower + move, p.upper + move
+        p = p._replace(levels=p.levels[1:], lower=np.where(pin, move, low), upper=np.where(pin, move, high))
+        damping = np.where(rng.random(300) < 0.5, 0.0, 1e-2)
+        data = p, [rng.uniform(0.5, 2.0, (300, m)) for m in ROWS[1:]], damping
+        along = jax.tree.map(lambda a: np.where(np.isfinite(a), rng.normal(size=a.shape), 0.0), data)
+        along = along[0]._replace(upper=np.where(pin, along[0].lower, along[0].upper)), along[1], damping * along[2]
+        return data, along
+
+    @pytest.fixture(scope="class")
+    def gradient(self):
+        return jax.jit(jax.vmap(jax.grad(self.cost, has_aux=True)))
+
+    def test_in_both_modes_they_are_central_differences(self, data, gradient):
+        """In matrices, targets, weights, bounds, secondary motion and damping; to fourth order."""
+        data, along = data
+
+        @jax.jit
+        @jax.vmap
+        def forward(data, along):
+            return jax.jvp(self.cost, (data,), (along,), has_aux=True)
+
+        def at(t):
+            moved = jax.tree.map(lambda a, b: np.where(np.isfinite(a), a + t * b, a), data, along)
+            return jax.tree.map(np.asarray, forward(moved, along))
+
+        h = 1e-5
+        points = {k: at(k * h) for k in (-2, -1, 0, 1, 2)}
+        _, ahead, (active, scaled) = points[0]
+        smooth = np.ones(300, bool)
+        for _, _, (its_active, its_scaled) in points.values():
+            smooth &= (its_active == active).all(1) & (its_scaled == scaled).all(1)
+        expected = sum(c * points[k][0] for k, c in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0))) / (12.0 * h)
+        rates = jax.tree.map(np.asarray, gradient(data)[0])
+        back = sum(
+            np.sum((g * v).reshape(300, -1), 1)
+            for g, v in zip(jax.tree.leaves(rates), jax.tree.leaves(along), strict=True)
+        )
+        assert smooth.sum() > 290
+        assert scaled.any(1).sum() > 150
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rates))
+        size = 1.0 + np.abs(expected)
+        assert np.max((np.abs(ahead - expected) / size)[smooth]) < 1e-6
+        assert np.max(np.abs(ahead - back) / size) < 1e-8
+
+    def test_they_are_finite_where_there_is_none(self, data, gradient):
+        """Zero targets, rows of zeros, everything pinned, weights of 0, dependent levels, edges, failed lanes."""
+        p, weights, damping = jax.tree.map(np.copy, data[0])
+        p.levels[0][1][0] = 0.0
+        p.levels[0][0][1] = 0.0
+        p.lower[2] = p.upper[2] = 0.0
+        weights[0][3] = 0.0
+        p.levels[1][0][4, :2] = p.levels[0][0][4]
+        p.lower[5] = 0.0
+        p.lower[6], p.upper[6] = 1.0, -1.0
+        p.levels[1][0][7, 0, 0] = np.nan
+        rates = jax.tree.leaves(gradient((p, weights, damping))[0])
+        assert all(np.isfinite(leaf).all() for leaf in rates)
+        assert all((np.asarray(leaf)[7] == 0.0).all() for leaf in rates)
+
+
+class TestScheme:
+    """Through ``osik_jax.solve``: both options of ``NullSpace``."""
+
+    @pytest.fixture(scope="class")
+    def arm(self):
+        return osik.load_robot("arm7")
+
+    @pytest.fixture(scope="class")
+    def tasks(self, arm):
+        p, R = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
+        height = osik.FrameTask(arm, "hand", rows=(False, False, True, False, False, False), priority=1)
+        far = p + jnp.array([0.3, 0.0, 0.0]), R
+        return {"height": height, "hand": osik.FrameTask(arm, "hand", rows="position", target=far, priority=2)}
+
+    def answer(self, arm, tasks, scheme, speed):
+        limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": speed})
+        return osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=limits)
+
+    def test_saturation_keeps_limits_and_priorities(self, arm, tasks):
+        plain, hard = osik.NullSpace(), osik.NullSpace(saturate=True)
+        loose, tight, far = (self.answer(arm, tasks, s, v) for s, v in ((plain, 0.1), (hard, 0.1), (hard, 1e6)))
+        assert float(loose.box_violation) > 0.05
+        assert float(tight.box_violation) == 0.0
+        assert int(tight.status) == Status.SOLVED
+        assert float(tight.kkt_residual) < 1e-6
+        np.testing.assert_allclose(tight.slack["height"], 0.0, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(loose.slack["hand"], 0.0, rtol=0, atol=1e-6)
+        assert abs(tight.slack["hand"][0]) > 0.1  # along x, where the target is; but straight on
+        np.testing.assert_allclose(tight.slack["hand"][1:], 0.0, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(far.velocity, loose.velocity, rtol=0, atol=1e-8)
+
+    def test_the_reverse_order_is_the_forward_one_where_all_can_be_had(self, arm, tasks):
+        forward, reverse = (
+            self.answer(arm, tasks, osik.NullSpace(damping=0.0, order=order), 0.1) for order in ("forward", "reverse")
+        )
+        assert float(jnp.abs(forward.velocity).max()) > 0.1
+        np.testing.assert_allclose(forward.velocity, reverse.velocity, rtol=0, atol=1e-9)
+
+    def test_mistakes(self):
+        with pytest.raises(ValueError, match="order is 'sideways'; orders: forward, reverse"):
+            osik.NullSpace(order=cast(Any, "sideways"))
+        with pytest.raises(ValueError, match="saturate needs order='forward'"):
+            osik.NullSpace(order="reverse", saturate=True)
+        with pytest.raises(ValueError, match="saturate is 1; it is True or False"):
+            osik.NullSpace(saturate=cast(Any, 1))
