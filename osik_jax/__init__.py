@@ -1,6 +1,9 @@
 """Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
 
 from . import _runtime as _runtime  # first: it sets up XLA's CPU client
+from ._batches import batch_axes as batch_axes
+from ._batches import batched as batched
+from ._batches import stack as stack
 from .control import Solution as Solution
 from .control import Trajectory as Trajectory
 from .control import rollout as rollout

@@ -39,7 +39,8 @@ def unknown_name(kind: str, name: object, available: tuple[str, ...]) -> KeyErro
     """The exception for a name that does not exist: the nearest one that does, and all of them."""
     close = difflib.get_close_matches(str(name), available, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else "."
-    return KeyError(f"no {kind} {name!r}{hint} {kind}s: {', '.join(available) or '(none)'}")
+    kinds = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
+    return KeyError(f"no {kind} {name!r}{hint} {kinds}: {', '.join(available) or '(none)'}")
 
 
 @dataclasses.dataclass(frozen=True)

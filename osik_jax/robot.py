@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import _loading
+from ._links import Factors, scaled_leaves
 from ._tree import BALL, FREE, KinematicTree, ModelHolder
 
 LockedJoints = Iterable[str] | Mapping[str, float]
@@ -28,7 +29,8 @@ class Robot(eqx.Module):
     tangent space (a free joint is a linear velocity in world axes, then an angular velocity in body axes).
 
     All arrays are traced leaves: robots with the same tree and other link lengths, masses or limits can be stacked and
-    vmapped over. ``mj_model`` is carried along unchanged; it does not follow edits of the leaves.
+    vmapped over (``scaled``, ``osik_jax.stack``). ``mj_model`` is carried along unchanged; it does not follow edits of
+    the leaves.
 
     Attributes:
         tree: names and topology (static).
@@ -173,6 +175,11 @@ class Robot(eqx.Module):
         return tuple(self.tree.joint_names[j] for j in self.tree.independent if self.tree.joint_types[j] != FREE)
 
     @property
+    def body_names(self) -> tuple[str, ...]:
+        """Moving bodies, in the order of ``body_mass`` and the other arrays over bodies, whose entry 0 is the world."""
+        return self.tree.body_names[1:]
+
+    @property
     def frame_names(self) -> tuple[str, ...]:
         """Every frame that can be asked for by name: bodies, URDF links (fused or not), sites, geoms."""
         return self.tree.frame_names
@@ -244,6 +251,24 @@ class Robot(eqx.Module):
             index = self.joint_qpos_index(name)
             q = q.at[index].set((value - self.qpos_offset[full]) / coefficient[full])
         return q
+
+    def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
+        """The same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
+
+        A link is made longer from its own origin: the joints of its children, its centre of mass and its frames move
+        away by the factor. Masses are scaled by their own factors only. Factors may be traced, so
+        ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of robots.
+
+        Args:
+            length: a factor for all links, or a mapping from body names or globs to factors; the others keep theirs.
+            mass: likewise.
+
+        Raises:
+            KeyError: no such body; the message lists those that exist.
+            ValueError: a body is given twice.
+        """
+        changed = scaled_leaves(self, length, mass)
+        return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
 
     def check_configuration(self, q: Float[Array, " nq"]) -> None:
         """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion."""
