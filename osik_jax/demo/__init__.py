@@ -10,6 +10,11 @@ from ._motion import Motion as Motion
 from ._motion import Stance as Stance
 from ._nao import double_support as double_support
 from ._nao import single_support as single_support
+from ._physics import PhysicsMeasurement as PhysicsMeasurement
+from ._physics import PhysicsRun as PhysicsRun
+from ._physics import measure_physics as measure_physics
+from ._physics import nao_world as nao_world
+from ._physics import run_physics as run_physics
 from ._references import Path as Path
 from ._references import Stroke as Stroke
 from ._references import minimum_jerk as minimum_jerk

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..physics._world import contact_corners as contact_corners
 from ..robot import Robot
 from ..tasks import FrameTask, SupportPolygon, Task
 from ._references import Path
@@ -85,16 +86,6 @@ class Motion:
     limits: Sequence[Any]
     balanced: bool = True
     notes: tuple[str, ...] = ()
-
-
-def contact_corners(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
-    """The frames ``NAME_corner_0``, ``..._1`` and so on, as points in the frame [m]; none: (0, 3)."""
-    tree, index = robot.tree, robot.tree.frame(frame)
-    origin, turn = np.asarray(robot.frame_position[index]), np.asarray(robot.frame_rotation[index])
-    names = [f"{frame}_corner_{k}" for k in range(len(tree.frame_names))]
-    found = [tree.frame(name) for name in names if name in tree.frame_names]
-    points = np.asarray(robot.frame_position)[np.array(found, int)]
-    return (points - origin) @ turn
 
 
 def tracking(robot: Robot, goal: Goal, *, weight: float, priority: int, gain: float = GAIN) -> FrameTask:

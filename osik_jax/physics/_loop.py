@@ -1,0 +1,205 @@
+"""The closed loop: sense, solve, command the servos, let MuJoCo run until the next tick."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..control import Solution, Tasks, _is_number, solve
+from ..kinematics import integrate
+from ..limits import Limit
+from ..robot import Robot
+from ..schemes import Scheme
+from ._simulation import Simulation
+
+
+class Command(eqx.Module):
+    """How the velocity of a tick becomes a servo target."""
+
+    @abc.abstractmethod
+    def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
+        """The configuration to servo to until the next tick.
+
+        Args:
+            robot: the robot.
+            last: the command of the tick before; at first, where the robot stands. (nq,)
+            sensed: (nq,)
+            velocity: what the tasks ask for at the sensed configuration. (nv,)
+            dt: time of one tick [s].
+        """
+
+
+class Integrated(Command):
+    """The last command moved on by the velocity: what is sensed acts through the tasks alone.
+
+    A servo gives way under load by effort over stiffness. The command moves on until the tasks are met all the same:
+    this is integral action, and steady errors go away. Their gains have to stay below what the servos and the contact
+    let oscillate: a robot that stands wants some 3 to 10 / s where the kinematic loop stands 20 / s and more.
+    """
+
+    def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
+        """See ``Command``."""
+        return integrate(robot, last, velocity, dt)
+
+
+class Lookahead(Command):
+    """Where the velocity leads from the sensed configuration in a given time: no memory, proportional action.
+
+    A steady error stays, that of a servo whose stiffness is multiplied by gain times time: with a gain of 20 / s and
+    0.05 s a servo holds its load as it would with the plan as its target. A time of one tick makes a robot fall limp.
+
+    Attributes:
+        time: [s].
+    """
+
+    time: Float[Array, ""]
+
+    def __init__(self, time: Array | float) -> None:
+        self.time = jnp.asarray(time, float)
+
+    def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
+        """See ``Command``."""
+        return integrate(robot, sensed, velocity, self.time)
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """What MuJoCo's data held at the start and after every tick: T is the number of ticks run and one.
+
+    Attributes:
+        time: [s]. (T,)
+        q: sensed configurations. (T, nq)
+        command: configurations that the servos were sent to. (T - 1, nq)
+        effort: of each servo [N m or N]. (T, n)
+        com: centre of mass [m]. (T, 3)
+        contact_points: of all feet, foot after foot [m]. (T, k, 3)
+        contact_forces: of the floor on each of them [N]. (T, k, 3)
+        solution: of each tick; every leaf has a leading axis. (T - 1, ...)
+        fell: whether the run ended by a fall, at ``time[-1]``.
+    """
+
+    time: Float[np.ndarray, " T"]
+    q: Float[np.ndarray, "T nq"]
+    command: Float[np.ndarray, "ticks nq"]
+    effort: Float[np.ndarray, "T n"]
+    com: Float[np.ndarray, "T 3"]
+    contact_points: Float[np.ndarray, "T k 3"]
+    contact_forces: Float[np.ndarray, "T k 3"]
+    solution: Solution
+    fell: bool
+
+
+def simulate(
+    simulation: Simulation,
+    tasks: Tasks | Callable[[Array], Tasks],
+    *,
+    scheme: Scheme,
+    limits: Sequence[Limit] = (),
+    dt: float = 0.005,
+    steps: int,
+    command: Command | None = None,
+    before_tick: Callable[[float, Simulation], None] | None = None,
+) -> Recording:
+    """Runs the loop from the simulation's present state, until the robot falls at the latest.
+
+    Each tick senses the configuration, base and joints, solves for the velocity there, makes a servo target of it and
+    lets MuJoCo run for ``dt``. One compiled program a tick; MuJoCo runs on the host.
+
+    Args:
+        simulation: the robot in its world; it is left where the run ended.
+        tasks: by name, or a function from time [s] to tasks, as in ``rollout``.
+        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
+        limits: joint position and velocity limits.
+        dt: control period [s], a whole number of the world's timesteps.
+        steps: number of ticks.
+        command: ``Integrated()`` (the default) or ``Lookahead(time)``.
+        before_tick: called with the time [s] since the start and the simulation, to push the robot, say.
+
+    Raises:
+        TypeError, ValueError: as in ``solve``; ``dt`` is no whole number of timesteps.
+    """
+    if steps < 1:
+        raise ValueError(f"steps is {steps}; there has to be one tick at least")
+    robot = simulation.world.robot
+    numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), _is_number)
+    leaves, treedef = jax.tree.flatten(structure)
+    program = partial(_tick, robot, numbers, scheme, tuple(limits), command or Integrated(), np.asarray(dt))
+    tick = partial(program, static=(tuple(leaves), treedef))
+    held = jnp.asarray(simulation.sense())
+    warm_start = _cold_start(lambda state: tick(0.0, *state, None)[1], (held, held))
+    frames, commands, solutions = [_frame(simulation)], [], []
+    for k in range(steps):
+        if before_tick is not None:
+            before_tick(k * dt, simulation)
+        held, solution = tick(k * dt, held, simulation.sense(), warm_start)
+        warm_start = solution.warm_start
+        simulation.step(held, dt)
+        frames.append(_frame(simulation))
+        commands.append(held)
+        solutions.append(solution)
+        if simulation.fallen():
+            break
+    return _recording(frames, commands, solutions, dt, simulation.fallen())
+
+
+@partial(jax.jit, static_argnames="static")
+def _tick(
+    robot: Robot,
+    numbers: Any,
+    scheme: Scheme,
+    limits: tuple[Limit, ...],
+    command: Command,
+    dt: Array,
+    t: Array,
+    last: Array,
+    sensed: Array,
+    warm_start: Any,
+    *,
+    static: tuple[tuple[Any, ...], Any],
+) -> tuple[Array, Solution]:
+    """The part of a tick that is pure: the command and the solution."""
+    tasks: Any = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
+    todo: Any = tasks(t) if callable(tasks) else tasks
+    solution = solve(robot, sensed, todo, scheme=scheme, limits=limits, dt=dt, warm_start=warm_start)
+    return command(robot, last, sensed, solution.velocity, dt), solution
+
+
+def _cold_start(tick: Callable[[Any], Solution], state: Any) -> Any:
+    """Zeros in the shape of a warm start, from a tick that is traced and not run: the first one compiles no program."""
+    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, state).warm_start)
+
+
+def _frame(simulation: Simulation) -> tuple[np.ndarray, ...]:
+    return (
+        simulation.sense(),
+        simulation.effort(),
+        simulation.com(),
+        simulation.contact_points(),
+        simulation.contact_forces(),
+    )
+
+
+def _recording(
+    frames: list[tuple[np.ndarray, ...]], commands: list[Array], solutions: list[Solution], dt: float, fell: bool
+) -> Recording:
+    q, effort, com, points, forces = (np.array(part) for part in zip(*frames, strict=True))
+    return Recording(
+        time=dt * np.arange(len(q)),
+        q=q,
+        command=np.array(commands),
+        effort=effort,
+        com=com,
+        contact_points=points,
+        contact_forces=forces,
+        solution=jax.tree.map(lambda *leaves: np.stack(leaves), *solutions),
+        fell=fell,
+    )

@@ -1,0 +1,159 @@
+"""A robot in MuJoCo that takes servo targets and tells its configuration."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._tree import FREE, QPOS_WIDTH, unknown_name
+from ._world import World, frame_pose
+
+FALL_TILT, FALL_HEIGHT = math.radians(45.0), 0.6
+"""A robot has fallen whose base has turned by more from upright, or is lower than this part of its first height."""
+
+
+class Simulation:
+    """A world with its state, stepped by MuJoCo's C code; on the host, and changed in place.
+
+    ``data`` is MuJoCo's own, for all that has no method here; ``mujoco.viewer`` takes ``model`` and ``data``.
+
+    Attributes:
+        world: what is simulated.
+        data: its state.
+    """
+
+    def __init__(self, world: World, q: Float[np.ndarray, " nq"] | Array | None = None) -> None:
+        self.world = world
+        self.data = mujoco.MjData(world.model)
+        tree = world.robot.tree
+        self._sensed = _entries(tree.independent, tree.full_qpos_address, tree.joint_types)
+        self._targets = np.array([tree.qpos_address[tree.joint(name)] for name in world.servos], int)
+        self._points = [g for foot in world.feet for g in world.contact_geoms(foot)]
+        self.reset(world.robot.q0 if q is None else q)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The world's MuJoCo model."""
+        return self.world.model
+
+    @property
+    def time(self) -> float:
+        """[s] since the reset."""
+        return float(self.data.time)
+
+    def reset(self, q: Float[np.ndarray, " nq"] | Array) -> None:
+        """Puts the robot at rest at a configuration, its servos there too.
+
+        Raises:
+            ValueError: q has the wrong length or is not finite.
+        """
+        robot = self.world.robot
+        wanted = jnp.asarray(q)
+        robot.check_configuration(wanted)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = np.asarray(robot.mujoco_qpos(wanted))
+        self.data.ctrl[:] = np.asarray(q)[self._targets]
+        mujoco.mj_forward(self.model, self.data)
+        self._upright = self._base()
+
+    def _base(self) -> tuple[float, np.ndarray]:
+        """Height of the base over the floor [m], and the world's vertical in its axes; of a fixed base, 1 and up."""
+        free = np.flatnonzero(self.model.jnt_type == FREE)
+        if not len(free):
+            return 1.0, np.array([0.0, 0.0, 1.0])
+        body = self.model.jnt_bodyid[free[0]]
+        return float(self.data.xpos[body, 2]) - self.world.floor, self.data.xmat[body].reshape(3, 3)[2].copy()
+
+    def fallen(self) -> bool:
+        """Whether the base tilts by more than 45 degrees from where the reset put it, or has lost 40 % of its height.
+
+        Never true of a robot that is bolted down.
+        """
+        (height, up), (first, upright) = self._base(), self._upright
+        return bool(up @ upright < math.cos(FALL_TILT) or height < FALL_HEIGHT * first)
+
+    def sense(self) -> Float[np.ndarray, " nq"]:
+        """The configuration: base and joints, without noise. A mimic joint is read at its leader. (nq,)."""
+        return self.data.qpos[self._sensed]
+
+    def step(self, command: Float[np.ndarray, " nq"] | Array, duration: float) -> None:
+        """Holds the servos' targets for some time.
+
+        Args:
+            command: configuration to servo to; what it says of the base is not read. (nq,)
+            duration: [s], a whole number of the world's timesteps.
+
+        Raises:
+            ValueError: ``duration`` is no whole number of timesteps, or the command is not finite.
+        """
+        targets = np.asarray(command)[self._targets]
+        if not np.isfinite(targets).all():
+            raise ValueError(f"the command of {', '.join(self._spoiled(targets))} is not finite")
+        self.data.ctrl[:] = targets
+        mujoco.mj_step(self.model, self.data, self._substeps(duration))
+        mujoco.mj_forward(self.model, self.data)
+
+    def _spoiled(self, targets: np.ndarray) -> list[str]:
+        return [name for name, value in zip(self.world.servos, targets, strict=True) if not np.isfinite(value)]
+
+    def _substeps(self, duration: float) -> int:
+        steps = duration / self.model.opt.timestep
+        if not (steps > 0.5 and math.isclose(steps, round(steps), rel_tol=1e-6)):
+            raise ValueError(f"{duration} s is no whole number of timesteps of {self.model.opt.timestep} s")
+        return round(steps)
+
+    def push(self, body: str, force: tuple[float, float, float]) -> None:
+        """A force on a body's centre of mass, in world axes [N], until it is set anew or the simulation is reset.
+
+        Raises:
+            KeyError: no such body; the message lists those that exist.
+        """
+        index = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, body)
+        if index <= 0:
+            raise unknown_name("body", body, tuple(self.model.body(b).name for b in range(1, self.model.nbody)))
+        self.data.xfrc_applied[index, :3] = force
+
+    def effort(self) -> Float[np.ndarray, " n"]:
+        """What each servo exerts [N m or N], in the order of ``world.servos``. (n,)."""
+        return self.data.actuator_force.copy()
+
+    def frame_pose(self, frame: str) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+        """Position [m] and rotation of a frame of the robot.
+
+        Raises:
+            KeyError: no such frame.
+        """
+        return frame_pose(self.world.robot, self.data, frame)
+
+    def com(self) -> Float[np.ndarray, "3"]:
+        """Centre of mass [m] of all that moves. (3,)."""
+        mass = np.where(self.model.body_weldid != 0, self.model.body_mass, 0.0)
+        return mass @ self.data.xipos / mass.sum()
+
+    def contact_points(self) -> Float[np.ndarray, "k 3"]:
+        """Where the contact points of all feet are [m], foot after foot. (k, 3)."""
+        radius = self.model.geom_size[self._points, :1]
+        return self.data.geom_xpos[self._points] - radius * np.array([0.0, 0.0, 1.0])
+
+    def contact_forces(self) -> Float[np.ndarray, "k 3"]:
+        """The force of the floor on each contact point [N], world axes. (k, 3)."""
+        out, wrench = np.zeros((len(self._points), 3)), np.zeros(6)
+        row = {geom: k for k, geom in enumerate(self._points)}
+        for c, contact in enumerate(self.data.contact):
+            mujoco.mj_contactForce(self.model, self.data, c, wrench)
+            force = contact.frame.reshape(3, 3).T @ wrench[:3]
+            first, second = (row.get(int(g)) for g in contact.geom)
+            if second is not None:
+                out[second] += force
+            elif first is not None:
+                out[first] -= force
+        return out
+
+
+def _entries(joints: tuple[int, ...], address: np.ndarray, kinds: tuple[int, ...]) -> np.ndarray:
+    """Where the entries of q are in MuJoCo's qpos."""
+    return np.concatenate([address[j] + np.arange(QPOS_WIDTH[kinds[j]]) for j in joints]).astype(int)

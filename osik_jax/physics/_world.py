@@ -1,0 +1,415 @@
+"""A MuJoCo model of a robot on a floor: contact at its feet, a position servo on every joint."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import select_joints
+from .._tree import BALL, FREE
+from ..robot import Robot
+
+Feet = Mapping[str, ArrayLike] | Sequence[str]
+"""Frames that touch the floor: names with their contact points in the frame [m], or names alone (see ``World``)."""
+
+CONTACT_RADIUS = 0.004
+"""Of the spheres that touch the floor [m]; each sits on its contact point, so that it touches at the point itself."""
+
+_COPIED = (
+    *("body_gravcomp", "dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp"),
+    *("jnt_stiffness", "jnt_solref", "jnt_solimp", "jnt_margin", "qpos_spring"),
+)
+"""Numbers of the robot's own model that the world takes over as they are: both have the same bodies and joints."""
+
+_GEARED = dict(solref=(0.004, 1.0), solimp=(0.99, 0.999, 0.001, 0.5, 2.0))
+"""One motor that turns two joints is stiffer than MuJoCo's default for an equality."""
+
+
+_SHAPES = (
+    mujoco.mjtGeom.mjGEOM_SPHERE,
+    mujoco.mjtGeom.mjGEOM_CAPSULE,
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    mujoco.mjtGeom.mjGEOM_CYLINDER,
+    mujoco.mjtGeom.mjGEOM_BOX,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Servo:
+    """A position servo: effort = stiffness (target - position) - damping velocity, cut at +- ``effort``.
+
+    Attributes:
+        stiffness: [N m/rad or N/m].
+        damping: [N m s/rad or N s/m].
+        effort: the greatest torque or force [N m or N]; ``None``: what the robot's model says, which may be nothing.
+    """
+
+    stiffness: float
+    damping: float
+    effort: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.stiffness > 0.0 and math.isfinite(self.stiffness) and 0.0 <= self.damping < math.inf):
+            raise ValueError(f"{self}: the stiffness has to be positive, the damping not negative, both finite")
+        if self.effort is not None and not self.effort > 0.0:
+            raise ValueError(f"{self}: the effort has to be positive")
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """A robot on a floor, ready for MuJoCo.
+
+    Attributes:
+        robot: the robot.
+        model: the compiled world: bodies and joints of ``robot.mj_model`` in its order, a floor, spheres that touch it
+            at the contact points, an actuator a servo. Its timestep is that of the simulation.
+        servos: by joint; the actuators have the same names and order.
+        feet: frame to its contact points in the frame [m]. Each (k, 3)
+        floor: height of the floor [m].
+    """
+
+    robot: Robot
+    model: mujoco.MjModel
+    servos: Mapping[str, Servo]
+    feet: Mapping[str, Float[np.ndarray, "k 3"]]
+    floor: float
+
+    def contact_geoms(self, foot: str) -> list[int]:
+        """The spheres of a foot, by their number in the model."""
+        return [self.model.geom(_geom_name(foot, k)).id for k in range(len(self.feet[foot]))]
+
+
+def build_world(
+    robot: Robot,
+    *,
+    feet: Feet | None = None,
+    servos: Mapping[str, Servo] | None = None,
+    friction: float = 0.9,
+    floor: float | None = None,
+    timestep: float = 0.001,
+) -> World:
+    """Puts a robot on a floor.
+
+    Masses, inertias, joint damping, armature and friction are those of ``robot.mj_model``, as MuJoCo compiled them; no
+    geometry of it collides. A follower of a mimic joint is geared to its leader, a locked joint held where it is.
+
+    Args:
+        robot: the robot.
+        feet: frames that touch the floor, with contact points in the frame [m], (k, 3). Without points: the lower
+            corners of the boxes that collide on the frame's body, else the sites ``NAME_corner_0``, ``NAME_corner_1``
+            and so on. Default: all frames that have such sites. A robot that is bolted down needs none.
+        servos: joint name or glob to its servo. Joints that are left out keep the position actuator of
+            ``robot.mj_model``: the embedded robots have one on every joint.
+        friction: sliding friction between feet and floor.
+        floor: its height [m]; default: that of the lowest contact point at ``robot.q0``.
+        timestep: of the simulation [s].
+
+    Raises:
+        KeyError: no such frame or joint; the message lists those that exist.
+        ValueError: a floating robot without contact points, a joint without a servo, a joint that no servo can turn
+            (ball), a locked joint that is free or ball, or a number out of range.
+    """
+    if not (0.0 < timestep < math.inf and 0.0 <= friction < math.inf):
+        raise ValueError(
+            f"timestep is {timestep} and friction {friction}; the one has to be positive, neither infinite"
+        )
+    points = _contact_points(robot, feet)
+    drives = _servos(robot, servos or {})
+    poses = _home_poses(robot, tuple(points))
+    lowest = [float((p + points[foot] @ R.T)[:, 2].min()) for foot, (p, R) in poses.items()]
+    height = (min(lowest) if lowest else 0.0) if floor is None else float(floor)
+    spec = mujoco.MjSpec()
+    _set_options(spec, timestep, robot.mj_model)
+    bodies = _add_bodies(spec, robot.mj_model)
+    _add_floor(spec, height, friction)
+    for foot, (_, rotation) in poses.items():
+        _add_contacts(spec, bodies, robot, foot, points[foot], rotation, friction)
+    _add_ties(spec, robot)
+    for joint, servo in drives.items():
+        _add_servo(spec, joint, servo)
+    return World(robot, _compiled(spec, robot.mj_model), drives, points, height)
+
+
+def _contact_points(robot: Robot, feet: Feet | None) -> dict[str, Float[np.ndarray, "k 3"]]:
+    """Frames and their points."""
+    names = robot.frame_names
+    if feet is None:
+        feet = [n.removesuffix("_corner_0") for n in names if n.endswith("_corner_0")]
+        feet = [name for name in feet if name in names]
+    if isinstance(feet, str):
+        raise TypeError(f"feet is a sequence of names or a mapping, not one string: use ({feet!r},)")
+    given = dict(feet) if isinstance(feet, Mapping) else {name: _sole_points(robot, name) for name in feet}
+    out = {name: np.atleast_2d(np.asarray(points, float)) for name, points in given.items()}
+    for name, points in out.items():
+        robot.tree.frame(name)
+        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
+            raise ValueError(
+                f"foot {name!r} has no contact points: give feet={{{name!r}: points}}, finite and (k, 3) in the frame "
+                f"[m]; or its model sites {name}_corner_0, {name}_corner_1, ..., or a box that collides"
+            )
+    if robot.floating_base and not out:
+        raise ValueError("a floating robot needs feet={frame: contact points (k, 3)} to stand on")
+    return out
+
+
+def contact_corners(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
+    """The frames ``NAME_corner_0``, ``..._1`` and so on, as points in the frame [m]; none: (0, 3)."""
+    tree = robot.tree
+    names = [f"{frame}_corner_{k}" for k in range(len(tree.frame_names))]
+    found = [tree.frame(name) for name in names if name in tree.frame_names]
+    return _in_frame(robot, frame, np.asarray(robot.frame_position)[np.array(found, int)])
+
+
+def _in_frame(robot: Robot, frame: str, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+    """Points of the body that a frame is fixed to, seen from the frame."""
+    index = robot.tree.frame(frame)
+    return (points - np.asarray(robot.frame_position[index])) @ np.asarray(robot.frame_rotation[index])
+
+
+def _sole_points(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
+    """The lower corners, at home, of the boxes that collide on the frame's body; without boxes, its corner sites."""
+    model, data = robot.mj_model, _home(robot)
+    body = _model_body(robot, robot.tree.frame_bodies[robot.tree.frame(frame)])
+    solid = (model.geom_bodyid == body) & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+    boxes = np.flatnonzero(solid & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX))
+    if not len(boxes):
+        return contact_corners(robot, frame)
+    origin, rotation = frame_pose(robot, data, frame)
+    corners = np.concatenate([_lower_corners(model, data, int(g)) for g in boxes])
+    return (corners - origin) @ rotation
+
+
+def _lower_corners(model: mujoco.MjModel, data: mujoco.MjData, box: int) -> Float[np.ndarray, "4 3"]:
+    """Counter-clockwise seen from above [m], in the world."""
+    turn = data.geom_xmat[box].reshape(3, 3) * model.geom_size[box]
+    down = int(np.argmax(np.abs(turn[2] / model.geom_size[box])))
+    a, b = (turn[:, k] for k in range(3) if k != down)
+    face = data.geom_xpos[box] - np.sign(turn[2, down]) * turn[:, down]
+    left = b if a[0] * b[1] > a[1] * b[0] else -b
+    return np.array([face + a + left, face - a + left, face - a - left, face + a - left])
+
+
+def _home_poses(robot: Robot, frames: tuple[str, ...]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    data = _home(robot)
+    return {frame: frame_pose(robot, data, frame) for frame in frames}
+
+
+def _home(robot: Robot) -> mujoco.MjData:
+    """MuJoCo's data of the robot's own model at ``robot.q0``."""
+    data = mujoco.MjData(robot.mj_model)
+    data.qpos[:] = np.asarray(robot.mujoco_qpos(robot.q0))
+    mujoco.mj_kinematics(robot.mj_model, data)
+    return data
+
+
+def frame_pose(
+    robot: Robot, data: mujoco.MjData, frame: str
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Where MuJoCo has a frame: position [m] and rotation, in data of the robot's own model or of its world."""
+    index = robot.tree.frame(frame)
+    body = _model_body(robot, robot.tree.frame_bodies[index])
+    turn = data.xmat[body].reshape(3, 3)
+    position = data.xpos[body] + turn @ np.asarray(robot.frame_position[index])
+    return position, turn @ np.asarray(robot.frame_rotation[index])
+
+
+def _model_body(robot: Robot, body: int) -> int:
+    """MuJoCo's number of a body of the tree."""
+    names = [_body_name(robot.mj_model, b) for b in range(robot.mj_model.nbody)]
+    return names.index(robot.tree.body_names[body])
+
+
+def _servos(robot: Robot, given: Mapping[str, Servo]) -> dict[str, Servo]:
+    """One for each independent joint but the free one, in the order of q, its effort filled in."""
+    chosen = {joint: servo for pattern, servo in given.items() for joint in select_joints(robot, pattern)}
+    own, limits = _own_servos(robot.mj_model), _efforts(robot.mj_model)
+    out: dict[str, Servo] = {}
+    for joint in robot.tree.independent:
+        name, kind = robot.tree.joint_names[joint], robot.tree.joint_types[joint]
+        if kind == BALL:
+            raise ValueError(f"joint {name!r} is a ball joint, which no servo can turn")
+        if kind != FREE:
+            found = chosen.get(joint, own.get(joint))
+            if found is None:
+                raise ValueError(
+                    f"joint {name!r} has no position actuator in the robot's model: give servos={{{name!r}: "
+                    "Servo(stiffness, damping, effort)}; a glob such as '*' stands for many"
+                )
+            out[name] = found if found.effort is not None else dataclasses.replace(found, effort=limits[joint])
+    return out
+
+
+def _own_servos(model: mujoco.MjModel) -> dict[int, Servo]:
+    """The position actuators of a model, by joint."""
+    out = {}
+    for joint, a in _actuators(model).items():
+        gain, bias = float(model.actuator_gainprm[a][0]), model.actuator_biasprm[a]
+        if gain > 0.0 and bias[1] == -gain:
+            out[joint] = Servo(gain, -float(bias[2]))
+    return out
+
+
+def _actuators(model: mujoco.MjModel) -> dict[int, int]:
+    """Joint to the actuator on it."""
+    on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    return {int(model.actuator_trnid[a][0]): int(a) for a in np.flatnonzero(on_joint)}
+
+
+def _efforts(model: mujoco.MjModel) -> list[float]:
+    """The greatest effort of each joint: that of its actuator, else that of the joint, else none."""
+    actuators = _actuators(model)
+    out = []
+    for j in range(model.njnt):
+        ranges = [model.jnt_actfrcrange[j]] if model.jnt_actfrclimited[j] else []
+        if j in actuators and model.actuator_forcelimited[actuators[j]]:
+            ranges.append(model.actuator_forcerange[actuators[j]])
+        out.append(min((float(np.abs(r).min()) for r in ranges), default=math.inf))
+    return out
+
+
+def _set_options(spec: mujoco.MjSpec, timestep: float, source: mujoco.MjModel) -> None:
+    spec.compiler.degree = False
+    spec.option.timestep = timestep
+    spec.option.gravity = source.opt.gravity
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 100.0  # feet that stick do not creep
+
+
+def _body_name(model: mujoco.MjModel, body: int) -> str:
+    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
+
+
+def _add_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[mujoco.MjsBody]:
+    """The bodies of a compiled model with their inertias and joints, in the same order."""
+    bodies = [spec.worldbody]
+    for b in range(1, model.nbody):
+        body = bodies[model.body_parentid[b]].add_body(
+            name=_body_name(model, b),
+            pos=model.body_pos[b],
+            quat=model.body_quat[b],
+            mass=model.body_mass[b],
+            ipos=model.body_ipos[b],
+            iquat=model.body_iquat[b],
+            inertia=model.body_inertia[b],
+            explicitinertial=True,
+        )
+        for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
+            body.add_joint(**_joint(model, j))
+        for g in range(model.body_geomadr[b], model.body_geomadr[b] + model.body_geomnum[b]):
+            _add_shape(body, model, g)
+        bodies.append(body)
+    return bodies
+
+
+def _add_shape(body: mujoco.MjsBody, model: mujoco.MjModel, g: int) -> None:
+    """For the eye alone; meshes and height fields stay out."""
+    kind = mujoco.mjtGeom(int(model.geom_type[g]))
+    if kind in _SHAPES:
+        look = dict(type=kind, pos=model.geom_pos[g], quat=model.geom_quat[g], size=model.geom_size[g])
+        body.add_geom(**look, rgba=model.geom_rgba[g], group=model.geom_group[g], contype=0, conaffinity=0, mass=0.0)
+
+
+def _joint(model: mujoco.MjModel, j: int) -> dict:
+    kind = mujoco.mjtJoint(int(model.jnt_type[j]))
+    out = dict(name=_joint_name(model, j), type=kind, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
+    if kind == mujoco.mjtJoint.mjJNT_FREE:
+        return out
+    limited = mujoco.mjtLimited.mjLIMITED_TRUE if model.jnt_limited[j] else mujoco.mjtLimited.mjLIMITED_FALSE
+    out |= dict(pos=model.jnt_pos[j], axis=model.jnt_axis[j], range=model.jnt_range[j], limited=limited)
+    if kind != mujoco.mjtJoint.mjJNT_BALL:
+        out["ref"] = model.qpos0[model.jnt_qposadr[j]]
+    return out
+
+
+def _joint_name(model: mujoco.MjModel, j: int) -> str:
+    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint{j}"
+
+
+def _add_floor(spec: mujoco.MjSpec, height: float, friction: float) -> None:
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=(0.0, 0.0, height),
+        size=(0.0, 0.0, 1.0),
+        friction=(friction, 0.005, 0.0001),
+        contype=1,
+        conaffinity=0,
+    )
+
+
+def _geom_name(foot: str, k: int) -> str:
+    return f"{foot}_contact_{k}"
+
+
+def _add_contacts(
+    spec: mujoco.MjSpec,
+    bodies: Sequence[mujoco.MjsBody],
+    robot: Robot,
+    foot: str,
+    points: Float[np.ndarray, "k 3"],
+    rotation: Float[np.ndarray, "3 3"],
+    friction: float,
+) -> None:
+    """A massless sphere on each contact point, up along the floor's normal as the foot stands at home."""
+    index = robot.tree.frame(foot)
+    body = bodies[_model_body(robot, robot.tree.frame_bodies[index])]
+    up = rotation.T @ np.array([0.0, 0.0, CONTACT_RADIUS])
+    centers = np.asarray(robot.frame_position[index]) + (points + up) @ np.asarray(robot.frame_rotation[index]).T
+    for k, center in enumerate(centers):
+        body.add_geom(
+            name=_geom_name(foot, k),
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=center,
+            size=(CONTACT_RADIUS, 0.0, 0.0),
+            mass=0.0,
+            friction=(friction, 0.005, 0.0001),
+            contype=0,
+            conaffinity=1,
+        )
+
+
+def _add_ties(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Followers geared to their leaders, locked hinges and slides held."""
+    tree, model = robot.tree, robot.mj_model
+    offset, reference = np.asarray(robot.qpos_offset), model.qpos0
+    for follower, leader, multiplier in tree.followers:
+        f, m = (reference[tree.full_qpos_address[j]] for j in (follower, leader))
+        constant = offset[tree.full_qpos_address[follower]] - f + multiplier * m
+        _tie(spec, tree.joint_names[follower], tree.joint_names[leader], constant, multiplier)
+    for joint in tree.locked:
+        if tree.joint_types[joint] in (FREE, BALL):
+            raise ValueError(f"joint {tree.joint_names[joint]!r} is locked, and free or ball: nothing can hold it")
+        at = tree.full_qpos_address[joint]
+        _tie(spec, tree.joint_names[joint], "", offset[at] - reference[at], 0.0)
+
+
+def _tie(spec: mujoco.MjSpec, joint: str, leader: str, constant: float, slope: float) -> None:
+    tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint, name2=leader, **_GEARED)
+    tie.objtype = mujoco.mjtObj.mjOBJ_JOINT
+    tie.data[:5] = (constant, slope, 0.0, 0.0, 0.0)
+
+
+def _add_servo(spec: mujoco.MjSpec, joint: str, servo: Servo) -> None:
+    actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+    actuator.gainprm[0] = servo.stiffness
+    actuator.biasprm[1], actuator.biasprm[2] = -servo.stiffness, -servo.damping
+    if servo.effort is not None and math.isfinite(servo.effort):
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        actuator.forcerange = (-servo.effort, servo.effort)
+
+
+def _compiled(spec: mujoco.MjSpec, source: mujoco.MjModel) -> mujoco.MjModel:
+    """The model, with the numbers of the robot's own that no version of MuJoCo spells alike."""
+    model = spec.compile()
+    for name in _COPIED:
+        getattr(model, name)[:] = getattr(source, name)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
