@@ -259,7 +259,7 @@ def test_mistakes_are_told(nao, arm, arm_world):
         simulation.step(arm.q0, 0.0015)
     with pytest.raises(ValueError, match="joint2 is not finite"):
         simulation.step(arm.q0.at[1].set(np.nan), DT)
-    with pytest.raises(KeyError, match="bodys: link0"):
+    with pytest.raises(KeyError, match="bodies: link0"):
         simulation.push("torso", (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="one tick"):
         physics.simulate(simulation, {"posture": osik.PostureTask(arm)}, scheme=osik.WeightedQP(), dt=DT, steps=0)
