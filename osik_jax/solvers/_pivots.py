@@ -26,6 +26,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ._double import first_smallest
+
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 
 DEPENDENT = 100.0
@@ -152,7 +154,7 @@ def _drop_wrong(limits: Limits, s: Dual) -> Dual:
     """Makes inactive the constraint whose multiplier has the wrong sign, the worst if there are several."""
     pressure = jnp.where(s.active == AT_LOWER, s.multiplier, jnp.where(s.active == AT_UPPER, -s.multiplier, 0.0))
     wrong = jnp.where(pressure < -limits.noise.multiplier, pressure, 0.0)
-    j = _argmin(wrong)
+    j = first_smallest(wrong)
     moves = s.searching & (wrong[j] < 0.0)
     held = s.active != INACTIVE
     row = s.tableau[j]
@@ -177,7 +179,7 @@ def _add_violated(limits: Limits, s: Dual) -> Dual:
     candidate = ~held & ~s.implied & ((violation > limits.noise.value) | limits.equality)
     gain = jnp.maximum(violation, 0.0) ** 2 / jnp.maximum(jnp.diagonal(s.tableau), unit * limits.scale)
     gain = jnp.where(candidate, jnp.where(limits.equality, jnp.inf, gain), -1.0)
-    best = _argmin(-gain)
+    best = first_smallest(-gain)
     pending = s.entering >= 0
     k = jnp.where(pending, s.entering, best)
     enters = s.searching & (pending | (gain[best] >= 0.0))
@@ -194,7 +196,7 @@ def _add_violated(limits: Limits, s: Dual) -> Dual:
     rate = side * sign * column
     blocks = rate < 0.0
     steps = jnp.where(blocks, jnp.maximum(side * s.multiplier, 0.0) / jnp.where(blocks, -rate, 1.0), jnp.inf)
-    leaving = _argmin(steps)
+    leaving = first_smallest(steps)
     drops = steps[leaving] < full
     length = jnp.minimum(steps[leaving], full)
     stuck = jnp.isinf(length)
@@ -233,7 +235,3 @@ def exchange(
     at_k = (jnp.arange(len(row)) == k).astype(row.dtype)
     column = jnp.where(held == held[k], row, -row)
     return jnp.where(moves, (column + at_k) / jnp.where(moves, row[k], 1.0), 0.0), row - at_k
-
-
-def _argmin(a: Float[Array, " m"]) -> Int[Array, ""]:
-    return jax.lax.argmin(a, 0, jnp.int32)

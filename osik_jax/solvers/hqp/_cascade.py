@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._box import inside
 from .._dense import apply, product
+from .._double import in_double
 from .._lanes import choose, in_lanes
 from .._status import Status
 from ._held import independent
@@ -22,10 +23,9 @@ from ._proposal import propose
 from ._replay import Decision, with_derivative
 from ._stack import Layout, Stack, Task, stacked
 
-_DEFAULTS = {
-    jnp.dtype("float64"): Tolerances(rank=1e-10, step=1e-13, multiplier=1e-10, feasible=1e-11),
-    jnp.dtype("float32"): Tolerances(rank=1e-5, step=1e-7, multiplier=1e-6, feasible=1e-5),
-}
+_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
+"""Rounding of the data makes rows independent that are not."""
+
 
 _NOTHING = 1e-2
 """Share of the rank tolerance up to which a pivot is none, whatever the rank that another factorisation found."""
@@ -50,7 +50,8 @@ def solve_hqp(
     Each level tries the working set of the warm start, then one that a dual method proposes, and judges the exact
     solution on it by its multipliers; where neither is the optimum, a primal active set goes on by hand. A row
     violated at its optimum, and every hard row with a nonzero multiplier, is tight on the whole face of minimisers: it
-    is frozen as an equality before the next level and eliminated by its null space.
+    is frozen as an equality before the next level and eliminated by its null space. The search is in double precision
+    also where the data are single.
 
     Args:
         levels: highest priority first; any number, each an equality or inequality level or a mixture.
@@ -58,7 +59,7 @@ def solve_hqp(
         upper: box, inf where unbounded. (n,)
         warm_start: that of the solution of a problem nearby with the same levels. It changes the time, not the answer.
         max_iterations: cap on the active-set iterations of one level (static); default 10 (n + rows of the level).
-        tolerances: what counts as zero; the default depends on the precision.
+        tolerances: what counts as zero; the default rank tolerance depends on the precision of the data.
 
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
@@ -67,14 +68,15 @@ def solve_hqp(
     """
     lower, upper = jnp.asarray(lower), jnp.asarray(upper)
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
-    tolerances = _DEFAULTS[dtype] if tolerances is None else tolerances
+    tolerances = Tolerances(rank=_RANK[dtype]) if tolerances is None else tolerances
     sane = _finite(levels, lower, upper)
     low, high = (jnp.where(sane, b, side).astype(dtype) for b, side in ((lower, -1.0), (upper, 1.0)))
     scaled = [jax.tree.map(lambda leaf: jnp.where(sane, leaf, 0.0), level.scaled()) for level in levels]
     layout, stack = stacked([*scaled, _smallest(lower.shape[0], dtype)], low, high)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
     end = _descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start)))
-    x = with_derivative(end.cascade.x, end.decisions, stack, _NOTHING * traced.rank)
+    nothing = jnp.maximum(_NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
+    x = with_derivative(end.cascade.x, end.decisions, stack, nothing)
     return _answer(levels, layout, end, x, sane, lower, upper)
 
 
@@ -111,7 +113,7 @@ class _End(NamedTuple):
 @cache
 def _descender(layout: Layout, max_iterations: int | None) -> Callable[..., _End]:
     cap = 10 * (layout.variables + layout.rows) if max_iterations is None else max_iterations
-    return in_lanes(partial(_descend_all, layout, cap))
+    return in_lanes(in_double(partial(_descend_all, layout, cap)))
 
 
 def _descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None) -> _End:

@@ -14,7 +14,7 @@ from ._held import Held, hold, multipliers, restoring_step
 from ._problem import Level, Tolerances, WorkingSet
 from ._stack import Task
 
-_ROUNDS = {jnp.dtype("float64"): 2, jnp.dtype("float32"): 3}
+_ROUNDS = 2
 """Corrections against exact residuals, the first solution among them."""
 
 
@@ -47,7 +47,7 @@ def land(task: Task, x: Float[Array, " n"], working: WorkingSet, tolerances: Tol
     counts = working.own != 0
     goal = jnp.where(counts, jnp.where(working.own == 1, level.upper, level.lower), 0.0)
     descend, rank = least_squares(level, counts, held, tolerances)
-    for _ in range(_ROUNDS[x.dtype]):
+    for _ in range(_ROUNDS):
         x = x + apply(task.projector, restoring_step(task, held, side, x))
         x = x + apply(task.projector, descend(jnp.where(counts, apply(level.matrix, x) - goal, 0.0)))
     slack = jnp.where(counts, apply(level.matrix, x) - goal, 0.0)

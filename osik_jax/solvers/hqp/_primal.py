@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply
+from .._double import first_smallest
 from ._held import Held, hold, multipliers
 from ._landing import least_squares, rounding, wrong_signs
 from ._problem import Tolerances
@@ -84,7 +85,7 @@ def _drop(
     multiplier = multipliers(task, held, -apply(task.projector, gradient))
     wrong = wrong_signs(task, s.side, multiplier, gradient, floor, tolerances)
     pressure = multiplier * s.side * task.length
-    worst = jnp.where(s.stalled > _PATIENCE, jnp.argmax(wrong), jnp.argmin(jnp.where(wrong, pressure, jnp.inf)))
+    worst = first_smallest(jnp.where(wrong, jnp.where(s.stalled > _PATIENCE, 0.0, pressure), jnp.inf))
     release = wrong.any()
     return s._replace(
         side=s.side.at[worst].set(jnp.where(release, 0, s.side[worst])),
@@ -107,7 +108,7 @@ def _advance(task: Task, s: LevelState, step: Float[Array, " n"], tolerances: To
     ideal = _line_search(apply(level.matrix, s.x), apply(level.matrix, step), level.lower, level.upper)
     blocked = limit <= ideal
     length = jnp.minimum(limit, ideal)
-    first = jnp.argmin(times)  # the least index among ties
+    first = first_smallest(times)  # the least index among ties
     x = s.x + length * step
     stalled = jnp.where(length * jnp.max(jnp.abs(step)) > 0.0, 0, s.stalled + 1)
     side = s.side.at[first].set(jnp.where(blocked, jnp.where(rate[first] > 0.0, 1, -1), s.side[first]))

@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 class Tolerances(NamedTuple):
     """What counts as zero, relative to the scale of the quantity at hand."""
 
-    rank: Float[Array, ""] | float  # part of a row outside the span of others, relative to the row
-    step: Float[Array, ""] | float  # change of the level's rows by a step, relative to their scale
-    multiplier: Float[Array, ""] | float  # multiplier, relative to the level's gradient
-    feasible: Float[Array, ""] | float  # violation of a row, relative to its scale
+    rank: Float[Array, ""] | float = 1e-10  # part of a row outside the span of others, relative to the row
+    step: Float[Array, ""] | float = 1e-13  # change of the level's rows by a step, relative to their scale
+    multiplier: Float[Array, ""] | float = 1e-10  # multiplier, relative to the level's gradient
+    feasible: Float[Array, ""] | float = 1e-11  # violation of a row, relative to its scale
 
 
 class Level(eqx.Module):

@@ -18,8 +18,8 @@ from .._pivots import AT_UPPER, INACTIVE, Dual, Limits, Noise, begin, search
 from ._problem import WorkingSet
 from ._stack import Task
 
-_DAMPING = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-7}
-_NOISE = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
+_DAMPING = 1e-9
+_NOISE = 1e-10
 
 
 def propose(
@@ -38,7 +38,7 @@ def _tableau(task: Task) -> tuple[Limits, Float[Array, " h"], Dual]:
     equality = level.lower == level.upper
     cost = jnp.where(equality[:, None], product(level.matrix * scale, task.projector), 0.0)
     residual = scale * jnp.where(equality, apply(level.matrix, x) - jnp.where(equality, level.lower, 0.0), 0.0)
-    hessian = product(cost.T, cost) + _DAMPING[dtype] * jnp.eye(len(x), dtype=dtype)
+    hessian = product(cost.T, cost) + _DAMPING * jnp.eye(len(x), dtype=dtype)
     factor = jax.lax.linalg.cholesky(hessian, symmetrize_input=False)
     soft = task.own & (task.lower != task.upper)
     unit = jnp.where(task.own, scale, 1.0)  # the rows of the level in the units of its cost
@@ -55,7 +55,7 @@ def _tableau(task: Task) -> tuple[Limits, Float[Array, " h"], Dual]:
     ]
     nearest = jnp.minimum(*(jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in bounds))
     reach = unit * task.length * jnp.max(jnp.abs(x)) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
-    small = root * _NOISE[dtype] * (reach + jnp.abs(value))
+    small = root * _NOISE * (reach + jnp.abs(value))
     limits = Limits(
         lower=bounds[0] * root,
         upper=bounds[1] * root,

@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._box import inside
 from .._dense import product
 from .._lanes import in_lanes
 from ..hqp import Level
@@ -102,7 +103,7 @@ def _descend(room: Room, fixed: Int[Array, " n"], max_iterations: int) -> _End:
     # one factorisation after another: see osik_jax/_runtime.py
     scale, side = jax.lax.optimization_barrier((scale, jnp.where(found.done, found.side, 0)))
     x, _ = settle(room, scale, side, dual_basis(room.projector, side))
-    x = _inside(jnp.where(side != 0, room.bound(side), x), room.lower, room.upper)
+    x = inside(jnp.where(side != 0, room.bound(side), x), room.lower, room.upper)
     done = found.done & jax.lax.stop_gradient(room.holds(x, scale))
     fixed = jnp.where((fixed == 0) & stopped & done, found.blocking, fixed)
     return _End(
@@ -143,14 +144,3 @@ def _purified(projector: Float[Array, "n n"]) -> Float[Array, "n n"]:
     projector = 0.5 * (projector + projector.T)
     square = product(projector, projector)
     return 3.0 * square - 2.0 * product(square, projector)
-
-
-@jax.custom_jvp
-def _inside(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Takes rounding away; what is on a bound moves with x, not half with x and half with the bound."""
-    return jnp.clip(x, lower, upper)
-
-
-@_inside.defjvp
-def _inside_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
-    return _inside(*primals), tangents[0]

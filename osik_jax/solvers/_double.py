@@ -1,0 +1,43 @@
+"""Double precision inside a program whose data are single.
+
+Whether a bound holds a level up, and on which side of the tolerance a pivot is, are yes or no; rounding that turns one
+over costs a lower level its optimum. Data rounded to single precision do not: the recorded hierarchies, rounded and
+solved in double, keep their level norms to 2e-7, and in single arithmetic one in seventeen missed by up to 5e-2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+def in_double(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function of pytrees, computed in double precision; floats come back in the precision of the first one."""
+
+    def wide(*args: Any) -> Any:
+        given = next(a.dtype for a in jax.tree.leaves(args) if _is_float(a))
+        with jax.enable_x64(True):
+            return _cast(function(*_cast(args, jnp.float64)), given)
+
+    return wide
+
+
+def _cast(tree: Any, dtype: Any) -> Any:
+    return jax.tree.map(lambda a: a.astype(dtype) if _is_float(a) else a, tree)
+
+
+def _is_float(a: Array) -> bool:
+    return jnp.issubdtype(a.dtype, jnp.floating)
+
+
+def first_smallest(a: Float[Array, " m"]) -> Int[Array, ""]:
+    """Index of the smallest number, the first of equals.
+
+    ``jnp.argmin`` does not compile for doubles in a program whose default is single.
+    """
+    index = jax.lax.iota(jnp.int32, a.shape[0])
+    return jnp.minimum(jnp.min(jnp.where(a == jnp.min(a), index, a.shape[0])), a.shape[0] - 1)
