@@ -16,7 +16,7 @@ from .._double import in_double
 from .._lanes import choose, in_lanes
 from .._status import Status
 from ._held import independent
-from ._landing import Landing, land, noise
+from ._landing import Landing, land, noise, nothing_landed
 from ._primal import LevelState, solve_level
 from ._problem import HQPSolution, Level, Tolerances, WorkingSet
 from ._proposal import propose
@@ -188,41 +188,68 @@ def _descend(
     cap: int,
 ) -> tuple[_Cascade, _Outcome]:
     """Solves one more level in the lanes that want it, and freezes what it decides."""
-    first = jax.vmap(_first_guess)(task, guess)
-    landed = jax.vmap(land)(task, task.x, first, tolerances)
-    landed = landed._replace(optimal=landed.optimal | ~wanted)
-    none = jnp.zeros_like(cascade.iterations)
-
-    def try_again() -> tuple[Landing, Array]:
-        x, working, changes = propose(task, ~landed.optimal, cap)
-        second = jax.vmap(land)(task, x, working, tolerances)
-        return choose(landed.optimal, (landed, none), (second, changes))
+    best, changes, factorizations = _land(task, wanted, tolerances, guess, cap)
 
     def by_hand() -> tuple[LevelState, Array]:
         start = jax.vmap(_by_hand_from)(task, cascade.side, best, tolerances)
         end = jax.vmap(partial(solve_level, max_iterations=cap))(task, start, tolerances)
         return end, end.iterations
 
-    best, changes = jax.lax.cond(jnp.all(landed.optimal), lambda: (landed, none), try_again)
-    end, more = jax.lax.cond(jnp.all(best.optimal), lambda: (jax.vmap(_at)(best), none), by_hand)
-    factorizations = cascade.factorizations + 3 + jnp.where(landed.optimal, 0, 3) + 2 * more
-    counted = cascade._replace(iterations=cascade.iterations + changes + more, factorizations=factorizations)
+    end, more = jax.lax.cond(jnp.all(best.optimal), lambda: (jax.vmap(_at)(best), jnp.zeros_like(changes)), by_hand)
+    counted = cascade._replace(
+        iterations=cascade.iterations + changes + more,
+        factorizations=cascade.factorizations + factorizations + 2 * more + 1,
+    )
     return jax.vmap(_freeze)(counted, task, end, tolerances)
 
 
-def _first_guess(task: Task, warm: WorkingSet | None) -> WorkingSet:
-    """The warm start as far as its bounds exist; without one, or all zeros, rows that miss their interval now."""
+class _Attempts(NamedTuple):
+    """The working set of the warm start, then the one that the dual method proposes."""
+
+    count: Int[Array, ""]
+    best: Landing
+    changes: Int[Array, " B"]
+    factorizations: Int[Array, " B"]
+
+
+def _land(
+    task: Task, wanted: Bool[Array, " B"], tolerances: Tolerances, guess: WorkingSet | None, cap: int
+) -> tuple[Landing, Int[Array, " B"], Int[Array, " B"]]:
+    """Lands where the warm start says and, in the lanes where that is not the optimum, where the dual method says."""
+
+    def named() -> tuple[Array, WorkingSet, Array]:
+        assert guess is not None
+        return task.x, jax.vmap(_usable)(task, guess), none
+
+    def go_on(s: _Attempts) -> Bool[Array, ""]:
+        return (s.count < 2) & ~jnp.all(s.best.optimal)
+
+    def attempt(s: _Attempts) -> _Attempts:
+        def proposed() -> tuple[Array, WorkingSet, Array]:
+            return propose(task, ~s.best.optimal, cap)
+
+        x, working, changes = proposed() if guess is None else jax.lax.cond(s.count == 0, named, proposed)
+        landed = jax.vmap(land)(task, x, working, tolerances)
+        spent = jnp.where(s.best.optimal, 0, 2 + s.count)  # a proposal has factored the damped level
+        best = choose(s.best.optimal, s.best, landed)
+        return _Attempts(s.count + 1, best, s.changes + changes, s.factorizations + spent)
+
+    none = jnp.zeros(len(wanted), jnp.int32)
+    nowhere = jax.vmap(nothing_landed)(task)._replace(optimal=~wanted)
+    first = jnp.asarray(1 if guess is None else 0, jnp.int32)
+    return jax.lax.while_loop(go_on, attempt, _Attempts(first, nowhere, none, none))[1:]
+
+
+def _usable(task: Task, warm: WorkingSet) -> WorkingSet:
+    """The warm start as far as its bounds exist; for one of zeros, the rows that miss their interval now."""
     level, value = task.level, apply(task.level.matrix, task.x)
-    own = jnp.where(value < level.lower, -1, jnp.where(value > level.upper, 1, 0))
-    side = jnp.zeros(task.lower.shape, jnp.int32)
-    if warm is not None:
-        known = jnp.any(warm.hard != 0) | jnp.any(warm.own != 0)
-        named = jnp.sign(warm.own)
-        named = jnp.where(jnp.isfinite(jnp.where(named < 0, level.lower, level.upper)), named, 0)
-        own = jnp.where(known, named, own)
-        side = jnp.sign(warm.hard)
-        side = jnp.where(task.free & jnp.isfinite(jnp.where(side < 0, task.lower, task.upper)), side, 0)
-    own = jnp.where(level.lower == level.upper, 2, own)
+    known = jnp.any(warm.hard != 0) | jnp.any(warm.own != 0)
+    missed = jnp.where(value < level.lower, -1, jnp.where(value > level.upper, 1, 0))
+    named = jnp.sign(warm.own)
+    named = jnp.where(jnp.isfinite(jnp.where(named < 0, level.lower, level.upper)), named, 0)
+    own = jnp.where(level.lower == level.upper, 2, jnp.where(known, named, missed))
+    side = jnp.sign(warm.hard)
+    side = jnp.where(task.free & jnp.isfinite(jnp.where(side < 0, task.lower, task.upper)), side, 0)
     return WorkingSet(side.astype(jnp.int32), own.astype(jnp.int32))
 
 

@@ -67,6 +67,21 @@ def land(task: Task, x: Float[Array, " n"], working: WorkingSet, tolerances: Tol
     )
 
 
+def nothing_landed(task: Task) -> Landing:
+    """Where the level starts, as a landing that is not the optimum."""
+    none = jnp.zeros(task.lower.shape, jnp.int32)
+    return Landing(
+        x=task.x,
+        side=none,
+        multiplier=jnp.zeros_like(task.lower),
+        counts=jnp.zeros(task.level.lower.shape, bool),
+        rank=jnp.asarray(0, jnp.int32),
+        residual=jnp.zeros_like(task.x[0]),
+        feasible=jnp.asarray(False),
+        optimal=jnp.asarray(False),
+    )
+
+
 def least_squares(
     level: Level, counts: Bool[Array, " m"], held: Held, tolerances: Tolerances
 ) -> tuple[Callable[[Float[Array, " m"]], Float[Array, " n"]], Int[Array, ""]]:
