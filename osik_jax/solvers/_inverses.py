@@ -25,7 +25,9 @@ def row_space_and_inverse(
     return space, damped
 
 
-def _factors(matrix: Array, cutoff: Array, most: Array, damping: Array) -> tuple[Array, Array, Array]:
+def _factors(
+    matrix: Array, cutoff: Array | float, most: Array | int, damping: Array | float
+) -> tuple[Array, Array, Array]:
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
     real = (s > cutoff) & (jnp.arange(len(s)) < most)
     vt, s = jnp.where(real[:, None], vt, 0.0), jnp.where(real, s, 1.0)
