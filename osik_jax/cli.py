@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -39,6 +39,8 @@ class Demo:
 
     motion: Literal["double-support", "single-support"] = "double-support"
     """What NAO does."""
+    physics: bool = False
+    """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every tick."""
     robot: str | None = None
     """A URDF or MJCF file (or nao, arm7) to move instead."""
     base: Literal["auto", "floating", "fixed"] = "auto"
@@ -186,19 +188,22 @@ def _demo(command: Demo) -> None:
     motion, out = _motion(command), _folder(command.out)
     for note in motion.notes:
         console.print(f"[yellow]note:[/yellow] {note}")
+    settings: Any = dict(
+        schemes=command.schemes,
+        dt=1.0 / command.frequency,
+        animation=command.animation,
+        renderer=command.renderer,
+    )
     with _progress(console) as announce:
-        summary, runs = demo.run_demo(
-            motion,
-            out,
-            schemes=command.schemes,
-            dt=1.0 / command.frequency,
-            animation=command.animation,
-            renderer=command.renderer,
-            announce=announce,
-        )
+        if command.physics:
+            summary, simulated = demo.run_physics_demo(motion, out, announce=announce, **settings)
+            last, table = simulated[-1].run, demo.physics_table(summary)
+        else:
+            summary, runs = demo.run_demo(motion, out, announce=announce, **settings)
+            last, table = runs[-1], demo.table(summary)
     if command.picture:
-        demo.draw_picture(motion, runs[-1], command.out / "picture.png")
-    console.print(demo.table(summary))
+        demo.draw_picture(motion, last, command.out / "picture.png")
+    console.print(table)
     console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
 
 
@@ -225,6 +230,8 @@ def _check(command: Demo) -> None:
     """Options that exclude each other, and values out of range."""
     if command.robot is None and (command.frame is not None or command.support):
         raise CommandError("--frame and --support go with --robot FILE; NAO's motions choose their own")
+    if command.physics and command.robot is not None:
+        raise CommandError("--physics goes with NAO's motions; for a robot of yours, see osik_jax.physics")
     if not command.frequency > 0.0:
         raise CommandError(f"--frequency is {command.frequency:g}; it has to be positive")
     if not command.duration * command.frequency >= 2.0:

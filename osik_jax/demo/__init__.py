@@ -15,6 +15,9 @@ from ._physics import PhysicsRun as PhysicsRun
 from ._physics import measure_physics as measure_physics
 from ._physics import nao_world as nao_world
 from ._physics import run_physics as run_physics
+from ._physics_demo import run_physics_demo as run_physics_demo
+from ._physics_report import physics_report as physics_report
+from ._physics_report import physics_table as physics_table
 from ._references import Path as Path
 from ._references import Stroke as Stroke
 from ._references import minimum_jerk as minimum_jerk

@@ -88,7 +88,7 @@ def measure(motion: Motion, q: Float[np.ndarray, "T nq"], dt: float) -> Measurem
         stances=stances,
         goals=goals,
         com=com,
-        com_margin=_margins(com, support),
+        com_margin=margins(com, support),
         support=support,
         displacement={k: poses[g.frame][0] - poses[g.frame][0][0] for k, g in motion.goals.items()},
         wanted={label: path[0] - path[0][0] for label, path in paths.items()},
@@ -159,7 +159,7 @@ def _support(motion: Motion, poses: dict[str, _Poses], time: np.ndarray) -> list
     return [hulls[tuple(row)] for row in standing]
 
 
-def _margins(com: np.ndarray, support: list[np.ndarray]) -> np.ndarray:
+def margins(com: np.ndarray, support: list[np.ndarray]) -> np.ndarray:
     """Least distance to the lines through the edges, positive inside."""
     out = []
     for point, vertices in zip(com[:, :2], support, strict=False):

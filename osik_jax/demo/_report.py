@@ -191,26 +191,26 @@ def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Labels, and functions from a scheme's figures to what its cell says."""
     rows: list[tuple[str, Any]] = []
     if example["standing"]:
-        rows.append(("standing feet, drift [mm]", lambda s: _number(_worst(s["standing"], "position_mm"), 0.1)))
+        rows.append(("standing feet, drift [mm]", lambda s: number(_worst(s["standing"], "position_mm"), 0.1)))
     if any("orientation_mrad" in figures for figures in example["standing"].values()):
-        rows.append(("standing feet, turn [mrad]", lambda s: _number(_worst(s["standing"], "orientation_mrad"), 0.1)))
+        rows.append(("standing feet, turn [mrad]", lambda s: number(_worst(s["standing"], "orientation_mrad"), 0.1)))
     if "balance" in example:
-        rows.append(("centre of mass inside by [mm]", lambda s: _inside(s["balance"]["least_margin_mm"])))
+        rows.append(("centre of mass inside by [mm]", lambda s: inside(s["balance"]["least_margin_mm"])))
     first = next(iter(example["goals"]))
     for label in example["goals"]:
         limit = 1.0 if label == first else None
         rows.append(
             (
                 f"{label.replace('_', ' ')}, from path [mm]",
-                lambda s, k=label: _number(s["goals"][k]["position_mm"], None),
+                lambda s, k=label: number(s["goals"][k]["position_mm"], None),
             )
         )
         rows.append(
-            ("  once there [mm]", lambda s, k=label, top=limit: _number(s["goals"][k]["settled_position_mm"], top))
+            ("  once there [mm]", lambda s, k=label, top=limit: number(s["goals"][k]["settled_position_mm"], top))
         )
-    rows.append(("position limits broken", lambda s: _count(s["limits"]["position_violations"])))
-    rows.append(("velocity limits broken", lambda s: _count(s["limits"]["velocity_violations"])))
-    rows.append(("ticks solved", lambda s: _solved(s["solver"]["status"])))
+    rows.append(("position limits broken", lambda s: limit_count(s["limits"]["position_violations"])))
+    rows.append(("velocity limits broken", lambda s: limit_count(s["limits"]["velocity_violations"])))
+    rows.append(("ticks solved", lambda s: solved(s["solver"]["status"])))
     rows.append(("compile [s]", lambda s: f"{s['solver']['compile_s']:.1f}"))
     rows.append(("a tick [µs]", lambda s: f"{s['solver']['microseconds_per_tick']:.0f}"))
     return rows
@@ -220,22 +220,26 @@ def _worst(standing: Mapping[str, Mapping[str, float]], key: str) -> float:
     return max(figures[key] for figures in standing.values())
 
 
-def _number(value: float | None, limit: float | None) -> str:
+def number(value: float | None, limit: float | None) -> str:
+    """A figure for a cell, red above its limit."""
     if value is None:
         return "-"
     text = f"{value:.2g}" if value < 10 else f"{value:.1f}"
     return text if limit is None or value <= limit else f"[red]{text}[/red]"
 
 
-def _inside(value: float) -> str:
+def inside(value: float) -> str:
+    """A margin for a cell, red where negative."""
     return f"{value:.1f}" if value >= 0.0 else f"[red]{value:.1f}[/red]"
 
 
-def _count(value: int) -> str:
+def limit_count(value: int) -> str:
+    """A count of violations for a cell, red above 0."""
     return "0" if value == 0 else f"[red]{value}[/red]"
 
 
-def _solved(status: Mapping[str, int]) -> str:
+def solved(status: Mapping[str, int]) -> str:
+    """Ticks solved out of all for a cell, red where some were not."""
     total = sum(status.values())
-    solved = status[Status.SOLVED.name]
-    return f"{solved}/{total}" if solved == total else f"[red]{solved}/{total}[/red]"
+    done = status[Status.SOLVED.name]
+    return f"{done}/{total}" if done == total else f"[red]{done}/{total}[/red]"

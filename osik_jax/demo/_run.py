@@ -19,6 +19,7 @@ from ._motion import Motion
 from ._report import Outcome, report, write_report
 from ._schemes import TITLES, make_scheme
 
+SCHEME_COLORS = {TITLES["weighted"]: "#f08c3a", TITLES["null-space"]: "#4d5561", TITLES["hierarchical"]: "#1565c0"}
 Announce = Callable[[str, float], None]
 """Called with the stage that runs and the part of the whole that is done, 0 to 1."""
 
@@ -109,7 +110,7 @@ def run_demo(
     files = [_save_figure(motion, runs, folder), _save_arrays(runs, folder)]
     if animation:
         start = share * len(schemes) + 0.05
-        files += _film(motion, runs[-1], folder, dt, renderer, lambda x: tell("filming", start + (0.99 - start) * x))
+        files += film(motion, runs[-1], folder, dt, renderer, lambda x: tell("filming", start + (0.99 - start) * x))
     summary = report(motion, {run.scheme: (run.outcome, run.measurement) for run in runs}, dt=dt, files=files)
     write_report(summary, folder / "report.json")
     tell("done", 1.0)
@@ -133,7 +134,7 @@ def _save_figure(motion: Motion, runs: Sequence[Run], folder: Path) -> str:
         comparison_panels(motion, {TITLES[run.scheme]: run.measurement for run in runs}),
         title=f"{motion.title}: {', '.join(TITLES[run.scheme] for run in runs)}",
         note="All figures are recomputed from the configurations by MuJoCo's C code.",
-        colors={TITLES["weighted"]: "#f08c3a", TITLES["null-space"]: "#4d5561", TITLES["hierarchical"]: "#1565c0"},
+        colors=SCHEME_COLORS,
     )
     figure.savefig(folder / "comparison.png")
     return "comparison.png"
@@ -175,7 +176,7 @@ def _worst_drift(m: Measurement) -> np.ndarray:
     return np.nanmax(np.stack([track.position for track in m.stances.values()]), 0)
 
 
-def _film(
+def film(
     motion: Motion, run: Run, folder: Path, dt: float, renderer: RendererName, progress: Callable[[float], None]
 ) -> list[str]:
     """The last scheme's motion; what each goal moves most along is drawn beside it."""

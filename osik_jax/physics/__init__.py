@@ -5,7 +5,7 @@ from ._loop import Integrated as Integrated
 from ._loop import Lookahead as Lookahead
 from ._loop import Recording as Recording
 from ._loop import simulate as simulate
+from ._servo import Servo as Servo
 from ._simulation import Simulation as Simulation
-from ._world import Servo as Servo
 from ._world import World as World
 from ._world import build_world as build_world

@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .._joint_selection import select_joints
 from .._tree import BALL, FREE
 from ..robot import Robot
+from ._servo import Servo as Servo
+from ._servo import add_servo, choose_servos
 
 Feet = Mapping[str, ArrayLike] | Sequence[str]
 """Frames that touch the floor: names with their contact points in the frame [m], or names alone (see ``World``)."""
@@ -38,27 +39,6 @@ _SHAPES = (
     mujoco.mjtGeom.mjGEOM_CYLINDER,
     mujoco.mjtGeom.mjGEOM_BOX,
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class Servo:
-    """A position servo: effort = stiffness (target - position) - damping velocity, cut at +- ``effort``.
-
-    Attributes:
-        stiffness: [N m/rad or N/m].
-        damping: [N m s/rad or N s/m].
-        effort: the greatest torque or force [N m or N]; ``None``: what the robot's model says, which may be nothing.
-    """
-
-    stiffness: float
-    damping: float
-    effort: float | None = None
-
-    def __post_init__(self) -> None:
-        if not (self.stiffness > 0.0 and math.isfinite(self.stiffness) and 0.0 <= self.damping < math.inf):
-            raise ValueError(f"{self}: the stiffness has to be positive, the damping not negative, both finite")
-        if self.effort is not None and not self.effort > 0.0:
-            raise ValueError(f"{self}: the effort has to be positive")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +100,7 @@ def build_world(
             f"timestep is {timestep} and friction {friction}; the one has to be positive, neither infinite"
         )
     points = _contact_points(robot, feet)
-    drives = _servos(robot, servos or {})
+    drives = choose_servos(robot, servos or {})
     poses = _home_poses(robot, tuple(points))
     lowest = [float((p + points[foot] @ R.T)[:, 2].min()) for foot, (p, R) in poses.items()]
     height = (min(lowest) if lowest else 0.0) if floor is None else float(floor)
@@ -132,7 +112,7 @@ def build_world(
         _add_contacts(spec, bodies, robot, foot, points[foot], rotation, friction)
     _add_ties(spec, robot)
     for joint, servo in drives.items():
-        _add_servo(spec, joint, servo)
+        add_servo(spec, joint, servo)
     return World(robot, _compiled(spec, robot.mj_model), drives, points, height)
 
 
@@ -223,54 +203,6 @@ def _model_body(robot: Robot, body: int) -> int:
     """MuJoCo's number of a body of the tree."""
     names = [_body_name(robot.mj_model, b) for b in range(robot.mj_model.nbody)]
     return names.index(robot.tree.body_names[body])
-
-
-def _servos(robot: Robot, given: Mapping[str, Servo]) -> dict[str, Servo]:
-    """One for each independent joint but the free one, in the order of q, its effort filled in."""
-    chosen = {joint: servo for pattern, servo in given.items() for joint in select_joints(robot, pattern)}
-    own, limits = _own_servos(robot.mj_model), _efforts(robot.mj_model)
-    out: dict[str, Servo] = {}
-    for joint in robot.tree.independent:
-        name, kind = robot.tree.joint_names[joint], robot.tree.joint_types[joint]
-        if kind == BALL:
-            raise ValueError(f"joint {name!r} is a ball joint, which no servo can turn")
-        if kind != FREE:
-            found = chosen.get(joint, own.get(joint))
-            if found is None:
-                raise ValueError(
-                    f"joint {name!r} has no position actuator in the robot's model: give servos={{{name!r}: "
-                    "Servo(stiffness, damping, effort)}; a glob such as '*' stands for many"
-                )
-            out[name] = found if found.effort is not None else dataclasses.replace(found, effort=limits[joint])
-    return out
-
-
-def _own_servos(model: mujoco.MjModel) -> dict[int, Servo]:
-    """The position actuators of a model, by joint."""
-    out = {}
-    for joint, a in _actuators(model).items():
-        gain, bias = float(model.actuator_gainprm[a][0]), model.actuator_biasprm[a]
-        if gain > 0.0 and bias[1] == -gain:
-            out[joint] = Servo(gain, -float(bias[2]))
-    return out
-
-
-def _actuators(model: mujoco.MjModel) -> dict[int, int]:
-    """Joint to the actuator on it."""
-    on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    return {int(model.actuator_trnid[a][0]): int(a) for a in np.flatnonzero(on_joint)}
-
-
-def _efforts(model: mujoco.MjModel) -> list[float]:
-    """The greatest effort of each joint: that of its actuator, else that of the joint, else none."""
-    actuators = _actuators(model)
-    out = []
-    for j in range(model.njnt):
-        ranges = [model.jnt_actfrcrange[j]] if model.jnt_actfrclimited[j] else []
-        if j in actuators and model.actuator_forcelimited[actuators[j]]:
-            ranges.append(model.actuator_forcerange[actuators[j]])
-        out.append(min((float(np.abs(r).min()) for r in ranges), default=math.inf))
-    return out
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, source: mujoco.MjModel) -> None:
@@ -394,16 +326,6 @@ def _tie(spec: mujoco.MjSpec, joint: str, leader: str, constant: float, slope: f
     tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint, name2=leader, **_GEARED)
     tie.objtype = mujoco.mjtObj.mjOBJ_JOINT
     tie.data[:5] = (constant, slope, 0.0, 0.0, 0.0)
-
-
-def _add_servo(spec: mujoco.MjSpec, joint: str, servo: Servo) -> None:
-    actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-    actuator.gainprm[0] = servo.stiffness
-    actuator.biasprm[1], actuator.biasprm[2] = -servo.stiffness, -servo.damping
-    if servo.effort is not None and math.isfinite(servo.effort):
-        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
-        actuator.forcerange = (-servo.effort, servo.effort)
 
 
 def _compiled(spec: mujoco.MjSpec, source: mujoco.MjModel) -> mujoco.MjModel:

@@ -1,0 +1,134 @@
+"""NAO with dynamics: figures of the report again from MuJoCo alone, and the judge on spoiled recordings."""
+
+import dataclasses
+import json
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from osik_jax import cli, demo
+from osik_jax.demo._physics_report import physics_figures
+
+DT = 0.005
+
+
+@pytest.fixture(scope="module")
+def lift(tmp_path_factory):
+    """The single-support motion of 8 s at 200 Hz: its motion, folder, report and run."""
+    motion, folder = demo.single_support(), tmp_path_factory.mktemp("physics")
+    summary, runs = demo.run_physics_demo(motion, folder, schemes=("weighted",), dt=DT, animation=False)
+    return motion, folder, summary, runs[0]
+
+
+def poses(motion, q):
+    """MuJoCo's data of the robot's own model along a motion."""
+    data = mujoco.MjData(motion.robot.mj_model)
+    for qpos in np.asarray(jax.vmap(motion.robot.mujoco_qpos)(q)):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(motion.robot.mj_model, data)
+        mujoco.mj_comPos(motion.robot.mj_model, data)
+        yield data
+
+
+def judged(motion, run, **changes):
+    """What the judge says of a recording with something changed."""
+    recording = dataclasses.replace(run.recording, **changes)
+    return physics_figures(demo.measure_physics(motion, run.world, recording, run.plan.q))
+
+
+def test_single_support_reaches_its_numbers(lift):
+    """What is wanted: 1 cm, 3 degrees and 5 mm, from the sensed configurations."""
+    motion, _, summary, run = lift
+    q, plan = run.recording.q, run.plan.q
+    assert len(q) == len(plan) == 1601
+    height = np.abs(q[:, 2] - plan[:, 2])
+    turns = Rotation.from_quat(q[:, [4, 5, 6, 3]]) * Rotation.from_quat(plan[:, [4, 5, 6, 3]]).inv()
+    tilt = np.degrees(turns.magnitude())
+    time = DT * np.arange(len(q))
+    soles = np.array([[data.site(foot).xpos.copy() for foot in ("l_sole", "r_sole")] for data in poses(motion, q)])
+    moved = np.linalg.norm((soles - soles[:1])[..., :2], axis=-1)
+    lifted = (time > motion.stances[1].lifted[0]) & (time < motion.stances[1].lifted[1])
+    assert height.max() <= 0.01 and tilt.max() <= 3.0
+    assert moved[:, 0].max() <= 0.005 and moved[~lifted, 1].max() <= 0.005
+    assert soles[780, 1, 2] - soles[0, 1, 2] > 0.05
+    figures = summary["schemes"]["weighted"]["physics"]
+    assert figures["fell_at_s"] is None and all(figures["reached"].values())
+    assert figures["base_height_error_mm"] == pytest.approx(1e3 * height.max(), rel=1e-9)
+    assert figures["base_tilt_error_deg"] == pytest.approx(tilt.max(), rel=1e-6)
+    for k, foot in enumerate(("l_sole", "r_sole")):
+        standing = np.ones_like(lifted) if k == 0 else ~lifted
+        assert figures["slip_mm"][foot] == pytest.approx(1e3 * moved[standing, k].max(), abs=0.2)
+        assert figures["slip_mm"][foot] <= 5.0 and figures["contact_slip_mm"][foot] <= 5.0
+
+
+def test_forces_are_those_of_the_motion(lift):
+    """The floor carries the weight on the foot that stands, under the centre of mass, within friction."""
+    motion, _, summary, run = lift
+    forces, points = run.recording.contact_forces, run.recording.contact_points
+    weight = 9.81 * float(motion.robot.body_mass.sum())
+    total = forces[..., 2].sum(-1)
+    assert total[1:].mean() == pytest.approx(weight, rel=2e-3)
+    in_the_air = slice(600, 1000)
+    np.testing.assert_array_equal(forces[in_the_air, 4:], 0.0)
+    assert (np.linalg.norm(forces[..., :2], axis=-1) <= 0.9 * forces[..., 2] * (1.0 + 1e-6) + 1e-9).all()
+    com = np.array([data.subtree_com[1].copy() for data in poses(motion, run.recording.q)])
+    np.testing.assert_allclose(run.recording.com, com, atol=1e-5)  # the sim's joints are geared, not one
+    pressure = (forces[..., 2:] * points[..., :2]).sum(1)[in_the_air] / total[in_the_air, None]
+    np.testing.assert_allclose(pressure.mean(0), com[in_the_air, :2].mean(0), atol=2e-3)
+    hull = ConvexHull(points[700, :4, :2]).equations
+    inside = -(hull[:, :2] @ pressure[100] + hull[:, 2]).max()
+    assert run.physics.pressure_margin[700] == pytest.approx(inside, abs=1e-9)
+    assert summary["schemes"]["weighted"]["physics"]["least_pressure_margin_mm"] > 0.0
+
+
+def test_torques_are_held_against_the_motors(lift):
+    motion, _, summary, run = lift
+    model = motion.robot.mj_model
+    limits = np.array([model.actuator(joint).forcerange[1] for joint in run.world.servos])
+    used = np.abs(run.recording.effort) / limits
+    figures = summary["schemes"]["weighted"]["physics"]
+    assert figures["greatest_part_of_torque_limit"] == pytest.approx(used.max())
+    assert used.max() <= 1.0 + 1e-9
+    assert figures["busiest_joint"] == list(run.world.servos)[int(used.max(0).argmax())]
+
+
+def test_the_judge_sees_what_is_wrong(lift):
+    motion, _, summary, run = lift
+    sunk, turned, slid = run.recording.q.copy(), run.recording.q.copy(), run.recording.contact_points.copy()
+    sunk[300, 2] -= 0.02
+    turned[300, 3:7] = Rotation.from_euler("x", 4.0, degrees=True).as_quat(scalar_first=True)
+    slid[1500:, 4:, 0] += 0.006
+    assert judged(motion, run)["reached"] == summary["schemes"]["weighted"]["physics"]["reached"]
+    assert not judged(motion, run, q=sunk)["reached"]["height"]
+    assert judged(motion, run, q=turned)["base_tilt_error_deg"] == pytest.approx(4.0, abs=0.2)
+    assert not judged(motion, run, q=turned)["reached"]["tilt"]
+    late = judged(motion, run, contact_points=slid)
+    assert late["slip_mm"]["r_sole"] > 5.0 and late["contact_slip_mm"]["r_sole"] > 5.0
+    assert not late["reached"]["slip"] and late["slip_mm"]["l_sole"] < 5.0
+    fell = judged(motion, run, fell=True)
+    assert fell["fell_at_s"] == pytest.approx(8.0) and not fell["reached"]["standing"]
+    told = json.loads(json.dumps(summary))
+    told["schemes"]["weighted"]["physics"] = fell
+    cells = [cell for column in demo.physics_table(told).columns for cell in column.cells]
+    assert "[red]fell at 8.00 s[/red]" in cells
+
+
+def test_files_hold_what_was_recorded(lift):
+    _, folder, summary, run = lift
+    assert {path.name for path in folder.iterdir()} == {"comparison.png", "motion.npz", "report.json"}
+    assert json.loads((folder / "report.json").read_text()) == summary
+    arrays = np.load(folder / "motion.npz")
+    np.testing.assert_array_equal(arrays["q_weighted"], run.recording.q)
+    np.testing.assert_array_equal(arrays["contact_forces_weighted"], run.recording.contact_forces)
+    settings = summary["settings"]
+    assert settings["servos"]["LKneePitch"] == {"stiffness": 150.0, "damping": 5.0, "effort": 3.023}
+    assert settings["timestep_s"] == 0.001 and settings["feedback_gain_per_s"] == 5.0
+
+
+def test_physics_of_a_file_is_refused(capsys, tmp_path):
+    assert cli.main(["demo", "--physics", "--robot", "arm7", "--out", str(tmp_path)]) == 2
+    assert "osik_jax.physics" in capsys.readouterr().err
