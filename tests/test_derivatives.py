@@ -100,14 +100,15 @@ class TestArrays:
         out = check(lambda a: qp_answer(solve_factored(a)), straight, least_squares(rng, rows=5))
         assert_exact(out, most=0.9)
 
-    def test_hierarchies(self, rng):
-        """Three levels of equalities and inequalities with weights, over a box: the answer and what levels lack."""
+    @pytest.mark.parametrize("sizes, n", [((3, 4, 4), 10), ((2, 9), 6)], ids=["few-rows", "more-rows-than-variables"])
+    def test_hierarchies(self, rng, sizes, n):
+        """Levels of equalities and inequalities with weights, over a box: the answer and what levels lack."""
 
         def solve(a):
             s = solve_hqp(as_levels(a[0]), a[1], a[2])
             return (s.x, s.slacks), (s.status, s.active)
 
-        assert_exact(check(solve, straight, hierarchies(rng, (3, 4, 4), 10)), most=0.9)
+        assert_exact(check(solve, straight, hierarchies(rng, sizes, n)), most=0.9)
 
     @pytest.mark.parametrize("method", ["damped", "undamped", "reverse", "saturated"])
     def test_null_space(self, rng, method):

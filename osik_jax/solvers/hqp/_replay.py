@@ -57,11 +57,17 @@ def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, "
 
     def descend(state: tuple[Array, Array], now: tuple[Decision, Level]) -> tuple[tuple[Array, Array], None]:
         decision, level = now
-        state = _block(*hard, decision.tight, n, *state, nothing)
+        state = _block(*_independent(*hard, decision.tight), n, *state, nothing)
         return _block(level.matrix, level.lower, level.upper, decision.counts, decision.rank, *state, nothing), None
 
-    start = _block(*hard, pinned, n, jnp.zeros_like(eye[0]), eye, nothing)
+    start = _block(*_independent(*hard, pinned), n, jnp.zeros_like(eye[0]), eye, nothing)
     return jax.lax.scan(descend, start, (decisions, stack.levels))[0][0]
+
+
+def _independent(matrix: Array, lower: Array, upper: Array, side: Array) -> tuple[Array, Array, Array, Array]:
+    """As many rows as there are variables, the tight ones first: those are independent, so there are no more."""
+    rows = jnp.argsort(side == 0, stable=True)[: matrix.shape[1]]
+    return matrix[rows], lower[rows], upper[rows], side[rows]
 
 
 def _block(
@@ -75,11 +81,9 @@ def _block(
     nothing: Array,
 ) -> tuple[Array, Array]:
     """Moves x in the projector's range so that the chosen rows, of that rank at most, come nearest to their bounds."""
-    n = x.shape[0]
-    rows = jnp.argsort(side == 0, stable=True)[:n] if matrix.shape[0] > n else jnp.arange(matrix.shape[0])
-    on = side[rows] != 0
-    target = jnp.where(side[rows] < 0, _finite(lower[rows], side[rows] < 0), _finite(upper[rows], side[rows] > 0))
-    chosen = jnp.where(on[:, None], matrix[rows], 0.0)
+    on = side != 0
+    target = jnp.where(side < 0, _finite(lower, side < 0), _finite(upper, side > 0))
+    chosen = jnp.where(on[:, None], matrix, 0.0)
     longest = jnp.sqrt(jnp.max(jnp.sum(jax.lax.stop_gradient(chosen) ** 2, -1)))
     space, inverse = row_space_and_inverse(product(chosen, projector), nothing * longest, rank, 0.0)
     gap = jnp.where(on, target - apply(chosen, x), 0.0)
