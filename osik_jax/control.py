@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ._joint_selection import concrete, scalar_layout
 from ._sanity import cleaned
+from ._structure import Static, put_together, taken_apart
 from .kinematics import forward_kinematics, integrate
 from .limits import ConfigurationLimit, Limit, limit_box
 from .robot import Robot
@@ -219,8 +220,7 @@ def rollout(
             raise ValueError(
                 f"feedback has shape {feedback.shape}; it is one configuration a tick, {(steps, robot.nq)}"
             )
-    numbers, structure = eqx.partition((tasks if callable(tasks) else dict(tasks), feedback), _is_number)
-    leaves, treedef = jax.tree.flatten(structure)
+    numbers, static = taken_apart((tasks if callable(tasks) else dict(tasks), feedback))
     q0 = _configuration(robot, q0)
     return _rollout(
         robot,
@@ -230,14 +230,9 @@ def rollout(
         tuple(limits),
         _tick(dt, q0),
         targets,
-        static=(tuple(leaves), treedef),
+        static=static,
         steps=steps,
     )
-
-
-def _is_number(leaf: Any) -> bool:
-    """Whether a leaf is traced: arrays, tracers among them, and Python floats; all else is structure."""
-    return eqx.is_array(leaf) or isinstance(leaf, float | np.ndarray | np.generic)
 
 
 @partial(jax.jit, static_argnames=("static", "steps"))
@@ -250,10 +245,10 @@ def _rollout(
     dt: Array | float,
     targets: Targets | None,
     *,
-    static: tuple[tuple[Any, ...], Any],
+    static: Static,
     steps: int,
 ) -> Trajectory:
-    tasks, feedback = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
+    tasks, feedback = put_together(numbers, static)
     time = jnp.arange(steps) * dt
     measured = None if callable(feedback) else feedback
 

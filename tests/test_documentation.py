@@ -16,8 +16,28 @@ ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = [*PAGES, *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "mkdocs.yml"))]
-PACKAGES = ("osik_jax", "osik_jax.solvers", "osik_jax.schemes", "osik_jax.physics", "osik_jax.demo", "osik_jax.viewer")
-OPTIONAL = ("matplotlib", "tyro", "rich", "torch", "pinocchio", "mink", "mediapy", "osik_jax.viewer", "osik_jax.demo")
+PACKAGES = (
+    "osik_jax",
+    "osik_jax.solvers",
+    "osik_jax.schemes",
+    "osik_jax.physics",
+    "osik_jax.demo",
+    "osik_jax.viewer",
+    "osik_jax.tuning",
+)
+OPTIONAL = (
+    "matplotlib",
+    "tyro",
+    "rich",
+    "torch",
+    "pinocchio",
+    "mink",
+    "mediapy",
+    "osik_jax.viewer",
+    "osik_jax.demo",
+    "osik_jax.tuning",
+    "optax",
+)
 
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")

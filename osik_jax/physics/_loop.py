@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..control import Solution, Tasks, _is_number, solve
+from .._structure import is_number
+from ..control import Solution, Tasks, solve
 from ..kinematics import integrate
 from ..limits import Limit
 from ..robot import Robot
@@ -130,7 +131,7 @@ def simulate(
     if steps < 1:
         raise ValueError(f"steps is {steps}; there has to be one tick at least")
     robot = simulation.world.robot
-    numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), _is_number)
+    numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), is_number)
     leaves, treedef = jax.tree.flatten(structure)
     program = partial(_tick, robot, numbers, scheme, tuple(limits), command or Integrated(), np.asarray(dt))
     tick = partial(program, static=(tuple(leaves), treedef))

@@ -1,0 +1,29 @@
+"""A pytree taken apart: its numbers, which are traced, and all else, which a program is compiled for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+Static = tuple[tuple[Any, ...], Any]
+"""Leaves that are no numbers, and the structure that they stand in; hashable."""
+
+
+def is_number(leaf: Any) -> bool:
+    """Whether a leaf is traced: arrays, tracers among them, and Python floats; all else is structure."""
+    return eqx.is_array(leaf) or isinstance(leaf, float | np.ndarray | np.generic)
+
+
+def taken_apart(tree: Any) -> tuple[Any, Static]:
+    """The numbers, as a pytree with None in the place of all else; and all else, to be a static argument of ``jit``."""
+    numbers, structure = eqx.partition(tree, is_number)
+    leaves, treedef = jax.tree.flatten(structure)
+    return numbers, (tuple(leaves), treedef)
+
+
+def put_together(numbers: Any, static: Static) -> Any:
+    """The pytree that ``taken_apart`` took apart."""
+    return eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))

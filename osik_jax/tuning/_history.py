@@ -1,0 +1,136 @@
+"""What tuning went through, and its state on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from ._parameters import ParameterSpace
+
+_FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class History:
+    """One row for each iteration, of the parameters that it began with.
+
+    Attributes:
+        loss: mean over the training scenarios that were kept. (k,)
+        held_out: mean over those held out; NaN where there are none. (k,)
+        dropped: training scenarios that were not kept. (k,)
+        held_out_dropped: likewise of those held out. (k,)
+        gradient_norm: of the mean loss, in the space that the optimiser moves in. (k,)
+        seconds: that the iteration took; the first one compiles. (k,)
+        vectors: the parameters, in that space. (k, p)
+    """
+
+    loss: Float[np.ndarray, " k"]
+    held_out: Float[np.ndarray, " k"]
+    dropped: Int[np.ndarray, " k"]
+    held_out_dropped: Int[np.ndarray, " k"]
+    gradient_norm: Float[np.ndarray, " k"]
+    seconds: Float[np.ndarray, " k"]
+    vectors: Float[np.ndarray, "k p"]
+
+    @classmethod
+    def empty(cls, size: int) -> History:
+        """No iteration, of so many parameters."""
+        none, counts = np.zeros(0), np.zeros(0, int)
+        return cls(none, none, counts, counts, none, none, np.zeros((0, size)))
+
+    def __len__(self) -> int:
+        """Number of iterations."""
+        return len(self.loss)
+
+    def and_then(self, **row: Any) -> History:
+        """With one more iteration."""
+        return History(**{name: np.append(old, np.asarray(row[name])[None], 0) for name, old in vars(self).items()})
+
+    @property
+    def best(self) -> int:
+        """The iteration with the lowest training loss among those that dropped fewest scenarios.
+
+        A loss over fewer scenarios is no better: it may have lost the hard ones.
+        """
+        loss = np.where(np.isfinite(self.loss), self.loss, np.inf)
+        return int(np.lexsort((loss, self.dropped))[0])
+
+    def stale(self, improvement: float) -> int:
+        """Iterations since the best loss last fell by more than this share, or fewer scenarios were dropped."""
+        last, best, fewest = 0, np.inf, np.inf
+        for k, (loss, dropped) in enumerate(zip(self.loss, self.dropped, strict=True)):
+            if dropped < fewest or (dropped == fewest and loss < best * (1.0 - improvement)):
+                last, best, fewest = k, loss, dropped
+        return len(self) - 1 - last
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """All that tuning needs to go on: the next parameters, the optimiser's memory, and what there was.
+
+    Attributes:
+        vector: parameters of the next iteration, in the space that the optimiser moves in. (p,)
+        optimizer: the optimiser's state.
+        history: of the iterations so far.
+    """
+
+    vector: Any
+    optimizer: Any
+    history: History
+
+
+def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace) -> None:
+    """Writes a state as .npz, in the place of an older one only when it is complete."""
+    arrays = {f"history/{name}": value for name, value in vars(state.history).items()}
+    arrays |= {f"optimizer/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state.optimizer))}
+    arrays |= {f"space/{name}": value for name, value in _described(space).items()}
+    whole = Path(path)
+    partial = whole.with_name(f".{whole.name}.partial")
+    with partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, format=_FORMAT, vector=np.asarray(state.vector), **arrays)
+    partial.replace(whole)
+
+
+def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: Any) -> State:
+    """A state that ``save_state`` wrote.
+
+    Args:
+        path: of the file.
+        space: of the parameters; has to be the one that was saved.
+        optimizer: the optimiser's first state, for its structure.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it is of other parameters, or another optimiser.
+    """
+    with np.load(path, allow_pickle=False) as file:
+        arrays = dict(file)
+    if arrays.get("format") != _FORMAT:
+        raise ValueError(f"{os.fspath(path)} is no state of a tuning that this version can read")
+    for name, value in _described(space).items():
+        saved = arrays[f"space/{name}"]
+        if saved.shape != value.shape or not (saved == value).all():
+            raise ValueError(f"the parameters are not those saved in {os.fspath(path)}: {name} {saved}, now {value}")
+    history = History(**{name: arrays[f"history/{name}"] for name in History.__dataclass_fields__})
+    return State(jnp.asarray(arrays["vector"]), _restored(arrays, optimizer, path), history)
+
+
+def _described(space: ParameterSpace) -> dict[str, np.ndarray]:
+    return {"names": np.array(space.names)} | {
+        name: np.asarray(getattr(space, name)) for name in ("log", "lower", "upper", "scale")
+    }
+
+
+def _restored(arrays: dict[str, np.ndarray], optimizer: Any, path: str | os.PathLike[str]) -> Any:
+    leaves, structure = jax.tree.flatten(optimizer)
+    saved = [arrays[f"optimizer/{i}"] for i in range(sum(name.startswith("optimizer/") for name in arrays))]
+    if [leaf.shape for leaf in saved] != [np.shape(leaf) for leaf in leaves]:
+        raise ValueError(f"{os.fspath(path)} was saved with another optimizer: it has arrays of other shapes")
+    return jax.tree.unflatten(structure, [jnp.asarray(new, old.dtype) for new, old in zip(saved, leaves, strict=True)])

@@ -1,0 +1,91 @@
+"""What is tuned: a robot, its tasks, a scheme and limits, run for some time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .._names import leaf_names, replace_named
+from .._structure import is_number
+from ..control import Targets, Tasks, Trajectory, rollout
+from ..limits import Limit
+from ..robot import Robot
+from ..schemes import Scheme
+
+_PARTS = ("robot", "scheme", "limits", "dt")
+
+
+class Loop(eqx.Module):
+    """A closed loop as ``osik_jax.rollout`` runs it: all that has numbers to tune, by name.
+
+    Numbers of tasks are called ``hand.weight``, ``hand.gain`` or ``hand.gain.maximum``; the others ``scheme.damping``,
+    ``limits[1].velocity``, ``robot.body_mass``, ``dt``. A name stands for all numbers under it, and ``*`` for any part
+    of a name up to a dot. ``names`` has all of them.
+
+    Attributes:
+        robot: the robot.
+        tasks: by name; or a function of time that returns them, of which an ``equinox.Module``'s fields have names.
+        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
+        limits: joint position and velocity limits.
+        dt: time of one tick [s].
+        steps: number of ticks (static).
+
+    Raises:
+        ValueError: a task has the name of another part of the loop.
+    """
+
+    robot: Robot
+    tasks: Tasks | Callable[[Array], Tasks]
+    scheme: Scheme
+    limits: tuple[Limit, ...]
+    dt: Float[Array, ""]
+    steps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        robot: Robot,
+        tasks: Tasks | Callable[[Array], Tasks],
+        *,
+        scheme: Scheme,
+        limits: Sequence[Limit] = (),
+        dt: ArrayLike | Array = 0.005,
+        steps: int,
+    ):
+        self.robot, self.scheme, self.limits, self.steps = robot, scheme, tuple(limits), steps
+        self.tasks = tasks if callable(tasks) else dict(tasks)
+        self.dt = jnp.asarray(dt, robot.q0.dtype)
+        taken = [name for name in _PARTS if not callable(tasks) and name in tasks]
+        if taken:
+            raise ValueError(f"a task cannot be called {taken[0]!r}: that is another part of the loop; rename it")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all numbers of the loop."""
+        return tuple(name.removeprefix("tasks.") for name in leaf_names(eqx.filter(self, is_number)))
+
+    def replace(self, values: Mapping[str, Any]) -> Self:
+        """The loop with other numbers, by name: ``loop.replace({"hand.weight": 2.0})``. Signs are not checked.
+
+        Raises:
+            KeyError: no such name; the message lists those that exist.
+            ValueError: a wrong shape, or a number that is given twice.
+        """
+        numbers, rest = eqx.partition(self, is_number)
+        return eqx.combine(replace_named(numbers, self.names, values), rest)
+
+    def rollout(self, q0: Float[Array, " nq"] | None = None, *, targets: Targets | None = None) -> Trajectory:
+        """The loop run from a configuration (default: the robot's home), with targets by tick as ``rollout`` takes."""
+        return rollout(
+            self.robot,
+            self.robot.q0 if q0 is None else q0,
+            self.tasks,
+            scheme=self.scheme,
+            limits=self.limits,
+            dt=self.dt,
+            steps=self.steps,
+            targets=targets,
+        )

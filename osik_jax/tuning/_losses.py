@@ -1,0 +1,181 @@
+"""What a trajectory costs."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .._joint_selection import scalar_layout
+from .._tree import DOF_WIDTH, FREE, unknown_name
+from ..control import Trajectory
+from ..kinematics import center_of_mass, forward_kinematics
+from ..tasks import ComTask, SupportPolygon, Task
+from ._loop import Loop
+
+LossFunction = Callable[[Trajectory, Loop], Float[Array, ""]]
+"""A scalar from one scenario's trajectory and the loop that ran it, its robot, targets and parameters in place."""
+
+
+class Loss(eqx.Module):
+    """Base of the ready losses: a ``LossFunction`` that adds up, ``Tracking("hand") + 0.1 * Smoothness()``."""
+
+    @abc.abstractmethod
+    def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
+        """What one trajectory costs."""
+
+    def __add__(self, other: LossFunction) -> Loss:
+        return WeightedSum((self, other), jnp.ones(2))
+
+    def __radd__(self, other: LossFunction) -> Loss:
+        return WeightedSum((other, self), jnp.ones(2))
+
+    def __mul__(self, factor: ArrayLike | Array) -> Loss:
+        return WeightedSum((self,), jnp.asarray(factor, float)[None])
+
+    __rmul__ = __mul__
+
+
+class WeightedSum(Loss):
+    """Several losses, each times a weight.
+
+    Attributes:
+        losses: functions of a trajectory and a loop, ready ones and others.
+        weights: one for each.
+    """
+
+    losses: tuple[LossFunction, ...]
+    weights: Float[Array, " k"]
+
+    def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
+        """The sum."""
+        return sum(
+            (weight * loss(trajectory, loop) for weight, loss in zip(self.weights, self.losses, strict=True)),
+            start=jnp.zeros((), trajectory.q.dtype),
+        )
+
+
+class Tracking(Loss):
+    """Mean over time of the squared error of tasks, summed over their rows [m^2, rad^2].
+
+    The error of an inequality task is how far its value is outside its bounds. Row weights do not count: they may be
+    what is tuned.
+
+    Attributes:
+        names: of the tasks; none: all of them. (static)
+        after: counts from this time on [s]: for how a motion ends, and not how it gets there.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    after: Float[Array, ""]
+
+    def __init__(self, *names: str, after: ArrayLike | Array = 0.0):
+        self.names, self.after = names, jnp.asarray(after, float)
+
+    def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
+        """The mean squared error."""
+        errors, tasks = trajectory.solution.error, _tasks_in_time(loop, trajectory.time)
+        for name in self.names:
+            if name not in errors:
+                raise unknown_name("task", name, tuple(errors))
+        squares = [_squared_miss(errors[name], tasks[name]) for name in self.names or errors]
+        return _mean_over_time(sum(squares[1:], start=squares[0]), trajectory.time >= self.after - 0.5 * loop.dt)
+
+
+def _tasks_in_time(loop: Loop, time: Float[Array, " steps"]) -> Mapping[str, Task]:
+    """The tasks, those that a function of time gives with one more axis."""
+    return jax.vmap(loop.tasks)(time) if callable(loop.tasks) else loop.tasks
+
+
+def _squared_miss(error: Float[Array, "steps m"], task: Task) -> Float[Array, " steps"]:
+    lower, upper = getattr(task, "lower", None), getattr(task, "upper", None)
+    if isinstance(task, ComTask) and task.polygon is not None:
+        upper = task.polygon.offsets
+    low = error if lower is None and upper is None else jnp.zeros_like(error)
+    if lower is not None:
+        low = jnp.minimum(error - lower, 0.0)
+    high = jnp.zeros_like(error) if upper is None else jnp.maximum(error - upper, 0.0)
+    return jnp.sum(low**2 + high**2, -1)
+
+
+def _mean_over_time(values: Float[Array, " steps"], counted: Array) -> Float[Array, ""]:
+    return jnp.sum(jnp.where(counted, values, 0.0)) / jnp.maximum(jnp.sum(counted), 1)
+
+
+class Smoothness(Loss):
+    """Mean over time of the squared acceleration, summed over v [rad^2/s^4, m^2/s^4], by differences between ticks.
+
+    Attributes:
+        from_rest: whether the first tick counts, with a velocity of zero before it. (static)
+    """
+
+    from_rest: bool = eqx.field(static=True, default=True)
+
+    def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
+        """The mean squared acceleration."""
+        velocity = trajectory.solution.velocity
+        before = jnp.zeros_like(velocity[:1]) if self.from_rest else velocity[:0]
+        change = jnp.diff(jnp.concatenate([before, velocity]), axis=0) / loop.dt
+        return jnp.sum(change**2) / jnp.maximum(change.shape[0], 1)
+
+
+class Effort(Loss):
+    """Mean over time of the squared speed, summed over the joints [rad^2/s^2, m^2/s^2]; a free base has no motor."""
+
+    def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
+        """The mean squared speed."""
+        tree = loop.robot.tree
+        driven = np.concatenate(
+            [np.full(DOF_WIDTH[tree.joint_types[j]], tree.joint_types[j] != FREE) for j in tree.independent]
+        )
+        return jnp.mean(jnp.sum(jnp.where(driven, trajectory.solution.velocity, 0.0) ** 2, -1))
+
+
+class JointLimitDistance(Loss):
+    """How far joints are into a margin before their limits: 0 outside it, 1 for a joint at its limit all the time.
+
+    Mean over time of the squares, summed over the joints that have two limits (the robot's own).
+
+    Attributes:
+        margin: as a share of each joint's range, up to 0.5.
+    """
+
+    margin: Float[Array, ""] = eqx.field(default=0.1, converter=lambda value: jnp.asarray(value, float))
+
+    def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
+        """The mean squared depth in the margin."""
+        robot = loop.robot
+        scalar, index = scalar_layout(robot)
+        lower, upper = robot.position_lower, robot.position_upper
+        limited = scalar & jnp.isfinite(lower) & jnp.isfinite(upper) & (upper > lower)
+        low, high = jnp.where(limited, lower, 0.0), jnp.where(limited, upper, 1.0)
+        share = (trajectory.q[1:, index] - low) / (high - low)
+        depth = jnp.maximum(self.margin - jnp.minimum(share, 1.0 - share), 0.0) / self.margin
+        return jnp.mean(jnp.sum(jnp.where(limited, depth, 0.0) ** 2, -1))
+
+
+class ComMargin(Loss):
+    """How far the centre of mass is into a margin inside a support polygon, or outside: squares, mean over time [m^2].
+
+    Attributes:
+        polygon: see ``osik_jax.support_polygon``.
+        margin: the wanted distance to the edge [m].
+    """
+
+    polygon: SupportPolygon
+    margin: Float[Array, ""] = eqx.field(default=0.02, converter=lambda value: jnp.asarray(value, float))
+
+    def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
+        """The mean squared depth in the margin."""
+
+        def depth(q: Any) -> Float[Array, ""]:
+            point = center_of_mass(loop.robot, forward_kinematics(loop.robot, q))
+            return jnp.maximum(self.margin - self.polygon.distance(point[:2]), 0.0)
+
+        return jnp.mean(jax.lax.map(jax.checkpoint(depth), trajectory.q[1:]) ** 2)

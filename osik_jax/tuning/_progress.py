@@ -1,0 +1,34 @@
+"""A bar with the loss."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+from ._history import History
+
+
+@contextlib.contextmanager
+def reported(iterations: int, *, shown: bool) -> Iterator[Callable[[History], None]]:
+    """A function to tell the history to, after each iteration; it draws a bar if wanted."""
+    if not shown:
+        yield lambda history: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (MofNCompleteColumn(), BarColumn(bar_width=30), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("compiling", total=iterations)
+        yield lambda history: bar.update(task, completed=len(history), description=describe(history))
+
+
+def describe(history: History) -> str:
+    """The last iteration in a line."""
+    if not len(history):
+        return "compiling"
+    parts = [f"loss {history.loss[-1]:.3e}", f"best {history.loss[history.best]:.3e}"]
+    if history.held_out[-1] == history.held_out[-1]:
+        parts.append(f"held out {history.held_out[-1]:.3e}")
+    lost = int(history.dropped[-1] + history.held_out_dropped[-1])
+    return ", ".join(parts + ([f"{lost} dropped"] if lost else []))

@@ -1,0 +1,104 @@
+"""What a loop is tried on: starts, targets, robots, as one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._names import find_leaves, replace_named
+from .._structure import is_number
+from ..control import Trajectory
+from ._loop import Loop
+
+
+class Scenarios(eqx.Module):
+    """Situations that a loop is run in, as a batch: every array has one more axis in front, of the same length.
+
+    ``scenarios[:48]`` and ``scenarios[48:]`` are scenarios too, to train on and to hold out.
+
+    Args:
+        q0: where each begins. (n, nq); default: the robot's home.
+        values: numbers of the loop that differ, by name as in ``Loop``: ``{"hand.target": (positions (n, 3), rotations
+            (n, 3, 3)), "robot.body_mass": masses}``. (n,) numbers for an array: each is repeated.
+        targets: targets that move, by task: what ``rollout`` takes as ``targets``, arrays of shape (n, steps, ...).
+
+    Raises:
+        ValueError: nothing is given, or lengths differ.
+    """
+
+    q0: Float[Array, "n nq"] | None
+    values: dict[str, Any]
+    targets: dict[str, Any]
+
+    def __init__(
+        self,
+        *,
+        q0: Any = None,
+        values: Mapping[str, Any] | None = None,
+        targets: Mapping[str, Any] | None = None,
+    ):
+        self.q0 = None if q0 is None else jnp.asarray(q0, float)
+        self.values = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), dict(values or {}))
+        self.targets = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), dict(targets or {}))
+        lengths = {leaf.shape[:1] for leaf in jax.tree.leaves(self)}
+        if len(lengths) != 1 or lengths & {(), (0,)}:
+            found = ", ".join(str(n[0]) if n else "none" for n in sorted(lengths)) or "nothing is given"
+            raise ValueError(f"scenarios are arrays with one leading axis of one length; lengths: {found}")
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return jax.tree.leaves(self)[0].shape[0]
+
+    def __getitem__(self, which: Any) -> Scenarios:
+        """Some of them: a slice, or an array of indices or of booleans."""
+        if isinstance(which, int):
+            raise TypeError(f"scenarios are many: use [{which} : {which + 1}]")
+        return jax.tree.map(lambda leaf: leaf[which], self)
+
+    def fitted(self, loop: Loop) -> Scenarios:
+        """The same in the precision and shapes of a loop's numbers.
+
+        Raises:
+            KeyError: a name that the loop does not have.
+            ValueError: a wrong shape, or a number that is given twice.
+        """
+        filled = replace_named(eqx.filter(loop, is_number), loop.names, self.values, batched=True)
+        leaves = dict(zip(loop.names, jax.tree.leaves(filled), strict=True))
+        places = [place for name in self.values for place in find_leaves(loop.names, name)]
+        values = {loop.names[place]: leaves[loop.names[place]] for place in places}
+        self._check_targets(loop)
+        q0 = None if self.q0 is None else _starts(self.q0, loop)
+        return eqx.tree_at(lambda s: (s.q0, s.values), self, (q0, values), is_leaf=lambda leaf: leaf is None)
+
+    def _check_targets(self, loop: Loop) -> None:
+        if callable(loop.tasks):
+            if self.targets:
+                raise ValueError("targets go with a dict of tasks; a function of time sets them itself")
+            return
+        for name, target in self.targets.items():
+            if name not in loop.tasks:
+                raise KeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(loop.tasks)}")
+            for leaf in jax.tree.leaves(target):
+                if leaf.shape[1:2] != (loop.steps,):
+                    raise ValueError(
+                        f"targets[{name!r}] has shape {leaf.shape}; it is (n, {loop.steps}, ...), one target a tick. "
+                        f"For targets that stand still: values={{'{name}.target': ...}}"
+                    )
+
+
+def _starts(q0: Array, loop: Loop) -> Float[Array, "n nq"]:
+    """In the precision of the loop; configurations of its robot."""
+    if q0.shape[1:] != (loop.robot.nq,):
+        raise ValueError(f"q0 has shape {q0.shape}, expected (n, {loop.robot.nq})")
+    return q0.astype(loop.robot.q0.dtype)
+
+
+def run_one(loop: Loop, scenario: Scenarios) -> tuple[Trajectory, Loop]:
+    """One scenario (no leading axis): its trajectory, and the loop with its numbers."""
+    own = loop.replace(scenario.values) if scenario.values else loop
+    return own.rollout(scenario.q0, targets=scenario.targets or None), own

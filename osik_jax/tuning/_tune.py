@@ -1,0 +1,242 @@
+"""The tuning itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._structure import Static, put_together, taken_apart
+from ._evaluate import Evaluation, Problem, check_loss, chunk_size
+from ._history import History, State, load_state, save_state
+from ._loop import Loop
+from ._losses import LossFunction
+from ._parameters import Parameter, ParameterSpace, overlap
+from ._progress import reported
+from ._scenarios import Scenarios
+
+try:
+    import optax
+except ImportError as missing:
+    raise ImportError("osik_jax.tuning needs optax: pip install 'osik-jax[tuning]'") from missing
+
+LEARNING_RATE = 0.1
+"""Of the default optimiser: weights and gains change by up to 10 % an iteration."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """What came of a tuning. The best iteration has the lowest training loss; held-out scenarios have no say in it.
+
+    Attributes:
+        loop: with the best parameters; ``loop.tasks``, ``loop.scheme``, ``loop.limits``.
+        parameters: the best ones, by name.
+        loss: the training loss of the best iteration.
+        held_out: the held-out loss of that iteration; NaN if nothing was held out.
+        iteration: which one it was.
+        history: of all iterations.
+        stopped: why there are no more.
+        space: of the parameters.
+        state: to go on from: ``tune(..., resume=tuning)``.
+    """
+
+    loop: Loop
+    parameters: dict[str, float]
+    loss: float
+    held_out: float
+    iteration: int
+    history: History
+    stopped: str
+    space: ParameterSpace
+    state: State
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the state as .npz, to go on from: ``tune(..., resume=path)``."""
+        save_state(path, self.state, self.space)
+
+
+def tune(
+    loss: LossFunction,
+    parameters: Sequence[str | Parameter],
+    scenarios: Scenarios,
+    *,
+    loop: Loop,
+    held_out: Scenarios | None = None,
+    optimizer: optax.GradientTransformation | None = None,
+    iterations: int = 100,
+    patience: int | None = None,
+    improvement: float = 1e-3,
+    chunk: int | None = None,
+    resume: Tuning | str | os.PathLike[str] | None = None,
+    save: str | os.PathLike[str] | None = None,
+    progress: bool = True,
+    callback: Callable[[History], None] | None = None,
+) -> Tuning:
+    """Lowers the mean loss of a closed loop over scenarios, by the gradient through its rollouts.
+
+    Args:
+        loss: a function of a scenario's trajectory and of its loop: ready ones such as ``Tracking("hand")`` and sums of
+            them, or your own.
+        parameters: names of numbers of the loop, or ``Parameter``s with bounds.
+        scenarios: to train on.
+        loop: what is tuned, with the numbers to begin at.
+        held_out: scenarios whose loss is reported and used for nothing.
+        optimizer: any of optax's, or a chain of them; also those that ask for values, as line searches do.
+            Default: ``optax.adam(LEARNING_RATE)``.
+        iterations: gradients taken, those of a resumed state among them.
+        patience: stops after so many iterations without a better training loss; None: never.
+        improvement: a share by which a loss has to be lower to be better, for ``patience``.
+        chunk: scenarios that run at a time. Fewer take less memory. Default: 64 on a CPU, all elsewhere.
+        resume: goes on from this result, or from a file that ``save`` wrote; the loss, the scenarios and the numbers
+            that are not tuned may be others, the parameters and the optimiser may not.
+        save: a .npz file, written after each iteration.
+        progress: whether to show a bar with the loss.
+        callback: told the history after each iteration.
+
+    Returns:
+        The best loop and what there was on the way. A scenario whose loss or gradient is not finite, or in which a
+        tick failed on a NaN, is left out of that iteration's mean, and counted in ``history.dropped``.
+
+    Raises:
+        KeyError: a name that does not exist; the message lists those that do.
+        TypeError: an argument of the wrong kind.
+        ValueError: parameters, bounds, scenarios or a saved state that do not fit; no training scenario can be kept.
+    """
+    check_loss(loss)
+    space = ParameterSpace(loop, parameters)
+    overlap(space, loop, scenarios.values | (held_out.values if held_out is not None else {}))
+    rule = _optimizer(optimizer)
+    state = _first_state(space, rule, resume)
+    step = _compiled_step(Problem(loss, loop, space), scenarios, held_out, rule, chunk)
+    stopped = "iterations"
+    with reported(iterations, shown=progress) as show:
+        show(state.history)
+        while len(state.history) < iterations:
+            state = step(state)
+            if save is not None:
+                save_state(save, state, space)
+            show(state.history)
+            if callback is not None:
+                callback(state.history)
+            if patience is not None and state.history.stale(improvement) >= patience:
+                stopped = "patience"
+                break
+    return _result(loop, space, state, stopped)
+
+
+def _optimizer(given: Any) -> optax.GradientTransformationExtraArgs:
+    if given is None:
+        return _default_optimizer
+    if not (callable(getattr(given, "init", None)) and callable(getattr(given, "update", None))):
+        raise TypeError(f"optimizer is {given!r}; it is an optax.GradientTransformation, such as optax.adam(0.1)")
+    return optax.with_extra_args_support(given)
+
+
+_default_optimizer = optax.with_extra_args_support(optax.adam(LEARNING_RATE))
+
+
+def _first_state(space: ParameterSpace, optimizer: optax.GradientTransformationExtraArgs, resume: Any) -> State:
+    fresh = State(space.initial, optimizer.init(space.initial), History.empty(len(space.names)))
+    if resume is None:
+        return fresh
+    if not isinstance(resume, Tuning):
+        return load_state(resume, space, fresh.optimizer)
+    if resume.space.names != space.names:
+        raise ValueError(f"the parameters are not those to resume: {resume.space.names}, now {space.names}")
+    if jax.tree.structure(resume.state.optimizer) != jax.tree.structure(fresh.optimizer):
+        raise ValueError("the optimizer is not the one to resume: its state has another structure")
+    return resume.state
+
+
+def _compiled_step(
+    problem: Problem,
+    scenarios: Scenarios,
+    held_out: Scenarios | None,
+    optimizer: optax.GradientTransformationExtraArgs,
+    chunk: int | None,
+) -> Callable[[State], State]:
+    """One iteration, on the host."""
+    numbers, static = taken_apart(problem)
+    batches = [each.fitted(problem.loop) for each in (scenarios, *([] if held_out is None else [held_out]))]
+    chunks = tuple(chunk_size(chunk, len(each)) for each in batches)
+
+    def step(state: State) -> State:
+        start = time.perf_counter()
+        vector, memory, row = _step(
+            numbers, state.vector, state.optimizer, batches, static=static, chunks=chunks, optimizer=optimizer
+        )
+        row = {name: np.asarray(value) for name, value in row.items()}
+        if row["dropped"] == len(scenarios):
+            raise ValueError(
+                f"no training scenario can be kept in iteration {len(state.history)}: each has a loss or gradient "
+                "that is not finite, or a tick that failed on a NaN; look at it with osik_jax.tuning.evaluate"
+            )
+        seconds = time.perf_counter() - start
+        history = state.history.and_then(**row, vectors=np.asarray(state.vector), seconds=seconds)
+        return State(vector, memory, history)
+
+    return step
+
+
+@partial(jax.jit, static_argnames=("static", "chunks", "optimizer"))
+def _step(
+    numbers: Any,
+    vector: Float[Array, " p"],
+    memory: Any,
+    batches: list[Scenarios],
+    *,
+    static: Static,
+    chunks: tuple[int, ...],
+    optimizer: optax.GradientTransformationExtraArgs,
+) -> tuple[Array, Any, dict[str, Array]]:
+    """The next vector and optimiser's state, and the row of the history."""
+    problem: Problem = put_together(numbers, static)
+    trained, gradient = problem.slope(vector, batches[0], chunks[0])
+    held = (
+        problem.value(vector, batches[1], chunks[1])
+        if len(batches) > 1
+        else Evaluation(jnp.zeros(0), jnp.zeros(0, bool))
+    )
+
+    def objective(other: Float[Array, " p"]) -> Float[Array, ""]:
+        tried = problem.value(other, batches[0], chunks[0])
+        worse = (trained.kept & ~tried.kept).any()
+        mean = jnp.sum(jnp.where(trained.kept, tried.losses, 0.0)) / jnp.maximum(jnp.sum(trained.kept), 1)
+        return jnp.where(worse, jnp.inf, mean)
+
+    updates, memory = optimizer.update(gradient, memory, vector, value=trained.loss, grad=gradient, value_fn=objective)
+    row = {
+        "loss": trained.loss,
+        "held_out": held.loss,
+        "dropped": trained.dropped,
+        "held_out_dropped": held.dropped,
+        "gradient_norm": jnp.linalg.norm(gradient),
+    }
+    return vector + updates, memory, row
+
+
+def _result(loop: Loop, space: ParameterSpace, state: State, stopped: str) -> Tuning:
+    history = state.history
+    if not len(history):
+        raise ValueError("iterations is 0: there is nothing to report")
+    best = history.best
+    vector = jnp.asarray(history.vectors[best])
+    return Tuning(
+        loop=space.apply(loop, vector),
+        parameters=space.by_name(vector),
+        loss=float(history.loss[best]),
+        held_out=float(history.held_out[best]),
+        iteration=best,
+        history=history,
+        stopped=stopped,
+        space=space,
+        state=state,
+    )
