@@ -13,7 +13,6 @@ import fnmatch
 import json
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -31,6 +30,8 @@ FEET = {"left_foot": "l_sole", "right_foot": "r_sole"}
 HANDS = {"left_hand": "l_gripper", "right_hand": "r_gripper"}
 COST_OF_A_GRADIENT = 3
 """In rollouts."""
+FAILED = 1e9
+"""What CMA-ES is told where no scenario can be kept."""
 
 
 class Experiment(NamedTuple):
@@ -130,32 +131,24 @@ def by_gradient(experiment: Experiment, iterations: int, **options: Any) -> tuni
     return tuning.tune(loss, names, training, loop=loop, held_out=held_out, iterations=iterations, **options)
 
 
-def population_cost(experiment: Experiment) -> tuple[Callable[[Any], jax.Array], tuning.ParameterSpace]:
-    """The training losses of many vectors of parameters, compiled once, and their space."""
+def by_cma(
+    experiment: Experiment, evaluations: int, *, sigma: float = 0.5, seed: int = 1
+) -> tuple[np.ndarray, tuning.Loop]:
+    """CMA-ES from the same start in the same space: the best training loss after each evaluation, and the best loop."""
     loss, names, loop, training, _ = experiment
     space = tuning.ParameterSpace(loop, names)
-
-    def cost(vector: jax.Array) -> jax.Array:
-        return tuning.evaluate(loss, space.apply(loop, vector), training).loss
-
-    return jax.jit(lambda vectors: jax.lax.map(cost, vectors)), space
-
-
-def by_cma(
-    cost: Callable[[Any], jax.Array], start: Any, evaluations: int, *, sigma: float = 0.5, seed: int = 1
-) -> tuple[np.ndarray, np.ndarray]:
-    """CMA-ES from the same start in the same space: the best loss after each evaluation, and the best vector."""
-    search = cma.CMAEvolutionStrategy(np.asarray(start), sigma, {"seed": seed, "verbose": -9})
-    best, vector, curve = np.inf, np.asarray(start), []
+    search = cma.CMAEvolutionStrategy(np.asarray(space.initial), sigma, {"seed": seed, "verbose": -9})
+    best, found, curve = np.inf, loop, []
     while len(curve) < evaluations:
-        asked = np.array(search.ask())
-        costs = np.nan_to_num(np.asarray(cost(asked)), nan=1e9)
-        search.tell(list(asked), costs.tolist())
-        for own, value in zip(asked, costs, strict=True):
+        asked, costs = search.ask(), []
+        for vector in asked:
+            tried = space.apply(loop, jnp.asarray(vector))
+            costs.append(float(jnp.nan_to_num(tuning.evaluate(loss, tried, training).loss, nan=FAILED)))
             if len(curve) < evaluations:
-                vector, best = (own, value) if value < best else (vector, best)
+                best, found = (costs[-1], tried) if costs[-1] < best else (best, found)
                 curve.append(best)
-    return np.array(curve), vector
+        search.tell(asked, costs)
+    return np.array(curve), found
 
 
 def compare(
@@ -194,11 +187,10 @@ def compare(
         },
         "tuned": tuned.parameters,
     }
-    losses, space = population_cost(experiment)
     for cost in costs:
         started, evaluations = time.perf_counter(), cost * iterations
-        runs = [by_cma(losses, space.initial, evaluations, seed=seed + 1) for seed in range(seeds)]
-        judged = [float(judge(space.apply(loop, jnp.asarray(found))).loss) for _, found in runs]
+        runs = [by_cma(experiment, evaluations, seed=seed + 1) for seed in range(seeds)]
+        judged = [float(judge(found).loss) for _, found in runs]
         out["cma" if cost == 1 else f"cma x {cost}"] = {
             "rollouts": evaluations * len(training),
             "training_loss": float(np.median([curve[-1] for curve, _ in runs])),
