@@ -8,57 +8,100 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ._dense import product
+from ._dense import apply, product
 
 
 @jax.custom_jvp
-def row_space_and_inverse(
-    matrix: Float[Array, "m n"], cutoff: Array | float, most: Int[Array, ""] | int, damping: Array | float
-) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
-    """Orthogonal projector onto what the rows span, and damped inverse, of the largest singular values.
+def row_space_and_motion(
+    matrix: Float[Array, "m n"], wanted: Float[Array, " m"], cutoff: Float[Array, ""], damping: Float[Array, ""]
+) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """Orthogonal projector onto what the rows span, and the damped motion that they ask for.
 
-    Those up to the cutoff are left out, and those beyond the first ``most``. The projector comes from singular vectors
-    and not from an inverse, so that it is one to the last digit however small the singular values are. Derivatives are
-    those at constant rank.
+    Singular values up to the cutoff are left out. The projector comes from singular vectors and not from an inverse, so
+    that it is one to the last digit however small the singular values are. Derivatives are those at constant rank.
     """
-    space, _, damped = _factors(matrix, cutoff, most, damping)
-    return space, damped
+    space, _, damped = _by_singular_values(matrix, cutoff, damping)
+    return space, apply(damped, wanted)
 
 
-def _factors(
-    matrix: Array, cutoff: Array | float, most: Array | int, damping: Array | float
-) -> tuple[Array, Array, Array]:
+def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    real = (s > cutoff) & (jnp.arange(len(s)) < most)
+    real = s > cutoff
     vt, s = jnp.where(real[:, None], vt, 0.0), jnp.where(real, s, 1.0)
     plain, damped = (product(vt.T * factor, u.T) for factor in (1.0 / s, s / (s**2 + damping)))
     return product(vt.T, vt), plain, damped
 
 
-@row_space_and_inverse.defjvp
-def _row_space_and_inverse_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    (a, cutoff, most, damping), (da, *_, d_damping) = primals, tangents
-    space, plain, damped = _factors(a, cutoff, most, damping)
-    turn = product(plain, da)
+@row_space_and_motion.defjvp
+def _row_space_and_motion_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+    (a, wanted, cutoff, damping), (da, d_wanted, _, d_damping) = primals, tangents
+    space, X, D = _by_singular_values(a, cutoff, damping)
+    y = apply(D, wanted)
+    z = apply(X.T, y)
+    pull = d_damping * apply(X, z) + damping * (_inverse_rate(a, X, da, z) + apply(X, _transposed_rate(a, X, da, y)))
+    moved = _inverse_rate(a, X, da, wanted) - pull
+    rate = moved - damping * apply(D, apply(X.T, moved))  # D solves (I + damping X X') D = X
+    return (space, y), (_space_rate(space, X, da), rate + apply(D, d_wanted))
+
+
+@jax.custom_jvp
+def row_space_and_motion_of_rank(
+    matrix: Float[Array, "m n"], wanted: Float[Array, " m"], rank: Int[Array, ""], cutoff: Float[Array, ""]
+) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """The same without damping, of as many pivots as the rank says, but for those up to the cutoff."""
+    space, inverse = _by_pivots(matrix, rank, cutoff)
+    return space, apply(inverse, wanted)
+
+
+def _by_pivots(matrix: Array, rank: Array, cutoff: Array) -> tuple[Array, Array]:
+    """From a complete orthogonal factorisation, matrix = permutation U S' Q'."""
+    m, n = matrix.shape
+    Q, R, order = jax.scipy.linalg.qr(matrix.T, mode="economic", pivoting=True)
+    pivots = jnp.abs(jnp.diagonal(R))
+    keep = (jnp.arange(min(m, n)) < rank) & (pivots > cutoff)
+    Q = jnp.where(keep, Q, 0.0)
+    U, S = jnp.linalg.qr(jnp.where(keep[:, None], R, 0.0).T)
+    S = jnp.where(keep[:, None] & keep[None, :], S, jnp.eye(len(keep), dtype=S.dtype))
+    solved = jax.scipy.linalg.solve_triangular(S, jnp.where(keep[:, None], U.T, 0.0))
+    inverse = jnp.zeros((n, m), matrix.dtype).at[:, order].set(product(Q, solved))
+    return product(Q, Q.T), inverse
+
+
+@row_space_and_motion_of_rank.defjvp
+def _row_space_and_motion_of_rank_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+    (a, wanted, rank, cutoff), (da, d_wanted, *_) = primals, tangents
+    space, X = _by_pivots(a, rank, cutoff)
+    rate = _inverse_rate(a, X, da, wanted) + apply(X, d_wanted)
+    return (space, apply(X, wanted)), (_space_rate(space, X, da), rate)
+
+
+def _space_rate(space: Float[Array, "n n"], X: Float[Array, "n m"], da: Float[Array, "m n"]) -> Float[Array, "n n"]:
+    turn = product(X, da)
     turn = turn - product(turn, space)
-    d_damped = _damped_rate(a, plain, damped, damping, da, d_damping)
-    return (space, damped), (turn + turn.T, d_damped)
+    return turn + turn.T
 
 
-def _damped_rate(
-    a: Float[Array, "m n"], X: Float[Array, "n m"], D: Float[Array, "n m"], d: Array, da: Array, dd: Array
-) -> Float[Array, "n m"]:
-    """Rate of the damped inverse D of a, at constant rank, X being the Moore-Penrose inverse.
+def _inverse_rate(
+    a: Float[Array, "m n"], X: Float[Array, "n m"], da: Float[Array, "m n"], w: Float[Array, " m"]
+) -> Float[Array, " n"]:
+    """Rate of X w, X being the Moore-Penrose inverse of a, at constant rank.
 
-    D solves (I + d X X') D = X, whose rate is from
     G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973.
     """
-    wide = product(X, product(X.T, da.T))
-    tall = product(product(da.T, X.T), X)
-    dX = wide - product(product(wide, a), X) + tall - product(X, product(a, tall)) - product(product(X, da), X)
-    moved = dd * product(X, product(X.T, D)) + d * (product(dX, product(X.T, D)) + product(X, product(dX.T, D)))
-    dD = dX - moved
-    return dD - d * product(D, product(X.T, dD))  # (I + d X X')^-1 = I - d D X'
+    x = apply(X, w)
+    wide = apply(X, apply(X.T, apply(da.T, w - apply(a, x))))
+    tall = apply(da.T, apply(X.T, x))
+    return wide + tall - apply(X, apply(a, tall)) - apply(X, apply(da, x))
+
+
+def _transposed_rate(
+    a: Float[Array, "m n"], X: Float[Array, "n m"], da: Float[Array, "m n"], v: Float[Array, " n"]
+) -> Float[Array, " m"]:
+    """Rate of X' v."""
+    y = apply(X.T, v)
+    wide = apply(da, apply(X, y))
+    tall = apply(X.T, apply(X, apply(da, v - apply(X, apply(a, v)))))
+    return wide - apply(a, apply(X, wide)) + tall - apply(X.T, apply(da.T, y))
 
 
 @jax.custom_jvp

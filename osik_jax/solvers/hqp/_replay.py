@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._dense import apply, product
-from .._inverses import row_space_and_inverse
+from .._inverses import row_space_and_motion_of_rank
 from ._problem import Level
 from ._stack import Stack
 
@@ -50,17 +50,16 @@ def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, " n"]:
-    h, n = stack.hard.shape
+    n = stack.hard.shape[1]
     hard = (stack.hard, stack.hard_lower, stack.hard_upper)
-    pinned = jnp.pad(jnp.where(stack.hard_lower == stack.hard_upper, -1, 0)[:n], (0, h - n))
-    eye = jnp.eye(n, dtype=stack.hard.dtype)
+    pinned = stack.hard_lower[:n] == stack.hard_upper[:n]
 
     def descend(state: tuple[Array, Array], now: tuple[Decision, Level]) -> tuple[tuple[Array, Array], None]:
         decision, level = now
         state = _block(*_independent(*hard, decision.tight), n, *state, nothing)
         return _block(level.matrix, level.lower, level.upper, decision.counts, decision.rank, *state, nothing), None
 
-    start = _block(*_independent(*hard, pinned), n, jnp.zeros_like(eye[0]), eye, nothing)
+    start = jnp.where(pinned, stack.hard_lower[:n], 0.0), jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(stack.hard.dtype))
     return jax.lax.scan(descend, start, (decisions, stack.levels))[0][0]
 
 
@@ -85,10 +84,10 @@ def _block(
     target = jnp.where(side < 0, _finite(lower, side < 0), _finite(upper, side > 0))
     chosen = jnp.where(on[:, None], matrix, 0.0)
     longest = jnp.sqrt(jnp.max(jnp.sum(jax.lax.stop_gradient(chosen) ** 2, -1)))
-    space, inverse = row_space_and_inverse(product(chosen, projector), nothing * longest, rank, 0.0)
     gap = jnp.where(on, target - apply(chosen, x), 0.0)
+    space, motion = row_space_and_motion_of_rank(product(chosen, projector), gap, rank, nothing * longest)
     # as in the projection (eq. 7): rounding over small singular values has left the projector's range
-    return x + apply(projector, apply(inverse, gap)), projector - product(projector, product(space, projector))
+    return x + apply(projector, motion), projector - product(projector, product(space, projector))
 
 
 def _finite(bound: Array, used: Array) -> Array:

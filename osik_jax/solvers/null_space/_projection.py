@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._dense import apply, product
-from .._inverses import row_space_and_inverse
+from .._inverses import row_space_and_motion
 from ..hqp import Level
 from ._problem import Demand
 
@@ -41,7 +41,6 @@ def level_motion(
     if not level.matrix.shape[0]:
         return jnp.zeros_like(x), projector
     demand = Demand.of(level, x, rank)
-    space, damped = row_space_and_inverse(product(demand.rows, projector), demand.cutoff, len(x), damping)
+    space, motion = row_space_and_motion(product(demand.rows, projector), demand.wanted, demand.cutoff, damping)
     # what rounding adds outside the projector's range, as much more as singular values are small, is taken off again
-    motion = apply(projector, apply(damped, demand.wanted))
-    return motion, projector - product(projector, product(space, projector))
+    return apply(projector, motion), projector - product(projector, product(space, projector))

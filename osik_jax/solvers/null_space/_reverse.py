@@ -29,7 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._dense import apply, product
-from .._inverses import regularised_inverse, row_space_and_inverse
+from .._inverses import regularised_inverse, row_space_and_motion
 from ..hqp import Level
 from ._problem import Demand
 
@@ -44,13 +44,13 @@ def solve_reverse(
         if not level.matrix.shape[0]:
             continue
         demand = Demand.of(level, x, rank)
-        space, damped = row_space_and_inverse(demand.rows, demand.cutoff, len(x), damping)
-        x = x + _least_disturbing(apply(damped, demand.wanted), eye - space, below, damping, rank)
+        space, motion = row_space_and_motion(demand.rows, demand.wanted, demand.cutoff, damping)
+        x = x + _least_disturbing(motion, eye - space, below, damping, rank)
         below.append(demand.rows)
     if not below:
         return x, eye
     rows = jnp.concatenate(below)
-    return x, eye - row_space_and_inverse(rows, _cutoff(rows, rank), rows.shape[1], damping)[0]
+    return x, eye - row_space_and_motion(rows, jnp.zeros(len(rows), x.dtype), _cutoff(rows, rank), damping)[0]
 
 
 def _least_disturbing(
