@@ -126,11 +126,13 @@ def _descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances,
         as_it_is = _skip(cascade, task)
 
         def solve() -> tuple[_Cascade, _Outcome]:
-            return choose(free, _descend(cascade, task, free, tolerances=tolerances, guess=guess, cap=cap), as_it_is)
+            new = _descend(cascade, task, free, tolerances=tolerances, guess=guess, known=known, cap=cap)
+            return choose(free, new, as_it_is)
 
         return jax.lax.cond(jnp.any(free), solve, lambda: as_it_is)
 
     first = jax.vmap(_start)(stack)
+    known = None if warm is None else jnp.any(warm.own != 0, (1, 2))  # that of a solution has at least the last level's
     levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (stack.levels, warm))
     numbers = jnp.arange(layout.levels)
     cascade, outcomes = jax.lax.scan(descend, first, (numbers, levels, guesses))
@@ -185,10 +187,11 @@ def _descend(
     *,
     tolerances: Tolerances,
     guess: WorkingSet | None,
+    known: Bool[Array, " B"] | None,
     cap: int,
 ) -> tuple[_Cascade, _Outcome]:
     """Solves one more level in the lanes that want it, and freezes what it decides."""
-    best, changes, factorizations = _land(task, wanted, tolerances, guess, cap)
+    best, changes, factorizations = _land(task, wanted, tolerances, guess, known, cap)
 
     def by_hand() -> tuple[LevelState, Array]:
         start = jax.vmap(_by_hand_from)(task, cascade.side, best, tolerances)
@@ -213,7 +216,12 @@ class _Attempts(NamedTuple):
 
 
 def _land(
-    task: Task, wanted: Bool[Array, " B"], tolerances: Tolerances, guess: WorkingSet | None, cap: int
+    task: Task,
+    wanted: Bool[Array, " B"],
+    tolerances: Tolerances,
+    guess: WorkingSet | None,
+    known: Bool[Array, " B"] | None,
+    cap: int,
 ) -> tuple[Landing, Int[Array, " B"], Int[Array, " B"]]:
     """Lands where the warm start says and, in the lanes where that is not the optimum, where the dual method says."""
 
@@ -230,8 +238,9 @@ def _land(
 
         x, working, changes = proposed() if guess is None else jax.lax.cond(s.count == 0, named, proposed)
         landed = jax.vmap(land)(task, x, working, tolerances)
-        spent = jnp.where(s.best.optimal, 0, 2 + s.count)  # a proposal has factored the damped level
-        best = choose(s.best.optimal, s.best, landed)
+        skipped = s.best.optimal if known is None else s.best.optimal | ((s.count == 0) & ~known)
+        spent = jnp.where(skipped, 0, 2 + s.count)  # a proposal has factored the damped level
+        best = choose(skipped, s.best, landed)
         return _Attempts(s.count + 1, best, s.changes + changes, s.factorizations + spent)
 
     none = jnp.zeros(len(wanted), jnp.int32)
@@ -241,13 +250,11 @@ def _land(
 
 
 def _usable(task: Task, warm: WorkingSet) -> WorkingSet:
-    """The warm start as far as its bounds exist; for one of zeros, the rows that miss their interval now."""
-    level, value = task.level, apply(task.level.matrix, task.x)
-    known = jnp.any(warm.hard != 0) | jnp.any(warm.own != 0)
-    missed = jnp.where(value < level.lower, -1, jnp.where(value > level.upper, 1, 0))
+    """The warm start as far as its bounds exist."""
+    level = task.level
     named = jnp.sign(warm.own)
     named = jnp.where(jnp.isfinite(jnp.where(named < 0, level.lower, level.upper)), named, 0)
-    own = jnp.where(level.lower == level.upper, 2, jnp.where(known, named, missed))
+    own = jnp.where(level.lower == level.upper, 2, named)
     side = jnp.sign(warm.hard)
     side = jnp.where(task.free & jnp.isfinite(jnp.where(side < 0, task.lower, task.upper)), side, 0)
     return WorkingSet(side.astype(jnp.int32), own.astype(jnp.int32))
