@@ -53,14 +53,7 @@ def nao_reaching(*, training: int = 32, held_out: int = 32, steps: int = 75, dt:
     tasks["torso"] = osik.FrameTask(robot, "torso", rows="orientation")
     tasks |= {name: osik.FrameTask(robot, hand, rows="position") for name, hand in HANDS.items()}
     tasks["posture"] = osik.PostureTask(robot)
-    loop = tuning.Loop(
-        robot,
-        tasks,
-        scheme=osik.WeightedQP(damping=1e-6),
-        limits=(osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)),
-        dt=dt,
-        steps=steps,
-    )
+    loop = loop_of(robot, tasks, dt, steps)
     loss = (
         tuning.Tracking(*HANDS, after=0.5 * steps * dt)
         + 10.0 * tuning.Tracking(*FEET)
@@ -80,18 +73,17 @@ def arm_reaching(*, training: int = 8, held_out: int = 8, steps: int = 30, dt: f
         "elbow": osik.FrameTask(robot, "link4", rows="position"),
         "posture": osik.PostureTask(robot),
     }
-    loop = tuning.Loop(
-        robot,
-        tasks,
-        scheme=osik.WeightedQP(damping=1e-6),
-        limits=(osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)),
-        dt=dt,
-        steps=steps,
-    )
+    loop = loop_of(robot, tasks, dt, steps)
     loss = tuning.Tracking("hand", after=0.5 * steps * dt) + 1e-6 * tuning.Smoothness()
     both = reachable(robot, ("*",), {"hand": "hand"}, training + held_out, spread=0.3)
 
     return Experiment(loss, parameters(tasks, dt), loop, both[:training], both[training:])
+
+
+def loop_of(robot: osik.Robot, tasks: dict[str, osik.Task], dt: float, steps: int) -> tuning.Loop:
+    """The closed loop that is tuned: weighted tasks inside joint position and velocity limits."""
+    limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)
+    return tuning.Loop(robot, tasks, scheme=osik.WeightedQP(damping=1e-6), limits=limits, dt=dt, steps=steps)
 
 
 def parameters(tasks: dict[str, osik.Task], dt: float) -> list[str | tuning.Parameter]:

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from rich.markup import escape
 from rich.table import Table
 
 from ..physics import World
 from ..viewer import Panel
 from ._motion import Motion
 from ._physics import FEEDBACK_GAIN, PhysicsMeasurement, PhysicsRun
-from ._report import inside, limit_count, number, report, solved
+from ._report import inside, limit_count, number, report, solved, table_of_schemes
 from ._schemes import TITLES
 
 HEIGHT, TILT, SLIP = 0.01, float(np.radians(3.0)), 0.005
@@ -82,13 +81,7 @@ def reached(physics: PhysicsMeasurement) -> dict[str, bool]:
 def physics_table(summary: Mapping[str, Any]) -> Table:
     """What each scheme reached with dynamics; red: not what it has to be."""
     schemes = list(summary["schemes"].values())
-    out = Table(title=f"{summary['title']}, with dynamics", title_justify="left", title_style="bold")
-    out.add_column("")
-    for scheme in schemes:
-        out.add_column(scheme["title"], justify="right")
-    for label, cell in _rows(schemes[0]):
-        out.add_row(escape(label), *(cell(scheme) for scheme in schemes))
-    return out
+    return table_of_schemes(f"{summary['title']}, with dynamics", schemes, _rows(schemes[0]))
 
 
 def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -104,13 +97,7 @@ def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
         ("greatest torque, of its limit", lambda s: number(s["physics"]["greatest_part_of_torque_limit"], None)),
         ("  in", lambda s: s["physics"]["busiest_joint"]),
         ("servo ticks at the limit", lambda s: str(s["physics"]["servo_ticks_at_limit"])),
-        *(
-            (
-                f"{label.replace('_', ' ')}, from path [mm]",
-                lambda s, k=label: number(s["goals"][k]["position_mm"], None),
-            )
-            for label in example["goals"]
-        ),
+        *(_goal_row(label) for label in example["goals"]),
         ("velocity limits broken", lambda s: limit_count(s["limits"]["velocity_violations"])),
         ("ticks solved", lambda s: solved(s["solver"]["status"])),
         ("a tick, MuJoCo and records too [µs]", lambda s: f"{s['solver']['microseconds_per_tick']:.0f}"),

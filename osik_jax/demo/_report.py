@@ -178,11 +178,16 @@ def _reached(motion: Motion, m: Measurement) -> dict[str, bool]:
 def table(summary: Mapping[str, Any]) -> Table:
     """The same for people: what each scheme reached."""
     schemes = list(summary["schemes"].values())
-    out = Table(title=summary["title"], title_justify="left", title_style="bold")
+    return table_of_schemes(summary["title"], schemes, _rows(schemes[0]))
+
+
+def table_of_schemes(title: str, schemes: Sequence[Mapping[str, Any]], rows: Sequence[tuple[str, Any]]) -> Table:
+    """A column for each scheme; of each row the label, and a function from a scheme's figures to what its cell says."""
+    out = Table(title=title, title_justify="left", title_style="bold")
     out.add_column("")
     for scheme in schemes:
         out.add_column(scheme["title"], justify="right")
-    for label, cell in _rows(schemes[0]):
+    for label, cell in rows:
         out.add_row(escape(label), *(cell(scheme) for scheme in schemes))
     return out
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
-
-from ._dense import clip_to_box
 
 
 @jax.custom_jvp
@@ -21,3 +20,8 @@ def inside(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array,
 @inside.defjvp
 def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
     return inside(*primals), tangents[0]
+
+
+def clip_to_box(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
+    """x in [lower, upper]; a bound that is none (NaN, an infinity on the wrong side) is passed over."""
+    return jnp.clip(x, jnp.where(lower < jnp.inf, lower, -jnp.inf), jnp.where(upper > -jnp.inf, upper, jnp.inf))

@@ -14,8 +14,3 @@ def product(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n
 def apply(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
     """The vector a x."""
     return jnp.matmul(a, x, precision="highest")
-
-
-def clip_to_box(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
-    """x in [lower, upper]; a bound that is none (NaN, an infinity on the wrong side) is passed over."""
-    return jnp.clip(x, jnp.where(lower < jnp.inf, lower, -jnp.inf), jnp.where(upper > -jnp.inf, upper, jnp.inf))

@@ -268,14 +268,7 @@ def _at(landing: Landing) -> LevelState:
 
 def _by_hand_from(task: Task, side: Int[Array, " h"], landing: Landing, tolerances: Tolerances) -> LevelState:
     """Where the landing is feasible, from there; else from where the level above ended."""
-    before = _at(landing)._replace(
-        x=task.x,
-        side=independent(task, side, tolerances.rank),
-        multiplier=jnp.zeros_like(landing.multiplier),
-        counts=jnp.zeros_like(landing.counts),
-        rank=jnp.zeros_like(landing.rank),
-        residual=jnp.zeros_like(landing.residual),
-    )
+    before = _at(nothing_landed(task))._replace(side=independent(task, side, tolerances.rank))
     return jax.tree.map(lambda a, b: jnp.where(landing.feasible, a, b), _at(landing), before)
 
 

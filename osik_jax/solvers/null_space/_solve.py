@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .._dense import clip_to_box
+from .._box import clip_to_box
 from .._status import Status
 from ..hqp import Level
 from ._problem import RANK, NullSpaceSolution, sane
