@@ -1,0 +1,280 @@
+"""Ticks a second of the closed loop against the size of the batch, on the default device.
+
+    python -m benchmarks.throughput [results.json] [--robot nao] [--batches 1,64,1024] [--schemes weighted,...]
+                                    [--precisions float64,float32]
+
+NAO stands on both feet, keeps its centre of mass and reaches with one hand, each lane from other angles of its arms and
+for another point; joint position and velocity limits, dt 5 ms. One call is one jitted, vmapped tick: solve, integrate,
+warm start carried on. A call is timed alone and blocked until ready; ``seconds`` is the median.
+
+``error`` is the largest difference of any task's error [m or rad] to float64 on the CPU, in the first lanes, after the
+same ticks. ``program_bytes`` is what XLA allots to the program, with its arguments and results; ``device_peak_bytes``
+the most that the device has held in this process, where it says so. A sweep ends where a call would take too long or
+memory runs out. A results file keeps its rows of other schemes, precisions and batches, so a sweep may be run in parts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable, Collection, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import osik_jax as osik
+
+SCHEMES = {"weighted": osik.WeightedQP, "null-space": osik.NullSpace, "hierarchical": osik.HierarchicalQP}
+PRECISIONS = ("float64", "float32")
+BATCHES = (1, 16, 64, 256, 1024, 4096, 16384, 65536)
+FRAMES = {"nao": (("l_sole", "r_sole"), "l_gripper"), "arm7": ((), "hand")}
+"""Of each robot: feet and hand."""
+ARMS = ("Shoulder", "Elbow", "joint")
+"""Parts of the names of the joints that differ from lane to lane."""
+DT = 0.005
+LANES = 64
+"""Different situations; larger batches repeat them."""
+CHECKED = 10
+"""Ticks after which errors are compared; they warm up too."""
+TIMED = (5, 100)
+"""Calls that are timed, at least and at most,"""
+SECONDS = 5.0
+"""for about so long."""
+LONGEST = 20.0
+"""[s] a call: a batch that would take more is left out."""
+
+
+class Setting(NamedTuple):
+    """A loop and the situations that it runs in, in one precision."""
+
+    robot: osik.Robot
+    tasks: dict[str, osik.Task]
+    limits: tuple[osik.Limit, ...]
+    starts: jax.Array
+    targets: jax.Array
+
+
+def setting(name: str) -> Setting:
+    """Both feet, centre of mass, one hand's position, posture; in the precision that is JAX's default now."""
+    robot = osik.load_robot(name)
+    feet, hand = FRAMES[name]
+    tasks: dict[str, osik.Task] = {foot: osik.FrameTask(robot, foot, weight=100.0, priority=1) for foot in feet}
+    if feet:
+        tasks["com"] = osik.ComTask(robot, weight=10.0, priority=2)
+    tasks["hand"] = osik.FrameTask(robot, hand, rows="position", priority=3)
+    tasks["posture"] = osik.PostureTask(robot, weight=1e-3, gain=1.0, priority=4)
+    starts, ends = (jnp.asarray(q) for q in arm_angles(robot))
+    poses = jax.jit(jax.vmap(lambda q: osik.forward_kinematics(robot, q).frame_pose(robot, hand)[0]))
+    return Setting(robot, tasks, (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)), starts, poses(ends))
+
+
+def arm_angles(robot: osik.Robot) -> np.ndarray:
+    """Starts and ends (2, LANES, nq): joints of the arms up to a quarter of their range off home. Seed 0."""
+    names = [name for name in robot.joint_names if any(part in name for part in ARMS)]
+    dofs, places = ([index(name) for name in names] for index in (robot.joint_dof_index, robot.joint_qpos_index))
+    low, high = np.asarray(robot.position_lower)[dofs], np.asarray(robot.position_upper)[dofs]
+    q = np.tile(np.asarray(robot.q0), (2, LANES, 1))
+    q[..., places] += 0.25 * (high - low) * np.random.default_rng(0).uniform(-1.0, 1.0, (2, LANES, len(names)))
+    q[..., places] = np.clip(q[..., places], low, high)
+    return q
+
+
+class State(NamedTuple):
+    """What is carried from tick to tick."""
+
+    q: jax.Array
+    warm_start: Any
+
+
+def batch_of(given: Setting, scheme: osik.Scheme, batch: int) -> tuple[Callable[..., Any], tuple[Any, ...], State]:
+    """The vmapped tick, its arguments before the state, and the first state."""
+    lanes = np.arange(batch) % LANES
+    tasks = osik.batched(given.tasks, {"hand.target[0]": given.targets[lanes]})
+    axes = osik.batch_axes(given.tasks, "hand.target[0]")
+
+    def solve(robot: Any, tasks: Any, scheme: Any, limits: Any, state: State) -> osik.Solution:
+        q, warm_start = state
+        return osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=DT, warm_start=warm_start)
+
+    def tick(robot: Any, tasks: Any, scheme: Any, limits: Any, state: State) -> tuple[State, Any, Any]:
+        solution = solve(robot, tasks, scheme, limits, state)
+        q = osik.integrate(robot, state.q, solution.velocity, DT)
+        return State(q, solution.warm_start), solution.error, solution.status == osik.Status.SOLVED
+
+    starts = given.starts[lanes]
+    first = jax.eval_shape(
+        lambda q: solve(given.robot, given.tasks, scheme, given.limits, State(q, None)).warm_start, given.starts[0]
+    )
+    none = jax.tree.map(lambda a: jnp.zeros((batch, *a.shape), a.dtype), first)
+    arguments = (given.robot, tasks, scheme, given.limits)
+    return jax.vmap(tick, in_axes=(None, axes, None, None, 0)), arguments, State(starts, none)
+
+
+def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
+    """The program, and the seconds that tracing and compiling took."""
+    jax.clear_caches()
+    started = time.perf_counter()
+    program = jax.jit(function).lower(*args).compile()
+    return program, time.perf_counter() - started
+
+
+@cache
+def reference(robot: str, scheme: str) -> dict[str, np.ndarray]:
+    """Task errors of all lanes after the checked ticks, in float64 on the CPU."""
+    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
+        tick, arguments, state = batch_of(setting(robot), SCHEMES[scheme](), LANES)
+        program, _ = compiled(tick, *arguments, state)
+        for _ in range(CHECKED):
+            state, error, _ = program(*arguments, state)
+        return {name: np.asarray(e) for name, e in error.items()}
+
+
+def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
+    """One row: how fast, how right, how much memory."""
+    tick, arguments, state = batch_of(given, scheme, batch)
+    program, compile_seconds = compiled(tick, *arguments, state)
+    solved: list[Any] = []
+    seconds: list[float] = []
+    errors: dict[str, float] = {}
+    calls = CHECKED + TIMED[0]
+    while len(solved) < calls:
+        started = time.perf_counter()
+        state, error, fine = jax.block_until_ready(program(*arguments, state))
+        seconds.append(time.perf_counter() - started)
+        solved.append(jnp.mean(fine))
+        if len(solved) == CHECKED:
+            calls += int(np.clip(SECONDS / min(seconds), *TIMED)) - TIMED[0]
+            n = min(batch, LANES)
+            errors = {name: float(np.abs(np.asarray(e)[:n] - wanted[name][:n]).max()) for name, e in error.items()}
+    each = float(np.median(seconds[CHECKED:]))
+    memory = program.memory_analysis()
+    parts = ("argument_size_in_bytes", "output_size_in_bytes", "temp_size_in_bytes")
+    return dict(
+        batch=batch,
+        seconds=each,
+        ticks_per_second=batch / each,
+        compile_seconds=compile_seconds,
+        solved=float(np.mean(solved)),
+        error=max(errors.values()),
+        errors=errors,
+        calls=calls - CHECKED,
+        program_bytes=sum(int(getattr(memory, part, 0)) for part in parts),
+        device_peak_bytes=(jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use"),
+    )
+
+
+def sweep(robot: str, scheme: str, precision: str, batches: list[int]) -> Iterator[dict[str, Any]]:
+    """Rows of growing batches, until a call would take too long or memory runs out."""
+    label, last = dict(robot=robot, scheme=scheme, precision=precision), None
+    wanted = reference(robot, scheme)
+    with jax.enable_x64(precision == "float64"):
+        given = setting(robot)
+        for batch in sorted(batches):
+            if last and last["seconds"] * batch / last["batch"] > LONGEST:
+                return
+            try:
+                last = label | measure(given, SCHEMES[scheme](), batch, wanted)
+            except jax.errors.JaxRuntimeError as failure:
+                if "RESOURCE_EXHAUSTED" not in str(failure):
+                    raise
+                return
+            yield last
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers were measured on."""
+    device = jax.devices()[0]
+    return dict(device=device.device_kind, platform=device.platform, cpu=processor(), jax=jax.__version__)
+
+
+def processor() -> str:
+    """Name of the CPU, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def kept(path: Path | None) -> list[dict[str, Any]]:
+    """Rows of an earlier run.
+
+    Raises:
+        ValueError: they are from another machine.
+    """
+    if path is None or not path.exists():
+        return []
+    before = json.loads(path.read_text())
+    here = machine()
+    if any(before[key] != here[key] for key in here):
+        raise ValueError(f"{path} is from another machine or release: name another file for {here}")
+    return before["rows"]
+
+
+def identity(row: dict[str, Any]) -> tuple[Any, ...]:
+    """What a row is of."""
+    return row["robot"], row["scheme"], row["precision"], row["batch"]
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    """A table; lines of JSON where rich is not installed."""
+    try:
+        from rich.console import Console
+        from rich.table import Table
+    except ImportError:
+        for row in rows:
+            print(json.dumps(row))
+        return
+    table = Table("scheme", "precision", "batch", "ms a call", "ticks/s", "solved", "error", "compile [s]", "MiB")
+    for r in rows:
+        table.add_row(
+            *(r["scheme"], r["precision"], f"{r['batch']:,}"),
+            *(f"{1e3 * r['seconds']:.3g}", f"{r['ticks_per_second']:,.0f}", f"{r['solved']:.4f}", f"{r['error']:.1e}"),
+            *(f"{r['compile_seconds']:.1f}", f"{r['program_bytes'] / 2**20:.2g}"),
+        )
+    Console(width=110).print(table)
+
+
+def listed(kind: Callable[[str], Any], among: Collection[str] = ()) -> Callable[[str], list[Any]]:
+    """Parser of a list with commas."""
+
+    def parse(text: str) -> list[Any]:
+        values = [kind(part) for part in text.split(",")]
+        wrong = [value for value in values if among and value not in among]
+        if wrong:
+            raise argparse.ArgumentTypeError(f"{wrong[0]!r} is none of {', '.join(among)}")
+        return values
+
+    return parse
+
+
+def main() -> None:
+    """Prints each row as it comes and a table at the end, and writes the rows to the file after each."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.throughput", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("results", nargs="?", type=Path, help="JSON file")
+    parser.add_argument("--robot", default="nao", choices=sorted(FRAMES))
+    parser.add_argument("--batches", type=listed(int), default=list(BATCHES))
+    parser.add_argument("--schemes", type=listed(str, SCHEMES), default=list(SCHEMES))
+    parser.add_argument("--precisions", type=listed(str, PRECISIONS), default=list(PRECISIONS))
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    rows, new = {identity(row): row for row in kept(given.results)}, []
+    for scheme in given.schemes:
+        for precision in given.precisions:
+            for row in sweep(given.robot, scheme, precision, given.batches):
+                print(json.dumps(row), flush=True)
+                rows[identity(row)] = row
+                new.append(row)
+                if given.results is not None:
+                    given.results.write_text(json.dumps(machine() | dict(rows=list(rows.values())), indent=1) + "\n")
+    show(new)
+
+
+if __name__ == "__main__":
+    main()
