@@ -171,7 +171,8 @@ def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, n
 
 def sweep(robot: str, scheme: str, precision: str, batches: list[int]) -> Iterator[dict[str, Any]]:
     """Rows of growing batches, until a call would take too long or memory runs out."""
-    label, last = dict(robot=robot, scheme=scheme, precision=precision), None
+    label: dict[str, Any] = dict(robot=robot, scheme=scheme, precision=precision)
+    last: dict[str, Any] | None = None
     wanted = reference(robot, scheme)
     with jax.enable_x64(precision == "float64"):
         given = setting(robot)

@@ -1,0 +1,79 @@
+"""The benchmark of batches: its numbers are there, right, and its file may be filled in parts."""
+
+import json
+import sys
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from benchmarks import throughput
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    """A file with one row, as the command line writes it."""
+    path = tmp_path_factory.mktemp("throughput") / "results.json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(throughput, "SECONDS", 0.01)
+        run(patch, path, "3")
+    return path
+
+
+def run(patch, path, batches):
+    options = ["--robot", "arm7", "--schemes", "weighted", "--precisions", "float64", "--batches", batches]
+    patch.setattr(sys, "argv", ["throughput", str(path), *options])
+    throughput.main()
+
+
+def test_a_row_is_right(path):
+    result = json.loads(path.read_text())
+    assert result["jax"] == jax.__version__ and result["platform"] == "cpu"
+    (row,) = result["rows"]
+    assert row["solved"] == 1.0 and row["error"] < 1e-12
+    assert row["ticks_per_second"] == row["batch"] / row["seconds"] > 0.0
+    assert row["compile_seconds"] > 0.0 and row["program_bytes"] > row["batch"] * 7 * 8
+
+
+def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
+    other = tmp_path / "results.json"
+    other.write_text(path.read_text())
+    (first,) = json.loads(path.read_text())["rows"]
+    monkeypatch.setattr(throughput, "measure", lambda given, scheme, batch, wanted: first | dict(batch=batch, calls=9))
+    run(monkeypatch, other, "5")
+    assert json.loads(other.read_text())["rows"] == [first, first | dict(batch=5, calls=9)]
+    run(monkeypatch, other, "3")
+    assert [row["calls"] for row in json.loads(other.read_text())["rows"]] == [9, 9]
+    monkeypatch.setattr(throughput, "machine", lambda: {"device": "another"})
+    with pytest.raises(ValueError, match="another machine"):
+        throughput.kept(other)
+
+
+def test_the_reference_is_the_rollout():
+    """The carried tick is ``rollout``'s: errors after the checked ticks."""
+    given = throughput.setting("arm7")
+    wanted = throughput.reference("arm7", "weighted")
+    hand: Any = given.tasks["hand"]
+    for lane in (0, 7):
+        tasks = given.tasks | {"hand": hand.replace(target=(given.targets[lane], hand.target[1]))}
+        motion = osik.rollout(
+            given.robot,
+            given.starts[lane],
+            tasks,
+            scheme=osik.WeightedQP(),
+            limits=given.limits,
+            dt=throughput.DT,
+            steps=throughput.CHECKED,
+        )
+        for name, error in motion.solution.error.items():
+            np.testing.assert_allclose(wanted[name][lane], error[-1], rtol=0, atol=1e-12)
+
+
+def test_a_sweep_ends_before_a_call_takes_too_long(monkeypatch):
+    monkeypatch.setattr(throughput, "LONGEST", 1.0)
+    monkeypatch.setattr(throughput, "reference", lambda *_: {})
+    monkeypatch.setattr(throughput, "measure", lambda *args: dict(batch=args[2], seconds=0.1 * args[2]))
+    found = throughput.sweep("arm7", "weighted", "float64", [1, 8, 64, 10])
+    assert [row["batch"] for row in found] == [1, 8, 10]
