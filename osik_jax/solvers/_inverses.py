@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,7 +25,9 @@ def row_space_and_motion(
     return space, apply(damped, wanted)
 
 
+@jax.custom_jvp
 def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
+    """Row space, Moore-Penrose inverse and damped inverse."""
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
     real = s > cutoff
     vt, s = jnp.where(real[:, None], vt, 0.0), jnp.where(real, s, 1.0)
@@ -32,16 +35,21 @@ def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[A
     return product(vt.T, vt), plain, damped
 
 
+@_by_singular_values.defjvp
+def _by_singular_values_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+    (a, cutoff, damping), (da, _, d_damping) = primals, tangents
+    space, X, D = _by_singular_values(a, cutoff, damping)
+    dX = _columns(lambda w: _inverse_rate(a, X, da, w), a)
+    dD = _columns(lambda w: _damped_rate(a, X, D, damping, da, d_damping, w), a)
+    return (space, X, D), (_space_rate(space, X, da), dX, dD)
+
+
 @row_space_and_motion.defjvp
 def _row_space_and_motion_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     (a, wanted, cutoff, damping), (da, d_wanted, _, d_damping) = primals, tangents
     space, X, D = _by_singular_values(a, cutoff, damping)
-    y = apply(D, wanted)
-    z = apply(X.T, y)
-    pull = d_damping * apply(X, z) + damping * (_inverse_rate(a, X, da, z) + apply(X, _transposed_rate(a, X, da, y)))
-    moved = _inverse_rate(a, X, da, wanted) - pull
-    rate = moved - damping * apply(D, apply(X.T, moved))  # D solves (I + damping X X') D = X
-    return (space, y), (_space_rate(space, X, da), rate + apply(D, d_wanted))
+    rate = _damped_rate(a, X, D, damping, da, d_damping, wanted) + apply(D, d_wanted)
+    return (space, apply(D, wanted)), (_space_rate(space, X, da), rate)
 
 
 @jax.custom_jvp
@@ -53,8 +61,9 @@ def row_space_and_motion_of_rank(
     return space, apply(inverse, wanted)
 
 
+@jax.custom_jvp
 def _by_pivots(matrix: Array, rank: Array, cutoff: Array) -> tuple[Array, Array]:
-    """From a complete orthogonal factorisation, matrix = permutation U S' Q'."""
+    """Row space and inverse from a complete orthogonal factorisation, matrix = permutation U S' Q'."""
     m, n = matrix.shape
     Q, R, order = jax.scipy.linalg.qr(matrix.T, mode="economic", pivoting=True)
     pivots = jnp.abs(jnp.diagonal(R))
@@ -65,6 +74,13 @@ def _by_pivots(matrix: Array, rank: Array, cutoff: Array) -> tuple[Array, Array]
     solved = jax.scipy.linalg.solve_triangular(S, jnp.where(keep[:, None], U.T, 0.0))
     inverse = jnp.zeros((n, m), matrix.dtype).at[:, order].set(product(Q, solved))
     return product(Q, Q.T), inverse
+
+
+@_by_pivots.defjvp
+def _by_pivots_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+    (a, rank, cutoff), (da, *_) = primals, tangents
+    space, X = _by_pivots(a, rank, cutoff)
+    return (space, X), (_space_rate(space, X, da), _columns(lambda w: _inverse_rate(a, X, da, w), a))
 
 
 @row_space_and_motion_of_rank.defjvp
@@ -79,6 +95,28 @@ def _space_rate(space: Float[Array, "n n"], X: Float[Array, "n m"], da: Float[Ar
     turn = product(X, da)
     turn = turn - product(turn, space)
     return turn + turn.T
+
+
+def _columns(rate: Callable[[Float[Array, " m"]], Float[Array, " n"]], a: Float[Array, "m n"]) -> Float[Array, "n m"]:
+    """The matrix of a linear map, for derivatives of second order; those of first order need its value alone."""
+    return jax.vmap(rate, out_axes=1)(jnp.eye(len(a), dtype=a.dtype))
+
+
+def _damped_rate(
+    a: Float[Array, "m n"],
+    X: Float[Array, "n m"],
+    D: Float[Array, "n m"],
+    damping: Array,
+    da: Float[Array, "m n"],
+    d_damping: Array,
+    w: Float[Array, " m"],
+) -> Float[Array, " n"]:
+    """Rate of D w; D solves (I + damping X X') D = X."""
+    y = apply(D, w)
+    z = apply(X.T, y)
+    pull = d_damping * apply(X, z) + damping * (_inverse_rate(a, X, da, z) + apply(X, _transposed_rate(a, X, da, y)))
+    moved = _inverse_rate(a, X, da, w) - pull
+    return moved - damping * apply(D, apply(X.T, moved))
 
 
 def _inverse_rate(

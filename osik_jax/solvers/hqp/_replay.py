@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Int
 
 from .._dense import apply, product
 from .._inverses import row_space_and_motion_of_rank
-from ._problem import Level
 from ._stack import Stack
 
 
@@ -46,7 +45,7 @@ def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     x, decisions, nothing, stack = primals
     *_, rates = tangents
     _, dx = jax.jvp(lambda s: _replay(decisions, nothing, s), (stack,), (rates,))
-    return x, dx
+    return _attach(x, decisions, nothing, stack), dx  # not x alone: the next derivative needs this one's rule
 
 
 def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, " n"]:
@@ -54,13 +53,12 @@ def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, "
     hard = (stack.hard, stack.hard_lower, stack.hard_upper)
     pinned = stack.hard_lower[:n] == stack.hard_upper[:n]
 
-    def descend(state: tuple[Array, Array], now: tuple[Decision, Level]) -> tuple[tuple[Array, Array], None]:
-        decision, level = now
+    state = jnp.where(pinned, stack.hard_lower[:n], 0.0), jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(stack.hard.dtype))
+    for k in range(len(decisions.rank)):  # no scan: linearising one forgets the rules inside, and then so do Hessians
+        decision, level = (jax.tree.map(lambda leaf, k=k: leaf[k], tree) for tree in (decisions, stack.levels))
         state = _block(*_independent(*hard, decision.tight), n, *state, nothing)
-        return _block(level.matrix, level.lower, level.upper, decision.counts, decision.rank, *state, nothing), None
-
-    start = jnp.where(pinned, stack.hard_lower[:n], 0.0), jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(stack.hard.dtype))
-    return jax.lax.scan(descend, start, (decisions, stack.levels))[0][0]
+        state = _block(level.matrix, level.lower, level.upper, decision.counts, decision.rank, *state, nothing)
+    return state[0]
 
 
 def _independent(matrix: Array, lower: Array, upper: Array, side: Array) -> tuple[Array, Array, Array, Array]:
@@ -83,7 +81,7 @@ def _block(
     on = side != 0
     target = jnp.where(side < 0, _finite(lower, side < 0), _finite(upper, side > 0))
     chosen = jnp.where(on[:, None], matrix, 0.0)
-    longest = jnp.sqrt(jnp.max(jnp.sum(jax.lax.stop_gradient(chosen) ** 2, -1)))
+    longest = jnp.max(jnp.abs(jax.lax.stop_gradient(chosen)))
     gap = jnp.where(on, target - apply(chosen, x), 0.0)
     space, motion = row_space_and_motion_of_rank(product(chosen, projector), gap, rank, nothing * longest)
     # as in the projection (eq. 7): rounding over small singular values has left the projector's range
