@@ -128,7 +128,7 @@ def hierarchies(unit_rows: bool) -> list[dict[str, Any]]:
     sense = np.zeros(low.shape[1], np.int32)
 
     def by_daqp(i: int) -> np.ndarray:
-        return daqp.solve(None, None, A[i], high[i], low[i], sense, breaks, primal_tol=1e-9)[0]
+        return daqp.solve(None, None, A[i], high[i], low[i], sense, breaks)[0]
 
     def levels(data: Any) -> list[Level]:
         return [Level(a, lo, None if k != 1 else hi) for k, (a, lo, hi) in enumerate(data)]
