@@ -209,11 +209,7 @@ def rollout(
     """
     _check_settings(scheme, limits, dt)
     _check_steps(steps)
-    if not callable(tasks):
-        _check_tasks(tasks)
-        _check_targets(tasks, targets, steps)
-    elif targets is not None:
-        raise ValueError("targets go with a dict of tasks; a function of time sets them itself")
+    check_targets(tasks, targets, steps)
     if feedback is not None and not callable(feedback):
         feedback = jnp.asarray(feedback)
         if feedback.shape != (steps, robot.nq):
@@ -260,7 +256,7 @@ def _rollout(
             q = _configuration(robot, feedback(t, q))
         elif sensed is not None:
             q = sensed.astype(q.dtype)
-        todo = _checked(tasks(t)) if callable(tasks) else _aim(tasks, target)
+        todo = _checked(tasks(t)) if callable(tasks) else aim(tasks, target)
         solution = _solve(robot, q, todo, scheme, limits, dt, warm_start)
         q = _move(robot, q, solution.velocity, dt)
         return (q, solution.warm_start), (q, solution)
@@ -284,7 +280,7 @@ def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, one))
 
 
-def _aim(tasks: dict[str, Task], targets: Targets | None) -> dict[str, Task]:
+def aim(tasks: dict[str, Task], targets: Targets | None) -> dict[str, Task]:
     """The tasks with this tick's targets."""
     aimed = {name: tasks[name].replace(target=target) for name, target in (targets or {}).items()}
     return {**tasks, **aimed}
@@ -352,7 +348,13 @@ def _check_steps(steps: Any) -> None:
         raise ValueError(f"steps is {steps!r}; it is the number of ticks, an integer")
 
 
-def _check_targets(tasks: Tasks, targets: Targets | None, steps: int) -> None:
+def check_targets(tasks: Tasks | Callable[[Array], Tasks], targets: Targets | None, steps: int) -> None:
+    """Raises where tasks are none, or targets by tick do not fit them."""
+    if callable(tasks):
+        if targets is not None:
+            raise ValueError("targets go with a dict of tasks; a function of time sets them itself")
+        return
+    _check_tasks(tasks)
     for name, target in (targets or {}).items():
         if name not in tasks:
             raise KeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(tasks)}")

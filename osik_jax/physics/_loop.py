@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._structure import is_number
-from ..control import Solution, Tasks, solve
+from ..control import Solution, Targets, Tasks, aim, check_targets, solve
 from ..kinematics import integrate
 from ..limits import Limit
 from ..robot import Robot
@@ -107,6 +107,7 @@ def simulate(
     limits: Sequence[Limit] = (),
     dt: float = 0.005,
     steps: int,
+    targets: Targets | None = None,
     command: Command | None = None,
     before_tick: Callable[[float, Simulation], None] | None = None,
 ) -> Recording:
@@ -122,26 +123,30 @@ def simulate(
         limits: joint position and velocity limits.
         dt: control period [s], a whole number of the world's timesteps.
         steps: number of ticks.
+        targets: targets of some tasks at each tick, by task name, as in ``rollout``.
         command: ``Integrated()`` (the default) or ``Lookahead(time)``.
         before_tick: called with the time [s] since the start and the simulation, to push the robot, say.
 
     Raises:
-        TypeError, ValueError: as in ``solve``; ``dt`` is no whole number of timesteps.
+        KeyError: ``targets`` names a task that does not exist.
+        TypeError, ValueError: as in ``solve``; ``dt`` is no whole number of timesteps; ``targets`` do not fit.
     """
     if steps < 1:
         raise ValueError(f"steps is {steps}; there has to be one tick at least")
+    check_targets(tasks, targets, steps)
     robot = simulation.world.robot
     numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), is_number)
     leaves, treedef = jax.tree.flatten(structure)
     program = partial(_tick, robot, numbers, scheme, tuple(limits), command or Integrated(), np.asarray(dt))
     tick = partial(program, static=(tuple(leaves), treedef))
     held = jnp.asarray(simulation.sense())
-    warm_start = _cold_start(lambda state: tick(0.0, *state, None)[1], (held, held))
+    paths = jax.tree.map(np.asarray, targets)
+    warm_start = _cold_start(lambda state: tick(0.0, *state, None, _at(paths, 0))[1], (held, held))
     frames, commands, solutions = [_frame(simulation)], [], []
     for k in range(steps):
         if before_tick is not None:
             before_tick(k * dt, simulation)
-        held, solution = tick(k * dt, held, simulation.sense(), warm_start)
+        held, solution = tick(k * dt, held, simulation.sense(), warm_start, _at(paths, k))
         warm_start = solution.warm_start
         simulation.step(held, dt)
         frames.append(_frame(simulation))
@@ -164,12 +169,13 @@ def _tick(
     last: Array,
     sensed: Array,
     warm_start: Any,
+    target: Targets | None,
     *,
     static: tuple[tuple[Any, ...], Any],
 ) -> tuple[Array, Solution]:
     """The part of a tick that is pure: the command and the solution."""
     tasks: Any = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
-    todo: Any = tasks(t) if callable(tasks) else tasks
+    todo: Any = tasks(t) if callable(tasks) else aim(tasks, target)
     solution = solve(robot, sensed, todo, scheme=scheme, limits=limits, dt=dt, warm_start=warm_start)
     return command(robot, last, sensed, solution.velocity, dt), solution
 
@@ -177,6 +183,11 @@ def _tick(
 def _cold_start(tick: Callable[[Any], Solution], state: Any) -> Any:
     """Zeros in the shape of a warm start, from a tick that is traced and not run: the first one compiles no program."""
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, state).warm_start)
+
+
+def _at(paths: Targets | None, tick: int) -> Targets | None:
+    """The targets of one tick."""
+    return jax.tree.map(lambda path: path[tick], paths)
 
 
 def _frame(simulation: Simulation) -> tuple[np.ndarray, ...]:
