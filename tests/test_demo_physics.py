@@ -96,6 +96,27 @@ def test_torques_are_held_against_the_motors(lift):
     assert figures["busiest_joint"] == list(run.world.servos)[int(used.max(0).argmax())]
 
 
+def test_sensed_joints_are_held_against_their_limits(lift):
+    """Against the ranges of MuJoCo's model, hinge by hinge."""
+    motion, _, summary, run = lift
+    model = motion.robot.mj_model
+    qpos = np.array([data.qpos.copy() for data in poses(motion, run.recording.q)])
+    hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    angle, (lower, upper) = qpos[:, model.jnt_qposadr[hinges]], model.jnt_range[hinges].T
+    beyond = np.degrees(np.maximum(np.maximum(lower - angle, angle - upper), 0.0))
+    figures = summary["schemes"]["weighted"]["physics"]
+    assert figures["joints_beyond_limits_deg"] == pytest.approx(beyond.max(), rel=1e-9)
+    assert figures["furthest_beyond"] == model.joint(hinges[beyond.max(0).argmax()]).name
+    assert 0.0 < beyond.max() < 0.5
+    within = run.recording.q.copy()
+    within[:] = np.asarray(motion.q0)
+    assert judged(motion, run, q=within)["furthest_beyond"] is None
+    within[7, motion.robot.joint_qpos_index("LKneePitch")] = model.joint("LKneePitch").range[1] + 0.1
+    spoiled = judged(motion, run, q=within)
+    assert spoiled["joints_beyond_limits_deg"] == pytest.approx(np.degrees(0.1))
+    assert spoiled["furthest_beyond"] == "LKneePitch"
+
+
 def test_the_judge_sees_what_is_wrong(lift):
     motion, _, summary, run = lift
     sunk, turned, slid = run.recording.q.copy(), run.recording.q.copy(), run.recording.contact_points.copy()

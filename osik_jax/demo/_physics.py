@@ -13,6 +13,7 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Float
 
+from .._tree import HINGE
 from ..physics import Integrated, Recording, Servo, Simulation, World, build_world, simulate
 from ..robot import Robot
 from ..tasks import PostureTask, Task
@@ -55,6 +56,8 @@ class PhysicsMeasurement:
         effort_used: the greatest part of its limit that any servo exerts. (T,)
         busiest: the joint with the greatest part.
         saturated: servos times ticks at their limit.
+        beyond_limits: the greatest angle by which any sensed hinge has left its position limits [rad], 0 inside. (T,)
+        furthest: the hinge that leaves its limits most; ``None``: none does.
         fell: when the robot fell [s], or ``None``.
     """
 
@@ -67,6 +70,8 @@ class PhysicsMeasurement:
     effort_used: Float[np.ndarray, " T"]
     busiest: str
     saturated: int
+    beyond_limits: Float[np.ndarray, " T"]
+    furthest: str | None
     fell: float | None
 
 
@@ -138,6 +143,7 @@ def measure_physics(
     standing = {s.frame: s.on_ground(recording.time) for s in motion.stances}
     touching = {foot: _touches(_of_foot(world, recording, foot)[1]) for foot in standing}
     used = np.abs(recording.effort) / np.array([servo.effort for servo in world.servos.values()])
+    hinges, beyond = _beyond_limits(world.robot, recording.q)
     return PhysicsMeasurement(
         height_error=np.abs(is_[:, 2] - wanted[:, 2]),
         tilt_error=_turn(is_[:, 3:], wanted[:, 3:]),
@@ -148,8 +154,19 @@ def measure_physics(
         effort_used=used.max(-1),
         busiest=list(world.servos)[int(used.max(0).argmax())],
         saturated=int((used >= 1.0 - 1e-9).sum()),
+        beyond_limits=beyond.max(-1, initial=0.0),
+        furthest=hinges[int(beyond.max(0).argmax())] if beyond.any() else None,
         fell=float(recording.time[-1]) if recording.fell else None,
     )
+
+
+def _beyond_limits(robot: Robot, q: Float[np.ndarray, "T nq"]) -> tuple[list[str], Float[np.ndarray, "T n"]]:
+    """Names of the hinges that move on their own, and by how much each is outside its position limits [rad]."""
+    tree = robot.tree
+    hinges = [j for j in tree.dof_address if tree.joint_types[j] == HINGE]
+    angle, dof = q[:, [tree.qpos_address[j] for j in hinges]], [tree.dof_address[j] for j in hinges]
+    lower, upper = np.asarray(robot.position_lower)[dof], np.asarray(robot.position_upper)[dof]
+    return [tree.joint_names[j] for j in hinges], np.maximum(np.maximum(lower - angle, angle - upper), 0.0)
 
 
 def _turn(a: Float[np.ndarray, "T 4"], b: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, " T"]:

@@ -52,6 +52,8 @@ def physics_figures(physics: PhysicsMeasurement) -> dict[str, Any]:
         "greatest_part_of_torque_limit": float(physics.effort_used.max()),
         "busiest_joint": physics.busiest,
         "servo_ticks_at_limit": physics.saturated,
+        "joints_beyond_limits_deg": float(np.degrees(physics.beyond_limits.max())),
+        "furthest_beyond": physics.furthest,
         "reached": reached(physics),
     }
 
@@ -97,6 +99,7 @@ def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
         ("greatest torque, of its limit", lambda s: number(s["physics"]["greatest_part_of_torque_limit"], None)),
         ("  in", lambda s: s["physics"]["busiest_joint"]),
         ("servo ticks at the limit", lambda s: str(s["physics"]["servo_ticks_at_limit"])),
+        ("joints beyond their position limits [deg]", lambda s: number(s["physics"]["joints_beyond_limits_deg"], None)),
         *(_goal_row(label) for label in example["goals"]),
         ("velocity limits broken", lambda s: limit_count(s["limits"]["velocity_violations"])),
         ("ticks solved", lambda s: solved(s["solver"]["status"])),
