@@ -211,10 +211,11 @@ def play(robot, path, dt):
     import mujoco.viewer
 
     data = mujoco.MjData(robot.mj_model)
+    poses = np.asarray(jax.vmap(robot.mujoco_qpos)(path))
     with mujoco.viewer.launch_passive(robot.mj_model, data) as window:
         while window.is_running():
-            for q in path:
-                data.qpos[:] = robot.mujoco_qpos(q)
+            for pose in poses:
+                data.qpos[:] = pose
                 mujoco.mj_forward(robot.mj_model, data)
                 window.sync()
                 time.sleep(dt)

@@ -317,7 +317,7 @@ for name in SCHEMES:
 left.set(xlabel="time [s]", ylabel="hand to target [mm]", title="Calmed: all stretch; not all come back")
 left.legend(loc="upper left", fontsize=8)
 dumbbell(right, "out of reach", number("rms acceleration"), "RMS joint acceleration [rad/s²]")
-right.set_title("Open: as it comes; filled: calmed")
+right.set_title("Damping calms; a hierarchy has none (filled: calmed)")
 fig.tight_layout()
 plt.show()
 
@@ -359,7 +359,7 @@ left.legend(loc="upper center", fontsize=7.5, ncols=2)
 left.set_ylim(1e-2, 3e3)
 dumbbell(right, "almost straight", number("speed"), "highest joint speed / its limit", scale="linear")
 right.axvline(1.0, color="black", ls="--", lw=1)
-right.set_title("Open: as it comes; filled: calmed")
+right.set_title("Who falls behind has to hurry (filled: calmed)")
 fig.tight_layout()
 plt.show()
 
@@ -438,8 +438,8 @@ assert results["joint limit", "null space", False]["beyond limit"] > 1e-3
 # ## How fast
 #
 # Time of one tick inside the compiled loop: the median of repeated runs, after those above that compiled, on the
-# machine that made this notebook. The schemes take turns, so that whatever else the machine does meets all of them. All
-# are for one robot alone; for batches see `3_many_at_once`.
+# machine that made this notebook. The schemes take turns, so that whatever else the machine does meets all of them; a
+# busy one makes all slower. All are for one robot alone; for batches see `3_many_at_once`.
 
 # %%
 took = {(situation, name): [] for situation in SITUATIONS for name in SCHEMES}
@@ -449,6 +449,8 @@ for _ in range(REPEATS):
         start = time.perf_counter()
         jax.block_until_ready(run(*given))
         times.append((time.perf_counter() - start) / STEPS)
+print(f"{os.cpu_count()} cores, JAX {jax.__version__}, {os.getloadavg()[0]:.1f} processes running on average")
+
 ticks = {name: [1e6 * np.median(took[situation, name]) for situation in SITUATIONS] for name in SCHEMES}  # [us]
 
 fig, axes = plt.subplots(figsize=(7.5, 3.0))

@@ -23,8 +23,8 @@ class NullSpace(Scheme):
     the others, a priority that cannot be met inside the limits is scaled down, keeping its direction, and the potential
     is followed as nearly as the limits allow.
 
-    ``order="reverse"`` builds the motion from the potential and the lowest priority up: the first is exact however the
-    others conflict with it, and nothing jumps where a priority comes to depend on those above. Limits are not hard
+    ``order="reverse"`` builds the motion from the potential and the lowest priority up: the first is exact, up to its
+    damping, however the others conflict with it, and nothing jumps where a priority comes to depend on those above. Limits are not hard
     there, and inequality rows count while what comes before them, the lower priorities, leaves them violated.
 
     Attributes:
