@@ -24,8 +24,9 @@ class NullSpace(Scheme):
     is followed as nearly as the limits allow.
 
     ``order="reverse"`` builds the motion from the potential and the lowest priority up: the first is exact, up to its
-    damping, however the others conflict with it, and nothing jumps where a priority comes to depend on those above. Limits are not hard
-    there, and inequality rows count while what comes before them, the lower priorities, leaves them violated.
+    damping, however the others conflict with it, and nothing jumps where a priority comes to depend on those above.
+    Limits are not hard there, and inequality rows count while what comes before them, the lower priorities, leaves them
+    violated.
 
     Attributes:
         order: "forward" or "reverse" (static).
