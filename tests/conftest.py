@@ -3,8 +3,8 @@
 import os
 from collections.abc import Iterator
 
-# Most of the suite's time is XLA's: without its optimiser and with its older fusions compiling takes a quarter. The gate
-# runs the recorded problems and the demos as users do.
+# Most of the suite's time is XLA's: without its optimiser and with its older fusions compiling takes a quarter of that.
+# The gate runs the recorded problems and the demos as users do.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false",

@@ -201,11 +201,46 @@ class TestHessian:
 
         z = jnp.concatenate([g, C.ravel()])
         hessian = np.asarray(jax.jit(jax.hessian(lambda z: loss(z)[0]))(z))
+        expected, active = self.differences(loss, z)
+        assert (active != 0).sum() >= 2
+        assert np.abs(hessian - expected).max() < 1e-6 * np.abs(expected).max()
+        assert np.abs(hessian - hessian.T).max() < 1e-9 * np.abs(hessian).max()
+
+    @staticmethod
+    def differences(loss, z):
+        """Of the gradient, extrapolated; and the active set, which has to be the same at all points."""
         gradient = jax.jit(jax.vmap(jax.grad(loss, has_aux=True)))
         h = 1e-4 * np.eye(len(z))
         slopes, active = gradient(np.concatenate([z + h, z - h, z + 2 * h, z - 2 * h]))
-        assert (active == active[0]).all() and (active[0] != 0).sum() >= 2
+        active = [np.asarray(a) for a in jax.tree.leaves(active)]
+        assert all((a == a[0]).all() for a in active)
         one, back, two, far = np.split(np.asarray(slopes), 4)
-        expected = (8.0 * (one - back) - (two - far)) / 12e-4
+        return (8.0 * (one - back) - (two - far)) / 12e-4, np.concatenate([a[0].ravel() for a in active])
+
+    @pytest.mark.parametrize("name", ["quadratic program", "hierarchy", "projections", "saturated"])
+    def test_through_a_loop(self, name):
+        """The rules of the solvers outlive the linearisation of a scan, also where singular values are equal or 0."""
+        rows = jnp.array([[1.0, 0.2, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
+        box = jnp.full(3, -0.3), jnp.full(3, 0.25)
+
+        def step(x, turn):
+            A, b = rows * jnp.cos(x[0] + turn), jnp.sin(x)
+            if name == "quadratic program":
+                s = solve_qp(A.T @ A + jnp.eye(3), -b, *box)
+                return x + s.x, s.active
+            if name == "hierarchy":
+                s = solve_hqp([Level(A[:1], b[:1]), Level(jnp.eye(3), b)], *box)
+                return x + s.x, s.warm_start
+            levels = [Level(A, b), Level(jnp.eye(3), b)]
+            s = solve_nullspace(levels, *box) if name == "saturated" else solve_nullspace(levels, damping=1e-3)
+            return x + s.x, s.active
+
+        def cost(x):
+            end, active = jax.lax.scan(step, x, jnp.array([0.1, 0.3]))
+            return jnp.sum(jnp.sin(end)), active
+
+        x = jnp.array([0.4, -0.7, 0.2])
+        hessian = np.asarray(jax.jit(jax.hessian(lambda x: cost(x)[0]))(x))
+        expected, active = self.differences(cost, x)
+        assert active.any() or name == "projections"
         assert np.abs(hessian - expected).max() < 1e-6 * np.abs(expected).max()
-        assert np.abs(hessian - hessian.T).max() < 1e-9 * np.abs(hessian).max()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._rules import custom_jvp
 
-@jax.custom_jvp
+
+@custom_jvp
 def inside(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
     """Takes rounding away; what is clipped keeps its own rate.
 

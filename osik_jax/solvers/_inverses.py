@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ._dense import apply, product
+from ._rules import custom_jvp
 
 
-@jax.custom_jvp
+@custom_jvp
 def row_space_and_motion(
     matrix: Float[Array, "m n"], wanted: Float[Array, " m"], cutoff: Float[Array, ""], damping: Float[Array, ""]
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
@@ -25,7 +26,7 @@ def row_space_and_motion(
     return space, apply(damped, wanted)
 
 
-@jax.custom_jvp
+@custom_jvp
 def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
     """Row space, Moore-Penrose inverse and damped inverse."""
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
@@ -52,7 +53,7 @@ def _row_space_and_motion_jvp(primals: tuple[Array, ...], tangents: tuple[Any, .
     return (space, apply(D, wanted)), (_space_rate(space, X, da), rate)
 
 
-@jax.custom_jvp
+@custom_jvp
 def row_space_and_motion_of_rank(
     matrix: Float[Array, "m n"], wanted: Float[Array, " m"], rank: Int[Array, ""], cutoff: Float[Array, ""]
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
@@ -61,7 +62,7 @@ def row_space_and_motion_of_rank(
     return space, apply(inverse, wanted)
 
 
-@jax.custom_jvp
+@custom_jvp
 def _by_pivots(matrix: Array, rank: Array, cutoff: Array) -> tuple[Array, Array]:
     """Row space and inverse from a complete orthogonal factorisation, matrix = permutation U S' Q'."""
     m, n = matrix.shape
@@ -142,7 +143,7 @@ def _transposed_rate(
     return wide - apply(a, apply(X, wide)) + tall - apply(X.T, apply(da.T, y))
 
 
-@jax.custom_jvp
+@custom_jvp
 def regularised_inverse(
     matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
 ) -> Float[Array, "n m"]:

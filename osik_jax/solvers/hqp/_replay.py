@@ -16,6 +16,8 @@ from jaxtyping import Array, Float, Int
 
 from .._dense import apply, product
 from .._inverses import row_space_and_motion_of_rank
+from .._rules import custom_jvp
+from ._problem import Level
 from ._stack import Stack
 
 
@@ -35,7 +37,7 @@ def with_derivative(x: Float[Array, " n"], decisions: Decision, stack: Stack, no
     return _attach(jax.lax.stop_gradient(x), decisions, nothing, stack)
 
 
-@jax.custom_jvp
+@custom_jvp
 def _attach(x: Array, decisions: Decision, nothing: Array, stack: Stack) -> Array:
     return x
 
@@ -53,12 +55,13 @@ def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, "
     hard = (stack.hard, stack.hard_lower, stack.hard_upper)
     pinned = stack.hard_lower[:n] == stack.hard_upper[:n]
 
-    state = jnp.where(pinned, stack.hard_lower[:n], 0.0), jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(stack.hard.dtype))
-    for k in range(len(decisions.rank)):  # no scan: linearising one forgets the rules inside, and then so do Hessians
-        decision, level = (jax.tree.map(lambda leaf, k=k: leaf[k], tree) for tree in (decisions, stack.levels))
+    def descend(state: tuple[Array, Array], now: tuple[Decision, Level]) -> tuple[tuple[Array, Array], None]:
+        decision, level = now
         state = _block(*_independent(*hard, decision.tight), n, *state, nothing)
-        state = _block(level.matrix, level.lower, level.upper, decision.counts, decision.rank, *state, nothing)
-    return state[0]
+        return _block(level.matrix, level.lower, level.upper, decision.counts, decision.rank, *state, nothing), None
+
+    start = jnp.where(pinned, stack.hard_lower[:n], 0.0), jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(stack.hard.dtype))
+    return jax.lax.scan(descend, start, (decisions, stack.levels))[0][0]
 
 
 def _independent(matrix: Array, lower: Array, upper: Array, side: Array) -> tuple[Array, Array, Array, Array]:

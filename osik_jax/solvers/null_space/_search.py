@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply, product
+from .._rules import custom_jvp
 
 
 class Room(NamedTuple):
@@ -91,7 +92,7 @@ def search(room: Room, max_iterations: int) -> Found:
     return jax.lax.while_loop(lambda f: ~f.done & ~f.failed & (f.iterations < max_iterations), body, start)
 
 
-@jax.custom_jvp
+@custom_jvp
 def dual_basis(projector: Float[Array, "n n"], side: Int[Array, " n"]) -> Float[Array, "n n"]:
     """C, the pseudo-inverse of the projector's columns of the saturated joints; its rows of the free ones are 0.
 

@@ -14,11 +14,12 @@ from jaxtyping import Array, Int
 
 from .._dense import apply
 from .._pivots import INACTIVE
+from .._rules import custom_jvp
 from ._factor import factorize, solve_system
 from ._problem import QP, active_targets
 
 
-@jax.custom_jvp
+@custom_jvp
 def differentiable(x: Array, y: Array, active: Int[Array, " m"], qp: QP) -> tuple[Array, Array]:
     """x and y as they are, with the derivatives of the minimiser and its row multipliers with respect to ``qp``."""
     return x, y
