@@ -211,7 +211,7 @@ def play(robot, path, dt):
     import mujoco.viewer
 
     data = mujoco.MjData(robot.mj_model)
-    poses = np.asarray(jax.vmap(robot.mujoco_qpos)(path))
+    poses = np.asarray(jax.vmap(robot.mujoco_qpos)(jnp.asarray(path)))
     with mujoco.viewer.launch_passive(robot.mj_model, data) as window:
         while window.is_running():
             for pose in poses:
