@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..kinematics import forward_kinematics
 from ..limits import ConfigurationLimit, VelocityLimit
 from ..robot import Robot, load_robot
 from ..tasks import ComTask, PostureTask, Task, support_polygon
+from ..tasks._leaves import home_kinematics
 from ._motion import GAIN, Goal, Motion, Stance, along, blended, circumscribed, contact_corners, tracking
 from ._references import Path, Stroke, minimum_jerk
 
@@ -109,7 +109,7 @@ def single_support(duration: float = 8.0) -> Motion:
 
 def _home_paths(robot: Robot, frames: tuple[str, ...]) -> dict[str, Path]:
     """Of each frame, a path that stays where it is at ``q0``."""
-    kinematics = forward_kinematics(robot, robot.q0)
+    kinematics = home_kinematics(robot)
     positions, rotations = kinematics.frame_poses(robot, frames)
     return {name: Path(np.asarray(p), np.asarray(R)) for name, p, R in zip(frames, positions, rotations, strict=True)}
 
