@@ -57,11 +57,13 @@ plt.rcParams |= {"axes.spines.top": False, "axes.spines.right": False, "axes.tit
 # | 3 | the waist (the frame `torso`) goes 5 cm to its left and back |
 # | 4 | the posture takes what freedom is left |
 #
-# Twice each: **kinematic**, where the robot is wherever its joints were sent, and **dynamic**, in MuJoCo with a floor,
+# The scheme is the hierarchical QP (eq. 9); the fast mode of the tests takes the null space (eqs. 6 to 8). Each motion
+# runs twice: **kinematic**, where the robot is wherever its joints were sent, and **dynamic**, in MuJoCo with a floor,
 # friction, gravity and a position servo on every joint. There the tasks see the sensed robot, base included, 200 times
 # a second.
-# The second motion shifts the weight onto the left foot, lifts the right one and opens the arms; the fast mode of the
-# tests leaves it out.
+#
+# The second motion shifts the weight onto the left foot, lifts the right one and opens the arms; the fast mode leaves
+# it out.
 
 # %%
 motions = {name: scene(DURATION) for name, scene in SCENES.items()}
@@ -82,7 +84,7 @@ for name, run in runs.items():
 INSTANTS = (0.0, 0.5) if FAST else (0.0, 0.24, 0.34, 0.48, 0.64)  # parts of the duration
 
 
-def snapshots(robot, q, support, instants, size=(1200, 420)):
+def snapshots(robot, q, support, instants, size=(400, 200) if FAST else (1200, 420)):
     """A picture of some instants of a motion, given as parts of its duration."""
     ticks = [round(part * (len(q) - 1)) for part in instants]
     with tempfile.TemporaryDirectory() as folder:
