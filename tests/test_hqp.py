@@ -7,7 +7,7 @@ import pytest
 import quadprog
 from recorded import recorded_hierarchies
 
-from osik_jax.solvers import Level, Status, solve_hqp
+from osik_jax.solvers import Level, Status, solve_hqp, solve_nullspace
 
 batched_hqp = jax.jit(jax.vmap(lambda levels, lower, upper: solve_hqp([Level(*a) for a in levels], lower, upper)))
 IMPROVED = 239
@@ -155,6 +155,22 @@ def test_a_bad_lane_leaves_its_neighbours_alone(recorded):
     assert np.isfinite(s.x[4]).all() and ((r.lower[4] <= s.x[4]) & (s.x[4] <= r.upper[4])).all()
     others = np.arange(len(r.lower)) != 4
     np.testing.assert_array_equal(np.asarray(s.x)[others], np.asarray(good.x)[others])
+
+
+@pytest.mark.parametrize("solver", [solve_hqp, solve_nullspace])
+def test_crossed_bounds_are_infeasible_and_their_middle_stands_for_them(solver):
+    def solve(lower, upper, low, high):
+        levels = [Level(jnp.array([[1.0, 1.0]]), lower[None], upper[None]), Level(jnp.eye(2), jnp.array([0.5, 0.0]))]
+        return solver(levels, low, high)
+
+    lower, upper = np.array([1.0, 0.5, 0.25]), np.array([0.0, 0.5, 0.25])
+    low, high = -np.ones((3, 2)), np.ones((3, 2))
+    low[2, 1], high[2, 1] = 0.5, -0.5
+    s = jax.jit(jax.vmap(solve))(lower, upper, low, high)
+    assert s.status.tolist() == [Status.INFEASIBLE, Status.SOLVED, Status.INFEASIBLE]
+    np.testing.assert_allclose(s.x[0], s.x[1], atol=1e-12)
+    np.testing.assert_allclose(s.slacks[0][:2], 0.0, atol=1e-12)  # of the middle
+    assert np.isfinite(s.x).all()
 
 
 def test_shapes_that_do_not_fit_are_named():

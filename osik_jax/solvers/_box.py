@@ -1,11 +1,20 @@
-"""The end of a solver: its answer inside the box to the last bit."""
+"""Bounds that cross at the start of a solver; at its end, an answer inside its box to the last bit."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._rules import custom_jvp
+
+
+def uncrossed(
+    lower: Float[Array, " n"], upper: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, ""]]:
+    """Crossed bounds as an equality halfway, which is as near to both as can be, and whether there were any."""
+    crossed = lower > upper
+    middle = 0.5 * jnp.where(crossed, lower + upper, 0.0)
+    return jnp.where(crossed, middle, lower), jnp.where(crossed, middle, upper), crossed.any()
 
 
 @custom_jvp

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._box import inside
+from .._box import inside, uncrossed
 from .._dense import apply, product
 from .._double import in_double
 from .._lanes import choose, in_lanes
@@ -70,14 +70,17 @@ def solve_hqp(
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
     tolerances = Tolerances(rank=_RANK[dtype]) if tolerances is None else tolerances
     sane = _finite(levels, lower, upper)
-    low, high = (jnp.where(sane, b, side).astype(dtype) for b, side in ((lower, -1.0), (upper, 1.0)))
+    levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True) if levels else ((), ())
+    low, high, empty = uncrossed(lower, upper)
+    possible = ~jnp.stack([empty, *crossed]).any()
+    low, high = (jnp.where(sane, b, side).astype(dtype) for b, side in ((low, -1.0), (high, 1.0)))
     scaled = [jax.tree.map(lambda leaf: jnp.where(sane, leaf, 0.0), level.scaled()) for level in levels]
     layout, stack = stacked([*scaled, _smallest(lower.shape[0], dtype)], low, high)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
     end = _descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start)))
     nothing = jnp.maximum(_NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
     x = with_derivative(end.cascade.x, end.decisions, stack, nothing)
-    return _answer(levels, layout, end, x, sane, lower, upper)
+    return _answer(levels, layout, end, x, sane, possible, lower, upper)
 
 
 def _smallest(n: int, dtype: jnp.dtype) -> Level:
@@ -339,11 +342,11 @@ def _row_space(
 
 
 def _finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:
-    """Whether the numbers can be computed with: no NaN, no infinity but as no bound, and a box that exists."""
+    """Whether the numbers can be computed with: no NaN, no infinity but as no bound."""
     checks = [jnp.isfinite(level.matrix).all() for level in levels]
     checks += [(low < jnp.inf).all() & (high > -jnp.inf).all() for low, high in _bounds(levels, lower, upper)]
     checks += [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
-    return jnp.stack([*checks, (lower <= upper).all()]).all()
+    return jnp.stack(checks).all()
 
 
 def _bounds(levels: Sequence[Level], lower: Array, upper: Array) -> list[tuple[Array, Array]]:
@@ -351,13 +354,21 @@ def _bounds(levels: Sequence[Level], lower: Array, upper: Array) -> list[tuple[A
 
 
 def _answer(
-    levels: Sequence[Level], layout: Layout, end: _End, x: Array, sane: Array, lower: Array, upper: Array
+    levels: Sequence[Level],
+    layout: Layout,
+    end: _End,
+    x: Array,
+    sane: Array,
+    possible: Array,
+    lower: Array,
+    upper: Array,
 ) -> HQPSolution:
     cascade = end.cascade
     at_bound = jnp.where(cascade.box < 0, lower, jnp.where(cascade.box > 0, upper, x))
     good = sane & jnp.isfinite(x).all()
     x = inside(jnp.where(good, at_bound, 0.0), lower, upper)
     status = jnp.where(cascade.done, Status.SOLVED, Status.MAX_ITERATIONS)
+    status = jnp.where(possible, status, Status.INFEASIBLE)
     return HQPSolution(
         x=x,
         slacks=tuple(jnp.where(good, level.distance(x), 0.0) for level in levels),

@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
+
+from .._box import uncrossed
 
 
 class Tolerances(NamedTuple):
@@ -24,7 +26,8 @@ class Level(eqx.Module):
 
     Attributes:
         matrix: A. (m, n); m may be 0.
-        lower: of A x; equal to ``upper`` for an equality, -inf for none. (m,)
+        lower: of A x; equal to ``upper`` for an equality, -inf for none; above it, the middle stands for both and the
+            answer is INFEASIBLE. (m,)
         upper: of A x; inf for none. Leave it out where all rows are equalities: it is then ``lower``, and the solver
             need not look for the rows that are not. (m,)
         weight: of the squared distances of the rows to their intervals, >= 0; None for ones. (m,)
@@ -74,6 +77,13 @@ class Level(eqx.Module):
         if self.equality:
             return Level(matrix, jnp.where(positive, self.lower * root, 0.0))
         return Level(matrix, _scaled_bound(self.lower, root, -jnp.inf), _scaled_bound(self.upper, root, jnp.inf))
+
+    def uncrossed(self) -> tuple[Level, Bool[Array, ""]]:
+        """The same level with crossed bounds as equalities halfway, and whether there were any."""
+        if self.equality:
+            return self, jnp.asarray(False)
+        lower, upper, crossed = uncrossed(self.lower, self.upper)
+        return Level(self.matrix, lower, upper, self.weight), crossed
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """A x minus the nearest point of its interval: the slack, 0 where the row holds."""

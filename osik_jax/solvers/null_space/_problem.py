@@ -22,7 +22,8 @@ class NullSpaceSolution(eqx.Module):
     Attributes:
         x: the answer; with bounds, inside them exactly, whatever the status. (n,)
         slacks: of each level, A x minus the nearest point of its interval (unweighted). ((m,), ...)
-        status: SOLVED; NUMERICAL_ERROR where the input cannot be computed with (x is then 0, clipped to its bounds);
+        status: SOLVED; INFEASIBLE where bounds cross (their middle stands for them);
+            NUMERICAL_ERROR where the input cannot be computed with (x is then 0, clipped to its bounds);
             with bounds, MAX_ITERATIONS where the search for the saturated joints was cut short.
         projector: onto what no level asks for; without bounds, the secondary motion went through it. (n, n)
         scales: of each level, the share s of its motion that the bounds leave room for; 1 without bounds. (k,)

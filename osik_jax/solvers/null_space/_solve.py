@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .._box import clip_to_box
+from .._box import clip_to_box, uncrossed
 from .._status import Status
 from ..hqp import Level
 from ._problem import RANK, NullSpaceSolution, sane
@@ -71,6 +71,8 @@ def solve_nullspace(
     if box is not None and order == "reverse":
         raise ValueError("bounds need order='forward': saturation goes from the highest level down")
     pull = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
+    levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True)
+    possible = ~jnp.stack(crossed).any()
     good = sane(levels, pull, jnp.asarray(damping, dtype)) & (True if box is None else _exists(*box))
     clean, pull, damped = _where(good, (list(levels), pull, jnp.asarray(damping, dtype)))
     scaled = [level.scaled() for level in clean]
@@ -78,11 +80,12 @@ def solve_nullspace(
     if box is None:
         method = solve_forward if order == "forward" else solve_reverse
         answer = _free(*method(scaled, pull, damped, rank), count=len(levels))
-        return _solution(clean, answer, good, jnp.zeros(n, dtype))
+        return _solution(clean, answer, good, possible, jnp.zeros(n, dtype))
     cap = 10 * (n + 2) if max_iterations is None else max_iterations
-    safe = jnp.where(good, box[0], -1.0), jnp.where(good, box[1], 1.0)
+    low, high, empty = uncrossed(*box)
+    safe = jnp.where(good, low, -1.0), jnp.where(good, high, 1.0)
     answer = solve_saturated(scaled, *safe, None if secondary is None else pull, damped, rank, cap)
-    return _solution(clean, answer, good, clip_to_box(jnp.zeros(n, dtype), *box))
+    return _solution(clean, answer, good, possible & ~empty, clip_to_box(jnp.zeros(n, dtype), *box))
 
 
 def _where(good: Array, tree: Any) -> Any:
@@ -104,7 +107,7 @@ def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] |
 
 
 def _exists(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Bool[Array, ""]:
-    return ((lower <= upper) & (lower < jnp.inf) & (upper > -jnp.inf)).all()
+    return ((lower < jnp.inf) & (upper > -jnp.inf)).all()
 
 
 def _free(x: Float[Array, " n"], projector: Float[Array, "n n"], *, count: int) -> Saturated:
@@ -113,10 +116,13 @@ def _free(x: Float[Array, " n"], projector: Float[Array, "n n"], *, count: int) 
     return Saturated(x, projector, jnp.ones(count, x.dtype), nothing, jnp.asarray(0), jnp.asarray(True))
 
 
-def _solution(levels: Sequence[Level], answer: Saturated, good: Array, fallback: Array) -> NullSpaceSolution:
+def _solution(
+    levels: Sequence[Level], answer: Saturated, good: Array, possible: Array, fallback: Array
+) -> NullSpaceSolution:
     good &= jnp.isfinite(answer.x).all()
     x = jnp.where(good, answer.x, fallback)
     status = jnp.where(answer.done, Status.SOLVED, Status.MAX_ITERATIONS)
+    status = jnp.where(possible, status, Status.INFEASIBLE)
     return NullSpaceSolution(
         x=x,
         slacks=tuple(jnp.where(good, level.distance(x), 0.0) for level in levels),

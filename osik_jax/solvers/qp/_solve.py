@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._box import inside
+from .._box import inside, uncrossed
 from .._dense import apply
 from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
 from .._status import Status
@@ -150,7 +150,8 @@ def _solve(qp: QP, guess: ArrayLike | None, max_iterations: int | None, toleranc
     allowed = jnp.asarray(_TOLERANCE[dtype] if tolerance is None else tolerance, dtype)
     sane = _finite(qp)
     safe = _replace_where(~sane, qp)
-    safe, crossed = _uncrossed(safe)
+    low, high, crossed = uncrossed(safe.lower, safe.upper)
+    safe = replace(safe, lower=low, upper=high)
     cold = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
     search = searcher(20 * m if max_iterations is None else max_iterations)
     found = search(*jax.lax.stop_gradient((safe, cold, allowed)))
@@ -179,14 +180,6 @@ def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found) -> 
     verdict = jnp.where(found.optimal, Status.SOLVED, Status.MAX_ITERATIONS)
     verdict = jnp.where(found.infeasible | crossed, Status.INFEASIBLE, verdict)
     return jnp.where(finite, verdict, Status.NUMERICAL_ERROR)
-
-
-def _uncrossed(qp: QP) -> tuple[QP, Bool[Array, ""]]:
-    """Crossed bounds as an equality halfway, which is as near to both as can be, and whether there were any."""
-    crossed = qp.lower > qp.upper
-    middle = 0.5 * jnp.where(crossed, qp.lower + qp.upper, 0.0)
-    bounds = dict(lower=jnp.where(crossed, middle, qp.lower), upper=jnp.where(crossed, middle, qp.upper))
-    return replace(qp, **bounds), crossed.any()
 
 
 def _finite(qp: QP) -> Bool[Array, ""]:
