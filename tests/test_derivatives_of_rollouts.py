@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arm_setting import DT, SCHEMES, arm_setting, solve, with_numbers
+from arm_setting import DT, SCHEMES, arm_setting, solve
 from jax.flatten_util import ravel_pytree
 
 import osik_jax as osik
@@ -24,11 +24,13 @@ class TestHessian:
     @all_schemes
     def test_of_a_tick(self, arm, rng, name):
         """Forward over reverse, with speeds at their bounds, against central differences of the gradient; symmetric."""
-        setting = arm_setting(arm, SCHEMES[name])
-        place = setting[2]["hand"].target[0]
+        robot, _, tasks, scheme, limits, dt = arm_setting(arm, SCHEMES[name])
+        hand, posture = tasks["hand"], tasks["posture"]
+        place, rotation = hand.target
 
         def loss(x):
-            s = solve(with_numbers(setting, x[:7], x[7:10], x[10]))
+            aimed = {"hand": hand.replace(target=(x[7:10], rotation)), "posture": posture.replace(gain=x[10])}
+            s = solve((robot, x[:7], aimed, scheme, limits, dt))
             return jnp.sum(jnp.sin(s.velocity)), (s.warm_start, jnp.abs(s.velocity) >= 0.8 - 1e-12)
 
         x = jnp.concatenate([arm.q0 + 0.3 * rng.normal(size=7), place + 0.2 * rng.normal(size=3), jnp.array([2.0])])
@@ -86,7 +88,7 @@ class TestRollout:
             assert float(reverse @ d) == pytest.approx(expected, rel=1e-5)
             assert float(push(d)) == pytest.approx(float(reverse @ d), rel=1e-9)
 
-    @all_schemes
+    @pytest.mark.parametrize("name", ["weighted", "hierarchical"])
     def test_memory_of_the_gradient(self, arm, name):
         """A tick more keeps the state of a tick, not what its solver went through."""
 

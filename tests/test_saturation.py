@@ -391,7 +391,8 @@ class TestDerivatives:
         return value, (answer.active, answer.scales < 1.0)
 
     @pytest.fixture(scope="class")
-    def data(self):
+    @staticmethod
+    def data():
         rng = np.random.default_rng(7)
         p = drawn(rng, 300)
         move = 0.3 * rng.normal(size=p.lower.shape)
@@ -405,8 +406,9 @@ class TestDerivatives:
         return data, along
 
     @pytest.fixture(scope="class")
-    def gradient(self):
-        return jax.jit(jax.vmap(jax.grad(self.cost, has_aux=True)))
+    @classmethod
+    def gradient(cls):
+        return jax.jit(jax.vmap(jax.grad(cls.cost, has_aux=True)))
 
     def test_in_both_modes_they_are_central_differences(self, data, gradient):
         """In matrices, targets, weights, bounds, secondary motion and damping; to fourth order."""
@@ -461,11 +463,13 @@ class TestScheme:
     """Through ``osik_jax.solve``: both options of ``NullSpace``."""
 
     @pytest.fixture(scope="class")
-    def arm(self):
+    @staticmethod
+    def arm():
         return osik.load_robot("arm7")
 
     @pytest.fixture(scope="class")
-    def tasks(self, arm):
+    @staticmethod
+    def tasks(arm):
         p, R = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
         height = osik.FrameTask(arm, "hand", rows=(False, False, True, False, False, False), priority=1)
         far = p + jnp.array([0.3, 0.0, 0.0]), R
