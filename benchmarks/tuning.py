@@ -1,6 +1,7 @@
 """Tuning by gradient beside CMA-ES: the same loop, scenarios, start and space, the same number of rollouts.
 
     python -m benchmarks.tuning [results.json]
+    python -m benchmarks.tuning --memory [ticks] [scenarios]      peak of one gradient; default 1000 and 256
 
 NAO stands on both feet and reaches with both hands for points that its arms can reach. All weights and gains start at
 the library's defaults, 1 and 10 / s. Training and held-out scenarios are drawn apart; neither method sees the second.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import fnmatch
 import json
+import resource
 import sys
 import time
 from functools import partial
@@ -194,6 +196,23 @@ def compare(
     return out
 
 
+def peak_memory(steps: int = 1000, scenarios: int = 256, *, chunk: int = 64) -> float:
+    """GiB that the whole process held at most, after one gradient on NAO; to be asked in a process of its own."""
+    experiment = nao_reaching(training=scenarios, held_out=1, steps=steps, dt=0.005)
+    loss, names, loop, training, _ = experiment
+    tuning.tune(loss, names, training, loop=loop, iterations=1, chunk=chunk, progress=False)
+    unit = 2**30 if sys.platform == "darwin" else 2**20  # bytes there, KiB elsewhere
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def report_memory(steps: int = 1000, scenarios: int = 256) -> None:
+    """Prints the peak, and how long it took."""
+    started = time.perf_counter()
+    peak = peak_memory(steps, scenarios)
+    seconds = time.perf_counter() - started
+    print(f"gradient of {steps} ticks x {scenarios} scenarios of NAO: {peak:.2f} GiB at most, {seconds:.0f} s in all")
+
+
 def main(path: str | None = None) -> None:
     """Prints a table, and writes all numbers as JSON."""
     jax.config.update("jax_enable_x64", True)
@@ -217,4 +236,8 @@ def main(path: str | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    if sys.argv[1:2] == ["--memory"]:
+        jax.config.update("jax_enable_x64", True)
+        report_memory(*map(int, sys.argv[2:4]))
+    else:
+        main(*sys.argv[1:2])
