@@ -76,7 +76,7 @@ def test_tuned_gains_stand(tuned):
     assert tuned.loss < 0.2 * tuned.history.loss[0]
     gains = {name: value for name, value in tuned.parameters.items() if name.endswith("gain")}
     assert len(gains) == 4 and max(gains.values()) < FOLLOWED
-    fell, height, tilt, slip, behind = in_physics(tuned.loop, 4.0)
+    fell, height, tilt, slip, behind = in_physics(tuned.loop, 8.0)
     assert not fell
     assert height < 0.01 and tilt < 3.0 and slip < 0.005
     assert behind < 0.02
