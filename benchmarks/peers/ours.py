@@ -1,0 +1,128 @@
+"""osik_jax: one jitted tick, or that tick vmapped over a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import osik_jax as osik
+
+from ..workload import DT, Workload
+
+SCHEMES: dict[str, Callable[[], osik.Scheme]] = {
+    "weighted": lambda: osik.WeightedQP(damping=1e-9),
+    "null-space": osik.NullSpace,
+    "hierarchical": osik.HierarchicalQP,
+}
+"""The weighted scheme has the damping of the peers, the others their defaults."""
+
+
+class Runner:
+    """One robot, or a batch of them, in our closed loop.
+
+    Args:
+        work: what to do.
+        scheme: of ``SCHEMES``.
+        precision: ``float64`` or ``float32``.
+        batch: number of robots; None for one without a batch axis.
+        warm: carry the active set from tick to tick.
+    """
+
+    packages = ("osik-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
+
+    def __init__(
+        self,
+        work: Workload,
+        *,
+        scheme: str = "weighted",
+        precision: str = "float64",
+        batch: int | None = None,
+        warm: bool = True,
+    ) -> None:
+        jax.config.update("jax_enable_x64", precision == "float64")
+        self.work, self.floating, self.batch = work, work.floating, batch
+        self.robot = osik.Robot.from_urdf(work.urdf, floating_base=work.floating)
+        self.places = np.array([self.robot.joint_qpos_index(name) for name in work.joints])
+        start = jnp.asarray(self._own(work.start), self.robot.q0.dtype)
+        tick = tick_of(self.robot, work, SCHEMES[scheme](), start)
+        none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), _warm_start(tick, start))
+        self.q, self.warm_start = start, none
+        if batch is not None:
+            tick = jax.vmap(tick, in_axes=(0, 0, 0, None))
+            self.q, self.warm_start = jax.tree.map(lambda a: jnp.tile(a, (batch, *[1] * a.ndim)), (start, none))
+        self.none = self.warm_start
+        self.program, self.warm = jax.jit(tick), warm
+        self.fine: list[jax.Array] = []
+
+    def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
+        """Targets, QP, integration in one program."""
+        self.q, self.warm_start, fine = self.program(
+            self.q, self.warm_start if self.warm else self.none, hand.astype(self.q.dtype), com.astype(self.q.dtype)
+        )
+        self.fine.append(fine)
+        return np.asarray(self.q)
+
+    def canonical(self, q: np.ndarray) -> np.ndarray:
+        """Our quaternions are w x y z."""
+        base = (q[..., :3], q[..., 4:7], q[..., 3:4]) if self.floating else ()
+        return np.concatenate([*base, q[..., self.places]], axis=-1)
+
+    def solved(self) -> float:
+        """Share of the lanes and ticks so far whose status is SOLVED."""
+        return float(np.mean([np.mean(np.asarray(fine)) for fine in self.fine]))
+
+    def _own(self, q: np.ndarray) -> np.ndarray:
+        own = np.array(self.robot.q0)
+        if self.floating:
+            own[:3], own[3], own[4:7] = q[:3], q[6], q[3:6]
+        own[self.places] = q[7 if self.floating else 0 :]
+        return own
+
+
+def tasks_of(robot: osik.Robot, work: Workload, start: jax.Array) -> dict[str, osik.Task]:
+    """The workload's tasks; priorities matter to the schemes that rank, weights within a level."""
+    c, gain = work.costs, 1.0 / DT
+    tasks: dict[str, osik.Task] = {
+        name: osik.FrameTask(robot, name, target=(p, R), weight=c.foot**2, priority=1, gain=gain)
+        for name, p, R in zip(work.feet, work.foot_positions, work.foot_rotations, strict=True)
+    }
+    if work.feet:
+        tasks["com"] = osik.ComTask(robot, target=work.com_start, weight=c.com**2, priority=2, gain=gain)
+    tasks["hand"] = osik.FrameTask(
+        robot,
+        work.hand,
+        target=(work.hand_position, work.hand_rotation),
+        position_weight=c.hand_position**2,
+        orientation_weight=c.hand_rotation**2,
+        priority=3,
+        gain=gain,
+    )
+    tasks["posture"] = osik.PostureTask(robot, target=start, weight=c.posture**2, priority=4, gain=gain)
+    return tasks
+
+
+def tick_of(robot: osik.Robot, work: Workload, scheme: osik.Scheme, start: jax.Array) -> Callable[..., Any]:
+    """(q, warm start, hand, centre of mass) to (q, warm start, solved), as a user's control loop would have it."""
+    tasks = tasks_of(robot, work, start)
+    limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)
+    rotation = jnp.asarray(work.hand_rotation, robot.q0.dtype)
+
+    def tick(q: jax.Array, warm_start: Any, hand: jax.Array, com: jax.Array) -> tuple[jax.Array, Any, jax.Array]:
+        aimed = tasks | {"hand": tasks["hand"].replace(target=(hand, rotation))}
+        if "com" in tasks:
+            aimed["com"] = tasks["com"].replace(target=com)
+        solution = osik.solve(robot, q, aimed, scheme=scheme, limits=limits, dt=DT, warm_start=warm_start)
+        q = osik.integrate(robot, q, solution.velocity, DT)
+        return q, solution.warm_start, solution.status == osik.Status.SOLVED
+
+    return tick
+
+
+def _warm_start(tick: Callable[..., Any], start: jax.Array) -> Any:
+    """Shapes of a warm start, from a tick that is traced and not run."""
+    point = jnp.zeros(3, start.dtype)
+    return jax.eval_shape(lambda q: tick(q, None, point, point)[1], start)
