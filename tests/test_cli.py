@@ -98,6 +98,7 @@ def test_a_renderer_that_does_not_work_is_explained(capsys, monkeypatch):
     def broken(*args, **kwargs):
         raise mujoco.FatalError("no\nOpenGL context")
 
+    monkeypatch.setattr(_opengl, "_failures", [])
     monkeypatch.setattr(_opengl.mujoco, "Renderer", broken)
     assert "no OpenGL context; use auto or raycast" in refused(capsys, "demo", "--renderer", "mujoco")
 

@@ -1,5 +1,6 @@
 """The viewer against MuJoCo: where faces, cameras, rays and pictures put a robot."""
 
+import os
 import subprocess
 import sys
 import types
@@ -279,9 +280,13 @@ def test_film_of_another_kind_is_refused(tmp_path, nao, monkeypatch):
 
 
 def test_without_opengl_rays_are_cast(nao, monkeypatch):
+    tries = []
+
     def broken(*args, **kwargs):
+        tries.append(args)
         raise mujoco.FatalError("no OpenGL context")
 
+    monkeypatch.setattr(_opengl, "_failures", [])
     monkeypatch.setattr(_opengl.mujoco, "Renderer", broken)
     camera = Camera((0.0, 0.0, 0.3), 2.0, 30.0, 10.0, 0.8)
     stage = Stage([robot_parts(nao)], camera, floor=0.0)
@@ -290,6 +295,24 @@ def test_without_opengl_rays_are_cast(nao, monkeypatch):
         _opengl.make_renderer("mujoco", stage, camera, (32, 32), floor=0.0)
     with pytest.raises(RuntimeError, match="no OpenGL context"):
         viewer.check_opengl()
+    assert len(tries) == 1
+
+
+def test_without_a_screen_asking_twice_is_safe():
+    """MuJoCo's own renderer aborts the process at its second failure."""
+    code = """
+from osik_jax.viewer import check_opengl
+for _ in range(2):
+    try:
+        check_opengl()
+    except RuntimeError as error:
+        print(error)
+"""
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    first, *rest = done.stdout.splitlines() or [""]
+    assert all(line == first for line in rest)
 
 
 def test_with_opengl_mujocos_renderer_draws(nao, monkeypatch):
@@ -319,6 +342,7 @@ def test_with_opengl_mujocos_renderer_draws(nao, monkeypatch):
             ids[4:] = 7  # a part of the robot
             return ids
 
+    monkeypatch.setattr(_opengl, "_failures", [])
     monkeypatch.setattr(_opengl.mujoco, "Renderer", Recorder)
     camera = Camera((0.0, 0.0, 0.3), 2.0, 30.0, 10.0, 0.8)
     stage = Stage([robot_parts(nao)], camera, floor=0.0)

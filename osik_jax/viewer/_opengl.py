@@ -18,6 +18,10 @@ _GL_ERRORS = (mujoco.FatalError, ImportError, AttributeError, OSError, RuntimeEr
 """What MuJoCo's renderer raises without a GL library, without a screen, or with a broken driver."""
 
 
+_failures: list[str] = []
+"""Why OpenGL does not work here, once that is known: MuJoCo 4.0 aborts the process at its second failure."""
+
+
 class Renderer(Protocol):
     """Draws a stage."""
 
@@ -35,12 +39,15 @@ class GlRenderer:
         Raises:
             RuntimeError: OpenGL does not work here.
         """
+        if _failures:
+            raise RuntimeError(_failures[0])
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 self._renderer = mujoco.Renderer(stage.model, height=size[1], width=size[0])
         except _GL_ERRORS as error:
-            raise RuntimeError(f"MuJoCo's renderer does not work here: {error}") from error
+            _failures.append(f"MuJoCo's renderer does not work here: {error}")
+            raise RuntimeError(_failures[0]) from error
         self._camera = camera.for_mujoco()
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 1
