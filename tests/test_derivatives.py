@@ -89,6 +89,7 @@ def qp_answer(s):
     return (s.x, s.slack, s.multipliers, s.row_multipliers), (s.status, s.active)
 
 
+@pytest.mark.slow
 class TestArrays:
     def test_quadratic_programs(self, rng):
         """With respect to H, g, box, rows and their bounds: minimiser, multipliers and slacks."""

@@ -12,6 +12,8 @@ from jax.flatten_util import ravel_pytree
 
 import osik_jax as osik
 
+pytestmark = pytest.mark.slow
+
 all_schemes = pytest.mark.parametrize("name", SCHEMES)
 
 

@@ -14,6 +14,8 @@ from jax.flatten_util import ravel_pytree
 
 import osik_jax as osik
 
+pytestmark = pytest.mark.slow
+
 CASES = 1000
 all_schemes = pytest.mark.parametrize("name", SCHEMES)
 

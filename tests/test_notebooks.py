@@ -38,7 +38,11 @@ def shown_text(output: Any) -> str:
     return output.get("text", "") + "".join(v for k, v in output.get("data", {}).items() if k.startswith("text/"))
 
 
-@each_notebook
+@pytest.mark.parametrize(
+    "source",
+    [SOURCES[0], *(pytest.param(source, marks=pytest.mark.slow) for source in SOURCES[1:])],
+    ids=lambda path: path.stem,
+)
 def test_runs_in_fast_mode(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OSIK_FAST", "1")
     monkeypatch.delenv("DISPLAY", raising=False)

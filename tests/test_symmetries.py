@@ -68,6 +68,7 @@ SCHEMES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_where_the_world_is(rng, scheme):
     """The base and all targets turned and moved: the same joint velocities, a base velocity turned with them."""

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
+
 from benchmarks.tuning import arm_reaching, compare
+
+pytestmark = pytest.mark.slow
 
 
 def test_the_arm_beats_cma():

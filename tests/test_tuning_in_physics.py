@@ -9,6 +9,8 @@ import pytest
 import osik_jax as osik
 from osik_jax import physics, tuning
 
+pytestmark = pytest.mark.slow
+
 FEET = {"left_foot": "l_sole", "right_foot": "r_sole"}
 FOLLOWED = 5.0
 """The highest gain that NAO's servos follow without swinging [1/s]; docs/physics.md."""

@@ -9,6 +9,8 @@ import pytest
 import osik_jax as osik
 from osik_jax import tuning
 
+pytestmark = pytest.mark.slow
+
 SCHEMES = {
     "weighted": osik.WeightedQP(damping=1e-3),
     "null-space": osik.NullSpace(damping=1e-3),
