@@ -92,8 +92,10 @@ class State(NamedTuple):
     warm_start: Any
 
 
-def batch_of(given: Setting, scheme: osik.Scheme, batch: int) -> tuple[Callable[..., Any], tuple[Any, ...], State]:
-    """The vmapped tick, its arguments before the state, and the first state."""
+def batch_of(
+    given: Setting, scheme: osik.Scheme, batch: int, *, mapped: Callable[..., Any] = jax.vmap
+) -> tuple[Any, tuple[Any, ...], State]:
+    """The tick mapped over lanes, its arguments before the state, and the first state."""
     lanes = np.arange(batch) % LANES
     tasks = osik.batched(given.tasks, {"hand.target[0]": given.targets[lanes]})
     axes = osik.batch_axes(given.tasks, "hand.target[0]")
@@ -113,7 +115,7 @@ def batch_of(given: Setting, scheme: osik.Scheme, batch: int) -> tuple[Callable[
     )
     none = jax.tree.map(lambda a: jnp.zeros((batch, *a.shape), a.dtype), first)
     arguments = (given.robot, tasks, scheme, given.limits)
-    return jax.vmap(tick, in_axes=(None, axes, None, None, 0)), arguments, State(starts, none)
+    return mapped(tick, in_axes=(None, axes, None, None, 0)), arguments, State(starts, none)
 
 
 def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:

@@ -24,6 +24,7 @@ PACKAGES = (
     "osik_jax.demo",
     "osik_jax.viewer",
     "osik_jax.tuning",
+    "osik_jax.scaling",
 )
 OPTIONAL = (
     "matplotlib",
@@ -36,6 +37,7 @@ OPTIONAL = (
     "osik_jax.viewer",
     "osik_jax.demo",
     "osik_jax.tuning",
+    "osik_jax.scaling",
     "optax",
 )
 

@@ -1,0 +1,195 @@
+"""A batch split over the devices of a mesh."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+_SHARED = -1
+"""In the place of an axis: every device has all of it."""
+
+
+def device_mesh(devices: Sequence[Any] | None = None) -> Mesh:
+    """Devices in a row, an axis called "lanes".
+
+    Args:
+        devices: default: all that JAX has, those of other hosts too where ``jax.distributed`` joined them.
+    """
+    return Mesh(np.array(jax.devices() if devices is None else list(devices)), ("lanes",))
+
+
+def sharded(
+    function: Callable[..., Any],
+    in_axes: Any = 0,
+    *,
+    mesh: Mesh | None = None,
+    donate_argnums: int | Sequence[int] = (),
+) -> ShardedFunction:
+    """Like ``jax.jit(jax.vmap(function, in_axes))``, with the batch split over devices.
+
+    Each device runs its own lanes to their own end: no device waits for another one's slowest lane, and nothing is
+    sent between them but gradients of what they share. Differentiable in both modes, and may be called inside ``jit``.
+
+    Args:
+        function: of one lane; pure.
+        in_axes: as ``jax.vmap`` takes it: one for all arguments or one for each, an axis, None, or a tree of them
+            (``osik_jax.batch_axes``). What is None is copied to every device.
+        mesh: the devices; the batch is split over all of its axes. Default: ``device_mesh()``.
+        donate_argnums: arguments whose memory the results may take, as in ``jax.jit``; they are lost to the caller.
+
+    Returns:
+        A function of batches. Results have the lanes in front and stay on their devices. Compiled once for each shape;
+        keep it, for another call of ``sharded`` compiles anew.
+
+    Raises:
+        TypeError: a function that cannot be called, or a mesh that is none.
+    """
+    if not callable(function):
+        raise TypeError(f"{function!r} is no function")
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as device_mesh(jax.devices()[:2])")
+    return ShardedFunction(function, in_axes, device_mesh() if mesh is None else mesh, donate_argnums)
+
+
+class ShardedFunction:
+    """What ``sharded`` returns.
+
+    Attributes:
+        function: of one lane.
+        in_axes: which axes are split.
+        mesh: the devices.
+    """
+
+    def __init__(
+        self, function: Callable[..., Any], in_axes: Any, mesh: Mesh, donate_argnums: int | Sequence[int] = ()
+    ):
+        self.function, self.in_axes, self.mesh = function, in_axes, mesh
+        self._program = jax.jit(self._shards, donate_argnums=donate_argnums)
+        functools.update_wrapper(self, function, updated=())
+
+    def __call__(self, *args: Any) -> Any:
+        """Results of all lanes.
+
+        A number of lanes that the devices do not divide is filled up with copies of the last lane, which are cut off
+        again; that moves data between devices, so large batches had better divide.
+
+        Raises:
+            ValueError: ``in_axes`` does not fit the arguments, lanes differ in number, or there are none.
+        """
+        batch = _Batch(args, self.in_axes)
+        count = batch.count
+        missing = -count % self.mesh.size
+        out = self._program(*self._placed(batch, missing))
+        return jax.tree.map(lambda a: a[:count], out) if missing else out
+
+    def place(self, *args: Any) -> tuple[Any, ...]:
+        """The arguments on the devices where the function wants them, so that calls in a loop copy nothing.
+
+        Raises:
+            ValueError: as a call does, and where the devices do not divide the number of lanes.
+        """
+        batch = _Batch(args, self.in_axes)
+        if batch.count % self.mesh.size:
+            raise ValueError(f"{batch.count} lanes do not divide over {self.mesh.size} devices")
+        return self._placed(batch, 0)
+
+    def _shards(self, *args: Any) -> Any:
+        batch = _Batch(args, self.in_axes)
+        axes = [None if axis == _SHARED else axis for axis in batch.axes]
+
+        def lane(own: list[Any]) -> Any:
+            return self.function(*jax.tree.unflatten(batch.structure, own))
+
+        # Checks of what varies over the mesh are off: loops inside the solvers begin with constants, which do not.
+        mapped = jax.shard_map(
+            jax.vmap(lane, in_axes=(axes,)),
+            mesh=self.mesh,
+            in_specs=([self._spec(axis) for axis in axes],),
+            out_specs=self._spec(0),
+            check_vma=False,
+        )
+        return mapped(batch.leaves)
+
+    def _spec(self, axis: int | None) -> PartitionSpec:
+        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, self.mesh.axis_names)
+
+    def _placed(self, batch: _Batch, missing: int) -> tuple[Any, ...]:
+        """The arguments on their devices, filled up; those that are there already are left alone."""
+        whole = [_filled(a, axis, missing) for a, axis in zip(batch.leaves, batch.axes, strict=True)]
+        places = {axis: NamedSharding(self.mesh, self._spec(None if axis == _SHARED else axis)) for axis in batch.axes}
+        wanted = [places[axis] for axis in batch.axes]
+        away = [i for i, (a, place) in enumerate(zip(whole, wanted, strict=True)) if not _is_there(a, place)]
+        moved = _moved([whole[i] for i in away], [wanted[i] for i in away])
+        for i, a in zip(away, moved, strict=True):
+            whole[i] = a
+        return jax.tree.unflatten(batch.structure, whole)
+
+
+class _Batch:
+    """Arguments taken apart, with an axis for each array, ``_SHARED`` where there is none."""
+
+    def __init__(self, args: tuple[Any, ...], in_axes: Any):
+        self.leaves, self.structure = jax.tree.flatten(args)
+        self.axes = _flat_axes(in_axes, args, self.leaves)
+
+    @property
+    def count(self) -> int:
+        """Number of lanes."""
+        lengths = {np.shape(a)[axis] for a, axis in zip(self.leaves, self.axes, strict=True) if axis != _SHARED}
+        if len(lengths) != 1 or 0 in lengths:
+            found = ", ".join(str(n) for n in sorted(lengths)) or "none, for in_axes splits no argument"
+            raise ValueError(f"the arguments that are split need one number of lanes, at least 1; found: {found}")
+        return lengths.pop()
+
+
+def _flat_axes(in_axes: Any, args: tuple[Any, ...], leaves: list[Any]) -> list[int]:
+    if isinstance(in_axes, (tuple, list)):
+        if len(in_axes) != len(args):
+            raise ValueError(f"in_axes has {len(in_axes)} parts, for {len(args)} arguments")
+        in_axes = tuple(in_axes)
+    marked = jax.tree.map(lambda axis: _SHARED if axis is None else axis, in_axes, is_leaf=lambda axis: axis is None)
+    axes = jax.tree.leaves(jax.tree.broadcast(marked, args))
+    for leaf, axis in zip(leaves, axes, strict=True):
+        if axis != _SHARED and not 0 <= axis < np.ndim(leaf):
+            raise ValueError(f"in_axes has axis {axis} for an array of shape {np.shape(leaf)}")
+    return axes
+
+
+def _is_there(leaf: Any, place: NamedSharding) -> bool:
+    """Whether it is where it is wanted; Python numbers always, for they take the precision of what they meet."""
+    if isinstance(leaf, (bool, int, float, complex)):
+        return True
+    known = isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer)
+    return known and leaf.committed and leaf.sharding == place
+
+
+def _moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:
+    if not leaves:
+        return []
+    if jax.process_count() == 1:
+        return jax.device_put(leaves, places)
+    return [_on_all_hosts(a, place) for a, place in zip(leaves, places, strict=True)]
+
+
+def _filled(a: Any, axis: int, missing: int) -> Any:
+    """With the last lane repeated."""
+    if axis == _SHARED or not missing:
+        return a
+    xp = np if isinstance(a, np.ndarray) else jnp
+    last = xp.take(a, xp.asarray([a.shape[axis] - 1]), axis=axis)
+    return xp.concatenate([a, xp.repeat(last, missing, axis=axis)], axis=axis)
+
+
+def _on_all_hosts(a: Any, place: NamedSharding) -> Any:
+    """One array over hosts from what each of them has whole; it takes its own part and asks nobody."""
+    if isinstance(a, Tracer) or (isinstance(a, jax.Array) and not a.is_fully_addressable):
+        return jax.device_put(a, place)
+    whole = np.asarray(a, jax.dtypes.canonicalize_dtype(a.dtype))
+    return jax.make_array_from_callback(whole.shape, place, lambda part: whole[part])

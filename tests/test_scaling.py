@@ -1,0 +1,359 @@
+"""Batches over devices and hosts, and jobs in chunks: equal to vmap, continued when killed, refused if they differ."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.core import Tracer
+
+from osik_jax import scaling
+
+HERE = Path(__file__).parent
+DEVICES = "--xla_force_host_platform_device_count"
+
+
+def start(script: str, *args: Any, devices: int = 1) -> subprocess.Popen[str]:
+    """A Python program beside the tests, with so many CPU devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {DEVICES}={devices}"
+    env = os.environ | {
+        "XLA_FLAGS": flags,
+        "PJRT_NPROC": str(8 * devices),  # devices of one process share their workers
+        "JAX_ENABLE_X64": "1",
+        "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path]),
+    }
+    command = [sys.executable, "-c", script, *map(str, args)]
+    return subprocess.Popen(command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def finish(process: subprocess.Popen[str]) -> Any:
+    """What the program printed last, as JSON."""
+    try:
+        out, errors = process.communicate(timeout=300)
+    finally:
+        process.kill()
+    assert process.returncode == 0, errors
+    return json.loads(out.splitlines()[-1])
+
+
+EIGHT = """
+import json
+import jax, jax.numpy as jnp, numpy as np
+import osik_jax as osik
+from osik_jax.scaling import device_mesh, sharded
+
+arm = osik.load_robot("arm7")
+limits = (osik.VelocityLimit(arm, velocity={'*': 0.4}),)
+q = arm.q0 + 0.3 * jax.random.normal(jax.random.key(0), (21, arm.nq))  # 21 lanes do not divide over 8 devices
+hand = osik.FrameTask(arm, "hand", rows="position", gain=3.0, priority=1)
+tasks = {"hand": hand, "posture": osik.PostureTask(arm, priority=2)}
+many = osik.batched(tasks, {"posture.gain": jnp.linspace(1.0, 3.0, 21)})
+axes = (None, 0, osik.batch_axes(tasks, "posture.gain"))
+largest = lambda a, b: max(float(abs(x - y).max()) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+found = {"devices": len(jax.devices())}
+for scheme in (osik.WeightedQP(), osik.NullSpace(), osik.HierarchicalQP()):
+    tick = lambda robot, q, tasks: osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=0.01)
+    split = sharded(tick, axes)
+    a, b = split(arm, q, many), jax.jit(jax.vmap(tick, axes))(arm, q, many)
+    exact = largest((a.status, a.warm_start), (b.status, b.warm_start))
+    split(arm, q + 0.01, many)
+    found[type(scheme).__name__] = dict(
+        error=largest(a, b), exact=exact, lanes=len(a.velocity), compiled=split._program._cache_size()
+    )
+
+def path(gain, q):
+    own = {"hand": hand.replace(gain=gain)}
+    return osik.solve(arm, q, own, scheme=osik.NullSpace(damping=1e-2), limits=limits, dt=0.01).velocity
+loss = lambda paths, gain, q: jnp.mean(paths(gain, q) ** 3)
+slope = jax.jit(jax.grad(loss, argnums=(1, 2)), static_argnums=0)
+both = slope(sharded(path, (None, 0)), 3.0, q), slope(jax.vmap(path, (None, 0)), 3.0, q)
+for name, a, b in zip(("shared", "lanes"), *both):
+    found["gradient, " + name] = dict(error=largest(a, b), size=float(abs(b).max()))
+
+mean = sharded(lambda a, x: a * x.mean(), (None, 0))
+placed = mean.place(3.0, q[:16])
+out = mean(*placed)
+last = placed[1].addressable_shards[7].data.shape
+found["placed"] = [last, len(out.sharding.device_set), out.sharding.is_fully_replicated]
+two = sharded(mean.function, (None, 0), mesh=device_mesh(jax.devices()[:2]))(3.0, q[:16])
+found["two"] = [largest(two, np.asarray(out)), len(two.sharding.device_set)]
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def eight():
+    return finish(start(EIGHT, devices=8))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["WeightedQP", "NullSpace", "HierarchicalQP"])
+def test_eight_devices_give_what_vmap_gives(eight, scheme):
+    assert eight["devices"] == 8
+    assert eight[scheme]["lanes"] == 21 and eight[scheme]["compiled"] == 1
+    assert eight[scheme]["exact"] == 0.0
+    assert eight[scheme]["error"] < 1e-12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["shared", "lanes"])
+def test_gradients_through_eight_devices(eight, what):
+    found = eight[f"gradient, {what}"]
+    assert found["error"] < 1e-12 * max(1.0, found["size"]) and found["size"] > 1e-4
+
+
+@pytest.mark.slow
+def test_results_stay_on_their_devices(eight):
+    assert eight["placed"] == [[2, 7], 8, False]
+    assert eight["two"][0] < 1e-12 and eight["two"][1] == 2
+
+
+TWO_HOSTS = """
+import json, sys
+from pathlib import Path
+import jax, numpy as np
+port, process, folder = sys.argv[1:]
+jax.distributed.initialize(f"localhost:{port}", 2, int(process))
+from jax.experimental.multihost_utils import sync_global_devices
+from osik_jax.scaling import run_in_chunks, sharded
+split = sharded(lambda x, a: {"y": a * x**2, "n": x[0] > 0.5}, (0, None))
+x = np.random.default_rng(0).uniform(size=(22, 3))
+job = dict(chunk=8, shared=(2.0,), out=folder, progress=False)
+first = run_in_chunks(split, x, **job)
+sync_global_devices("written")
+lost = Path(folder) / "00000001.1-of-2.npz"
+if process == "1":
+    lost.unlink()
+sync_global_devices("lost")
+missing = first.missing
+before = {path.name: path.stat().st_mtime_ns for path in Path(folder).glob("*.npz")}
+sync_global_devices("counted")
+run_in_chunks(split, x, **job)
+sync_global_devices("written again")
+kept = sum(path.stat().st_mtime_ns == before.get(path.name) for path in Path(folder).glob("*.npz"))
+uneven = split(x[:5], 2.0)["y"]
+total = float(jax.jit(lambda y: y.sum())(uneven))
+print(json.dumps([len(jax.devices()), len(jax.local_devices()), missing, kept, total]))
+"""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return probe.getsockname()[1]
+
+
+def test_two_hosts_write_their_own_lanes(tmp_path):
+    """And again where the part of one is lost: both run that chunk, and no other."""
+    x, port = np.random.default_rng(0).uniform(size=(22, 3)), free_port()
+    for found in map(finish, [start(TWO_HOSTS, port, i, tmp_path, devices=2) for i in range(2)]):
+        assert found[:4] == [4, 2, [1], 4]
+        assert found[4] == pytest.approx((2.0 * x[:5] ** 2).sum(), rel=1e-14)
+    parts = sorted(path.name for path in tmp_path.glob("*.npz"))
+    assert parts == [f"{k:08d}.{i}-of-2.npz" for k in range(3) for i in range(2)]
+    saved = scaling.load(tmp_path)
+    np.testing.assert_array_equal(saved[:]["y"], 2.0 * x**2)
+    np.testing.assert_array_equal(saved[7:17]["n"], x[7:17, 0] > 0.5)
+
+
+KILLED = """
+import os, signal, sys
+import jax, numpy as np
+from osik_jax.scaling import run_in_chunks
+def batch(start, stop):
+    if start == 40:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"x": np.arange(start, stop, dtype=float)}
+square = jax.jit(jax.vmap(lambda lane, a: {"y": a * lane["x"] ** 2}, (0, None)))
+run_in_chunks(square, batch, count=64, chunk=8, shared=(3.0,), out=sys.argv[1])
+"""
+
+
+def square(lane, a):
+    return {"y": a * lane["x"] ** 2}
+
+
+@pytest.fixture
+def counted():
+    """The function of the job that is killed, and the chunks that it ran."""
+    ran: list[int] = []
+    program = jax.jit(jax.vmap(square, (0, None)))
+
+    def function(batch, a):
+        if not isinstance(batch["x"], Tracer):
+            ran.append(int(batch["x"][0]))
+        return program(batch, a)
+
+    return function, ran
+
+
+def numbers(start: int, stop: int) -> dict[str, Any]:
+    return {"x": np.arange(start, stop, dtype=float)}
+
+
+def test_killed_and_continued(tmp_path, counted):
+    function, ran = counted
+    killed = start(KILLED, tmp_path)
+    killed.communicate(timeout=120)
+    assert killed.returncode == -signal.SIGKILL
+    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
+    assert list(sorted(before)) == [f"{k:08d}.npz" for k in range(4)]  # chunk 4 was on its way
+    with pytest.raises(ValueError, match="chunk 4 of .* is missing, with 3 more of 8"):
+        scaling.load(tmp_path)[:]
+    np.testing.assert_array_equal(scaling.load(tmp_path)[3:30]["y"], 3.0 * np.arange(3.0, 30.0) ** 2)
+
+    out = scaling.run_in_chunks(function, numbers, count=64, chunk=8, shared=(3.0,), out=tmp_path, progress=False)
+    assert ran == [32, 40, 48, 56]
+    np.testing.assert_array_equal(out[:]["y"], 3.0 * np.arange(64.0) ** 2)
+    assert all((tmp_path / name).stat().st_mtime_ns == then for name, then in before.items())
+
+    ran.clear()
+    scaling.run_in_chunks(function, numbers, count=64, chunk=8, shared=(3.0,), out=tmp_path, progress=False)
+    assert ran == [] and not list(tmp_path.glob(".*"))
+
+
+def test_a_half_written_file_does_not_count(tmp_path, counted, monkeypatch):
+    function, _ = counted
+    job: dict[str, Any] = dict(chunk=8, shared=(3.0,), out=tmp_path, progress=False)
+    real = np.savez
+
+    def full_disk(file, *args, **arrays):
+        file.write(b"half of it")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        scaling.run_in_chunks(function, numbers(0, 20), **job)
+    monkeypatch.setattr(np, "savez", real)
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+    np.testing.assert_array_equal(
+        scaling.run_in_chunks(function, numbers(0, 20), **job)[:]["y"], 3.0 * np.arange(20.0) ** 2
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(batch=numbers(1, 21)), r"batch\.x was float64 20 \w+, is float64 20 \w+$"),
+        (dict(batch=numbers(0, 21)), r"count was 20, is 21; batch\.x was float64 20 \w+, is float64 21 \w+$"),
+        (dict(batch=dict(x=np.arange(20))), r"batch\.x was float64 20 \w+, is int64 20"),
+        (
+            dict(batch=numbers(0, 20) | dict(z=np.zeros(20))),
+            r"batch\.structure was .*; batch\.z was absent, is float64",
+        ),
+        (dict(shared=(4.0,)), r"differs: shared\.\[0\] was float64 scalar \w+, is float64 scalar \w+$"),
+        (dict(chunk=5), "differs: chunk was 8, is 5$"),
+        (dict(label="cube"), "differs: label was , is cube$"),
+    ],
+)
+def test_another_job_is_refused(tmp_path, counted, changes, message):
+    function, ran = counted
+    job: dict[str, Any] = dict(batch=numbers(0, 20), chunk=8, shared=(3.0,), out=tmp_path, progress=False)
+    scaling.run_in_chunks(function, **job)
+    ran.clear()
+    with pytest.raises(ValueError, match=message):
+        scaling.run_in_chunks(function, **job | changes)
+    assert ran == []
+
+
+def test_structure_of_robots_and_tasks_is_part_of_the_job():
+    """The same in every process, and another for another scheme or other rows."""
+    import osik_jax as osik
+    from osik_jax.scaling._fingerprint import differences, fingerprint
+
+    arm, again = osik.load_robot("arm7"), osik.load_robot("arm7")
+    assert fingerprint(arm) == fingerprint(again)
+    assert differences(fingerprint(arm), fingerprint(arm.scaled(mass={"link7": 2.0})))[0].startswith("body_mass was")
+    assert fingerprint(osik.WeightedQP()) != fingerprint(osik.NullSpace())
+    a, b = (fingerprint(osik.FrameTask(arm, "hand", rows=rows)) for rows in ("position", "orientation"))
+    assert any(line.startswith("structure was") for line in differences(a, b))
+
+
+def test_slices_and_structures(tmp_path):
+    x = np.random.default_rng(1).normal(size=(23, 2))
+    double = jax.jit(jax.vmap(lambda x: (x[0], {"both": 2.0 * x, "none": None})))
+    saved = scaling.run_in_chunks(double, x, chunk=5, out=tmp_path, progress=False)
+    assert (len(saved), saved.chunks, saved.missing, saved.names) == (23, 5, (), ("[0]", "[1].both"))
+    for lanes in (slice(None), slice(4, 11), slice(-3, None), slice(2, 20, 4), slice(9, 9), slice(50, None)):
+        first, rest = saved[lanes]
+        np.testing.assert_array_equal(first, x[lanes, 0])
+        np.testing.assert_array_equal(rest["both"], 2.0 * x[lanes])
+        assert rest["none"] is None
+    like = jax.eval_shape(double, x)
+    again, by_name = scaling.load(tmp_path, like=like), scaling.load(tmp_path)
+    np.testing.assert_array_equal(again[3:9][1]["both"], by_name[3:9]["[1].both"])
+    np.testing.assert_array_equal(by_name.read(["[0]"], slice(20, 23))["[0]"], x[20:, 0])
+    with pytest.raises(KeyError, match=r"no array 'both'; arrays: \[0\], \[1\]\.both"):
+        by_name.read(["both"])
+    one: Any = 3
+    with pytest.raises(TypeError, match=r"use \[3 : 3 \+ 1\]"):
+        by_name[one]
+    with pytest.raises(ValueError, match="step"):
+        by_name[::-1]
+    with pytest.raises(ValueError, match=r"like has the arrays a; saved are \[0\], \[1\]\.both"):
+        scaling.load(tmp_path, like={"a": 0})
+    with pytest.raises(FileNotFoundError, match="no manifest"):
+        scaling.load(tmp_path / "elsewhere")
+
+
+def test_in_memory_with_a_bar(capsys):
+    x = jnp.linspace(0.0, 1.0, 10)
+    got = scaling.run_in_chunks(scaling.sharded(lambda x: {"y": x + 1.0}), x, chunk=4)
+    assert isinstance(got["y"], np.ndarray)
+    np.testing.assert_array_equal(got["y"], np.asarray(x) + 1.0)
+    assert "10/10" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(chunk=0), "chunk is 0"),
+        (dict(batch=dict(a=np.zeros(3), b=np.zeros(4))), "lengths: 3, 4"),
+        (dict(batch={}), "nothing is given"),
+        (dict(batch=numbers), "count has to say"),
+        (dict(count=3), "count goes with a batch that is a function"),
+        (dict(batch=lambda a, b: numbers(a, b + 1), count=9), r"batch\(0, 4\) made arrays of 5 lanes, expected 4"),
+        (dict(function=lambda b: {"sum": b["x"].sum()}), "4 of them: sum does not"),
+        (dict(function=lambda b: {}), "there are none"),
+    ],
+)
+def test_mistakes_in_jobs(changes, message):
+    job: dict[str, Any] = dict(function=lambda batch: batch, batch=numbers(0, 8), chunk=4, progress=False)
+    with pytest.raises(ValueError, match=message):
+        scaling.run_in_chunks(**job | changes)
+
+
+def test_mistakes_in_sharded():
+    add = scaling.sharded(lambda x, y: x + y, (0, None))
+    with pytest.raises(ValueError, match="in_axes has 2 parts, for 1 arguments"):
+        add(jnp.ones(3))
+    with pytest.raises(ValueError, match="axis 0 for an array of shape \\(\\)"):
+        add(1.0, jnp.ones(3))
+    with pytest.raises(ValueError, match="found: 0"):
+        add(jnp.ones(0), 1.0)
+    with pytest.raises(ValueError, match="found: 2, 3"):
+        scaling.sharded(lambda x, y: x + y)(jnp.ones(3), jnp.ones(2))
+    with pytest.raises(ValueError, match="in_axes splits no argument"):
+        scaling.sharded(lambda x: x, None)(jnp.ones(3))
+    number: Any = 3
+    with pytest.raises(TypeError, match="mesh is 3"):
+        scaling.sharded(lambda x: x, mesh=number)
+    with pytest.raises(TypeError, match="3 is no function"):
+        scaling.sharded(number)
+
+
+def test_other_axes_and_precisions():
+    x, y = np.arange(12.0).reshape(3, 4), np.arange(4, dtype=np.float32)
+    got = scaling.sharded(lambda x, y, a: (x * y, a * y), (1, 0, None))(x, y, 2.0)
+    np.testing.assert_array_equal(got[0], x.T * y[:, None])
+    assert got[1].dtype == jnp.float32  # a Python number takes the precision of what it meets
