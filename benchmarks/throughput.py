@@ -3,9 +3,9 @@
     python -m benchmarks.throughput [results.json] [--robot nao] [--batches 1,64,1024] [--schemes weighted,...]
                                     [--precisions float64,float32]
 
-NAO stands on both feet, keeps its centre of mass and reaches with one hand, each lane from other angles of its arms and
-for another point; joint position and velocity limits, dt 5 ms. One call is one jitted, vmapped tick: solve, integrate,
-warm start carried on. A call is timed alone and blocked until ready; ``seconds`` is the median.
+The robot stands on both feet, keeps its centre of mass and reaches with one hand, each lane from other angles of its
+arms and for another point; joint position and velocity limits, dt 5 ms. One call is one jitted, vmapped tick: solve,
+integrate, warm start carried on. A call is timed alone and blocked until ready; ``seconds`` is the median.
 
 ``error`` is the largest difference of any task's error [m or rad] to float64 on the CPU, in the first lanes, after the
 same ticks. ``program_bytes`` is what XLA allots to the program, with its arguments and results; ``device_peak_bytes``
@@ -33,9 +33,13 @@ import osik_jax as osik
 SCHEMES = {"weighted": osik.WeightedQP, "null-space": osik.NullSpace, "hierarchical": osik.HierarchicalQP}
 PRECISIONS = ("float64", "float32")
 BATCHES = (1, 16, 64, 256, 1024, 4096, 16384, 65536)
-FRAMES = {"nao": (("l_sole", "r_sole"), "l_gripper"), "arm7": ((), "hand")}
+FRAMES = {
+    "nao": (("l_sole", "r_sole"), "l_gripper"),
+    "g1": (("left_ankle_roll_link", "right_ankle_roll_link"), "right_wrist_yaw_link"),
+    "arm7": ((), "hand"),
+}
 """Of each robot: feet and hand."""
-ARMS = ("Shoulder", "Elbow", "joint")
+ARMS = {"nao": ("Shoulder", "Elbow"), "g1": ("shoulder", "elbow"), "arm7": ("joint",)}
 """Parts of the names of the joints that differ from lane to lane."""
 DT = 0.005
 LANES = 64
@@ -62,21 +66,31 @@ class Setting(NamedTuple):
 
 def setting(name: str) -> Setting:
     """Both feet, centre of mass, one hand's position, posture; in the precision that is JAX's default now."""
-    robot = osik.load_robot(name)
+    robot = loaded(name)
     feet, hand = FRAMES[name]
     tasks: dict[str, osik.Task] = {foot: osik.FrameTask(robot, foot, weight=100.0, priority=1) for foot in feet}
     if feet:
         tasks["com"] = osik.ComTask(robot, weight=10.0, priority=2)
     tasks["hand"] = osik.FrameTask(robot, hand, rows="position", priority=3)
     tasks["posture"] = osik.PostureTask(robot, weight=1e-3, gain=1.0, priority=4)
-    starts, ends = (jnp.asarray(q) for q in arm_angles(robot))
+    starts, ends = (jnp.asarray(q) for q in arm_angles(robot, ARMS[name]))
     poses = jax.jit(jax.vmap(lambda q: osik.forward_kinematics(robot, q).frame_pose(robot, hand)[0]))
     return Setting(robot, tasks, (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)), starts, poses(ends))
 
 
-def arm_angles(robot: osik.Robot) -> np.ndarray:
+def loaded(name: str) -> osik.Robot:
+    """An embedded robot; G1 is example-robot-data's, standing as in ``python -m benchmarks``."""
+    if name != "g1":
+        return osik.load_robot(name)
+    from .peers.ours import standing  # with Pinocchio, which the others do without
+    from .robots import workload
+
+    return standing(workload(name))
+
+
+def arm_angles(robot: osik.Robot, parts: tuple[str, ...]) -> np.ndarray:
     """Starts and ends (2, LANES, nq): joints of the arms up to a quarter of their range off home. Seed 0."""
-    names = [name for name in robot.joint_names if any(part in name for part in ARMS)]
+    names = [name for name in robot.joint_names if any(part in name for part in parts)]
     dofs, places = ([index(name) for name in names] for index in (robot.joint_dof_index, robot.joint_qpos_index))
     low, high = np.asarray(robot.position_lower)[dofs], np.asarray(robot.position_upper)[dofs]
     q = np.tile(np.asarray(robot.q0), (2, LANES, 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -45,9 +46,9 @@ class Runner:
     ) -> None:
         jax.config.update("jax_enable_x64", precision == "float64")
         self.work, self.floating, self.batch = work, work.floating, batch
-        self.robot = osik.Robot.from_urdf(work.urdf, floating_base=work.floating)
+        self.robot = standing(work)
         self.places = np.array([self.robot.joint_qpos_index(name) for name in work.joints])
-        start = jnp.asarray(self._own(work.start), self.robot.q0.dtype)
+        start = self.robot.q0
         tick = tick_of(self.robot, work, SCHEMES[scheme](), start)
         none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), _warm_start(tick, start))
         self.q, self.warm_start = start, none
@@ -75,12 +76,16 @@ class Runner:
         """Share of the lanes and ticks so far whose status is SOLVED."""
         return float(np.mean([np.mean(np.asarray(fine)) for fine in self.fine]))
 
-    def _own(self, q: np.ndarray) -> np.ndarray:
-        own = np.array(self.robot.q0)
-        if self.floating:
-            own[:3], own[3], own[4:7] = q[:3], q[6], q[3:6]
-        own[self.places] = q[7 if self.floating else 0 :]
-        return own
+
+def standing(work: Workload) -> osik.Robot:
+    """The workload's robot; its home is the workload's start."""
+    robot = osik.Robot.from_urdf(work.urdf, floating_base=work.floating)
+    q, start = np.array(robot.q0), work.start
+    if work.floating:
+        q[:7] = start[[0, 1, 2, 6, 3, 4, 5]]
+        start = start[7:]
+    q[[robot.joint_qpos_index(name) for name in work.joints]] = start
+    return replace(robot, q0=jnp.asarray(q))
 
 
 def tasks_of(robot: osik.Robot, work: Workload, start: jax.Array) -> dict[str, osik.Task]:
