@@ -377,6 +377,7 @@ class TestBatchesAndFailures:
             solve_nullspace(level, -np.ones(3), np.ones(2))
 
 
+@pytest.mark.slow
 class TestDerivatives:
     """300 random cases, most of them saturated and scaled: two levels and a secondary motion."""
 

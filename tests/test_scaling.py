@@ -153,6 +153,7 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+@pytest.mark.slow
 def test_two_hosts_write_their_own_lanes(tmp_path):
     """And again where the part of one is lost: both run that chunk, and no other."""
     x, port = np.random.default_rng(0).uniform(size=(22, 3)), free_port()
@@ -201,6 +202,7 @@ def numbers(start: int, stop: int) -> dict[str, Any]:
     return {"x": np.arange(start, stop, dtype=float)}
 
 
+@pytest.mark.slow
 def test_killed_and_continued(tmp_path, counted):
     function, ran = counted
     killed = start(KILLED, tmp_path)

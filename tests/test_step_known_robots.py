@@ -14,6 +14,8 @@ import pytest
 
 import osik_jax as osik
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
 TICKS = 10
 GAIN = 20.0

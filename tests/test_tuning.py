@@ -381,6 +381,7 @@ class TestTune:
         with pytest.raises(FileNotFoundError):
             run(loop, scenarios, resume=tmp_path / "no.npz")
 
+    @pytest.mark.slow
     def test_a_line_search(self, loop, scenarios):
         """An optimiser that asks for values along the way."""
         search = optax.chain(optax.sgd(1.0), optax.scale_by_backtracking_linesearch(max_backtracking_steps=5))
