@@ -41,6 +41,7 @@ from osik_jax import physics, tuning
 from osik_jax.viewer import hero_picture
 
 jax.config.update("jax_enable_x64", True)  # double precision: controllers want it
+jax.config.update("jax_disable_most_optimizations", True)  # compiled in half the time; not for long runs
 
 FAST = "OSIK_FAST" in os.environ  # the tests run this notebook with smaller sizes
 ITERATIONS = 40  # gradients; the fast mode takes them from the file below

@@ -55,6 +55,7 @@ def test_runs_in_fast_mode(source: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     finally:
         plt.close("all")
         jax.config.update("jax_enable_x64", True)
+        jax.config.update("jax_disable_most_optimizations", False)
         jax.clear_caches()
     assert sorted(source.parent.iterdir()) == files
 
