@@ -17,13 +17,14 @@ import json
 import shlex
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 
 from . import gate, report
+from .command_line import listed
 from .peers import PEERS
 from .processes import Entrant, cores
 from .race import Race
@@ -92,18 +93,6 @@ def measure(race: Race, selection: Selection, *, quick: bool, part: str) -> dict
         for group in many_robots(selection):
             many += race.run(group, rounds=rounds, ticks=400, seconds=5 * seconds)
     return dict(one_robot=single, many_robots=many)
-
-
-def listed(kind: Callable[[str], Any], among: Collection[str] = ()) -> Callable[[str], list[Any]]:
-    """Parser of a list with commas."""
-
-    def parse(text: str) -> list[Any]:
-        values = [kind(part) for part in text.split(",")]
-        if wrong := [value for value in values if among and value not in among]:
-            raise argparse.ArgumentTypeError(f"{wrong[0]!r} is none of {', '.join(among)}")
-        return values
-
-    return parse
 
 
 def settings() -> argparse.Namespace:

@@ -24,6 +24,7 @@ import numpy as np
 
 from osik_jax.scaling import device_mesh, sharded
 
+from .command_line import listed
 from .throughput import (
     CHECKED,
     FRAMES,
@@ -34,7 +35,6 @@ from .throughput import (
     TIMED,
     Setting,
     batch_of,
-    listed,
     machine,
     reference,
     setting,

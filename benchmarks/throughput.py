@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
+
+from .command_line import listed
+from .machine import processor
 
 SCHEMES = {"weighted": osik.WeightedQP, "null-space": osik.NullSpace, "hierarchical": osik.HierarchicalQP}
 PRECISIONS = ("float64", "float32")
@@ -210,15 +212,6 @@ def machine() -> dict[str, Any]:
     return dict(device=device.device_kind, platform=device.platform, cpu=processor(), jax=jax.__version__)
 
 
-def processor() -> str:
-    """Name of the CPU, as far as the system tells."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-
-
 def kept(path: Path | None) -> list[dict[str, Any]]:
     """Rows of an earlier run.
 
@@ -256,19 +249,6 @@ def show(rows: list[dict[str, Any]]) -> None:
             *(f"{r['compile_seconds']:.1f}", f"{r['program_bytes'] / 2**20:.2g}"),
         )
     Console(width=110).print(table)
-
-
-def listed(kind: Callable[[str], Any], among: Collection[str] = ()) -> Callable[[str], list[Any]]:
-    """Parser of a list with commas."""
-
-    def parse(text: str) -> list[Any]:
-        values = [kind(part) for part in text.split(",")]
-        wrong = [value for value in values if among and value not in among]
-        if wrong:
-            raise argparse.ArgumentTypeError(f"{wrong[0]!r} is none of {', '.join(among)}")
-        return values
-
-    return parse
 
 
 def main() -> None:

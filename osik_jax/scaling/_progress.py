@@ -6,6 +6,8 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 
+from .._progress import progress_bar
+
 
 @contextlib.contextmanager
 def reported(total: int, done: int, *, shown: bool) -> Iterator[Callable[[int], None]]:
@@ -13,17 +15,12 @@ def reported(total: int, done: int, *, shown: bool) -> Iterator[Callable[[int], 
     if not shown:
         yield lambda more: None
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (MofNCompleteColumn(), BarColumn(bar_width=30), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("compiling", total=total, completed=done)
+    with progress_bar(total, done) as update:
         start, own = time.perf_counter(), [0]
 
         def advance(more: int) -> None:
             own[0] += more
             rate = own[0] / (time.perf_counter() - start)
-            bar.update(task, advance=more, description=f"{rate:,.0f} lanes/s")
+            update(done + own[0], f"{rate:,.0f} lanes/s")
 
         yield advance

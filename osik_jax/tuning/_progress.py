@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 
+from .._progress import progress_bar
 from ._history import History
 
 
@@ -14,13 +15,8 @@ def reported(iterations: int, *, shown: bool) -> Iterator[Callable[[History], No
     if not shown:
         yield lambda history: None
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (MofNCompleteColumn(), BarColumn(bar_width=30), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("compiling", total=iterations)
-        yield lambda history: bar.update(task, completed=len(history), description=describe(history))
+    with progress_bar(iterations) as update:
+        yield lambda history: update(len(history), describe(history))
 
 
 def describe(history: History) -> str:
