@@ -167,13 +167,23 @@ class KinematicTree:
         return np.asarray(self.joint_bodies, int)[self.dof_joint]
 
     @cached_property
-    def levels(self) -> tuple[np.ndarray, ...]:
-        """Bodies by depth; the first level is the world."""
-        depth = np.zeros(len(self.body_parents), int)
-        for body, parent in enumerate(self.body_parents):
-            if body:
-                depth[body] = depth[parent] + 1
-        return tuple(np.flatnonzero(depth == d) for d in range(depth.max() + 1))
+    def parents(self) -> np.ndarray:
+        """``body_parents`` as an array."""
+        return np.asarray(self.body_parents, int)
+
+    @cached_property
+    def root(self) -> int:
+        """The first moving body, or the world where nothing moves."""
+        return min(1, len(self.body_parents) - 1)
+
+    @cached_property
+    def doublings(self) -> tuple[np.ndarray, ...]:
+        """Of each body its parent, then the ancestor 2 above it, 4, 8, ... until that is the world for all."""
+        rounds, above = [], self.parents
+        while above.any():
+            rounds.append(above)
+            above = above[above]
+        return tuple(rounds)
 
     @cached_property
     def descendants(self) -> np.ndarray:

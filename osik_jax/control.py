@@ -22,6 +22,7 @@ from .robot import Robot
 from .schemes import Scheme, VelocityProblem
 from .solvers import Status
 from .tasks import Task
+from .tasks._rows import rows_of
 
 Tasks = Mapping[str, Task]
 Targets = Mapping[str, Any]
@@ -128,9 +129,7 @@ def _solve(
         {k: posed & own for k, (_, own) in looked_at.items()},
     )
     kinematics = forward_kinematics(robot, q)
-    problem = _velocity_problem(
-        robot, q, {k: t.rows(robot, kinematics, q) for k, t in tasks.items()}, tasks, limits, dt
-    )
+    problem = _velocity_problem(robot, q, rows_of(robot, kinematics, q, tasks), tasks, limits, dt)
     given = _spoiled(problem, raw_box, jnp.stack([set_up, *sound.values()]).all())
     answer = scheme.solve(given, warm_start)
     v = answer.velocity

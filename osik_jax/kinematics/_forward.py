@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -13,7 +12,9 @@ from jaxtyping import Array, Float
 
 from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
 from ..robot import Robot
+from ._composition import world_poses
 from ._joints import dof_kinds, joint_transforms
+from ._rigid import compose, cross, rotate
 
 
 class Kinematics(eqx.Module):
@@ -51,8 +52,8 @@ class Kinematics(eqx.Module):
         ids = np.array([robot.tree.frame(name) for name in names], int)
         bodies = np.asarray(robot.tree.frame_bodies, int)[ids]
         rotations = self.body_rotation[bodies]
-        positions = self.body_position[bodies] + _apply(rotations, robot.frame_position[ids])
-        return positions, _compose(rotations, robot.frame_rotation[ids])
+        positions = self.body_position[bodies] + rotate(rotations, robot.frame_position[ids])
+        return positions, compose(rotations, robot.frame_rotation[ids])
 
 
 def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
@@ -63,11 +64,11 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     """
     robot.check_configuration(q)
     local = joint_transforms(robot, robot.mujoco_qpos(q))
-    position, rotation = _chain(robot.tree, local.xpos, local.xmat)
+    position, rotation = world_poses(robot.tree, local.xpos, local.xmat)
     joint_parents = np.asarray(robot.tree.body_parents, int)[np.asarray(robot.tree.joint_bodies, int)]
     turn = rotation[joint_parents]
-    anchor = position[joint_parents] + _apply(turn, local.xanchor)
-    linear, angular = _motion_axes(robot.tree, _apply(turn, local.xaxis), rotation)
+    anchor = position[joint_parents] + rotate(turn, local.xanchor)
+    linear, angular = _motion_axes(robot.tree, rotate(turn, local.xaxis), rotation)
     return Kinematics(position, rotation, linear, angular, anchor[robot.tree.dof_joint])
 
 
@@ -79,7 +80,7 @@ def frame_jacobians(robot: Robot, kinematics: Kinematics, names: Sequence[str]) 
     """
     ids = np.array([robot.tree.frame(name) for name in names], int)
     bodies = np.asarray(robot.tree.frame_bodies, int)[ids]
-    points = kinematics.body_position[bodies] + _apply(kinematics.body_rotation[bodies], robot.frame_position[ids])
+    points = kinematics.body_position[bodies] + rotate(kinematics.body_rotation[bodies], robot.frame_position[ids])
     mask = robot.tree.moves[bodies][:, None, :]
     linear = _velocity_at(kinematics, points[:, None, :])
     angular = jnp.broadcast_to(kinematics.dof_angular, linear.shape)
@@ -116,11 +117,11 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
         KeyError, ValueError: as in ``center_of_mass``.
     """
     mass, moment = _body_moments(robot, kinematics, subtree)
-    below = jnp.asarray(robot.tree.descendants, mass.dtype)
-    mass_below = jnp.matmul(below, mass, precision="highest")[robot.tree.dof_body][:, None]
-    moment_below = jnp.matmul(below, moment, precision="highest")[robot.tree.dof_body]
+    carried = jnp.asarray(robot.tree.descendants[robot.tree.dof_body], mass.dtype)
+    below = jnp.matmul(carried, jnp.concatenate([mass[:, None], moment], 1), precision="highest")
+    mass_below, moment_below = below[:, :1], below[:, 1:]
     arm = moment_below - mass_below * kinematics.dof_anchor
-    columns = mass_below * kinematics.dof_linear + jnp.cross(kinematics.dof_angular, arm)
+    columns = mass_below * kinematics.dof_linear + cross(kinematics.dof_angular, arm)
     return independent_columns(robot.tree, columns.T / jnp.sum(mass))
 
 
@@ -131,33 +132,6 @@ def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"
     for index, coefficient in followers:
         reduced = reduced + jacobian[..., index] * coefficient
     return reduced
-
-
-def _apply(rotation: Float[Array, "... 3 3"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Rotates; written as a sum, which XLA fuses and never runs in reduced precision."""
-    return jnp.sum(rotation * vector[..., None, :], -1)
-
-
-def _compose(a: Float[Array, "... 3 3"], b: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], -2)
-
-
-def _chain(
-    tree: KinematicTree, position: Float[Array, "nbody 3"], rotation: Float[Array, "nbody 3 3"]
-) -> tuple[Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]:
-    """Composes poses in parents into poses in the world, depth by depth."""
-    parents = np.asarray(tree.body_parents, int)
-    place = np.zeros(len(parents), int)
-    levels = [(position[:1], rotation[:1])]
-    for above, bodies in zip(tree.levels, tree.levels[1:], strict=False):
-        place[above] = np.arange(len(above))
-        parent = place[parents[bodies]]
-        p, turn = jax.lax.optimization_barrier(levels[-1])  # or XLA recomputes all ancestors of every body
-        p, turn = p[parent], turn[parent]
-        levels.append((p + _apply(turn, position[bodies]), _compose(turn, rotation[bodies])))
-    order = np.argsort(np.concatenate(tree.levels))
-    positions, rotations = (jnp.concatenate(parts)[order] for parts in zip(*levels, strict=True))
-    return positions, rotations
 
 
 def _motion_axes(
@@ -178,7 +152,7 @@ def _motion_axes(
 
 def _velocity_at(kinematics: Kinematics, points: Float[Array, "k 1 3"]) -> Float[Array, "k nvfull 3"]:
     """Velocity that each dof, at unit speed, gives to each point were it fixed to the moved body."""
-    return kinematics.dof_linear + jnp.cross(kinematics.dof_angular, points - kinematics.dof_anchor)
+    return kinematics.dof_linear + cross(kinematics.dof_angular, points - kinematics.dof_anchor)
 
 
 def _body_moments(
@@ -192,5 +166,5 @@ def _body_moments(
         if not isinstance(mass, Tracer) and not np.asarray(mass)[below].sum() > 0.0:
             raise ValueError(f"the subtree of {subtree!r} has no mass, so it has no centre of mass")
         mass = jnp.where(below, mass, 0.0)
-    centers = kinematics.body_position + _apply(kinematics.body_rotation, robot.body_com)
+    centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
     return mass, mass[:, None] * centers

@@ -8,9 +8,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..solvers import Level
+from ..solvers._dense import apply
 from ..tasks import TaskRows
 from ..tasks._leaves import as_scalar
 
@@ -51,11 +53,11 @@ class VelocityProblem(eqx.Module):
 
     def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
         """Of each task, J v minus the nearest point of its interval."""
-        out = {}
-        for name, rows in self.rows.items():
-            value = rows.jacobian @ velocity
-            out[name] = value - jnp.clip(value, rows.lower, rows.upper)
-        return out
+        rows = self.rows.values()
+        values = apply(jnp.concatenate([r.jacobian for r in rows]), velocity)
+        ends = np.cumsum([len(r.error) for r in rows])[:-1]
+        apart = zip(self.rows.items(), jnp.split(values, ends), strict=True)
+        return {name: value - jnp.clip(value, r.lower, r.upper) for (name, r), value in apart}
 
 
 class SchemeAnswer(eqx.Module):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._rules import custom_jvp
+from .._rules import custom_jvp
 
 
 def uncrossed(

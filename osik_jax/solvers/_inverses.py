@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._rules import custom_jvp
 from ._dense import apply, product
-from ._rules import custom_jvp
 
 
 @custom_jvp

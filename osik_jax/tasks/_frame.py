@@ -116,35 +116,33 @@ class FrameTask(Task):
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Rows in the order x, y, z, rotation x, y, z, those left out skipped. (m <= 6)."""
         del q
-        error, jacobian, feedforward = self._all_rows(robot, kinematics)
-        weight = self.weight * jnp.concatenate([self.position_weight, self.orientation_weight])
-        if not all(self.kept):
-            kept = np.flatnonzero(self.kept)
-            error, jacobian, feedforward, weight = (x[kept] for x in (error, jacobian, feedforward, weight))
+        return self.rows_at(*kinematics.frame_pose(robot, self.frame), frame_jacobian(robot, kinematics, self.frame))
+
+    def rows_at(
+        self, position: Float[Array, "3"], rotation: Float[Array, "3 3"], jacobian: Float[Array, "6 nv"]
+    ) -> TaskRows:
+        """The same from the frame's pose and Jacobian."""
+        parts = []
+        if any(self.kept[:3]):
+            linear = self._position_in_world if self.axes == "world" else self._position_in_frame
+            parts.append((self.kept[:3], (*linear(position, rotation, jacobian), self.position_weight)))
+        if any(self.kept[3:]):
+            angular = self._orientation_in_world if self.axes == "world" else self._orientation_in_frame
+            parts.append((self.kept[3:], (*angular(rotation, jacobian[3:]), self.orientation_weight)))
+        chosen = [_chosen(kept, arrays) for kept, arrays in parts]
+        error, rows, feedforward, weight = (jnp.concatenate(arrays) for arrays in zip(*chosen, strict=True))
         return task_rows(
             error,
-            jacobian,
+            rows,
             gain=self.gain,
-            weight=weight,
+            weight=self.weight * weight,
             lower=self.lower,
             upper=self.upper,
             feedforward=feedforward,
         )
 
-    def _all_rows(self, robot: Robot, kinematics: Kinematics) -> tuple[Array, Array, Array]:
-        """Error (6,), Jacobian (6, nv) and feed-forward (6,)."""
-        position, rotation = kinematics.frame_pose(robot, self.frame)
-        jacobian = frame_jacobian(robot, kinematics, self.frame)
-        if self.axes == "world":
-            linear = self._position_in_world(position, jacobian)
-            angular = self._orientation_in_world(rotation, jacobian[3:])
-        else:
-            linear = self._position_in_frame(position, rotation, jacobian)
-            angular = self._orientation_in_frame(rotation, jacobian[3:])
-        error, rows, feedforward = (jnp.concatenate(pair) for pair in zip(linear, angular, strict=True))
-        return error, rows, feedforward
-
-    def _position_in_world(self, position: Array, jacobian: Array) -> _Parts:
+    def _position_in_world(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
+        del rotation
         return position - self.target[0], jacobian[:3], self.target_velocity[:3]
 
     def _position_in_frame(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
@@ -179,6 +177,11 @@ class FrameTask(Task):
 
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
+
+
+def _chosen(kept: Sequence[bool], arrays: Sequence[Array]) -> list[Array]:
+    """The rows that are kept, of each array."""
+    return list(arrays) if all(kept) else [array[np.flatnonzero(kept)] for array in arrays]
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..._rules import custom_jvp
 from .._dense import apply, product
 from .._inverses import row_space_and_motion_of_rank
-from .._rules import custom_jvp
 from ._problem import Level
 from ._stack import Stack
 

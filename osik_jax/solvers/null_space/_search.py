@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._rules import custom_jvp
 from .._dense import apply, product
-from .._rules import custom_jvp
 
 
 class Room(NamedTuple):

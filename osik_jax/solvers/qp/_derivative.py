@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from ..._rules import custom_jvp
 from .._dense import apply
 from .._pivots import INACTIVE
-from .._rules import custom_jvp
 from ._factor import factorize, solve_system
 from ._problem import QP, active_targets
 
