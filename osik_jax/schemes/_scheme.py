@@ -53,11 +53,13 @@ class VelocityProblem(eqx.Module):
 
     def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
         """Of each task, J v minus the nearest point of its interval."""
-        rows = self.rows.values()
-        values = apply(jnp.concatenate([r.jacobian for r in rows]), velocity)
-        ends = np.cumsum([len(r.error) for r in rows])[:-1]
-        apart = zip(self.rows.items(), jnp.split(values, ends), strict=True)
-        return {name: value - jnp.clip(value, r.lower, r.upper) for (name, r), value in apart}
+        dense = {name: rows for name, rows in self.rows.items() if rows.dofs is None}
+        values = {name: velocity[np.array(rows.dofs, int)] for name, rows in self.rows.items() if name not in dense}
+        if dense:
+            together = apply(jnp.concatenate([rows.jacobian for rows in dense.values()]), velocity)
+            ends = np.cumsum([len(rows.error) for rows in dense.values()])[:-1]
+            values |= dict(zip(dense, jnp.split(together, ends), strict=True))
+        return {name: values[name] - jnp.clip(values[name], r.lower, r.upper) for name, r in self.rows.items()}
 
 
 class SchemeAnswer(eqx.Module):

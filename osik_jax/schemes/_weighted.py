@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._joint_selection import concrete
@@ -37,11 +38,11 @@ class WeightedQP(Scheme):
         equalities = [rows for rows in problem.rows.values() if rows.is_equality]
         intervals = [rows for rows in problem.rows.values() if not rows.is_equality]
         answer = solve_least_squares_qp(
-            *_stack(equalities, problem),
+            *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
             problem.upper,
             **_soft_rows(intervals),
-            damping=self.damping,
+            **_pulls([rows for rows in equalities if rows.dofs is not None], problem, self.damping),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
         )
@@ -50,8 +51,20 @@ class WeightedQP(Scheme):
         )
 
 
+def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Array, ""]) -> dict[str, Array]:
+    """Rows that each ask for one dof's velocity, with the damping: a strength and a centre for each dof."""
+    n = problem.lower.shape[0]
+    strength, pull = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)
+    for rows in singles:
+        place = np.full(n, len(rows.dofs or ()))
+        place[np.array(rows.dofs, int)] = np.arange(len(rows.dofs or ()))
+        weight, wanted = (jnp.append(a, 0.0)[place] for a in (rows.weight, rows.weight * rows.lower))
+        strength, pull = strength + weight, pull + wanted
+    return dict(damping=strength, center=pull / strength)
+
+
 def _stack(equalities: list[TaskRows], problem: VelocityProblem) -> tuple[Array, Array, Array]:
-    """Matrix, target and weight of all equality rows."""
+    """Matrix, target and weight of equality rows."""
     nothing = jnp.zeros((0, problem.lower.shape[0]), problem.lower.dtype)
     none = nothing[:, 0]
     return (

@@ -103,11 +103,16 @@ class PostureTask(Task):
             lower=self.lower,
             upper=self.upper,
             feedforward=feedforward,
+            dofs=tuple(dofs) if self._adds(robot) else None,
         )
+
+    def _adds(self, robot: Robot) -> bool:
+        """Whether all joints are hinges and slides, whose values simply add up."""
+        return all(is_scalar(robot, joint) for joint in self.joints)
 
     def _difference(self, robot: Robot, q: Array, dofs: list[int]) -> Float[Array, " m"]:
         """From the target to q, on the chosen dofs."""
-        if all(is_scalar(robot, joint) for joint in self.joints):
+        if self._adds(robot):
             places = np.array([robot.tree.qpos_address[joint] for joint in self.joints])
             return (q - self.target)[places]
         return difference(robot, self.target, q)[np.array(dofs)]

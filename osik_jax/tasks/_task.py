@@ -28,6 +28,8 @@ class TaskRows(eqx.Module):
         lower: bound on ``jacobian @ v``. Equality: ``-gain e + x*'``; inequality: ``gain (lower - x) + x*'``. (m,)
         upper: the same as ``lower`` for an equality; inequality: ``gain (upper - x) + x*'``. (m,)
         weight: of the square of each row's residual. (m,)
+        dofs: where each row asks for one dof's velocity as it is, those dofs (static): ``jacobian`` is then those rows
+            of the identity, which a scheme may use to save work. None elsewhere.
     """
 
     error: Float[Array, " m"]
@@ -35,6 +37,7 @@ class TaskRows(eqx.Module):
     lower: Float[Array, " m"]
     upper: Float[Array, " m"]
     weight: Float[Array, " m"]
+    dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
 
     @property
     def is_equality(self) -> bool:
@@ -119,21 +122,23 @@ def task_rows(
     lower: Float[Array, " m"] | None = None,
     upper: Float[Array, " m"] | None = None,
     feedforward: Float[Array, " m"] | None = None,
+    dofs: tuple[int, ...] | None = None,
 ) -> TaskRows:
     """The rows of an equality task, or with bounds of an inequality task on ``error``: what ``Task.rows`` returns.
 
     Equality: ``jacobian v = -gain(error) error + feedforward``. Inequality: ``gain (lower - error) + feedforward <=
     jacobian v <= gain (upper - error) + feedforward``; infinite bounds stay infinite, and an adaptive gain is evaluated
-    at the distance of the value to the interval, 0 inside. Rows of weight 0 do not count for the gain.
+    at the distance of the value to the interval, 0 inside. Rows of weight 0 do not count for the gain. ``dofs``: see
+    ``TaskRows``.
     """
     shift = jnp.zeros_like(error) if feedforward is None else feedforward
     if lower is None or upper is None:
         wanted = shift - evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
-        return TaskRows(error, jacobian, wanted, wanted, weight)
+        return TaskRows(error, jacobian, wanted, wanted, weight, dofs)
     outside = jnp.maximum(lower - error, 0.0) + jnp.maximum(error - upper, 0.0)
     rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
     low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
-    return TaskRows(error, jacobian, low, high, weight)
+    return TaskRows(error, jacobian, low, high, weight, dofs)
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:

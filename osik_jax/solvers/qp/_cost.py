@@ -33,7 +33,7 @@ class Quadratic(eqx.Module):
 
 
 class LeastSquares(eqx.Module):
-    """1/2 sum_i weight_i (A x - b)_i^2 + 1/2 sum_j damping_j x_j^2.
+    """1/2 sum_i weight_i (A x - b)_i^2 + 1/2 sum_j damping_j (x_j - center_j)^2.
 
     Products go through A: what forming H = A'WA rounds away (small weights beside large ones) is kept.
     """
@@ -42,15 +42,16 @@ class LeastSquares(eqx.Module):
     target: Float[Array, " m"]
     weight: Float[Array, " m"]
     damping: Float[Array, " n"]
+    center: Float[Array, " n"]
 
     def hessian(self) -> Float[Array, "n n"]:
         """A'WA + D, rounded."""
         return product(self.matrix.T * self.weight, self.matrix) + jnp.diag(self.damping)
 
     def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """A'W(A x - b) + D x."""
+        """A'W(A x - b) + D (x - c)."""
         residual = self.weight * (apply(self.matrix, x) - self.target)
-        return apply(self.matrix.T, residual) + self.damping * x
+        return apply(self.matrix.T, residual) + self.damping * (x - self.center)
 
     def curvature(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """A'WA x + D x."""
@@ -63,4 +64,5 @@ class LeastSquares(eqx.Module):
             target=jnp.zeros_like(self.target),
             weight=jnp.zeros_like(self.weight),
             damping=jnp.ones_like(self.damping),
+            center=jnp.zeros_like(self.center),
         )

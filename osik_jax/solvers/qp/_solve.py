@@ -79,12 +79,13 @@ def solve_least_squares_qp(
     rows_upper: Float[ArrayLike, " p"] | None = None,
     *,
     damping: Float[ArrayLike, "..."] = 1e-9,
+    center: Float[ArrayLike, "..."] = 0.0,
     rows_compliance: Float[ArrayLike, " p"] | None = None,
     warm_start: Int[ArrayLike, " n+p"] | None = None,
     max_iterations: int | None = None,
     tolerance: Float[ArrayLike, ""] | None = None,
 ) -> QPSolution:
-    """Minimises 1/2 sum_i weight_i (matrix_i x - target_i)^2 + 1/2 damping |x|^2, constrained as in ``solve_qp``.
+    """Minimises 1/2 sum_i weight_i (matrix_i x - target_i)^2 + 1/2 damping |x - center|^2, constrained as ``solve_qp``.
 
     The factored form: the answer is refined against residuals of the matrix itself, so that small weights survive
     beside large ones.
@@ -94,6 +95,7 @@ def solve_least_squares_qp(
         target: b. (m,)
         weight: of the squared residuals, >= 0. (m,)
         damping: > 0; makes the answer unique. A scalar or one per variable (n,).
+        center: where the damping pulls to. A scalar or one per variable (n,).
         lower: as in ``solve_qp``, and so are the following.
         upper: of the box. (n,)
         rows: general constraints. (p, n)
@@ -106,7 +108,8 @@ def solve_least_squares_qp(
     """
     matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)
     n = matrix.shape[1]
-    cost = LeastSquares(matrix, target, weight, jnp.broadcast_to(jnp.asarray(damping, matrix.dtype), (n,)))
+    pulls = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
+    cost = LeastSquares(matrix, target, weight, *pulls)
     qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
     return _solve(qp, warm_start, max_iterations, tolerance)
 
