@@ -167,3 +167,26 @@ def test_shapes_that_do_not_fit_are_named():
         solve_qp(jnp.eye(2), jnp.zeros(3), -jnp.ones(3), jnp.ones(3))
     with pytest.raises(ValueError, match="bounds do not fit"):
         solve_qp(jnp.eye(2), jnp.zeros(2), -jnp.ones(3), jnp.ones(2))
+
+
+def test_damping_towards_a_centre(rng):
+    """The centre's pull written as rows of the matrix, one for each variable: the same answer and derivatives."""
+    lanes, m, n = 20, 4, 9
+    A, b, weight = rng.normal(size=(lanes, m, n)), rng.normal(size=(lanes, m)), rng.uniform(0.1, 2.0, (lanes, m))
+    strength, center = rng.uniform(0.1, 2.0, (lanes, n)), rng.normal(size=(lanes, n))
+    lower, upper = -rng.uniform(0.1, 1.0, (lanes, n)), rng.uniform(0.1, 1.0, (lanes, n))
+
+    def pulled(strength, center, A, b, weight, lower, upper):
+        return solve_least_squares_qp(A, b, weight, lower, upper, damping=strength, center=center).x
+
+    def rows(strength, center, A, b, weight, lower, upper):
+        taller = jnp.concatenate([A, jnp.eye(n)]), jnp.concatenate([b, center]), jnp.concatenate([weight, strength])
+        return solve_least_squares_qp(*taller, lower, upper, damping=1e-14).x
+
+    data = strength, center, A, b, weight, lower, upper
+    ours, expected = (jax.jit(jax.vmap(f))(*data) for f in (pulled, rows))
+    assert 0.2 < np.mean((expected > lower) & (expected < upper)) < 0.8
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-10)
+    ours, expected = (jax.jit(jax.vmap(jax.jacrev(f, argnums=(0, 1, 3))))(*data) for f in (pulled, rows))
+    for own, other in zip(ours, expected, strict=True):
+        np.testing.assert_allclose(own, other, rtol=0, atol=1e-8)

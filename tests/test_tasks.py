@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 import osik_jax as osik
 from osik_jax.tasks._gain import safe_norm
 from osik_jax.tasks._rotation import inverse_left_jacobian, rotation_log
+from osik_jax.tasks._rows import rows_of
 
 MASK = (True, True, False, True, False, True)
 SEED = 7
@@ -662,3 +663,35 @@ class TestMistakes:
             osik.AdaptiveGain(2.0, 1.0, -1.0)
         with pytest.raises(ValueError, match="scalar"):
             osik.AdaptiveGain([2.0, 3.0], 1.0, 1.0)
+
+
+def test_rows_of_all_tasks_together_are_those_of_each():
+    """Frames of several manners, one alone in its own, a subclass that goes its own way, and other kinds of tasks."""
+    robot = osik.load_robot("nao")
+
+    class Doubled(osik.FrameTask):
+        def rows(self, robot, kinematics, q):
+            own = super().rows(robot, kinematics, q)
+            return eqx.tree_at(lambda r: r.jacobian, own, 2.0 * own.jacobian)
+
+    tasks = {
+        "left": osik.FrameTask(robot, "l_sole", weight=2.0, gain=3.0),
+        "right": osik.FrameTask(robot, "r_sole", priority=2, target_velocity=0.1 * np.arange(6.0)),
+        "hand": osik.FrameTask(robot, "l_gripper", rows="position"),
+        "other hand": osik.FrameTask(robot, "r_gripper", rows="position", gain=osik.AdaptiveGain(5.0, 1.0, 2.0)),
+        "head": osik.FrameTask(robot, "Head", axes="frame", rows=(True, False, True, False, True, True)),
+        "box": osik.FrameTask(robot, "l_gripper", lower=-0.1, upper=[0.1, np.inf, 0.2, 1.0, 1.0, 1.0]),
+        "doubled": Doubled(robot, "torso"),
+        "com": osik.ComTask(robot),
+        "posture": osik.PostureTask(robot),
+    }
+    q = osik.integrate(robot, robot.q0, 0.1 * jnp.cos(jnp.arange(robot.nv)))
+    kinematics = osik.forward_kinematics(robot, q)
+    together = jax.jit(lambda q: rows_of(robot, osik.forward_kinematics(robot, q), q, tasks))(q)
+    direct = rows_of(robot, kinematics, q, tasks)
+    assert list(direct) == list(tasks)
+    for name, task in tasks.items():
+        alone = task.rows(robot, kinematics, q)
+        assert direct[name].is_equality == alone.is_equality == (name != "box")
+        for ours, expected in zip(jax.tree.leaves(together[name]), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-13)

@@ -82,9 +82,10 @@ def frame_jacobians(robot: Robot, kinematics: Kinematics, names: Sequence[str]) 
     bodies = np.asarray(robot.tree.frame_bodies, int)[ids]
     points = kinematics.body_position[bodies] + rotate(kinematics.body_rotation[bodies], robot.frame_position[ids])
     mask = robot.tree.moves[bodies][:, None, :]
-    linear = _velocity_at(kinematics, points[:, None, :])
-    angular = jnp.broadcast_to(kinematics.dof_angular, linear.shape)
-    return independent_columns(robot.tree, jnp.where(mask, jnp.concatenate([linear, angular], -1).mT, 0.0))
+    axis = kinematics.dof_angular.T
+    linear = kinematics.dof_linear.T + cross(axis, points[:, :, None] - kinematics.dof_anchor.T, along=-2)
+    columns = jnp.concatenate([linear, jnp.broadcast_to(axis, linear.shape)], -2)
+    return independent_columns(robot.tree, jnp.where(mask, columns, 0.0))
 
 
 def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Array, "6 nv"]:
@@ -117,12 +118,11 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
         KeyError, ValueError: as in ``center_of_mass``.
     """
     mass, moment = _body_moments(robot, kinematics, subtree)
-    carried = jnp.asarray(robot.tree.descendants[robot.tree.dof_body], mass.dtype)
-    below = jnp.matmul(carried, jnp.concatenate([mass[:, None], moment], 1), precision="highest")
-    mass_below, moment_below = below[:, :1], below[:, 1:]
-    arm = moment_below - mass_below * kinematics.dof_anchor
-    columns = mass_below * kinematics.dof_linear + cross(kinematics.dof_angular, arm)
-    return independent_columns(robot.tree, columns.T / jnp.sum(mass))
+    carried = jnp.asarray(robot.tree.moves, mass.dtype)
+    mass_below, moment_below = (jnp.matmul(a.T, carried, precision="highest") for a in (mass, moment))
+    arm = moment_below - mass_below * kinematics.dof_anchor.T
+    columns = mass_below * kinematics.dof_linear.T + cross(kinematics.dof_angular.T, arm, along=-2)
+    return independent_columns(robot.tree, columns / jnp.sum(mass))
 
 
 def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"]) -> Float[Array, "... nv"]:
@@ -148,11 +148,6 @@ def _motion_axes(
     if turns.any():
         angular = jnp.where(turns[:, None], rotation[tree.dof_body, :, number % 3], angular)
     return linear, angular
-
-
-def _velocity_at(kinematics: Kinematics, points: Float[Array, "k 1 3"]) -> Float[Array, "k nvfull 3"]:
-    """Velocity that each dof, at unit speed, gives to each point were it fixed to the moved body."""
-    return kinematics.dof_linear + cross(kinematics.dof_angular, points - kinematics.dof_anchor)
 
 
 def _body_moments(

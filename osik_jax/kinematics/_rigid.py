@@ -6,6 +6,7 @@ library call of it, which sums of three numbers do not repay.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -22,8 +23,8 @@ def compose(a: Float[Array, "... 3 3"], b: Float[Array, "... 3 3"]) -> Float[Arr
     return x + y + z
 
 
-def cross(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """a x b."""
-    ax, ay, az = (a[..., i] for i in range(3))
-    bx, by, bz = (b[..., i] for i in range(3))
-    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
+def cross(a: Float[Array, "..."], b: Float[Array, "..."], *, along: int = -1) -> Float[Array, "..."]:
+    """a x b, along an axis of length 3."""
+    ax, ay, az = (jax.lax.index_in_dim(a, i, along, keepdims=False) for i in range(3))
+    bx, by, bz = (jax.lax.index_in_dim(b, i, along, keepdims=False) for i in range(3))
+    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], along)

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
+from .._blocks import first_axes_as_one, in_blocks
+
 _BLOCK = 16
 """Lanes that a CPU core takes at a time: 64 matrices of 35 x 35 doubles fill a third of its second cache."""
 
@@ -31,14 +33,14 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
     @custom_vmap
     def lanes(*args: Any) -> Any:
-        return _in_blocks(solve, args)
+        return in_blocks(solve, args, _BLOCK)
 
     @lanes.def_vmap
     def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
         wide = jax.tree.map(
             lambda a, batched: a if batched else jnp.broadcast_to(a, (axis_size, *a.shape)), args, tuple(in_batched)
         )
-        merged = jax.tree.map(_merge, wide)
+        merged = jax.tree.map(first_axes_as_one, wide)
         out = jax.tree.map(lambda a: a.reshape(axis_size, a.shape[0] // axis_size, *a.shape[1:]), lanes(*merged))
         return out, jax.tree.map(lambda _: True, out)
 
@@ -46,25 +48,6 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
         return jax.tree.map(lambda a: a[0], lanes(*jax.tree.map(lambda a: jnp.asarray(a)[None], args)))
 
     return one
-
-
-def _in_blocks(solve: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-    count = jax.tree.leaves(args)[0].shape[0]
-    if count <= _BLOCK or jax.default_backend() != "cpu":
-        return solve(*args)
-    blocks = -(-count // _BLOCK)
-    padding = blocks * _BLOCK - count
-
-    def split(a: jax.Array) -> jax.Array:
-        filled = jnp.concatenate([a, jnp.broadcast_to(a[:1], (padding, *a.shape[1:]))]) if padding else a
-        return filled.reshape(blocks, _BLOCK, *a.shape[1:])
-
-    out = jax.lax.map(lambda block: solve(*block), jax.tree.map(split, args))
-    return jax.tree.map(lambda a: _merge(a)[:count], out)
-
-
-def _merge(a: jax.Array) -> jax.Array:
-    return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
 
 
 def choose(where: jax.Array, new: Any, old: Any) -> Any:

@@ -93,7 +93,7 @@ class PostureTask(Task):
         if self.target is None:
             error = q[np.array([tree.qpos_address[j] for j in self.joints])]
         else:
-            error = self._difference(robot, q, dofs)
+            error = self._difference(robot, self.target, q, dofs)
             jacobian, feedforward = self._turn(robot, error, jacobian)
         return task_rows(
             error,
@@ -110,12 +110,12 @@ class PostureTask(Task):
         """Whether all joints are hinges and slides, whose values simply add up."""
         return all(is_scalar(robot, joint) for joint in self.joints)
 
-    def _difference(self, robot: Robot, q: Array, dofs: list[int]) -> Float[Array, " m"]:
+    def _difference(self, robot: Robot, target: Array, q: Array, dofs: list[int]) -> Float[Array, " m"]:
         """From the target to q, on the chosen dofs."""
         if self._adds(robot):
             places = np.array([robot.tree.qpos_address[joint] for joint in self.joints])
-            return (q - self.target)[places]
-        return difference(robot, self.target, q)[np.array(dofs)]
+            return (q - target)[places]
+        return difference(robot, target, q)[np.array(dofs)]
 
     def _turn(self, robot: Robot, error: Array, jacobian: Array) -> tuple[Float[Array, "m nv"], Float[Array, " m"]]:
         """Jacobian and feed-forward with the rotations' blocks put in."""

@@ -19,13 +19,13 @@ def rows_of(
     robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], tasks: Mapping[str, Task]
 ) -> dict[str, TaskRows]:
     """``task.rows`` of each; frames that are asked for in the same way are worked on in one go, which is faster."""
-    groups: dict[Hashable, list[str]] = {}
+    groups: dict[Hashable, dict[str, FrameTask]] = {}
     for name, task in tasks.items():
-        if type(task) is FrameTask:
-            groups.setdefault(_manner(task), []).append(name)
-    found = {}
-    for names in groups.values():
-        found |= _frame_rows(robot, kinematics, {name: tasks[name] for name in names})
+        if isinstance(task, FrameTask) and type(task) is FrameTask:  # a subclass may have rows of its own
+            groups.setdefault(_manner(task), {})[name] = task
+    found: dict[str, TaskRows] = {}
+    for alike in groups.values():
+        found |= _frame_rows(robot, kinematics, alike)
     return {name: found[name] if name in found else task.rows(robot, kinematics, q) for name, task in tasks.items()}
 
 

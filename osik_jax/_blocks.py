@@ -1,0 +1,36 @@
+"""A long batch in pieces that stay in the cache."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> Any:
+    """``function(*args)``, on a CPU some lanes at a time, one block after another.
+
+    Args:
+        function: takes and returns pytrees whose arrays have a leading axis, the lanes.
+        args: what it is called with.
+        size: lanes in a block; the last block is filled up with copies of the first lane.
+    """
+    count = jax.tree.leaves(args)[0].shape[0]
+    if count <= size or jax.default_backend() != "cpu":
+        return function(*args)
+    blocks = -(-count // size)
+    padding = blocks * size - count
+
+    def split(a: jax.Array) -> jax.Array:
+        filled = jnp.concatenate([a, jnp.broadcast_to(a[:1], (padding, *a.shape[1:]))]) if padding else a
+        return filled.reshape(blocks, size, *a.shape[1:])
+
+    out = jax.lax.map(lambda block: function(*block), jax.tree.map(split, args))
+    return jax.tree.map(lambda a: first_axes_as_one(a)[:count], out)
+
+
+def first_axes_as_one(a: jax.Array) -> jax.Array:
+    """The first two axes as one."""
+    return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
