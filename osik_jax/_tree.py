@@ -168,8 +168,8 @@ class KinematicTree:
 
     @cached_property
     def parents(self) -> np.ndarray:
-        """``body_parents`` as an array."""
-        return np.asarray(self.body_parents, int)
+        """``body_parents`` as an array, of JAX's integers in either precision."""
+        return np.asarray(self.body_parents, np.int32)
 
     @cached_property
     def root(self) -> int:

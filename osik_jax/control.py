@@ -157,7 +157,10 @@ def _spoiled(problem: VelocityProblem, raw_box: tuple[Array, Array], fine: Array
 
     It comes in through a select, so that derivatives with respect to what the problem was made of are 0 in that lane.
     """
-    rows = {name: replace(r, weight=jnp.where(fine, r.weight, jnp.nan)) for name, r in problem.rows.items()}
+    rows = {
+        name: replace(r, jacobian=jnp.where(fine, r.jacobian, jnp.nan), weight=jnp.where(fine, r.weight, jnp.nan))
+        for name, r in problem.rows.items()
+    }
     lower, upper = (
         jnp.where(jnp.isnan(raw), raw, b) for raw, b in zip(raw_box, (problem.lower, problem.upper), strict=True)
     )
