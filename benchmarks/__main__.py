@@ -25,10 +25,10 @@ from rich.console import Console
 
 from . import gate, report
 from .command_line import listed
+from .descriptions import ROBOTS
 from .peers import PEERS
 from .processes import Entrant, cores
 from .race import Race
-from .robots import ROBOTS
 
 SCHEMES = ("weighted", "null-space", "hierarchical")
 PRECISIONS = ("float64", "float32")

@@ -28,7 +28,7 @@ class Race:
     """Runs on one robot. A context manager: on leaving it forgets the programs that it compiled.
 
     Args:
-        robot: a name in ``robots.ROBOTS``.
+        robot: a name in ``descriptions.ROBOTS``.
         pythons: interpreters of peers that have an environment of their own.
         report: told what happens.
 

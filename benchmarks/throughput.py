@@ -19,6 +19,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +31,7 @@ import numpy as np
 import osik_jax as osik
 
 from .command_line import listed
+from .descriptions import ROBOTS, lean_urdf
 from .machine import processor
 
 SCHEMES = {"weighted": osik.WeightedQP, "null-space": osik.NullSpace, "hierarchical": osik.HierarchicalQP}
@@ -84,10 +86,13 @@ def loaded(name: str) -> osik.Robot:
     """An embedded robot; G1 is example-robot-data's, standing as in ``python -m benchmarks``."""
     if name != "g1":
         return osik.load_robot(name)
-    from .peers.ours import standing  # with Pinocchio, which the others do without
-    from .robots import workload
-
-    return standing(workload(name))
+    given = ROBOTS[name]
+    robot = osik.Robot.from_urdf(lean_urdf(given), floating_base=True)
+    q = np.array(robot.q0)
+    q[[robot.joint_qpos_index(joint) for joint in given.posture]] = list(given.posture.values())
+    kinematics = osik.forward_kinematics(robot, jnp.asarray(q))
+    q[2] -= min(float(kinematics.frame_pose(robot, foot)[0][2]) for foot in given.feet)
+    return replace(robot, q0=jnp.asarray(q))
 
 
 def arm_angles(robot: osik.Robot, parts: tuple[str, ...]) -> np.ndarray:

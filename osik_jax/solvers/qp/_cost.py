@@ -19,6 +19,10 @@ class Quadratic(eqx.Module):
         """H."""
         return self.matrix
 
+    def diagonal(self) -> Float[Array, " n"]:
+        """Of H."""
+        return jnp.diagonal(self.matrix)
+
     def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """H x + g."""
         return apply(self.matrix, x) + self.linear
@@ -47,6 +51,10 @@ class LeastSquares(eqx.Module):
     def hessian(self) -> Float[Array, "n n"]:
         """A'WA + D, rounded."""
         return product(self.matrix.T * self.weight, self.matrix) + jnp.diag(self.damping)
+
+    def diagonal(self) -> Float[Array, " n"]:
+        """Of the Hessian."""
+        return jnp.sum(self.weight[:, None] * self.matrix**2, 0) + self.damping
 
     def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """A'W(A x - b) + D (x - c)."""

@@ -6,9 +6,7 @@ answer always comes from a fresh factorisation at the final active set, never fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -16,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply
-from .._lanes import choose, in_lanes
+from .._lanes import choose
 from .._pivots import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, NO_GAP, Noise
 from ._factor import factorize, minimize_on
 from ._problem import QP
@@ -55,20 +53,15 @@ class Scales(NamedTuple):
     multiplier: Float[Array, " m"]
 
 
-@cache
-def searcher(max_iterations: int) -> Callable[[QP, Array, Array], Found]:
-    """The search for one problem, with a cap on the changes of the active set."""
-    return in_lanes(lambda qp, guess, tolerance: _search(qp, guess, tolerance, max_iterations))
-
-
-def _search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Found:
+def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int) -> Found:
+    """The search for a batch: every argument has a leading axis, the lanes. A cap on the changes of the active set."""
     lanes, n = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1]
     hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
     nothing = jnp.zeros(lanes, jnp.int32)
     start = Found(
         x=jnp.zeros((lanes, n), hessian.dtype),
         row_multipliers=jnp.zeros(qp.rows.shape[:2], hessian.dtype),
-        active=jax.vmap(_possible)(qp, guess),
+        active=jax.vmap(possible)(qp, guess),
         implied=jnp.zeros(guess.shape, bool),
         iterations=nothing,
         factorizations=nothing,
@@ -94,11 +87,11 @@ def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Floa
     stiff, qp = qp, replace(qp, compliance=found.compliance)
     factor = jax.vmap(factorize)(qp, hessian, found.active)
     x, y = minimize_on(qp, factor, found.active)
-    scales = jax.vmap(_scales)(qp, hessian, x, y)
+    scales = jax.vmap(scales_of)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
     noise = Noise(*(tolerance[:, None] * a for a in scales))
-    optimal = jax.vmap(_optimal)(qp, found, x, y, noise)
+    optimal = jax.vmap(optimal_on)(qp, found, x, y, noise)
     more = Noise(*(_NEARLY[hessian.dtype] * a for a in noise))
-    nearly = jax.vmap(_optimal)(qp, found, x, y, more)
+    nearly = jax.vmap(optimal_on)(qp, found, x, y, more)
     exhausted = found.iterations >= cap
     searching = ~(found.done | optimal | exhausted)
 
@@ -150,7 +143,7 @@ def _give_way(stiff: QP, hessian: Float[Array, "n n"], found: Found, scales: Sca
     )
 
 
-def _possible(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
+def possible(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
     """The guess, where the bounds that it names exist; equal bounds of the box are active from the start."""
     n = qp.lower.shape[0] - qp.rows.shape[0]
     named = jnp.where(guess == AT_UPPER, qp.upper, qp.lower)
@@ -161,9 +154,8 @@ def _possible(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
     return jnp.where(pinned, EQUALITY, label).astype(jnp.int32)
 
 
-def _scales(qp: QP, hessian: Float[Array, "n n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
-    """Invariant to the units of the variables: each is measured by the root of its curvature."""
-    diagonal = jnp.diagonal(hessian)
+def scales_of(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
+    """Invariant to the units of the variables: each is measured by the root of its curvature, from H's diagonal."""
     root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
     reach = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
     span = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])
@@ -176,7 +168,7 @@ def _scales(qp: QP, hessian: Float[Array, "n n"], x: Float[Array, " n"], y: Floa
     return Scales(value, value / jnp.maximum(reach, jnp.finfo(x.dtype).tiny) ** 2 + pull)
 
 
-def _optimal(qp: QP, found: Found, x: Float[Array, " n"], y: Float[Array, " p"], noise: Noise) -> Bool[Array, ""]:
+def optimal_on(qp: QP, found: Found, x: Float[Array, " n"], y: Float[Array, " p"], noise: Noise) -> Bool[Array, ""]:
     """Whether the minimiser on the active set is the minimiser: others hold, multipliers have their signs."""
     active = found.active
     slope = qp.cost.gradient(x) - apply(qp.rows.T, y)

@@ -15,8 +15,9 @@ from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._derivative import differentiable
+from ._fused import searcher
 from ._problem import QP, QPSolution
-from ._search import Found, searcher
+from ._search import Found
 
 _TOLERANCE = {jnp.dtype("float64"): 1e-12, jnp.dtype("float32"): 1e-7}
 
@@ -111,7 +112,8 @@ def solve_least_squares_qp(
     pulls = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
     cost = LeastSquares(matrix, target, weight, *pulls)
     qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
-    return _solve(qp, warm_start, max_iterations, tolerance)
+    gives_way = rows is None or rows_compliance is not None
+    return _solve(qp, warm_start, max_iterations, tolerance, gives_way=gives_way)
 
 
 def _problem(
@@ -147,7 +149,15 @@ def _problem(
     return QP(cost, rows, compliance, *stack)
 
 
-def _solve(qp: QP, guess: ArrayLike | None, max_iterations: int | None, tolerance: ArrayLike | None) -> QPSolution:
+def _solve(
+    qp: QP,
+    guess: ArrayLike | None,
+    max_iterations: int | None,
+    tolerance: ArrayLike | None,
+    *,
+    gives_way: bool = False,
+) -> QPSolution:
+    """Searches, certifies, and differentiates nothing but the answer; ``gives_way`` where rows may all be soft."""
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
     allowed = jnp.asarray(_TOLERANCE[dtype] if tolerance is None else tolerance, dtype)
@@ -156,7 +166,7 @@ def _solve(qp: QP, guess: ArrayLike | None, max_iterations: int | None, toleranc
     low, high, crossed = uncrossed(safe.lower, safe.upper)
     safe = replace(safe, lower=low, upper=high)
     cold = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
-    search = searcher(20 * m if max_iterations is None else max_iterations)
+    search = searcher(20 * m if max_iterations is None else max_iterations, gives_way)
     found = search(*jax.lax.stop_gradient((safe, cold, allowed)))
     solved = replace(safe, compliance=jnp.where(found.infeasible, found.compliance, safe.compliance))
     x, y = differentiable(found.x, found.row_multipliers, found.active, solved)

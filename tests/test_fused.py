@@ -1,0 +1,223 @@
+"""The kernel's way into the search, without a GPU: what it proposes is taken only where it is right."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from recorded import QP_DAMPING, recorded_qps
+
+from osik_jax.solvers import Status, solve_least_squares_qp
+from osik_jax.solvers.qp import _fused, _kernel, _search
+from osik_jax.solvers.qp._cost import LeastSquares
+from osik_jax.solvers.qp._kernel import Proposal, Shape
+from osik_jax.solvers.qp._problem import QP
+
+CAP = 1000
+SOFT = 3
+
+
+class Batch(NamedTuple):
+    """Recorded QPs in single precision with soft rows on the base, and their answers by the search."""
+
+    qp: QP
+    guess: jax.Array
+    tolerance: jax.Array
+    answers: _search.Found
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    p = recorded_qps("nao")
+    at_bound = (np.minimum(p.solution - p.lower, p.upper - p.solution) < 1e-12).any(1)
+    pick = np.flatnonzero(at_bound)[:40]
+    A, b, lower, upper = (jnp.asarray(a[pick], jnp.float32) for a in (p.A, p.b, p.lower, p.upper))
+    rng = np.random.default_rng(3)
+    count, _, n = A.shape
+    rows = jnp.asarray(rng.normal(size=(count, SOFT, n)), jnp.float32)
+    damping = jnp.full((count, n), QP_DAMPING, jnp.float32)
+    cost = LeastSquares(A, b, jnp.ones_like(b), damping, jnp.zeros_like(damping))
+    side = jnp.full((count, SOFT), 0.1, jnp.float32)
+    low, high = jnp.concatenate([lower, -side], 1), jnp.concatenate([upper, side], 1)
+    qp = QP(cost, rows, jnp.full((count, SOFT), 0.1, jnp.float32), low, high)
+    guess, tolerance = jnp.zeros(low.shape, jnp.int32), jnp.full(count, 1e-7, jnp.float32)
+    answers = jax.jit(lambda *a: _search.search(*a, max_iterations=CAP))(qp, guess, tolerance)
+    assert answers.optimal.all() and (answers.active[:, :n] != 0).any(1).all() and (answers.active[:, n:] != 0).any()
+    return Batch(qp, guess, tolerance, answers)
+
+
+def proposal_of(found: _search.Found) -> Proposal:
+    yes = jnp.ones_like(found.iterations)
+    return Proposal(found.x, found.row_multipliers, found.active, yes, yes, yes)
+
+
+def completed(batch: Batch, proposal: Proposal) -> tuple[_search.Found, jax.Array]:
+    """The end, and the lanes in which the proposal was taken."""
+    end = jax.jit(lambda p, *given: _fused.proposed_and_searched(*given, propose=lambda *_: p, max_iterations=CAP))(
+        proposal, *batch[:3]
+    )
+    return end, jnp.all(end.x == proposal.x, 1) & (end.factorizations == proposal.factorizations)
+
+
+def assert_right(batch: Batch, end: _search.Found) -> None:
+    """In the measure of the precision contract: rows of the cost, as a share of the largest that is asked for."""
+    cost = batch.qp.cost
+    assert isinstance(cost, LeastSquares) and end.optimal.all()
+    off = jnp.einsum("bmn,bn->bm", cost.matrix, end.x - batch.answers.x)
+    assert (jnp.max(jnp.abs(off), 1) / jnp.max(jnp.abs(cost.target), 1)).max() < 1e-5
+
+
+def test_right_proposals_are_taken(batch):
+    end, taken = completed(batch, proposal_of(batch.answers))
+    assert taken.all() and (end.factorizations == 1).all()
+    np.testing.assert_array_equal(end.x, batch.answers.x)
+    np.testing.assert_array_equal(end.active, batch.answers.active)
+    np.testing.assert_array_equal(end.row_multipliers, batch.answers.row_multipliers)
+
+
+def unbounded_minimisers(batch: Batch) -> Proposal:
+    """Of the cost alone: stationary, but outside the box."""
+    x = jax.vmap(lambda c: jnp.linalg.solve(c.hessian(), -c.gradient(jnp.zeros_like(c.damping))))(batch.qp.cost)
+    return proposal_of(batch.answers)._replace(
+        x=x, active=jnp.zeros_like(batch.guess), row_multipliers=jnp.zeros_like(batch.answers.row_multipliers)
+    )
+
+
+def held_too_much(batch: Batch) -> Proposal:
+    """The minimiser with one more variable held at its bound: everything is right but the sign of a multiplier."""
+    qp, n = batch.qp, batch.answers.x.shape[1]
+    boxed = jnp.isfinite(qp.lower[:, :n]) & (batch.answers.active[:, :n] == 0)
+    at = jnp.argmax(jnp.where(boxed, batch.answers.x - qp.lower[:, :n], -1.0), 1)
+    active = batch.answers.active.at[jnp.arange(len(at)), at].set(-1)
+    factor = jax.vmap(_search.factorize)(qp, jax.vmap(lambda c: c.hessian())(qp.cost), active)
+    x, y = _search.minimize_on(qp, factor, active)
+    return proposal_of(batch.answers)._replace(x=x, row_multipliers=y, active=active)
+
+
+def changed(batch: Batch, **how: Any) -> Proposal:
+    right = proposal_of(batch.answers)
+    return right._replace(**{name: change(getattr(right, name)) for name, change in how.items()})
+
+
+WRONG = {
+    "not settled": lambda b: changed(b, settled=jnp.zeros_like),
+    "NaN": lambda b: changed(b, x=lambda x: x.at[:, 3].set(jnp.nan)),
+    "NaN multipliers": lambda b: changed(b, row_multipliers=lambda y: y * jnp.nan),
+    "infinite": lambda b: changed(b, x=lambda x: x.at[:, 0].set(jnp.inf)),
+    "zeros": lambda b: changed(b, x=jnp.zeros_like, active=jnp.zeros_like, row_multipliers=jnp.zeros_like),
+    "a little off": lambda b: changed(b, x=lambda x: 1.001 * x),
+    "nothing active": lambda b: changed(b, active=jnp.zeros_like),
+    "signs turned": lambda b: changed(b, active=lambda a: -a),
+    "all equalities": lambda b: changed(b, active=lambda a: jnp.full_like(a, 2)),
+    "unknown labels": lambda b: changed(b, active=lambda a: jnp.where(a == 0, 77, a)),
+    "unbounded": unbounded_minimisers,
+    "held too much": held_too_much,
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_wrong_proposals_are_not(batch, wrong):
+    proposal = WRONG[wrong](batch)
+    end, taken = completed(batch, proposal)
+    assert not taken.any()
+    assert_right(batch, end)
+
+
+def test_what_is_left_goes_through_in_blocks(batch, monkeypatch):
+    """Wrong in 25 of 40 lanes, 4 lanes a block; the others stay as proposed."""
+    monkeypatch.setattr(_fused, "_SMALLEST", 4)
+    lanes = jnp.arange(len(batch.guess))
+    spoiled = (lanes * 7) % 8 < 5
+    right = proposal_of(batch.answers)
+    proposal = right._replace(x=jnp.where(spoiled[:, None], 0.0, right.x), settled=jnp.where(spoiled, 0, 1))
+    end, taken = completed(batch, proposal)
+    np.testing.assert_array_equal(taken, ~spoiled)
+    assert_right(batch, end)
+    assert (end.factorizations[spoiled] == 2).all()  # the kernel's, and one from the active set that it left
+
+
+def test_too_many_changes_are_not_taken(batch):
+    proposal = proposal_of(batch.answers)._replace(iterations=jnp.full_like(batch.answers.iterations, CAP + 1))
+    end, taken = completed(batch, proposal)
+    assert not taken.any() and (end.iterations <= CAP).all()
+
+
+def solved(batch: Batch, **options: Any) -> Any:
+    cost, n = batch.qp.cost, batch.answers.x.shape[1]
+    assert isinstance(cost, LeastSquares)
+    low, high = batch.qp.lower, batch.qp.upper
+
+    def one(cost, rows, low, high, compliance):
+        given = (cost.matrix, cost.target, cost.weight, low[:n], high[:n], rows, low[n:], high[n:])
+        return solve_least_squares_qp(*given, damping=QP_DAMPING, rows_compliance=compliance, **options)
+
+    return jax.jit(jax.vmap(one))(cost, batch.qp.rows, low, high, batch.qp.compliance)
+
+
+@pytest.fixture
+def beside_a_gpu(monkeypatch):
+    """JAX with a CUDA device and Warp installed, as far as the choice can see; returns what the kernel is asked."""
+    asked = []
+
+    def propose(qp, guess, tolerance, max_iterations):
+        asked.append(qp.cost.matrix.shape[1:])
+        nothing = jnp.zeros(len(guess), jnp.int32)
+        return Proposal(jnp.full_like(qp.cost.damping, jnp.nan), jnp.zeros_like(qp.compliance), guess, *[nothing] * 3)
+
+    monkeypatch.setattr(_kernel, "available", lambda: True)
+    monkeypatch.setattr(_fused, "find_spec", lambda name: name)
+    monkeypatch.setattr(_kernel, "propose", propose)
+    jax.clear_caches()
+    yield asked
+    jax.clear_caches()
+
+
+def test_a_cpu_beside_a_gpu_keeps_to_xla(batch, beside_a_gpu):
+    """Where a program runs decides, not what the machine has."""
+    answer = solved(batch)
+    assert set(beside_a_gpu) == {batch.qp.cost.matrix.shape[1:]}  # traced, but not what is compiled
+    assert (answer.status == Status.SOLVED).all()
+    np.testing.assert_allclose(answer.x, batch.answers.x, atol=1e-6)
+
+
+@pytest.mark.parametrize("why", ["switched off", "no warp", "double", "hard rows", "large", "many rows"])
+def test_when_the_kernel_is_not_asked(batch, beside_a_gpu, monkeypatch, why):
+    A, n, options = np.ones((4, 5), np.float32), 5, {}
+    if why == "switched off":
+        monkeypatch.setenv(_fused.SWITCH, "0")
+    if why == "no warp":
+        monkeypatch.setattr(_fused, "find_spec", lambda name: None)
+    if why == "double":
+        A = A.astype(float)
+    if why == "hard rows":
+        options = dict(rows=A[:1], rows_lower=-np.ones(1), rows_upper=np.ones(1))
+    if why == "large":
+        A, n = np.ones((4, 65), np.float32), 65
+    if why == "many rows":
+        A = np.ones((2000, 5), np.float32)
+    bound = np.ones(n, A.dtype)
+    jax.jit(lambda: solve_least_squares_qp(A, A[:, 0], A[:, 0], -bound, bound, **options)).lower()
+    assert beside_a_gpu == []
+
+
+def test_the_kernel_is_asked_for_soft_rows_and_none(beside_a_gpu):
+    A, bound = np.ones((4, 5), np.float32), np.ones(5, np.float32)
+    b, one = A[:, 0], bound[:1]
+    jax.jit(lambda: solve_least_squares_qp(A, b, b, -bound, bound)).lower()
+    assert set(beside_a_gpu) == {(4, 5)}
+    soft = dict(rows=A[:1], rows_lower=-one, rows_upper=one, rows_compliance=one)
+    A = np.ones((6, 5), np.float32)
+    jax.jit(
+        lambda: jax.vmap(lambda b: solve_least_squares_qp(A, b, b, -bound, bound, **soft))(A[:3, :1] * A.T[:1])
+    ).lower()
+    assert set(beside_a_gpu) == {(4, 5), (6, 5)}
+
+
+@pytest.mark.parametrize("shape", [Shape(35, 50, 0), Shape(32, 47, 32), Shape(64, 90, 8), Shape(1, 1, 0)])
+def test_what_the_text_is_compiled_for(shape):
+    assert 1 <= shape.warps <= 4
+    first = _kernel.source(shape).splitlines()[0]
+    n, m, p = shape
+    assert first == f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};"
+    assert Shape(65, 10, 0).warps == Shape(64, 1000, 0).warps == Shape(10, 10, 33).warps == 0

@@ -1,0 +1,163 @@
+"""The CUDA kernel, where there is a CUDA device: recorded and random QPs against float64 answers and the XLA route."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problem_families import WHOLE_BODY_DAMPING, whole_body
+from recorded import QP_DAMPING, recorded_qps
+
+from osik_jax.solvers import Status, solve_least_squares_qp
+from osik_jax.solvers.qp import _fused, _kernel
+from osik_jax.solvers.qp._cost import LeastSquares
+from osik_jax.solvers.qp._problem import QP
+
+usable = _kernel.available() and _fused.find_spec("warp") is not None
+pytestmark = pytest.mark.skipif(not usable, reason="needs a CUDA device, JAX for it and Warp (extra cuda)")
+
+
+@pytest.fixture(params=["1", "0"], ids=["fused", "xla"])
+def route(request, monkeypatch):
+    """Both routes have to pass."""
+    monkeypatch.setenv(_fused.SWITCH, request.param)
+    jax.clear_caches()
+    yield request.param
+    jax.clear_caches()
+
+
+def single(*arrays: Any) -> list[jax.Array]:
+    return [jnp.asarray(a, jnp.float32) for a in arrays]
+
+
+def off(A, x, expected, b):
+    """Rows of the cost, as a share of the largest that is asked for: what the precision contract is about."""
+    return np.abs(np.einsum("bmn,bn->bm", A, np.asarray(x, float) - expected)).max(1) / np.abs(b).max(1)
+
+
+@pytest.mark.parametrize("robot", ["g1", "nao"])
+def test_recorded_qps_cold_and_warm(robot, route):
+    p = recorded_qps(robot)
+    weight, lower, upper = np.ones_like(p.b), *single(p.lower, p.upper)
+    solve = jax.jit(jax.vmap(lambda *a: solve_least_squares_qp(*a[:5], damping=QP_DAMPING, warm_start=a[5])))
+    start = jnp.zeros(lower.shape, jnp.int32)
+    for warm in (False, True):
+        s = solve(*single(p.A, p.b, weight), lower, upper, start)
+        assert (s.status == Status.SOLVED).all()
+        assert ((lower <= s.x) & (s.x <= upper)).all()
+        assert off(p.A, s.x, p.solution, p.b).max() < 1e-5
+        assert not warm or (np.asarray(s.factorizations) == 1).mean() > 0.99
+        start = s.active
+
+
+def test_whole_body_family(route, rng):
+    p = whole_body(rng, 2000)
+    solve = jax.vmap(lambda *a: solve_least_squares_qp(*a, damping=WHOLE_BODY_DAMPING))
+    s = jax.jit(solve)(*single(*p[:5]))
+    with jax.default_device(jax.devices("cpu")[0]):
+        expected = np.asarray(jax.jit(solve)(*p[:5]).x)
+    assert (np.asarray(s.status) == Status.SOLVED).mean() > 0.85  # in single precision; the fused route has more
+    fine = np.asarray(s.status) == Status.SOLVED
+    error = off(np.sqrt(p.weight)[..., None] * p.A, s.x, expected, np.sqrt(p.weight) * p.b)
+    assert error[fine].max() < 5e-5
+
+
+def soft_problems(rng, count, n, m, p):
+    """Rows that give way, some of them equalities, some without bounds; a box of which a part is pinned or open.
+
+    A pull to a centre, different from variable to variable."""
+    A, C = rng.normal(size=(count, m, n)), rng.normal(size=(count, p, n))
+    b, weight = rng.normal(size=(count, m)), 10.0 ** rng.uniform(-1, 1, (count, m))
+    lower, upper = -rng.exponential(size=(count, n)), rng.exponential(size=(count, n))
+    lower[rng.random(lower.shape) < 0.3], upper[rng.random(upper.shape) < 0.3] = -np.inf, np.inf
+    upper = np.where(np.isfinite(lower) & (rng.random(lower.shape) < 0.05), lower, upper)
+    low, high = rng.normal(size=(count, p)) - 0.5, np.full((count, p), np.inf)
+    high = np.where(rng.random(low.shape) < 0.5, low + rng.exponential(size=low.shape), high)
+    high = np.where(rng.random(low.shape) < 0.1, low, high)
+    low = np.where(rng.random(low.shape) < 0.1, -np.inf, low)
+    pulls = 10.0 ** rng.uniform(-2, 0, (count, n)), rng.normal(size=(count, n))
+    return A, b, weight, lower, upper, C, low, high, 10.0 ** rng.uniform(-2, 0, (count, p)), *pulls
+
+
+@pytest.mark.parametrize("shape", [(3, 0, 2), (12, 20, 5), (31, 60, 1), (33, 40, 3), (48, 30, 32), (64, 50, 4)])
+def test_any_size_with_soft_rows(shape, route, rng):
+    data = soft_problems(rng, 500, *shape)
+
+    def one(A, b, weight, lower, upper, C, low, high, compliance, damping, center):
+        rows = dict(rows=C, rows_lower=low, rows_upper=high, rows_compliance=compliance) if shape[2] else {}
+        return solve_least_squares_qp(A, b, weight, lower, upper, **rows, damping=damping, center=center)
+
+    solve = jax.vmap(one)
+    s = jax.jit(solve)(*single(*data))
+    with jax.default_device(jax.devices("cpu")[0]):
+        expected = jax.jit(solve)(*data)
+    assert (s.status == Status.SOLVED).all()
+    np.testing.assert_allclose(s.x, expected.x, atol=2e-4)
+    np.testing.assert_allclose(s.row_multipliers, expected.row_multipliers, atol=5e-3)
+
+
+def test_hard_rows_go_the_other_way(rng):
+    """In the same batch: lanes whose rows do not give way are solved by the search."""
+    data = soft_problems(rng, 64, 8, 12, 2)
+    data[6][...], data[7][...] = -0.05, 0.05
+    data[3][...], data[4][...] = -1.0, 1.0
+    data[8][::3] = 0.0
+    solve = jax.vmap(
+        lambda A, b, w, lower, upper, C, low, high, c, d, m: solve_least_squares_qp(
+            A, b, w, lower, upper, C, low, high, rows_compliance=c, damping=d, center=m
+        )
+    )
+    s = jax.jit(solve)(*single(*data))
+    with jax.default_device(jax.devices("cpu")[0]):
+        expected = jax.jit(solve)(*data)
+    assert (s.status == Status.SOLVED).all()
+    np.testing.assert_allclose(s.x, expected.x, atol=1e-4)
+
+
+def test_a_bad_lane_disturbs_no_other(rng):
+    p = whole_body(rng, 100)
+    given = single(*p[:5])
+    solve = jax.jit(jax.vmap(lambda *a: solve_least_squares_qp(*a, damping=WHOLE_BODY_DAMPING)))
+    good = solve(*given)
+    bad = solve(given[0].at[3, 2, 1].set(jnp.nan), *given[1:])
+    assert bad.status[3] == Status.NUMERICAL_ERROR and np.isfinite(bad.x[3]).all()
+    others = np.arange(100) != 3
+    np.testing.assert_array_equal(np.asarray(bad.x)[others], np.asarray(good.x)[others])
+
+
+def test_derivatives_are_those_of_the_other_route(rng, monkeypatch):
+    p = recorded_qps("nao")
+    A, b, lower, upper = single(p.A[:50], p.b[:50], p.lower[:50], p.upper[:50])
+
+    def cost(b):
+        solve = jax.vmap(lambda *a: solve_least_squares_qp(*a, damping=QP_DAMPING).x)
+        return jnp.sum(jnp.einsum("bmn,bn->bm", A, solve(A, b, jnp.ones_like(b), lower, upper)) ** 2)
+
+    slopes = []
+    for route in ("1", "0"):
+        monkeypatch.setenv(_fused.SWITCH, route)
+        jax.clear_caches()
+        slopes.append(np.asarray(jax.jit(jax.grad(cost))(b)))
+    np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-4 * np.abs(slopes[1]).max())
+
+
+def test_the_kernel_alone_settles_what_it_is_told(rng):
+    """From the active set of the answer: one factorisation, nothing changed, the answer to rounding."""
+    p = recorded_qps("g1")
+    count, m, n = p.A.shape
+    at = np.where(p.solution <= p.lower + 1e-12, -1, np.where(p.solution >= p.upper - 1e-12, 1, 0))
+    A, b, weight, damping = single(p.A, p.b, np.ones((count, m)), np.full((count, n), QP_DAMPING))
+    lower, upper = single(p.lower, p.upper)
+    qp = QP(
+        LeastSquares(A, b, weight, damping, 0 * damping),
+        jnp.zeros((count, 0, n), jnp.float32),
+        jnp.zeros((count, 0), jnp.float32),
+        lower,
+        upper,
+    )
+    guess, tolerance = jnp.asarray(at, jnp.int32), jnp.full(count, 1e-7, jnp.float32)
+    found = jax.jit(lambda *a: _kernel.propose(a[0], a[1], a[2], 100))(qp, guess, tolerance)
+    assert found.settled.all() and (found.factorizations == 1).all() and (found.iterations == 0).all()
+    np.testing.assert_array_equal(found.active, guess)
+    assert off(p.A, found.x, p.solution, p.b).max() < 1e-5
