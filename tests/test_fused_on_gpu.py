@@ -142,8 +142,8 @@ def test_derivatives_are_those_of_the_other_route(rng, monkeypatch):
     np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-4 * np.abs(slopes[1]).max())
 
 
-def test_the_kernel_alone_settles_what_it_is_told(rng):
-    """From the active set of the answer: one factorisation, nothing changed, the answer to rounding."""
+def test_the_kernel_settles_alone(rng):
+    """From the active set of the answer with one factorisation, from nothing with more; XLA is left nothing."""
     p = recorded_qps("g1")
     count, m, n = p.A.shape
     at = np.where(p.solution <= p.lower + 1e-12, -1, np.where(p.solution >= p.upper - 1e-12, 1, 0))
@@ -157,7 +157,11 @@ def test_the_kernel_alone_settles_what_it_is_told(rng):
         upper,
     )
     guess, tolerance = jnp.asarray(at, jnp.int32), jnp.full(count, 1e-7, jnp.float32)
-    found = jax.jit(lambda *a: _kernel.propose(a[0], a[1], a[2], 100))(qp, guess, tolerance)
+    kernel = jax.jit(lambda *a: _kernel.propose(a[0], a[1], a[2], 1000))
+    found = kernel(qp, guess, tolerance)
     assert found.settled.all() and (found.factorizations == 1).all() and (found.iterations == 0).all()
     np.testing.assert_array_equal(found.active, guess)
     assert off(p.A, found.x, p.solution, p.b).max() < 1e-5
+    cold = kernel(qp, jnp.zeros_like(guess), tolerance)
+    assert cold.settled.all()
+    assert off(p.A, cold.x, p.solution, p.b).max() < 1e-5

@@ -4,9 +4,9 @@
 //     over lower <= [x; C x + t] <= upper
 //
 // Guess an active set, factor, solve, refine, look: bounds that are crossed become active, bounds whose multiplier has
-// the wrong sign become inactive, all at once while that leaves fewer of them, else one at a time (block principal
-// pivoting: J. Judice, F. Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear
-// complementarity problems", Computers & Operations Research 21, 1994). A soft row that is active is a row of the cost.
+// the wrong sign become inactive, all at once, until none is left. Where several such exchanges have not left fewer, the
+// dual method goes on from there (Goldfarb and Idnani, as in _pivots.py), which does not cycle: one constraint at a time, a
+// factorization each. A soft row that is active is a row of the cost.
 //
 // Variable i belongs to lane i % 32. Constants from _kernel.py: N variables, M rows of the cost, P soft rows (at most
 // 32), WARPS a block.
@@ -24,8 +24,8 @@ constexpr float LAST_CORRECTION = 1e-6f;      // as a share of x: of the one tha
 constexpr float NEARLY = 10.f;                // roundings; a bound crossed by less holds
 constexpr float WORTH = 0.25f;                // a correction that shrinks less than to this share was rounding
 constexpr int MOST_CORRECTIONS = 6;
-constexpr int MOST_FACTORIZATIONS = 30;
-constexpr int PATIENCE = 3;                   // exchanges that do not help
+constexpr int MOST_FACTORIZATIONS = 100;
+constexpr int PATIENCE = 2;                   // exchanges that do not help, before the dual method
 
 __shared__ float4 rows_of[WARPS][(ROWS + 1) * LD / 4];
 __shared__ float4 half_of[WARPS][N * LD / 4];
@@ -36,8 +36,8 @@ float* const S = (float*)rows_of[warp];       // A, then C
 float* const half = (float*)half_of[warp];    // L^-1, for the free variables
 float* const columns = (float*)vectors_of[warp];
 float* const point = columns + 2 * LD;
-float* const slope_of_free = point + LD;
-float* const middle = slope_of_free + LD;
+float* const right_side = point + LD;
+float* const middle = right_side + LD;
 float* const weights = middle + LD;
 float* const targets = weights + TALL;
 float* const residuals = targets + TALL;
@@ -69,6 +69,23 @@ auto across = [&](const float* a, const float* b, int from, int to) {  // sum of
   for (int e = 0; e < 3; ++e)
     if (k + e < to) sum.x += a[(k + e) * LD] * b[k + e];
   return (sum.x + sum.y) + (sum.z + sum.w);
+};
+auto solve = [&](const float* right, const float* unit, float* step) {  // with the Hessian of the free variables
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+    if (lane + 32 * h < 4 * NG) right_side[lane + 32 * h] = unit[h] * right[h];
+  __syncwarp();
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    int i = lane + 32 * h, groups = NG < 8 * (h + 1) ? NG : 8 * (h + 1);
+    if (i < N) middle[i] = dot(half + i * LD, right_side, groups);
+  }
+  __syncwarp();
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    int i = lane + 32 * h;
+    step[h] = unit[h] * across(half + (i < N ? i : N - 1), middle, 32 * h, N);
+  }
 };
 auto finite = [](float a) { return fabsf(a) <= 3.4e38f; };
 auto nearest_bound = [&](float low, float high) {
@@ -116,7 +133,10 @@ for (int r = lane; r < M; r += 32) {
 }
 
 int factorizations = 0, changes = 0, best = CONSTRAINTS + 1, lives = PATIENCE;
-bool settled = false;
+bool settled = false, dual = false;
+int entering = -1;                            // the constraint that the dual method is making active, -1 for none
+float pushed = 0.f;                           // its multiplier so far
+float row_push = 0.f;                         // multiplier of the lane's row
 while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes) {
   if (has_row) {
     weights[M + lane] = row_state == FREE ? 0.f : 1.f / gives;
@@ -225,32 +245,25 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
     __syncwarp();
     for (int r = lane; r < ROWS; r += 32) {
       float value = dot(S + r * LD, point, NG);
-      residuals[r] = weights[r] * (targets[r] - value);
+      residuals[r] = r >= M && r - M + N == entering ? pushed : weights[r] * (targets[r] - value);
       if (r >= M) row_values[r - M] = value;
     }
     __syncwarp();
 #pragma unroll
     for (int h = 0; h < H; ++h) {
       slope[h] = across(S + index[h], residuals, 0, ROWS) - damp[h] * (x[h] - rest[h]);
+      if (lane + 32 * h == entering) slope[h] += pushed;
       if (!exists[h]) slope[h] = 0.f;
     }
     bool enough = share * share <= LAST_CORRECTION * before || share > WORTH * before;
     if (round == MOST_CORRECTIONS || (round > 1 && enough)) break;
     before = share;
-#pragma unroll
-    for (int h = 0; h < H; ++h)
-      if (lane + 32 * h < 4 * NG) slope_of_free[lane + 32 * h] = unit[h] * slope[h];
-    __syncwarp();
-#pragma unroll
-    for (int h = 0; h < H; ++h)
-      if (exists[h]) middle[index[h]] = dot(half + index[h] * LD, slope_of_free, NG < 8 * (h + 1) ? NG : 8 * (h + 1));
-    __syncwarp();
-    float moved = 0.f, far = 0.f;
+    float step[H], moved = 0.f, far = 0.f;
+    solve(slope, unit, step);
 #pragma unroll
     for (int h = 0; h < H; ++h) {
-      float step = unit[h] * across(half + index[h], middle, 32 * h, N);
-      x[h] += step;
-      moved = fmaxf(moved, fabsf(step * root[h]));
+      x[h] += step[h];
+      moved = fmaxf(moved, fabsf(step[h] * root[h]));
       far = fmaxf(far, fabsf(x[h] * root[h]));
     }
     share = largest(moved) / fmaxf(largest(far), 1e-37f);
@@ -277,7 +290,8 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
     if (state[h] == AT_UPPER && slope[h] < -pull) next[h] = FREE;
     wrong += __popc(__ballot_sync(ALL, next[h] != state[h]));
   }
-  float push = 0.f;
+  row_push = 0.f;
+  float row_gain = -1.f;
   if (has_row) {
     float reach = 0.f, span = 0.f, value = row_values[lane];
     for (int k = 0; k < N; ++k) {
@@ -286,22 +300,114 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
     }
     float rounding = noise * (fminf(far * reach, long_ * span) + fabsf(value) + nearest_bound(row_low, row_high));
     float pull = rounding / fmaxf(reach * reach, 1e-37f), crossed = NEARLY * rounding;
-    push = row_state == FREE ? 0.f : weights[M + lane] * (targets[M + lane] - value);
     if (row_state == FREE)
       next_row = value < row_low - crossed ? AT_LOWER : value > row_high + crossed ? AT_UPPER : FREE;
-    if (row_state == AT_LOWER && push < -pull) next_row = FREE;
-    if (row_state == AT_UPPER && push > pull) next_row = FREE;
+    else
+      row_push = weights[M + lane] * (targets[M + lane] - value);
+    if (row_state == AT_LOWER && row_push < -pull) next_row = FREE;
+    if (row_state == AT_UPPER && row_push > pull) next_row = FREE;
+    float gap = fmaxf(row_low - value, value - row_high);
+    if (row_state == FREE && next_row != FREE) row_gain = gap * gap / (gives + reach * reach);
   }
   wrong += __popc(__ballot_sync(ALL, next_row != row_state));
-  settled = wrong == 0;
-  if (has_row) row_values[lane] = push;
+  settled = wrong == 0 && entering < 0;
   lives = wrong < best ? PATIENCE : lives - 1;
   best = wrong < best ? wrong : best;
-  if (settled || lives < 0) break;
-  changes += wrong;
+  dual = dual || lives < 0;
+  if (settled) break;
+  bool frees = has_row && row_state != FREE && next_row == FREE;
 #pragma unroll
-  for (int h = 0; h < H; ++h) state[h] = next[h];
-  row_state = next_row;
+  for (int h = 0; h < H; ++h) frees = frees || (state[h] != FREE && next[h] == FREE);
+  bool drops = entering < 0 && __any_sync(ALL, frees);
+  if (!dual || drops) {  // all at once; the dual method begins with what has to become inactive
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      bool takes = next[h] != state[h] && (!dual || next[h] == FREE);
+      changes += __popc(__ballot_sync(ALL, takes));
+      if (takes) state[h] = next[h];
+    }
+    bool takes = next_row != row_state && (!dual || next_row == FREE);
+    changes += __popc(__ballot_sync(ALL, takes));
+    if (takes) row_state = next_row;
+    continue;
+  }
+
+  // ---- one step of the dual method. Which constraint: the one whose activation would raise the dual objective most
+  if (entering < 0) {
+    float gain = row_gain;
+    int which = N + lane;
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      float inverse = 0.f;
+      for (int k = 32 * h; k < N; ++k) inverse += half[k * LD + index[h]] * half[k * LD + index[h]];
+      float gap = fmaxf(low[h] - x[h], x[h] - high[h]);
+      float own_gain = gap * gap / fmaxf(inverse * unit[h] * unit[h], 1e-37f);
+      if (state[h] == FREE && next[h] != FREE && own_gain > gain) gain = own_gain, which = lane + 32 * h;
+    }
+    unsigned first = __ballot_sync(ALL, gain == largest(gain));
+    entering = __shfl_sync(ALL, which, __ffs(first) - 1);
+    pushed = 0.f;
+  }
+  // which way and how far: to x + length side ahead, and the multipliers of the active constraints with it
+  const int place = entering < N ? entering & 31 : entering - N, part = entering < N ? entering >> 5 : -1;
+  float along[H], ahead[H], rate[H];
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+    along[h] = !exists[h] ? 0.f : part < 0 ? S[(M + place) * LD + index[h]] : lane + 32 * h == entering ? 1.f : 0.f;
+  solve(along, unit, ahead);
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+    if (lane + 32 * h < 4 * NG) point[lane + 32 * h] = ahead[h];
+  float value = has_row ? row_values[lane] : 0.f;
+  __syncwarp();
+  for (int r = lane; r < ROWS; r += 32) {
+    float change = dot(S + r * LD, point, NG);
+    residuals[r] = weights[r] * change;
+    if (r >= M) row_values[r - M] = change;
+  }
+  __syncwarp();
+  float gap_low = row_low - value - gives * pushed, gap_high = value + gives * pushed - row_high;
+  float gain = gives + (has_row ? row_values[lane] : 0.f);
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    rate[h] = across(S + index[h], residuals, 0, ROWS) + damp[h] * ahead[h] - along[h];
+    if (part == h) gap_low = low[h] - x[h], gap_high = x[h] - high[h], gain = ahead[h];
+  }
+  gap_low = __shfl_sync(ALL, gap_low, place), gap_high = __shfl_sync(ALL, gap_high, place);
+  gain = __shfl_sync(ALL, gain, place);
+  const float side = pushed > 0.f ? 1.f : pushed < 0.f ? -1.f : gap_low > gap_high ? 1.f : -1.f;
+  const float full = fmaxf(side > 0.f ? gap_low : gap_high, 0.f) / fmaxf(gain, 1e-37f);
+  float shortest = INFINITY;
+  int leaving = -1;
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    float sign = state[h] == AT_LOWER ? 1.f : state[h] == AT_UPPER ? -1.f : 0.f;
+    float falls = -sign * side * rate[h], length = fmaxf(-sign * slope[h], 0.f) / falls;
+    if (exists[h] && falls > 0.f && length < shortest) shortest = length, leaving = lane + 32 * h;
+  }
+  if (has_row) {
+    float sign = row_state == AT_LOWER ? 1.f : row_state == AT_UPPER ? -1.f : 0.f;
+    float falls = sign * side * residuals[M + lane], length = fmaxf(sign * row_push, 0.f) / falls;
+    if (falls > 0.f && length < shortest) shortest = length, leaving = N + lane;
+  }
+  const float length = -largest(-shortest);
+  ++changes;
+  if (full <= length) {
+    int label = side > 0.f ? AT_LOWER : AT_UPPER;
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (lane + 32 * h == entering) state[h] = label;
+    if (has_row && N + lane == entering) row_state = label;
+    entering = -1, pushed = 0.f;
+  } else {
+    unsigned first = __ballot_sync(ALL, shortest == length);
+    leaving = __shfl_sync(ALL, leaving, __ffs(first) - 1);
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (lane + 32 * h == leaving) state[h] = FREE;
+    if (has_row && N + lane == leaving) row_state = FREE;
+    pushed += side * length;
+  }
 }
 
 // ---- the answer
@@ -312,7 +418,7 @@ for (int h = 0; h < H; ++h)
     active.data[problem * CONSTRAINTS + index[h]] = state[h];
   }
 if (has_row) {
-  row_multipliers.data[problem * P + lane] = hard ? 0.f : row_values[lane];
+  row_multipliers.data[problem * P + lane] = row_push;
   active.data[problem * CONSTRAINTS + N + lane] = row_state;
 }
 if (lane == 0) {
