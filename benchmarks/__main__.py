@@ -58,6 +58,8 @@ class Selection(NamedTuple):
         """Ours in all schemes and precisions."""
         if "osik_jax" not in self.peers:
             return []
+        if options.get("batch", 1) > 1:
+            options |= dict(devices=len(cores()))
         return [ours(scheme, precision, **options) for scheme in self.schemes for precision in self.precisions]
 
 

@@ -1,4 +1,4 @@
-"""osik_jax: one jitted tick, or that tick vmapped over a batch."""
+"""osik_jax: one jitted tick, or that tick over a batch, which CPU devices share."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
+from osik_jax.scaling import sharded
 
 from ..workload import DT, Workload
 
@@ -31,6 +32,7 @@ class Runner:
         precision: ``float64`` or ``float32``.
         batch: number of robots; None for one without a batch axis.
         warm: carry the active set from tick to tick.
+        devices: CPU devices that the batch is split over, one for each core.
     """
 
     packages = ("osik-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
@@ -43,7 +45,10 @@ class Runner:
         precision: str = "float64",
         batch: int | None = None,
         warm: bool = True,
+        devices: int = 1,
     ) -> None:
+        if devices > 1:
+            jax.config.update("jax_num_cpu_devices", devices)
         jax.config.update("jax_enable_x64", precision == "float64")
         self.work, self.floating, self.batch = work, work.floating, batch
         self.robot = standing(work)
@@ -52,11 +57,11 @@ class Runner:
         tick = tick_of(self.robot, work, SCHEMES[scheme](), start)
         none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), _warm_start(tick, start))
         self.q, self.warm_start = start, none
+        self.program, self.warm = jax.jit(tick), warm
         if batch is not None:
-            tick = jax.vmap(tick, in_axes=(0, 0, 0, None))
+            self.program = sharded(tick, in_axes=(0, 0, 0, None))
             self.q, self.warm_start = jax.tree.map(lambda a: jnp.tile(a, (batch, *[1] * a.ndim)), (start, none))
         self.none = self.warm_start
-        self.program, self.warm = jax.jit(tick), warm
         self.fine: list[jax.Array] = []
 
     def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
