@@ -8,6 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+BLOCK = 16
+"""Lanes that a CPU core takes through a tick at a time: 64 matrices of 35 x 35 doubles fill a third of its second cache.
+
+The solvers have the same, so that a block of a tick is one of theirs.
+"""
+
 
 def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> Any:
     """``function(*args)``, on a CPU some lanes at a time, one block after another.

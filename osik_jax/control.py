@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ._blocks import BLOCK
 from ._joint_selection import concrete, scalar_layout
 from ._rules import blocked
 from ._sanity import cleaned
@@ -24,9 +25,6 @@ from .schemes import Scheme, VelocityProblem
 from .solvers import Status
 from .tasks import Task
 from .tasks._rows import rows_of
-
-_BLOCK = 64
-"""Lanes of a batch that a CPU takes through a tick at a time: what they need stays in its second cache."""
 
 Tasks = Mapping[str, Task]
 Targets = Mapping[str, Any]
@@ -115,7 +113,7 @@ def solve(
 
 
 @jax.jit
-@blocked(_BLOCK)
+@blocked(BLOCK)
 def _solve(
     robot: Robot,
     q: Array,

@@ -14,10 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from .._blocks import first_axes_as_one, in_blocks
-
-_BLOCK = 16
-"""Lanes that a CPU core takes at a time: 64 matrices of 35 x 35 doubles fill a third of its second cache."""
+from .._blocks import BLOCK, first_axes_as_one, in_blocks
 
 
 def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
@@ -33,7 +30,7 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
     @custom_vmap
     def lanes(*args: Any) -> Any:
-        return in_blocks(solve, args, _BLOCK)
+        return in_blocks(solve, args, BLOCK)
 
     @lanes.def_vmap
     def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
