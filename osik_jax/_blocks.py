@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 BLOCK = 16
-"""Lanes that a CPU core takes through a tick at a time: 64 matrices of 35 x 35 doubles fill a third of its second cache.
+"""Lanes that a CPU core takes through a tick at a time, so that what they need stays in its second cache.
 
 The solvers have the same, so that a block of a tick is one of theirs.
 """

@@ -30,7 +30,11 @@ def custom_jvp(function: Callable[..., Any]) -> Ruled:
 
 
 def blocked(size: int) -> Callable[[Callable[..., Any]], Ruled]:
-    """The function as it is, which on a CPU takes this many lanes of a ``vmap`` at a time."""
+    """The function as it is, which on a CPU takes this many lanes of a ``vmap`` at a time.
+
+    Its derivatives run on all lanes at once: in blocks, those of a tick of G1 would be a fifth faster in a batch of
+    1,024 and take half as long again to compile.
+    """
 
     def decorate(function: Callable[..., Any]) -> Ruled:
         ruled = Ruled(function, block=size)
