@@ -32,7 +32,7 @@ from .race import Race
 
 SCHEMES = ("weighted", "null-space", "hierarchical")
 PRECISIONS = ("float64", "float32")
-BATCHES = (1, 64, 1024)
+BATCHES = (1, 64, 1024, 16384)
 
 
 def ours(scheme: str, precision: str, *, pinned: bool = False, **options: Any) -> Entrant:

@@ -1,0 +1,34 @@
+"""The benchmark of parts: all are there, compiled and timed, and a profile names operations of the program."""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks import parts
+
+
+def test_rows_of_all_parts(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "parts.json"
+    monkeypatch.setattr(parts, "SECONDS", 0.0)
+    monkeypatch.setattr(sys, "argv", ["parts", str(path), "--robot", "arm7", "--batches", "3", "--operations", "4"])
+    parts.main()
+    rows = {row["part"]: row for row in json.loads(path.read_text())["rows"]}
+    assert list(rows) == ["dispatch", "forward kinematics", "rows", "tick", "gradient"]
+    assert all(row["seconds"] > 0.0 and row["compile_seconds"] > 0.0 and row["batch"] == 3 for row in rows.values())
+    assert (
+        rows["dispatch"]["operations"] == 1 < rows["forward kinematics"]["operations"] < rows["gradient"]["operations"]
+    )
+    slowest = rows["tick"]["slowest"]
+    assert len(slowest) == 4 and all(seconds > 0.0 for _, seconds in slowest)
+    assert "gradient" in capsys.readouterr().out
+
+
+def test_an_operation_is_found_where_it_is():
+    """A product far larger than the rest of its program."""
+    big = jnp.ones((400, 400))
+    program = jax.jit(lambda a: jnp.sin(a @ a)[0]).lower(big).compile()
+    (slowest, seconds), *rest = parts.profiled(program, (big,), 3)
+    assert "dot" in slowest
+    assert seconds > 2.0 * sum(others for _, others in rest)
