@@ -214,6 +214,12 @@ def test_the_kernel_is_asked_for_soft_rows_and_none(beside_a_gpu):
     assert set(beside_a_gpu) == {(4, 5), (6, 5)}
 
 
+def test_no_gpu_no_kernel():
+    assert not _kernel.available()
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert not _kernel.available()
+
+
 @pytest.mark.parametrize("shape", [Shape(35, 50, 0), Shape(32, 47, 32), Shape(64, 90, 8), Shape(1, 1, 0)])
 def test_what_the_text_is_compiled_for(shape):
     assert 1 <= shape.warps <= 4

@@ -111,6 +111,8 @@ def _kernel(shape: Shape) -> Callable[..., Any]:
         )  # fmt: skip
 
     solve_all.__annotations__ = inputs | outputs
+    # what XLA calls it: the same in every process, for caches of compiled programs
+    solve_all.__qualname__ = solve_all.__name__ = "solve_qp_" + "_".join(map(str, shape))
     block = 32 * shape.warps
     kernel = warp.kernel(solve_all, enable_backward=False, module="unique", launch_bounds=block)
     return warp.jax_kernel(kernel, num_outputs=len(outputs), block_dim=block)
@@ -124,8 +126,9 @@ def source(shape: Shape) -> str:
 
 
 def available() -> bool:
-    """Whether JAX has a CUDA device."""
-    try:
-        return bool(jax.devices("cuda"))
-    except RuntimeError:
-        return False
+    """Whether the device that JAX computes on where it is not told otherwise is a GPU.
+
+    Beside one, under ``jax.default_device`` of a CPU, there is nothing to compile a kernel for.
+    """
+    device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
+    return getattr(device, "platform", device) in ("gpu", "cuda")
