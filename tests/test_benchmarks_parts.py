@@ -1,4 +1,4 @@
-"""The benchmark of parts: all are there, compiled and timed, and a profile names operations of the program."""
+"""Benchmarks of parts and of rollouts: all is there, compiled and timed; a profile names operations of the program."""
 
 import json
 import sys
@@ -6,7 +6,7 @@ import sys
 import jax
 import jax.numpy as jnp
 
-from benchmarks import parts
+from benchmarks import parts, rollouts
 
 
 def test_rows_of_all_parts(tmp_path, monkeypatch, capsys):
@@ -32,3 +32,13 @@ def test_an_operation_is_found_where_it_is():
     (slowest, seconds), *rest = parts.profiled(program, (big,), 3)
     assert "dot" in slowest
     assert seconds > 2.0 * sum(others for _, others in rest)
+
+
+def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
+    path = tmp_path / "rollouts.json"
+    monkeypatch.setattr(sys, "argv", ["rollouts", str(path), "--robot", "arm7", "--robots", "2", "--ticks", "3"])
+    rollouts.main()
+    forward, gradient = json.loads(path.read_text())["rows"]
+    assert (forward["part"], gradient["part"]) == ("forward", "gradient")
+    assert forward["finite"] and gradient["finite"]
+    assert 0.0 < forward["seconds"] < gradient["seconds"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -72,7 +73,7 @@ def assert_same(ours, theirs, atol):
 class TestRollout:
     @all_schemes
     def test_equals_a_python_loop(self, arm, home, tasks, limits, name):
-        """Every number of the solution, with a target that moves."""
+        """Every number of the solution but the warm start, with a target that moves."""
         p, R = paths(home)
         run = osik.rollout(
             arm, arm.q0, tasks, scheme=SCHEMES[name], limits=limits, dt=DT, steps=STEPS, targets={"hand": (p, R)}
@@ -86,7 +87,8 @@ class TestRollout:
         )
         np.testing.assert_allclose(run.time, DT * np.arange(STEPS), rtol=0, atol=1e-15)
         np.testing.assert_allclose(run.q, q, rtol=0, atol=1e-12)
-        assert_same(run.solution, solution, 1e-10)
+        own, expected = (replace(s, warm_start=None) for s in (run.solution, solution))
+        assert_same(own, expected, 1e-10)  # which rows are active where nothing is asked for is a tie
         np.testing.assert_array_equal(run.solution.status, osik.Status.SOLVED)
         assert np.abs(q[-1] - q[0]).max() > 0.05
 

@@ -1,0 +1,94 @@
+"""What the gradient through rollouts costs: over weights that all robots share and the target of each.
+
+    python -m benchmarks.rollouts [results.json] [--robot g1] [--robots 64] [--ticks 100] [--scheme weighted]
+                                  [--precision float64]
+
+The setting is that of ``benchmarks.throughput``, closed loop, on the default device. The loss is the mean over robots
+and ticks of the squared distance of the hand to its target. ``forward`` is the loss alone, ``gradient`` both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import osik_jax as osik
+
+from .throughput import DT, FRAMES, LANES, PRECISIONS, SCHEMES, machine, setting
+
+CALLS = 5
+"""Timed calls of each, after one that does not count."""
+
+
+def measure(robot: str, scheme: str, robots: int, ticks: int) -> list[dict[str, Any]]:
+    """A row of the loss, and one of the loss with its gradient."""
+    given = setting(robot)
+    hand = given.tasks["hand"]
+    assert isinstance(hand, osik.FrameTask)
+    lanes = np.arange(robots) % LANES
+    starts, points = given.starts[lanes], given.targets[lanes]
+
+    def path(q: jax.Array, point: jax.Array, tasks: dict[str, osik.Task]) -> jax.Array:
+        aimed = tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
+        run = osik.rollout(given.robot, q, aimed, scheme=SCHEMES[scheme](), limits=given.limits, dt=DT, steps=ticks)
+        return jnp.mean(run.solution.error["hand"] ** 2)
+
+    def loss(weights: dict[str, jax.Array], points: jax.Array) -> jax.Array:
+        tasks = {name: task.replace(weight=weights[name]) for name, task in given.tasks.items()}
+        return jnp.mean(jax.vmap(path, in_axes=(0, 0, None))(starts, points, tasks))
+
+    at = {name: task.weight for name, task in given.tasks.items()}, points
+    rows = []
+    for name, function in (("forward", loss), ("gradient", jax.value_and_grad(loss, argnums=(0, 1)))):
+        started = time.perf_counter()
+        program = jax.jit(function).lower(*at).compile()
+        compiled = time.perf_counter() - started
+        seconds = []
+        for _ in range(CALLS + 1):
+            started = time.perf_counter()
+            out = jax.block_until_ready(program(*at))
+            seconds.append(time.perf_counter() - started)
+        fine = bool(jax.tree.reduce(lambda ok, leaf: ok & bool(jnp.isfinite(leaf).all()), out, True))
+        memory = getattr(program.memory_analysis(), "temp_size_in_bytes", 0)
+        each = float(np.median(seconds[1:]))
+        rows.append(dict(part=name, seconds=each, compile_seconds=compiled, finite=fine, temporary_bytes=int(memory)))
+    return rows
+
+
+def main() -> None:
+    """Prints a table, and writes a file where one is named."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.rollouts", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("results", nargs="?", type=Path, help="JSON file")
+    parser.add_argument("--robot", default="g1", choices=sorted(FRAMES))
+    parser.add_argument("--robots", type=int, default=64)
+    parser.add_argument("--ticks", type=int, default=100)
+    parser.add_argument("--scheme", default="weighted", choices=sorted(SCHEMES))
+    parser.add_argument("--precision", default="float64", choices=PRECISIONS)
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", given.precision == "float64")
+    rows = measure(given.robot, given.scheme, given.robots, given.ticks)
+    if given.results is not None:
+        asked = {key: value for key, value in vars(given).items() if key != "results"}
+        given.results.write_text(json.dumps(machine() | asked | dict(rows=rows), indent=1) + "\n", encoding="utf-8")
+    table = Table("part", "ms", "times forward", "ticks/s", "finite", "compile [s]", "temporary [MiB]")
+    for row in rows:
+        each = row["seconds"]
+        table.add_row(
+            *(row["part"], f"{1e3 * each:,.1f}", f"{each / rows[0]['seconds']:.2f}"),
+            *(f"{given.robots * given.ticks / each:,.0f}", str(row["finite"]), f"{row['compile_seconds']:.1f}"),
+            f"{row['temporary_bytes'] / 2**20:,.1f}",
+        )
+    Console(width=110).print(table)
+
+
+if __name__ == "__main__":
+    main()
