@@ -63,7 +63,7 @@ class Selection(NamedTuple):
         return [ours(scheme, precision, **options) for scheme in self.schemes for precision in self.precisions]
 
 
-QUICK = Selection(schemes=SCHEMES[:1], precisions=PRECISIONS[:1], batches=BATCHES[-1:])
+QUICK = Selection(schemes=SCHEMES[:1], precisions=PRECISIONS[:1], batches=(1024,))
 
 
 def one_robot(selection: Selection) -> list[Entrant]:

@@ -114,7 +114,7 @@ def test_everyone_is_in_the_program():
     names = [entrant.name for entrant in one_robot(Selection())]
     assert {"mink", "pink", "placo"} < set(names) and len(names) == len(set(names)) == 9
     batches = [entrant.options["batch"] for group in many_robots(Selection()) for entrant in group if entrant.options]
-    assert sorted(set(batches)) == [1, 64, 1024] and len(batches) == 18
+    assert sorted(set(batches)) == [1, 64, 1024, 16384] and len(batches) == 24
     (group,) = many_robots(QUICK)
     assert [entrant.peer for entrant in group] == ["mink", "pink", "placo", "osik_jax"]
     assert group[-1].robots == 1024 and group[0].robots == len(cores())
