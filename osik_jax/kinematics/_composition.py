@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._rules import custom_jvp
@@ -19,11 +20,15 @@ Poses = tuple[Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]
 def world_poses(tree: KinematicTree, position: Float[Array, "nbody 3"], rotation: Float[Array, "nbody 3 3"]) -> Poses:
     """Poses of all bodies in the world from their poses in their parents. Rotations have to be rotations.
 
+    The world itself does not move, whatever its row says.
+
     All bodies at once, each with the ancestor as far above it as it has come: a tree of depth d takes log2(d) rounds.
     The derivative adds up velocities along each body's ancestors, one product with a constant matrix: as cheap in
     either mode, however deep the tree.
     """
-    return _composer(tree)(position, rotation)
+    moves = np.arange(len(tree.body_parents)) > 0
+    position = jnp.where(moves[:, None], position, 0.0)
+    return _composer(tree)(position, jnp.where(moves[:, None, None], rotation, np.eye(3)))
 
 
 @lru_cache(maxsize=64)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
@@ -64,7 +66,8 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     """
     robot.check_configuration(q)
     local = joint_transforms(robot, robot.mujoco_qpos(q))
-    position, rotation = world_poses(robot.tree, local.xpos, local.xmat)
+    turned = jax.vmap(lambda quaternion: jaxlie.SO3(quaternion).as_matrix())(local.xquat)  # of any length
+    position, rotation = world_poses(robot.tree, local.xpos, turned)
     joint_parents = np.asarray(robot.tree.body_parents, int)[np.asarray(robot.tree.joint_bodies, int)]
     turn = rotation[joint_parents]
     anchor = position[joint_parents] + rotate(turn, local.xanchor)

@@ -24,7 +24,10 @@ with contextlib.redirect_stdout(None):  # it prints which of its optional back e
 
 
 def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
-    """MJX data in which ``xpos, xmat, xanchor, xaxis`` are in the frame of each body's parent."""
+    """MJX data in which ``xpos, xquat, xanchor, xaxis`` are in the frame of each body's parent.
+
+    The quaternions are as long as the model's and the joints' axes are: 1, unless somebody changed those numbers.
+    """
     model, data = _forest(
         robot.tree.joint_types, robot.tree.joint_bodies, len(robot.tree.body_names), jnp.result_type(float).name
     )

@@ -58,9 +58,13 @@ def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Arr
     for rows in singles:
         place = np.full(n, len(rows.dofs or ()))
         place[np.array(rows.dofs, int)] = np.arange(len(rows.dofs or ()))
-        weight, wanted = (jnp.append(a, 0.0)[place] for a in (rows.weight, rows.weight * rows.lower))
+        usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of nought is NaN
+        weight, wanted = (jnp.append(a, 0.0)[place] for a in (usable, usable * rows.lower))
         strength, pull = strength + weight, pull + wanted
-    return dict(damping=strength, center=pull / strength)
+    center = pull / strength
+    for rows in singles:
+        strength = jnp.where(jnp.isnan(rows.weight).any(), jnp.nan, strength)
+    return dict(damping=strength, center=center)
 
 
 def _stack(equalities: list[TaskRows], problem: VelocityProblem) -> tuple[Array, Array, Array]:
