@@ -31,7 +31,7 @@ import osik_jax as osik
 from osik_jax.tasks._rows import rows_of
 
 from .command_line import listed
-from .throughput import DT, FRAMES, LANES, PRECISIONS, SCHEMES, Setting, machine, setting
+from .throughput import DT, FRAMES, LANES, PRECISIONS, SCHEMES, Setting, compiled, machine, setting
 
 SECONDS = 1.0
 """That the calls of one part take, about."""
@@ -114,10 +114,8 @@ def measure(given: Setting, scheme: str, batch: int, operations: int) -> list[di
     args = jax.tree.map(lambda a: a[lanes], situations)
     rows = []
     for name, function in functions.items():
-        started = time.perf_counter()
-        program = jax.jit(function if batch == 1 else jax.vmap(function)).lower(*args).compile()
-        compiled = time.perf_counter() - started
-        row = dict(part=name, batch=batch, seconds=median_seconds(program, *args), compile_seconds=compiled)
+        program, compile_seconds = compiled(function if batch == 1 else jax.vmap(function), *args)
+        row = dict(part=name, batch=batch, seconds=median_seconds(program, *args), compile_seconds=compile_seconds)
         slowest = profiled(program, args, operations) if operations and name == "tick" else []
         rows.append(row | dict(operations=operations_of(program.as_text() or ""), slowest=slowest))
     return rows

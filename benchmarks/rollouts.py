@@ -23,7 +23,7 @@ from rich.table import Table
 
 import osik_jax as osik
 
-from .throughput import DT, FRAMES, LANES, PRECISIONS, SCHEMES, machine, setting
+from .throughput import DT, FRAMES, LANES, PRECISIONS, SCHEMES, compiled, machine, setting
 
 CALLS = 5
 """Timed calls of each, after one that does not count."""
@@ -49,9 +49,7 @@ def measure(robot: str, scheme: str, robots: int, ticks: int) -> list[dict[str, 
     at = {name: task.weight for name, task in given.tasks.items()}, points
     rows = []
     for name, function in (("forward", loss), ("gradient", jax.value_and_grad(loss, argnums=(0, 1)))):
-        started = time.perf_counter()
-        program = jax.jit(function).lower(*at).compile()
-        compiled = time.perf_counter() - started
+        program, compile_seconds = compiled(function, *at)
         seconds = []
         for _ in range(CALLS + 1):
             started = time.perf_counter()
@@ -60,7 +58,9 @@ def measure(robot: str, scheme: str, robots: int, ticks: int) -> list[dict[str, 
         fine = bool(jax.tree.reduce(lambda ok, leaf: ok & bool(jnp.isfinite(leaf).all()), out, True))
         memory = getattr(program.memory_analysis(), "temp_size_in_bytes", 0)
         each = float(np.median(seconds[1:]))
-        rows.append(dict(part=name, seconds=each, compile_seconds=compiled, finite=fine, temporary_bytes=int(memory)))
+        rows.append(
+            dict(part=name, seconds=each, compile_seconds=compile_seconds, finite=fine, temporary_bytes=int(memory))
+        )
     return rows
 
 

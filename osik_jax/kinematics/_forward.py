@@ -68,7 +68,7 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     local = joint_transforms(robot, robot.mujoco_qpos(q))
     turned = jax.vmap(lambda quaternion: jaxlie.SO3(quaternion).as_matrix())(local.xquat)  # of any length
     position, rotation = world_poses(robot.tree, local.xpos, turned)
-    joint_parents = np.asarray(robot.tree.body_parents, int)[np.asarray(robot.tree.joint_bodies, int)]
+    joint_parents = robot.tree.parents[np.asarray(robot.tree.joint_bodies, int)]
     turn = rotation[joint_parents]
     anchor = position[joint_parents] + rotate(turn, local.xanchor)
     linear, angular = _motion_axes(robot.tree, rotate(turn, local.xaxis), rotation)
