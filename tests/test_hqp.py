@@ -7,7 +7,7 @@ import pytest
 import quadprog
 from recorded import recorded_hierarchies
 
-from osik_jax.solvers import Level, Status, solve_hqp, solve_nullspace
+from osik_jax.solvers import Level, Status, Tolerances, solve_hqp, solve_nullspace
 
 batched_hqp = jax.jit(jax.vmap(lambda levels, lower, upper: solve_hqp([Level(*a) for a in levels], lower, upper)))
 IMPROVED = 239
@@ -139,6 +139,45 @@ def test_inequalities_at_any_level_and_weights_inside_a_level():
     np.testing.assert_allclose(solve_hqp(off, -box[:1], box[:1]).x, [0.0], atol=1e-12)
 
 
+@pytest.mark.parametrize("solver", [solve_hqp, solve_nullspace])
+def test_known_equalities_are_kept_whatever_their_upper_bounds_round_to(rng, solver):
+    """A compiler may compute one expression twice: an equality in two roundings still stands before lower levels."""
+    n, sizes, apart = 8, (3, 2, 8), np.array([-1e-15, 0.0, 1e-15])
+    low, high = -np.full(n, 0.6), np.full(n, 0.6)
+    box = (low, high) if solver is solve_hqp else ()
+
+    def solve(levels, upper):
+        first, second, last = levels
+        known = Level(first[0], first[1], upper, equalities=[True] * 3)
+        mixed = Level(second[0], second[1], second[1] + jnp.array([0.0, 0.1]), equalities=[True, False])
+        return solver([known, mixed, Level(*last)], *box)
+
+    levels = [(rng.normal(size=(30, m, n)), 0.1 * rng.normal(size=(30, m))) for m in sizes]
+    levels[0][1][::2] = 0.0  # holds from the start, with nothing active
+    batched = jax.jit(jax.vmap(solve))
+    expected = batched(levels, levels[0][1])
+    for shift in (apart, -apart):
+        s = batched(levels, levels[0][1] + shift)
+        np.testing.assert_array_equal(s.status, Status.SOLVED)
+        np.testing.assert_allclose(s.slacks[0], 0.0, atol=1e-12)
+        np.testing.assert_allclose(s.slacks[1][:, 0], 0.0, atol=1e-12)
+        np.testing.assert_allclose(s.x, expected.x, atol=1e-12)
+        if solver is solve_hqp:
+            np.testing.assert_array_equal(s.warm_start.own[:, 0, :3], 2)
+
+
+def test_residual_tells_what_lower_levels_took():
+    """Two rows nearer to parallel than the rank tolerance: the first level is one of them alone, for all below."""
+    levels = [Level([[1.0, 0.0], [1.0, 1e-4]], [0.0, 0.0]), Level([[0.0, 1.0]], [1.0])]
+    box = jnp.full(2, 5.0)
+    kept = solve_hqp(levels, -box, box)
+    np.testing.assert_allclose(kept.x, 0.0, atol=1e-12)
+    assert kept.kkt_residual < 1e-12
+    lost = solve_hqp(levels, -box, box, tolerances=Tolerances(rank=1e-3))
+    assert np.linalg.norm(lost.slacks[0]) > 1e-5
+    assert lost.kkt_residual >= np.linalg.norm(lost.slacks[0]) - 1e-12
+
+
 def test_level_without_rows_and_pinned_variables():
     levels = [Level(jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0)), Level(jnp.ones((1, 3)), [6.0], [6.0])]
     s = solve_hqp(levels, jnp.array([1.0, -jnp.inf, -10.0]), jnp.array([1.0, jnp.inf, 2.0]))
@@ -176,6 +215,8 @@ def test_crossed_bounds_are_infeasible_and_their_middle_stands_for_them(solver):
 def test_shapes_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match=r"lower has shape \(3,\)"):
         Level(jnp.ones((2, 4)), jnp.zeros(3), jnp.zeros(2))
+    with pytest.raises(ValueError, match="equalities has 1 flags; the matrix has 2 rows"):
+        Level(jnp.ones((2, 4)), jnp.zeros(2), jnp.zeros(2), equalities=[True])
 
 
 def test_derivatives_are_those_of_the_solution_map(rng, recorded):

@@ -49,7 +49,7 @@ class VelocityProblem(eqx.Module):
         matrix, lower, upper, weight = (
             jnp.concatenate([getattr(r, field) for r in rows]) for field in ("jacobian", "lower", "upper", "weight")
         )
-        return Level(matrix, lower, None if all(r.is_equality for r in rows) else upper, weight)
+        return Level(matrix, lower, upper, weight, [r.is_equality for r in rows for _ in r.error])
 
     def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
         """Of each task, J v minus the nearest point of its interval."""

@@ -27,6 +27,9 @@ _RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
 """Rounding of the data makes rows independent that are not."""
 
 
+_LOST = 100.0
+"""Rank tolerances; a level whose optimum those below it have worsened by more was not kept."""
+
 _NOTHING = 1e-2
 """Share of the rank tolerance up to which a pivot is none, whatever the rank that another factorisation found."""
 
@@ -70,12 +73,14 @@ def solve_hqp(
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
     tolerances = Tolerances(rank=_RANK[dtype]) if tolerances is None else tolerances
     sane = _finite(levels, lower, upper)
+    equal = [level.equal | ~sane for level in levels]
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True) if levels else ((), ())
     low, high, empty = uncrossed(lower, upper)
     possible = ~jnp.stack([empty, *crossed]).any()
     low, high = (jnp.where(sane, b, side).astype(dtype) for b, side in ((low, -1.0), (high, 1.0)))
     scaled = [jax.tree.map(lambda leaf: jnp.where(sane, leaf, 0.0), level.scaled()) for level in levels]
-    layout, stack = stacked([*scaled, _smallest(lower.shape[0], dtype)], low, high)
+    scaled, equal = [*scaled, _smallest(len(low), dtype)], [*equal, jnp.ones(len(low), bool)]
+    layout, stack = stacked(scaled, equal, low, high, (lower >= upper) & sane)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
     end = _descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start)))
     nothing = jnp.maximum(_NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
@@ -111,6 +116,7 @@ class _End(NamedTuple):
     decisions: Decision  # with a leading axis, the levels, and so the following
     working: WorkingSet
     multipliers: Float[Array, "L h"]
+    reached: Float[Array, " L"]  # the norm of each level's slack at its own optimum
 
 
 @cache
@@ -139,14 +145,15 @@ def _descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances,
     levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (stack.levels, warm))
     numbers = jnp.arange(layout.levels)
     cascade, outcomes = jax.lax.scan(descend, first, (numbers, levels, guesses))
-    return _End(cascade, *jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes))
+    end = _End(cascade, *jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes))
+    return end._replace(cascade=jax.vmap(partial(_certified, tolerances=tolerances))(cascade, stack, end.reached))
 
 
 def _start(stack: Stack) -> _Cascade:
     h, n = stack.hard.shape
     dtype = stack.hard.dtype
     lower, upper = stack.hard_lower[:n], stack.hard_upper[:n]
-    pinned = lower == upper
+    pinned = stack.hard_equal[:n]
     nothing = jnp.asarray(0, jnp.int32)
     return _Cascade(
         x=jnp.clip(jnp.zeros(n, dtype), lower, upper),
@@ -163,7 +170,7 @@ def _start(stack: Stack) -> _Cascade:
     )
 
 
-_Outcome = tuple[Decision, WorkingSet, Float[Array, "B h"]]
+_Outcome = tuple[Decision, WorkingSet, Float[Array, "B h"], Float[Array, " B"]]
 
 
 def _task(layout: Layout, k: Int[Array, ""], stack: Stack, level: Level, cascade: _Cascade) -> Task:
@@ -172,11 +179,13 @@ def _task(layout: Layout, k: Int[Array, ""], stack: Stack, level: Level, cascade
     bounded = jnp.isfinite(cascade.lower) | jnp.isfinite(cascade.upper)
     return Task(
         level=level,
+        equal=stack.equal[k],
         matrix=stack.hard,
         lower=cascade.lower,
         upper=cascade.upper,
         free=~cascade.frozen & bounded & (of < k),
         own=of == k,
+        soft=(of == k) & ~stack.hard_equal,
         place=jnp.asarray(layout.place_of_row)[k],
         projector=cascade.projector,
         x=cascade.x,
@@ -257,7 +266,7 @@ def _usable(task: Task, warm: WorkingSet) -> WorkingSet:
     level = task.level
     named = jnp.sign(warm.own)
     named = jnp.where(jnp.isfinite(jnp.where(named < 0, level.lower, level.upper)), named, 0)
-    own = jnp.where(level.lower == level.upper, 2, named)
+    own = jnp.where(task.equal, 2, named)
     side = jnp.sign(warm.hard)
     side = jnp.where(task.free & jnp.isfinite(jnp.where(side < 0, task.lower, task.upper)), side, 0)
     return WorkingSet(side.astype(jnp.int32), own.astype(jnp.int32))
@@ -280,7 +289,7 @@ def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Toleranc
     value = apply(level.matrix, end.x)
     slack = value - jnp.clip(value, level.lower, level.upper)
     small = tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + jnp.sqrt(jnp.sum(slack**2)))
-    counts = (level.lower == level.upper) | (jnp.abs(slack) > small)
+    counts = task.equal | (jnp.abs(slack) > small)
     gradient = apply(level.matrix.T, jnp.where(counts, slack, 0.0))
     pressure = jnp.abs(end.multiplier) * task.length
     floor = tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + noise(level, end.x, slack, tolerances)
@@ -310,18 +319,34 @@ def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Toleranc
         residual=jnp.maximum(cascade.residual, end.residual),
         done=cascade.done & end.done,
     )
-    own = jnp.where(level.lower == level.upper, 2, missed).astype(jnp.int32)
+    own = jnp.where(task.equal, 2, missed).astype(jnp.int32)
     # rows held without a multiplier decide nothing, unless more of the level would count without them (a tie)
     tie = same & (rank - bounds != end.rank)
     decision = Decision(jnp.where(tight | tie, end.side, 0), missed, jnp.where(tie, end.rank, rank - bounds))
-    return after, (decision, WorkingSet(end.side, own), end.multiplier)
+    return after, (decision, WorkingSet(end.side, own), end.multiplier, jnp.sqrt(jnp.sum(slack**2)))
 
 
 def _skip(cascade: _Cascade, task: Task) -> tuple[_Cascade, _Outcome]:
     """A level that finds no freedom decides nothing."""
     none, own = jnp.zeros_like(cascade.side), jnp.zeros(task.level.lower.shape, jnp.int32)
     decision = Decision(none, own, jnp.zeros_like(cascade.iterations))
-    return cascade, (decision, WorkingSet(none, own), jnp.zeros_like(cascade.lower))
+    anything = jnp.full_like(cascade.residual, jnp.inf)  # x has stopped moving
+    return cascade, (decision, WorkingSet(none, own), jnp.zeros_like(cascade.lower), anything)
+
+
+def _certified(cascade: _Cascade, stack: Stack, reached: Float[Array, " L"], *, tolerances: Tolerances) -> _Cascade:
+    """What the levels below took from each level's optimum: part of the residual, and the verdict."""
+
+    def lost(level: Level, reached: Array) -> tuple[Array, Array]:
+        slack = jnp.sqrt(jnp.sum(level.distance(cascade.x) ** 2))
+        more = jnp.maximum(slack - reached, 0.0)
+        allowed = _LOST * tolerances.rank * (level.size * jnp.max(jnp.abs(cascade.x)) + slack)
+        return level.size * more, more <= allowed
+
+    residual, kept = jax.vmap(lost)(stack.levels, reached)
+    return cascade._replace(
+        residual=jnp.maximum(cascade.residual, jnp.max(residual)), done=cascade.done & jnp.all(kept)
+    )
 
 
 def _row_space(

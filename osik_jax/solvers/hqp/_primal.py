@@ -55,7 +55,7 @@ def solve_level(task: Task, start: LevelState, tolerances: Tolerances, max_itera
     def body(s: LevelState) -> LevelState:
         value = apply(level.matrix, s.x)
         slack = value - jnp.clip(value, level.lower, level.upper)
-        counts = (slack != 0.0) | (level.lower == level.upper)
+        counts = (slack != 0.0) | task.equal
         held = jax.lax.optimization_barrier(hold(task, s.side, tolerances.rank))
         descend, rank = least_squares(level, counts, held, tolerances)
         step = apply(task.projector, descend(slack))

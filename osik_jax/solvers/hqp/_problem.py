@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from .._box import uncrossed
+from .._dense import apply
 
 
 class Tolerances(NamedTuple):
@@ -31,14 +34,16 @@ class Level(eqx.Module):
         upper: of A x; inf for none. Leave it out where all rows are equalities: it is then ``lower``, and the solver
             need not look for the rows that are not. (m,)
         weight: of the squared distances of the rows to their intervals, >= 0; None for ones. (m,)
-        equality: whether ``upper`` was left out (static).
+        equalities: rows that are equalities whatever ``upper`` says, which is not looked at there: all where ``upper``
+            was left out (static). Name them where bounds are computed under ``jit``: XLA may compute an expression
+            twice, in two roundings, and what was one number is then two. (m,)
     """
 
     matrix: Float[Array, "m n"]
     lower: Float[Array, " m"]
     upper: Float[Array, " m"]
     weight: Float[Array, " m"] | None
-    equality: bool = eqx.field(static=True)
+    equalities: tuple[bool, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -46,16 +51,31 @@ class Level(eqx.Module):
         lower: ArrayLike | Array,
         upper: ArrayLike | Array | None = None,
         weight: ArrayLike | Array | None = None,
+        equalities: Sequence[bool] | None = None,
     ):
         self.matrix = jnp.asarray(matrix)
         self.lower = jnp.asarray(lower, self.matrix.dtype)
-        self.equality = upper is None
+        count = self.matrix.shape[-2]
+        self.equalities = (upper is None,) * count if equalities is None else tuple(map(bool, equalities))
         self.upper = self.lower if upper is None else jnp.asarray(upper, self.matrix.dtype)
         self.weight = None if weight is None else jnp.asarray(weight, self.matrix.dtype)
         rows = self.matrix.shape[:-1]
         for name, array in (("lower", self.lower), ("upper", self.upper), ("weight", self.weight)):
             if array is not None and array.shape != rows:
                 raise ValueError(f"{name} has shape {array.shape}; the matrix {self.matrix.shape} asks for {rows}")
+        if len(self.equalities) != count:
+            raise ValueError(f"equalities has {len(self.equalities)} flags; the matrix has {count} rows")
+
+    @property
+    def equality(self) -> bool:
+        """Whether all rows are known to be equalities."""
+        return all(self.equalities)
+
+    @property
+    def equal(self) -> Bool[Array, " m"]:
+        """Rows to be treated as equalities: those known to be, and those whose bounds are equal or crossed."""
+        counts = True if self.weight is None else self.weight > 0.0
+        return jnp.array(self.equalities, bool) | ((self.lower >= self.upper) & counts)
 
     @property
     def length(self) -> Float[Array, " m"]:
@@ -74,20 +94,23 @@ class Level(eqx.Module):
         positive = self.weight > 0.0
         root = jnp.where(positive, jnp.sqrt(jnp.where(positive, self.weight, 1.0)), 0.0)
         matrix = root[:, None] * self.matrix
-        if self.equality:
-            return Level(matrix, jnp.where(positive, self.lower * root, 0.0))
-        return Level(matrix, _scaled_bound(self.lower, root, -jnp.inf), _scaled_bound(self.upper, root, jnp.inf))
+        known = np.array(self.equalities, bool)
+        goal = jnp.where(positive, jnp.where(known, self.lower, 0.0) * root, 0.0)
+        lower, upper = (
+            jnp.where(known, goal, _scaled_bound(bound, root, none))
+            for bound, none in ((self.lower, -jnp.inf), (self.upper, jnp.inf))
+        )
+        return Level(matrix, lower, upper, equalities=self.equalities)
 
     def uncrossed(self) -> tuple[Level, Bool[Array, ""]]:
         """The same level with crossed bounds as equalities halfway, and whether there were any."""
-        if self.equality:
-            return self, jnp.asarray(False)
-        lower, upper, crossed = uncrossed(self.lower, self.upper)
-        return Level(self.matrix, lower, upper, self.weight), crossed
+        known = np.array(self.equalities, bool)
+        lower, upper, crossed = uncrossed(self.lower, jnp.where(known, self.lower, self.upper))
+        return Level(self.matrix, lower, upper, self.weight, self.equalities), crossed
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """A x minus the nearest point of its interval: the slack, 0 where the row holds."""
-        value = self.matrix @ x
+        value = apply(self.matrix, x)
         return value - jnp.clip(value, self.lower, self.upper)
 
 
@@ -116,7 +139,7 @@ class HQPSolution(eqx.Module):
         status: a ``Status`` code.
         iterations: changes of the active sets of all levels together.
         factorizations: systems factored, all levels together.
-        kkt_residual: the largest stationarity residual of a level.
+        kkt_residual: the largest stationarity residual of a level, and what the levels below took from its optimum.
         active: of the box, -1 at the lower bound, 1 at the upper, 2 equality, 0 free. (n,)
         active_rows: of each level, its rows that miss their interval: -1 below it, 1 above, 2 equality; 0 for those
             that hold. ((m,), ...)

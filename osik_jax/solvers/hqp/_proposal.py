@@ -35,23 +35,21 @@ def propose(
 def _tableau(task: Task) -> tuple[Limits, Float[Array, " h"], Dual]:
     level, x, dtype = task.level, task.x, task.x.dtype
     scale = 1.0 / jnp.where(level.size > 0.0, level.size, 1.0)
-    equality = level.lower == level.upper
-    cost = jnp.where(equality[:, None], product(level.matrix * scale, task.projector), 0.0)
-    residual = scale * jnp.where(equality, apply(level.matrix, x) - jnp.where(equality, level.lower, 0.0), 0.0)
+    cost = jnp.where(task.equal[:, None], product(level.matrix * scale, task.projector), 0.0)
+    residual = scale * jnp.where(task.equal, apply(level.matrix, x) - jnp.where(task.equal, level.lower, 0.0), 0.0)
     hessian = product(cost.T, cost) + _DAMPING * jnp.eye(len(x), dtype=dtype)
     factor = jax.lax.linalg.cholesky(hessian, symmetrize_input=False)
-    soft = task.own & (task.lower != task.upper)
     unit = jnp.where(task.own, scale, 1.0)  # the rows of the level in the units of its cost
     rows = product(task.matrix * unit[:, None], task.projector)
     right = jnp.concatenate([rows.T, apply(cost.T, residual)[:, None]], 1)
     half = jax.scipy.linalg.solve_triangular(factor, right, lower=True)
     half, slope = half[:, :-1], half[:, -1]
-    tableau = product(half.T, half) + jnp.diag(soft.astype(dtype))
+    tableau = product(half.T, half) + jnp.diag(task.soft.astype(dtype))
     own = jnp.diagonal(tableau)
     root = 1.0 / jnp.sqrt(jnp.where(own > 0.0, own, 1.0))
     value = unit * apply(task.matrix, x) - apply(half.T, slope)
     bounds = [
-        jnp.where(task.free | soft, unit * b, side) for b, side in ((task.lower, -jnp.inf), (task.upper, jnp.inf))
+        jnp.where(task.free | task.soft, unit * b, side) for b, side in ((task.lower, -jnp.inf), (task.upper, jnp.inf))
     ]
     nearest = jnp.minimum(*(jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in bounds))
     reach = unit * task.length * jnp.max(jnp.abs(x)) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
@@ -75,7 +73,6 @@ def _point(task: Task, root: Float[Array, " h"], end: Dual) -> Float[Array, " n"
 
 
 def _working_set(task: Task, end: Dual) -> WorkingSet:
-    level = task.level
     side = jnp.where(end.active == INACTIVE, 0, jnp.where(end.active == AT_UPPER, 1, -1)).astype(jnp.int32)
-    own = jnp.where(level.lower == level.upper, 2, jnp.pad(side, (0, 1))[task.place])
+    own = jnp.where(task.equal, 2, jnp.pad(side, (0, 1))[task.place])
     return WorkingSet(jnp.where(task.own, 0, side), own.astype(jnp.int32))

@@ -53,7 +53,7 @@ def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, " n"]:
     n = stack.hard.shape[1]
     hard = (stack.hard, stack.hard_lower, stack.hard_upper)
-    pinned = stack.hard_lower[:n] == stack.hard_upper[:n]
+    pinned = stack.hard_equal[:n]
 
     def descend(state: tuple[Array, Array], now: tuple[Decision, Level]) -> tuple[tuple[Array, Array], None]:
         decision, level = now

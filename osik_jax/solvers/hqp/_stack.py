@@ -27,23 +27,31 @@ class Layout(NamedTuple):
 
 
 class Stack(NamedTuple):
-    """The numbers of a hierarchy."""
+    """The numbers of a hierarchy.
+
+    Which rows are equalities is settled once, and not asked of the bounds again: XLA may have computed those twice, in
+    two roundings.
+    """
 
     levels: Level  # with a leading axis; rows of zeros without bounds fill up
+    equal: Bool[Array, "L m"]  # rows that are equalities
     hard: Float[Array, "h n"]
     hard_lower: Float[Array, " h"]
     hard_upper: Float[Array, " h"]
+    hard_equal: Bool[Array, " h"]
 
 
 class Task(NamedTuple):
     """One level, as it stands below those that are done."""
 
     level: Level
+    equal: Bool[Array, " m"]  # the level's equalities; their bounds are one number, but for rounding
     matrix: Float[Array, "h n"]  # the hard rows
     lower: Float[Array, " h"]
     upper: Float[Array, " h"]
     free: Bool[Array, " h"]  # to be left alone: neither frozen, nor without bounds, nor of a level to come
     own: Bool[Array, " h"]  # of this level
+    soft: Bool[Array, " h"]  # of this level, and no equalities
     place: Int[Array, " m"]  # of the level's rows among the hard ones; h for none
     projector: Float[Array, "n n"]  # onto the null space of the frozen rows
     x: Float[Array, " n"]  # with the frozen rows at their values, and feasible
@@ -58,8 +66,14 @@ class Task(NamedTuple):
         return jnp.zeros(len(self.lower) + 1, bool).at[self.place].max(flags)[:-1]
 
 
-def stacked(levels: Sequence[Level], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> tuple[Layout, Stack]:
-    """Layout and numbers of a hierarchy whose weights are multiplied in."""
+def stacked(
+    levels: Sequence[Level],
+    equal: Sequence[Bool[Array, " m"]],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    pinned: Bool[Array, " n"],
+) -> tuple[Layout, Stack]:
+    """Layout and numbers of a hierarchy whose weights are multiplied in; which rows, and variables, are equalities."""
     n, m = lower.shape[0], max(level.matrix.shape[0] for level in levels)
     mixed = [level for level in levels if not level.equality]
     first, level_of, places = n, [-1] * n, []
@@ -73,9 +87,13 @@ def stacked(levels: Sequence[Level], lower: Float[Array, " n"], upper: Float[Arr
     layout = Layout(n, len(levels), m, tuple(level_of), tuple(places))
     stack = Stack(
         levels=jax.tree.map(lambda *a: jnp.stack(a), *(_padded(level, m) for level in levels)),
+        equal=jnp.stack([jnp.pad(rows, (0, m - len(rows))) for rows in equal]),
         hard=jnp.concatenate([jnp.eye(n, dtype=lower.dtype), *(level.matrix for level in mixed)]),
         hard_lower=jnp.concatenate([lower, *(level.lower for level in mixed)]),
         hard_upper=jnp.concatenate([upper, *(level.upper for level in mixed)]),
+        hard_equal=jnp.concatenate(
+            [pinned, *(rows for level, rows in zip(levels, equal, strict=True) if not level.equality)]
+        ),
     )
     return layout, stack
 

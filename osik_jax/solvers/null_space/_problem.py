@@ -55,7 +55,7 @@ class Demand(NamedTuple):
         """Equalities count always, inequalities where x violates them."""
         value = apply(level.matrix, x)
         wanted = jnp.clip(value, level.lower, level.upper) - value
-        counts = (level.lower == level.upper) | (wanted != 0.0)
+        counts = level.equal | (wanted != 0.0)
         rows = jnp.where(counts[:, None], level.matrix, 0.0)
         return cls(rows, wanted, rank * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2)))
 
