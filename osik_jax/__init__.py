@@ -10,12 +10,14 @@ from .control import rollout as rollout
 from .control import solve as solve
 from .kinematics import Kinematics as Kinematics
 from .kinematics import center_of_mass as center_of_mass
+from .kinematics import centroidal_momentum_matrix as centroidal_momentum_matrix
 from .kinematics import com_jacobian as com_jacobian
 from .kinematics import difference as difference
 from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import frame_jacobian as frame_jacobian
 from .kinematics import frame_jacobians as frame_jacobians
 from .kinematics import integrate as integrate
+from .kinematics import mass_matrix as mass_matrix
 from .limits import ConfigurationLimit as ConfigurationLimit
 from .limits import Limit as Limit
 from .limits import VelocityLimit as VelocityLimit

@@ -21,7 +21,7 @@ Factors = Mapping[str, Float[Array, ""] | float] | Float[Array, ""] | float
 def scaled_leaves(robot: Robot, length: Factors, mass: Factors) -> dict[str, Array]:
     """The leaves of a robot that other lengths and masses change, by field."""
     tree, dtype = robot.tree, robot.body_position.dtype
-    longer = _factors(tree, length, "length", dtype)
+    longer, heavier = _factors(tree, length, "length", dtype), _factors(tree, mass, "mass", dtype)
     parent, carrier = np.asarray(tree.body_parents, int), np.asarray(tree.frame_bodies, int)
     owner = np.asarray(tree.joint_bodies, int)
     return {
@@ -29,7 +29,8 @@ def scaled_leaves(robot: Robot, length: Factors, mass: Factors) -> dict[str, Arr
         "body_com": robot.body_com * longer[:, None],
         "joint_position": robot.joint_position * longer[owner, None],
         "frame_position": robot.frame_position * longer[carrier, None],
-        "body_mass": robot.body_mass * _factors(tree, mass, "mass", dtype),
+        "body_mass": robot.body_mass * heavier,
+        "body_inertia": robot.body_inertia * (heavier * longer**2)[:, None, None],
     }
 
 

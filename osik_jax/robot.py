@@ -38,8 +38,10 @@ class Robot(eqx.Module):
         body_quaternion: of each body in its parent, w x y z. (nbody, 4)
         body_mass: [kg]; what is fixed to the world does not count. (nbody,)
         body_com: centre of mass of each body in its own frame [m]. (nbody, 3)
+        body_inertia: rotational inertia of each body about its centre of mass, in its own axes [kg m^2]. (nbody, 3, 3)
         joint_position: anchor of each joint in its body [m]. (njoint, 3)
         joint_axis: axis of each joint in its body. (njoint, 3)
+        dof_armature: inertia that each dof's drive adds, MuJoCo's ``armature`` [kg m^2 or kg]. (full nv,)
         joint_reference: MuJoCo's qpos0, the joint values at which bodies sit as described. (full nq,)
         frame_position: of each named frame in its body [m]. (nframe, 3)
         frame_rotation: of each named frame in its body. (nframe, 3, 3)
@@ -55,8 +57,10 @@ class Robot(eqx.Module):
     body_quaternion: Float[Array, "nbody 4"]
     body_mass: Float[Array, " nbody"]
     body_com: Float[Array, "nbody 3"]
+    body_inertia: Float[Array, "nbody 3 3"]
     joint_position: Float[Array, "njoint 3"]
     joint_axis: Float[Array, "njoint 3"]
+    dof_armature: Float[Array, " nvfull"]
     joint_reference: Float[Array, " nqfull"]
     frame_position: Float[Array, "nframe 3"]
     frame_rotation: Float[Array, "nframe 3 3"]
@@ -256,7 +260,8 @@ class Robot(eqx.Module):
         """The same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
 
         A link is made longer from its own origin: the joints of its children, its centre of mass and its frames move
-        away by the factor. Masses are scaled by their own factors only. Factors may be traced, so
+        away by the factor. Masses are scaled by their own factors only, inertias by mass times length squared. Factors may
+        be traced, so
         ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of robots.
 
         Args:

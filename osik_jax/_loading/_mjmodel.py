@@ -81,6 +81,7 @@ def from_mjmodel(
         **_body_arrays(model, bodies, placement),
         joint_position=model.jnt_pos,
         joint_axis=model.jnt_axis,
+        dof_armature=model.dof_armature,
         joint_reference=model.qpos0,
         frame_position=[frame.position for frame in frames.values()],
         frame_rotation=[frame.rotation for frame in frames.values()],
@@ -285,18 +286,25 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
 
 
 def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Placement]) -> dict[str, ArrayLike]:
-    """Poses of the moving bodies in their parents; their masses and centres with all that is fixed to them."""
-    mass, moment = np.zeros(len(bodies)), np.zeros((len(bodies), 3))
-    for b, place in enumerate(placement):
-        if place.body:  # what is fixed to the world is no part of what moves
-            mass[place.body] += model.body_mass[b]
-            moment[place.body] += model.body_mass[b] * (place.position + place.rotation @ model.body_ipos[b])
+    """Poses of the moving bodies in their parents; their masses, centres and inertias with all that is fixed to them."""
+    mass, moment, inertia = np.zeros(len(bodies)), np.zeros((len(bodies), 3)), np.zeros((len(bodies), 3, 3))
+    parts = [(b, place, place.position + place.rotation @ model.body_ipos[b]) for b, place in enumerate(placement)]
+    parts = [part for part in parts if part[1].body]  # what is fixed to the world is no part of what moves
+    for b, place, center in parts:
+        mass[place.body] += model.body_mass[b]
+        moment[place.body] += model.body_mass[b] * center
+    centers = moment / np.where(mass > 0.0, mass, 1.0)[:, None]
+    for b, place, center in parts:
+        axes, arm = place.rotation @ _matrix(model.body_iquat[b]), center - centers[place.body]
+        inertia[place.body] += axes * model.body_inertia[b] @ axes.T
+        inertia[place.body] += model.body_mass[b] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     poses = [_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]) for b in bodies]
     return dict(
         body_position=[pose.position for pose in poses],
         body_quaternion=[quaternion(pose.rotation) for pose in poses],
         body_mass=mass,
-        body_com=moment / np.where(mass > 0.0, mass, 1.0)[:, None],
+        body_com=centers,
+        body_inertia=inertia,
     )
 
 
