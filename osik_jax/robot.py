@@ -77,9 +77,12 @@ class Robot(eqx.Module):
         urdf: str | os.PathLike[str],
         *,
         floating_base: bool | None = None,
+        velocity_limits: Mapping[str, float] | None = None,
         locked_joints: LockedJoints = (),
+        collision_meshes: bool = False,
+        package_dirs: Iterable[str | os.PathLike[str]] = (),
     ) -> Robot:
-        """Loads a URDF. Mesh files are never read; boxes, spheres, cylinders and capsules are kept for drawing.
+        """Loads a URDF. Boxes, spheres, cylinders and capsules are kept as geoms; mesh files are not read unless asked.
 
         Every link is a frame, with or without a joint of its own. Limits come from ``<limit>``: no ``<limit>`` means
         none, an absent ``lower`` or ``upper`` is 0 as the format has it, and a velocity of 0 or none means unknown,
@@ -88,21 +91,37 @@ class Robot(eqx.Module):
         MuJoCo demands some. What is fixed to the world (the root link of an arm) does not count as the robot's mass.
 
         Args:
-            urdf: path of the file, or the XML text itself. Lengths in metres, angles in radians.
+            urdf: path of the file, ``package://`` address, or the XML text itself. Lengths in metres, angles in
+                radians.
             floating_base: ``True``: put a free joint, ``floating_base``, on the root link unless the URDF has a
                 ``floating`` joint already (below a root link called ``world``: on the one link fixed to it).
                 ``False``: the root link is fixed to the world, and ``floating`` joints are locked. ``None``: as
                 ``True``, but a root link called ``world`` is the world and stays fixed.
+            velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; wins over the file's.
             locked_joints: names or globs of joints to freeze at 0, or a mapping from them to the values to freeze at
                 [rad or m]. A mimic joint is locked by locking its leader.
+            collision_meshes: read the collision shapes that are meshes (STL, OBJ, MSH) too; without, no mesh file is
+                needed.
+            package_dirs: folders that are ROS packages or hold some, for ``package://`` addresses. Then
+                ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH`` are looked through, then the folders above the file.
 
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: the XML or the model in it is broken or cannot be represented (``planar`` joints); the message
-                says where.
-            KeyError: ``locked_joints`` names a joint that does not exist.
+            FileNotFoundError: no such file, or with ``collision_meshes`` a mesh is not found; the message says where it
+                was looked for.
+            ValueError: the XML or the model in it is broken or cannot be represented (``planar`` joints, several root
+                links); the message says where.
+            KeyError: ``velocity_limits`` or ``locked_joints`` names a joint that does not exist.
         """
-        return cls(**_loading.from_urdf(urdf, floating_base=floating_base, locked_joints=locked_joints))
+        return cls(
+            **_loading.from_urdf(
+                urdf,
+                floating_base=floating_base,
+                velocity_limits=velocity_limits,
+                locked_joints=locked_joints,
+                collision_meshes=collision_meshes,
+                package_dirs=package_dirs,
+            )
+        )
 
     @classmethod
     def from_mjcf(
@@ -117,7 +136,8 @@ class Robot(eqx.Module):
 
         Active joint equality constraints that are linear become exact mimic joints, those without a second joint lock
         the first; other constraints (``connect``, ``weld``, tendons) are not honoured. Where files of meshes, height
-        fields or textures cannot be read, the geoms that need them are left out.
+        fields or textures cannot be read, the geoms that need them are left out. Where the model does not compile for
+        want of masses, moving bodies without get 2e-15 kg. ``fusestatic`` is not followed: it loses names.
 
         Args:
             mjcf: path of the file, or the XML text itself.

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ._mjmodel import as_mapping, element_names, from_mjmodel
+from ._mjmodel import LEAST_INERTIA, as_mapping, element_names, from_mjmodel
 from ._source import Source, check_root, parse_xml, read_source
 
 FLOATING_BASE = "floating_base"
@@ -38,6 +38,7 @@ def from_mjcf(
 def _model(source: Source, floating_base: bool | None) -> mujoco.MjModel:
     read = mujoco.MjSpec.from_string if source.path is None else mujoco.MjSpec.from_file
     spec = read(str(source.path or source.content))
+    spec.compiler.fusestatic = False  # it would lose the names of the bodies that it fuses
     model = _compile(spec)
     if floating_base and not _free_joints(model):
         _add_base(spec, model)
@@ -52,13 +53,17 @@ def _free_joints(model: mujoco.MjModel) -> list[str]:
 
 
 def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compiles as is, or without what comes from files if that fails."""
+    """Compiles as is; if that fails, without what comes from files, then with some mass where MuJoCo demands it."""
     try:
         return spec.compile()
     except ValueError as error:
-        if not any(_needs_file(asset) for asset in _assets(spec)):
-            raise
-        _strip_files(spec, error)
+        if any(_needs_file(asset) for asset in _assets(spec)):
+            _strip_files(spec, error)
+    try:
+        return spec.compile()
+    except ValueError:
+        spec.compiler.boundmass = max(spec.compiler.boundmass, LEAST_INERTIA)
+        spec.compiler.boundinertia = max(spec.compiler.boundinertia, LEAST_INERTIA)
     return spec.compile()
 
 

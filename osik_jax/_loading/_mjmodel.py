@@ -17,6 +17,9 @@ from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTr
 VELOCITY_LIMIT_PREFIX = "velocity_limit/"
 """A custom numeric of this name and a joint's holds the joint's greatest speed [rad/s or m/s]."""
 
+LEAST_INERTIA = 2e-15
+"""Mass [kg] and moments [kg m^2] of moving bodies that have none: MuJoCo asks for more than 1e-15."""
+
 _MASSLESS = 1e-14
 """Mass per body [kg] that counts as none: MuJoCo itself demands 1e-15 of every moving body."""
 

@@ -6,20 +6,19 @@ import dataclasses
 import math
 import os
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from ._mjmodel import VELOCITY_LIMIT_PREFIX, as_mapping, from_mjmodel, quaternion
+from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, as_mapping, from_mjmodel, quaternion
+from ._packages import Packages, is_uri
 from ._source import check_root, parse_xml, read_source
 from ._urdf_elements import IDENTITY, Joint, Link, Pose, Shape, Urdf, read_urdf
 
 WORLD = "world"
 FLOATING_BASE = "floating_base"
-
-_LEAST_INERTIA = 2e-15
-"""Mass [kg] and moments [kg m^2] of moving links that have none: MuJoCo asks for more than 1e-15."""
 
 _GEOMS = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -28,27 +27,35 @@ _GEOMS = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3
+_MESH_SUFFIXES = (".stl", ".obj", ".msh")
 
 
 def from_urdf(
     urdf: str | os.PathLike[str],
     *,
     floating_base: bool | None = None,
+    velocity_limits: Mapping[str, float] | None = None,
     locked_joints: Iterable[str] | Mapping[str, float] = (),
+    collision_meshes: bool = False,
+    package_dirs: Iterable[str | os.PathLike[str]] = (),
 ) -> dict[str, Any]:
     """The fields of a Robot from a URDF file or text; see ``Robot.from_urdf``."""
-    source = read_source(urdf, "URDF")
+    packages = Packages(package_dirs)
+    source = read_source(packages.path(urdf) if is_uri(urdf) else urdf, "URDF")
     root = parse_xml(source)
     check_root(root, "robot", source)
     try:
         description = _with_base(read_urdf(root), floating_base)
-        model = urdf_spec(description).compile()
+        spec = urdf_spec(description)
+        if collision_meshes:
+            _add_meshes(spec, description, packages, source.path)
+        model = spec.compile()
     except ValueError as error:
         raise ValueError(f"{source.label}: {error}") from None
     locked = as_mapping(locked_joints)
     if floating_base is False:
         locked = {j.name: None for j in description.joints if j.kind == "floating"} | locked
-    return from_mjmodel(model, locked_joints=locked)
+    return from_mjmodel(model, velocity_limits=velocity_limits, locked_joints=locked)
 
 
 def _with_base(urdf: Urdf, floating_base: bool | None) -> Urdf:
@@ -119,7 +126,7 @@ def _free_pose(joint: Joint, fixed_at: Mapping[str, Pose]) -> Pose:
 def _add_body(parent: mujoco.MjsBody, pose: Pose, link: Link, *, moving: bool) -> mujoco.MjsBody:
     moments, axes = np.linalg.eigh(link.inertia)
     axes[:, 0] *= np.sign(np.linalg.det(axes))
-    least = _LEAST_INERTIA if moving else 0.0
+    least = LEAST_INERTIA if moving else 0.0
     body = parent.add_body(
         name=link.name,
         pos=pose.position,
@@ -136,17 +143,44 @@ def _add_body(parent: mujoco.MjsBody, pose: Pose, link: Link, *, moving: bool) -
 
 def _add_shapes(body: mujoco.MjsBody, link: Link) -> None:
     for shape in link.shapes:
-        color = {} if shape.color is None else {"rgba": shape.color}
-        body.add_geom(
-            type=_GEOMS[shape.kind],
-            size=_geom_size(shape),
-            pos=shape.pose.position,
-            quat=quaternion(shape.pose.rotation),
-            group=_VISUAL_GROUP if shape.visual else _COLLISION_GROUP,
-            contype=0,
-            conaffinity=0,
-            mass=0.0,
-            **color,
+        if shape.kind in _GEOMS:
+            _add_geom(body, shape, type=_GEOMS[shape.kind], size=_geom_size(shape))
+
+
+def _add_geom(body: mujoco.MjsBody, shape: Shape, **form: Any) -> None:
+    color = {} if shape.color is None else {"rgba": shape.color}
+    body.add_geom(
+        pos=shape.pose.position,
+        quat=quaternion(shape.pose.rotation),
+        group=_VISUAL_GROUP if shape.visual else _COLLISION_GROUP,
+        contype=0,
+        conaffinity=0,
+        mass=0.0,
+        **form,
+        **color,
+    )
+
+
+def _add_meshes(spec: mujoco.MjSpec, urdf: Urdf, packages: Packages, beside: Path | None) -> None:
+    """Adds the collision shapes that are meshes; a file at one scale is read once."""
+    names: dict[tuple[Path, tuple[float, ...]], str] = {}
+    for link in urdf.links.values():
+        body = spec.worldbody if link.name == urdf.root else spec.body(link.name)
+        for shape in link.shapes:
+            if shape.kind != "mesh" or shape.visual:
+                continue
+            key = packages.path(shape.file, beside=beside), shape.size
+            _check_mesh(key[0], link.name)
+            if key not in names:
+                names[key] = f"{key[0].stem}_{len(names)}"
+                spec.add_mesh(name=names[key], file=str(key[0]), scale=shape.size)
+            _add_geom(body, shape, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=names[key])
+
+
+def _check_mesh(path: Path, link: str) -> None:
+    if path.suffix.lower() not in _MESH_SUFFIXES:
+        raise ValueError(
+            f"link {link!r}: MuJoCo cannot read the mesh {str(path)!r}; it reads {', '.join(_MESH_SUFFIXES)}"
         )
 
 

@@ -31,13 +31,14 @@ IDENTITY = Pose(np.zeros(3), np.eye(3))
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A box (full edges), sphere (radius), cylinder or capsule (radius, length) to draw. Lengths in metres."""
+    """A box (full edges), sphere (radius), cylinder or capsule (radius, length) [m], or a mesh (scale of its file)."""
 
     kind: str
     size: tuple[float, ...]
     pose: Pose
     color: _Color | None
     visual: bool
+    file: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,21 +207,28 @@ def _rgba(material: ElementTree.Element | None) -> _Color | None:
 
 
 def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], where: str) -> Shape | None:
-    """A primitive; None for meshes, which are never needed, and for shapes without size."""
-    primitives = [e for e in element.findall("geometry/*") if e.tag in ("box", "sphere", "cylinder", "capsule")]
-    if not primitives:
+    """None for shapes without size."""
+    shapes = [e for e in element.findall("geometry/*") if e.tag in ("box", "sphere", "cylinder", "capsule", "mesh")]
+    if not shapes:
         return None
-    (primitive, *_), where = primitives, f"{where}, {element.tag}"
-    if primitive.tag == "box":
-        size = tuple(_numbers(_attribute(primitive, "size", where), 3, f"{where}, box size"))
-    else:
-        lengths = ("radius",) if primitive.tag == "sphere" else ("radius", "length")
-        size = tuple(_number(primitive, name, f"{where}, {primitive.tag}") for name in lengths)
-    if min(size) <= 0.0:
+    (shape, *_), where = shapes, f"{where}, {element.tag}"
+    size, file = _size(shape, where), ""
+    if shape.tag == "mesh":
+        file = _attribute(shape, "filename", f"{where}, mesh")
+    elif min(size) <= 0.0:
         return None
     material = element.find("material")
     color = _rgba(material) or (None if material is None else colors.get(material.get("name", "")))
-    return Shape(primitive.tag, size, _origin(element, where), color, element.tag == "visual")
+    return Shape(shape.tag, size, _origin(element, where), color, element.tag == "visual", file)
+
+
+def _size(shape: ElementTree.Element, where: str) -> tuple[float, ...]:
+    if shape.tag == "mesh":
+        return tuple(_numbers(shape.get("scale", "1 1 1"), 3, f"{where}, mesh scale"))
+    if shape.tag == "box":
+        return tuple(_numbers(_attribute(shape, "size", where), 3, f"{where}, box size"))
+    lengths = ("radius",) if shape.tag == "sphere" else ("radius", "length")
+    return tuple(_number(shape, name, f"{where}, {shape.tag}") for name in lengths)
 
 
 def _joint(element: ElementTree.Element) -> Joint:
