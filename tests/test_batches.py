@@ -194,7 +194,9 @@ def edited_model(robot, longer, heavier):
     model.jnt_pos *= length[model.jnt_bodyid][:, None]
     model.site_pos *= length[model.site_bodyid][:, None]
     model.geom_pos *= length[model.geom_bodyid][:, None]
-    model.body_mass *= np.array([heavier.get(name, 1.0) for name in names])
+    mass = np.array([heavier.get(name, 1.0) for name in names])
+    model.body_mass *= mass
+    model.body_inertia *= (mass * length**2)[:, None]
     return model
 
 
@@ -210,6 +212,13 @@ def glob_equals(name, key):
     return name.endswith(key.removeprefix("*")) if key.startswith("*") else name == key
 
 
+def full_velocity(robot, v):
+    """MuJoCo's velocity: that of all joints, followers too."""
+    eye = np.eye(len(robot.tree.dof_joint))
+    terms = (eye[:, index] * coefficient for index, coefficient in robot.tree.dof_columns)
+    return sum(terms) @ np.asarray(v)
+
+
 class TestScaledLinks:
     @pytest.mark.parametrize("name", LONGER)
     def test_equal_an_edited_mujoco_model(self, name, rng):
@@ -220,14 +229,17 @@ class TestScaledLinks:
         q = osik.integrate(robot, robot.q0, jnp.asarray(0.4 * rng.normal(size=robot.nv)), 1.0)
         data = mujoco.MjData(model)
         data.qpos[:] = np.asarray(robot.mujoco_qpos(q))
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
+        mujoco.mj_forward(model, data)
         kin = jax.jit(osik.forward_kinematics)(scaled, q)
         sites = [name for name in robot.frame_names if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) >= 0]
         expected = [data.body(name).xpos for name in robot.body_names] + [data.site(name).xpos for name in sites]
         np.testing.assert_allclose(kin.frame_poses(scaled, (*robot.body_names, *sites))[0], expected, atol=1e-9)
         moving = np.where(model.body_weldid != 0, model.body_mass, 0.0)
         np.testing.assert_allclose(osik.center_of_mass(scaled, kin), moving @ data.xipos / moving.sum(), atol=1e-9)
+        v = jnp.asarray(rng.normal(size=robot.nv))
+        data.qvel[:] = full_velocity(robot, v)
+        mujoco.mj_energyVel(model, data)
+        np.testing.assert_allclose(v @ osik.mass_matrix(scaled, kin) @ v / 2.0, data.energy[1], rtol=1e-12)
         before = robot_com(robot, next(mujoco_poses(robot, q)))
         assert np.abs(np.asarray(osik.center_of_mass(scaled, kin)) - before).max() > 1e-3
 
