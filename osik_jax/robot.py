@@ -280,9 +280,9 @@ class Robot(eqx.Module):
         """The same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
 
         A link is made longer from its own origin: the joints of its children, its centre of mass and its frames move
-        away by the factor. Masses are scaled by their own factors only, inertias by mass times length squared. Factors may
-        be traced, so
-        ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of robots.
+        away by the factor. Masses are scaled by their own factors only, inertias by mass times length squared; drives
+        stay. Factors may be traced: ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of
+        robots.
 
         Args:
             length: a factor for all links, or a mapping from body names or globs to factors; the others keep theirs.

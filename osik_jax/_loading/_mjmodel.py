@@ -289,7 +289,7 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
 
 
 def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Placement]) -> dict[str, ArrayLike]:
-    """Poses of the moving bodies in their parents; their masses, centres and inertias with all that is fixed to them."""
+    """Poses of the moving bodies in their parents; their inertial properties with all that is fixed to them."""
     mass, moment, inertia = np.zeros(len(bodies)), np.zeros((len(bodies), 3)), np.zeros((len(bodies), 3, 3))
     parts = [(b, place, place.position + place.rotation @ model.body_ipos[b]) for b, place in enumerate(placement)]
     parts = [part for part in parts if part[1].body]  # what is fixed to the world is no part of what moves
