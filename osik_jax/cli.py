@@ -109,7 +109,7 @@ def _told() -> Iterator[None]:
 
 
 def read_robot(source: str, base: str = "auto") -> Robot:
-    """An embedded robot by name, or a URDF or MJCF file, told apart by what is in it.
+    """A robot by name (embedded, or one of robot_descriptions), or a URDF or MJCF file, told apart by what is in it.
 
     Args:
         source: name or path.
@@ -125,11 +125,12 @@ def read_robot(source: str, base: str = "auto") -> Robot:
             if base != "auto":
                 raise ValueError(f"--base goes with a file; {source} is what it is")
             return load_robot(source)
-        path = Path(source)
+        path, floating = Path(source), {"auto": None, "floating": True, "fixed": False}[base]
         if not path.is_file():
+            if source.endswith("_description"):
+                return load_robot(source, floating_base=floating)
             raise FileNotFoundError(f"no such file: {source} (embedded robots: {', '.join(_EMBEDDED)})")
         text = path.read_text(encoding="utf-8", errors="replace")
-        floating = {"auto": None, "floating": True, "fixed": False}[base]
         if "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]:
             return Robot.from_mjcf(path, floating_base=floating)
         return Robot.from_urdf(path, floating_base=floating)

@@ -319,10 +319,31 @@ class Robot(eqx.Module):
                     )
 
 
-def load_robot(name: str) -> Robot:
+def load_robot(
+    name: str,
+    *,
+    floating_base: bool | None = None,
+    velocity_limits: Mapping[str, float] | None = None,
+    locked_joints: LockedJoints = (),
+) -> Robot:
     """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
 
+    Any other name is one of the package robot_descriptions (the extra ``descriptions``): MuJoCo Menagerie as
+    ``panda_mj_description``, ``g1_mj_description`` and so on, URDFs as ``panda_description``. That package clones the
+    robot's git repository into a cache when it is asked for the first time.
+
+    Args:
+        name: of the robot.
+        floating_base: as in ``Robot.from_mjcf`` and, for URDFs, ``Robot.from_urdf``.
+        velocity_limits: likewise.
+        locked_joints: likewise.
+
     Raises:
-        KeyError: no such robot; the message lists those that exist.
+        KeyError: no such robot; the message lists those with names like it.
+        ImportError: the robot is one of robot_descriptions, which is not installed.
+        ValueError: the robot comes as xacro alone, or its file cannot be read.
     """
-    return Robot(**_loading.embedded(name))
+    load = _loading.embedded if name in _loading.ROBOTS else _loading.described
+    return Robot(
+        **load(name, floating_base=floating_base, velocity_limits=velocity_limits, locked_joints=locked_joints)
+    )
