@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -294,6 +295,32 @@ class Robot(eqx.Module):
         """
         changed = scaled_leaves(self, length, mass)
         return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
+
+    def to_mjcf(self, path: str | os.PathLike[str] | None = None) -> str:
+        """The robot as MJCF, as its leaves have it now: scaled, edited, joints locked.
+
+        Locked joints are gone, their bodies posed at the locked values. Links that are fixed to others are one body
+        with them and stay as frames. Mimic joints are joint equality constraints, velocity limits custom numerics
+        ``velocity_limit/JOINT``, and ``q0`` is the keyframe ``home``. Frames that are no bodies are sites, or geoms
+        where they were: simple shapes are kept, meshes are not, so the file needs no other. Shapes keep their sizes,
+        and those without a name their places in ``mj_model``. Actuators, sensors, tendons, other constraints and the
+        masses of what is fixed to the world are left out; bodies that locked joints leave fixed to the world count as
+        such when the file is read. ``Robot.from_mjcf`` of the text is the same robot in all else.
+
+        Args:
+            path: file to write the text to, if any.
+
+        Returns:
+            The text.
+
+        Raises:
+            ValueError: a stack of robots, or numbers that MJCF has no place for: a joint limited on one side alone,
+                limits that differ between the dofs of a free or ball joint.
+        """
+        text = _loading.to_mjcf(self)
+        if path is not None:
+            Path(path).write_text(text, encoding="utf-8")
+        return text
 
     def check_configuration(self, q: Float[Array, " nq"]) -> None:
         """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion."""

@@ -6,3 +6,4 @@ from ._embedded import embedded as embedded
 from ._mjcf import from_mjcf as from_mjcf
 from ._mjmodel import from_mjmodel as from_mjmodel
 from ._urdf import from_urdf as from_urdf
+from ._write import to_mjcf as to_mjcf

@@ -63,7 +63,7 @@ def from_mjmodel(
     _check(model, names, body_names)
     asked = _asked_locks(model, names, as_mapping(locked_joints))
     followers, locked = _resolve(names, *_equality_followers(model), asked)
-    bodies, placement = _moving_bodies(model)
+    bodies, placement = moving_bodies(model)
     frames = _frames(model, body_names, placement)
     tree = KinematicTree(
         body_names=tuple(body_names[b] for b in bodies),
@@ -133,7 +133,8 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     return out
 
 
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
+def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a unit quaternion (w, x, y, z)."""
     out = np.zeros(9)
     mujoco.mju_quat2Mat(out, np.asarray(quaternion, float))
     return out.reshape(3, 3)
@@ -255,7 +256,7 @@ def _qpos_offset(model: mujoco.MjModel, followers: list[Follower], locked: Mappi
     return out
 
 
-def _moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
+def moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
     """The world and the bodies with joints; where each body of the model sits on them."""
     bodies, placement = [0], [Placement(0, np.zeros(3), np.eye(3))]
     for b in range(1, model.nbody):
@@ -263,12 +264,13 @@ def _moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
             placement.append(Placement(len(bodies), np.zeros(3), np.eye(3)))
             bodies.append(b)
         else:
-            placement.append(_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]))
+            placement.append(placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]))
     return bodies, placement
 
 
-def _placed(on: Placement, position: np.ndarray, quaternion: np.ndarray) -> Placement:
-    return Placement(on.body, on.position + on.rotation @ position, on.rotation @ _matrix(quaternion))
+def placed(on: Placement, position: np.ndarray, quaternion: np.ndarray) -> Placement:
+    """What sits at a pose in a placement."""
+    return Placement(on.body, on.position + on.rotation @ position, on.rotation @ rotation_matrix(quaternion))
 
 
 def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[Placement]) -> dict[str, Placement]:
@@ -277,7 +279,7 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
 
     def add(kind: str, name: str | None, body: int, position: np.ndarray, quaternion: np.ndarray) -> None:
         if name:
-            out[name if name not in out else f"{kind}:{name}"] = _placed(placement[body], position, quaternion)
+            out[name if name not in out else f"{kind}:{name}"] = placed(placement[body], position, quaternion)
 
     for s in range(model.nsite):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
@@ -298,10 +300,10 @@ def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Place
         moment[place.body] += model.body_mass[b] * center
     centers = moment / np.where(mass > 0.0, mass, 1.0)[:, None]
     for b, place, center in parts:
-        axes, arm = place.rotation @ _matrix(model.body_iquat[b]), center - centers[place.body]
+        axes, arm = place.rotation @ rotation_matrix(model.body_iquat[b]), center - centers[place.body]
         inertia[place.body] += axes * model.body_inertia[b] @ axes.T
         inertia[place.body] += model.body_mass[b] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    poses = [_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]) for b in bodies]
+    poses = [placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]) for b in bodies]
     return dict(
         body_position=[pose.position for pose in poses],
         body_quaternion=[quaternion(pose.rotation) for pose in poses],
