@@ -20,8 +20,11 @@ from .kinematics import integrate as integrate
 from .kinematics import mass_matrix as mass_matrix
 from .limits import ConfigurationLimit as ConfigurationLimit
 from .limits import Limit as Limit
+from .limits import LimitRows as LimitRows
+from .limits import LinearLimit as LinearLimit
 from .limits import VelocityLimit as VelocityLimit
 from .limits import limit_box as limit_box
+from .limits import limit_rows as limit_rows
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot
 from .schemes import HierarchicalQP as HierarchicalQP

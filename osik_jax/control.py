@@ -18,8 +18,8 @@ from ._joint_selection import concrete, scalar_layout
 from ._rules import blocked
 from ._sanity import cleaned
 from ._structure import Static, put_together, taken_apart
-from .kinematics import forward_kinematics, integrate
-from .limits import ConfigurationLimit, Limit, limit_box
+from .kinematics import Kinematics, forward_kinematics, integrate
+from .limits import ConfigurationLimit, Limit, limit_box, limit_rows
 from .robot import Robot
 from .schemes import Scheme, VelocityProblem
 from .solvers import Status
@@ -41,7 +41,9 @@ class Solution(eqx.Module):
         factorizations: systems factored, all levels together; 1 in ``WeightedQP`` where the warm start was right.
         kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``); the
             largest finite number where the status is NUMERICAL_ERROR.
-        box_violation: how far v leaves its box [rad/s or m/s]; 0 but for ``NullSpace``.
+        box_violation: how far v leaves its box [rad/s or m/s], 0 but for ``NullSpace``; or, where that is more, how far
+            it leaves the rows of limits that are no box, in their units: rounding, but for ``NullSpace`` and where the
+            status is INFEASIBLE.
         slack: of each task, J v minus the nearest point of its interval: what the task did not get. {name: (m,)}
         error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
         warm_start: for the next tick: the active set, as a pytree of integers; None for ``NullSpace``.
@@ -132,7 +134,7 @@ def _solve(
         {k: posed & own for k, (_, own) in looked_at.items()},
     )
     kinematics = forward_kinematics(robot, q)
-    problem = _velocity_problem(robot, q, rows_of(robot, kinematics, q, tasks), tasks, limits, dt)
+    problem = _velocity_problem(robot, kinematics, q, tasks, limits, dt)
     given = _spoiled(problem, raw_box, jnp.stack([set_up, *sound.values()]).all())
     answer = scheme.solve(given, warm_start)
     v = answer.velocity
@@ -143,7 +145,7 @@ def _solve(
         iterations=answer.iterations,
         factorizations=answer.factorizations,
         kkt_residual=jnp.where(failed, jnp.finfo(v.dtype).max, answer.kkt_residual),
-        box_violation=jnp.max(_finite(jnp.maximum(jnp.maximum(given.lower - v, v - given.upper), 0.0))),
+        box_violation=jnp.max(_finite(_beyond_limits(given, v))),
         slack={name: _finite(jnp.where(sound[name], slack, 0.0)) for name, slack in problem.slack(v).items()},
         error={name: _finite(jnp.where(sound[name], rows.error, 0.0)) for name, rows in problem.rows.items()},
         warm_start=answer.warm_start,
@@ -163,6 +165,12 @@ def _spoiled(problem: VelocityProblem, raw_box: tuple[Array, Array], fine: Array
         jnp.where(jnp.isnan(raw), raw, b) for raw, b in zip(raw_box, (problem.lower, problem.upper), strict=True)
     )
     return replace(problem, rows=rows, lower=lower, upper=upper)
+
+
+def _beyond_limits(problem: VelocityProblem, v: Float[Array, " nv"]) -> Float[Array, " m"]:
+    """How far v leaves its box, then its rows."""
+    box = jnp.maximum(jnp.maximum(problem.lower - v, v - problem.upper), 0.0)
+    return box if problem.limit_rows is None else jnp.concatenate([box, problem.limit_rows.violation(v)])
 
 
 def _finite(x: Array) -> Array:
@@ -289,7 +297,12 @@ def aim(tasks: dict[str, Task], targets: Targets | None) -> dict[str, Task]:
 
 
 def _velocity_problem(
-    robot: Robot, q: Array, rows: dict[str, Any], tasks: dict[str, Task], limits: tuple[Limit, ...], dt: Array | float
+    robot: Robot,
+    kinematics: Kinematics,
+    q: Array,
+    tasks: dict[str, Task],
+    limits: tuple[Limit, ...],
+    dt: Array | float,
 ) -> VelocityProblem:
     lower, upper = limit_box(robot, q, limits, dt)
     scalar, index = scalar_layout(robot)
@@ -298,13 +311,15 @@ def _velocity_problem(
         if isinstance(limit, ConfigurationLimit):
             low, high = jnp.maximum(low, limit.lower), jnp.minimum(high, limit.upper)
     return VelocityProblem(
-        rows=rows,
+        rows=rows_of(robot, kinematics, q, tasks),
         priorities=tuple((name, task.priority) for name, task in tasks.items()),
         lower=lower,
         upper=upper,
         position=jnp.where(scalar, q[index], 0.0),
         position_lower=jnp.where(scalar, low, -jnp.inf),
         position_upper=jnp.where(scalar, high, jnp.inf),
+        hard=tuple(name for name, task in tasks.items() if task.hard),
+        limit_rows=limit_rows(robot, kinematics, q, limits, dt),
     )
 
 

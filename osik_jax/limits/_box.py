@@ -1,23 +1,26 @@
-"""From limits to one box on the velocity."""
+"""From limits to one box on the velocity, and to rows where a box does not do."""
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._joint_selection import concrete
+from ..kinematics import Kinematics
 from ..robot import Robot
+from ._rows import LimitRows
 
 _ORDER = ("velocity", "position")
 
 
 class Limit(eqx.Module):
-    """Base of all limits: subclass it and write ``box`` to make your own.
+    """Base of all limits: subclass it and write ``box``, ``rows`` or both to make your own.
+
+    A box always exists; rows may contradict it or each other, and the answer is then INFEASIBLE.
 
     Attributes:
         kind: ``"velocity"`` limits are applied before ``"position"`` limits, whatever order they are given in. Of two
@@ -26,11 +29,25 @@ class Limit(eqx.Module):
 
     kind: ClassVar[Literal["velocity", "position"]] = "velocity"
 
-    @abc.abstractmethod
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-        """Lower and upper bounds on v [rad/s or m/s], lower <= upper, +-inf where free."""
+        """Lower and upper bounds on v [rad/s or m/s], lower <= upper, +-inf where free. Default: all free."""
+        del dt
+        free = jnp.full(robot.nv, jnp.inf, jnp.result_type(jnp.asarray(q), robot.q0))
+        return -free, free
+
+    def rows(
+        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
+    ) -> LimitRows | None:
+        """Bounds on linear functions of v, at configuration q whose kinematics are given. Default: none."""
+        del robot, kinematics, q, dt
+        return None
+
+    def after(self, velocity: Float[Array, " nv"]) -> Self:
+        """The limit for the next tick, once this one's answer is ``velocity``; itself where it remembers nothing."""
+        del velocity
+        return self
 
 
 def limit_box(
@@ -64,3 +81,26 @@ def limit_box(
         low, high = limit.box(robot, q, dt)
         lower, upper = jnp.clip(low, lower, upper), jnp.clip(high, lower, upper)
     return lower, upper
+
+
+def limit_rows(
+    robot: Robot,
+    kinematics: Kinematics,
+    q: Float[Array, " nq"],
+    limits: Sequence[Limit],
+    dt: Float[Array, ""] | float,
+) -> LimitRows | None:
+    """The rows of all limits that have any, in the order of the limits; None where there are none.
+
+    Args:
+        robot: the robot.
+        kinematics: at q.
+        q: configuration. (nq,)
+        limits: any number of limits.
+        dt: time until the next configuration [s], positive.
+    """
+    found = [limit.rows(robot, kinematics, q, dt) for limit in limits]
+    parts = [rows for rows in found if rows is not None]
+    if not parts:
+        return None
+    return LimitRows(*(jnp.concatenate([getattr(r, name) for r in parts]) for name in ("jacobian", "lower", "upper")))

@@ -5,11 +5,14 @@ from __future__ import annotations
 import equinox as eqx
 
 from ..solvers import WorkingSet, solve_hqp
-from ._scheme import Scheme, SchemeAnswer, VelocityProblem
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem, status_with
 
 
 class HierarchicalQP(Scheme):
     """Lexicographic least squares over the priorities, inside the box at every level.
+
+    Hard tasks and limits with rows are the first level, before all priorities; where they are missed, the answer is
+    INFEASIBLE.
 
     Equality and inequality tasks may stand at any level; weights trade off tasks of the same priority. Where a level
     cannot be met it is missed by as little as possible, and the levels below use what freedom is left.
@@ -22,13 +25,16 @@ class HierarchicalQP(Scheme):
 
     def solve(self, problem: VelocityProblem, warm_start: WorkingSet | None = None) -> SchemeAnswer:
         """The velocity of one tick; the warm start is the working set of every level."""
-        levels = [problem.level(names) for names in problem.by_priority()]
+        constraints = problem.constraints()
         answer = solve_hqp(
-            levels, problem.lower, problem.upper, warm_start=warm_start, max_iterations=self.max_iterations
+            problem.levels(), problem.lower, problem.upper, warm_start=warm_start, max_iterations=self.max_iterations
         )
+        status = answer.status
+        if constraints is not None:
+            status = status_with(constraints, status, answer.x)
         return SchemeAnswer(
             answer.x,
-            answer.status,
+            status,
             answer.iterations,
             answer.factorizations,
             answer.kkt_residual,

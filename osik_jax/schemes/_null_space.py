@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..solvers import Level, NullSpaceSolution, solve_nullspace
-from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
 
 class NullSpace(Scheme):
@@ -27,6 +27,10 @@ class NullSpace(Scheme):
     damping, however the others conflict with it, and nothing jumps where a priority comes to depend on those above.
     Limits are not hard there, and inequality rows count while what comes before them, the lower priorities, leaves them
     violated.
+
+    Hard tasks and limits with rows are the first level, undamped. What it asks for and cannot have makes the answer
+    INFEASIBLE. Its inequality rows take part only where standing still violates them, and the levels below may break
+    the others: of limits, ``box_violation`` tells that too.
 
     Attributes:
         order: "forward" or "reverse" (static).
@@ -55,7 +59,7 @@ class NullSpace(Scheme):
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
         """The velocity of one tick."""
-        levels = [problem.level(names) for names in problem.by_priority()]
+        constraints, levels = problem.constraints(), problem.levels()
         descent = -self.potential_gain * limit_potential_gradient(
             problem.position, problem.position_lower, problem.position_upper, self.margin
         )
@@ -64,15 +68,28 @@ class NullSpace(Scheme):
             *((problem.lower, problem.upper) if self.saturate else ()),
             order=self.order,
             secondary=descent,
-            damping=self.damping,
+            damping=self.damping if constraints is None else _exact_first(self.damping, len(levels)),
             rank_tolerance=self.rank_tolerance,
         )
+        status = answer.status
+        if constraints is not None:
+            status = status_with(constraints, status, answer.x, start=self._start(problem))
         first, count = levels[0].scaled(), jnp.asarray(len(levels))
         if self.saturate:
             residual = _first_residual(first, answer, problem)
-            return SchemeAnswer(answer.x, answer.status, answer.iterations, count + answer.iterations, residual)
+            return SchemeAnswer(answer.x, status, answer.iterations, count + answer.iterations, residual)
         gradient = first.matrix.T @ first.distance(answer.x)
-        return SchemeAnswer(answer.x, answer.status, count, count, jnp.max(jnp.abs(gradient)))
+        return SchemeAnswer(answer.x, status, count, count, jnp.max(jnp.abs(gradient)))
+
+    def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
+        """Where the first level begins: an inequality row that holds there takes no part in it."""
+        nowhere = jnp.zeros_like(problem.position)
+        return jnp.clip(nowhere, problem.lower, problem.upper) if self.saturate else nowhere
+
+
+def _exact_first(damping: Float[Array, ""], levels: int) -> list[Array]:
+    """Of each level: none of the constraints, which damping would let off a part of what they ask."""
+    return [jnp.zeros_like(damping)] + [damping] * (levels - 1)
 
 
 def _first_residual(first: Level, answer: NullSpaceSolution, problem: VelocityProblem) -> Float[Array, ""]:

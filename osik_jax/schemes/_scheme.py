@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,14 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ..solvers import Level
+from ..limits import LimitRows
+from ..solvers import Level, Status
 from ..solvers._dense import apply
 from ..tasks import TaskRows
 from ..tasks._leaves import as_scalar
 
+_HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
+"""A hard row that is missed by less, of what its numbers amount to, holds."""
+
 
 class VelocityProblem(eqx.Module):
-    """One tick: what the tasks ask of the velocity, and its box.
+    """One tick: what the tasks ask of the velocity, and its limits.
 
     Attributes:
         rows: of each task, by name.
@@ -28,6 +32,8 @@ class VelocityProblem(eqx.Module):
         position: of each dof [rad or m], 0 for ball and free joints. (nv,)
         position_lower: of each dof, -inf where free or no ``ConfigurationLimit`` was given. (nv,)
         position_upper: likewise, inf where free. (nv,)
+        hard: names of the tasks that are constraints (static).
+        limit_rows: of the limits that are no box, all together; None where there are none.
     """
 
     rows: dict[str, TaskRows]
@@ -37,19 +43,39 @@ class VelocityProblem(eqx.Module):
     position: Float[Array, " nv"]
     position_lower: Float[Array, " nv"]
     position_upper: Float[Array, " nv"]
+    hard: tuple[str, ...] = eqx.field(default=(), static=True)
+    limit_rows: LimitRows | None = None
+
+    def soft(self) -> dict[str, TaskRows]:
+        """Rows of the tasks that are no constraints."""
+        return {name: rows for name, rows in self.rows.items() if name not in self.hard}
 
     def by_priority(self) -> list[list[str]]:
-        """Names of the tasks of each priority, most important first."""
-        ranks = sorted({rank for _, rank in self.priorities})
-        return [[name for name, own in self.priorities if own == rank] for rank in ranks]
+        """Names of the tasks of each priority, most important first; without those that are constraints."""
+        ranked = [(name, rank) for name, rank in self.priorities if name not in self.hard]
+        return [[name for name, own in ranked if own == rank] for rank in sorted({rank for _, rank in ranked})]
 
-    def level(self, names: list[str]) -> Level:
+    def level(self, names: Sequence[str]) -> Level:
         """The rows of some tasks as one level."""
         rows = [self.rows[name] for name in names]
         matrix, lower, upper, weight = (
             jnp.concatenate([getattr(r, field) for r in rows]) for field in ("jacobian", "lower", "upper", "weight")
         )
         return Level(matrix, lower, upper, weight, [r.is_equality for r in rows for _ in r.error])
+
+    def constraints(self) -> Level | None:
+        """What has to hold beside the box, as the first level: hard tasks, then the rows of limits; None for none."""
+        if self.limit_rows is None:
+            return self.level(self.hard) if self.hard else None
+        limit = self.limit_rows
+        rows = Level(limit.jacobian, limit.lower, limit.upper, jnp.ones_like(limit.lower), (False,) * len(limit.lower))
+        return _joined(self.level(self.hard), rows) if self.hard else rows
+
+    def levels(self) -> list[Level]:
+        """The constraints, if there are any, and the priorities."""
+        first = self.constraints()
+        ranked = [self.level(names) for names in self.by_priority()]
+        return ranked if first is None else [first, *ranked]
 
     def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
         """Of each task, J v minus the nearest point of its interval."""
@@ -60,6 +86,31 @@ class VelocityProblem(eqx.Module):
             ends = np.cumsum([len(rows.error) for rows in dense.values()])[:-1]
             values |= dict(zip(dense, jnp.split(together, ends), strict=True))
         return {name: values[name] - jnp.clip(values[name], r.lower, r.upper) for name, r in self.rows.items()}
+
+
+def _joined(first: Level, second: Level) -> Level:
+    matrix, lower, upper, weight = (
+        jnp.concatenate([getattr(level, field) for level in (first, second)])
+        for field in ("matrix", "lower", "upper", "weight")
+    )
+    return Level(matrix, lower, upper, weight, first.equalities + second.equalities)
+
+
+def status_with(
+    constraints: Level, status: Int[Array, ""], velocity: Float[Array, " nv"], *, start: Array | None = None
+) -> Int[Array, ""]:
+    """INFEASIBLE in the place of SOLVED where the velocity misses a constraint.
+
+    With a ``start`` only those count that are equalities or violated there (what a projection looks at). (nv,)
+    """
+    level = constraints.scaled()
+    finite = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (level.lower, level.upper)]
+    nearest = jnp.minimum(*finite)
+    size = level.length * jnp.max(jnp.abs(velocity)) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
+    missed = jnp.abs(level.distance(velocity)) > _HOLDS[velocity.dtype] * size
+    if start is not None:
+        missed &= level.equal | (level.distance(start) != 0.0)
+    return jnp.where(missed.any() & (status == Status.SOLVED), Status.INFEASIBLE, status)
 
 
 class SchemeAnswer(eqx.Module):

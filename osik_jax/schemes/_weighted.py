@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._joint_selection import concrete
-from ..solvers import solve_least_squares_qp
+from ..solvers import Level, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf
 
@@ -17,7 +19,9 @@ class WeightedQP(Scheme):
     """min 1/2 sum_i weight_i |J_i v - wanted_i|^2 + 1/2 damping |v|^2  subject to the box.
 
     Weights multiply squared residuals (pink and mink: ``weight = cost**2``). Rows of inequality tasks cost the square
-    of their distance to the interval. Priorities are ignored. Smooth where tasks conflict; no task is met exactly while
+    of their distance to the interval. Hard tasks and limits with rows are rows of the program that cost nothing and do
+    not give way; where they contradict each other or the box, they are missed by as little as can be and the answer is
+    INFEASIBLE. Priorities are ignored. Smooth where tasks conflict; no task is met exactly while
     another pulls against it.
 
     Attributes:
@@ -35,13 +39,13 @@ class WeightedQP(Scheme):
 
     def solve(self, problem: VelocityProblem, warm_start: Int[Array, " m"] | None = None) -> SchemeAnswer:
         """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""
-        equalities = [rows for rows in problem.rows.values() if rows.is_equality]
-        intervals = [rows for rows in problem.rows.values() if not rows.is_equality]
+        equalities = [rows for rows in problem.soft().values() if rows.is_equality]
+        intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
             problem.upper,
-            **_soft_rows(intervals),
+            **_rows(intervals, problem.constraints()),
             **_pulls([rows for rows in equalities if rows.dofs is not None], problem, self.damping),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
@@ -76,6 +80,20 @@ def _stack(equalities: list[TaskRows], problem: VelocityProblem) -> tuple[Array,
         jnp.concatenate([none, *(r.lower for r in equalities)]),
         jnp.concatenate([none, *(r.weight for r in equalities)]),
     )
+
+
+def _rows(intervals: list[TaskRows], constraints: Level | None) -> dict[str, Any]:
+    """The rows that give way, then those that do not."""
+    soft = _soft_rows(intervals)
+    if constraints is None:
+        return soft
+    hard = constraints.scaled()
+    stiff = dict(
+        rows=hard.matrix, rows_lower=hard.lower, rows_upper=hard.upper, rows_compliance=jnp.zeros_like(hard.lower)
+    )
+    both = {name: jnp.concatenate([soft[name], array]) if soft else array for name, array in stiff.items()}
+    count = len(both["rows"]) - len(hard.lower)
+    return both | dict(rows_equalities=(False,) * count + hard.equalities)
 
 
 def _soft_rows(intervals: list[TaskRows]) -> dict[str, Array]:

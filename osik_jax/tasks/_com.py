@@ -40,6 +40,7 @@ class ComTask(Task):
         weight: of each squared row.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such body.
@@ -69,12 +70,13 @@ class ComTask(Task):
         weight: ArrayLike | Array = 1.0,
         gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
         priority: int = 1,
+        hard: bool = False,
     ):
         _check_exclusive(target, target_velocity, lower, upper, polygon, axes)
         if subtree is not None:
             robot.tree.frame(subtree)
         self.axes, self.subtree = _check_axes(axes), subtree
-        self.priority = check_priority(priority)
+        self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)

@@ -60,6 +60,7 @@ class FrameTask(Task):
             factor (angle/2) / sin(angle/2), at most pi/2.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame.
@@ -94,13 +95,14 @@ class FrameTask(Task):
         orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
         gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
         priority: int = 1,
+        hard: bool = False,
     ):
         robot.tree.frame(frame)
         self.frame = frame
         self.kept = _row_mask(rows)
         self.axes = _option("axes", axes, ("world", "frame"))
         self.orientation_jacobian = _option("orientation_jacobian", orientation_jacobian, ("analytic", "geometric"))
-        self.priority = check_priority(priority)
+        self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         pose = home_kinematics(robot).frame_pose(robot, frame) if target is None else target
         self.target = as_pose(pose, dtype)

@@ -41,6 +41,7 @@ class PostureTask(Task):
         weight: of each squared row: a scalar. Several posture tasks give several weights.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -66,9 +67,10 @@ class PostureTask(Task):
         weight: ArrayLike | Array = 1.0,
         gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
         priority: int = 1,
+        hard: bool = False,
     ):
         self.joints = tuple(select_all(robot, joints))
-        self.priority = check_priority(priority)
+        self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)

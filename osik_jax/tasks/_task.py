@@ -50,6 +50,8 @@ class Task(eqx.Module):
 
     Attributes:
         priority: 1 is the most important; static.
+        hard: whether the task is a constraint, above every priority (static): it is met to rounding, or the answer is
+            INFEASIBLE and misses it, with all that is hard, by least squares with their weights.
         weight: of the task's squared residual against others in the same weighted problem or level.
         gain: [1/s], a constant or an ``AdaptiveGain``: the wanted error rate is ``-gain * error``.
     """
@@ -57,10 +59,16 @@ class Task(eqx.Module):
     weight: Float[Array, ""] = eqx.field(default=1.0, converter=lambda value: as_scalar(value, "weight"), kw_only=True)
     gain: Gain = eqx.field(default=DEFAULT_GAIN, converter=lambda value: as_gain(value), kw_only=True)
     priority: int = eqx.field(default=1, static=True, kw_only=True)
+    hard: bool = eqx.field(default=False, static=True, kw_only=True)
 
     @abc.abstractmethod
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
+
+    def after(self, velocity: Float[Array, " nv"]) -> Self:
+        """The task for the next tick, once this one's answer is ``velocity``; itself where it remembers nothing."""
+        del velocity
+        return self
 
     def replace(self, **changes: Any) -> Self:
         """The same task with other numbers, checked and converted as on construction.

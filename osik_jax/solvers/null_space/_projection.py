@@ -24,12 +24,12 @@ from ._problem import Demand
 
 
 def solve_forward(
-    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Array, rank: Array | float
+    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Sequence[Array], rank: Array | float
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The answer, and the projector onto what no level asks for."""
     x, projector = jnp.zeros_like(secondary), jnp.eye(len(secondary), dtype=secondary.dtype)
-    for level in levels:
-        motion, projector = level_motion(level, x, projector, damping, rank)
+    for level, own in zip(levels, damping, strict=True):
+        motion, projector = level_motion(level, x, projector, own, rank)
         x = x + motion
     return x + apply(projector, secondary), projector
 

@@ -35,29 +35,35 @@ from ._problem import Demand
 
 
 def solve_reverse(
-    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Array, rank: Array | float
+    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Sequence[Array], rank: Array | float
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The answer, and the projector onto what no level asks for. The secondary motion comes first of all."""
     x, eye = secondary, jnp.eye(len(secondary), dtype=secondary.dtype)
-    below: list[Array] = []
-    for level in reversed(levels):
+    below: list[tuple[Array, Array]] = []
+    for level, own in zip(reversed(levels), reversed(damping), strict=True):
         if not level.matrix.shape[0]:
             continue
         demand = Demand.of(level, x, rank)
-        space, motion = row_space_and_motion(demand.rows, demand.wanted, demand.cutoff, damping)
-        x = x + _least_disturbing(motion, eye - space, below, damping, rank)
-        below.append(demand.rows)
+        space, motion = row_space_and_motion(demand.rows, demand.wanted, demand.cutoff, own)
+        x = x + _least_disturbing(motion, eye - space, below, rank)
+        below.append((demand.rows, own))
     if not below:
         return x, eye
-    rows = jnp.concatenate(below)
-    return x, eye - row_space_and_motion(rows, jnp.zeros(len(rows), x.dtype), _cutoff(rows, rank), damping)[0]
+    rows = jnp.concatenate([rows for rows, _ in below])
+    return x, eye - row_space_and_motion(rows, jnp.zeros(len(rows), x.dtype), _cutoff(rows, rank), damping[-1])[0]
 
 
 def _least_disturbing(
-    change: Float[Array, " n"], free: Float[Array, "n n"], below: Sequence[Array], damping: Array, rank: Array | float
+    change: Float[Array, " n"],
+    free: Float[Array, "n n"],
+    below: Sequence[tuple[Array, Array]],
+    rank: Array | float,
 ) -> Float[Array, " n"]:
-    """The change of a level with what its null space can do for the rows below, the highest of them first."""
-    for rows in reversed(below):
+    """The change of a level with what its null space can do for the rows below, the highest of them first.
+
+    Each comes with its damping.
+    """
+    for rows, damping in reversed(below):
         restricted = product(rows, free)
         inverse = regularised_inverse(restricted, _cutoff(rows, rank), damping)
         change = change - apply(free, apply(inverse, apply(rows, change)))

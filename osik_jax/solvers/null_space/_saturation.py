@@ -52,7 +52,7 @@ def solve_saturated(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     secondary: Float[Array, " n"] | None,
-    damping: Array,
+    damping: Sequence[Array],
     rank: Array | float,
     max_iterations: int,
 ) -> Saturated:
@@ -62,8 +62,8 @@ def solve_saturated(
     nowhere = jnp.zeros_like(x)
     fixed = jnp.where(lower == upper, 2, 0)
     ends = []
-    for level in levels:
-        motion, projector = level_motion(level, x, projector, damping, rank)
+    for level, own in zip(levels, damping, strict=True):
+        motion, projector = level_motion(level, x, projector, own, rank)
         end = _descend(Room(x, motion, nowhere, projector, lower, upper), fixed, max_iterations)
         ends.append(end)
         x, projector, fixed = end.x, end.projector, end.fixed

@@ -29,7 +29,7 @@ def solve_nullspace(
     *,
     order: Literal["forward", "reverse"] = "forward",
     secondary: Float[Array, " n"] | None = None,
-    damping: Float[Array, ""] | float = 0.0,
+    damping: Float[Array, ""] | float | Sequence[Float[Array, ""]] = 0.0,
     rank_tolerance: Float[Array, ""] | float | None = None,
     max_iterations: int | None = None,
 ) -> NullSpaceSolution:
@@ -54,14 +54,15 @@ def solve_nullspace(
         order: of the levels (static).
         secondary: motion in what all levels leave free, such as a potential's descent; with bounds, x comes as near to
             it as levels and bounds allow. (n,)
-        damping: of the motion of each level, in squared singular values: s / (s^2 + damping) stands for 1 / s.
+        damping: of the motion of each level, in squared singular values: s / (s^2 + damping) stands for 1 / s. One for
+            all, or a list with one for each level.
         rank_tolerance: singular values of A P under this share of the Frobenius norm of A (P projects onto what the
             levels before leave free) count as zero; default 1e-10 (1e-5 in float32). Against A and not A P, so that
             a level which repeats one above it has rank 0, not the rank of its rounding.
         max_iterations: cap on the search for the saturated joints, for each level (static); default 10 (n + 2).
 
     Raises:
-        ValueError: an order that does not exist, or bounds in reverse order.
+        ValueError: an order that does not exist, bounds in reverse order, or a damping too many or few.
     """
     n = levels[0].matrix.shape[1]
     dtype = jnp.result_type(*(level.matrix for level in levels))
@@ -73,8 +74,10 @@ def solve_nullspace(
     pull = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True)
     possible = ~jnp.stack(crossed).any()
-    good = sane(levels, pull, jnp.asarray(damping, dtype)) & (True if box is None else _exists(*box))
-    clean, pull, damped = _where(good, (list(levels), pull, jnp.asarray(damping, dtype)))
+    given = jax.tree.map(lambda number: jnp.asarray(number, dtype), damping)
+    good = sane(levels, pull, *jax.tree.leaves(given)) & (True if box is None else _exists(*box))
+    clean, pull, damped = _where(good, (list(levels), pull, given))
+    damped = _one_each(damped, len(levels))
     scaled = [level.scaled() for level in clean]
     rank = RANK[dtype] if rank_tolerance is None else rank_tolerance
     if box is None:
@@ -91,6 +94,14 @@ def solve_nullspace(
 def _where(good: Array, tree: Any) -> Any:
     """The numbers as they are, or zeros."""
     return jax.tree.map(lambda leaf: jnp.where(good, leaf, 0.0), tree)
+
+
+def _one_each(damping: Array | Sequence[Array], count: int) -> list[Array]:
+    if isinstance(damping, Array):
+        return [damping] * count
+    if len(damping) != count:
+        raise ValueError(f"there are {len(damping)} dampings and {count} levels")
+    return list(damping)
 
 
 def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._pivots import AT_UPPER, INACTIVE
@@ -19,6 +20,7 @@ class QP(eqx.Module):
         compliance: of the rows; 0 for a hard row (t = 0), 1 / weight for one that gives way at that price. (p,)
         lower: lower bounds of x, then of the rows; -inf allowed. (n + p,)
         upper: upper bounds; inf allowed, equal to the lower for an equality. (n + p,)
+        known: constraints that are equalities to the lower bound, whatever the upper is (static); None for none.
     """
 
     cost: Quadratic | LeastSquares
@@ -26,11 +28,13 @@ class QP(eqx.Module):
     compliance: Float[Array, " p"]
     lower: Float[Array, " n+p"]
     upper: Float[Array, " n+p"]
+    known: tuple[bool, ...] | None = eqx.field(default=None, static=True)
 
     @property
     def equality(self) -> Bool[Array, " n+p"]:
-        """Constraints whose bounds are equal."""
-        return self.lower == self.upper
+        """Constraints that are known to be equalities, and those whose bounds are equal."""
+        equal = self.lower == self.upper
+        return equal if self.known is None else equal | np.array(self.known)
 
 
 class QPSolution(eqx.Module):

@@ -7,6 +7,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._box import inside, uncrossed
@@ -68,7 +69,7 @@ def solve_qp(
     return _solve(qp, warm_start, max_iterations, tolerance)
 
 
-@partial(jax.jit, static_argnames="max_iterations")
+@partial(jax.jit, static_argnames=("max_iterations", "rows_equalities"))
 def solve_least_squares_qp(
     matrix: Float[ArrayLike, "m n"],
     target: Float[ArrayLike, " m"],
@@ -82,6 +83,7 @@ def solve_least_squares_qp(
     damping: Float[ArrayLike, "..."] = 1e-9,
     center: Float[ArrayLike, "..."] = 0.0,
     rows_compliance: Float[ArrayLike, " p"] | None = None,
+    rows_equalities: tuple[bool, ...] | None = None,
     warm_start: Int[ArrayLike, " n+p"] | None = None,
     max_iterations: int | None = None,
     tolerance: Float[ArrayLike, ""] | None = None,
@@ -103,6 +105,9 @@ def solve_least_squares_qp(
         rows_lower: of the rows. (p,)
         rows_upper: of the rows. (p,)
         rows_compliance: of the rows; 0 where hard. (p,)
+        rows_equalities: rows that are equalities whatever ``rows_upper`` says, which is not looked at there (static).
+            Name them where bounds are computed under ``jit``: XLA may compute an expression twice, in two roundings,
+            and what was one number is then two. (p,)
         warm_start: ``active`` of the solution of a problem nearby. (n + p,)
         max_iterations: cap on changes of the active set (static).
         tolerance: relative violation that counts as none.
@@ -111,8 +116,8 @@ def solve_least_squares_qp(
     n = matrix.shape[1]
     pulls = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
     cost = LeastSquares(matrix, target, weight, *pulls)
-    qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
-    gives_way = rows is None or rows_compliance is not None
+    qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance, rows_equalities)
+    gives_way = rows is None or (rows_compliance is not None and not any(rows_equalities or ()))
     return _solve(qp, warm_start, max_iterations, tolerance, gives_way=gives_way)
 
 
@@ -125,6 +130,7 @@ def _problem(
     rows_lower: ArrayLike | None,
     rows_upper: ArrayLike | None,
     compliance: ArrayLike | None,
+    equalities: tuple[bool, ...] | None = None,
 ) -> QP:
     """The problem as one stack of constraints; shapes are checked here."""
     dtype = cost.matrix.dtype
@@ -146,7 +152,11 @@ def _problem(
     compliance = jnp.zeros(p, dtype) if compliance is None else jnp.asarray(compliance, dtype)
     if compliance.shape != (p,):
         raise ValueError(f"rows_compliance has shape {compliance.shape}; there are {p} rows")
-    return QP(cost, rows, compliance, *stack)
+    equalities = (False,) * p if equalities is None else equalities
+    if len(equalities) != p:
+        raise ValueError(f"rows_equalities has {len(equalities)} flags; there are {p} rows")
+    known = (False,) * n + equalities if any(equalities) else None
+    return QP(cost, rows, compliance, stack[0], stack[1], known)
 
 
 def _solve(
@@ -163,7 +173,7 @@ def _solve(
     allowed = jnp.asarray(_TOLERANCE[dtype] if tolerance is None else tolerance, dtype)
     sane = _finite(qp)
     safe = _replace_where(~sane, qp)
-    low, high, crossed = uncrossed(safe.lower, safe.upper)
+    low, high, crossed = uncrossed(safe.lower, _upper(safe))
     safe = replace(safe, lower=low, upper=high)
     cold = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
     search = searcher(20 * m if max_iterations is None else max_iterations, gives_way)
@@ -189,6 +199,11 @@ def _solve(
     )
 
 
+def _upper(qp: QP) -> Float[Array, " n+p"]:
+    """Upper bounds, those of known equalities exactly the lower ones."""
+    return qp.upper if qp.known is None else jnp.where(np.array(qp.known), qp.lower, qp.upper)
+
+
 def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found) -> Array:
     verdict = jnp.where(found.optimal, Status.SOLVED, Status.MAX_ITERATIONS)
     verdict = jnp.where(found.infeasible | crossed, Status.INFEASIBLE, verdict)
@@ -204,13 +219,10 @@ def _finite(qp: QP) -> Bool[Array, ""]:
 
 def _replace_where(bad: Bool[Array, ""], qp: QP) -> QP:
     """A harmless problem in the place of a bad one, so that derivatives stay finite too."""
-    harmless = QP(
-        qp.cost.harmless(),
-        jnp.zeros_like(qp.rows),
-        jnp.ones_like(qp.compliance),
-        jnp.full_like(qp.lower, -jnp.inf),
-        jnp.full_like(qp.upper, jnp.inf),
-    )
+    free = jnp.full_like(qp.upper, jnp.inf)
+    if qp.known is not None:
+        free = jnp.where(np.array(qp.known), 0.0, free)
+    harmless = QP(qp.cost.harmless(), jnp.zeros_like(qp.rows), jnp.ones_like(qp.compliance), -free, free, qp.known)
     return jax.tree.map(lambda a, b: jnp.where(bad, a, b), harmless, qp)
 
 
