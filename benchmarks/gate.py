@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from .judge import verdict
 from .processes import Entrant, cores
 from .race import Race
 
@@ -25,7 +26,8 @@ ENTRANTS = {
 def measured(race: Race) -> dict[str, dict[str, Any]]:
     """Rows by name."""
     entrants = [Entrant(name, "osik_jax", options, cores(1)) for name, options in ENTRANTS.items()]
-    return {row["name"]: row for row in race.run(entrants, rounds=9, ticks=100, seconds=0.2)}
+    rows = race.run(entrants, rounds=9, ticks=100, seconds=0.2)
+    return {row["name"]: row | verdict(race.work, row.pop("motion")) for row in rows}
 
 
 def verdicts(rows: dict[str, dict[str, Any]], baseline: dict[str, Any]) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -55,6 +55,13 @@ def judged(work: Workload, motion: np.ndarray, lane: int = 0) -> dict[str, float
         worst = {name: max(worst[name], value) for name, value in found.items()}
         before = q
     return worst
+
+
+def verdict(work: Workload, motions: np.ndarray) -> dict[str, Any]:
+    """The largest errors of a row's motions (lanes, ticks, nq), and what is worse than it may be."""
+    scores = [judged(work, path, lane) for lane, path in enumerate(motions)]
+    worst = {name: max(score[name] for score in scores) for name in BOUNDS}
+    return dict(score=worst, failures=failures(worst))
 
 
 def failures(score: dict[str, float]) -> list[str]:

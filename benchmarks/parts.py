@@ -31,7 +31,8 @@ import osik_jax as osik
 from osik_jax.tasks._rows import rows_of
 
 from .command_line import listed
-from .throughput import DT, FRAMES, LANES, PRECISIONS, SCHEMES, Setting, compiled, machine, setting
+from .descriptions import ROBOTS
+from .throughput import DT, LANES, PRECISIONS, SCHEMES, Setting, compiled, machine, setting
 
 SECONDS = 1.0
 """That the calls of one part take, about."""
@@ -140,7 +141,7 @@ def main() -> None:
     """Prints the tables, and writes a file where one is named."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.parts", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("results", nargs="?", type=Path, help="JSON file")
-    parser.add_argument("--robot", default="g1", choices=sorted(FRAMES))
+    parser.add_argument("--robot", default="g1", choices=sorted(ROBOTS))
     parser.add_argument("--batches", type=listed(int), default=[1, 1024])
     parser.add_argument("--scheme", default="weighted", choices=sorted(SCHEMES))
     parser.add_argument("--precision", default="float64", choices=PRECISIONS)

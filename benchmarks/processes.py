@@ -88,14 +88,19 @@ def started(
         options: of its runner, and ``core``.
         workload: file of the workload.
         python: its interpreter.
-        cache: folder of JAX's compiled programs.
+        cache: folder of compiled programs, of JAX and of Warp.
 
     Raises:
         PeerUnavailable: it did not come up.
     """
-    settings = {"JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    settings = {
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "WARP_CACHE_PATH": str(cache / "warp"),
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *_own_path(python)]),
+    }
     command = [python, "-m", "benchmarks.worker", peer, str(workload), json.dumps(dict(options))]
-    environment = {**os.environ, **ONE_THREAD, **settings, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, **ONE_THREAD, **settings}
     pipe = subprocess.PIPE
     with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         try:
@@ -106,6 +111,12 @@ def started(
             raise PeerUnavailable(str(reason)) from reason
         with process:
             yield Worker(process, errors)
+
+
+def _own_path(python: str) -> list[str]:
+    """Where this process looks for packages, if a peer has no environment of its own."""
+    given = os.environ.get("PYTHONPATH", "")
+    return given.split(os.pathsep) if given and python == sys.executable else []
 
 
 class Team:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .judge import BOUNDS, failures, judged
 from .processes import Entrant, PeerUnavailable, Team
-from .robots import workload
 from .workload import Workload
 
 WARM_UP = 10
@@ -28,7 +26,7 @@ class Race:
     """Runs on one robot. A context manager: on leaving it forgets the programs that it compiled.
 
     Args:
-        robot: a name in ``descriptions.ROBOTS``.
+        work: what everyone does.
         pythons: interpreters of peers that have an environment of their own.
         report: told what happens.
 
@@ -37,8 +35,8 @@ class Race:
         missing: peers that did not start, and why.
     """
 
-    def __init__(self, robot: str, *, pythons: Mapping[str, str], report: Callable[[str], None]) -> None:
-        self.work, self.pythons, self.report = workload(robot), pythons, report
+    def __init__(self, work: Workload, *, pythons: Mapping[str, str], report: Callable[[str], None]) -> None:
+        self.work, self.pythons, self.report = work, pythons, report
         self.missing: dict[str, str] = {}
         self.versions: dict[str, dict[str, str]] = {}
         self._folder = tempfile.TemporaryDirectory()
@@ -52,7 +50,7 @@ class Race:
         self._folder.cleanup()
 
     def run(self, entrants: Iterable[Entrant], *, rounds: int, ticks: int, seconds: float) -> list[dict[str, Any]]:
-        """Rows of those entrants that could start.
+        """Rows of those entrants that could start, not judged yet.
 
         Args:
             entrants: who takes part, in turns.
@@ -68,10 +66,12 @@ class Race:
             for _ in range(rounds):
                 for record in records:
                     record.take_turn()
+            for record in records:
+                record.weigh()
         finally:
             for record in records:
                 record.team.close()
-        return [record.row(self.work) for record in records]
+        return [record.row() for record in records]
 
     def again(self, entrant: Entrant) -> float:
         """Seconds of the first tick in a new process, with its programs from the compilation cache."""
@@ -107,6 +107,7 @@ class Record:
         self.seconds: list[list[float]] = [[] for _ in team.workers]
         self.kernel: list[float] = []
         self.motion: list[list[Any]] = []
+        self.memory: list[dict[str, Any]] = []
 
     def warm_up(self, ticks: int, seconds: float) -> None:
         """The first ticks, which are judged but not timed; they set how many ticks a turn has."""
@@ -120,6 +121,10 @@ class Record:
         for own, found in zip(self.seconds, self._moved(self.ticks), strict=True):
             own.extend(found)
 
+    def weigh(self) -> None:
+        """What its processes have had in memory."""
+        self.memory = self.team.ask(what="memory")
+
     def _moved(self, ticks: int) -> list[list[float]]:
         answers = self.team.ask(what="run", ticks=ticks)
         self.solved = min(answer["solved"] for answer in answers)
@@ -129,11 +134,13 @@ class Record:
             self.motion[lane].extend(path)
         return [answer["seconds"] for answer in answers]
 
-    def row(self, work: Workload) -> dict[str, Any]:
-        """Times in seconds; ``kernel_ratio`` is an undisturbed tick over an undisturbed reference kernel."""
+    def row(self) -> dict[str, Any]:
+        """Times in seconds; ``kernel_ratio`` is an undisturbed tick over an undisturbed reference kernel.
+
+        ``peak_bytes`` is of one process. ``motion`` has the canonical configurations of some robots, for the judge:
+        (robots, ticks, nq).
+        """
         entrant, pooled = self.team.entrant, np.concatenate([np.asarray(own) for own in self.seconds])
-        scores = [judged(work, np.array(path), lane) for lane, path in enumerate(self.motion)]
-        worst = {name: max(score[name] for score in scores) for name in BOUNDS}
         kernel = float(np.percentile(self.kernel, UNDISTURBED))
         return dict(
             name=entrant.name,
@@ -142,6 +149,7 @@ class Record:
             cores=list(entrant.cores),
             robots=entrant.robots,
             timed_ticks=len(pooled),
+            judged_ticks=len(self.motion[0]),
             tick_seconds_median=float(np.median(pooled)),
             tick_seconds_p99=float(np.percentile(pooled, 99)),
             steps_per_second=(entrant.options.get("batch") or 1) * sum(1.0 / float(np.mean(s)) for s in self.seconds),
@@ -149,7 +157,14 @@ class Record:
             kernel_ratio=float(np.percentile(pooled, UNDISTURBED)) / kernel,
             build_seconds=self.team.workers[0].hello["build_seconds"],
             first_tick_seconds=self.first,
+            device=self.memory[0]["device"],
+            peak_bytes=_largest([each["peak_bytes"] for each in self.memory]),
+            device_peak_bytes=_largest([each["device_peak_bytes"] for each in self.memory]),
             solved=self.solved,
-            score=worst,
-            failures=failures(worst),
+            motion=np.array(self.motion),
         )
+
+
+def _largest(given: Sequence[int | None]) -> int | None:
+    known = [each for each in given if each is not None]
+    return max(known, default=None)

@@ -25,14 +25,16 @@ def surroundings() -> dict[str, Any]:
 
 
 def show(console: Console, result: dict[str, Any]) -> None:
-    """A table of one robot, one of many, and who was not there."""
-    console.print(
-        f"{result['robot']} on {result['cpu']}, {result['cores']} cores, load {result['load']:.1f} at the end"
-    )
+    """A table of one robot, one of many, one of gradients, and who was not there."""
+    devices = sorted({row["device"] for row in [*result["one_robot"], *result["many_robots"]] if row["device"]})
+    place = ", ".join([result["cpu"], f"{result['cores']} cores", *devices])
+    console.print(f"{result['robot']} on {place}, load {result['load']:.1f} at the end")
     if result["one_robot"]:
         console.print(_one_robot(result["one_robot"]))
     if result["many_robots"]:
         console.print(_many_robots(result["many_robots"]))
+    if result["gradients"]:
+        console.print(_gradients(result["gradients"]))
     for row in [*result["one_robot"], *result["many_robots"]]:
         if row["failures"]:
             console.print(f"[red]{row['name']} failed:[/red] {', '.join(row['failures'])}")
@@ -42,7 +44,16 @@ def show(console: Console, result: dict[str, Any]) -> None:
 
 def _one_robot(rows: list[dict[str, Any]]) -> Table:
     table = Table(title="One robot, one core: a step, NumPy to NumPy")
-    for heading in ("entrant", "µs median", "µs p99", "times mink", "first tick [s]", "from cache [s]", *_QUALITY):
+    for heading in (
+        "entrant",
+        "µs median",
+        "µs p99",
+        "times mink",
+        "first tick [s]",
+        "from cache [s]",
+        "MiB",
+        *_QUALITY,
+    ):
         table.add_column(heading, justify="left" if heading == "entrant" else "right")
     mink = next((row["tick_seconds_median"] for row in rows if row["peer"] == "mink"), None)
     for row in rows:
@@ -54,6 +65,7 @@ def _one_robot(rows: list[dict[str, Any]]) -> Table:
             f"{median / mink:.2f}" if mink else "",
             f"{row['first_tick_seconds']:.2g}",
             f"{warm:.2g}" if warm is not None else "",
+            _mebibytes(row["peak_bytes"]),
             *_quality(row),
         )
     return table
@@ -61,7 +73,8 @@ def _one_robot(rows: list[dict[str, Any]]) -> Table:
 
 def _many_robots(rows: list[dict[str, Any]]) -> Table:
     table = Table(title="Many robots, all cores")
-    for heading in ("entrant", "robots", "steps/s", "ms a step of all", "first tick [s]", *_QUALITY):
+    memory = ("MiB a process", "MiB of the device")
+    for heading in ("entrant", "robots", "steps/s", "ms a step of all", "first tick [s]", *memory, *_QUALITY):
         table.add_column(heading, justify="left" if heading == "entrant" else "right")
     for row in rows:
         table.add_row(
@@ -70,14 +83,40 @@ def _many_robots(rows: list[dict[str, Any]]) -> Table:
             f"{row['steps_per_second']:,.0f}",
             f"{1e3 * row['tick_seconds_median']:.3g}",
             f"{row['first_tick_seconds']:.2g}",
+            *(_mebibytes(row[key]) for key in ("peak_bytes", "device_peak_bytes")),
             *_quality(row),
         )
     return table
 
 
-_QUALITY = ("hand, feet, CoM [mm]", "solved", "judged")
+def _gradients(rows: list[dict[str, Any]]) -> Table:
+    table = Table(title="Gradients over weights and targets, and the value alone")
+    heads = ("of a", "scheme", "precision", "robots", "ticks", "value [ms]", "with gradient [ms]", "times")
+    for heading in (*heads, "compile [s]", "MiB", "MiB of the device", "finite"):
+        table.add_column(heading, justify="left" if heading in heads[:3] else "right")
+    for row in rows:
+        forward, gradient = row["forward_seconds"], row["gradient_seconds"]
+        table.add_row(
+            *(row["what"], row["scheme"], row["precision"], f"{row['robots']:,}", str(row["ticks"])),
+            *(f"{1e3 * forward:.3g}", f"{1e3 * gradient:.3g}", f"{gradient / forward:.2f}"),
+            f"{row['compile_seconds']:.1f}",
+            *(_mebibytes(row[key]) for key in ("peak_bytes", "device_peak_bytes")),
+            "yes" if row["finite"] else "NO",
+        )
+    return table
 
 
-def _quality(row: dict[str, Any]) -> tuple[str, str, str]:
+def _mebibytes(given: int | None) -> str:
+    return "" if given is None else f"{given / 2**20:,.0f}"
+
+
+_QUALITY = ("ticks", "hand, feet, CoM [mm]", "solved", "judged")
+"""Slow entrants come to fewer ticks, and so not to the fastest part of the curve."""
+
+
+def _quality(row: dict[str, Any]) -> tuple[str, str, str, str]:
+    ticks, solved = f"{row['judged_ticks']:,}", f"{row['solved']:.4f}"
+    if row["score"] is None:
+        return ticks, "", solved, "not yet"
     errors = ", ".join(f"{1e3 * row['score'][name]:.2f}" for name in ("hand", "feet", "com"))
-    return errors, f"{row['solved']:.4f}", "FAILED" if row["failures"] else "good"
+    return ticks, errors, solved, "FAILED" if row["failures"] else "good"

@@ -23,7 +23,10 @@ from rich.table import Table
 
 import osik_jax as osik
 
-from .throughput import DT, FRAMES, LANES, PRECISIONS, SCHEMES, compiled, machine, setting
+from .descriptions import ROBOTS
+from .device import device_bytes
+from .machine import peak_bytes
+from .throughput import DT, LANES, PRECISIONS, SCHEMES, compiled, machine, setting
 
 CALLS = 5
 """Timed calls of each, after one that does not count."""
@@ -68,7 +71,7 @@ def main() -> None:
     """Prints a table, and writes a file where one is named."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.rollouts", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("results", nargs="?", type=Path, help="JSON file")
-    parser.add_argument("--robot", default="g1", choices=sorted(FRAMES))
+    parser.add_argument("--robot", default="g1", choices=sorted(ROBOTS))
     parser.add_argument("--robots", type=int, default=64)
     parser.add_argument("--ticks", type=int, default=100)
     parser.add_argument("--scheme", default="weighted", choices=sorted(SCHEMES))
@@ -78,7 +81,9 @@ def main() -> None:
     rows = measure(given.robot, given.scheme, given.robots, given.ticks)
     if given.results is not None:
         asked = {key: value for key, value in vars(given).items() if key != "results"}
-        given.results.write_text(json.dumps(machine() | asked | dict(rows=rows), indent=1) + "\n", encoding="utf-8")
+        memory = dict(peak_bytes=peak_bytes(), device_peak_bytes=device_bytes())
+        result = machine() | asked | memory | dict(rows=rows)
+        given.results.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     table = Table("part", "ms", "times forward", "ticks/s", "finite", "compile [s]", "temporary [MiB]")
     for row in rows:
         each = row["seconds"]

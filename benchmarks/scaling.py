@@ -25,9 +25,9 @@ import numpy as np
 from osik_jax.scaling import device_mesh, sharded
 
 from .command_line import listed
+from .descriptions import ROBOTS
 from .throughput import (
     CHECKED,
-    FRAMES,
     LANES,
     PRECISIONS,
     SCHEMES,
@@ -111,7 +111,7 @@ def main() -> None:
     """Prints each row as it comes and a table at the end, and writes the rows to the file after each."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("results", nargs="?", type=Path, help="JSON file")
-    parser.add_argument("--robot", default="nao", choices=sorted(FRAMES))
+    parser.add_argument("--robot", default="nao", choices=sorted(ROBOTS))
     parser.add_argument("--scheme", default="weighted", choices=sorted(SCHEMES))
     parser.add_argument("--precision", default="float32", choices=PRECISIONS)
     parser.add_argument("--lanes", type=int, default=16384, help="on each device")

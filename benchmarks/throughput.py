@@ -32,19 +32,12 @@ import osik_jax as osik
 
 from .command_line import listed
 from .descriptions import ROBOTS, lean_urdf
+from .device import device_bytes
 from .machine import processor
 
 SCHEMES = {"weighted": osik.WeightedQP, "null-space": osik.NullSpace, "hierarchical": osik.HierarchicalQP}
 PRECISIONS = ("float64", "float32")
 BATCHES = (1, 16, 64, 256, 1024, 4096, 16384, 65536)
-FRAMES = {
-    "nao": (("l_sole", "r_sole"), "l_gripper"),
-    "g1": (("left_ankle_roll_link", "right_ankle_roll_link"), "right_wrist_yaw_link"),
-    "arm7": ((), "hand"),
-}
-"""Of each robot: feet and hand."""
-ARMS = {"nao": ("Shoulder", "Elbow"), "g1": ("shoulder", "elbow"), "arm7": ("joint",)}
-"""Parts of the names of the joints that differ from lane to lane."""
 DT = 0.005
 LANES = 64
 """Different situations; larger batches repeat them."""
@@ -71,27 +64,28 @@ class Setting(NamedTuple):
 def setting(name: str) -> Setting:
     """Both feet, centre of mass, one hand's position, posture; in the precision that is JAX's default now."""
     robot = loaded(name)
-    feet, hand = FRAMES[name]
+    feet, hand = ROBOTS[name].feet, ROBOTS[name].hand
     tasks: dict[str, osik.Task] = {foot: osik.FrameTask(robot, foot, weight=100.0, priority=1) for foot in feet}
     if feet:
         tasks["com"] = osik.ComTask(robot, weight=10.0, priority=2)
     tasks["hand"] = osik.FrameTask(robot, hand, rows="position", priority=3)
     tasks["posture"] = osik.PostureTask(robot, weight=1e-3, gain=1.0, priority=4)
-    starts, ends = (jnp.asarray(q) for q in arm_angles(robot, ARMS[name]))
+    starts, ends = (jnp.asarray(q) for q in arm_angles(robot, ROBOTS[name].arms))
     poses = jax.jit(jax.vmap(lambda q: osik.forward_kinematics(robot, q).frame_pose(robot, hand)[0]))
     return Setting(robot, tasks, (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)), starts, poses(ends))
 
 
 def loaded(name: str) -> osik.Robot:
-    """An embedded robot; G1 is example-robot-data's, standing as in ``python -m benchmarks``."""
-    if name != "g1":
-        return osik.load_robot(name)
+    """An embedded robot, or one of example-robot-data, standing as in ``python -m benchmarks``."""
     given = ROBOTS[name]
-    robot = osik.Robot.from_urdf(lean_urdf(given), floating_base=True)
+    if not given.urdf:
+        return osik.load_robot(name)
+    robot = osik.Robot.from_urdf(lean_urdf(given), floating_base=bool(given.feet))
     q = np.array(robot.q0)
     q[[robot.joint_qpos_index(joint) for joint in given.posture]] = list(given.posture.values())
     kinematics = osik.forward_kinematics(robot, jnp.asarray(q))
-    q[2] -= min(float(kinematics.frame_pose(robot, foot)[0][2]) for foot in given.feet)
+    if given.feet:
+        q[2] -= min(float(kinematics.frame_pose(robot, foot)[0][2]) for foot in given.feet)
     return replace(robot, q0=jnp.asarray(q))
 
 
@@ -188,7 +182,7 @@ def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, n
         errors=errors,
         calls=calls - CHECKED,
         program_bytes=sum(int(getattr(memory, part, 0)) for part in parts),
-        device_peak_bytes=(jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use"),
+        device_peak_bytes=device_bytes(),
     )
 
 
@@ -260,7 +254,7 @@ def main() -> None:
     """Prints each row as it comes and a table at the end, and writes the rows to the file after each."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.throughput", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("results", nargs="?", type=Path, help="JSON file")
-    parser.add_argument("--robot", default="nao", choices=sorted(FRAMES))
+    parser.add_argument("--robot", default="nao", choices=sorted(ROBOTS))
     parser.add_argument("--batches", type=listed(int), default=list(BATCHES))
     parser.add_argument("--schemes", type=listed(str, SCHEMES), default=list(SCHEMES))
     parser.add_argument("--precisions", type=listed(str, PRECISIONS), default=list(PRECISIONS))

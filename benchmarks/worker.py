@@ -16,6 +16,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from .machine import peak_bytes
 from .peers import peer, versions
 from .workload import Workload
 
@@ -72,8 +73,11 @@ def answer(loop: Loop, question: dict[str, Any]) -> dict[str, Any]:
             return loop.run(question["ticks"])
         case "kernel":
             return dict(seconds=[reference_kernel() for _ in range(question["times"])])
+        case "memory":
+            device = loop.runner.device()
+            return dict(peak_bytes=peak_bytes(), device=device.name, device_peak_bytes=device.peak_bytes)
         case unknown:
-            raise ValueError(f"a worker knows no {unknown!r}; it knows run and kernel")
+            raise ValueError(f"a worker knows no {unknown!r}; it knows run, kernel and memory")
 
 
 def main() -> None:

@@ -1,18 +1,23 @@
 """The benchmark beside the peers: motions are judged by Pinocchio, wrong ones fail, processes take turns."""
 
+import json
+from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
+import pinocchio as pin
 import pytest
 from rich.console import Console
 
-from benchmarks import gate, report
-from benchmarks.__main__ import QUICK, Selection, many_robots, one_robot
-from benchmarks.judge import BOUNDS, failures, judged
+from benchmarks import figures, gate, motions, report
+from benchmarks.__main__ import LONGEST, QUICK, Selection, affordable, many_robots, one_robot
+from benchmarks.descriptions import ROBOTS
+from benchmarks.judge import BOUNDS, failures, judged, verdict
 from benchmarks.peers import peer
-from benchmarks.processes import Entrant, cores
+from benchmarks.processes import ROOT, Entrant, cores
 from benchmarks.race import Race
-from benchmarks.robots import workload
+from benchmarks.robots import pinocchio_model, workload
 from benchmarks.workload import DT, Workload
 
 TICKS = 40
@@ -23,36 +28,36 @@ def work():
     return workload("panda")
 
 
-def motion_of(runner: Any, work: Workload) -> np.ndarray:
-    return np.array([runner.canonical(runner.tick(work.hand_at(k), work.com_at(k))) for k in range(TICKS)])
+def motion_of(runner: Any, work: Workload, ticks: int = TICKS, lane: int = 0) -> np.ndarray:
+    return np.array([runner.canonical(runner.tick(work.hand_at(k, lane), work.com_at(k))) for k in range(ticks)])
 
 
 @pytest.fixture(scope="module")
-def motions(work):
+def paths(work):
     """Ours and mink's."""
     return {name: motion_of(peer(name)(work), work) for name in ("osik_jax", "mink")}
 
 
-def test_ours_is_minks_motion(work, motions):
+def test_ours_is_minks_motion(work, paths):
     """Orientation errors are written in other ways, which differ as the angle itself does, by its square."""
-    assert np.abs(motions["mink"] - work.start).max() > 0.02
-    np.testing.assert_allclose(motions["osik_jax"], motions["mink"], rtol=0, atol=1e-5)
+    assert np.abs(paths["mink"] - work.start).max() > 0.02
+    np.testing.assert_allclose(paths["osik_jax"], paths["mink"], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["osik_jax", "mink"])
-def test_a_good_motion_counts(work, motions, name):
-    score = judged(work, motions[name])
+def test_a_good_motion_counts(work, paths, name):
+    score = judged(work, paths[name])
     assert not failures(score)
     assert 0.0 < score["hand"] < 2e-3 and score["position_excess"] == 0.0
 
 
-def test_a_wrong_motion_fails(work, motions):
+def test_a_wrong_motion_fails(work, paths):
     """Standing still, a tick late at full speed, another lane's target, beyond limits, not a number."""
 
     def named(motion, lane=0):
         return {text.split()[0] for text in failures(judged(work, motion, lane))}
 
-    good = motions["mink"]
+    good = paths["mink"]
     assert named(np.tile(work.start, (TICKS, 1))) == {"hand"}
     assert "hand" in named(good, lane=1)
     jump = good.copy()
@@ -84,19 +89,105 @@ def test_a_workload_survives_its_file(work):
     np.testing.assert_array_equal(again.hand_at(70, np.arange(3)), work.hand_at(70, np.arange(3)))
 
 
-def test_processes_take_turns_and_who_is_missing_is_left_out(capsys):
+@pytest.mark.parametrize("name", ["nao", "arm7"])
+def test_urdfs_of_embedded_robots_are_those_robots(name):
+    """All links, sites and the centre of mass by Pinocchio are where MuJoCo has those of the MJCF."""
+    work = workload(name)
+    model = mujoco.MjModel.from_xml_path(str(ROOT / "osik_jax" / "robots" / f"{name}.xml"))
+    data, theirs = mujoco.MjData(model), pinocchio_model(work.urdf, work.floating)
+    pin_data, base = theirs.createData(), 7 if work.floating else 0
+    moving = 1 if work.floating else 2  # Pinocchio leaves out what is fixed to the world
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        q = work.start.copy()
+        q[base:] = rng.uniform(work.position_lower, work.position_upper)
+        data.qpos[:base] = q[[0, 1, 2, 6, 3, 4, 5]][:base]
+        data.qpos[[model.joint(joint).qposadr[0] for joint in work.joints]] = q[base:]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        pin.framesForwardKinematics(theirs, pin_data, q)
+        for body in range(1, model.nbody):
+            own = theirs.getFrameId(model.body(body).name, pin.FrameType.BODY)
+            np.testing.assert_allclose(pin_data.oMf[own].translation, data.xpos[body], atol=1e-14)
+            np.testing.assert_allclose(pin_data.oMf[own].rotation.ravel(), data.xmat[body], atol=1e-14)
+        for site in {*work.feet, work.hand} - {model.body(i).name for i in range(model.nbody)}:
+            own = pin_data.oMf[theirs.getFrameId(site)].translation
+            np.testing.assert_allclose(own, data.site(site).xpos, atol=1e-14)
+        np.testing.assert_allclose(pin.centerOfMass(theirs, pin_data, q), data.subtree_com[moving], atol=1e-14)
+    for joint, speed in zip(work.joints, work.velocity, strict=True):
+        assert speed == model.numeric(f"velocity_limit/{joint}").data[0]
+
+
+@pytest.mark.parametrize("name", sorted(ROBOTS))
+def test_every_robot_can_do_its_workload(name):
+    """The exact answer of a QP, mink's, is within the judge's bounds wherever the curve is fastest."""
+    work = workload(name)
+    assert not failures(judged(work, motion_of(peer("mink")(work), work, ticks=400)))
+
+
+def test_processes_take_turns_and_who_is_missing_is_left_out(work, tmp_path, capsys):
     said: list[str] = []
-    with Race("panda", pythons={"placo": "no-such-python"}, report=said.append) as race:
+    with Race(work, pythons={"placo": "no-such-python"}, report=said.append) as race:
         entrants = [Entrant("one", "mink", cores=cores(1)), Entrant("nobody", "placo")]
         (row,) = race.run(entrants, rounds=2, ticks=20, seconds=1.0)
-    assert row["timed_ticks"] == 40 and not row["failures"] and row["robots"] == 1
+    assert row["timed_ticks"] == 40 and row["robots"] == 1
+    assert row["judged_ticks"] == 51 and row["motion"].shape == (1, 51, 7)
+    assert 2**24 < row["peak_bytes"] < 2**34 and row["device"] is row["device_peak_bytes"] is None
     assert 0.0 < row["tick_seconds_median"] <= row["tick_seconds_p99"] < 1.0
     assert 0.0 < row["kernel_ratio"] <= row["tick_seconds_median"] / row["kernel_seconds"]
     assert "no-such-python" in race.missing["placo"] and any("placo is left out" in text for text in said)
     assert race.versions["mink"].keys() >= {"mink", "mujoco", "daqp", "python"}
-    result = dict(robot="panda", one_robot=[row], many_robots=[row], missing=race.missing)
-    report.show(Console(width=160), report.surroundings() | result)
+    result = report.surroundings() | dict(robot="panda", one_robot=[row], many_robots=[], gradients=[], missing={})
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(motions.kept(result, work, path)))
+    report.show(Console(width=160), result)
+    assert "not yet" in capsys.readouterr().out
+    later = motions.judged_later(path)
+    (found,) = later["one_robot"]
+    assert not found["failures"] and "motion" not in found and 0.0 < found["score"]["hand"] < 1e-3
+    report.show(Console(width=160), later)
     assert "1.00" in capsys.readouterr().out
+
+
+def test_the_worst_lane_of_a_batch_counts(work, motions_of_lanes):
+    good = verdict(work, motions_of_lanes)
+    assert not good["failures"]
+    motions_of_lanes[1, 20:, 0] += 0.05
+    assert verdict(work, motions_of_lanes)["failures"]
+
+
+@pytest.fixture
+def motions_of_lanes(work):
+    """Of two robots, each with its own target, by mink."""
+    return np.array([motion_of(peer("mink")(work), work, lane=lane) for lane in range(2)])
+
+
+def test_a_figure_has_a_line_of_each(tmp_path):
+    def row(peer, batch, rate, **options):
+        named = dict(peer=peer, name=peer, device=None, failures=[])
+        return named | dict(options=options | dict(batch=batch), robots=batch or 2, steps_per_second=rate)
+
+    rows = [row("mink", None, 1e4), row("mjinx", 4, 1e3), row("mjinx", 64, 2e3)]
+    for precision in ("float64", "float32"):
+        for batch in (1, 64):
+            rows += [row("osik_jax", batch, 7e3 * batch, scheme="weighted", precision=precision)]
+    result = dict(robot="panda", cpu="a CPU", many_robots=rows)
+    figures.draw(result, tmp_path / "figure.svg")
+    drawn = (tmp_path / "figure.svg").read_text()
+    for text in ("osik_jax, weighted", "mjinx", "mink", "float64", "float32", "panda on a CPU"):
+        assert f"<!-- {text}" in drawn or text in drawn
+    figures.draw(result | dict(many_robots=rows[:1]), tmp_path / "none.svg")
+    assert not (tmp_path / "none.svg").exists()
+
+
+def test_a_batch_that_would_take_too_long_is_left_out(work):
+    said: list[str] = []
+    with Race(work, pythons={}, report=said.append) as race:
+        small = dict(peer="mjinx", options=dict(batch=4), tick_seconds_median=0.6 * LONGEST)
+        large = Entrant("mjinx, batch 8", "mjinx", dict(batch=8))
+        assert list(affordable([large], [small], race)) == [] and "left out" in said[-1]
+        quicker = small | dict(tick_seconds_median=0.4 * LONGEST)
+        assert list(affordable([large], [small | dict(peer="mink-warp"), quicker], race)) == [large]
 
 
 def test_the_gate_sees_what_is_slow_or_wrong():
@@ -112,9 +203,17 @@ def test_the_gate_sees_what_is_slow_or_wrong():
 
 def test_everyone_is_in_the_program():
     names = [entrant.name for entrant in one_robot(Selection())]
-    assert {"mink", "pink", "placo"} < set(names) and len(names) == len(set(names)) == 9
-    batches = [entrant.options["batch"] for group in many_robots(Selection()) for entrant in group if entrant.options]
-    assert sorted(set(batches)) == [1, 64, 1024, 16384] and len(batches) == 24
-    (group,) = many_robots(QUICK)
+    assert {"mink", "pink", "placo", "mjinx", "mink-warp"} < set(names)
+    assert len(names) == len(set(names)) == 5 + 6 + 4  # peers, schemes in precisions, two of them cold
+    entrants = [entrant for group in many_robots(Selection()) for entrant in group]
+    assert len({entrant.name for entrant in entrants}) == len(entrants)
+    mine = [entrant.options["batch"] for entrant in entrants if entrant.peer == "osik_jax"]
+    assert sorted(set(mine)) == [1, 64, 1024, 16384] and len(mine) == 24 + 4
+    for name in ("mjinx", "mink-warp"):
+        assert [entrant.robots for entrant in entrants if entrant.peer == name] == [1, 64, 1024, 16384]
+    group, *alone = many_robots(QUICK)
     assert [entrant.peer for entrant in group] == ["mink", "pink", "placo", "osik_jax"]
     assert group[-1].robots == 1024 and group[0].robots == len(cores())
+    assert [[entrant.peer for entrant in each] for each in alone] == [["mjinx"], ["mink-warp"]]
+    (kept, *_), *_ = many_robots(replace(QUICK, resident=True, peers=["osik_jax"]))
+    assert kept.options["resident"] == 4

@@ -13,8 +13,12 @@ PEERS = {
     "mink": "with_mink",
     "pink": "with_pink",
     "placo": "with_placo",
+    "mjinx": "with_mjinx",
+    "mink-warp": "with_mink_warp",
 }
 """Names, and the modules here that speak to them."""
+BATCHED = frozenset({"osik_jax", "mjinx", "mink-warp"})
+"""Those that run many robots in one process. They compile, too, and keep what they compiled."""
 
 
 def peer(name: str) -> type[Any]:

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import importlib.metadata
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 
+class Device(NamedTuple):
+    """An accelerator, and the most memory that it has held; of a CPU, nothing."""
+
+    name: str | None = None
+    peak_bytes: int | None = None
+
+
 class Peer(Protocol):
-    """A robot in closed loop: made from a workload and options of its own, it stands at the start."""
+    """A robot in closed loop: made from a workload and options of its own, it stands at the start.
+
+    Those in ``BATCHED`` have the options ``batch``, a number of robots, and ``resident``: the configurations of so many
+    robots come back, those of the others stay where they were computed.
+    """
 
     packages: tuple[str, ...]
     """Whose versions matter."""
@@ -23,7 +34,11 @@ class Peer(Protocol):
         ...
 
     def solved(self) -> float:
-        """Share of all answers so far that the library calls solved."""
+        """Share of all answers so far that the library calls solved; NaN where it does not say."""
+        ...
+
+    def device(self) -> Device:
+        """The accelerator that it runs on."""
         ...
 
 

@@ -13,7 +13,9 @@ import numpy as np
 import osik_jax as osik
 from osik_jax.scaling import sharded
 
+from ..device import device_bytes, device_name
 from ..workload import DT, Workload
+from ._peer import Device
 
 SCHEMES: dict[str, Callable[[], osik.Scheme]] = {
     "weighted": lambda: osik.WeightedQP(damping=1e-9),
@@ -33,6 +35,7 @@ class Runner:
         batch: number of robots; None for one without a batch axis.
         warm: carry the active set from tick to tick.
         devices: CPU devices that the batch is split over, one for each core.
+        resident: of a batch, the configurations of all but so many robots stay on the device.
     """
 
     packages = ("osik-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
@@ -46,11 +49,12 @@ class Runner:
         batch: int | None = None,
         warm: bool = True,
         devices: int = 1,
+        resident: int | None = None,
     ) -> None:
         if devices > 1:
             jax.config.update("jax_num_cpu_devices", devices)
         jax.config.update("jax_enable_x64", precision == "float64")
-        self.work, self.floating, self.batch = work, work.floating, batch
+        self.work, self.floating, self.batch, self.resident = work, work.floating, batch, resident
         self.robot = standing(work)
         self.places = np.array([self.robot.joint_qpos_index(name) for name in work.joints])
         start = self.robot.q0
@@ -70,7 +74,7 @@ class Runner:
             self.q, self.warm_start if self.warm else self.none, hand.astype(self.q.dtype), com.astype(self.q.dtype)
         )
         self.fine.append(fine)
-        return np.asarray(self.q)
+        return np.asarray(self.q if self.resident is None else jax.block_until_ready(self.q)[: self.resident])
 
     def canonical(self, q: np.ndarray) -> np.ndarray:
         """Our quaternions are w x y z."""
@@ -80,6 +84,10 @@ class Runner:
     def solved(self) -> float:
         """Share of the lanes and ticks so far whose status is SOLVED."""
         return float(np.mean([np.mean(np.asarray(fine)) for fine in self.fine]))
+
+    def device(self) -> Device:
+        """JAX's."""
+        return Device(device_name(), device_bytes())
 
 
 def standing(work: Workload) -> osik.Robot:

@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from ..robots import pinocchio_model
 from ..workload import DT, Workload
+from ._peer import Device
 
 pink: Any = import_module("pink")  # in the extra "bench" alone
 
@@ -50,6 +51,10 @@ class Runner:
     def solved(self) -> float:
         """pink raises where a QP fails."""
         return 1.0
+
+    def device(self) -> Device:
+        """A CPU."""
+        return Device()
 
     def _set_up_tasks(self) -> None:
         work, c = self.work, self.work.costs

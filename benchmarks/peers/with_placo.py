@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..workload import DT, Workload
+from ._peer import Device
 
 placo: Any = import_module("placo")  # in an environment of its own, where nothing checks types
 
@@ -49,6 +50,10 @@ class Runner:
     def solved(self) -> float:
         """PlaCo raises where a QP fails."""
         return 1.0
+
+    def device(self) -> Device:
+        """A CPU."""
+        return Device()
 
     def _stand(self) -> None:
         joints = self.work.start[7 if self.work.floating else 0 :]
