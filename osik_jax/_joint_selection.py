@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -43,6 +43,12 @@ def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:
     if isinstance(patterns, str):
         raise TypeError(f"joints is a sequence of names and globs, not one string: use ({patterns!r},)")
     return sorted({joint for pattern in patterns for joint in select_joints(robot, pattern)})
+
+
+def dofs_of(robot: Robot, joints: Sequence[int]) -> list[int]:
+    """Entries of v that belong to some independent joints, joint by joint."""
+    tree = robot.tree
+    return [tree.dof_address[j] + i for j in joints for i in range(DOF_WIDTH[tree.joint_types[j]])]
 
 
 def is_scalar(robot: Robot, joint: int) -> bool:

@@ -1,11 +1,20 @@
 """Tasks: errors, Jacobians and wanted velocities."""
 
+from ._axis_align import AxisAlignTask as AxisAlignTask
 from ._com import ComTask as ComTask
 from ._frame import FrameTask as FrameTask
+from ._function import FunctionTask as FunctionTask
 from ._gain import AdaptiveGain as AdaptiveGain
+from ._joint_coupling import JointCouplingTask as JointCouplingTask
+from ._joint_velocity import DampingTask as DampingTask
+from ._joint_velocity import FreezeTask as FreezeTask
+from ._joint_velocity import JointVelocityTask as JointVelocityTask
+from ._joint_velocity import LowAccelerationTask as LowAccelerationTask
+from ._look_at import LookAtTask as LookAtTask
 from ._polygon import SupportPolygon as SupportPolygon
 from ._polygon import support_polygon as support_polygon
 from ._posture import PostureTask as PostureTask
+from ._relative_frame import RelativeFrameTask as RelativeFrameTask
 from ._task import Task as Task
 from ._task import TaskRows as TaskRows
 from ._task import task_rows as task_rows

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._joint_selection import is_scalar, select_all
+from .._joint_selection import dofs_of, is_scalar, select_all
 from .._tree import BALL, DOF_WIDTH, FREE
 from ..kinematics import Kinematics, difference
 from ..robot import Robot
@@ -74,7 +74,7 @@ class PostureTask(Task):
         dtype = robot.q0.dtype
         self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)
-        rows = sum(DOF_WIDTH[robot.tree.joint_types[j]] for j in self.joints)
+        rows = len(dofs_of(robot, self.joints))
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
         self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
@@ -88,12 +88,11 @@ class PostureTask(Task):
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """One row for each dof of the chosen joints, in the order of v."""
         del kinematics
-        tree = robot.tree
-        dofs = [tree.dof_address[j] + i for j in self.joints for i in range(DOF_WIDTH[tree.joint_types[j]])]
+        dofs = dofs_of(robot, self.joints)
         jacobian = jnp.asarray(np.eye(robot.nv)[dofs], self.weight.dtype)
         feedforward = self.target_velocity
         if self.target is None:
-            error = q[np.array([tree.qpos_address[j] for j in self.joints])]
+            error = q[np.array([robot.tree.qpos_address[j] for j in self.joints])]
         else:
             error = self._difference(robot, self.target, q, dofs)
             jacobian, feedforward = self._turn(robot, error, jacobian)

@@ -1,4 +1,4 @@
-"""The logarithm of a rotation and the matrix that turns angular velocity into its rate."""
+"""The logarithm of a rotation and the matrix that turns angular velocity into its rate; products in full precision."""
 
 from __future__ import annotations
 
@@ -52,3 +52,8 @@ def cross_matrix(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     x, y, z = vector
     zero = jnp.zeros_like(x)
     return jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+
+
+def dot(a: Array, b: Array) -> Array:
+    """The matrix product, in full precision on every device."""
+    return jnp.matmul(a, b, precision="highest")

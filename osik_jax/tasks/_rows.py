@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Hashable, Mapping
 
 import jax
@@ -11,40 +12,52 @@ from jaxtyping import Array, Float
 
 from ..kinematics import Kinematics, frame_jacobians
 from ..robot import Robot
+from ._axis_align import AxisAlignTask
 from ._frame import FrameTask
+from ._framed import FramedTask
+from ._look_at import LookAtTask
+from ._relative_frame import RelativeFrameTask
 from ._task import Task, TaskRows
+
+_TOGETHER = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask)
+"""Kinds that are worked on in one go; a subclass may have rows of its own."""
+_APART = {"frame", "root", "target_frame", "priority", "hard"}
+"""Static fields that such tasks may differ in: they do not reach ``rows_at``."""
 
 
 def rows_of(
     robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], tasks: Mapping[str, Task]
 ) -> dict[str, TaskRows]:
     """``task.rows`` of each; frames that are asked for in the same way are worked on in one go, which is faster."""
-    groups: dict[Hashable, dict[str, FrameTask]] = {}
+    groups: dict[Hashable, dict[str, FramedTask]] = {}
     for name, task in tasks.items():
-        if isinstance(task, FrameTask) and type(task) is FrameTask:  # a subclass may have rows of its own
+        if isinstance(task, FramedTask) and type(task) in _TOGETHER:
             groups.setdefault(_manner(task), {})[name] = task
     found: dict[str, TaskRows] = {}
     for alike in groups.values():
-        found |= _frame_rows(robot, kinematics, alike)
+        found |= _framed_rows(robot, kinematics, alike)
     return {name: found[name] if name in found else task.rows(robot, kinematics, q) for name, task in tasks.items()}
 
 
-def _manner(task: FrameTask) -> Hashable:
-    """Equal for tasks that differ in their numbers, frame and priority alone."""
+def _manner(task: FramedTask) -> Hashable:
+    """Equal for tasks that differ in their numbers, frames and priority alone."""
+    fields = [(f.name, getattr(task, f.name), bool(f.metadata.get("static"))) for f in dataclasses.fields(task)]
+    options = tuple(value for name, value, static in fields if static and name not in _APART)
+    structure = tuple(jax.tree.structure(value) for _, value, static in fields if not static)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(task))
-    options = task.kept, task.axes, task.orientation_jacobian, task.lower is None
-    return *options, jax.tree.structure(task.gain), shapes
+    return type(task), len(task.frames), options, structure, shapes
 
 
-def _frame_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, FrameTask]) -> dict[str, TaskRows]:
+def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, FramedTask]) -> dict[str, TaskRows]:
     """Of tasks of one manner."""
-    frames = [task.frame for task in tasks.values()]
     first, *_ = tasks.values()
+    frames = [frame for task in tasks.values() for frame in task.frames]
     stacked = [jnp.stack(leaves) for leaves in zip(*map(jax.tree.leaves, tasks.values()), strict=True)]
     together = jax.tree.unflatten(jax.tree.structure(first), stacked)
-    poses = kinematics.frame_poses(robot, frames)
-    rows = jax.vmap(FrameTask.rows_at)(together, *poses, frame_jacobians(robot, kinematics, frames))
-    apart = [jax.tree.map(lambda a, i=i: a[i], rows) for i in np.arange(len(frames))]
-    if first.lower is None:  # what makes an equality: one array for both bounds
+    found = *kinematics.frame_poses(robot, frames), frame_jacobians(robot, kinematics, frames)
+    by_task = [a.reshape(len(tasks), len(first.frames), *a.shape[1:]) for a in found]
+    rows = jax.vmap(type(first).rows_at)(together, *by_task)
+    apart = [jax.tree.map(lambda a, i=i: a[i], rows) for i in np.arange(len(tasks))]
+    if not first.bounded:  # what makes an equality: one array for both bounds
         apart = [TaskRows(one.error, one.jacobian, one.lower, one.lower, one.weight) for one in apart]
     return dict(zip(tasks, apart, strict=True))

@@ -1,0 +1,160 @@
+"""A task made of a user's own function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._structure import Static, put_together, taken_apart
+from ..kinematics import Kinematics, forward_kinematics, integrate
+from ..robot import Robot
+from ._gain import AdaptiveGain, as_gain
+from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+
+Function = Callable[[Robot, Kinematics, Float[Array, " nq"]], Float[Array, " m"] | Float[Array, ""]]
+
+
+class FunctionTask(Task):
+    """Brings a function of the configuration to a value, or keeps it within bounds; the Jacobian comes by itself.
+
+    With x = ``function(robot, kinematics, q)``, a scalar or (m,), the Jacobian is that of x along the tangent,
+    ``d x(integrate(q, v)) / dv`` at v = 0, by forward differentiation through the kinematics: exact, and dearer than
+    one written by hand, which a task of your own would have (``Task``).
+
+    - a target: ``e = x - target``, ``e' = J v - target'``, asked to be ``-gain(e) e``;
+    - bounds: ``gain (lower - x) <= J v - target' <= gain (upper - x)``.
+
+    A function that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers (arrays and
+    floats; integers are static) without compiling: ``task.replace(function=...)``. Any other function compiles once for
+    each object: define it once and keep it, for a lambda made anew in a loop compiles anew.
+
+    Args:
+        robot: the robot.
+        function: of (robot, kinematics, q), differentiable; it may ignore any of the three. Choose one whose Jacobian
+            is finite everywhere: that of a norm is not at 0, that of its square is.
+        target: of x, one entry for each row, or a scalar; default 0, also where x is something else at ``robot.q0``.
+        target_velocity: of the target, or of the bounds, in the units of x a second; default 0.
+        lower: makes an inequality task: lower bounds on x, one for each row, or a scalar.
+        upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
+        weight: of each squared row.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        TypeError: a target and bounds, or a function that is none.
+        ValueError: x is neither a scalar nor (m,), a wrong shape, a negative weight, lower > upper.
+    """
+
+    numbers: Any
+    structure: Static = eqx.field(static=True)
+    target: Float[Array, " m"] | None
+    target_velocity: Float[Array, " m"]
+    lower: Float[Array, " m"] | None
+    upper: Float[Array, " m"] | None
+
+    def __init__(
+        self,
+        robot: Robot,
+        function: Function,
+        *,
+        target: ArrayLike | Array | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        if not callable(function):
+            raise TypeError(f"function is a {type(function).__name__}; it is called with (robot, kinematics, q)")
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        numbers, self.structure = taken_apart(function)
+        self.numbers = jax.tree.map(lambda a: jnp.asarray(a, dtype if isinstance(a, float) else None), numbers)
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+        rows = _length(robot, function)
+        velocity = 0.0 if target_velocity is None else target_velocity
+        self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
+        self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
+        if target is not None and self.lower is not None:
+            raise TypeError("a FunctionTask has a target or bounds (lower, upper), not both")
+        self.target = None
+        if self.lower is None:
+            self.target = as_vector(0.0 if target is None else target, (rows,), "target", dtype)
+
+    @property
+    def function(self) -> Function:
+        """The function, with the numbers that it has now."""
+        return put_together(self.numbers, self.structure)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """One row for each entry of x."""
+        del kinematics
+
+        def value(v: Float[Array, " nv"]) -> tuple[Array, Array]:
+            moved = integrate(robot, q, v)
+            x = jnp.atleast_1d(self.function(robot, forward_kinematics(robot, moved), moved))
+            return x, x
+
+        jacobian, x = jax.jacfwd(value, has_aux=True)(jnp.zeros(robot.nv, q.dtype))
+        return task_rows(
+            x if self.target is None else x - self.target,
+            jacobian,
+            gain=self.gain,
+            weight=jnp.broadcast_to(self.weight, x.shape),
+            lower=self.lower,
+            upper=self.upper,
+            feedforward=self.target_velocity,
+        )
+
+    def replace(self, **changes: Any) -> Self:
+        """The same task with other numbers; ``function`` takes one of the same structure. See ``Task.replace``.
+
+        Raises:
+            TypeError: a name that is not one of this task's numbers, or a function of another structure.
+            ValueError: a wrong shape or value.
+        """
+        if "function" not in changes or "function" not in self.replaceable:
+            return super().replace(**changes)
+        numbers = self._numbers(changes.pop("function"))
+        return eqx.tree_at(lambda task: task.numbers, self, numbers).replace(**changes)
+
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Names that ``replace`` takes; ``function`` is among them if it has numbers."""
+        names = super().replaceable
+        own = ("function",) if jax.tree.leaves(self.numbers) else ()
+        return tuple(name for name in names if name != "numbers") + own
+
+    def _numbers(self, function: Any) -> Any:
+        """Those of another function of the same structure, in the precision of the ones they replace."""
+        numbers, structure = taken_apart(function)
+        if structure != self.structure:
+            raise TypeError("the function's structure differs, not its numbers alone; make another FunctionTask of it")
+        new = jax.tree.map(lambda old, a: jnp.asarray(a, old.dtype), self.numbers, numbers)
+        for old, a in zip(jax.tree.leaves(self.numbers), jax.tree.leaves(new), strict=True):
+            if a.shape != old.shape:
+                raise ValueError(f"an array of the function has shape {a.shape}, expected {old.shape}")
+        return new
+
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)
+
+
+def _length(robot: Robot, function: Function) -> int:
+    """How many rows a function makes."""
+    x = jax.eval_shape(lambda r, q: function(r, forward_kinematics(r, q), q), robot, robot.q0)
+    shape = getattr(x, "shape", None)
+    if shape is None or len(shape) > 1 or 0 in shape:
+        raise ValueError(f"the function returns {x}; it returns a scalar or an array (m,)")
+    return shape[0] if shape else 1

@@ -1,0 +1,116 @@
+"""A task on a linear combination of joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import concrete, is_scalar, select_joints
+from ..kinematics import Kinematics
+from ..robot import Robot
+from ._gain import AdaptiveGain, as_gain
+from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._rotation import dot
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+
+
+class JointCouplingTask(Task):
+    """Couples joints like gears: ``sum_i ratio_i q_i`` at a value, or within bounds.
+
+    One row. A target: ``e = ratios q - target``, ``e' = ratios v - target'``, asked to be ``-gain(e) e``; bounds:
+    ``gain (lower - ratios q) <= ratios v <= gain (upper - ratios q)``. ``{"a": 1.0, "b": -1.0}`` keeps two joints
+    equal, ``{"waist": 1.0, "hip": 1.0, "knee": 1.0}`` the sum of three. A ``<mimic>`` joint needs none: it is no
+    coordinate of its own.
+
+    Args:
+        robot: the robot.
+        ratios: from joint names to factors; hinges and slides. Kept in the order of v, for ``replace(ratios=...)`` too.
+        target: of the sum [rad or m, times the ratios' units]; default 0, also where q0 has another value.
+        target_velocity: of the target, or of the bounds; default 0.
+        lower: makes an inequality task: lower bound on the sum.
+        upper: upper bound; one of the two may be left out.
+        weight: of the squared row.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such joint, or it is locked or a mimic follower.
+        TypeError: a target and bounds, or ratios that are no mapping.
+        ValueError: no ratio that is not 0, a ball or free joint, a wrong shape, a negative weight, lower > upper.
+    """
+
+    joints: tuple[int, ...] = eqx.field(static=True)
+    ratios: Float[Array, " k"]
+    target: Float[Array, "1"] | None
+    target_velocity: Float[Array, "1"]
+    lower: Float[Array, "1"] | None
+    upper: Float[Array, "1"] | None
+
+    def __init__(
+        self,
+        robot: Robot,
+        ratios: Mapping[str, float],
+        *,
+        target: ArrayLike | Array | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        by_joint = _by_joint(robot, ratios)
+        self.joints = tuple(by_joint)
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        self.ratios = jnp.asarray(list(by_joint.values()), dtype)
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+        velocity = 0.0 if target_velocity is None else target_velocity
+        self.target_velocity = as_vector(velocity, (1,), "target_velocity", dtype)
+        self.lower, self.upper = as_bounds(lower, upper, 1, dtype)
+        if target is not None and self.lower is not None:
+            raise TypeError("a JointCouplingTask has a target or bounds (lower, upper), not both")
+        self.target = None
+        if self.lower is None:
+            self.target = as_vector(0.0 if target is None else target, (1,), "target", dtype)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """One row."""
+        del kinematics
+        tree = robot.tree
+        places, dofs = (np.array([at[j] for j in self.joints]) for at in (tree.qpos_address, tree.dof_address))
+        value = dot(self.ratios, q[places])[None]
+        return task_rows(
+            value if self.target is None else value - self.target,
+            jnp.zeros((1, robot.nv), self.ratios.dtype).at[0, dofs].set(self.ratios),
+            gain=self.gain,
+            weight=self.weight[None],
+            lower=self.lower,
+            upper=self.upper,
+            feedforward=self.target_velocity,
+        )
+
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)
+
+
+def _by_joint(robot: Robot, ratios: Mapping[str, float]) -> dict[int, float]:
+    """Ratios by joint, in the order of v."""
+    if not isinstance(ratios, Mapping):
+        raise TypeError(f"ratios is a {type(ratios).__name__}; it is a mapping from joint names to factors")
+    found = {joint: value for name, value in ratios.items() for joint in select_joints(robot, name)}
+    seen = [concrete(value) for value in found.values()]
+    if not found or all(value is not None and not value.any() for value in seen):
+        raise ValueError(f"ratios is {dict(ratios)}; at least one joint has a ratio that is not 0")
+    turning = [robot.tree.joint_names[j] for j in found if not is_scalar(robot, j)]
+    if turning:
+        raise ValueError(f"ratios are of the values of hinges and slides; leave out {', '.join(turning)}")
+    return {joint: found[joint] for joint in sorted(found)}

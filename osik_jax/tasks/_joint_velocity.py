@@ -1,0 +1,215 @@
+"""Tasks on the velocities of joints, whatever the configuration."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterable
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import dofs_of, select_all
+from ..kinematics import Kinematics
+from ..robot import Robot
+from ._leaves import as_scalar, as_vector
+from ._task import Task, TaskRows, check_priority
+
+
+class VelocityTask(Task):
+    """Base of tasks that want dofs at a velocity: rows of the identity, ``v_i = wanted_i``.
+
+    There is no error that could decay: it is 0, and there is no gain.
+    """
+
+    joints: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(
+        self, robot: Robot, joints: Iterable[str] | None, *, weight: ArrayLike | Array, priority: int, hard: bool
+    ):
+        self.joints = tuple(select_all(robot, joints))
+        self.priority, self.hard = check_priority(priority), hard
+        self.weight = as_scalar(weight, "weight", robot.q0.dtype)
+        self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
+
+    @abc.abstractmethod
+    def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
+        """Velocities of these dofs [rad/s or m/s]."""
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """One row for each dof of the chosen joints, in the order of v."""
+        del kinematics, q
+        dofs = dofs_of(robot, self.joints)
+        wanted = self.wanted(dofs)
+        return TaskRows(
+            error=jnp.zeros_like(wanted),
+            jacobian=jnp.asarray(np.eye(robot.nv)[dofs], wanted.dtype),
+            lower=wanted,
+            upper=wanted,
+            weight=jnp.broadcast_to(self.weight, wanted.shape),
+            dofs=tuple(dofs),
+        )
+
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Names that ``replace`` takes."""
+        return tuple(name for name in super().replaceable if name != "gain")
+
+
+class DampingTask(VelocityTask):
+    """Wants joints to stand still, at a low weight: of the motions that serve the other tasks, a slow one.
+
+    ``v_i = 0``. It calms near singularities and settles what the other tasks leave open. Each scheme has a damping of
+    all dofs of its own; this one has a weight and a priority, and can choose joints.
+
+    Args:
+        robot: the robot.
+        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
+            to take part.
+        weight: of each squared row. Several damping tasks give several weights.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such joint, or it is locked or a mimic follower.
+        ValueError: a negative weight.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        joints: Iterable[str] | None = None,
+        weight: ArrayLike | Array = 1e-3,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+
+    def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
+        """Nought."""
+        return jnp.zeros(len(dofs), self.weight.dtype)
+
+
+class FreezeTask(VelocityTask):
+    """Makes joints stand still while the rest of the robot works: ``v_i = 0``.
+
+    Meant as a constraint (``hard=True``) or at priority 1; to leave joints out of the problem altogether, load the
+    robot with ``locked_joints``.
+
+    Args:
+        robot: the robot.
+        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; the free base by its name.
+        weight: of each squared row.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such joint, or it is locked or a mimic follower.
+        ValueError: no joints, a negative weight.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        joints: Iterable[str],
+        *,
+        weight: ArrayLike | Array = 1.0,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        if not self.joints:
+            raise ValueError("a FreezeTask needs at least one joint")
+
+    def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
+        """Nought."""
+        return jnp.zeros(len(dofs), self.weight.dtype)
+
+
+class JointVelocityTask(VelocityTask):
+    """Wants joints to move at given velocities: ``v_i = target_i``.
+
+    Args:
+        robot: the robot.
+        target: the velocities [rad/s or m/s], one for each row, or a scalar. Rows are in the order of v; ball joints
+            have angular velocities in their own axes, a free base linear ones in the world's and angular ones in its
+            own.
+        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
+            to take part.
+        weight: of each squared row.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such joint, or it is locked or a mimic follower.
+        ValueError: a wrong shape, a negative weight.
+    """
+
+    target: Float[Array, " m"]
+
+    def __init__(
+        self,
+        robot: Robot,
+        target: ArrayLike | Array,
+        *,
+        joints: Iterable[str] | None = None,
+        weight: ArrayLike | Array = 1.0,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        self.target = as_vector(target, (len(dofs_of(robot, self.joints)),), "target", robot.q0.dtype)
+
+    def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
+        """The target."""
+        del dofs
+        return self.target
+
+
+class LowAccelerationTask(VelocityTask):
+    """Wants joints to keep the velocity that they had: ``v_i = velocity_i``, that of the tick before.
+
+    At a low weight it makes motions smooth. It takes no energy out of a motion, so have something beside it that does,
+    such as a ``PostureTask`` or a ``DampingTask``. ``rollout`` hands the velocity from tick to tick; with ``solve``,
+    write ``task = task.after(solution.velocity)``.
+
+    Args:
+        robot: the robot.
+        velocity: that of the tick before (nv,) [rad/s or m/s], or a scalar; default 0, a robot at rest.
+        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
+            to take part.
+        weight: of each squared row.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such joint, or it is locked or a mimic follower.
+        ValueError: a wrong shape, a negative weight.
+    """
+
+    velocity: Float[Array, " nv"]
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        velocity: ArrayLike | Array = 0.0,
+        joints: Iterable[str] | None = None,
+        weight: ArrayLike | Array = 1e-3,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        self.velocity = as_vector(velocity, (robot.nv,), "velocity", robot.q0.dtype)
+
+    def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
+        """What the dofs had."""
+        return self.velocity[np.array(dofs, int)]
+
+    def after(self, velocity: Float[Array, " nv"]) -> Self:
+        """The task for the next tick, once this one's answer is ``velocity`` [rad/s or m/s]."""
+        return self.replace(velocity=velocity)

@@ -1,0 +1,205 @@
+"""What tasks share that point an axis of a frame: the angle to a direction, as two rows or as a cone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ..robot import Robot
+from ._framed import FramedTask
+from ._gain import AdaptiveGain, as_gain, safe_norm
+from ._leaves import as_scalar, as_vector, concrete
+from ._rotation import dot
+from ._task import TaskRows, check_priority, task_rows
+
+_SMALL_SINE_SQUARED = 1e-3
+_BEHIND = -0.5
+"""Cosine below which a direction counts as behind: there the formulas divide by it, in front by one plus it."""
+_LEAST_SINE = 0.1
+"""What rows across the error are divided by at least, next to the opposite direction."""
+_TIP = 0.01
+"""Angle [rad] below which that of a cone is rounded off, so that its gradient passes through 0."""
+
+
+class PointingTask(FramedTask):
+    """Base of tasks that bring an axis a of a frame to a direction d, or keep it in a cone around one.
+
+    All in the frame's own axes, with t the angle from a to d, u the unit vector from a towards d across a, and B (3, 2)
+    two unit vectors across a:
+
+    - equality: ``e = -t B' u``, two rows [rad] whose norm is the angle; the turn about the axis is free;
+    - cone: ``x = t <= half_angle``, one row [rad], asked to follow ``x' <= gain (half_angle - x)``.
+
+    The Jacobians are exact, with two exceptions that keep them bounded. Within 0.1 rad of the opposite direction the
+    row across the error, t / sin(t) there, stays as it is at 0.1 rad; both ask for the same motion where the task can
+    be met. At the opposite direction itself, where every way is the shortest, the axis turns towards the first column
+    of B. A cone's angle is rounded off below 0.01 rad (``t^2 / 0.02 + 0.005``), its bound likewise.
+    """
+
+    frame: str = eqx.field(static=True)
+    target_frame: str | None = eqx.field(static=True)
+    axis: Float[Array, "3"]
+    target: Float[Array, "3"]
+    target_velocity: Float[Array, "3"]
+    half_angle: Float[Array, ""] | None
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        target_frame: str | None,
+        *,
+        axis: ArrayLike | Array,
+        target: ArrayLike | Array,
+        target_velocity: ArrayLike | Array,
+        half_angle: ArrayLike | Array | None,
+        weight: ArrayLike | Array,
+        gain: ArrayLike | Array | AdaptiveGain,
+        priority: int,
+        hard: bool,
+    ):
+        self.frame, self.target_frame = frame, target_frame
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        self.axis = as_direction(axis, "axis", dtype)
+        self.target = as_vector(target, (3,), "target", dtype)
+        self.target_velocity = as_vector(target_velocity, (3,), "target_velocity", dtype)
+        self.half_angle = None if half_angle is None else _as_half_angle(half_angle, dtype)
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frame, and that of the target if there is one."""
+        return (self.frame,) if self.target_frame is None else (self.frame, self.target_frame)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the task is a cone."""
+        return self.half_angle is not None
+
+    def pointing_rows(
+        self, direction: Float[Array, "3"], jacobian: Float[Array, "3 nv"], drift: Float[Array, "3"]
+    ) -> TaskRows:
+        """The rows from d, a unit vector in the frame's axes, whose rate there is ``jacobian v + drift``."""
+        error, slope = deviation(unit(self.axis), direction)
+        upper = None
+        if self.half_angle is not None:
+            slope = dot(error, slope)[None] / jnp.maximum(safe_norm(error), _TIP)
+            error, upper = _rounded(jnp.sum(error**2))[None], _rounded(self.half_angle**2)[None]
+        return task_rows(
+            error,
+            dot(slope, jacobian),
+            gain=self.gain,
+            weight=jnp.broadcast_to(self.weight, error.shape),
+            lower=None if upper is None else jnp.full_like(upper, -jnp.inf),
+            upper=upper,
+            feedforward=-dot(slope, drift),
+        )
+
+    def _convert(self, name: str, value: Any) -> Any:
+        if name == "axis":
+            return as_direction(value, name, self.weight.dtype)
+        if name == "half_angle":
+            return _as_half_angle(value, self.weight.dtype)
+        return super()._convert(name, value)
+
+
+def check_frames(robot: Robot, frame: str, target_frame: str | None) -> None:
+    """Raises KeyError where one does not exist, ValueError where they are the same."""
+    robot.tree.frame(frame)
+    if target_frame is not None:
+        robot.tree.frame(target_frame)
+    if frame == target_frame:
+        raise ValueError(f"frame and target_frame are both {frame!r}; the one never moves as seen from the other")
+
+
+def as_direction(value: Any, what: str, dtype: Any) -> Float[Array, "3"]:
+    """A vector (3,) of any length but 0.
+
+    Raises:
+        ValueError: it is not.
+    """
+    out = as_vector(value, (3,), what, dtype)
+    seen = concrete(out)
+    if seen is not None and not (np.isfinite(seen).all() and seen.any()):
+        raise ValueError(f"{what} is {seen}; a direction is finite and not 0")
+    return out
+
+
+def unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The vector at length 1; 0 stays 0."""
+    length = safe_norm(vector)
+    return vector / jnp.where(length > 0.0, length, 1.0)
+
+
+def deviation(axis: Float[Array, "3"], direction: Float[Array, "3"]) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
+    """The error e of ``PointingTask`` from two unit vectors, and D with ``e' = D d'`` for a rate d' across d."""
+    basis = _across(axis)
+    cosine, beside = dot(axis, direction), dot(basis, direction)
+    behind = cosine < _BEHIND
+    front = _in_front(axis, basis, jnp.where(behind, 1.0, cosine), jnp.where(behind, 0.0, beside))
+    back = _behind(basis, jnp.where(behind, cosine, -1.0), jnp.where(behind, beside, 0.0))
+    return jnp.where(behind, back[0], front[0]), jnp.where(behind, back[1], front[1])
+
+
+def _in_front(
+    axis: Array, basis: Array, cosine: Float[Array, ""], beside: Float[Array, "2"]
+) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
+    """Error and slope where the two are at most 120 degrees apart: a rate is carried from d to a, then stretched.
+
+    With s the sine, ``k = t / s`` and ``g = (1 - k) / s^2``, which is -1/6 at 0: ``e = -k y``, ``y = B' d``, and
+    ``D = -(k I + g y y') (B' - y a' / (1 + cos t))``.
+    """
+    squared = jnp.sum(beside**2)
+    small = (squared < _SMALL_SINE_SQUARED) & (cosine > 0.0)
+    safe = jnp.where(small, 1.0, squared)
+    sine = jnp.sqrt(safe)
+    series = 1 / 6 + squared * (3 / 40 + squared * (5 / 112 + squared * (35 / 1152 + squared * 63 / 2816)))
+    bend = jnp.where(small, -series, (1.0 - jnp.arctan2(sine, cosine) / sine) / safe)
+    ratio = 1.0 - bend * squared
+    carried = basis - jnp.outer(beside, axis) / (1.0 + cosine)
+    return -ratio * beside, -(ratio * carried + bend * jnp.outer(beside, dot(beside, carried)))
+
+
+def _behind(
+    basis: Array, cosine: Float[Array, ""], beside: Float[Array, "2"]
+) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
+    """Error and slope behind: ``e = -t u`` and ``D = -(k I + (1 / cos t - k) u u') B'``."""
+    squared = jnp.sum(beside**2)
+    clear = squared > jnp.finfo(squared.dtype).eps ** 2
+    sine = jnp.sqrt(jnp.where(clear, squared, 1.0))
+    way = jnp.where(clear, beside / sine, jnp.array([1.0, 0.0], beside.dtype))
+    sine = jnp.where(clear, sine, 0.0)
+    angle = jnp.arctan2(sine, cosine)
+    ratio = angle / jnp.maximum(sine, _LEAST_SINE)
+    return -angle * way, -(ratio * basis + (1.0 / cosine - ratio) * jnp.outer(way, dot(way, basis)))
+
+
+def _across(axis: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    """Two unit vectors that make a right-handed basis with a unit vector (Duff et al., JCGT 6(1), 2017)."""
+    x, y, z = axis
+    sign = jnp.where(z < 0.0, -1.0, 1.0).astype(axis.dtype)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return jnp.array([[1.0 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]])
+
+
+def _rounded(squared: Float[Array, ""]) -> Float[Array, ""]:
+    """An angle from its square, rounded off below the tip."""
+    tip = squared < _TIP**2
+    return jnp.where(tip, squared / (2.0 * _TIP) + 0.5 * _TIP, jnp.sqrt(jnp.where(tip, 1.0, squared)))
+
+
+def _as_half_angle(value: Any, dtype: Any) -> Float[Array, ""]:
+    out = as_vector(value, (), "half_angle", dtype)
+    seen = concrete(out)
+    if seen is not None and not (0.0 < seen <= math.pi):
+        raise ValueError(f"half_angle is {seen}; it is an angle in rad, above 0 and up to pi. None: an equality")
+    return out

@@ -1,0 +1,120 @@
+"""A task on the pose of a frame in another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ..robot import Robot
+from ._gain import AdaptiveGain
+from ._leaves import Pose, home_kinematics
+from ._pose import PoseLike, PoseTask
+from ._rotation import cross_matrix, dot
+from ._task import DEFAULT_GAIN, TaskRows
+
+
+class RelativeFrameTask(PoseTask):
+    """Brings a frame to a pose in another frame, its root, or keeps it within bounds around one.
+
+    A ``FrameTask`` whose world is the root: p and R are the frame's pose in the root, ``p = R_r' (p_f - p_r)`` and
+    ``R = R_r' R_f``, with the Jacobians ``R_r' (J_f,lin - J_r,lin + [p_f - p_r] J_r,ang)`` and
+    ``R_r' (J_f,ang - J_r,ang)``. The robot may move either of the two, or both as one: two hands on one tray, a foot
+    under the pelvis.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom.
+        root: the frame that the pose is in; another one.
+        target: ``(p (3,), R (3, 3))`` or a (4, 4) matrix, in the root; default: what holds at ``robot.q0``.
+        target_velocity: of the target in the root, (6,), [linear; angular] in the root's axes [m/s, rad/s]; default 0.
+        lower: makes an inequality task: lower bounds on the rows of e, one for each row that is kept, or a scalar.
+        upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
+        position_weight: weight of the squared position rows, scalar or (3,) along the axes of ``axes``.
+        orientation_weight: weight of the squared orientation rows, scalar or (3,). A row of weight 0 costs nothing.
+        weight: multiplies all rows' weights.
+        rows: ``"pose"``, ``"position"``, ``"orientation"``, or six booleans (x, y, z, rotation about x, y, z): the rows
+            that the task has. Static; weights are not.
+        axes: ``"root"`` or ``"frame"``.
+        orientation_jacobian: ``"analytic"`` or ``"geometric"``, see ``FrameTask``.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such frame.
+        ValueError: frame and root are the same, a wrong shape, a rotation that is not one, a negative weight,
+            lower > upper, an unknown option.
+    """
+
+    root: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        root: str,
+        *,
+        target: PoseLike | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        position_weight: ArrayLike | Array = 1.0,
+        orientation_weight: ArrayLike | Array = 1.0,
+        weight: ArrayLike | Array = 1.0,
+        rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
+        axes: Literal["root", "frame"] = "root",
+        orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        robot.tree.frame(frame)
+        robot.tree.frame(root)
+        if frame == root:
+            raise ValueError(f"frame and root are both {frame!r}; the pose of a frame in itself never changes")
+        self.root = root
+        super().__init__(
+            robot,
+            frame,
+            target=_home(robot, frame, root) if target is None else target,
+            target_velocity=target_velocity,
+            lower=lower,
+            upper=upper,
+            position_weight=position_weight,
+            orientation_weight=orientation_weight,
+            weight=weight,
+            rows=rows,
+            axes=axes,
+            outer_axes="root",
+            orientation_jacobian=orientation_jacobian,
+            gain=gain,
+            priority=priority,
+            hard=hard,
+        )
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frame, then its root."""
+        return self.frame, self.root
+
+    def rows_at(
+        self, positions: Float[Array, "2 3"], rotations: Float[Array, "2 3 3"], jacobians: Float[Array, "2 6 nv"]
+    ) -> TaskRows:
+        """Rows in the order x, y, z, rotation x, y, z, those left out skipped (m <= 6)."""
+        turn, (frame, root) = rotations[1].T, jacobians
+        apart = positions[0] - positions[1]
+        linear = frame[:3] - root[:3] + dot(cross_matrix(apart), root[3:])
+        jacobian = jnp.concatenate([dot(turn, linear), dot(turn, frame[3:] - root[3:])])
+        return self.pose_rows(dot(turn, apart), dot(turn, rotations[0]), jacobian)
+
+
+def _home(robot: Robot, frame: str, root: str) -> Pose:
+    """The frame's pose in the root at the robot's home configuration."""
+    positions, rotations = home_kinematics(robot).frame_poses(robot, (frame, root))
+    turn = rotations[1].T
+    return dot(turn, positions[0] - positions[1]), dot(turn, rotations[0])
