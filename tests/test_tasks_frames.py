@@ -1,6 +1,7 @@
 """Tasks on two frames and on axes, against central differences, mink and numbers worked out by hand."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -210,7 +211,7 @@ class TestPointingErrors:
     def test_by_hand(self, robot):
         """Looking along x, at a point 2 m away, 0.3 rad to the left: the turn about z [rad], the way along y [m]."""
         point = 2.0 * np.array([math.cos(0.3), math.sin(0.3), 0.0])
-        options = dict(axis=(1.0, 0.0, 0.0), target=point, gain=2.0)
+        options: dict[str, Any] = dict(axis=(1.0, 0.0, 0.0), target=point, gain=2.0)
         look = _alone(osik.LookAtTask(robot, "hand", **options), jnp.zeros(3), jnp.eye(3))
         cone = _alone(osik.LookAtTask(robot, "hand", half_angle=0.1, **options), jnp.zeros(3), jnp.eye(3))
         about_z = look.jacobian[:, 5]
@@ -285,7 +286,7 @@ class TestGradients:
         with jax.enable_x64(x64):
             head = osik.Robot.from_mjcf(HEAD)
             points = jnp.asarray(points, head.q0.dtype)
-            options = dict(axis=(1.0, 0.0, 0.0), gain=osik.AdaptiveGain(10.0, 1.0, 2.0))
+            options: dict[str, Any] = dict(axis=(1.0, 0.0, 0.0), gain=osik.AdaptiveGain(10.0, 1.0, 2.0))
             tasks = {
                 f"{kind.__name__} {half_angle}": kind(head, "head", half_angle=half_angle, **options)
                 for kind in (osik.LookAtTask, osik.AxisAlignTask)
