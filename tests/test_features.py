@@ -1,0 +1,88 @@
+"""The table of features: what it says of us is tested, its names exist, and nothing of ours is missing from it."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import osik_jax as osik
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "features.md").read_text(encoding="utf-8")
+NONE = "—"
+COLUMNS = 12
+
+
+def rows(page: str) -> list[list[str]]:
+    """Cells of the tables of features, heads left out."""
+    lines = [line for line in page.splitlines() if line.startswith("|") and not line.startswith("|--")]
+    cells = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
+    return [row for row in cells if len(row) > 3 and row[1] != "osik-jax"]
+
+
+ROWS = rows(PAGE)
+
+
+@cache
+def tested_by(name: str) -> frozenset[str]:
+    """``test_x`` and ``TestClass::test_x`` of a file."""
+    found = set()
+    for node in ast.parse((ROOT / "tests" / name).read_text(encoding="utf-8")).body:
+        inside = node.body if isinstance(node, ast.ClassDef) else [node]
+        prefix = f"{node.name}::" if isinstance(node, ast.ClassDef) else ""
+        found |= {prefix + part.name for part in inside if isinstance(part, ast.FunctionDef)}
+    return frozenset(name for name in found if name.rpartition("::")[2].startswith("test_"))
+
+
+def missing_tests(cell: str) -> list[str]:
+    """Of the tests that a cell names, those that do not exist."""
+    named = [quoted.partition("::")[::2] for quoted in re.findall(r"`([^`]+)`", cell)]
+    return [f"{file}::{test}" for file, test in named if test not in tested_by(file)]
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
+def test_what_is_said_of_us_is_shown_by_a_test(row: list[str]):
+    assert len(row) == COLUMNS
+    ours, shown = row[1:3]
+    if ours == NONE or not shown.startswith("`"):
+        assert shown == NONE
+        assert ours == NONE or "`" not in ours, "a name of ours without a test"
+    else:
+        assert not missing_tests(shown)
+
+
+def test_a_test_that_does_not_exist_is_seen():
+    assert missing_tests("`test_features.py::test_a_test_that_does_not_exist_is_seen`") == []
+    assert missing_tests("`test_features.py::test_nothing`") == ["test_features.py::test_nothing"]
+
+
+def test_names_of_ours_exist():
+    """Every name in backquotes in our column: ``Name``, ``Name(option=)``, ``object.name``, ``package.name``."""
+    checked = 0
+    for row in ROWS:
+        for name in re.findall(r"`([\w.]+)(?:\([^`]*\))?`", row[1]):
+            checked += 1
+            first, *rest = name.split(".")
+            if first == "osik_jax":
+                assert hasattr(importlib.import_module(".".join((first, *rest[:-1]))), rest[-1]), name
+            elif first in ("robot", "solution", "jax"):
+                owner = dict(robot=osik.Robot, solution=osik.Solution, jax=importlib.import_module("jax"))[first]
+                assert rest[0] in dir(owner) or rest[0] in owner.__annotations__, name
+            elif first[0].isupper():
+                assert hasattr(osik, first), name
+                assert all(hasattr(getattr(osik, first), part) for part in rest), name
+    assert checked > 20
+
+
+def test_every_task_limit_and_scheme_of_ours_is_in_it():
+    ours = " ".join(row[1] for row in ROWS)
+    bases = osik.Task, osik.Limit, osik.Scheme
+    public = [getattr(osik, name) for name in dir(osik) if not name.startswith("_")]
+    kinds = [kind for kind in public if isinstance(kind, type) and issubclass(kind, bases) and kind not in bases]
+    assert len(kinds) >= 8
+    assert [kind.__name__ for kind in kinds if f"`{kind.__name__}" not in ours] == []
