@@ -29,7 +29,7 @@ ROWS = rows(PAGE)
 
 
 @cache
-def tested_by(name: str) -> frozenset[str]:
+def functions_of(name: str) -> frozenset[str]:
     """``test_x`` and ``TestClass::test_x`` of a file."""
     found = set()
     for node in ast.parse((ROOT / "tests" / name).read_text(encoding="utf-8")).body:
@@ -42,7 +42,7 @@ def tested_by(name: str) -> frozenset[str]:
 def missing_tests(cell: str) -> list[str]:
     """Of the tests that a cell names, those that do not exist."""
     named = [quoted.partition("::")[::2] for quoted in re.findall(r"`([^`]+)`", cell)]
-    return [f"{file}::{test}" for file, test in named if test not in tested_by(file)]
+    return [f"{file}::{test}" for file, test in named if test not in functions_of(file)]
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
@@ -77,12 +77,3 @@ def test_names_of_ours_exist():
                 assert hasattr(osik, first), name
                 assert all(hasattr(getattr(osik, first), part) for part in rest), name
     assert checked > 20
-
-
-def test_every_task_limit_and_scheme_of_ours_is_in_it():
-    ours = " ".join(row[1] for row in ROWS)
-    bases = osik.Task, osik.Limit, osik.Scheme
-    public = [getattr(osik, name) for name in dir(osik) if not name.startswith("_")]
-    kinds = [kind for kind in public if isinstance(kind, type) and issubclass(kind, bases) and kind not in bases]
-    assert len(kinds) >= 8
-    assert [kind.__name__ for kind in kinds if f"`{kind.__name__}" not in ours] == []
