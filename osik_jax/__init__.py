@@ -18,6 +18,7 @@ from .kinematics import frame_jacobian as frame_jacobian
 from .kinematics import frame_jacobians as frame_jacobians
 from .kinematics import integrate as integrate
 from .kinematics import mass_matrix as mass_matrix
+from .limits import AccelerationLimit as AccelerationLimit
 from .limits import ConfigurationLimit as ConfigurationLimit
 from .limits import Limit as Limit
 from .limits import LimitRows as LimitRows

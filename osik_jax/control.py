@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ._blocks import BLOCK
 from ._joint_selection import concrete, scalar_layout
@@ -29,6 +29,8 @@ from .tasks._rows import rows_of
 Tasks = Mapping[str, Task]
 Targets = Mapping[str, Any]
 Feedback = Callable[[Array, Array], Array]
+_Carry = tuple[Array, Any, Any]
+"""What a tick leaves to the next: configuration, velocity and warm start."""
 
 
 class Solution(eqx.Module):
@@ -96,7 +98,8 @@ def solve(
         q: configuration. (nq,)
         tasks: by name; the names come back in ``slack`` and ``error``.
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
-        limits: joint position and velocity limits.
+        limits: hard bounds on the velocity. Those that remember the last tick's velocity, such as
+            ``AccelerationLimit``, need it each time: ``limit.after(solution.velocity)``.
         dt: time until the next tick [s].
         warm_start: that of the tick before (``Solution.warm_start``), with the same tasks, scheme and limits. It saves
             time and does not change the answer; a wrong one costs time only.
@@ -201,7 +204,8 @@ def rollout(
             that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers (arrays and
             floats; integers are static) without compiling; any other function compiles once for each object.
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
-        limits: joint position and velocity limits.
+        limits: hard bounds on the velocity. Limits and tasks that remember the last velocity get it at each tick; the
+            first takes them as they are.
         dt: time of one tick [s].
         steps: number of ticks (static).
         targets: targets of some tasks at each tick, by task name: what ``replace(target=...)`` takes, with a leading
@@ -258,24 +262,34 @@ def _rollout(
     time = jnp.arange(steps) * dt
     measured = None if callable(feedback) else feedback
 
-    def tick(
-        state: tuple[Array, Any], now: tuple[Array, Targets | None, Array | None]
-    ) -> tuple[tuple[Array, Any], tuple[Array, Solution]]:
-        (q, warm_start), (t, target, sensed) = state, now
+    def tick(state: _Carry, now: tuple[Array, Targets | None, Array | None]) -> tuple[_Carry, tuple[Array, Solution]]:
+        (q, velocity, warm_start), (t, target, sensed) = state, now
         if callable(feedback):
             q = _configuration(robot, feedback(t, q))
         elif sensed is not None:
             q = sensed.astype(q.dtype)
         todo = _checked(tasks(t)) if callable(tasks) else aim(tasks, target)
-        solution = _solve(robot, q, todo, scheme, limits, dt, warm_start)
+        todo, kept = remembering((todo, limits), velocity, t > 0.0)
+        solution = _solve(robot, q, todo, scheme, kept, dt, warm_start)
         q = _move(robot, q, solution.velocity, dt)
-        return (q, solution.warm_start), (q, solution)
+        return (q, solution.velocity, solution.warm_start), (q, solution)
 
     ticks = (time, targets, measured)
-    cold = _cold_start(lambda now: tick((q0, None), now)[0][1], ticks)
+    cold = _cold_start(lambda now: tick((q0, None, None), now)[0][1:], ticks)
     thrifty = jax.checkpoint(tick, prevent_cse=False)
-    _, (q, solution) = jax.lax.scan(thrifty, (q0, cold), ticks, length=steps)
+    _, (q, solution) = jax.lax.scan(thrifty, (q0, *cold), ticks, length=steps)
     return Trajectory(time, jnp.concatenate([q0[None], q]), solution)
+
+
+def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, moved: Bool[Array, ""] | bool) -> Any:
+    """Tasks and limits ``after`` a tick's velocity; as they are where there was no tick (``moved`` is false)."""
+
+    def one(part: Task | Limit) -> Task | Limit:
+        if velocity is None or type(part).after in (Task.after, Limit.after):
+            return part
+        return jax.tree.map(lambda new, old: jnp.where(moved, new, old), part.after(velocity), part)
+
+    return jax.tree.map(one, tasks_and_limits, is_leaf=lambda part: isinstance(part, Task | Limit))
 
 
 def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
@@ -285,7 +299,7 @@ def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
 
 
 def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:
-    """Zeros in the shape of a warm start, from a tick that is traced and not run."""
+    """Zeros in the shape of what a tick leaves to the next, from one that is traced and not run."""
     one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), jax.tree.map(jnp.asarray, ticks))
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, one))
 

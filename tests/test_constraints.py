@@ -211,16 +211,17 @@ class TestAgainstOthers:
         assert (value - linear.lower)[needed].min() > -1e-12
 
 
-class TestContradictions:
-    @pytest.fixture(scope="class")
-    def spoiled(self, lanes):
-        """Lane 3: one joint has to turn both ways; lane 5: a NaN."""
-        q, place, matrix, lower, upper = map(np.array, lanes)
-        matrix[3, 0] = matrix[3, 1] = np.eye(7)[0]
-        lower[3, 0], upper[3, 0], lower[3, 1], upper[3, 1] = 1.0, np.inf, -np.inf, -1.0
-        matrix[5, 2, 4] = np.nan
-        return tuple(map(jnp.asarray, (q, place, matrix, lower, upper)))
+@pytest.fixture(scope="module")
+def spoiled(lanes):
+    """Lane 3: one joint has to turn both ways; lane 5: a NaN."""
+    q, place, matrix, lower, upper = map(np.array, lanes)
+    matrix[3, 0] = matrix[3, 1] = np.eye(7)[0]
+    lower[3, 0], upper[3, 0], lower[3, 1], upper[3, 1] = 1.0, np.inf, -np.inf, -1.0
+    matrix[5, 2, 4] = np.nan
+    return tuple(map(jnp.asarray, (q, place, matrix, lower, upper)))
 
+
+class TestContradictions:
     @pytest.mark.parametrize("name", SCHEMES)
     def test_in_their_lane_only(self, arm, lanes, spoiled, name):
         clean = solve_lanes(cases(arm, lanes), SCHEMES[name])

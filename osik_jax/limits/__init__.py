@@ -1,5 +1,6 @@
 """Limits: hard bounds on the velocity, feasible by construction."""
 
+from ._acceleration import AccelerationLimit as AccelerationLimit
 from ._box import Limit as Limit
 from ._box import limit_box as limit_box
 from ._box import limit_rows as limit_rows

@@ -14,7 +14,10 @@ from ..kinematics import Kinematics
 from ..robot import Robot
 from ._rows import LimitRows
 
-_ORDER = ("velocity", "position")
+Kind = Literal["acceleration", "velocity", "braking", "position"]
+_COMPUTED: tuple[Kind, ...] = ("acceleration", "braking")
+_ROUNDINGS = 4.0
+_ORDER: tuple[Kind, ...] = ("acceleration", "velocity", "braking", "position")
 
 
 class Limit(eqx.Module):
@@ -23,11 +26,16 @@ class Limit(eqx.Module):
     A box always exists; rows may contradict it or each other, and the answer is then INFEASIBLE.
 
     Attributes:
-        kind: ``"velocity"`` limits are applied before ``"position"`` limits, whatever order they are given in. Of two
-            that have nothing in common the one applied first holds.
+        kind: ``"acceleration"`` limits are applied before ``"velocity"``, ``"braking"`` and ``"position"`` limits, in
+            this order, whatever order they are given in. Of two that have nothing in common the one applied first
+            holds.
     """
 
-    kind: ClassVar[Literal["velocity", "position"]] = "velocity"
+    kind: ClassVar[Kind] = "velocity"
+
+    def parts(self) -> Sequence[Limit]:
+        """The limits that take its place in the box, for one that is of several kinds."""
+        return (self,)
 
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
@@ -45,7 +53,10 @@ class Limit(eqx.Module):
         return None
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The limit for the next tick, once this one's answer is ``velocity``; itself where it remembers nothing."""
+        """The limit for the next tick, once this one's answer is ``velocity``; itself where it remembers nothing.
+
+        What remembers has it as a leaf. ``rollout`` calls this at every tick; around ``solve`` it is for you to do.
+        """
         del velocity
         return self
 
@@ -55,7 +66,7 @@ def limit_box(
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
     """The box on v that all limits ask for over a step of dt [s]; lower <= upper always.
 
-    Velocity limits first; then each position limit is clipped into the box so far:
+    Acceleration and velocity limits first; then each position limit is clipped into the box so far:
     ``lower = clip((q_lower - q) / dt, v_lower, v_upper)``, ``upper = clip((q_upper - q) / dt, v_lower, v_upper)``.
     So a joint outside its range comes back as fast as its velocity limit lets it instead of making the problem
     infeasible. Without limits: -inf and inf.
@@ -77,10 +88,19 @@ def limit_box(
         raise ValueError(f"dt is {dt}; it has to be positive, in seconds")
     dtype = jnp.result_type(jnp.asarray(q), robot.q0)
     lower, upper = jnp.full(robot.nv, -jnp.inf, dtype), jnp.full(robot.nv, jnp.inf, dtype)
-    for limit in sorted(limits, key=lambda limit: _ORDER.index(limit.kind)):
+    parts = [part for limit in limits for part in limit.parts()]
+    for limit in sorted(parts, key=lambda part: _ORDER.index(part.kind)):
         low, high = limit.box(robot, q, dt)
         lower, upper = jnp.clip(low, lower, upper), jnp.clip(high, lower, upper)
+    if any(part.kind in _COMPUTED for part in parts):
+        lower = jnp.minimum(lower, _a_little_below(upper))
     return lower, upper
+
+
+def _a_little_below(upper: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """By a few roundings: XLA may compute a bound twice, in two roundings, and bounds that are one would then cross."""
+    share = _ROUNDINGS * jnp.finfo(upper.dtype).eps
+    return jnp.where(upper > 0.0, upper * (1.0 - share), upper * (1.0 + share))
 
 
 def limit_rows(

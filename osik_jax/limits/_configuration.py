@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete, dof_names, dof_values, scalar_layout
 from ..robot import Robot
-from ._box import Limit
+from ._box import Kind, Limit
 
 _ROUNDING = 8.0  # machine epsilons of the way to a bound that are kept clear of it, so that q + v dt stays within
 
@@ -34,7 +34,7 @@ class ConfigurationLimit(Limit):
         ValueError: a wrong shape, lower > upper, or a finite limit on a ball or free joint.
     """
 
-    kind: ClassVar[Literal["velocity", "position"]] = "position"
+    kind: ClassVar[Kind] = "position"
     lower: Float[Array, " nv"]
     upper: Float[Array, " nv"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete, dof_names, dof_values
 from ..robot import Robot
-from ._box import Limit
+from ._box import Kind, Limit
 
 
 class VelocityLimit(Limit):
@@ -28,7 +28,7 @@ class VelocityLimit(Limit):
         ValueError: a wrong shape, or a speed that is negative or not a number.
     """
 
-    kind: ClassVar[Literal["velocity", "position"]] = "velocity"
+    kind: ClassVar[Kind] = "velocity"
     velocity: Float[Array, " nv"]
 
     def __init__(self, robot: Robot, *, velocity: ArrayLike | Array | Mapping[str, float] | None = None):

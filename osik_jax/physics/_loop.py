@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._structure import is_number
-from ..control import Solution, Targets, Tasks, aim, check_targets, solve
+from ..control import Solution, Targets, Tasks, aim, check_targets, remembering, solve
 from ..kinematics import integrate
 from ..limits import Limit
 from ..robot import Robot
@@ -120,7 +120,7 @@ def simulate(
         simulation: the robot in its world; it is left where the run ended.
         tasks: by name, or a function from time [s] to tasks, as in ``rollout``.
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
-        limits: joint position and velocity limits.
+        limits: hard bounds on the velocity, as in ``rollout``.
         dt: control period [s], a whole number of the world's timesteps.
         steps: number of ticks.
         targets: targets of some tasks at each tick, by task name, as in ``rollout``.
@@ -141,13 +141,13 @@ def simulate(
     tick = partial(program, static=(tuple(leaves), treedef))
     held = jnp.asarray(simulation.sense())
     paths = jax.tree.map(np.asarray, targets)
-    warm_start = _cold_start(lambda state: tick(0.0, *state, None, _at(paths, 0))[1], (held, held))
+    memory = _cold_start(lambda state: tick(0.0, *state, (None, None), _at(paths, 0))[1], (held, held))
     frames, commands, solutions = [_frame(simulation)], [], []
     for k in range(steps):
         if before_tick is not None:
             before_tick(k * dt, simulation)
-        held, solution = tick(k * dt, held, simulation.sense(), warm_start, _at(paths, k))
-        warm_start = solution.warm_start
+        held, solution = tick(k * dt, held, simulation.sense(), memory, _at(paths, k))
+        memory = solution.velocity, solution.warm_start
         simulation.step(held, dt)
         frames.append(_frame(simulation))
         commands.append(held)
@@ -168,7 +168,7 @@ def _tick(
     t: Array,
     last: Array,
     sensed: Array,
-    warm_start: Any,
+    memory: tuple[Any, Any],
     target: Targets | None,
     *,
     static: tuple[tuple[Any, ...], Any],
@@ -176,13 +176,19 @@ def _tick(
     """The part of a tick that is pure: the command and the solution."""
     tasks: Any = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
     todo: Any = tasks(t) if callable(tasks) else aim(tasks, target)
-    solution = solve(robot, sensed, todo, scheme=scheme, limits=limits, dt=dt, warm_start=warm_start)
+    velocity, warm_start = memory
+    todo, kept = remembering((todo, limits), velocity, t > 0.0)
+    solution = solve(robot, sensed, todo, scheme=scheme, limits=kept, dt=dt, warm_start=warm_start)
     return command(robot, last, sensed, solution.velocity, dt), solution
 
 
 def _cold_start(tick: Callable[[Any], Solution], state: Any) -> Any:
-    """Zeros in the shape of a warm start, from a tick that is traced and not run: the first one compiles no program."""
-    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, state).warm_start)
+    """Zeros in the shape of the last velocity and of a warm start, from a tick that is traced and not run.
+
+    So the first one compiles no program.
+    """
+    one = jax.eval_shape(tick, state)
+    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), (one.velocity, one.warm_start))
 
 
 def _at(paths: Targets | None, tick: int) -> Targets | None:

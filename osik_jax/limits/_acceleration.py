@@ -1,0 +1,162 @@
+"""Greatest joint accelerations, and speeds from which a joint can still stop inside its range."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import concrete, dof_names, dof_values, scalar_layout
+from ..robot import Robot
+from ._box import Kind, Limit, limit_box
+from ._configuration import ConfigurationLimit
+
+_Box = tuple[Float[Array, " nv"], Float[Array, " nv"]]
+_ROUNDING = 32.0  # machine epsilons of the way to a bound that braking leaves over
+_MOST_TICKS = 1e6  # of braking
+
+
+class AccelerationLimit(Limit):
+    """``|v - v_last| <= acceleration dt``, and no speed from which a joint cannot stop inside its range.
+
+    With ``d`` the way left to a bound, the greatest speed towards it is the one from which braking by
+    ``acceleration dt`` a tick stops on the bound, in whole ticks:
+
+        v = d / (n dt) + (n - 1) / 2 acceleration dt,    n the least number with  n (n + 1) / 2 acceleration dt^2 >= d
+
+    (n dt times v, less the n (n - 1) / 2 acceleration dt^2 that braking takes off, is d). It is the discrete form of
+    ``v^2 <= 2 acceleration d`` (A. Del Prete, "Joint position and velocity bounds in discrete-time
+    acceleration/torque control of robot arms", RA-L 2018; F. Flacco, A. De Luca, O. Khatib, ICRA 2012), and exact where
+    positions move by ``v dt``: from a state that fulfils it every velocity in the box leads to one that does, so the
+    three limits never contradict each other in closed loop, whatever is chosen inside the box.
+
+    From other states (outside the range, too fast, stopped too late) the acceleration holds, then the velocity limit,
+    then the speed from which the joint can stop at the other end; and it comes back as fast as these let it.
+
+    It needs the velocity of the last tick: ``rollout`` hands it on; around ``solve`` use
+    ``limit = limit.after(solution.velocity)``.
+
+    Args:
+        robot: the robot; its ``position_lower`` and ``position_upper`` are the default ranges.
+        acceleration: greatest accelerations [rad/s^2 or m/s^2]: an array (nv,), or a mapping from joint names or globs
+            to values; joints that are not named are free. A free base takes part only when it is named (the value then
+            bounds the change of each of its six velocities) or in an array. Infinite: free.
+        velocity: of the last tick, (nv,) [rad/s or m/s], or a mapping in the same way; default 0: at rest.
+        lower: lower ends of the ranges, as in ``ConfigurationLimit``; use the same there. -inf: none.
+        upper: upper ends of the ranges, in the same way.
+
+    Raises:
+        KeyError: a mapping names a joint that does not exist.
+        ValueError: a wrong shape, an acceleration that is not positive, or a range as in ``ConfigurationLimit``.
+    """
+
+    kind: ClassVar[Kind] = "acceleration"
+    acceleration: Float[Array, " nv"]
+    velocity: Float[Array, " nv"]
+    lower: Float[Array, " nv"]
+    upper: Float[Array, " nv"]
+
+    def __init__(
+        self,
+        robot: Robot,
+        acceleration: ArrayLike | Array | Mapping[str, float],
+        *,
+        velocity: ArrayLike | Array | Mapping[str, float] | None = None,
+        lower: ArrayLike | Array | Mapping[str, float] | None = None,
+        upper: ArrayLike | Array | Mapping[str, float] | None = None,
+    ):
+        free = jnp.full(robot.nv, jnp.inf)
+        self.acceleration = dof_values(robot, acceleration, free, "acceleration")
+        self.velocity = dof_values(robot, velocity, jnp.zeros(robot.nv), "velocity")
+        ranges = ConfigurationLimit(robot, lower=lower, upper=upper)
+        self.lower, self.upper = ranges.lower, ranges.upper
+        seen = concrete(self.acceleration)
+        if seen is not None and not (seen > 0.0).all():
+            bad = np.flatnonzero(~(seen > 0.0))
+            names = [f"{dof_names(robot)[i]} ({seen[i]})" for i in bad]
+            raise ValueError(f"accelerations have to be positive: {', '.join(names)}")
+
+    def parts(self) -> Sequence[Limit]:
+        """The accelerations themselves, and the braking; a velocity limit comes in between."""
+        return _Reachable(self.acceleration, self.velocity), _Stopping(self.acceleration, self.lower, self.upper)
+
+    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
+        """Both parts together."""
+        return limit_box(robot, q, self.parts(), dt)
+
+    def after(self, velocity: Float[Array, " nv"]) -> Self:
+        """The limit for the next tick, once this one's answer is ``velocity``."""
+        return eqx.tree_at(lambda limit: limit.velocity, self, jnp.asarray(velocity, self.velocity.dtype))
+
+
+class _Reachable(Limit):
+    """What one tick can make of the last velocity."""
+
+    kind: ClassVar[Kind] = "acceleration"
+    acceleration: Float[Array, " nv"]
+    velocity: Float[Array, " nv"]
+
+    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
+        del robot, q
+        free = jnp.isinf(self.acceleration)
+        change = _rounded(jnp.where(free, 0.0, self.acceleration) * dt)
+        lower, upper = self.velocity - change, self.velocity + change
+        return jnp.where(free, -jnp.inf, lower), jnp.where(free, jnp.inf, upper)
+
+
+class _Stopping(Limit):
+    """Speeds from which joints can stop inside their ranges."""
+
+    kind: ClassVar[Kind] = "braking"
+    acceleration: Float[Array, " nv"]
+    lower: Float[Array, " nv"]
+    upper: Float[Array, " nv"]
+
+    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
+        """Outside a range: back inside in one tick, but not faster than what can stop at the other end."""
+        scalar, index = scalar_layout(robot)
+        position = jnp.asarray(q)[index]
+        above = stopping_speed(_way(jnp.where(scalar, self.upper, jnp.inf), position), self.acceleration, dt)
+        below = stopping_speed(_way(-jnp.where(scalar, self.lower, -jnp.inf), -position), self.acceleration, dt)
+        lower, upper = -below, above
+        outside = upper < 0.0  # above the range; below it, the lower bound is the one to give way
+        least, most = jnp.minimum(lower, upper), jnp.maximum(lower, upper)
+        return jnp.where(outside, lower, least), jnp.where(outside, most, upper)
+
+
+def _rounded(product: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """To one bit less, so that no compiler makes one operation of it and of the sum that it goes into."""
+    precision = jnp.finfo(product.dtype)
+    return jax.lax.reduce_precision(product, precision.nexp, precision.nmant - 1)
+
+
+def _way(bound: Float[Array, " nv"], position: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """To the bound, rounded down; an infinite bound stays so, with gradients 0."""
+    free = jnp.isinf(bound)
+    way = jnp.where(free, 0.0, bound) - position
+    return jnp.where(free, bound, way - _ROUNDING * jnp.finfo(way.dtype).eps * jnp.abs(way))
+
+
+def stopping_speed(
+    way: Float[Array, " nv"], acceleration: Float[Array, " nv"], dt: Float[Array, ""] | float
+) -> Float[Array, " nv"]:
+    """The greatest velocity from which braking stops within the way left, of which some is used in every tick.
+
+    See ``AccelerationLimit``. Piecewise linear in ``way`` [rad or m], continuous, with n ticks of braking in a piece;
+    ``way / dt`` for a way that is negative, or an acceleration that is infinite.
+    """
+    free, instant = jnp.isinf(way), jnp.isinf(acceleration)
+    way_left = jnp.where(free, 0.0, way)
+    change = jnp.where(instant, 1.0, acceleration) * dt
+    least = jnp.finfo(way_left.dtype).tiny
+    triangle = jax.lax.stop_gradient(jnp.maximum(way_left, 0.0) / jnp.maximum(change * dt, least))
+    ticks = jnp.ceil(0.5 * (jnp.sqrt(1.0 + 8.0 * triangle) - 1.0))
+    ticks = jnp.where(instant, 1.0, jnp.clip(ticks, 1.0, _MOST_TICKS))
+    speed = way_left / (ticks * dt) + 0.5 * (ticks - 1.0) * change
+    return jnp.where(free, way, speed)
