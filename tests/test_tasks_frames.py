@@ -375,7 +375,7 @@ class TestClosedLoop:
 class TestBatchesAndCompilation:
     def test_every_number_counts_and_compiles_nothing(self, robot, tasks, q):
         moving = {k: task.replace(target_velocity=0.1) for k, task in tasks.items()}
-        assert_every_number_counts(robot, moving, q, but=("mask", "position", "orientation"))
+        assert_every_number_counts(robot, moving, q, idle=("['mask']", "['position']", "['orientation']"))
 
     def test_vmap_equals_a_loop(self, robot, tasks, configurations, found):
         for i in range(3):

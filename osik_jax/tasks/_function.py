@@ -140,7 +140,10 @@ class FunctionTask(Task):
         """Those of another function of the same structure, in the precision of the ones they replace."""
         numbers, structure = taken_apart(function)
         if structure != self.structure:
-            raise TypeError("the function's structure differs, not its numbers alone; make another FunctionTask of it")
+            raise TypeError(
+                "the function's structure differs, not its numbers alone (an integer is structure: write 0.0 for 0); "
+                "make another FunctionTask of it"
+            )
         new = jax.tree.map(lambda old, a: jnp.asarray(a, old.dtype), self.numbers, numbers)
         for old, a in zip(jax.tree.leaves(self.numbers), jax.tree.leaves(new), strict=True):
             if a.shape != old.shape:
