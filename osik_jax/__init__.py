@@ -4,6 +4,7 @@ from . import _runtime as _runtime  # first: it sets up XLA's CPU client
 from ._batches import batch_axes as batch_axes
 from ._batches import batched as batched
 from ._batches import stack as stack
+from .collision import CollisionShape as CollisionShape
 from .control import Solution as Solution
 from .control import Trajectory as Trajectory
 from .control import rollout as rollout
@@ -19,6 +20,7 @@ from .kinematics import frame_jacobians as frame_jacobians
 from .kinematics import integrate as integrate
 from .kinematics import mass_matrix as mass_matrix
 from .limits import AccelerationLimit as AccelerationLimit
+from .limits import CollisionAvoidanceLimit as CollisionAvoidanceLimit
 from .limits import ConfigurationLimit as ConfigurationLimit
 from .limits import Limit as Limit
 from .limits import LimitRows as LimitRows

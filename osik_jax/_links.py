@@ -23,12 +23,14 @@ def scaled_leaves(robot: Robot, length: Factors, mass: Factors) -> dict[str, Arr
     tree, dtype = robot.tree, robot.body_position.dtype
     longer, heavier = _factors(tree, length, "length", dtype), _factors(tree, mass, "mass", dtype)
     parent, carrier = np.asarray(tree.body_parents, int), np.asarray(tree.frame_bodies, int)
-    owner = np.asarray(tree.joint_bodies, int)
+    owner, wearer = np.asarray(tree.joint_bodies, int), np.asarray(tree.geom_bodies, int)
     return {
         "body_position": robot.body_position * longer[parent, None],
         "body_com": robot.body_com * longer[:, None],
         "joint_position": robot.joint_position * longer[owner, None],
         "frame_position": robot.frame_position * longer[carrier, None],
+        "geom_position": robot.geom_position * longer[wearer, None],
+        "geom_size": robot.geom_size * longer[wearer, None],
         "body_mass": robot.body_mass * heavier,
         "body_inertia": robot.body_inertia * (heavier * longer**2)[:, None, None],
     }

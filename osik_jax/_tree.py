@@ -59,6 +59,9 @@ class KinematicTree:
         joint_bodies: the body that each joint moves.
         frame_names: every name that can be asked for: bodies, URDF links, sites, geoms.
         frame_bodies: the body that each frame is fixed to.
+        geom_names: name of each of the MuJoCo model's geoms, in its order.
+        geom_types: MuJoCo's geom types.
+        geom_bodies: the body that each geom is fixed to.
         followers: ``(follower, leader, multiplier)`` by joint index, hinges and slides only.
         locked: indices of locked joints.
     """
@@ -70,6 +73,9 @@ class KinematicTree:
     joint_bodies: tuple[int, ...]
     frame_names: tuple[str, ...]
     frame_bodies: tuple[int, ...]
+    geom_names: tuple[str, ...] = ()
+    geom_types: tuple[int, ...] = ()
+    geom_bodies: tuple[int, ...] = ()
     followers: tuple[tuple[int, int, float], ...] = ()
     locked: tuple[int, ...] = ()
 

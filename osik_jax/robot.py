@@ -46,6 +46,9 @@ class Robot(eqx.Module):
         joint_reference: MuJoCo's qpos0, the joint values at which bodies sit as described. (full nq,)
         frame_position: of each named frame in its body [m]. (nframe, 3)
         frame_rotation: of each named frame in its body. (nframe, 3, 3)
+        geom_position: of each of the model's geoms in its body [m]. (ngeom, 3)
+        geom_rotation: of each geom in its body. (ngeom, 3, 3)
+        geom_size: MuJoCo's sizes of each geom [m]; of a mesh, factors of its vertices. (ngeom, 3)
         qpos_offset: values of locked joints and offsets of followers, 0 elsewhere. (full nq,)
         position_lower: lower joint limits [rad or m], -inf where free. (nv,)
         position_upper: upper joint limits [rad or m], inf where free. (nv,)
@@ -65,6 +68,9 @@ class Robot(eqx.Module):
     joint_reference: Float[Array, " nqfull"]
     frame_position: Float[Array, "nframe 3"]
     frame_rotation: Float[Array, "nframe 3 3"]
+    geom_position: Float[Array, "ngeom 3"]
+    geom_rotation: Float[Array, "ngeom 3 3"]
+    geom_size: Float[Array, "ngeom 3"]
     qpos_offset: Float[Array, " nqfull"]
     position_lower: Float[Array, " nv"]
     position_upper: Float[Array, " nv"]
@@ -280,10 +286,10 @@ class Robot(eqx.Module):
     def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
         """The same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
 
-        A link is made longer from its own origin: the joints of its children, its centre of mass and its frames move
-        away by the factor. Masses are scaled by their own factors only, inertias by mass times length squared; drives
-        stay. Factors may be traced: ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of
-        robots.
+        A link is made longer from its own origin: the joints of its children, its centre of mass, its frames and its
+        geoms move away by the factor, and its geoms grow by it. Masses are scaled by their own factors only, inertias
+        by mass times length squared. Factors may be traced, so
+        ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of robots.
 
         Args:
             length: a factor for all links, or a mapping from body names or globs to factors; the others keep theirs.

@@ -73,6 +73,9 @@ def from_mjmodel(
         joint_bodies=tuple(placement[b].body for b in model.jnt_bodyid),
         frame_names=tuple(frames),
         frame_bodies=tuple(frame.body for frame in frames.values()),
+        geom_names=element_names(model, mujoco.mjtObj.mjOBJ_GEOM, "geom", model.ngeom),
+        geom_types=tuple(int(t) for t in model.geom_type),
+        geom_bodies=tuple(placement[b].body for b in model.geom_bodyid),
         followers=tuple(follower[:3] for follower in followers),
         locked=tuple(sorted(locked)),
     )
@@ -88,6 +91,7 @@ def from_mjmodel(
         joint_reference=model.qpos0,
         frame_position=[frame.position for frame in frames.values()],
         frame_rotation=[frame.rotation for frame in frames.values()],
+        **_geom_arrays(model, placement),
         qpos_offset=_qpos_offset(model, followers, locked),
         position_lower=lower,
         position_upper=upper,
@@ -98,7 +102,7 @@ def from_mjmodel(
 
 
 def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count: int) -> tuple[str, ...]:
-    """Names of a model's bodies or joints; one without a name is called by its kind and number."""
+    """Names of a model's bodies, joints or geoms; one without a name is called by its kind and number."""
     given = [mujoco.mj_id2name(model, kind, k) for k in range(count)]
     out = []
     for k, name in enumerate(given):
@@ -310,6 +314,18 @@ def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Place
         body_mass=mass,
         body_com=centers,
         body_inertia=inertia,
+    )
+
+
+def _geom_arrays(model: mujoco.MjModel, placement: list[Placement]) -> dict[str, ArrayLike]:
+    """Poses of the geoms in the moving bodies, and their sizes."""
+    described = zip(model.geom_bodyid, model.geom_pos, model.geom_quat, strict=True)
+    poses = [_placed(placement[body], position, quaternion) for body, position, quaternion in described]
+    meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    return dict(
+        geom_position=np.array([pose.position for pose in poses]).reshape(-1, 3),
+        geom_rotation=np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
+        geom_size=np.where(meshes[:, None], 1.0, model.geom_size),
     )
 
 

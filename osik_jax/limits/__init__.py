@@ -4,6 +4,7 @@ from ._acceleration import AccelerationLimit as AccelerationLimit
 from ._box import Limit as Limit
 from ._box import limit_box as limit_box
 from ._box import limit_rows as limit_rows
+from ._collision import CollisionAvoidanceLimit as CollisionAvoidanceLimit
 from ._configuration import ConfigurationLimit as ConfigurationLimit
 from ._linear import LinearLimit as LinearLimit
 from ._rows import LimitRows as LimitRows

@@ -1,0 +1,3 @@
+"""Distances between the robot's own geoms, and between them and the world."""
+
+from ._shape import CollisionShape as CollisionShape

@@ -1,0 +1,194 @@
+"""What shapes are made of: a unit core of each kind, scaled by a shape's sizes; convex hulls of points and meshes."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import scipy.spatial
+from jaxtyping import Array, Float
+
+from ..kinematics._rigid import rotate
+from ._distance import Core
+
+CYLINDER_SIDES = 16
+"""Of the prism around a cylinder, whose corners stand out by 2 % of the radius."""
+
+MOST_EDGES = 24
+"""Edge directions of a hull with more of them are left out of the search for separating axes."""
+
+_MERGED = 1e-6
+"""Normals and edge directions that differ by less are one."""
+
+
+class Kind(enum.Enum):
+    """What a shape's distances are computed from."""
+
+    SEGMENT = enum.auto()
+    BOX = enum.auto()
+    CYLINDER = enum.auto()
+    ELLIPSOID = enum.auto()
+    HULL = enum.auto()
+    PLANE = enum.auto()
+
+
+KINDS = {
+    int(mujoco.mjtGeom.mjGEOM_PLANE): Kind.PLANE,
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): Kind.SEGMENT,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): Kind.SEGMENT,
+    int(mujoco.mjtGeom.mjGEOM_BOX): Kind.BOX,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): Kind.CYLINDER,
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): Kind.ELLIPSOID,
+    int(mujoco.mjtGeom.mjGEOM_MESH): Kind.HULL,
+}
+"""Of MuJoCo's geom types; those that are missing have no distance here."""
+
+
+class UnitCore(NamedTuple):
+    """A core before it is scaled, turned and moved.
+
+    Attributes:
+        vertices: (v, 3)
+        normals: of its faces, each or its opposite. (f, 3)
+        edges: directions of its edges, each or its opposite. (e, 3)
+    """
+
+    vertices: Float[np.ndarray, "v 3"] | Array
+    normals: Float[np.ndarray, "f 3"] | Array
+    edges: Float[np.ndarray, "e 3"] | Array
+
+
+@cache
+def unit_core(kind: Kind) -> UnitCore:
+    """The core that shapes of a kind share; a hull has its own."""
+    if kind is Kind.SEGMENT:
+        ends = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+        return UnitCore(ends, np.zeros((0, 3)), ends[1:])
+    if kind is Kind.BOX:
+        corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(-1, 3)
+        return UnitCore(corners, np.eye(3), np.eye(3))
+    return convex_hull(_prism() if kind is Kind.CYLINDER else _ball())
+
+
+def convex_hull(points: np.ndarray) -> UnitCore:
+    """The hull of points that do not lie in a plane.
+
+    Raises:
+        ValueError: they do, or are not finite.
+    """
+    try:
+        hull = scipy.spatial.ConvexHull(np.asarray(points, float))
+    except (scipy.spatial.QhullError, ValueError) as error:
+        raise ValueError(f"these {len(points)} points have no convex hull: {str(error).splitlines()[0]}") from None
+    faces, normals = hull.simplices, hull.equations[:, :3]
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    normals_of_edges = np.tile(np.arange(len(faces)), 3)
+    edges = _bent_edges(hull.points, np.sort(ends, axis=1), normals[normals_of_edges])
+    edges = _different(edges)
+    return UnitCore(hull.points[hull.vertices], _different(normals), edges if len(edges) <= MOST_EDGES else edges[:0])
+
+
+def geom_hull(model: mujoco.MjModel, geom: int) -> UnitCore:
+    """The hull of a mesh geom: MuJoCo's own, so no finer than its ``maxhullvert``, where it has one."""
+    mesh = model.geom_dataid[geom]
+    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    points = model.mesh_vert[start : start + count]
+    graph = model.mesh_graphadr[mesh]
+    if graph >= 0:
+        number = model.mesh_graph[graph]
+        points = points[model.mesh_graph[graph + 2 + number : graph + 2 + 2 * number]]
+    return convex_hull(points)
+
+
+def padded(cores: Sequence[UnitCore]) -> UnitCore:
+    """Cores of one size, with a leading axis: short ones repeat their first rows; all have edges, or none."""
+    complete = all(len(core.edges) for core in cores)
+    columns = zip(*(core if complete else core._replace(edges=np.zeros((0, 3))) for core in cores), strict=True)
+    return UnitCore(*(_of_one_length(column) for column in columns))
+
+
+def scaling(kinds: Sequence[Kind]) -> tuple[np.ndarray, np.ndarray]:
+    """How MuJoCo's sizes scale unit cores: of each the entry for x, y and z (k, 3), and whether entry 0 is a radius."""
+    entries = {Kind.SEGMENT: (1, 1, 1), Kind.CYLINDER: (0, 0, 1)}
+    return np.array([entries.get(kind, (0, 1, 2)) for kind in kinds]), np.array([k is Kind.SEGMENT for k in kinds])
+
+
+def world_cores(
+    kinds: Sequence[Kind],
+    unit: UnitCore,
+    size: Float[Array, "k 3"],
+    position: Float[Array, "k 3"],
+    rotation: Float[Array, "k 3 3"],
+) -> Core:
+    """Cores of shapes of MuJoCo's sizes, placed in the world; all with a leading axis."""
+    entries, rounded = scaling(kinds)
+    vertices, normals, edges = (jnp.asarray(rows, size.dtype) for rows in unit)
+    x, y, z = (size[np.arange(len(kinds)), entries[:, i], None] for i in range(3))
+    factors, areas = jnp.stack([x, y, z], -1), jnp.stack([y * z, x * z, x * y], -1)
+    turn = rotation[:, None]
+    return Core(
+        position[:, None] + rotate(turn, vertices * factors),
+        rotate(turn, unit_rows(normals * areas)),
+        rotate(turn, edges * factors),
+        jnp.where(rounded, size[:, 0], 0.0),
+    )
+
+
+def unit_rows(rows: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """Rows of length 1; those of length 0 stay so, with derivatives 0."""
+    square = jnp.sum(rows * rows, -1, keepdims=True)
+    nought = square == 0.0
+    return jnp.where(nought, 0.0, rows / jnp.sqrt(jnp.where(nought, 1.0, square)))
+
+
+def _prism() -> np.ndarray:
+    """A prism around the cylinder of radius 1 between z = -1 and 1."""
+    angle = 2.0 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
+    ring = np.stack([np.cos(angle), np.sin(angle)], -1) / np.cos(np.pi / CYLINDER_SIDES)
+    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-1.0, 1.0)])
+
+
+def _ball() -> np.ndarray:
+    """A polyhedron of 42 corners around the unit ball: an icosahedron with its edges halved."""
+    golden = 0.5 * (1.0 + np.sqrt(5.0))
+    corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+    points = np.array([np.roll(corner, k) for corner in corners for k in range(3)])
+    points /= np.linalg.norm(points[0])
+    first, second = np.triu_indices(len(points), 1)
+    near = np.linalg.norm(points[first] - points[second], axis=1) < 1.2
+    halves = (points[first] + points[second])[near]
+    points = np.concatenate([points, halves / np.linalg.norm(halves, axis=1, keepdims=True)])
+    return points / -scipy.spatial.ConvexHull(points).equations[:, 3].max()
+
+
+def _bent_edges(points: np.ndarray, ends: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Directions of the edges whose two triangles are not in one plane; each edge is given twice."""
+    order = np.lexsort(ends.T)
+    ends, normals = ends[order].reshape(-1, 2, 2)[:, 0], normals[order].reshape(-1, 2, 3)
+    bent = np.linalg.norm(normals[:, 0] - normals[:, 1], axis=1) > _MERGED
+    along = np.diff(points[ends[bent]], axis=1)[:, 0]
+    return along / np.linalg.norm(along, axis=1, keepdims=True)
+
+
+def _different(directions: np.ndarray) -> np.ndarray:
+    """Unit vectors without those that are, or are opposite to, one before them."""
+    kept: list[np.ndarray] = []
+    for direction in directions:
+        if all(min(np.linalg.norm(direction - k), np.linalg.norm(direction + k)) > _MERGED for k in kept):
+            kept.append(direction)
+    return np.array(kept).reshape(-1, 3)
+
+
+def _of_one_length(parts: Sequence[Float[np.ndarray, "n 3"] | Array]) -> Float[np.ndarray, "k n 3"] | Array:
+    longest = max(map(len, parts))
+    array = jnp if any(isinstance(part, jax.Array) for part in parts) else np
+    rows = [np.minimum(np.arange(longest), max(len(part) - 1, 0)) for part in parts]
+    return array.stack(
+        [part[index] if len(part) else array.zeros((longest, 3)) for part, index in zip(parts, rows, strict=True)]
+    )

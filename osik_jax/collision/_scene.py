@@ -1,0 +1,169 @@
+"""All pairs of shapes at once: grouped by what they are, each group one vectorised computation."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._tree import KinematicTree
+from ..kinematics import Kinematics
+from ..kinematics._forward import independent_columns
+from ..kinematics._rigid import compose, cross, rotate
+from ..robot import Robot
+from ._distance import Core, Nearest, between_polytopes, between_segments, from_plane
+from ._geometry import Kind, UnitCore, padded, unit_core, world_cores
+
+_ROUNDS = 4
+"""Searches for the depth of an overlap of shapes whose edges are not all known."""
+
+
+class Group(NamedTuple):
+    """Pairs that one computation does; ``first`` and ``second`` number the scene's shapes."""
+
+    first: tuple[int, ...]
+    second: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """The static half: which shapes there are and which of them are kept apart.
+
+    Attributes:
+        names: of each shape that takes part.
+        kinds: of each.
+        bodies: the moving body that each is fixed to.
+        geoms: of those that are the robot's own, which come first, the number of the geom.
+        frames: of the others, the frame that each is fixed to.
+        hulls: of each, its place among the hulls; 0 for those that are none.
+        groups: the pairs.
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    bodies: tuple[int, ...]
+    geoms: tuple[int, ...]
+    frames: tuple[int, ...]
+    hulls: tuple[int, ...]
+    groups: tuple[Group, ...]
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Computed once: every call of a jitted function asks for it."""
+        return hash(tuple(getattr(self, field.name) for field in dataclasses.fields(self)))
+
+    @cached_property
+    def pairs(self) -> np.ndarray:
+        """Shapes of each pair, in the order of the distances. (pairs, 2), int."""
+        return np.concatenate([np.array([group.first, group.second]).T for group in self.groups])
+
+    @cached_property
+    def pair_bodies(self) -> np.ndarray:
+        """Moving bodies of each pair. (pairs, 2), int."""
+        return np.asarray(self.bodies, int)[self.pairs]
+
+    @cached_property
+    def pair_names(self) -> tuple[tuple[str, str], ...]:
+        """Names of each pair's shapes."""
+        return tuple((self.names[i], self.names[j]) for i, j in self.pairs)
+
+
+_RANKS = {Kind.PLANE: 0, Kind.SEGMENT: 1, Kind.BOX: 2, Kind.CYLINDER: 2, Kind.ELLIPSOID: 3, Kind.HULL: 3}
+"""Kinds of one rank share a computation, padded to the largest of them; of a pair the lower rank comes first."""
+
+
+def grouped(kinds: Sequence[Kind], pairs: Sequence[tuple[int, int]]) -> tuple[Group, ...]:
+    """Pairs by what computes them: few groups, for each is compiled by itself."""
+    found: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for pair in pairs:
+        i, j = sorted(pair, key=lambda k: (_RANKS[kinds[k]], k))
+        low, high = _RANKS[kinds[i]], _RANKS[kinds[j]]
+        computation = (low, 0) if low == 0 else (0, high) if high == 3 else (low, high)
+        found.setdefault(computation, []).append((i, j))
+    return tuple(Group(*map(tuple, zip(*found[key], strict=True))) for key in sorted(found))
+
+
+class Placed(eqx.Module):
+    """Shapes in the world.
+
+    Attributes:
+        position: [m]. (k, 3)
+        rotation: from each shape's axes to the world's. (k, 3, 3)
+        size: MuJoCo's [m]. (k, 3)
+    """
+
+    position: Float[Array, "k 3"]
+    rotation: Float[Array, "k 3 3"]
+    size: Float[Array, "k 3"]
+
+
+def place(scene: Scene, robot: Robot, kinematics: Kinematics, added: Placed) -> Placed:
+    """The scene's shapes in the world; ``added`` are those that are not the robot's, each in its frame."""
+    own, frames = np.asarray(scene.geoms, int), np.asarray(scene.frames, int)
+    robots = Placed(robot.geom_position[own], robot.geom_rotation[own], robot.geom_size[own])
+    turn = robot.frame_rotation[frames]
+    others = Placed(
+        robot.frame_position[frames] + rotate(turn, added.position), compose(turn, added.rotation), added.size
+    )
+    local = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), robots, others)
+    bodies = np.asarray(scene.bodies, int)
+    turn = kinematics.body_rotation[bodies]
+    return Placed(
+        kinematics.body_position[bodies] + rotate(turn, local.position), compose(turn, local.rotation), local.size
+    )
+
+
+def nearest(scene: Scene, placed: Placed, hulls: UnitCore | None) -> Nearest:
+    """Distances, points and normals of all pairs, with a leading axis; the first shape of a pair is ``a``."""
+    parts = [_of_group(scene, group, placed, hulls) for group in scene.groups]
+    return jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
+
+
+def _of_group(scene: Scene, group: Group, placed: Placed, hulls: UnitCore | None) -> Nearest:
+    second = _cores(scene, group.second, placed, hulls)
+    if scene.kinds[group.first[0]] is Kind.PLANE:
+        planes = np.asarray(group.first, int)
+        return jax.vmap(from_plane)(placed.position[planes], placed.rotation[planes, :, 2], second)
+    first = _cores(scene, group.first, placed, hulls)
+    if scene.kinds[group.second[0]] is Kind.SEGMENT:
+        return jax.vmap(between_segments)(first, second)
+    complete = first.edges.shape[1] and second.edges.shape[1]
+    return jax.vmap(lambda a, b: between_polytopes(a, b, rounds=1 if complete else _ROUNDS))(first, second)
+
+
+def _cores(scene: Scene, ids: tuple[int, ...], placed: Placed, hulls: UnitCore | None) -> Core:
+    """The cores of some shapes, of one size, with a leading axis."""
+    index, kinds = np.asarray(ids, int), [scene.kinds[k] for k in ids]
+    units = [unit_core(kind) for kind in dict.fromkeys(kinds) if kind is not Kind.HULL]
+    start = {kind: k for k, kind in enumerate(kind for kind in dict.fromkeys(kinds) if kind is not Kind.HULL)}
+    if hulls is not None and Kind.HULL in kinds:
+        units += [UnitCore(*(rows[k] for rows in hulls)) for k in range(len(hulls.vertices))]
+    table = padded(units)
+    rows = [start.get(scene.kinds[k], len(start) + scene.hulls[k]) for k in ids]
+    unit = UnitCore(*(column[np.array(rows)] for column in table))
+    return world_cores(kinds, unit, placed.size[index], placed.position[index], placed.rotation[index])
+
+
+def separation_jacobian(
+    tree: KinematicTree, kinematics: Kinematics, near: Nearest, bodies: tuple[Int[Array, " k"], Int[Array, " k"]]
+) -> Float[Array, "k nv"]:
+    """``d distance / dt = J v`` of pairs whose shapes are fixed to these bodies: ``normal' (J_b - J_a)``."""
+    moves = jnp.asarray(tree.moves)
+
+    def along(points: Float[Array, "k 3"], body: Int[Array, " k"]) -> Float[Array, "k nvfull"]:
+        arm = points[:, None] - kinematics.dof_anchor
+        velocity = kinematics.dof_linear + cross(jnp.broadcast_to(kinematics.dof_angular, arm.shape), arm)
+        return jnp.where(moves[body], jnp.sum(velocity * near.normal[:, None], -1), 0.0)
+
+    rate = along(near.point_b, bodies[1]) - along(near.point_a, bodies[0])
+    return independent_columns(tree, rate)

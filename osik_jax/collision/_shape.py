@@ -1,0 +1,187 @@
+"""Shapes that a model does not have: obstacles in the world, and what links are taken for."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import concrete
+from ._geometry import Kind, UnitCore, convex_hull
+
+_ROTATION_TOLERANCE = 1e-4
+
+
+class CollisionShape(eqx.Module):
+    """A convex shape fixed to the world, or to a frame of the robot. Make one by ``sphere``, ``capsule`` and so on.
+
+    Attributes:
+        kind: what it is (static).
+        frame: name of the robot's frame that it is fixed to; None: the world (static).
+        position: of its centre in the frame [m]; of a half-space, any point of its surface. (3,)
+        rotation: from its axes to the frame's. (3, 3)
+        size: [m], as of MuJoCo's geoms; of a hull, factors of its points. (3,)
+        hull: of a hull, its vertices [m], face normals and edges.
+    """
+
+    kind: Kind = eqx.field(static=True)
+    frame: str | None = eqx.field(static=True)
+    position: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+    size: Float[Array, "3"]
+    hull: UnitCore | None = None
+
+    @classmethod
+    def sphere(
+        cls, radius: ArrayLike | Array, position: ArrayLike | Array = (0.0, 0.0, 0.0), *, frame: str | None = None
+    ) -> Self:
+        """A ball.
+
+        Args:
+            radius: [m].
+            position: of its centre, in the frame [m]. (3,)
+            frame: of the robot; None: the world.
+
+        Raises:
+            ValueError: a size that is not positive, or a wrong shape.
+        """
+        return cls(Kind.SEGMENT, frame, _vector(position, "position"), jnp.eye(3), _sizes(radius, 0.0, 0.0))
+
+    @classmethod
+    def capsule(
+        cls, radius: ArrayLike | Array, start: ArrayLike | Array, end: ArrayLike | Array, *, frame: str | None = None
+    ) -> Self:
+        """All points within ``radius`` [m] of the segment between two points of the frame [m].
+
+        Raises:
+            ValueError: as in ``sphere``; start and end are one point.
+        """
+        start, end = _vector(start, "start"), _vector(end, "end")
+        length = jnp.linalg.norm(end - start)
+        _check_positive(length, "the length of a capsule")
+        rotation = _turned_to((end - start) / length)
+        return cls(Kind.SEGMENT, frame, 0.5 * (start + end), rotation, _sizes(radius, 0.5 * length, 0.0))
+
+    @classmethod
+    def box(
+        cls,
+        half_sizes: ArrayLike | Array,
+        position: ArrayLike | Array = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | Array | None = None,
+        *,
+        frame: str | None = None,
+    ) -> Self:
+        """A box.
+
+        Args:
+            half_sizes: half its edges [m]. (3,)
+            position: of its centre, in the frame [m]. (3,)
+            rotation: from its axes to the frame's. (3, 3)
+            frame: of the robot; None: the world.
+
+        Raises:
+            ValueError: as in ``sphere``; ``rotation`` is no rotation.
+        """
+        sizes = _sizes(*_vector(half_sizes, "half_sizes"))
+        return cls(Kind.BOX, frame, _vector(position, "position"), _rotation(rotation), sizes)
+
+    @classmethod
+    def cylinder(
+        cls, radius: ArrayLike | Array, start: ArrayLike | Array, end: ArrayLike | Array, *, frame: str | None = None
+    ) -> Self:
+        """A cylinder of ``radius`` [m] between two points of the frame [m]; taken as the prism of 16 sides around it.
+
+        Raises:
+            ValueError: as in ``capsule``.
+        """
+        start, end = _vector(start, "start"), _vector(end, "end")
+        length = jnp.linalg.norm(end - start)
+        _check_positive(length, "the length of a cylinder")
+        rotation = _turned_to((end - start) / length)
+        return cls(Kind.CYLINDER, frame, 0.5 * (start + end), rotation, _sizes(radius, 0.5 * length, 0.0))
+
+    @classmethod
+    def half_space(cls, point: ArrayLike | Array, normal: ArrayLike | Array, *, frame: str | None = None) -> Self:
+        """All that is behind a plane.
+
+        Args:
+            point: of the plane, in the frame [m]. (3,)
+            normal: of the plane, towards the free side. (3,)
+            frame: of the robot; None: the world.
+
+        Raises:
+            ValueError: a wrong shape, or a normal of length 0.
+        """
+        normal = _vector(normal, "normal")
+        length = jnp.linalg.norm(normal)
+        _check_positive(length, "the length of a normal")
+        return cls(Kind.PLANE, frame, _vector(point, "point"), _turned_to(normal / length), jnp.zeros(3))
+
+    @classmethod
+    def convex(
+        cls,
+        points: np.ndarray,
+        position: ArrayLike | Array = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | Array | None = None,
+        *,
+        frame: str | None = None,
+    ) -> Self:
+        """The convex hull of points, such as a mesh's vertices.
+
+        Args:
+            points: [m]. (k, 3)
+            position: of their origin, in the frame [m]. (3,)
+            rotation: from their axes to the frame's. (3, 3)
+            frame: of the robot; None: the world.
+
+        Raises:
+            ValueError: as in ``box``; the points lie in a plane.
+        """
+        hull = convex_hull(np.asarray(points, float))
+        return cls(Kind.HULL, frame, _vector(position, "position"), _rotation(rotation), jnp.ones(3), hull)
+
+
+def _vector(value: Any, what: str) -> Float[Array, "3"]:
+    out = jnp.asarray(value, float)
+    if out.shape != (3,):
+        raise ValueError(f"{what} has shape {out.shape}, expected (3,)")
+    return out
+
+
+def _sizes(*sizes: Any) -> Float[Array, "3"]:
+    for size in sizes:
+        if not isinstance(size, float) or size != 0.0:
+            _check_positive(size, "a size")
+    return jnp.stack([jnp.asarray(size, float) for size in sizes])
+
+
+def _check_positive(value: Any, what: str) -> None:
+    seen = concrete(value)
+    if seen is not None and not (seen > 0.0).all():
+        raise ValueError(f"{what} is {seen}; it has to be positive [m]")
+
+
+def _rotation(value: Any) -> Float[Array, "3 3"]:
+    if value is None:
+        return jnp.eye(3)
+    out = jnp.asarray(value, float)
+    if out.shape != (3, 3):
+        raise ValueError(f"rotation has shape {out.shape}, expected (3, 3)")
+    seen = concrete(out)
+    if seen is not None:
+        off = np.abs(seen @ seen.T - np.eye(3)).max()
+        if not (off < _ROTATION_TOLERANCE and np.linalg.det(seen) > 0.0):
+            raise ValueError("rotation is no rotation matrix: its columns are not right-handed unit vectors")
+    return out
+
+
+def _turned_to(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """A rotation that takes z to a unit vector."""
+    steepest = jnp.eye(3, dtype=axis.dtype)[jnp.argmin(jnp.abs(axis))]
+    side = jnp.cross(steepest, axis)
+    side = side / jnp.linalg.norm(side)
+    return jnp.stack([side, jnp.cross(axis, side), axis], -1)

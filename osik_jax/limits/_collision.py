@@ -1,0 +1,290 @@
+"""Collision avoidance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, Literal, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import concrete
+from .._tree import unknown_name
+from ..collision._distance import Nearest
+from ..collision._geometry import Kind, UnitCore, geom_hull, padded
+from ..collision._pairs import Member, Patterns, candidate_pairs, members
+from ..collision._scene import Placed, Scene, grouped, nearest, place, separation_jacobian
+from ..collision._shape import CollisionShape
+from ..kinematics import Kinematics
+from ..robot import Robot
+from ..tasks._leaves import as_scalar, as_vector, home_kinematics
+from ._box import Limit
+from ._rows import LimitRows
+
+
+class CollisionAvoidanceLimit(Limit):
+    """Keeps the robot's geoms a distance from each other and from the world.
+
+    Of the ``max_pairs`` closest pairs, each with the signed distance d between its shapes, the unit normal n from one
+    to the other and the Jacobians of the nearest points a and b:
+
+        n' (J_b - J_a) v >= -min(gain, 1 / dt) (d - minimum_distance)           where d < detection_distance
+
+    A pair nearer than ``minimum_distance`` is asked to part at no more than ``recovery_speed``. The rows are those of
+    a tick's start: over a step, turning shapes come nearer by about ``(omega dt)**2 r / 2`` more than the rows tell,
+    omega being their angular velocity relative to each other and r the distance of the nearest point from its axis.
+    That is what ``minimum_distance`` is for. Pairs beyond the ``max_pairs`` closest are free for the tick.
+
+    Geoms: planes, spheres, capsules, boxes, cylinders (as prisms of 16 sides around them), ellipsoids (as polyhedra of
+    42 corners around them, up to 7 % larger) and meshes (as their convex hulls). Height fields and SDFs have no
+    distance here. Pairs are those that MuJoCo would let collide: not of one body, nor of bodies with one joint between
+    them, and by the masks ``contype`` and ``conaffinity`` and the model's ``<exclude>``; locked joints are none.
+
+    The distance is exact and once differentiable, but for faces and edges that come to lie flat on each other, where
+    the nearest points jump. Where a mesh or an ellipsoid overlaps another shape its depth is overestimated where edges
+    cross.
+
+    Args:
+        robot: the robot; its geoms are what is kept apart.
+        pairs: which to keep apart: pairs of names or globs of geoms, shapes, links or bodies (``"world"``), such as
+            ``[("*hand*", "torso")]``. Masks then do not count. None: all that may collide.
+        exclude: names or globs of what is left out, or pairs of them.
+        shapes: obstacles, and shapes of links that have no geoms, by name. They meet all that has masks.
+        minimum_distance: [m]; may be negative.
+        detection_distance: beyond it a pair is free [m].
+        gain: [1/s], of the approach to ``minimum_distance``; more than 1 / dt counts as 1 / dt.
+        recovery_speed: at which pairs that are too near have to part, if they are near enough to need it [m/s]. 0: they
+            have to come no nearer.
+        q0_distance: pairs that are nearer than this at ``q0`` are left out [m]: the soles on the floor, links whose
+            geoms overlap by construction. None: ``minimum_distance``. ``-inf``: none is.
+        max_pairs: how many rows there are (static).
+
+    Raises:
+        KeyError: a name matches nothing.
+        ValueError: no pair is left, or a number or shape does not fit.
+    """
+
+    kind: ClassVar[Literal["velocity", "position"]] = "velocity"
+    minimum_distance: Float[Array, ""]
+    detection_distance: Float[Array, ""]
+    gain: Float[Array, ""]
+    recovery_speed: Float[Array, ""]
+    shapes: Placed
+    hulls: UnitCore | None
+    scene: Scene = eqx.field(static=True, repr=False)
+    max_pairs: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        pairs: Patterns | None = None,
+        exclude: Iterable[str | tuple[str, str]] = (),
+        shapes: Mapping[str, CollisionShape] | None = None,
+        minimum_distance: ArrayLike | Array = 0.01,
+        detection_distance: ArrayLike | Array = 0.25,
+        gain: ArrayLike | Array = 20.0,
+        recovery_speed: ArrayLike | Array = 0.1,
+        q0_distance: float | None = None,
+        max_pairs: int = 20,
+    ):
+        if isinstance(max_pairs, bool) or not isinstance(max_pairs, int) or max_pairs < 1:
+            raise ValueError(f"max_pairs is {max_pairs!r}; it is the number of rows, an integer from 1 up")
+        dtype = robot.q0.dtype
+        self.minimum_distance = _number(minimum_distance, "minimum_distance", dtype)
+        self.detection_distance = _number(detection_distance, "detection_distance", dtype)
+        self.gain = _number(gain, "gain", dtype)
+        self.recovery_speed = _number(recovery_speed, "recovery_speed", dtype)
+        self._check_distances()
+        shapes = dict(shapes or {})
+        found = members(robot, shapes)
+        possible = candidate_pairs(robot, found, pairs, exclude)
+        least = self.minimum_distance if q0_distance is None else q0_distance
+        kept = _apart_at_home(robot, found, shapes, possible, least)
+        self.scene, self.shapes, self.hulls = _assembled(robot, found, shapes, kept)
+        self.max_pairs = min(max_pairs, len(kept))
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of the shapes that are kept apart, pair by pair, in the order of ``distances``."""
+        return self.scene.pair_names
+
+    def distances(self, robot: Robot, kinematics: Kinematics) -> Float[Array, " pairs"]:
+        """Signed distances [m] of all ``pairs``, negative where they overlap."""
+        return self._nearest(robot, kinematics).distance
+
+    def rows(
+        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
+    ) -> LimitRows:
+        """Lower bounds on the rates of the closest pairs' distances [m/s]; -inf beyond ``detection_distance``."""
+        del q
+        near = self._nearest(robot, kinematics)
+        _, closest = jax.lax.top_k(-near.distance, self.max_pairs)
+        near = jax.tree.map(lambda a: a[closest], near)
+        bodies = jnp.asarray(self.scene.pair_bodies)[closest].T
+        approach = -jnp.minimum(self.gain, 1.0 / dt) * (near.distance - self.minimum_distance)
+        lower = jnp.minimum(approach, self.recovery_speed)
+        lower = jnp.where(near.distance < self.detection_distance, lower, -jnp.inf)
+        jacobian = separation_jacobian(robot.tree, kinematics, near, (bodies[0], bodies[1]))
+        return LimitRows(jacobian, lower, jnp.full_like(lower, jnp.inf))
+
+    def replace(self, **changes: ArrayLike | Array) -> Self:
+        """The same limit with another ``minimum_distance``, ``detection_distance``, ``gain`` or ``recovery_speed``.
+
+        Works inside ``jit``; nothing is compiled again.
+
+        Raises:
+            TypeError: any other name.
+            ValueError: as on construction.
+        """
+        for name in changes:
+            if name not in _NUMBERS:
+                raise TypeError(f"a CollisionAvoidanceLimit has no {name!r} to replace; it has: {', '.join(_NUMBERS)}")
+        names = tuple(changes)
+        if not names:
+            return self
+        values = [_number(changes[name], name, self.gain.dtype) for name in names]
+        new = eqx.tree_at(lambda limit: [getattr(limit, name) for name in names], self, values)
+        new._check_distances()
+        return new
+
+    def moved(
+        self,
+        shape: str,
+        *,
+        position: ArrayLike | Array | None = None,
+        rotation: ArrayLike | Array | None = None,
+        size: ArrayLike | Array | None = None,
+    ) -> Self:
+        """The same limit with one of the added shapes somewhere else, or of another size.
+
+        Works inside ``jit``; nothing is compiled again. The rows take obstacles as standing still.
+
+        Args:
+            shape: its name.
+            position: in its frame [m]; see ``CollisionShape``. (3,)
+            rotation: (3, 3)
+            size: [m]; see ``CollisionShape``. (3,)
+
+        Raises:
+            KeyError: no added shape of this name takes part; the message lists those that do.
+            ValueError: a wrong shape.
+        """
+        added = self.scene.names[len(self.scene.geoms) :]
+        if shape not in added:
+            raise unknown_name("added shape", shape, added)
+        place, given = added.index(shape), dict(position=position, rotation=rotation, size=size)
+        changes = {name: value for name, value in given.items() if value is not None}
+        if not changes:
+            return self
+        new = []
+        for name, value in changes.items():
+            old = getattr(self.shapes, name)
+            new.append(old.at[place].set(as_vector(value, old.shape[1:], name, old.dtype)))
+        return eqx.tree_at(lambda limit: [getattr(limit.shapes, name) for name in changes], self, new)
+
+    def _nearest(self, robot: Robot, kinematics: Kinematics) -> Nearest:
+        return nearest(self.scene, place(self.scene, robot, kinematics, self.shapes), self.hulls)
+
+    def _check_distances(self) -> None:
+        least, most = concrete(self.minimum_distance), concrete(self.detection_distance)
+        if least is not None and most is not None and not (most > least).all():
+            raise ValueError(f"detection_distance is {most}; it has to be more than minimum_distance, {least}")
+
+
+_NUMBERS = ("minimum_distance", "detection_distance", "gain", "recovery_speed")
+
+
+def _number(value: ArrayLike | Array, name: str, dtype: Any) -> Float[Array, ""]:
+    """A scalar leaf; distances may be negative."""
+    if not name.endswith("distance"):
+        return as_scalar(value, name, dtype)
+    out = as_vector(value, (), name, dtype)
+    seen = concrete(out)
+    if seen is not None and not np.isfinite(seen).all():
+        raise ValueError(f"{name} is {seen}; it has to be finite [m]")
+    return out
+
+
+def _apart_at_home(
+    robot: Robot,
+    found: Sequence[Member],
+    shapes: Mapping[str, CollisionShape],
+    possible: Sequence[tuple[int, int]],
+    least: Float[Array, ""] | float,
+) -> list[tuple[int, int]]:
+    """Pairs that are no nearer than ``least`` at q0."""
+    if isinstance(least, float) and least == -np.inf:
+        return list(possible)
+    scene, added, hulls = _assembled(robot, found, shapes, possible)
+    distances = concrete(_home_distances(robot, scene, added, hulls)), concrete(least)
+    if distances[0] is None or distances[1] is None:
+        raise TypeError("which pairs are apart at q0 cannot be told from traced numbers; give q0_distance=-inf")
+    taking_part = _taking_part(possible)
+    kept = [
+        (taking_part[i], taking_part[j])
+        for (i, j), distance in zip(scene.pairs, distances[0], strict=True)
+        if distance >= distances[1]
+    ]
+    if not kept:
+        raise ValueError(
+            f"all {len(possible)} pairs are nearer than {least} m at q0; a smaller q0_distance keeps them: "
+            f"{', '.join('-'.join(names) for names in scene.pair_names)}"
+        )
+    return kept
+
+
+def _home_distances(robot: Robot, scene: Scene, added: Placed, hulls: UnitCore | None) -> Float[Array, " pairs"]:
+    @jax.jit
+    def distances(robot: Robot, kinematics: Kinematics, added: Placed, hulls: UnitCore | None) -> Array:
+        return nearest(scene, place(scene, robot, kinematics, added), hulls).distance
+
+    return distances(robot, home_kinematics(robot), added, hulls)
+
+
+def _assembled(
+    robot: Robot, found: Sequence[Member], shapes: Mapping[str, CollisionShape], pairs: Sequence[tuple[int, int]]
+) -> tuple[Scene, Placed, UnitCore | None]:
+    """The scene of some pairs of members, its added shapes and its hulls."""
+    taking_part = _taking_part(pairs)
+    number = {k: n for n, k in enumerate(taking_part)}
+    geoms = [k for k in taking_part if found[k].link is not None]
+    added = [found[k].name for k in taking_part[len(geoms) :]]
+    kinds = [Kind(found[k].kind) for k in taking_part]
+    hulled = [k for k, kind in zip(taking_part, kinds, strict=True) if kind is Kind.HULL]
+    units = [_unit(robot, k, shapes.get(found[k].name)) for k in hulled]
+    scene = Scene(
+        names=tuple(found[k].name for k in taking_part),
+        kinds=tuple(kinds),
+        bodies=tuple(found[k].body for k in taking_part),
+        geoms=tuple(geoms),
+        frames=tuple(robot.tree.frame(shapes[name].frame or robot.tree.body_names[0]) for name in added),
+        hulls=tuple(hulled.index(k) if k in hulled else 0 for k in taking_part),
+        groups=grouped(kinds, [(number[i], number[j]) for i, j in pairs]),
+    )
+    dtype = robot.q0.dtype
+    placed = Placed(
+        *(_stacked([getattr(shapes[name], field) for name in added], like, dtype) for field, like in _PLACED)
+    )
+    hulls = jax.tree.map(lambda rows: jnp.asarray(rows, dtype), padded(units)) if units else None
+    return scene, placed, hulls
+
+
+def _unit(robot: Robot, number: int, shape: CollisionShape | None) -> UnitCore:
+    """The hull of an added shape, or of one of the robot's geoms."""
+    return geom_hull(robot.mj_model, number) if shape is None or shape.hull is None else shape.hull
+
+
+_PLACED = (("position", (3,)), ("rotation", (3, 3)), ("size", (3,)))
+
+
+def _stacked(values: Sequence[Array], shape: tuple[int, ...], dtype: Any) -> Array:
+    return jnp.stack([jnp.asarray(value, dtype) for value in values]) if values else jnp.zeros((0, *shape), dtype)
+
+
+def _taking_part(pairs: Sequence[tuple[int, int]]) -> list[int]:
+    return sorted({k for pair in pairs for k in pair})
