@@ -288,7 +288,7 @@ class Robot(eqx.Module):
 
         A link is made longer from its own origin: the joints of its children, its centre of mass, its frames and its
         geoms move away by the factor, and its geoms grow by it. Masses are scaled by their own factors only, inertias
-        by mass times length squared. Factors may be traced, so
+        by mass times length squared; drives stay. Factors may be traced:
         ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of robots.
 
         Args:

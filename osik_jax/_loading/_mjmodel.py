@@ -320,7 +320,7 @@ def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Place
 def _geom_arrays(model: mujoco.MjModel, placement: list[Placement]) -> dict[str, ArrayLike]:
     """Poses of the geoms in the moving bodies, and their sizes."""
     described = zip(model.geom_bodyid, model.geom_pos, model.geom_quat, strict=True)
-    poses = [_placed(placement[body], position, quaternion) for body, position, quaternion in described]
+    poses = [placed(placement[body], position, quaternion) for body, position, quaternion in described]
     meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     return dict(
         geom_position=np.array([pose.position for pose in poses]).reshape(-1, 3),
