@@ -1,4 +1,4 @@
-"""Mass matrix and centroidal momentum, from the inertias of what hangs below each dof."""
+"""Mass matrix and centroidal momentum, from the inertias of what each dof carries."""
 
 from __future__ import annotations
 
@@ -12,12 +12,20 @@ from ._forward import Kinematics, center_of_mass, independent_columns
 from ._rigid import compose, cross, rotate
 
 
-class Momenta(NamedTuple):
-    """Of each dof at unit speed, all else at rest. World axes, angular about the robot's centre of mass."""
+class Composite(NamedTuple):
+    """Each body with all that hangs from it, as one rigid body; in world axes."""
 
-    velocity: Float[Array, "nvfull 3"]  # of the point of what it moves that is at the centre of mass [m/s]
+    mass: Float[Array, " nbody"]  # [kg]
+    center: Float[Array, "nbody 3"]  # of mass [m]
+    inertia: Float[Array, "nbody 3 3"]  # about that [kg m^2]
+
+
+class Momenta(NamedTuple):
+    """Of what each dof carries, when it moves at unit speed and all others rest; in world axes."""
+
+    center: Float[Array, "nvfull 3"]  # of mass [m]
     linear: Float[Array, "nvfull 3"]  # [kg m/s]
-    angular: Float[Array, "nvfull 3"]  # [kg m^2/s]
+    angular: Float[Array, "nvfull 3"]  # about that centre [kg m^2/s]
 
 
 def mass_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "nv nv"]:
@@ -29,9 +37,10 @@ def mass_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "nv nv"]:
     Composite bodies (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.2), all dofs at once.
     """
     momenta = _momenta(robot, kinematics)
-    carries = jnp.asarray(robot.tree.moves[robot.tree.dof_body])  # [i, j]: dof j moves the body of dof i
-    products = jnp.matmul(momenta.linear, momenta.velocity.T, precision="highest")
-    products = products + jnp.matmul(momenta.angular, kinematics.dof_angular.T, precision="highest")
+    axis = kinematics.dof_angular
+    velocity = kinematics.dof_linear + cross(axis, momenta.center[:, None] - kinematics.dof_anchor)
+    products = jnp.sum(momenta.linear[:, None] * velocity + momenta.angular[:, None] * axis, -1)
+    carries = jnp.asarray(robot.tree.moves[robot.tree.dof_body])  # [i, j]: dof j moves what dof i does
     full = jnp.where(carries, products, jnp.where(carries.T, products.T, 0.0)) + jnp.diag(robot.dof_armature)
     return independent_columns(robot.tree, independent_columns(robot.tree, full).T)
 
@@ -44,21 +53,30 @@ def centroidal_momentum_matrix(robot: Robot, kinematics: Kinematics) -> Float[Ar
     35, 2013).
     """
     momenta = _momenta(robot, kinematics)
-    return independent_columns(robot.tree, jnp.concatenate([momenta.linear, momenta.angular], -1).T)
+    angular = momenta.angular + cross(momenta.center - center_of_mass(robot, kinematics), momenta.linear)
+    return independent_columns(robot.tree, jnp.concatenate([momenta.linear, angular], -1).T)
 
 
 def _momenta(robot: Robot, kinematics: Kinematics) -> Momenta:
-    center = center_of_mass(robot, kinematics)
-    turn, mass = kinematics.body_rotation, robot.body_mass
-    arm = kinematics.body_position + rotate(turn, robot.body_com) - center
-    moment = mass[:, None] * arm
-    steiner = jnp.sum(moment * arm, -1)[:, None, None] * jnp.eye(3, dtype=arm.dtype) - moment[:, :, None] * arm[:, None]
-    inertia = compose(compose(turn, robot.body_inertia), turn.mT) + steiner
-    parts = jnp.concatenate([mass[:, None], moment, inertia.reshape(-1, 9)], -1)
-    carried = jnp.asarray(robot.tree.moves.T, parts.dtype)
-    below = jnp.matmul(carried, parts, precision="highest")
-    mass_below, moment_below, inertia_below = below[:, :1], below[:, 1:4], below[:, 4:].reshape(-1, 3, 3)
+    mass, center, inertia = (of_bodies[robot.tree.dof_body] for of_bodies in _composites(robot, kinematics))
     axis = kinematics.dof_angular
     velocity = kinematics.dof_linear + cross(axis, center - kinematics.dof_anchor)
-    linear = mass_below * velocity + cross(axis, moment_below)
-    return Momenta(velocity, linear, rotate(inertia_below, axis) + cross(moment_below, velocity))
+    return Momenta(center, mass[:, None] * velocity, rotate(inertia, axis))
+
+
+def _composites(robot: Robot, kinematics: Kinematics) -> Composite:
+    """Summed about their own centres: about one point for all, what is light and far away would lose its digits."""
+    turn, mass = kinematics.body_rotation, robot.body_mass
+    centers = kinematics.body_position + rotate(turn, robot.body_com)
+    below = jnp.asarray(robot.tree.descendants, mass.dtype)
+    masses = below * mass
+    total = jnp.sum(masses, -1)
+    heavy = total > 0.0
+    moment = jnp.matmul(masses, centers - centers[robot.tree.root], precision="highest")
+    center = centers[robot.tree.root] + moment / jnp.where(heavy, total, 1.0)[:, None]
+    arm = centers - center[:, None]
+    spread = jnp.sum((masses[:, :, None] * arm)[..., :, None] * arm[..., None, :], 1)
+    own = compose(compose(turn, robot.body_inertia), turn.mT)
+    inertia = jnp.matmul(below, own.reshape(-1, 9), precision="highest").reshape(-1, 3, 3)
+    trace = jnp.trace(spread, axis1=-2, axis2=-1)[:, None, None]
+    return Composite(total, center, inertia + trace * jnp.eye(3, dtype=mass.dtype) - spread)
