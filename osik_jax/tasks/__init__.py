@@ -1,7 +1,10 @@
 """Tasks: errors, Jacobians and wanted velocities."""
 
+from ._angular_momentum import AngularMomentumTask as AngularMomentumTask
 from ._axis_align import AxisAlignTask as AxisAlignTask
 from ._com import ComTask as ComTask
+from ._contact import ContactTask as ContactTask
+from ._equality_constraint import EqualityConstraintTask as EqualityConstraintTask
 from ._frame import FrameTask as FrameTask
 from ._function import FunctionTask as FunctionTask
 from ._gain import AdaptiveGain as AdaptiveGain
@@ -10,7 +13,9 @@ from ._joint_velocity import DampingTask as DampingTask
 from ._joint_velocity import FreezeTask as FreezeTask
 from ._joint_velocity import JointVelocityTask as JointVelocityTask
 from ._joint_velocity import LowAccelerationTask as LowAccelerationTask
+from ._kinetic_energy import KineticEnergyTask as KineticEnergyTask
 from ._look_at import LookAtTask as LookAtTask
+from ._manipulability import ManipulabilityTask as ManipulabilityTask
 from ._polygon import SupportPolygon as SupportPolygon
 from ._polygon import support_polygon as support_polygon
 from ._posture import PostureTask as PostureTask
@@ -18,3 +23,4 @@ from ._relative_frame import RelativeFrameTask as RelativeFrameTask
 from ._task import Task as Task
 from ._task import TaskRows as TaskRows
 from ._task import task_rows as task_rows
+from ._wheel import WheelTask as WheelTask

@@ -75,7 +75,7 @@ class ComTask(Task):
         _check_exclusive(target, target_velocity, lower, upper, polygon, axes)
         if subtree is not None:
             robot.tree.frame(subtree)
-        self.axes, self.subtree = _check_axes(axes), subtree
+        self.axes, self.subtree = check_axes(axes), subtree
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         self.weight = as_scalar(weight, "weight", dtype)
@@ -144,7 +144,12 @@ def _cast(polygon: SupportPolygon, dtype: Any) -> SupportPolygon:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), polygon)
 
 
-def _check_axes(axes: str) -> str:
+def check_axes(axes: str) -> str:
+    """The names of axes, if they are x, y or z, each at most once.
+
+    Raises:
+        ValueError: they are not.
+    """
     if not axes or len(set(axes)) != len(axes) or not set(axes) <= set("xyz"):
         raise ValueError(f"axes is {axes!r}; it is made of x, y and z, each at most once")
     return axes

@@ -1,0 +1,101 @@
+"""A task on the angular momentum about the centre of mass."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ..kinematics import Kinematics, centroidal_momentum_matrix
+from ..robot import Robot
+from ._com import check_axes
+from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._task import Task, TaskRows, check_priority
+
+
+class AngularMomentumTask(Task):
+    """Gives the robot an angular momentum about its centre of mass, or keeps that within bounds.
+
+    With A the angular rows of ``centroidal_momentum_matrix`` along the chosen axes of the world:
+
+    - a target h*: ``A v = h*``; the default, 0, makes arms swing against legs;
+    - bounds: ``lower <= A v <= upper``.
+
+    A velocity is asked for, and no configuration: the error is 0, and there is no gain. Linear momentum is the
+    mass times the velocity of a ``ComTask``.
+
+    Args:
+        robot: the robot.
+        target: angular momentum [kg m^2/s], one entry for each axis, a vector x, y, z, or a scalar; default 0.
+        lower: makes an inequality task: lower bounds [kg m^2/s], one for each axis, or a scalar.
+        upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
+        axes: which of the world's axes, e.g. ``"xyz"``, ``"z"``.
+        weight: of each squared row.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        TypeError: a target and bounds.
+        ValueError: a wrong shape, a negative weight, lower > upper, an unknown axis.
+    """
+
+    axes: str = eqx.field(static=True)
+    target: Float[Array, " m"] | None
+    lower: Float[Array, " m"] | None
+    upper: Float[Array, " m"] | None
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        target: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        axes: str = "xyz",
+        weight: ArrayLike | Array = 1.0,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        if target is not None and (lower is not None or upper is not None):
+            raise TypeError("an AngularMomentumTask has a target or bounds (lower, upper), not both")
+        self.axes = check_axes(axes)
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_scalar(0.0, "gain", dtype)
+        self.lower, self.upper = as_bounds(lower, upper, len(axes), dtype)
+        self.target = self._along_axes(0.0 if target is None else target) if self.lower is None else None
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """One row for each axis."""
+        del q
+        kept = np.array([3 + "xyz".index(axis) for axis in self.axes])
+        jacobian = centroidal_momentum_matrix(robot, kinematics)[kept]
+        weight = jnp.broadcast_to(self.weight, (len(kept),))
+        error = jnp.zeros(len(kept), jacobian.dtype)
+        if self.lower is not None and self.upper is not None:
+            return TaskRows(error, jacobian, self.lower, self.upper, weight)
+        wanted = error if self.target is None else self.target
+        return TaskRows(error, jacobian, wanted, wanted, weight)
+
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Names that ``replace`` takes."""
+        return tuple(name for name in super().replaceable if name != "gain")
+
+    def _along_axes(self, value: Any) -> Float[Array, " m"]:
+        """One entry for each axis, from that, from a scalar, or from a vector x, y, z."""
+        value = jnp.asarray(value, self.weight.dtype)
+        if value.shape == (3,) and len(self.axes) < 3:
+            value = value[np.array(["xyz".index(axis) for axis in self.axes])]
+        return as_vector(value, (len(self.axes),), "target", self.weight.dtype)
+
+    def _convert(self, name: str, value: Any) -> Any:
+        return self._along_axes(value) if name == "target" else super()._convert(name, value)
+
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)

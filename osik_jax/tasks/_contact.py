@@ -1,0 +1,171 @@
+"""A task that keeps a point or a sole on a plane."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ..kinematics._rigid import cross
+from ..robot import Robot
+from ._framed import FramedTask
+from ._gain import AdaptiveGain, as_gain
+from ._leaves import Pose, as_pose, as_scalar, as_vector, home_kinematics
+from ._plane import as_normal, as_offset, plane_axes
+from ._pointing import across, unit
+from ._pose import option
+from ._rotation import dot
+from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
+
+
+class ContactTask(FramedTask):
+    """Keeps a frame in contact with a plane of the world: a foot on the ground, a hand on a wall.
+
+    The plane is all x with ``normal x = offset``, t_1 and t_2 two unit vectors along it; p (3,) is the contact point of
+    the frame, R (3, 3) the frame's axes, and p*, R* those of the anchor. The rows are those of e that the kind of
+    contact keeps, asked to follow ``e' = -gain e``:
+
+    | contact | sliding | rows | e |
+    |---|---|---|---|
+    | ``"point"`` | no | 3 | ``t_1 (p - p*), t_2 (p - p*), normal p - offset`` |
+    | ``"point"`` | yes | 1 | ``normal p - offset`` |
+    | ``"plane"`` | no | 6 | as a point, then ``t_1 a, t_2 a, normal (b* x b)`` |
+    | ``"plane"`` | yes | 3 | ``normal p - offset, t_1 a, t_2 a`` |
+
+    with a the frame's axis that stands on the plane and b one across it, in world axes. The last three are the sines of
+    the tilts and of the turn about the normal, so angles have to stay below 90 degrees, as those of a contact do. Two
+    feet in contact and a robot of the right size make ``hard=True`` feasible; rows that contradict each other do not.
+
+    A contact holds motions, no forces: nothing keeps a real foot from lifting or slipping but a slow motion.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom.
+        contact: ``"point"``, or ``"plane"`` for a sole that lies on it.
+        sliding: whether the contact may move along the plane, and turn about its normal.
+        point: the contact point in the frame's axes [m]; default: its origin.
+        normal: of the plane, in the world, of any length.
+        offset: of the plane along its normal [m]; default: where the contact point is in the anchor.
+        anchor: pose of the frame that the contact holds, ``(p (3,), R (3, 3))`` or a (4, 4) matrix: the position along
+            the plane and the turn about the normal. Default: the pose at ``robot.q0``.
+        axis: the frame's axis that stands on the plane (``"plane"`` alone), in the frame's axes, of any length.
+            Default: the one along the normal in the anchor.
+        weight: of each squared row.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such frame.
+        TypeError: an axis for a point.
+        ValueError: a wrong shape, a direction of length 0, a negative weight, an unknown kind of contact.
+    """
+
+    frame: str = eqx.field(static=True)
+    contact: str = eqx.field(static=True)
+    sliding: bool = eqx.field(static=True)
+    point: Float[Array, "3"]
+    normal: Float[Array, "3"]
+    offset: Float[Array, ""]
+    anchor: Pose | None
+    axis: Float[Array, "3"] | None
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        contact: Literal["point", "plane"] = "plane",
+        sliding: bool = False,
+        point: ArrayLike | Array = (0.0, 0.0, 0.0),
+        normal: ArrayLike | Array = (0.0, 0.0, 1.0),
+        offset: ArrayLike | Array | None = None,
+        anchor: tuple[ArrayLike | Array, ArrayLike | Array] | ArrayLike | Array | None = None,
+        axis: ArrayLike | Array | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        robot.tree.frame(frame)
+        self.frame, self.sliding = frame, bool(sliding)
+        self.contact = option("contact", contact, ("point", "plane"))
+        if contact == "point" and axis is not None:
+            raise TypeError("a contact at a point has no axis that stands on the plane; contact='plane' has")
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+        self.point = as_vector(point, (3,), "point", dtype)
+        self.normal = as_normal(normal, dtype)
+        held = as_pose(home_kinematics(robot).frame_pose(robot, frame) if anchor is None else anchor, dtype)
+        height = dot(self.normal, held[0] + dot(held[1], self.point)) if offset is None else offset
+        self.offset = as_offset(height, dtype)
+        self.anchor = None if sliding else held
+        standing = dot(held[1].T, self.normal) if axis is None else axis
+        self.axis = as_normal(standing, dtype) if contact == "plane" else None
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frame."""
+        return (self.frame,)
+
+    @property
+    def bounded(self) -> bool:
+        """No."""
+        return False
+
+    def rows_at(
+        self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
+    ) -> TaskRows:
+        """Positions along the plane's axes, then tilts and the turn: those that the kind of contact has."""
+        turn, axes = rotations[0], plane_axes(self.normal)
+        arm = dot(turn, self.point)
+        linear = jacobians[0, :3] + cross(jacobians[0, 3:], arm[:, None], along=-2)
+        error, jacobian = self._place(positions[0] + arm, axes), dot(axes, linear)
+        if self.sliding:
+            error, jacobian = error[2:], jacobian[2:]
+        if self.axis is not None:
+            tilt, spin = self._tilt(self.axis, turn, axes)
+            error, jacobian = jnp.concatenate([error, tilt]), jnp.concatenate([jacobian, dot(spin, jacobians[0, 3:])])
+        weight = jnp.broadcast_to(self.weight, error.shape)
+        return task_rows(error, jacobian, gain=self.gain, weight=weight)
+
+    def _place(self, point: Float[Array, "3"], axes: Float[Array, "3 3"]) -> Float[Array, "3"]:
+        """Along the plane from the anchor, and above the plane."""
+        if self.anchor is None:
+            return dot(axes, point) - self.offset * jnp.array([0.0, 0.0, 1.0], point.dtype)
+        held = self.anchor[0] + dot(self.anchor[1], self.point)
+        along = dot(axes[:2], point - held)
+        return jnp.append(along, dot(axes[2], point) - self.offset)
+
+    def _tilt(
+        self, axis: Float[Array, "3"], turn: Float[Array, "3 3"], axes: Float[Array, "3 3"]
+    ) -> tuple[Float[Array, " m"], Float[Array, "m 3"]]:
+        """Sines of the tilts, and of the turn where it is held, with their slopes over the angular velocity."""
+        standing = dot(turn, axis)
+        error, slope = dot(axes[:2], standing), cross(standing, axes[:2])
+        if self.anchor is None:
+            return error, slope
+        beside = across(axis)[0]
+        ahead = dot(turn, beside)
+        wanted = cross(axes[2], unit(self._along(dot(self.anchor[1], beside), axes[2])))
+        return jnp.append(error, dot(wanted, ahead)), jnp.concatenate([slope, cross(ahead, wanted)[None]])
+
+    @staticmethod
+    def _along(direction: Float[Array, "3"], normal: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The part of a direction that is along the plane."""
+        return direction - dot(normal, direction) * normal
+
+    def _convert(self, name: str, value: Any) -> Any:
+        dtype = self.weight.dtype
+        if name in ("normal", "axis"):
+            return as_normal(value, dtype)
+        if name == "offset":
+            return as_offset(value, dtype)
+        if name == "anchor":
+            return as_pose(value, dtype)
+        return super()._convert(name, value)

@@ -1,0 +1,248 @@
+"""A task that keeps the equality constraints of an MJCF model: closed loops and coupled joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._loading._mjmodel import element_names
+from .._tree import KinematicTree, unknown_name
+from ..kinematics import Kinematics, frame_jacobians
+from ..kinematics._forward import independent_columns
+from ..kinematics._rigid import compose, cross, rotate
+from ..robot import Robot
+from ._gain import AdaptiveGain, as_gain
+from ._leaves import as_scalar
+from ._rotation import cross_matrix
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+
+_TYPES = {
+    int(mujoco.mjtEq.mjEQ_CONNECT): "connect",
+    int(mujoco.mjtEq.mjEQ_WELD): "weld",
+    int(mujoco.mjtEq.mjEQ_JOINT): "joint",
+}
+_Rows = tuple[Float[Array, " m"], Float[Array, "m nv"]]
+
+
+class Constraint(NamedTuple):
+    """The structure of one constraint."""
+
+    name: str
+    kind: str  # "connect", "weld" or "joint"
+    ends: tuple[str, ...]  # two frames, or one or two joints
+
+
+class EqualityConstraintTask(Task):
+    """Keeps equality constraints of the robot's MJCF model: ``connect``, ``weld`` and ``joint``.
+
+    A kinematic tree cannot have loops: linkages that close are cut somewhere, and a constraint holds the ends together.
+    The error is MuJoCo's residual (``efc_pos``), asked to follow ``e' = -gain e``; use ``hard=True`` or the first
+    priority. With p, R the points and axes of the two ends:
+
+    - connect: ``p_1 - p_2``, 3 rows [m];
+    - weld: that, and ``torque_scale`` times the vector part of the quaternion of ``R_2' R_1 relative``, about half the
+      angle [rad] between the two, which go the short way round; 6 rows;
+    - joint: ``q_1 - r_1 - polynomial(q_2 - r_2)`` with r the values at MuJoCo's ``qpos0``; 1 row [rad or m].
+
+    Rows are in the order of the model's constraints. Anchors stay in their bodies' axes: they do not follow
+    ``Robot.scaled``. Other constraints (tendons, flexes) cannot be kept by this task.
+
+    Args:
+        robot: the robot, from MJCF or a MuJoCo model.
+        constraints: names of constraints; one without a name is called by its number, ``"equality0"``. Default: all
+            active ones of the three kinds, but for joint constraints that the robot already has as mimic or locked
+            joints.
+        weight: of each squared row.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such constraint.
+        TypeError: one string instead of a sequence of them.
+        ValueError: there is none to keep, one is of another kind, or the robot has it as a mimic or locked joint.
+    """
+
+    constraints: tuple[Constraint, ...] = eqx.field(static=True)
+    anchors: Float[Array, "k 2 3"]
+    """Points that meet, in the two frames of each connect and weld [m]."""
+    relative: Float[Array, "w 3 3"]
+    """Rotation from the axes in which the second end of each weld should be to the first end's."""
+    torque_scale: Float[Array, " w"]
+    """Of the rotation rows of each weld."""
+    coefficients: Float[Array, "j 5"]
+    """Of the polynomial of each joint constraint, the constant first."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        constraints: Iterable[str] | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        chosen = _selected(robot, constraints)
+        self.constraints = tuple(_structure(robot, e) for e in chosen)
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+        model = robot.mj_model
+        kinds = [constraint.kind for constraint in self.constraints]
+        spatial = [e for e, kind in zip(chosen, kinds, strict=True) if kind != "joint"]
+        welds = [e for e, kind in zip(chosen, kinds, strict=True) if kind == "weld"]
+        joints = [e for e, kind in zip(chosen, kinds, strict=True) if kind == "joint"]
+        self.anchors = jnp.asarray(np.reshape([_anchors(model, e) for e in spatial], (-1, 2, 3)), dtype)
+        self.relative = jnp.asarray(np.reshape([_relative(model, e) for e in welds], (-1, 3, 3)), dtype)
+        self.torque_scale = jnp.asarray([model.eq_data[e, 10] for e in welds], dtype)
+        self.coefficients = jnp.asarray(np.reshape([model.eq_data[e, :5] for e in joints], (-1, 5)), dtype)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """3, 6 or 1 rows for each constraint."""
+        by_kind = {"joint": iter(self._joint_rows(robot, q)), **self._spatial_rows(robot, kinematics)}
+        parts = [next(by_kind[constraint.kind]) for constraint in self.constraints]
+        error, jacobian = (jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        return task_rows(error, jacobian, gain=self.gain, weight=jnp.broadcast_to(self.weight, error.shape))
+
+    def _spatial_rows(self, robot: Robot, kinematics: Kinematics) -> dict[str, Any]:
+        """Of connects, and of welds."""
+        spatial = [constraint for constraint in self.constraints if constraint.kind != "joint"]
+        if not spatial:
+            return {}
+        frames = [frame for constraint in spatial for frame in constraint.ends]
+        origins, turns = kinematics.frame_poses(robot, frames)
+        arms = rotate(turns, self.anchors.reshape(-1, 3))
+        jacobians = frame_jacobians(robot, kinematics, frames)
+        linear = jacobians[:, :3] + cross(jacobians[:, 3:], arms[:, :, None], along=-2)
+        points, linear, angular, turns = (
+            a.reshape(len(spatial), 2, *a.shape[1:]) for a in (origins + arms, linear, jacobians[:, 3:], turns)
+        )
+        apart = list(zip(points[:, 0] - points[:, 1], linear[:, 0] - linear[:, 1], strict=True))
+        kinds = [constraint.kind for constraint in spatial]
+        at = [place for place, kind in enumerate(kinds) if kind == "weld"]
+        turned = [self._turned(k, turns[place], angular[place]) for k, place in enumerate(at)]
+        welds = [_joined(apart[place], rotation) for place, rotation in zip(at, turned, strict=True)]
+        connects = [rows for rows, kind in zip(apart, kinds, strict=True) if kind == "connect"]
+        return {"connect": iter(connects), "weld": iter(welds)}
+
+    def _turned(self, weld: int, turns: Float[Array, "2 3 3"], angular: Float[Array, "2 3 nv"]) -> _Rows:
+        """The rotation rows of a weld."""
+        first, second = turns
+        wxyz = jaxlie.SO3.from_matrix(compose(second.T, compose(first, self.relative[weld]))).wxyz
+        wxyz = jnp.where(wxyz[0] < 0.0, -wxyz, wxyz)
+        rate = 0.5 * (wxyz[0] * jnp.eye(3, dtype=wxyz.dtype) - cross_matrix(wxyz[1:]))
+        spin = jnp.matmul(compose(rate, second.T), angular[0] - angular[1], precision="highest")
+        return self.torque_scale[weld] * wxyz[1:], self.torque_scale[weld] * spin
+
+    def _joint_rows(self, robot: Robot, q: Float[Array, " nq"]) -> list[_Rows]:
+        joints = [constraint.ends for constraint in self.constraints if constraint.kind == "joint"]
+        qpos, tree = robot.mujoco_qpos(q) - robot.joint_reference, robot.tree
+        rows = []
+        for (name, *leader), (constant, *higher) in zip(joints, self.coefficients, strict=True):
+            error, jacobian = qpos[_qpos(tree, name)] - constant, _column(tree, name, q.dtype)
+            for other in leader:
+                x = qpos[_qpos(tree, other)]
+                error = error - sum(c * x ** (k + 1) for k, c in enumerate(higher))
+                slope = sum((k + 1) * c * x**k for k, c in enumerate(higher))
+                jacobian = jacobian - slope * _column(tree, other, q.dtype)
+            rows.append((error[None], independent_columns(tree, jacobian)[None]))
+        return rows
+
+
+def _joined(a: _Rows, b: _Rows) -> _Rows:
+    return jnp.concatenate([a[0], b[0]]), jnp.concatenate([a[1], b[1]])
+
+
+def _qpos(tree: KinematicTree, joint: str) -> int:
+    return int(tree.full_qpos_address[tree.joint(joint)])
+
+
+def _column(tree: KinematicTree, joint: str, dtype: Any) -> Float[Array, " nvfull"]:
+    """1 at the joint's own dof."""
+    return jnp.asarray(np.arange(len(tree.dof_joint)) == tree.full_dof_address[tree.joint(joint)], dtype)
+
+
+def _selected(robot: Robot, names: Iterable[str] | None) -> list[int]:
+    """Constraints of the model by number, in its order."""
+    model = robot.mj_model
+    available = element_names(model, mujoco.mjtObj.mjOBJ_EQUALITY, "equality", model.neq)
+    if names is None:
+        active = np.flatnonzero(model.eq_active0)
+        found = [int(e) for e in active if int(model.eq_type[e]) in _TYPES and not _is_kept(model, int(e))]
+        if not found:
+            raise ValueError(
+                "the model has no active connect, weld or joint constraint that is not a mimic or locked joint; "
+                f"constraints: {', '.join(available) or '(none)'}"
+            )
+        return found
+    if isinstance(names, str):
+        raise TypeError(f"constraints is a sequence of names, not one string: use ({names!r},)")
+    numbers = set()
+    for name in names:
+        if name not in available:
+            raise unknown_name("constraint", name, available)
+        numbers.add(available.index(name))
+        _check_kind(robot, available.index(name), name)
+    if not numbers:
+        raise ValueError(f"there is no constraint to keep; constraints: {', '.join(available)}")
+    return sorted(numbers)
+
+
+def _check_kind(robot: Robot, e: int, name: str) -> None:
+    if int(robot.mj_model.eq_type[e]) not in _TYPES:
+        kind = mujoco.mjtEq(int(robot.mj_model.eq_type[e])).name
+        raise ValueError(f"constraint {name!r} is of kind {kind}; it can be connect, weld or joint")
+    if _is_kept(robot.mj_model, e):
+        raise ValueError(f"constraint {name!r} holds already: its joint is a mimic joint of the robot, or locked")
+
+
+def _is_kept(model: mujoco.MjModel, e: int) -> bool:
+    """Whether the robot was made with it: an active joint constraint that is linear or constant."""
+    if int(model.eq_type[e]) != mujoco.mjtEq.mjEQ_JOINT or not model.eq_active0[e]:
+        return False
+    return int(model.eq_obj2id[e]) < 0 or not model.eq_data[e, 2:5].any()
+
+
+def _structure(robot: Robot, e: int) -> Constraint:
+    model = robot.mj_model
+    name = element_names(model, mujoco.mjtObj.mjOBJ_EQUALITY, "equality", model.neq)[e]
+    kind = _TYPES[int(model.eq_type[e])]
+    ids = [int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e])]
+    if kind == "joint":
+        return Constraint(name, kind, tuple(robot.tree.joint_names[i] for i in ids if i >= 0))
+    if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+        return Constraint(name, kind, tuple(_site_frame(robot, i) for i in ids))
+    bodies = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    return Constraint(name, kind, tuple(bodies[i] for i in ids))
+
+
+def _site_frame(robot: Robot, site: int) -> str:
+    name = robot.mj_model.site(site).name
+    return f"site:{name}" if f"site:{name}" in robot.frame_names else name
+
+
+def _anchors(model: mujoco.MjModel, e: int) -> np.ndarray:
+    """The point in the first end and in the second."""
+    if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+        return np.zeros((2, 3))
+    first, second = model.eq_data[e, :3], model.eq_data[e, 3:6]
+    weld = int(model.eq_type[e]) == mujoco.mjtEq.mjEQ_WELD  # whose numbers are in the other order
+    return np.array([second, first] if weld else [first, second])
+
+
+def _relative(model: mujoco.MjModel, e: int) -> np.ndarray:
+    if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+        return np.eye(3)
+    out = np.zeros(9)
+    mujoco.mju_quat2Mat(out, model.eq_data[e, 6:10])
+    return out.reshape(3, 3)

@@ -1,0 +1,66 @@
+"""A task that keeps the kinetic energy low."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ..kinematics import Kinematics, mass_matrix
+from ..robot import Robot
+from ._leaves import as_scalar
+from ._task import Task, TaskRows, check_priority
+
+_NOISE = 4.0
+"""Roundings for each dof; where motions have less inertia than this share of their dofs', the root is finite."""
+
+
+class KineticEnergyTask(Task):
+    """Keeps the kinetic energy low: of all motions that serve the other tasks, the one that moves the least mass.
+
+    With M = L L' the ``mass_matrix``, asks for ``L' v = 0``. In a weighted problem that adds ``weight v' M v / 2``,
+    the weight times the kinetic energy [J]: damping in which a heavy dof counts more than a light one. It has as many
+    rows as v has entries and leaves nothing free, so it comes last, or with a small weight. The error is 0, and
+    there is no gain.
+
+    L is a Cholesky factor. Where a motion moves no mass at all, M counts as larger by some roundings, so that L exists
+    and has finite derivatives.
+
+    Args:
+        robot: the robot.
+        weight: of the energy against the other tasks' squared rows, halved [1/J].
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``: nothing moves.
+
+    Raises:
+        ValueError: a negative weight.
+    """
+
+    def __init__(self, robot: Robot, *, weight: ArrayLike | Array = 1.0, priority: int = 1, hard: bool = False):
+        self.priority, self.hard = check_priority(priority), hard
+        self.weight = as_scalar(weight, "weight", robot.q0.dtype)
+        self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """As many rows as v has entries: the square root of the mass matrix."""
+        del q
+        root = _root(mass_matrix(robot, kinematics))
+        zero = jnp.zeros(robot.nv, root.dtype)
+        return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape))
+
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Names that ``replace`` takes."""
+        return tuple(name for name in super().replaceable if name != "gain")
+
+
+def _root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """U with U' U = matrix, which is symmetric and not negative; of each dof in units of its own inertia."""
+    inertia = jnp.diagonal(matrix)
+    moves = inertia > 0.0
+    scale = jnp.where(moves, jnp.sqrt(jnp.where(moves, inertia, 1.0)), 0.0)
+    unit = jnp.where(moves, scale, 1.0)
+    noise = _NOISE * len(inertia) * jnp.finfo(matrix.dtype).eps
+    lift = jnp.diag(jnp.where(moves, noise, 1.0))
+    return jax.lax.linalg.cholesky(matrix / (unit[:, None] * unit) + lift, symmetrize_input=False).T * scale

@@ -1,0 +1,183 @@
+"""A task that keeps a frame able to move in all directions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import select_all
+from .._tree import DOF_WIDTH, KinematicTree
+from ..kinematics import Kinematics, forward_kinematics, frame_jacobian, integrate
+from ..robot import Robot
+from ._gain import AdaptiveGain, as_gain
+from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._pose import option, row_mask
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+
+_NOISE = 10.0
+"""Roundings for each dof; a row of the Jacobian that the rows before it leave less of itself than this depends on
+them."""
+
+
+class ManipulabilityTask(Task):
+    """Raises a frame's manipulability, brings it to a value, or keeps it within bounds.
+
+    Yoshikawa's index ``m = sqrt(det(J J'))`` is that of the chosen rows and joints of ``frame_jacobian``: the volume of
+    what the frame's velocity can be at joint speeds of norm 1, 0 where it is singular (T. Yoshikawa, "Manipulability of
+    robotic mechanisms", International Journal of Robotics Research 4, 1985). With x = m, or ln m for ``log=True``, and
+    g its gradient along the tangent:
+
+    - nothing more given: the joints are asked to go up the gradient, ``v = gain g``, with the error -g. One row for
+      each dof of the chosen joints that moves the frame; asks for nothing where the index is greatest.
+    - a target: ``e = x - x*``, ``g' v = -gain e + x*'``. One row.
+    - bounds: ``gain (lower - x) <= g' v - x*' <= gain (upper - x)``. One row.
+
+    At a singular configuration m has a kink, so no gradient: there (to rounding) it counts as 0 with all derivatives 0,
+    ln m as that of the smallest number, and the task pushes neither way. A lower bound keeps away from there. The unit
+    of m changes with the rows; ``log=True`` makes x free of it but for a constant, and g steep near singularities.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom.
+        target: wanted x.
+        target_velocity: of the target, or of the bounds [1/s]; default 0.
+        lower: makes an inequality task: lower bound on x.
+        upper: upper bound; one of the two may be left out.
+        rows: of the Jacobian: ``"pose"``, ``"position"``, ``"orientation"``, or six booleans (x, y, z, rotation about
+            x, y, z). A planar arm has ``(True, True, False, False, False, False)``: rows that no joint moves make the
+            index 0.
+        axes: those of the rows, ``"world"`` or ``"frame"``.
+        joints: names and globs of the joints that count. Default: all but the free base, which makes any frame able to
+            move anywhere.
+        log: whether x is ln m.
+        weight: of each squared row.
+        gain: [1/s], a number or an ``AdaptiveGain``; without target and bounds, the speed for a gradient of 1.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such frame or joint.
+        TypeError: a target and bounds, or a ``target_velocity`` without either.
+        ValueError: fewer dofs than rows, a wrong shape, a negative weight, lower > upper, an unknown option.
+    """
+
+    frame: str = eqx.field(static=True)
+    kept: tuple[bool, ...] = eqx.field(static=True)
+    axes: str = eqx.field(static=True)
+    dofs: tuple[int, ...] = eqx.field(static=True)
+    log: bool = eqx.field(static=True)
+    target: Float[Array, ""] | None
+    target_velocity: Float[Array, ""] | None
+    lower: Float[Array, "1"] | None
+    upper: Float[Array, "1"] | None
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        target: ArrayLike | Array | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
+        axes: Literal["world", "frame"] = "world",
+        joints: Iterable[str] | None = None,
+        log: bool = False,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        body = robot.tree.frame_bodies[robot.tree.frame(frame)]
+        self.frame, self.kept, self.log = frame, row_mask(rows), log
+        self.axes = option("axes", axes, ("world", "frame"))
+        self.dofs = _moving_dofs(robot.tree, body, select_all(robot, joints))
+        if len(self.dofs) < sum(self.kept):
+            raise ValueError(
+                f"{len(self.dofs)} dofs of the chosen joints move {frame!r}, which cannot go {sum(self.kept)} ways: "
+                "its manipulability is 0 everywhere. Choose fewer rows or more joints"
+            )
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+        self.lower, self.upper = as_bounds(lower, upper, 1, dtype)
+        if target is not None and self.lower is not None:
+            raise TypeError("a ManipulabilityTask has a target or bounds (lower, upper), not both")
+        climbs = target is None and self.lower is None
+        if climbs and target_velocity is not None:
+            raise TypeError("a target_velocity is that of a target or of bounds; there are none")
+        velocity = 0.0 if target_velocity is None else target_velocity
+        self.target = None if target is None else as_vector(target, (), "target", dtype)
+        self.target_velocity = None if climbs else as_vector(velocity, (), "target_velocity", dtype)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """One row, or where it climbs one for each dof that moves the frame."""
+        del kinematics
+        standing = jnp.zeros(robot.nv, q.dtype)
+        value, gradient = jax.value_and_grad(lambda step: self.value(robot, integrate(robot, q, step)))(standing)
+        if self.target_velocity is None:
+            return self._climb(robot, gradient)
+        return task_rows(
+            (value if self.target is None else value - self.target)[None],
+            gradient[None],
+            gain=self.gain,
+            weight=self.weight[None],
+            lower=self.lower,
+            upper=self.upper,
+            feedforward=self.target_velocity[None],
+        )
+
+    def value(self, robot: Robot, q: Float[Array, " nq"]) -> Float[Array, ""]:
+        """Yoshikawa's index, or its logarithm, at configuration q."""
+        kinematics = forward_kinematics(robot, q)
+        jacobian = frame_jacobian(robot, kinematics, self.frame)[:, np.array(self.dofs)]
+        if self.axes == "frame":
+            turn = kinematics.frame_pose(robot, self.frame)[1].T
+            parts = (jnp.matmul(turn, part, precision="highest") for part in (jacobian[:3], jacobian[3:]))
+            jacobian = jnp.concatenate(list(parts))
+        return _volume(jacobian[np.flatnonzero(self.kept)], log=self.log)
+
+    def _climb(self, robot: Robot, gradient: Float[Array, " nv"]) -> TaskRows:
+        dofs = np.array(self.dofs)
+        error = -gradient[dofs]
+        identity = jnp.asarray(np.eye(robot.nv)[dofs], error.dtype)
+        weight = jnp.broadcast_to(self.weight, error.shape)
+        return task_rows(error, identity, gain=self.gain, weight=weight, dofs=self.dofs)
+
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)
+
+
+def _moving_dofs(tree: KinematicTree, body: int, joints: Sequence[int]) -> tuple[int, ...]:
+    """Of the joints' entries of v, those that move the body, be it by a follower."""
+    moves = np.zeros(tree.nv, bool)
+    for index, coefficient in tree.dof_columns:
+        moves |= tree.moves[body][index] & (coefficient != 0.0)
+    chosen = [tree.dof_address[j] + i for j in joints for i in range(DOF_WIDTH[tree.joint_types[j]])]
+    return tuple(dof for dof in chosen if moves[dof])
+
+
+def _volume(rows: Float[Array, "m n"], *, log: bool) -> Float[Array, ""]:
+    """sqrt(det(rows rows')) or its logarithm, m <= n: the product of what each row adds to those before it.
+
+    From a QR factorisation, so that small values keep their digits, which determinants of products lose.
+    """
+    m, n = rows.shape
+    noise = _NOISE * n * jnp.finfo(rows.dtype).eps
+    lengths = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2, 1))
+    added = jnp.abs(jnp.diagonal(jnp.linalg.qr(jax.lax.stop_gradient(rows).T, mode="r")))
+    singular = jnp.any(added <= noise * lengths)
+    safe = jnp.where(singular, jnp.eye(m, n, dtype=rows.dtype), rows)
+    added = jnp.abs(jnp.diagonal(jnp.linalg.qr(safe.T)[1]))
+    if log:
+        return jnp.where(singular, jnp.log(jnp.finfo(rows.dtype).tiny), jnp.sum(jnp.log(added)))
+    return jnp.where(singular, 0.0, jnp.prod(added))

@@ -1,0 +1,139 @@
+"""A task that makes a wheel roll."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ..kinematics._rigid import cross
+from ..robot import Robot
+from ._framed import FramedTask
+from ._gain import AdaptiveGain, as_gain
+from ._leaves import as_scalar, as_vector, check_not_negative
+from ._plane import as_normal, as_offset
+from ._pointing import as_direction, unit
+from ._rotation import dot
+from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
+
+
+class WheelTask(FramedTask):
+    """Makes a wheel roll on a plane of the world without slipping.
+
+    With a the wheel's axis and n the plane's normal in world axes, the wheel rolls along ``x = a x n / |a x n|``, its
+    side is ``y = n x x``, and it touches the plane at ``p + radius (a x x)``, its lowest point, also when it leans.
+    With u the velocity of the wheel's material there and h its height over the plane:
+
+    - ``x u = 0`` and ``y u = 0``: no slip ahead, none to the side. These are velocities that cannot be integrated to a
+      configuration: their error is 0, and what the steps of a loop miss is not made up for later;
+    - ``h' = -gain h``: the wheel stays on the plane.
+
+    A wheel with rollers on its rim (omniwheel, mecanum) has one row in place of the first two: no slip along the
+    roller's axis, ``(cos(angle) x + sin(angle) y) u = 0``. A wheel that lies flat on the plane has no rolling
+    direction; there its centre is what is held at the plane.
+
+    With a base that is free to move, wheels at priority 1 or with ``hard=True`` turn a wanted motion of the base, or of
+    a hand, into turns of the wheels.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom that turns with the wheel, with its origin at the wheel's centre.
+        radius: of the wheel [m].
+        axis: about which it turns, in the frame's axes, of any length. A turn about it by the right-hand rule rolls
+            the wheel ahead, along x.
+        roller_angle: makes a wheel with rollers: from the rolling direction to the roller's axis on the plane, about n
+            [rad]: 0 for an omniwheel, +-pi/4 for most mecanum wheels. Default: a plain wheel.
+        normal: of the plane, in the world, towards the wheel, of any length.
+        offset: of the plane along its normal [m].
+        weight: of each squared row.
+        gain: of the height [1/s], a number or an ``AdaptiveGain``.
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        KeyError: no such frame.
+        ValueError: a wrong shape, a direction of length 0, a negative radius or weight.
+    """
+
+    frame: str = eqx.field(static=True)
+    radius: Float[Array, ""]
+    axis: Float[Array, "3"]
+    roller_angle: Float[Array, ""] | None
+    normal: Float[Array, "3"]
+    offset: Float[Array, ""]
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        radius: ArrayLike | Array,
+        axis: ArrayLike | Array = (0.0, 1.0, 0.0),
+        roller_angle: ArrayLike | Array | None = None,
+        normal: ArrayLike | Array = (0.0, 0.0, 1.0),
+        offset: ArrayLike | Array = 0.0,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        robot.tree.frame(frame)
+        self.frame = frame
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_gain(gain, dtype)
+        self.radius = _as_radius(radius, dtype)
+        self.axis = unit(as_direction(axis, "axis", dtype))
+        self.roller_angle = None if roller_angle is None else as_vector(roller_angle, (), "roller_angle", dtype)
+        self.normal, self.offset = as_normal(normal, dtype), as_offset(offset, dtype)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The wheel."""
+        return (self.frame,)
+
+    @property
+    def bounded(self) -> bool:
+        """No."""
+        return False
+
+    def rows_at(
+        self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
+    ) -> TaskRows:
+        """No slip ahead and to the side, or along the rollers; then the height."""
+        axle = dot(rotations[0], self.axis)
+        ahead = unit(cross(axle, self.normal))
+        spoke = self.radius * cross(axle, ahead)
+        touching = jacobians[0, :3] + cross(jacobians[0, 3:], spoke[:, None], along=-2)
+        directions = jnp.concatenate([self._held(ahead), self.normal[None]])
+        height = dot(self.normal, positions[0] + spoke) - self.offset
+        error = jnp.zeros(len(directions), height.dtype).at[-1].set(height)
+        weight = jnp.broadcast_to(self.weight, error.shape)
+        return task_rows(error, dot(directions, touching), gain=self.gain, weight=weight)
+
+    def _held(self, ahead: Float[Array, "3"]) -> Float[Array, "m 3"]:
+        """Directions along the plane in which the wheel does not slip."""
+        aside = cross(self.normal, ahead)
+        if self.roller_angle is None:
+            return jnp.stack([ahead, aside])
+        return (jnp.cos(self.roller_angle) * ahead + jnp.sin(self.roller_angle) * aside)[None]
+
+    def _convert(self, name: str, value: Any) -> Any:
+        dtype = self.weight.dtype
+        if name == "radius":
+            return _as_radius(value, dtype)
+        if name == "axis":
+            return unit(as_direction(value, name, dtype))
+        if name == "normal":
+            return as_normal(value, dtype)
+        return super()._convert(name, value)
+
+
+def _as_radius(value: Any, dtype: Any) -> Float[Array, ""]:
+    out = as_vector(value, (), "radius", dtype)
+    check_not_negative(out, "radius")
+    return out

@@ -1,0 +1,268 @@
+"""Mass matrix, momentum, energy and manipulability against MuJoCo C, pink and central differences."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from pink.tasks import ManipulabilityTask as PinkManipulabilityTask
+from task_checks import assert_every_number_counts, assert_finite_gradients, rows_and_differences, rows_of_each
+
+import osik_jax as osik
+
+MODEL = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="post" pos="1 0 0"><geom size="0.2"/></body>
+    <body name="trunk" pos="0.1 0.2 0.6">
+      <freejoint name="base"/>
+      <inertial pos="0.02 0.01 0.1" mass="6" fullinertia="0.2 0.15 0.1 0.02 -0.01 0.015"/>
+      <body name="left" pos="0 0.2 0.1">
+        <joint name="shoulder" type="ball" armature="0.02"/>
+        <inertial pos="0.1 0 -0.05" quat="0.9 0.1 -0.3 0.2" mass="1.5" diaginertia="0.01 0.02 0.015"/>
+        <body name="fore" pos="0.3 0 0">
+          <joint name="elbow" axis="0 1 0.2" pos="0.01 0 0" armature="0.1"/>
+          <joint name="roll" axis="1 0 0" pos="0 0.02 0"/>
+          <inertial pos="0.1 0 0.01" mass="0.8" diaginertia="0.001 0.004 0.004"/>
+          <body name="glove" pos="0.2 0 0" euler="20 30 40">
+            <inertial pos="0.05 0 0" quat="0.5 0.5 0.4 0.3" mass="0.3" diaginertia="0.001 0.0005 0.0007"/>
+            <site name="tip" pos="0.1 0 0"/>
+          </body>
+        </body>
+      </body>
+      <body name="right" pos="0 -0.2 0.1">
+        <joint name="lift" type="slide" axis="0 0.1 1" range="-0.5 0.5"/>
+        <inertial pos="0 0 -0.1" mass="1.1" diaginertia="0.01 0.01 0.002"/>
+        <body name="hand" pos="0.1 0 -0.2">
+          <joint name="wrist" axis="1 0.3 0"/>
+          <joint name="stuck" axis="0 0 1"/>
+          <inertial pos="0.02 0 -0.1" mass="0.6" diaginertia="0.002 0.001 0.002"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint joint1="wrist" joint2="elbow" polycoef="0.1 -0.7 0 0 0"/></equality>
+</mujoco>
+"""
+LANES = 4
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return osik.Robot.from_mjcf(MODEL, locked_joints={"stuck": 0.4})
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+@pytest.fixture(scope="module")
+def states(robot):
+    """Configurations anywhere and velocities. (LANES, nq), (LANES, nv)"""
+    rng = np.random.default_rng(5)
+    steps = jnp.asarray(rng.uniform(-1.5, 1.5, (LANES, robot.nv)))
+    q = jax.jit(jax.vmap(osik.integrate, in_axes=(None, None, 0)))(robot, robot.q0, steps)
+    return q, rng.normal(size=(LANES, robot.nv))
+
+
+@pytest.fixture(scope="module")
+def oracles(robot, states):
+    """MuJoCo's data at each state, with velocities of all its joints, and the matrix that makes them from v."""
+    model, full = robot.mj_model, _full_velocities(robot)
+    out = []
+    for q, v in zip(*states, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = robot.mujoco_qpos(q), full @ v
+        mujoco.mj_forward(model, data)
+        mujoco.mj_energyVel(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        out.append(data)
+    return out, full
+
+
+def _full_velocities(robot):
+    """MuJoCo's velocities = this matrix @ v, by names."""
+    model, out = robot.mj_model, np.zeros((robot.mj_model.nv, robot.nv))
+    for name, width in (("base", 6), ("shoulder", 3), ("elbow", 1), ("roll", 1), ("lift", 1)):
+        full, own = model.joint(name).dofadr[0], robot.joint_dof_index(name)
+        out[full : full + width, own : own + width] = np.eye(width)
+    out[model.joint("wrist").dofadr[0], robot.joint_dof_index("elbow")] = -0.7
+    return out
+
+
+_matrices = jax.jit(
+    jax.vmap(
+        lambda robot, q: (
+            osik.mass_matrix(robot, osik.forward_kinematics(robot, q)),
+            osik.centroidal_momentum_matrix(robot, osik.forward_kinematics(robot, q)),
+        ),
+        in_axes=(None, 0),
+    )
+)
+
+
+class TestMatrices:
+    def test_mass_matrix_is_mujocos(self, robot, states, oracles):
+        datas, full = oracles
+        ours, _ = _matrices(robot, states[0])
+        for matrix, data, v in zip(ours, datas, states[1], strict=True):
+            expected = np.zeros((robot.mj_model.nv, robot.mj_model.nv))
+            mujoco.mj_fullM(robot.mj_model, data, expected)
+            np.testing.assert_allclose(matrix, full.T @ expected @ full, rtol=0.0, atol=1e-13)
+            assert v @ matrix @ v / 2.0 == pytest.approx(data.energy[1], rel=1e-13)
+
+    def test_momentum_is_mujocos(self, robot, states, oracles):
+        datas, _ = oracles
+        _, ours = _matrices(robot, states[0])
+        trunk, mass = robot.mj_model.body("trunk").id, float(robot.body_mass.sum())
+        for matrix, data, v in zip(ours, datas, states[1], strict=True):
+            np.testing.assert_allclose(matrix[:3] @ v, mass * data.subtree_linvel[trunk], rtol=0.0, atol=1e-12)
+            np.testing.assert_allclose(matrix[3:] @ v, data.subtree_angmom[trunk], rtol=0.0, atol=1e-12)
+
+    def test_single_precision_keeps_small_links(self, robot, states):
+        """Far from the origin, the wrist's own inertia is a 10,000th of what it has about there."""
+        exact, _ = _matrices(robot, states[0])
+        moved = states[0].at[:, :3].add(jnp.array([30.0, -20.0, 5.0]))
+        with jax.enable_x64(False):
+            single = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), robot)
+            rough, _ = _matrices(single, jnp.asarray(moved, jnp.float32))
+        scale = np.sqrt(np.diagonal(exact, axis1=1, axis2=2))
+        error = np.abs(np.asarray(rough, float) - exact) / (scale[:, :, None] * scale[:, None])
+        assert error.max() < 1e-4, error.max()
+
+
+def _solve(robot, q, tasks, scheme):
+    """Of all lanes; tasks are shared."""
+    return jax.jit(jax.vmap(lambda q: osik.solve(robot, q, tasks, scheme=scheme)))(q)
+
+
+class TestAngularMomentum:
+    def test_rows_are_the_momentum(self, robot, states, oracles):
+        trunk = robot.mj_model.body("trunk").id
+        tasks = {
+            "all": osik.AngularMomentumTask(robot, target=[0.1, 0.2, 0.3], weight=2.0),
+            "zx": osik.AngularMomentumTask(robot, axes="zx", target=[0.1, 0.2, 0.3]),
+            "bounds": osik.AngularMomentumTask(robot, axes="y", lower=-0.1, upper=0.2),
+        }
+        rows = jax.jit(jax.vmap(rows_of_each, in_axes=(None, None, 0)))(robot, tasks, states[0])
+        for k, (data, v) in enumerate(zip(oracles[0], states[1], strict=True)):
+            momentum = data.subtree_angmom[trunk]
+            np.testing.assert_allclose(rows["all"].jacobian[k] @ v, momentum, atol=1e-12)
+            np.testing.assert_allclose(rows["zx"].jacobian[k] @ v, momentum[[2, 0]], atol=1e-12)
+            np.testing.assert_allclose(rows["bounds"].jacobian[k] @ v, momentum[[1]], atol=1e-12)
+        np.testing.assert_array_equal(rows["zx"].lower[0], [0.3, 0.1])
+        np.testing.assert_array_equal(rows["all"].weight[0], [2.0, 2.0, 2.0])
+        np.testing.assert_array_equal((rows["bounds"].lower[0], rows["bounds"].upper[0]), ([-0.1], [0.2]))
+        assert all(not np.asarray(r.error).any() for r in rows.values())
+
+    def test_a_reach_turns_the_floating_robot_by_as_much(self, robot, states):
+        """With no momentum, MuJoCo's is 0 at the answer, though the arm moves."""
+        rate = np.array([0.3, -0.2, 0.1, 0.0, 0.0, 0.0])
+        tasks = {
+            "momentum": osik.AngularMomentumTask(robot, priority=1),
+            "tip": osik.FrameTask(robot, "tip", rows="position", gain=0.0, target_velocity=rate, priority=2),
+        }
+        answer = _solve(robot, states[0], tasks, osik.HierarchicalQP())
+        trunk, full = robot.mj_model.body("trunk").id, _full_velocities(robot)
+        for q, v in zip(states[0], answer.velocity, strict=True):
+            data = mujoco.MjData(robot.mj_model)
+            data.qpos[:], data.qvel[:] = robot.mujoco_qpos(q), full @ v
+            mujoco.mj_forward(robot.mj_model, data)
+            mujoco.mj_subtreeVel(robot.mj_model, data)
+            np.testing.assert_allclose(data.subtree_angmom[trunk], 0.0, atol=1e-12)
+            velocity = np.zeros(6)
+            site = robot.mj_model.site("tip").id
+            mujoco.mj_objectVelocity(robot.mj_model, data, mujoco.mjtObj.mjOBJ_SITE, site, velocity, 0)
+            np.testing.assert_allclose(velocity[3:], rate[:3], atol=1e-9)
+
+    def test_mistakes(self, robot):
+        with pytest.raises(TypeError, match="not both"):
+            osik.AngularMomentumTask(robot, target=0.0, lower=0.0)
+        with pytest.raises(ValueError, match="axes is 'xw'"):
+            osik.AngularMomentumTask(robot, axes="xw")
+        task = osik.AngularMomentumTask(robot, axes="xy", lower=-1.0, upper=1.0)
+        with pytest.raises(ValueError, match="lower > upper"):
+            task.replace(lower=2.0)
+        with pytest.raises(TypeError, match="it has: weight, lower, upper"):
+            task.replace(gain=2.0)
+        np.testing.assert_array_equal(osik.AngularMomentumTask(robot, axes="zy").replace(target=[1, 2, 3]).target, [3, 2])
+
+
+class TestKineticEnergy:
+    def test_weighted_squares_are_the_energy(self, robot, states, oracles):
+        tasks = {"energy": osik.KineticEnergyTask(robot, weight=0.5)}
+        rows = jax.jit(jax.vmap(rows_of_each, in_axes=(None, None, 0)))(robot, tasks, states[0])["energy"]
+        for k, (data, v) in enumerate(zip(oracles[0], states[1], strict=True)):
+            cost = rows.weight[k] @ (rows.jacobian[k] @ v) ** 2 / 2.0
+            assert cost == pytest.approx(0.5 * data.energy[1], rel=1e-11)
+
+    def test_of_all_motions_the_least_energy(self, robot, states, oracles):
+        """Khatib's inertia-weighted inverse, from MuJoCo's mass matrix and Jacobian."""
+        rate = np.array([0.3, -0.2, 0.1, 0.0, 0.0, 0.0])
+        tasks = {
+            "tip": osik.FrameTask(robot, "tip", rows="position", gain=0.0, target_velocity=rate, priority=1),
+            "energy": osik.KineticEnergyTask(robot, priority=2),
+        }
+        answer = _solve(robot, states[0], tasks, osik.HierarchicalQP())
+        datas, full = oracles
+        model = robot.mj_model
+        for data, v in zip(datas, answer.velocity, strict=True):
+            mass, linear = np.zeros((model.nv, model.nv)), np.zeros((3, model.nv))
+            mujoco.mj_fullM(model, data, mass)
+            mujoco.mj_jacSite(model, data, linear, None, model.site("tip").id)
+            weighted = np.linalg.solve(full.T @ mass @ full, (linear @ full).T)
+            expected = weighted @ np.linalg.solve(linear @ full @ weighted, rate[:3])
+            np.testing.assert_allclose(v, expected, atol=1e-9)
+
+    def test_finite_where_a_motion_moves_no_mass(self):
+        """Two hinges about one axis, and one about the line on which all the mass is: M has rank 1."""
+        robot = osik.Robot.from_mjcf(
+            """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/>
+            <inertial pos="0 0 0" mass="1" diaginertia="1e-3 1e-3 1e-3"/>
+            <body><joint name="b" axis="0 1 0"/><joint name="c" axis="1 0 0"/>
+            <inertial pos="0.3 0 0" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body></body></worldbody></mujoco>"""
+        )
+        import equinox as eqx
+
+        point = eqx.tree_at(lambda r: r.body_inertia, robot, jnp.zeros_like(robot.body_inertia))
+        rows = rows_of_each(point, {"energy": osik.KineticEnergyTask(point)}, point.q0)["energy"]
+        expected = 0.09 * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+        np.testing.assert_allclose(rows.jacobian.T @ rows.jacobian, expected, atol=1e-14)
+        assert_finite_gradients(point, {"energy": osik.KineticEnergyTask(point)}, point.q0)
+
+
+def _panda():
+    import importlib.metadata
+
+    files = importlib.metadata.files("example-robot-data") or []
+    (found,) = [file for file in files if str(file).endswith("panda_description/urdf/panda.urdf")]
+    return str(found.locate())
+
+
+class TestManipulability:
+    @pytest.fixture(scope="class")
+    def panda(self):
+        return osik.Robot.from_urdf(_panda(), floating_base=False)
+
+    @pytest.mark.parametrize("rows", ["pose", "position", "orientation"])
+    def test_index_and_slope_are_pinks(self, panda, rows):
+        model = pin.buildModelFromUrdf(_panda())
+        mask = {"pose": None}.get(rows, rows)
+        theirs = PinkManipulabilityTask("panda_hand", model, mask=mask)
+        task = osik.ManipulabilityTask(panda, "panda_hand", rows=rows, target=0.05, log=False)
+        rng = np.random.default_rng(3)
+        q = np.append(rng.uniform(panda.position_lower, panda.position_upper)[:7], 0.01)
+        own = rows_of_each(panda, {"m": task}, jnp.asarray(q))["m"]
+
+        def index(joints):
+            from pink import Configuration
+
+            return theirs.compute_manipulability(Configuration(model, model.createData(), np.append(joints, [q[7]] * 2)))
+
+        assert own.error[0] + 0.05 == pytest.approx(index(q[:7]), rel=1e-10)
+        steps = 1e-6 * np.eye(7)
+        slope = [(index(q[:7] + step) - index(q[:7] - step)) / 2e-6 for step in steps]
+        np.testing.assert_allclose(own.jacobian[0], [*slope, 0.0], atol=1e-8)
