@@ -1,11 +1,15 @@
 """Mass matrix, momentum, energy and manipulability against MuJoCo C, pink and central differences."""
 
+import importlib.metadata
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from pink import Configuration
 from pink.tasks import ManipulabilityTask as PinkManipulabilityTask
 from task_checks import assert_every_number_counts, assert_finite_gradients, rows_and_differences, rows_of_each
 
@@ -127,8 +131,8 @@ class TestMatrices:
         exact, _ = _matrices(robot, states[0])
         moved = states[0].at[:, :3].add(jnp.array([30.0, -20.0, 5.0]))
         with jax.enable_x64(False):
-            single = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), robot)
-            rough, _ = _matrices(single, jnp.asarray(moved, jnp.float32))
+            single = osik.Robot.from_mjcf(MODEL, locked_joints={"stuck": 0.4})
+            rough, _ = _matrices(single, jnp.asarray(np.asarray(moved), jnp.float32))
         scale = np.sqrt(np.diagonal(exact, axis1=1, axis2=2))
         error = np.abs(np.asarray(rough, float) - exact) / (scale[:, :, None] * scale[:, None])
         assert error.max() < 1e-4, error.max()
@@ -188,7 +192,9 @@ class TestAngularMomentum:
             task.replace(lower=2.0)
         with pytest.raises(TypeError, match="it has: weight, lower, upper"):
             task.replace(gain=2.0)
-        np.testing.assert_array_equal(osik.AngularMomentumTask(robot, axes="zy").replace(target=[1, 2, 3]).target, [3, 2])
+        np.testing.assert_array_equal(
+            osik.AngularMomentumTask(robot, axes="zy").replace(target=[1, 2, 3]).target, [3, 2]
+        )
 
 
 class TestKineticEnergy:
@@ -225,8 +231,6 @@ class TestKineticEnergy:
             <body><joint name="b" axis="0 1 0"/><joint name="c" axis="1 0 0"/>
             <inertial pos="0.3 0 0" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body></body></worldbody></mujoco>"""
         )
-        import equinox as eqx
-
         point = eqx.tree_at(lambda r: r.body_inertia, robot, jnp.zeros_like(robot.body_inertia))
         rows = rows_of_each(point, {"energy": osik.KineticEnergyTask(point)}, point.q0)["energy"]
         expected = 0.09 * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
@@ -235,18 +239,30 @@ class TestKineticEnergy:
 
 
 def _panda():
-    import importlib.metadata
-
     files = importlib.metadata.files("example-robot-data") or []
     (found,) = [file for file in files if str(file).endswith("panda_description/urdf/panda.urdf")]
     return str(found.locate())
 
 
-class TestManipulability:
-    @pytest.fixture(scope="class")
-    def panda(self):
-        return osik.Robot.from_urdf(_panda(), floating_base=False)
+FLAT = (True, True) + (False,) * 4
 
+
+@pytest.fixture(scope="module")
+def planar():
+    """Two links of half a metre."""
+    return osik.Robot.from_mjcf(
+        """<mujoco><worldbody><body><joint name="a" axis="0 0 1"/><geom size="0.1"/>
+        <body pos="0.5 0 0"><joint name="b" axis="0 0 1"/><geom size="0.1"/><site name="tip" pos="0.5 0 0"/>
+        </body></body></worldbody></mujoco>"""
+    )
+
+
+@pytest.fixture(scope="module")
+def panda():
+    return osik.Robot.from_urdf(_panda(), floating_base=False)
+
+
+class TestManipulability:
     @pytest.mark.parametrize("rows", ["pose", "position", "orientation"])
     def test_index_and_slope_are_pinks(self, panda, rows):
         model = pin.buildModelFromUrdf(_panda())
@@ -258,11 +274,113 @@ class TestManipulability:
         own = rows_of_each(panda, {"m": task}, jnp.asarray(q))["m"]
 
         def index(joints):
-            from pink import Configuration
-
-            return theirs.compute_manipulability(Configuration(model, model.createData(), np.append(joints, [q[7]] * 2)))
+            return theirs.compute_manipulability(
+                Configuration(model, model.createData(), np.append(joints, [q[7]] * 2))
+            )
 
         assert own.error[0] + 0.05 == pytest.approx(index(q[:7]), rel=1e-10)
         steps = 1e-6 * np.eye(7)
         slope = [(index(q[:7] + step) - index(q[:7] - step)) / 2e-6 for step in steps]
         np.testing.assert_allclose(own.jacobian[0], [*slope, 0.0], atol=1e-8)
+
+    def test_forms(self, arm, robot, states):
+        """The logarithm, chosen rows and joints in either axes; a row for each dof where it climbs."""
+        q = arm.configuration({name: 0.3 + 0.2 * i for i, name in enumerate(arm.joint_names)})
+        some = arm.joint_names[1:6]
+        flat = (True, True, False, False, False, True)
+        made = {
+            "m": dict(target=0.0, rows="position"),
+            "log": dict(target=0.0, rows="position", log=True),
+            "flat": dict(target=0.0, rows=flat, joints=some),
+            "own": dict(target=0.0, rows=flat, joints=some, axes="frame"),
+            "climb": dict(rows="position", gain=2.0, weight=3.0),
+            "bounds": dict(rows="position", lower=0.1, gain=2.0, target_velocity=0.5),
+        }
+        tasks = {name: osik.ManipulabilityTask(arm, "hand", **options) for name, options in made.items()}
+        rows, slopes = rows_and_differences(arm, tasks, q)
+        kin = osik.forward_kinematics(arm, q)
+        jacobian, turn = np.asarray(osik.frame_jacobian(arm, kin, "hand")), np.asarray(kin.frame_pose(arm, "hand")[1])
+        own = np.concatenate([turn.T @ jacobian[:3], turn.T @ jacobian[3:]])
+
+        def volume(matrix):
+            return np.prod(np.linalg.svd(matrix, compute_uv=False))
+
+        m = volume(jacobian[:3])
+        assert rows["m"].error[0] == pytest.approx(m, rel=1e-12)
+        assert rows["log"].error[0] == pytest.approx(np.log(m), rel=1e-12)
+        assert rows["flat"].error[0] == pytest.approx(volume(jacobian[np.array(flat)][:, 1:6]), rel=1e-11)
+        assert rows["own"].error[0] == pytest.approx(volume(own[np.array(flat)][:, 1:6]), rel=1e-11)
+        for name in ("m", "log", "flat", "own", "bounds"):
+            np.testing.assert_allclose(rows[name].jacobian, slopes[name], atol=1e-8)
+        gradient = np.asarray(rows["m"].jacobian[0])
+        np.testing.assert_allclose(rows["climb"].lower, 2.0 * gradient, atol=1e-14)
+        np.testing.assert_array_equal(rows["climb"].jacobian, np.eye(arm.nv))
+        np.testing.assert_array_equal(rows["climb"].weight, np.full(arm.nv, 3.0))
+        assert rows["bounds"].lower[0] == pytest.approx(2.0 * (0.1 - m) + 0.5, rel=1e-12)
+        assert rows["bounds"].upper[0] == np.inf
+        climbs = osik.ManipulabilityTask(robot, "hand", rows=(False, False, True, True, False, False), joints=None)
+        names = [robot.tree.joint_names[j] for j, dof in robot.tree.dof_address.items() if dof in climbs.dofs]
+        assert names == ["elbow", "lift"]  # the wrist follows the elbow
+
+    def test_climbing_reaches_a_greatest_index(self, planar):
+        """Of the elbow of a planar arm: at a right angle between its two equal links."""
+        task = osik.ManipulabilityTask(planar, "tip", rows=FLAT, gain=20.0)
+        start = jnp.array([0.2, 0.3])
+        path = osik.rollout(planar, start, {"m": task}, scheme=osik.WeightedQP(damping=1e-9), dt=0.02, steps=200)
+        np.testing.assert_allclose(path.q[-1], [0.2, np.pi / 2], atol=1e-6)
+
+    def test_a_lower_bound_keeps_away_from_singularities(self, planar):
+        """A tip pulled out of reach: its index is sin(elbow) / 4, and the elbow stays bent by as much as is asked."""
+        far = np.array([1.5, 0.0, 0.0]), np.eye(3)
+        reach = osik.FrameTask(planar, "tip", rows=FLAT, target=far, gain=2.0)
+        bound = osik.ManipulabilityTask(planar, "tip", rows=FLAT, lower=0.05, hard=True)
+        setting = dict(scheme=osik.WeightedQP(damping=1e-3), limits=(osik.VelocityLimit(planar, velocity={"*": 2.0}),))
+        paths = [
+            osik.rollout(planar, jnp.array([0.5, 1.0]), tasks, **setting, dt=0.01, steps=200)
+            for tasks in ({"reach": reach}, {"reach": reach, "index": bound})
+        ]
+        free, kept = (np.sin(np.asarray(path.q[:, 1])) / 4.0 for path in paths)
+        assert free.min() < 0.01
+        assert kept.min() > 0.05 - 1e-3
+        assert kept[-1] == pytest.approx(0.05, abs=1e-5)
+
+    def test_finite_where_it_is_singular(self, planar):
+        """Of two rows, stretched out they are of rank 1, and where nothing moves along z of rank 0."""
+        tasks = {
+            "flat": osik.ManipulabilityTask(planar, "tip", rows=FLAT, lower=0.1),
+            "log": osik.ManipulabilityTask(planar, "tip", rows=FLAT, lower=0.1, log=True),
+            "up": osik.ManipulabilityTask(planar, "tip", rows=(False, False, True) + (False,) * 3, target=0.1),
+            "climb": osik.ManipulabilityTask(planar, "tip", rows=FLAT),
+        }
+        straight = jnp.array([0.2, 0.0])
+        rows = rows_of_each(planar, tasks, straight)
+        assert (rows["flat"].error[0], rows["up"].error[0]) == (0.0, -0.1)
+        assert rows["log"].error[0] == pytest.approx(np.log(np.finfo(float).tiny))
+        np.testing.assert_array_equal(rows["climb"].lower, [0.0, 0.0])
+        assert_finite_gradients(planar, {name: tasks[name] for name in ("log", "climb")}, straight)
+        near = rows_of_each(planar, tasks, jnp.array([0.2, 1e-7]))
+        assert near["flat"].error[0] == pytest.approx(0.25e-7, rel=1e-7)
+        np.testing.assert_allclose(near["flat"].jacobian, [[0.0, 0.25]], atol=1e-7)
+
+    def test_mistakes(self, arm):
+        with pytest.raises(ValueError, match="2 dofs of the chosen joints move 'hand'"):
+            osik.ManipulabilityTask(arm, "hand", joints=arm.joint_names[:2])
+        with pytest.raises(TypeError, match="not both"):
+            osik.ManipulabilityTask(arm, "hand", target=1.0, upper=2.0)
+        with pytest.raises(TypeError, match="there are none"):
+            osik.ManipulabilityTask(arm, "hand", target_velocity=0.1)
+        with pytest.raises(KeyError, match="did you mean 'hand'"):
+            osik.ManipulabilityTask(arm, "hnd")
+        with pytest.raises(ValueError, match="axes is 'local'"):
+            osik.ManipulabilityTask(arm, "hand", axes="local")
+
+
+def test_every_number_counts_and_nothing_compiles_again(planar):
+    q = jnp.array([0.3, 0.7])
+    tasks = {
+        "index": osik.ManipulabilityTask(planar, "tip", rows=FLAT, target=0.1),
+        "bounds": osik.ManipulabilityTask(planar, "tip", rows=FLAT, lower=0.1, upper=0.2),
+        "climb": osik.ManipulabilityTask(planar, "tip", rows=FLAT, gain=osik.AdaptiveGain(4.0, 1.0, 2.0)),
+    }
+    assert_every_number_counts(planar, tasks, q)
+    assert_finite_gradients(planar, {"index": tasks["index"]}, q)

@@ -169,15 +169,18 @@ def _moving_dofs(tree: KinematicTree, body: int, joints: Sequence[int]) -> tuple
 def _volume(rows: Float[Array, "m n"], *, log: bool) -> Float[Array, ""]:
     """sqrt(det(rows rows')) or its logarithm, m <= n: the product of what each row adds to those before it.
 
-    From a QR factorisation, so that small values keep their digits, which determinants of products lose.
+    By Gram and Schmidt's method, so that small values keep their digits, which determinants of products lose.
     """
     m, n = rows.shape
-    noise = _NOISE * n * jnp.finfo(rows.dtype).eps
-    lengths = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2, 1))
-    added = jnp.abs(jnp.diagonal(jnp.linalg.qr(jax.lax.stop_gradient(rows).T, mode="r")))
-    singular = jnp.any(added <= noise * lengths)
-    safe = jnp.where(singular, jnp.eye(m, n, dtype=rows.dtype), rows)
-    added = jnp.abs(jnp.diagonal(jnp.linalg.qr(safe.T)[1]))
+    noise = (_NOISE * n * jnp.finfo(rows.dtype).eps) ** 2
+    squares, singular, volume = jnp.sum(rows**2, 1), jnp.asarray(False), jnp.ones((), rows.dtype)
+    for k in range(m):
+        square = jnp.sum(rows[k] ** 2)
+        depends = square <= noise * squares[k]
+        length = jnp.sqrt(jnp.where(depends, 1.0, square))
+        direction = rows[k] / length
+        rows = rows - jnp.matmul(rows, direction, precision="highest")[:, None] * direction
+        singular, volume = singular | depends, volume * length
     if log:
-        return jnp.where(singular, jnp.log(jnp.finfo(rows.dtype).tiny), jnp.sum(jnp.log(added)))
-    return jnp.where(singular, 0.0, jnp.prod(added))
+        return jnp.where(singular, jnp.log(float(jnp.finfo(rows.dtype).tiny)), jnp.log(volume))
+    return jnp.where(singular, 0.0, volume)
