@@ -61,6 +61,11 @@ def assert_every_number_counts(robot, tasks, q, idle=()):
     assert len(_traces) == traces
 
 
+def alone(*given):
+    """Batches of one."""
+    return jax.tree.map(lambda a: jnp.asarray(a)[None], given)
+
+
 def assert_finite_gradients(rows, *given):
     """Of all that a dict of rows holds, in both modes, with respect to every number given, for each of a batch."""
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 from pink import Configuration
 from pink.tasks import ManipulabilityTask as PinkManipulabilityTask
-from task_checks import assert_every_number_counts, assert_finite_gradients, rows_and_differences, rows_of_each
+from task_checks import alone, assert_every_number_counts, assert_finite_gradients, at_each, rows_of_each
 
 import osik_jax as osik
 
@@ -235,7 +235,7 @@ class TestKineticEnergy:
         rows = rows_of_each(point, {"energy": osik.KineticEnergyTask(point)}, point.q0)["energy"]
         expected = 0.09 * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
         np.testing.assert_allclose(rows.jacobian.T @ rows.jacobian, expected, atol=1e-14)
-        assert_finite_gradients(point, {"energy": osik.KineticEnergyTask(point)}, point.q0)
+        assert_finite_gradients(rows_of_each, *alone(point, {"energy": osik.KineticEnergyTask(point)}, point.q0))
 
 
 def _panda():
@@ -260,6 +260,10 @@ def planar():
 @pytest.fixture(scope="module")
 def panda():
     return osik.Robot.from_urdf(_panda(), floating_base=False)
+
+
+def _index(robot, **options):
+    return osik.ManipulabilityTask(robot, "hand", **options)
 
 
 class TestManipulability:
@@ -296,8 +300,8 @@ class TestManipulability:
             "climb": dict(rows="position", gain=2.0, weight=3.0),
             "bounds": dict(rows="position", lower=0.1, gain=2.0, target_velocity=0.5),
         }
-        tasks = {name: osik.ManipulabilityTask(arm, "hand", **options) for name, options in made.items()}
-        rows, slopes = rows_and_differences(arm, tasks, q)
+        tasks = {name: _index(arm, **options) for name, options in made.items()}
+        rows, slopes = jax.tree.map(lambda a: a[0], at_each(arm, tasks, q[None]))
         kin = osik.forward_kinematics(arm, q)
         jacobian, turn = np.asarray(osik.frame_jacobian(arm, kin, "hand")), np.asarray(kin.frame_pose(arm, "hand")[1])
         own = np.concatenate([turn.T @ jacobian[:3], turn.T @ jacobian[3:]])
@@ -334,9 +338,10 @@ class TestManipulability:
         far = np.array([1.5, 0.0, 0.0]), np.eye(3)
         reach = osik.FrameTask(planar, "tip", rows=FLAT, target=far, gain=2.0)
         bound = osik.ManipulabilityTask(planar, "tip", rows=FLAT, lower=0.05, hard=True)
-        setting = dict(scheme=osik.WeightedQP(damping=1e-3), limits=(osik.VelocityLimit(planar, velocity={"*": 2.0}),))
+        start, scheme = jnp.array([0.5, 1.0]), osik.WeightedQP(damping=1e-3)
+        limits = (osik.VelocityLimit(planar, velocity={"*": 2.0}),)
         paths = [
-            osik.rollout(planar, jnp.array([0.5, 1.0]), tasks, **setting, dt=0.01, steps=200)
+            osik.rollout(planar, start, tasks, scheme=scheme, limits=limits, dt=0.01, steps=200)
             for tasks in ({"reach": reach}, {"reach": reach, "index": bound})
         ]
         free, kept = (np.sin(np.asarray(path.q[:, 1])) / 4.0 for path in paths)
@@ -357,7 +362,9 @@ class TestManipulability:
         assert (rows["flat"].error[0], rows["up"].error[0]) == (0.0, -0.1)
         assert rows["log"].error[0] == pytest.approx(np.log(np.finfo(float).tiny))
         np.testing.assert_array_equal(rows["climb"].lower, [0.0, 0.0])
-        assert_finite_gradients(planar, {name: tasks[name] for name in ("log", "climb")}, straight)
+        assert_finite_gradients(
+            rows_of_each, *alone(planar, {name: tasks[name] for name in ("log", "climb")}, straight)
+        )
         near = rows_of_each(planar, tasks, jnp.array([0.2, 1e-7]))
         assert near["flat"].error[0] == pytest.approx(0.25e-7, rel=1e-7)
         np.testing.assert_allclose(near["flat"].jacobian, [[0.0, 0.25]], atol=1e-7)
@@ -372,7 +379,7 @@ class TestManipulability:
         with pytest.raises(KeyError, match="did you mean 'hand'"):
             osik.ManipulabilityTask(arm, "hnd")
         with pytest.raises(ValueError, match="axes is 'local'"):
-            osik.ManipulabilityTask(arm, "hand", axes="local")
+            _index(arm, axes="local")
 
 
 def test_every_number_counts_and_nothing_compiles_again(planar):
@@ -383,4 +390,4 @@ def test_every_number_counts_and_nothing_compiles_again(planar):
         "climb": osik.ManipulabilityTask(planar, "tip", rows=FLAT, gain=osik.AdaptiveGain(4.0, 1.0, 2.0)),
     }
     assert_every_number_counts(planar, tasks, q)
-    assert_finite_gradients(planar, {"index": tasks["index"]}, q)
+    assert_finite_gradients(rows_of_each, *alone(planar, {"index": tasks["index"]}, q))

@@ -141,7 +141,7 @@ def unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def deviation(axis: Float[Array, "3"], direction: Float[Array, "3"]) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
     """The error e of ``PointingTask`` from two unit vectors, and D with ``e' = D d'`` for a rate d' across d."""
-    basis = _across(axis)
+    basis = across(axis)
     cosine, beside = dot(axis, direction), dot(basis, direction)
     behind = cosine < _BEHIND
     front = _in_front(axis, basis, jnp.where(behind, 1.0, cosine), jnp.where(behind, 0.0, beside))
@@ -182,7 +182,7 @@ def _behind(
     return -angle * way, -(ratio * basis + (1.0 / cosine - ratio) * jnp.outer(way, dot(way, basis)))
 
 
-def _across(axis: Float[Array, "3"]) -> Float[Array, "2 3"]:
+def across(axis: Float[Array, "3"]) -> Float[Array, "2 3"]:
     """Two unit vectors that make a right-handed basis with a unit vector (Duff et al., JCGT 6(1), 2017)."""
     x, y, z = axis
     sign = jnp.where(z < 0.0, -1.0, 1.0).astype(axis.dtype)

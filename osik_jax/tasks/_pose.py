@@ -64,9 +64,9 @@ class PoseTask(FramedTask):
         hard: bool,
     ):
         self.frame = frame
-        self.kept = _row_mask(rows)
-        self.axes = _option("axes", axes, (outer_axes, "frame"))
-        self.orientation_jacobian = _option("orientation_jacobian", orientation_jacobian, ("analytic", "geometric"))
+        self.kept = row_mask(rows)
+        self.axes = option("axes", axes, (outer_axes, "frame"))
+        self.orientation_jacobian = option("orientation_jacobian", orientation_jacobian, ("analytic", "geometric"))
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         self.target = as_pose(target, dtype)
@@ -159,14 +159,23 @@ def _row_weight(value: Any, name: str, dtype: Any) -> Float[Array, "3"]:
     return out
 
 
-def _option(name: str, value: str, available: tuple[str, ...]) -> str:
+def option(name: str, value: str, available: tuple[str, ...]) -> str:
+    """The value, if it is one of those available.
+
+    Raises:
+        ValueError: it is not; the message lists them.
+    """
     if value not in available:
         raise ValueError(f"{name} is {value!r}; it is one of: {', '.join(map(repr, available))}")
     return value
 
 
-def _row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
-    """Six booleans from the name of a set of rows or from themselves."""
+def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
+    """Six booleans from the name of a set of rows or from themselves.
+
+    Raises:
+        ValueError: no such name, not six, or none of them is true.
+    """
     if isinstance(rows, str):
         if rows not in _ROWS:
             raise ValueError(str(unknown_name("set of rows", rows, tuple(_ROWS))))

@@ -13,13 +13,15 @@ from jaxtyping import Array, Float
 from ..kinematics import Kinematics, frame_jacobians
 from ..robot import Robot
 from ._axis_align import AxisAlignTask
+from ._contact import ContactTask
 from ._frame import FrameTask
 from ._framed import FramedTask
 from ._look_at import LookAtTask
 from ._relative_frame import RelativeFrameTask
 from ._task import Task, TaskRows
+from ._wheel import WheelTask
 
-_TOGETHER = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask)
+_TOGETHER = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask, ContactTask, WheelTask)
 """Kinds that are worked on in one go; a subclass may have rows of its own."""
 _APART = {"frame", "root", "target_frame", "priority", "hard"}
 """Static fields that such tasks may differ in: they do not reach ``rows_at``."""
