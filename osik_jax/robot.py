@@ -142,9 +142,10 @@ class Robot(eqx.Module):
         """Loads an MJCF file or text. The first keyframe is ``q0``.
 
         Active joint equality constraints that are linear become exact mimic joints, those without a second joint lock
-        the first; an ``EqualityConstraintTask`` keeps ``connect``, ``weld`` and the other joint constraints; tendons are
-        not honoured. Where files of meshes, height fields or textures cannot be read, the geoms that need them are left out. Where the model does not compile for
-        want of masses, moving bodies without get 2e-15 kg. ``fusestatic`` is not followed: it loses names.
+        the first; an ``EqualityConstraintTask`` keeps ``connect``, ``weld`` and the other joint constraints. Tendons
+        are not honoured. Where files of meshes, height fields or textures cannot be read, the geoms that need them are
+        left out. Where the model does not compile for want of masses, moving bodies without get 2e-15 kg.
+        ``fusestatic`` is not followed: it loses names.
 
         Args:
             mjcf: path of the file, or the XML text itself.
