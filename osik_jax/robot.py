@@ -309,10 +309,10 @@ class Robot(eqx.Module):
         Locked joints are gone, their bodies posed at the locked values. Links that are fixed to others are one body
         with them and stay as frames. Mimic joints are joint equality constraints, velocity limits custom numerics
         ``velocity_limit/JOINT``, and ``q0`` is the keyframe ``home``. Frames that are no bodies are sites, or geoms
-        where they were: simple shapes are kept, meshes are not, so the file needs no other. Shapes keep their sizes,
-        and those without a name their places in ``mj_model``. Actuators, sensors, tendons, other constraints and the
-        masses of what is fixed to the world are left out; bodies that locked joints leave fixed to the world count as
-        such when the file is read. ``Robot.from_mjcf`` of the text is the same robot in all else.
+        where they were: simple shapes are kept, meshes are not, so the file needs no other. Actuators, sensors,
+        tendons, other constraints and the masses of what is fixed to the world are left out; bodies that locked joints
+        leave fixed to the world count as such when the file is read. ``Robot.from_mjcf`` of the text is the same robot
+        in all else.
 
         Args:
             path: file to write the text to, if any.
@@ -322,7 +322,7 @@ class Robot(eqx.Module):
 
         Raises:
             ValueError: a stack of robots, or numbers that MJCF has no place for: a joint limited on one side alone,
-                limits that differ between the dofs of a free or ball joint.
+                limits that differ between the dofs of a free or ball joint, the frame of a body moved without it.
         """
         text = _loading.to_mjcf(self)
         if path is not None:

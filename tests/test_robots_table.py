@@ -36,7 +36,7 @@ def test_poses_are_as_right_as_the_page_says(name: str):
 
 
 def test_a_wrong_pose_is_seen():
-    """The judge itself: an arm with a link 1 mm longer is 1 mm off, in the largest coordinate at least 1 / sqrt(3) mm."""
+    """The judge itself: an arm with a link 1 mm longer is 1 mm off, so some coordinate is by 1 / sqrt(3) mm."""
     robot = robots_table.load("arm7")
     longer = robot.scaled(length={"link6": 1.0 + 1e-3 / 0.088})
     assert 1e-3 / np.sqrt(3.0) <= robots_table.pose_error("arm7", longer) <= 1.000001e-3

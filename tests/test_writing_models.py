@@ -158,7 +158,9 @@ def test_inertias_come_back():
     robot = scaled_nao()
     again = Robot.from_mjcf(robot.to_mjcf())
     assert again.body_names == robot.body_names
-    for leaf in ("body_mass", "body_com", "body_inertia", "dof_armature"):
+    assert again.tree.geom_types == robot.tree.geom_types
+    leaves = "body_mass", "body_com", "body_inertia", "dof_armature", "geom_position", "geom_rotation", "geom_size"
+    for leaf in leaves:
         ours, theirs = getattr(robot, leaf), getattr(again, leaf)
         np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-13, err_msg=leaf)
 
@@ -203,7 +205,7 @@ def test_moved_frames_are_written_and_moved_bodies_are_not_mistaken_for_frames()
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-15)
     at = robot.tree.frame("link7")
     wrong = eqx.tree_at(lambda r: r.frame_position, robot, robot.frame_position.at[at].add(0.01))
-    with pytest.raises(ValueError, match=r"frame 'link7' is a body of its own: move the body"):
+    with pytest.raises(ValueError, match=r"frame 'link7' is a body or geom of its own and not where that is"):
         wrong.to_mjcf()
 
 

@@ -63,7 +63,7 @@ def from_mjmodel(
     _check(model, names, body_names)
     asked = _asked_locks(model, names, as_mapping(locked_joints))
     followers, locked = _resolve(names, *_equality_followers(model), asked)
-    bodies, placement = moving_bodies(model)
+    bodies, placement = _moving_bodies(model)
     frames = _frames(model, body_names, placement)
     tree = KinematicTree(
         body_names=tuple(body_names[b] for b in bodies),
@@ -260,7 +260,7 @@ def _qpos_offset(model: mujoco.MjModel, followers: list[Follower], locked: Mappi
     return out
 
 
-def moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
+def _moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
     """The world and the bodies with joints; where each body of the model sits on them."""
     bodies, placement = [0], [Placement(0, np.zeros(3), np.eye(3))]
     for b in range(1, model.nbody):
@@ -268,12 +268,11 @@ def moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
             placement.append(Placement(len(bodies), np.zeros(3), np.eye(3)))
             bodies.append(b)
         else:
-            placement.append(placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]))
+            placement.append(_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]))
     return bodies, placement
 
 
-def placed(on: Placement, position: np.ndarray, quaternion: np.ndarray) -> Placement:
-    """What sits at a pose in a placement."""
+def _placed(on: Placement, position: np.ndarray, quaternion: np.ndarray) -> Placement:
     return Placement(on.body, on.position + on.rotation @ position, on.rotation @ rotation_matrix(quaternion))
 
 
@@ -283,7 +282,7 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
 
     def add(kind: str, name: str | None, body: int, position: np.ndarray, quaternion: np.ndarray) -> None:
         if name:
-            out[name if name not in out else f"{kind}:{name}"] = placed(placement[body], position, quaternion)
+            out[name if name not in out else f"{kind}:{name}"] = _placed(placement[body], position, quaternion)
 
     for s in range(model.nsite):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
@@ -307,7 +306,7 @@ def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Place
         axes, arm = place.rotation @ rotation_matrix(model.body_iquat[b]), center - centers[place.body]
         inertia[place.body] += axes * model.body_inertia[b] @ axes.T
         inertia[place.body] += model.body_mass[b] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    poses = [placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]) for b in bodies]
+    poses = [_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]) for b in bodies]
     return dict(
         body_position=[pose.position for pose in poses],
         body_quaternion=[quaternion(pose.rotation) for pose in poses],
@@ -320,7 +319,7 @@ def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Place
 def _geom_arrays(model: mujoco.MjModel, placement: list[Placement]) -> dict[str, ArrayLike]:
     """Poses of the geoms in the moving bodies, and their sizes."""
     described = zip(model.geom_bodyid, model.geom_pos, model.geom_quat, strict=True)
-    poses = [placed(placement[body], position, quaternion) for body, position, quaternion in described]
+    poses = [_placed(placement[body], position, quaternion) for body, position, quaternion in described]
     meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     return dict(
         geom_position=np.array([pose.position for pose in poses]).reshape(-1, 3),

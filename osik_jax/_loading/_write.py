@@ -11,15 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
-from ._mjmodel import (
-    LEAST_INERTIA,
-    VELOCITY_LIMIT_PREFIX,
-    Placement,
-    moving_bodies,
-    placed,
-    quaternion,
-    rotation_matrix,
-)
+from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, quaternion, rotation_matrix
 from ._urdf_elements import IDENTITY, Pose
 
 if TYPE_CHECKING:
@@ -32,6 +24,9 @@ _SHAPES = {
 }
 _ROUNDING = 1e-9
 """Of its greatest moment of inertia, by which a body may break the triangle inequality for rounding alone."""
+
+_SAME = 1e-6
+"""Up to this, a frame and what it is the frame of are in one place [m, or entries of a rotation matrix]."""
 
 
 class _JointPlace(NamedTuple):
@@ -227,41 +222,42 @@ def _one(values: ArrayLike, joint: str, what: str) -> float:
 def _add_frames(robot: Robot, bodies: list[ElementTree.Element]) -> None:
     """Geoms of simple shapes, and as sites all frames that are neither those nor bodies."""
     tree = robot.tree
-    done = set(tree.body_names) | _add_geoms(robot, bodies)
+    done = dict.fromkeys(tree.body_names, IDENTITY) | _add_geoms(robot, bodies)
     for k, (name, body) in enumerate(zip(tree.frame_names, tree.frame_bodies, strict=True)):
-        pose = Pose(*(np.asarray(leaf[k], float) for leaf in (robot.frame_position, robot.frame_rotation)))
+        pose = _pose(robot.frame_position[k], robot.frame_rotation[k])
         if name not in done:
             _put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
-        elif name in tree.body_names and any(map(np.any, (a - b for a, b in zip(pose, IDENTITY, strict=True)))):
-            raise ValueError(f"frame {name!r} is a body of its own: move the body (body_position), not the frame")
+        elif not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(pose, done[name], strict=True)):
+            raise ValueError(
+                f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
+            )
 
 
-def _add_geoms(robot: Robot, bodies: list[ElementTree.Element]) -> set[str]:
-    """The shapes of ``mj_model`` that need no file, at the frames of the robot where they are named; their names."""
-    model, tree, names = robot.mj_model, robot.tree, set()
-    _, placement = moving_bodies(model)
-    for g in range(model.ngeom):
-        if int(model.geom_type[g]) not in _SHAPES:
-            continue
-        place = placed(placement[model.geom_bodyid[g]], model.geom_pos[g], model.geom_quat[g])
+def _pose(position: ArrayLike, rotation: ArrayLike) -> Pose:
+    return Pose(np.asarray(position, float), np.asarray(rotation, float))
+
+
+def _add_geoms(robot: Robot, bodies: list[ElementTree.Element]) -> dict[str, Pose]:
+    """The shapes that need no file; the frames that are their names, and where they are."""
+    model, tree = robot.mj_model, robot.tree
+    done: dict[str, Pose] = {}
+    for g in (g for g, kind in enumerate(tree.geom_types) if kind in _SHAPES):
+        pose = _pose(robot.geom_position[g], robot.geom_rotation[g])
         values, name = _appearance(model, g), mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g)
         if name:
             name = f"geom:{name}" if f"geom:{name}" in tree.frame_names else name
-            k = tree.frame(name)
-            pose = (np.asarray(leaf[k], float) for leaf in (robot.frame_position, robot.frame_rotation))
-            place = Placement(place.body, *pose)
-            names.add(name)
+            done[name] = pose
             values |= dict(name=name)
-        _put(bodies[place.body], "geom", **values, pos=place.position, quat=quaternion(place.rotation))
-    return names
+        places = dict(size=robot.geom_size[g], pos=pose.position, quat=quaternion(pose.rotation))
+        _put(bodies[tree.geom_bodies[g]], "geom", **values, **places)
+    return done
 
 
 def _appearance(model: mujoco.MjModel, geom: int) -> dict[str, str | ArrayLike]:
-    """Shape, colour and what it collides with; masses are the bodies'."""
+    """Kind, colour and what it collides with; masses are the bodies'."""
     material = model.geom_matid[geom]
     return dict(
         type=_SHAPES[int(model.geom_type[geom])],
-        size=model.geom_size[geom],
         rgba=model.geom_rgba[geom] if material < 0 else model.mat_rgba[material],
         group=str(model.geom_group[geom]),
         contype=str(model.geom_contype[geom]),
