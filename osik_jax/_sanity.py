@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-_NEVER_INFINITE = {"weight", "position_weight", "orientation_weight", "gain", "target", "target_velocity"}
+_WEIGHTS = {"weight", "position_weight", "orientation_weight", "gain"}
+_NEVER_INFINITE = _WEIGHTS | {"target", "target_velocity", "axis", "ratios"}
 """Fields of a task that bound nothing."""
 
 

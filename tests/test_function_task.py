@@ -161,8 +161,9 @@ class TestCompilation:
 
         q, task = configurations[0], tasks["apart"]
         before = error(task, q)
-        half = (before[0] - 0.1) / 1.0
-        other = task.replace(function=Apart(jnp.array([3.0, 4.0]), 0.0, 2, "left hand"), gain=osik.AdaptiveGain(4, 3, 2))
+        half = before[0] - 0.1
+        new = Apart(jnp.array([3.0, 4.0]), 0.0, 2, "left hand")
+        other = task.replace(function=new, gain=osik.AdaptiveGain(4, 3, 2))
         np.testing.assert_allclose(error(other, q), [3.0 * half, 4.0 * half], rtol=1e-14)
         made = osik.FunctionTask(
             robot, Apart(jnp.array([5.0, 6.0]), 0.2, 2, "left hand"), gain=osik.AdaptiveGain(9, 8, 7)

@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -382,6 +383,22 @@ class TestBatchesAndCompilation:
             expected = jax.tree.leaves(rows_of_each(robot, tasks, configurations[i]))
             for ours, theirs in zip(jax.tree.leaves(found[0]), expected, strict=True):
                 np.testing.assert_allclose(ours[i], theirs, atol=1e-12)
+
+    def test_what_is_no_number_is_said(self, head):
+        """A lane spoiled through any leaf stands still and has the status; its neighbours do not notice."""
+        task = osik.LookAtTask(head, "head", axis=(1.0, 0.0, 0.0), target=(0.5, 1.0, 0.1), half_angle=0.2)
+        spoiled = [task.replace(target=jnp.array(1.0))]
+        for name, value in (("axis", np.inf), ("axis", np.nan), ("target", np.inf), ("half_angle", np.nan)):
+            leaf = jnp.full_like(getattr(task, name), value)
+            spoiled.append(eqx.tree_at(lambda t, name=name: getattr(t, name), task, leaf))
+
+        def solve(task):
+            return osik.solve(head, head.q0, {"look": task}, scheme=osik.WeightedQP())
+
+        solutions = jax.jit(jax.vmap(solve))(osik.stack(spoiled))
+        np.testing.assert_array_equal(solutions.status == osik.Status.NUMERICAL_ERROR, [False, True, True, True, True])
+        assert np.abs(solutions.velocity[0]).max() > 0.1
+        np.testing.assert_array_equal(solutions.velocity[1:], np.zeros((4, 2)))
 
     def test_a_float32_robot_has_float32_tasks(self, robot):
         small = jax.tree.map(lambda x: x.astype(jnp.float32), robot)

@@ -210,15 +210,18 @@ class TestClosedLoop:
         """By hand, one joint: v = (w1 gain (target - q) + w2 v_last) / (w1 + w2)."""
         posture = osik.PostureTask(arm, target=arm.q0 + 0.5, gain=5.0)
         smooth = osik.LowAccelerationTask(arm, weight=3.0)
-        tick = jax.jit(lambda q, tasks: osik.solve(arm, q, tasks, scheme=osik.WeightedQP(damping=1e-12), dt=DT))
-        q, way, speed = arm.q0, 0.5, 0.0
+        tasks, scheme = {"posture": posture, "smooth": smooth}, osik.WeightedQP(damping=1e-12)
+        run = osik.rollout(arm, arm.q0, tasks, scheme=scheme, dt=DT, steps=20)
+        way, speed, speeds = 0.5, 0.0, []
         for _ in range(20):
-            solution = tick(q, {"posture": posture, "smooth": smooth})
             speed = (5.0 * way + 3.0 * speed) / 4.0
-            np.testing.assert_allclose(solution.velocity, np.full(7, speed), rtol=1e-9)
-            q, way = q + DT * solution.velocity, way - DT * speed
-            smooth = smooth.after(solution.velocity)
-        assert speed > 1.0
+            way -= DT * speed
+            speeds.append(speed)
+        np.testing.assert_allclose(run.solution.velocity, np.repeat(speeds, 7).reshape(20, 7), rtol=1e-9)
+        last = smooth.after(run.solution.velocity[-2])
+        solution = osik.solve(arm, run.q[-2], tasks | {"smooth": last}, scheme=scheme, dt=DT)
+        np.testing.assert_allclose(solution.velocity, np.full(7, speed), rtol=1e-9)
+        assert 1.0 < speeds[-1] < max(speeds) and speeds[0] < 0.7
 
 
 class TestMistakes:
