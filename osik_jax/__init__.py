@@ -22,9 +22,11 @@ from .kinematics import mass_matrix as mass_matrix
 from .limits import AccelerationLimit as AccelerationLimit
 from .limits import CollisionAvoidanceLimit as CollisionAvoidanceLimit
 from .limits import ConfigurationLimit as ConfigurationLimit
+from .limits import FloatingBaseVelocityLimit as FloatingBaseVelocityLimit
 from .limits import Limit as Limit
 from .limits import LimitRows as LimitRows
 from .limits import LinearLimit as LinearLimit
+from .limits import PositionBarrier as PositionBarrier
 from .limits import VelocityLimit as VelocityLimit
 from .limits import limit_box as limit_box
 from .limits import limit_rows as limit_rows
@@ -48,6 +50,7 @@ from .tasks import FunctionTask as FunctionTask
 from .tasks import JointCouplingTask as JointCouplingTask
 from .tasks import JointVelocityTask as JointVelocityTask
 from .tasks import KineticEnergyTask as KineticEnergyTask
+from .tasks import LimitTask as LimitTask
 from .tasks import LookAtTask as LookAtTask
 from .tasks import LowAccelerationTask as LowAccelerationTask
 from .tasks import ManipulabilityTask as ManipulabilityTask

@@ -325,7 +325,7 @@ def _velocity_problem(
         if isinstance(limit, ConfigurationLimit):
             low, high = jnp.maximum(low, limit.lower), jnp.minimum(high, limit.upper)
     return VelocityProblem(
-        rows=rows_of(robot, kinematics, q, tasks),
+        rows=rows_of(robot, kinematics, q, {name: task.during(dt) for name, task in tasks.items()}),
         priorities=tuple((name, task.priority) for name, task in tasks.items()),
         lower=lower,
         upper=upper,

@@ -1,11 +1,13 @@
 """Limits: hard bounds on the velocity, feasible by construction."""
 
 from ._acceleration import AccelerationLimit as AccelerationLimit
+from ._barrier import PositionBarrier as PositionBarrier
 from ._box import Limit as Limit
 from ._box import limit_box as limit_box
 from ._box import limit_rows as limit_rows
 from ._collision import CollisionAvoidanceLimit as CollisionAvoidanceLimit
 from ._configuration import ConfigurationLimit as ConfigurationLimit
+from ._floating_base import FloatingBaseVelocityLimit as FloatingBaseVelocityLimit
 from ._linear import LinearLimit as LinearLimit
 from ._rows import LimitRows as LimitRows
 from ._velocity import VelocityLimit as VelocityLimit

@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete
+from .._numbers import as_bounds
 from ..kinematics import Kinematics
 from ..robot import Robot
-from ..tasks._leaves import as_bounds
 from ._box import Limit
 from ._rows import LimitRows
 

@@ -14,6 +14,7 @@ from ._joint_velocity import FreezeTask as FreezeTask
 from ._joint_velocity import JointVelocityTask as JointVelocityTask
 from ._joint_velocity import LowAccelerationTask as LowAccelerationTask
 from ._kinetic_energy import KineticEnergyTask as KineticEnergyTask
+from ._limit import LimitTask as LimitTask
 from ._look_at import LookAtTask as LookAtTask
 from ._manipulability import ManipulabilityTask as ManipulabilityTask
 from ._polygon import SupportPolygon as SupportPolygon

@@ -10,6 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._joint_selection import concrete as concrete
+from .._numbers import as_bounds as as_bounds
+from .._numbers import as_scalar as as_scalar
+from .._numbers import as_vector as as_vector
+from .._numbers import check_bounds as check_bounds
+from .._numbers import check_not_negative as check_not_negative
 from ..kinematics import Kinematics, forward_kinematics
 from ..robot import Robot
 
@@ -26,60 +31,6 @@ compiled_kinematics = jax.jit(forward_kinematics)
 def home_kinematics(robot: Robot) -> Kinematics:
     """Where everything is at the robot's home configuration."""
     return compiled_kinematics(robot, robot.q0)
-
-
-def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
-    """A finite number that is not negative: a gain, a weight. ``dtype=None``: an array's own, else JAX's default.
-
-    Raises:
-        ValueError: it is not, or not a scalar.
-    """
-    if dtype is None:
-        own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
-        dtype = value.dtype if own else float
-    out = as_vector(value, (), what, dtype)
-    check_not_negative(out, what)
-    return out
-
-
-def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Array:
-    """An array of this shape; a scalar is repeated.
-
-    Raises:
-        ValueError: any other shape.
-    """
-    out = jnp.asarray(value, dtype)
-    if out.shape not in ((), shape):
-        expected = "a scalar" if shape == () else f"{shape} or a scalar"
-        raise ValueError(f"{what} has shape {out.shape}, expected {expected}. Batch with jax.vmap.")
-    return jnp.broadcast_to(out, shape)
-
-
-def check_not_negative(value: Array, what: str) -> None:
-    """Raises ValueError where a value can be seen to be negative or not finite."""
-    seen = concrete(value)
-    if seen is not None and not (np.isfinite(seen).all() and (seen >= 0.0).all()):
-        raise ValueError(f"{what} is {seen}; it has to be finite and not negative")
-
-
-def as_bounds(lower: Any, upper: Any, rows: int, dtype: Any) -> tuple[Array | None, Array | None]:
-    """Both bounds as arrays (rows,), a missing one infinite; (None, None) where neither is given."""
-    if lower is None and upper is None:
-        return None, None
-    low = as_vector(-jnp.inf if lower is None else lower, (rows,), "lower", dtype)
-    high = as_vector(jnp.inf if upper is None else upper, (rows,), "upper", dtype)
-    check_bounds(low, high)
-    return low, high
-
-
-def check_bounds(lower: Array | None, upper: Array | None) -> None:
-    """Raises ValueError where lower can be seen to be above upper."""
-    low, high = concrete(lower), concrete(upper)
-    if lower is None or upper is None or low is None or high is None:
-        return
-    if (low > high).any():
-        rows = np.flatnonzero(low > high)
-        raise ValueError(f"lower > upper in rows {rows.tolist()}: lower {low[rows]}, upper {high[rows]}")
 
 
 def as_pose(value: Any, dtype: Any) -> Pose:

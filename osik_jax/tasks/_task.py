@@ -65,6 +65,11 @@ class Task(eqx.Module):
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
 
+    def during(self, dt: Float[Array, ""] | float) -> Self:
+        """The task for a tick of dt [s], which ``solve`` asks for; itself where that does not matter."""
+        del dt
+        return self
+
     def after(self, velocity: Float[Array, " nv"]) -> Self:
         """The task for the next tick, once this one's answer is ``velocity``; itself where it remembers nothing."""
         del velocity

@@ -1,0 +1,96 @@
+"""Walls that a frame's origin does not pass."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import concrete
+from .._numbers import as_bounds, as_scalar
+from ..kinematics import Kinematics, frame_jacobian
+from ..robot import Robot
+from ._box import Limit
+from ._rows import LimitRows
+
+
+class PositionBarrier(Limit):
+    """Keeps a frame's origin p between planes by a control barrier: ``lower <= normals p <= upper``.
+
+    The speed towards a plane falls with the way left to it:
+
+        gain (lower - normals p)  <=  normals J v  <=  gain (upper - normals p)
+
+    With ``gain dt <= 1`` a step from inside ends inside, but for the curvature of the path, which is of second order in
+    ``v dt``; from outside p comes back by ``gain`` a second. Without normals the planes are a box along the world's
+    axes. One normal and one bound make a half-space.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom (static).
+        lower: bounds on the coordinates [m], one for each normal or a scalar; left out or -inf: none.
+        upper: bounds on the coordinates, in the same way.
+        normals: directions in the world, (m, 3) or one (3,), of length 1 for bounds in metres; default: x, y and z.
+        gain: [1/s], > 0: the share of the way left that a second may take.
+
+    Raises:
+        KeyError: no such frame.
+        ValueError: a wrong shape, no bound at all, lower > upper, a normal of length 0 or a gain that is not positive.
+    """
+
+    frame: str = eqx.field(static=True)
+    normals: Float[Array, "m 3"]
+    lower: Float[Array, " m"]
+    upper: Float[Array, " m"]
+    gain: Float[Array, ""]
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        normals: ArrayLike | Array | None = None,
+        gain: ArrayLike | Array = 10.0,
+    ):
+        robot.tree.frame(frame)
+        self.frame, dtype = frame, robot.q0.dtype
+        self.normals = _normals(np.eye(3) if normals is None else normals, dtype)
+        low, high = as_bounds(lower, upper, len(self.normals), dtype)
+        if low is None or high is None:
+            raise ValueError("a PositionBarrier needs lower, upper or both")
+        self.lower, self.upper = low, high
+        self.gain = as_scalar(gain, "gain", dtype)
+        seen = concrete(self.gain)
+        if seen is not None and not seen > 0.0:
+            raise ValueError(f"gain is {seen}; it has to be positive: at 0 the frame could not move")
+
+    def rows(
+        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
+    ) -> LimitRows:
+        """One row for each normal."""
+        del q, dt
+        position, _ = kinematics.frame_pose(robot, self.frame)
+        value = jnp.matmul(self.normals, position, precision="highest")
+        jacobian = jnp.matmul(self.normals, frame_jacobian(robot, kinematics, self.frame)[:3], precision="highest")
+        return LimitRows(jacobian, self._rate(self.lower, value), self._rate(self.upper, value))
+
+    def _rate(self, bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
+        """``gain (bound - value)``; an infinite bound stays so, with gradients 0."""
+        free = jnp.isinf(bound)
+        return jnp.where(free, bound, self.gain * (jnp.where(free, 0.0, bound) - value))
+
+
+def _normals(value: Any, dtype: Any) -> Float[Array, "m 3"]:
+    normals = jnp.atleast_2d(jnp.asarray(value, dtype))
+    if normals.ndim != 2 or normals.shape[1] != 3:
+        raise ValueError(f"normals has shape {np.shape(value)}, expected (m, 3) or (3,)")
+    seen = concrete(normals)
+    if seen is not None and not (np.isfinite(seen).all() and (np.abs(seen).max(1) > 0.0).all()):
+        raise ValueError(f"normals have to be finite and not 0: {seen}")
+    return normals

@@ -1,0 +1,111 @@
+"""Greatest speeds of a floating base."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._joint_selection import concrete
+from .._numbers import as_vector
+from .._tree import FREE, unknown_name
+from ..kinematics import Kinematics
+from ..robot import Robot
+from ._box import Kind, Limit
+from ._rows import LimitRows
+
+
+class FloatingBaseVelocityLimit(Limit):
+    """``-linear <= p' <= linear`` and ``-angular <= w <= angular``, along the base's own axes or the world's.
+
+    p' is the velocity of the base's origin, w its angular velocity, both given in the chosen axes. A free joint's
+    velocity in v is linear in world axes, then angular in those of the body: what is bounded in the same axes is part
+    of the box, the other three are rows with the base's rotation in them.
+
+    Args:
+        robot: the robot.
+        linear: greatest speeds along the three axes [m/s], (3,) or a scalar; left out or infinite: free.
+        angular: greatest speeds about the three axes [rad/s], in the same way.
+        axes: ``"base"`` or ``"world"`` (static).
+        joint: name of the free joint; default: the only one (static).
+
+    Raises:
+        KeyError: no such free joint.
+        ValueError: a wrong shape, a speed that is negative or not a number, no speed at all, an unknown option, or
+            several free joints and none named.
+    """
+
+    kind: ClassVar[Kind] = "velocity"
+    linear: Float[Array, "3"] | None
+    angular: Float[Array, "3"] | None
+    axes: str = eqx.field(static=True)
+    joint: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        linear: ArrayLike | Array | None = None,
+        angular: ArrayLike | Array | None = None,
+        axes: Literal["base", "world"] = "base",
+        joint: str | None = None,
+    ):
+        if linear is None and angular is None:
+            raise ValueError("a FloatingBaseVelocityLimit needs linear, angular or both")
+        if axes not in ("base", "world"):
+            raise ValueError(f"axes is {axes!r}; it is 'base' or 'world'")
+        self.axes, self.joint = axes, _free_joint(robot, joint)
+        self.linear, self.angular = _speeds(robot, linear, "linear"), _speeds(robot, angular, "angular")
+
+    def box(
+        self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
+    ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+        """The speeds along the axes that v itself has."""
+        lower, upper = super().box(robot, q, dt)
+        first = robot.tree.dof_address[self.joint]
+        speeds, start = (self.linear, first) if self.axes == "world" else (self.angular, first + 3)
+        if speeds is None:
+            return lower, upper
+        return lower.at[start : start + 3].set(-speeds), upper.at[start : start + 3].set(speeds)
+
+    def rows(
+        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
+    ) -> LimitRows | None:
+        """The others: ``R' p'`` in the base's axes, ``R w`` in the world's, R the base's rotation. (3,) or none."""
+        del q, dt
+        speeds = self.linear if self.axes == "base" else self.angular
+        if speeds is None:
+            return None
+        body = robot.tree.body_names[robot.tree.joint_bodies[self.joint]]
+        _, rotation = kinematics.frame_pose(robot, body)
+        turn = rotation.T if self.axes == "base" else rotation
+        start = robot.tree.dof_address[self.joint] + (0 if self.axes == "base" else 3)
+        jacobian = jnp.zeros((3, robot.nv), turn.dtype).at[:, start : start + 3].set(turn)
+        return LimitRows(jacobian, -speeds, speeds)
+
+
+def _free_joint(robot: Robot, name: str | None) -> int:
+    """Index of the free joint of that name, or of the only one."""
+    tree = robot.tree
+    free = {tree.joint_names[j]: j for j in tree.independent if tree.joint_types[j] == FREE}
+    if not free:
+        raise ValueError("the robot has no free joint; load it with floating_base=True, or use a VelocityLimit")
+    if name is None and len(free) > 1:
+        raise ValueError(f"which free joint? joint is one of: {', '.join(free)}")
+    if name is not None and name not in free:
+        raise unknown_name("free joint", name, tuple(free))
+    return free[name] if name is not None else next(iter(free.values()))
+
+
+def _speeds(robot: Robot, value: ArrayLike | Array | None, what: str) -> Float[Array, "3"] | None:
+    if value is None:
+        return None
+    speeds = as_vector(value, (3,), what, robot.q0.dtype)
+    seen = concrete(speeds)
+    if seen is not None and not np.all(seen >= 0.0):
+        raise ValueError(f"{what} is {seen}; speeds have to be 0 or more")
+    return speeds

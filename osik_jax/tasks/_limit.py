@@ -1,0 +1,93 @@
+"""Limits that may give way."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ..kinematics import Kinematics
+from ..limits import Limit, limit_box, limit_rows
+from ..robot import Robot
+from ._leaves import as_scalar
+from ._task import Task, TaskRows, check_priority
+
+
+class LimitTask(Task):
+    """A limit as an inequality task: it holds at its priority, and gives way to what is above it.
+
+    ``lower <= v <= upper``, one row for each dof, and then the limit's own rows, if it has any, at their bounds. There
+    is no error that could decay: it is 0, and there is no gain.
+
+    Args:
+        robot: the robot.
+        limit: any limit.
+        weight: of each squared row [rad/s, m/s, or the unit of the limit's row].
+        priority: 1 is the most important.
+        hard: makes it a constraint, see ``Task``.
+
+    Raises:
+        TypeError: something that is no limit.
+        ValueError: a negative weight.
+    """
+
+    limit: Limit
+    dt: Float[Array, ""]
+
+    def __init__(
+        self,
+        robot: Robot,
+        limit: Limit,
+        *,
+        weight: ArrayLike | Array = 1.0,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        if not isinstance(limit, Limit):
+            raise TypeError(f"limit is a {type(limit).__name__}, not a Limit")
+        self.limit = limit
+        self.priority, self.hard = check_priority(priority), hard
+        dtype = robot.q0.dtype
+        self.weight = as_scalar(weight, "weight", dtype)
+        self.gain = as_scalar(0.0, "gain", dtype)
+        self.dt = as_scalar(1.0, "dt", dtype)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """One row for each dof, then those of the limit, for the tick that ``during`` says (1 s where it was not)."""
+        lower, upper = limit_box(robot, q, (self.limit,), self.dt)
+        jacobian, own = jnp.eye(robot.nv, dtype=lower.dtype), limit_rows(robot, kinematics, q, (self.limit,), self.dt)
+        if own is not None:
+            parts = ((jacobian, own.jacobian), (lower, own.lower), (upper, own.upper))
+            jacobian, lower, upper = (jnp.concatenate(part) for part in parts)
+        return TaskRows(
+            error=jnp.zeros_like(lower),
+            jacobian=jacobian,
+            lower=lower,
+            upper=upper,
+            weight=jnp.broadcast_to(self.weight, lower.shape),
+            dofs=tuple(range(robot.nv)) if own is None else None,
+        )
+
+    def during(self, dt: Float[Array, ""] | float) -> Self:
+        """The task for a tick of dt [s]."""
+        return eqx.tree_at(lambda task: task.dt, self, jnp.asarray(dt, self.dt.dtype))
+
+    def after(self, velocity: Float[Array, " nv"]) -> Self:
+        """The task for the next tick, once this one's answer is ``velocity``."""
+        return eqx.tree_at(lambda task: task.limit, self, self.limit.after(velocity))
+
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Names that ``replace`` takes."""
+        return tuple(name for name in super().replaceable if name not in ("gain", "dt"))
+
+    def _convert(self, name: str, value: Any) -> Any:
+        if name != "limit":
+            return super()._convert(name, value)
+        if jax.tree.structure(value) != jax.tree.structure(self.limit):
+            raise ValueError(f"limit is a {type(value).__name__} of another structure than the task's")
+        return value

@@ -1,0 +1,274 @@
+"""Limits that are rows, and limits that give way: against MuJoCo, mink, and in closed loop."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mink
+import mujoco
+import numpy as np
+import pytest
+from derivative_checks import assert_exact, check
+
+import osik_jax as osik
+from osik_jax.solvers import Status
+
+MJCF = """
+<mujoco>
+  <worldbody>
+    <body name="stand"><joint name="slider" type="slide"/><geom size="0.1"/></body>
+    <body name="torso"><freejoint name="root"/><geom size="0.1"/>
+      <body name="arm" pos="0.1 0.2 0"><joint name="shoulder" axis="0 1 0"/><geom size="0.1"/>
+        <body name="fist" pos="0.3 0 0.1"><joint name="elbow" axis="1 0 1"/><geom size="0.1"/></body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+LINEAR, ANGULAR = np.array([0.3, 0.2, np.inf]), np.array([1.0, 0.5, 0.7])
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def flying():
+    return osik.Robot.from_mjcf(MJCF)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return mujoco.MjModel.from_xml_string(MJCF)
+
+
+@jax.jit
+def asked(robot, limit, q):
+    """The limit's box and rows."""
+    kinematics = osik.forward_kinematics(robot, q)
+    return osik.limit_box(robot, q, (limit,), DT), osik.limit_rows(robot, kinematics, q, (limit,), DT)
+
+
+def anywhere(robot, rng):
+    return np.asarray(osik.integrate(robot, robot.q0, rng.uniform(-1.0, 1.0, robot.nv)))
+
+
+def sides(box, rows):
+    """All that is bounded, as one matrix and its bounds."""
+    matrix = np.concatenate([np.eye(len(box[0])), rows.jacobian])
+    lower, upper = (np.concatenate([a, b]) for a, b in zip(box, (rows.lower, rows.upper), strict=True))
+    bounded = np.isfinite(lower) | np.isfinite(upper)
+    return matrix[bounded], lower[bounded], upper[bounded]
+
+
+class TestFloatingBase:
+    def test_in_its_own_axes_against_mink(self, flying, model, rng):
+        ours = osik.FloatingBaseVelocityLimit(flying, linear=LINEAR, angular=ANGULAR)
+        theirs = mink.FreeJointVelocityLimit(model, LINEAR, ANGULAR)
+        for _ in range(5):
+            q = anywhere(flying, rng)
+            configuration = mink.Configuration(model, q)
+            constraint = theirs.compute_qp_inequalities(configuration, DT)
+            assert constraint.G is not None and constraint.h is not None
+            finite = np.isfinite(constraint.h)
+            expected = np.column_stack([constraint.G[finite], constraint.h[finite] / DT])
+            matrix, lower, upper = sides(*asked(flying, ours, q))
+            found = np.concatenate([np.column_stack([matrix, upper]), np.column_stack([-matrix, -lower])])
+            assert found.shape == expected.shape
+            for row in expected:
+                assert np.abs(found - row).max(1).min() < 1e-12
+
+    def test_in_the_worlds_axes_against_mujoco(self, flying, model, rng):
+        ours = osik.FloatingBaseVelocityLimit(flying, linear=LINEAR, angular=ANGULAR, axes="world", joint="root")
+        data, velocity = mujoco.MjData(model), np.zeros(6)
+        for _ in range(5):
+            q, v = anywhere(flying, rng), rng.normal(size=flying.nv)
+            data.qpos[:], data.qvel[:] = q, v
+            mujoco.mj_forward(model, data)
+            body = model.body("torso").id
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+            matrix, lower, upper = sides(*asked(flying, ours, q))
+            np.testing.assert_allclose(matrix @ v, np.r_[velocity[3:5], velocity[:3]], atol=1e-12)
+            np.testing.assert_allclose(upper, np.r_[LINEAR[:2], ANGULAR], atol=1e-15)
+            np.testing.assert_array_equal(lower, -upper)
+
+    def test_one_of_the_two(self, flying):
+        for options, rows in (
+            (dict(linear=1.0), 3),
+            (dict(angular=1.0), 0),
+            (dict(linear=1.0, axes="world"), 0),
+            (dict(angular=1.0, axes="world"), 3),
+        ):
+            box, found = asked(flying, osik.FloatingBaseVelocityLimit(flying, **options), flying.q0)
+            assert (0 if found is None else len(found.lower)) == rows
+            assert np.isfinite(box[1]).sum() == 3 - rows
+
+    def test_mistakes(self, flying, arm):
+        make = osik.FloatingBaseVelocityLimit
+        with pytest.raises(ValueError, match="needs linear, angular or both"):
+            make(flying)
+        with pytest.raises(ValueError, match="no free joint"):
+            make(arm, linear=1.0)
+        with pytest.raises(KeyError, match="free joints: root"):
+            make(flying, linear=1.0, joint="rot")
+        with pytest.raises(ValueError, match="0 or more"):
+            make(flying, angular=[1.0, -1.0, 1.0])
+        with pytest.raises(ValueError, match="'base' or 'world'"):
+            make(flying, linear=1.0, axes="body")
+
+
+@jax.jit
+def places(arm, q):
+    return jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "hand")[0])(q)
+
+
+class TestBarrier:
+    def test_rows_against_mujoco(self, flying, model, rng):
+        normals = rng.normal(size=(4, 3))
+        lower, upper = np.array([-0.1, -np.inf, 0.0, -1.0]), np.array([0.2, 0.3, np.inf, 1.0])
+        wall = osik.PositionBarrier(flying, "fist", lower=lower, upper=upper, normals=normals, gain=3.0)
+        data, jacobian = mujoco.MjData(model), np.zeros((3, model.nv))
+        for _ in range(5):
+            q = anywhere(flying, rng)
+            data.qpos[:] = q
+            mujoco.mj_forward(model, data)
+            mujoco.mj_jacBody(model, data, jacobian, None, model.body("fist").id)
+            value = normals @ data.body("fist").xpos
+            rows = asked(flying, wall, q)[1]
+            np.testing.assert_allclose(rows.jacobian, normals @ jacobian, atol=1e-12)
+            np.testing.assert_allclose(rows.lower, 3.0 * (lower - value), atol=1e-12)
+            np.testing.assert_allclose(rows.upper, 3.0 * (upper - value), atol=1e-12)
+
+    def test_a_hand_that_wants_through(self, arm):
+        """The hand slides along the walls, and does not pass them by more than the path curves in a tick."""
+        p, R = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
+        tasks = {
+            "hand": osik.FrameTask(arm, "hand", target=(p + np.array([0.3, 0.2, 0.0]), R), orientation_weight=0.0),
+            "posture": osik.PostureTask(arm, weight=1e-4, priority=2),
+        }
+        skew = np.array([0.6, 0.8, 0.0])
+        walls = (
+            osik.PositionBarrier(arm, "hand", upper=p + np.array([0.1, np.inf, np.inf]), gain=20.0),
+            osik.PositionBarrier(arm, "hand", normals=skew, upper=skew @ p + 0.15, gain=20.0),
+        )
+        limits = (osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": 1.0}), *walls)
+        path = osik.rollout(arm, arm.q0, tasks, scheme=osik.HierarchicalQP(), limits=limits, dt=DT, steps=150)
+        assert (path.solution.status == Status.SOLVED).all()
+        assert path.solution.box_violation.max() < 1e-9
+        hand = np.asarray(places(arm, path.q))
+        assert (hand[:, 0] - p[0]).max() < 0.1 + 1e-4
+        assert (hand @ skew - skew @ p).max() < 0.15 + 1e-4
+        np.testing.assert_allclose(hand[-1, 0] - p[0], 0.1, atol=1e-3)
+        np.testing.assert_allclose(hand[-1] @ skew - skew @ p, 0.15, atol=1e-3)
+
+    def test_mistakes(self, arm):
+        make = osik.PositionBarrier
+        with pytest.raises(KeyError, match="did you mean 'hand'"):
+            make(arm, "hnd", lower=0.0)
+        with pytest.raises(ValueError, match="needs lower, upper or both"):
+            make(arm, "hand")
+        with pytest.raises(ValueError, match=r"normals has shape \(2,\)"):
+            make(arm, "hand", lower=0.0, normals=[1.0, 0.0])
+        with pytest.raises(ValueError, match="not 0"):
+            make(arm, "hand", lower=0.0, normals=[0.0, 0.0, 0.0])
+        with pytest.raises(ValueError, match="gain is 0"):
+            make(arm, "hand", lower=0.0, gain=0.0)
+        with pytest.raises(ValueError, match="lower > upper"):
+            make(arm, "hand", lower=1.0, upper=0.0)
+
+
+def test_derivatives_of_rows(flying):
+    """With respect to the configuration and all numbers of the limits, in both modes."""
+    rng = np.random.default_rng(3)
+    count = 8
+    q = jnp.stack([jnp.asarray(anywhere(flying, rng)) for _ in range(count)])
+    limits = (
+        osik.FloatingBaseVelocityLimit(flying, linear=[0.3, 0.2, 0.1], angular=ANGULAR),
+        osik.FloatingBaseVelocityLimit(flying, linear=0.4, angular=ANGULAR, axes="world"),
+        osik.PositionBarrier(flying, "fist", lower=-0.2, upper=[0.3, np.inf, 0.4]),
+    )
+    point = jnp.zeros(flying.nv), limits
+    rates = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=(count, *leaf.shape))), point)
+
+    def path(case, t):
+        q, (v, more) = case
+        moved = jax.tree.map(lambda leaf, rate: jnp.where(jnp.isinf(leaf), leaf, leaf * (1.0 + t * rate)), limits, more)
+        return osik.integrate(flying, q, v, t), moved
+
+    def function(point):
+        q, limits = point
+        rows = osik.limit_rows(flying, osik.forward_kinematics(flying, q), q, limits, DT)
+        return (rows.jacobian, *(jnp.where(jnp.isinf(b), 0.0, b) for b in (rows.lower, rows.upper))), ()
+
+    assert_exact(check(function, path, (q, rates)), most=1.0)
+
+
+@jax.jit
+def solve(robot, tasks, scheme, limits):
+    return osik.solve(robot, robot.q0, tasks, scheme=scheme, limits=limits, dt=DT)
+
+
+class TestLimitTask:
+    def tasks(self, arm, limit, priority):
+        p, R = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
+        return {
+            "hand": osik.FrameTask(arm, "hand", target=(p + np.array([0.2, 0.3, 0.1]), R), rows="position", priority=2),
+            "speed": osik.LimitTask(arm, limit, priority=priority),
+            "posture": osik.PostureTask(arm, priority=4, weight=1e-3),
+        }
+
+    def test_above_the_others_it_is_the_limit(self, arm):
+        limit = osik.VelocityLimit(arm, velocity={"*": 0.5})
+        tasks = self.tasks(arm, limit, 1)
+        ranked = solve(arm, tasks, osik.HierarchicalQP(), ())
+        rest = {name: task for name, task in tasks.items() if name != "speed"}
+        strict = solve(arm, rest, osik.HierarchicalQP(), (limit,))
+        np.testing.assert_allclose(ranked.velocity, strict.velocity, atol=1e-9)
+        np.testing.assert_allclose(np.abs(ranked.velocity).max(), 0.5, atol=1e-12)
+
+    def test_below_another_it_gives_way(self, arm):
+        """The hand's task is met, and the speeds are as little beyond the limit as that allows."""
+        limit = osik.VelocityLimit(arm, velocity={"*": 0.5})
+        s = solve(arm, self.tasks(arm, limit, 3), osik.HierarchicalQP(), ())
+        assert s.status == Status.SOLVED
+        assert np.abs(s.slack["hand"]).max() < 1e-9
+        v = np.asarray(s.velocity)
+        beyond = v - np.clip(v, -0.5, 0.5)
+        np.testing.assert_allclose(s.slack["speed"], beyond, atol=1e-15)
+        assert np.abs(beyond).max() > 0.1
+        J = np.asarray(osik.frame_jacobian(arm, osik.forward_kinematics(arm, arm.q0), "hand"))[:3]
+        null = np.linalg.svd(J)[2][3:]
+        np.testing.assert_allclose(null @ beyond, 0.0, atol=1e-9)  # its gradient, where the hand leaves freedom
+
+    def test_weighted(self, arm):
+        limit = osik.VelocityLimit(arm, velocity={"*": 0.5})
+        tasks = self.tasks(arm, limit, 1)
+        ends = []
+        for weight in (1e-3, 1.0, 1e6):
+            s = solve(arm, {**tasks, "speed": tasks["speed"].replace(weight=weight)}, osik.WeightedQP(), ())
+            ends.append(np.abs(s.velocity).max())
+        assert ends[0] > ends[1] > ends[2]
+        np.testing.assert_allclose(ends[2], 0.5, atol=1e-5)
+
+    def test_knows_the_tick_and_the_last_velocity(self, arm):
+        soft = {
+            "range": osik.LimitTask(arm, osik.ConfigurationLimit(arm)),
+            "jerk": osik.LimitTask(arm, osik.AccelerationLimit(arm, {"*": 2.0})),
+            "posture": osik.PostureTask(arm, target=arm.q0.at[0].set(5.0), priority=2),
+        }
+        path = osik.rollout(arm, arm.q0, soft, scheme=osik.HierarchicalQP(), dt=0.05, steps=60)
+        assert np.abs(np.diff(np.asarray(path.solution.velocity), axis=0, prepend=0.0)).max() < 2.0 * 0.05 + 1e-9
+        reached = np.asarray(path.q[:, 0])
+        np.testing.assert_allclose(reached.max(), arm.position_upper[0], atol=1e-9)
+
+    def test_mistakes(self, arm):
+        with pytest.raises(TypeError, match="not a Limit"):
+            osik.LimitTask(arm, osik.PostureTask(arm))
+        task = osik.LimitTask(arm, osik.VelocityLimit(arm))
+        assert task.replaceable == ("weight", "limit")
+        with pytest.raises(ValueError, match="another structure"):
+            task.replace(limit=osik.ConfigurationLimit(arm))
+        new = osik.VelocityLimit(arm, velocity={"*": 0.1})
+        np.testing.assert_array_equal(task.replace(limit=new).limit.velocity, 0.1)
