@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import jax
@@ -10,6 +12,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax import Robot
@@ -386,12 +389,13 @@ def test_collision_meshes_are_read_where_asked_for(package: Path):
     assert model.body_mass.sum() == 3.0
 
 
+@pytest.mark.parametrize("slash", ["", "/"])
 @pytest.mark.parametrize("where", ["given", "itself", "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"])
-def test_packages_are_found(package: Path, where: str, monkeypatch: pytest.MonkeyPatch):
+def test_packages_are_found(package: Path, where: str, slash: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ROS_PACKAGE_PATH", raising=False)
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    address, folders = "package://bot_description/urdf/bot.urdf", ()
-    with pytest.raises(FileNotFoundError, match=r"no file 'package://bot_description/.*package_dirs.*\(nowhere\)"):
+    address, folders = f"package://{slash}bot_description/urdf/bot.urdf", ()
+    with pytest.raises(FileNotFoundError, match=r"no file 'package:///?bot_description/.*package_dirs.*\(nowhere\)"):
         Robot.from_urdf(address)
     if where in ("given", "itself"):
         folders = ("/not/there", package if where == "itself" else package.parent)
@@ -425,6 +429,31 @@ def test_meshes_that_cannot_be_read_are_named(package: Path, old: str, new: str,
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(error, match=message):
         Robot.from_urdf(path, collision_meshes=True)
+
+
+def corners_of_stl(path: Path) -> np.ndarray:
+    """All corners of all triangles of a binary STL file."""
+    triangle = np.dtype([("normal", "<3f4"), ("corners", "<9f4"), ("flags", "<u2")])
+    return np.fromfile(path, triangle, offset=84)["corners"].reshape(-1, 3).astype(float)
+
+
+def test_collision_meshes_of_a_known_robot():
+    """Every STL of a G1 lies in its link's frame where the URDF puts it: the same box around its corners."""
+    (file,) = (f for f in importlib.metadata.files("example-robot-data") or [] if f.name == "g1_29dof_rev_1_0.urdf")
+    path = Path(str(file.locate()))
+    model = Robot.from_urdf(path, collision_meshes=True).mj_model
+    geoms = iter(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH))
+    shapes = ElementTree.parse(path).getroot().findall("link/collision")
+    meshes = [(shape, mesh) for shape in shapes if (mesh := shape.find("geometry/mesh")) is not None]
+    assert len(meshes) > 20
+    for shape, mesh in meshes:
+        name = mesh.get("filename", "").rpartition("/")[2]
+        origin = {} if (element := shape.find("origin")) is None else element.attrib
+        position, angles = (np.fromstring(origin.get(key, "0 0 0"), sep=" ") for key in ("xyz", "rpy"))
+        rotation = Rotation.from_euler("xyz", angles).as_matrix()
+        expected = corners_of_stl(path.parent.parent / "meshes" / name) @ rotation.T + position
+        ours = vertices(model, next(geoms))
+        np.testing.assert_allclose([ours.min(0), ours.max(0)], [expected.min(0), expected.max(0)], atol=1e-5)
 
 
 def test_package_dirs_is_no_string():

@@ -50,7 +50,7 @@ class Packages:
         if text.startswith(_FILE_SCHEME):
             yield Path(unquote(text.removeprefix(_FILE_SCHEME)))
         elif text.startswith(_PACKAGE_SCHEMES):
-            package, _, rest = text.partition("://")[2].partition("/")
+            package, _, rest = text.partition("://")[2].lstrip("/").partition("/")  # some write three slashes
             for folder in (*self.folders, *_environment()):
                 yield folder / package / rest
                 if folder.name == package:
