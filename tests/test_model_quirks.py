@@ -442,7 +442,7 @@ def test_collision_meshes_of_a_known_robot():
     (file,) = (f for f in importlib.metadata.files("example-robot-data") or [] if f.name == "g1_29dof_rev_1_0.urdf")
     path = Path(str(file.locate()))
     model = Robot.from_urdf(path, collision_meshes=True).mj_model
-    geoms = iter(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH))
+    geoms = iter(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).tolist())
     shapes = ElementTree.parse(path).getroot().findall("link/collision")
     meshes = [(shape, mesh) for shape in shapes if (mesh := shape.find("geometry/mesh")) is not None]
     assert len(meshes) > 20
