@@ -9,19 +9,19 @@ import pytest
 from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, recorded_qps
 
-from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp import _fused, _kernel
+from osik_jax.solvers import Status, _cuda, solve_least_squares_qp
+from osik_jax.solvers.qp import _kernel
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
 
-usable = _kernel.available() and _fused.find_spec("warp") is not None
+usable = _cuda.available() and _cuda.find_spec("warp") is not None
 pytestmark = pytest.mark.skipif(not usable, reason="needs a CUDA device, JAX for it and Warp (extra cuda)")
 
 
 @pytest.fixture(params=["1", "0"], ids=["fused", "xla"])
 def route(request, monkeypatch):
     """Both routes have to pass."""
-    monkeypatch.setenv(_fused.SWITCH, request.param)
+    monkeypatch.setenv(_cuda.SWITCH, request.param)
     jax.clear_caches()
     yield request.param
     jax.clear_caches()
@@ -136,7 +136,7 @@ def test_derivatives_are_those_of_the_other_route(rng, monkeypatch):
 
     slopes = []
     for route in ("1", "0"):
-        monkeypatch.setenv(_fused.SWITCH, route)
+        monkeypatch.setenv(_cuda.SWITCH, route)
         jax.clear_caches()
         slopes.append(np.asarray(jax.jit(jax.grad(cost))(b)))
     np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-4 * np.abs(slopes[1]).max())

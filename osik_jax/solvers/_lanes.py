@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool
 
 from .._blocks import BLOCK, first_axes_as_one, in_blocks
 
@@ -45,6 +46,27 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
         return jax.tree.map(lambda a: a[0], lanes(*jax.tree.map(lambda a: jnp.asarray(a)[None], args)))
 
     return one
+
+
+def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, Any], Any], block: int) -> Any:
+    """The state of all lanes, of which those that are not done have been worked on again, a block of them at a time.
+
+    Args:
+        state: a pytree whose arrays have a leading axis, the lanes.
+        done: lanes that stay as they are.
+        again: from the numbers of a block's lanes and the state of all to the new state of that block.
+        block: lanes that are worked on together; a block that is not full has copies of the last lane.
+    """
+    lanes = len(done)
+
+    def body(carry: tuple[Any, Array]) -> tuple[Any, Array]:
+        state, done = carry
+        (at,) = jnp.nonzero(~done, size=block, fill_value=lanes)
+        end = again(jnp.minimum(at, lanes - 1), state)
+        state = jax.tree.map(lambda all_, new: all_.at[at].set(new, mode="drop"), state, end)
+        return state, done.at[at].set(True, mode="drop")
+
+    return jax.lax.while_loop(lambda carry: ~jnp.all(carry[1]), body, (state, done))[0]
 
 
 def choose(where: jax.Array, new: Any, old: Any) -> Any:

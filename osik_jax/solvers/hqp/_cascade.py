@@ -1,96 +1,29 @@
-"""solve_hqp: level after level, each on the minimisers of those above (eq. 9)."""
+"""Level after level, each on the minimisers of those above (eq. 9): what XLA makes of a hierarchy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from .._box import inside, uncrossed
 from .._dense import apply, product
-from .._double import in_double
-from .._lanes import choose, in_lanes
-from .._status import Status
+from .._lanes import choose
 from ._held import independent
 from ._landing import Landing, land, noise, nothing_landed
 from ._primal import LevelState, solve_level
-from ._problem import HQPSolution, Level, Tolerances, WorkingSet
+from ._problem import Level, Tolerances, WorkingSet
 from ._proposal import propose
-from ._replay import Decision, with_derivative
-from ._stack import Layout, Stack, Task, stacked
+from ._replay import Decision
+from ._stack import Layout, Stack, Task
 
-_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
-"""Rounding of the data makes rows independent that are not."""
-
+NOTHING = 1e-2
+"""Share of the rank tolerance up to which a pivot is none, whatever the rank that another factorisation found."""
 
 _LOST = 100.0
 """Rank tolerances; a level whose optimum those below it have worsened by more was not kept."""
-
-_NOTHING = 1e-2
-"""Share of the rank tolerance up to which a pivot is none, whatever the rank that another factorisation found."""
-
-
-@partial(jax.jit, static_argnames="max_iterations")
-def solve_hqp(
-    levels: Sequence[Level],
-    lower: Float[ArrayLike, " n"],
-    upper: Float[ArrayLike, " n"],
-    *,
-    warm_start: WorkingSet | None = None,
-    max_iterations: int | None = None,
-    tolerances: Tolerances | None = None,
-) -> HQPSolution:
-    """Lexicographic least squares: level k minimises |w_k|^2 among the minimisers of the levels before it.
-
-    w_k is the (weighted) distance of the level's rows A_k x to their intervals [lower_k, upper_k]; the box
-    ``lower <= x <= upper`` is hard at every level. What freedom is left after the last level goes into the smallest
-    |x|, so that the answer is unique. Pure, compiled on first use, and batched by ``vmap``.
-
-    Each level tries the working set of the warm start, then one that a dual method proposes, and judges the exact
-    solution on it by its multipliers; where neither is the optimum, a primal active set goes on by hand. A row
-    violated at its optimum, and every hard row with a nonzero multiplier, is tight on the whole face of minimisers: it
-    is frozen as an equality before the next level and eliminated by its null space. The search is in double precision
-    also where the data are single.
-
-    Args:
-        levels: highest priority first; any number, each an equality or inequality level or a mixture.
-        lower: box, -inf where unbounded. (n,)
-        upper: box, inf where unbounded. (n,)
-        warm_start: that of the solution of a problem nearby with the same levels. It changes the time, not the answer.
-        max_iterations: cap on the active-set iterations of one level (static); default 10 (n + rows of the level).
-        tolerances: what counts as zero; the default rank tolerance depends on the precision of the data.
-
-    Returns:
-        The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
-
-    When not to use it: one level (``solve_least_squares_qp`` is several times faster).
-    """
-    lower, upper = jnp.asarray(lower), jnp.asarray(upper)
-    dtype = jnp.result_type(lower, *(level.matrix for level in levels))
-    tolerances = Tolerances(rank=_RANK[dtype]) if tolerances is None else tolerances
-    sane = _finite(levels, lower, upper)
-    equal = [level.equal | ~sane for level in levels]
-    levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True) if levels else ((), ())
-    low, high, empty = uncrossed(lower, upper)
-    possible = ~jnp.stack([empty, *crossed]).any()
-    low, high = (jnp.where(sane, b, side).astype(dtype) for b, side in ((low, -1.0), (high, 1.0)))
-    scaled = [jax.tree.map(lambda leaf: jnp.where(sane, leaf, 0.0), level.scaled()) for level in levels]
-    scaled, equal = [*scaled, _smallest(len(low), dtype)], [*equal, jnp.ones(len(low), bool)]
-    layout, stack = stacked(scaled, equal, low, high, (lower >= upper) & sane)
-    traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
-    end = _descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start)))
-    nothing = jnp.maximum(_NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
-    x = with_derivative(end.cascade.x, end.decisions, stack, nothing)
-    return _answer(levels, layout, end, x, sane, possible, lower, upper)
-
-
-def _smallest(n: int, dtype: jnp.dtype) -> Level:
-    """The last level: what freedom is left goes into the smallest norm."""
-    return Level(jnp.eye(n, dtype=dtype), jnp.zeros(n, dtype))
 
 
 class _Cascade(NamedTuple):
@@ -109,24 +42,31 @@ class _Cascade(NamedTuple):
     done: Bool[Array, ""]
 
 
-class _End(NamedTuple):
-    """The cascade after its last level, and what each level decided."""
+class Descent(NamedTuple):
+    """Where the last level ended, and what each level decided."""
 
-    cascade: _Cascade
+    x: Float[Array, " n"]
+    box: Int[Array, " n"]  # active bounds
     decisions: Decision  # with a leading axis, the levels, and so the following
     working: WorkingSet
     multipliers: Float[Array, "L h"]
     reached: Float[Array, " L"]  # the norm of each level's slack at its own optimum
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
+    done: Bool[Array, ""]
 
 
-@cache
-def _descender(layout: Layout, max_iterations: int | None) -> Callable[..., _End]:
-    cap = 10 * (layout.variables + layout.rows) if max_iterations is None else max_iterations
-    return in_lanes(in_double(partial(_descend_all, layout, cap)))
+def descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None) -> Descent:
+    """All levels, all lanes: every array has a leading axis, the lanes, and then perhaps one of levels.
 
-
-def _descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None) -> _End:
-    """All levels, all lanes: every array has a leading axis, the lanes, and then perhaps one of levels."""
+    Args:
+        layout: where rows stand (static).
+        cap: on the active-set iterations of one level (static).
+        stack: the numbers.
+        tolerances: what counts as zero.
+        warm: working sets to try first; all zeros in a lane for none.
+    """
 
     def descend(cascade: _Cascade, now: tuple[Array, Any, WorkingSet | None]) -> tuple[_Cascade, _Outcome]:
         k, level, guess = now
@@ -145,8 +85,20 @@ def _descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances,
     levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (stack.levels, warm))
     numbers = jnp.arange(layout.levels)
     cascade, outcomes = jax.lax.scan(descend, first, (numbers, levels, guesses))
-    end = _End(cascade, *jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes))
-    return end._replace(cascade=jax.vmap(partial(_certified, tolerances=tolerances))(cascade, stack, end.reached))
+    decisions, working, multipliers, reached = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes)
+    end = Descent(
+        x=cascade.x,
+        box=cascade.box,
+        decisions=decisions,
+        working=working,
+        multipliers=multipliers,
+        reached=reached,
+        residual=cascade.residual,
+        iterations=cascade.iterations,
+        factorizations=cascade.factorizations,
+        done=cascade.done,
+    )
+    return jax.vmap(certified)(end, stack, tolerances)
 
 
 def _start(stack: Stack) -> _Cascade:
@@ -334,19 +286,17 @@ def _skip(cascade: _Cascade, task: Task) -> tuple[_Cascade, _Outcome]:
     return cascade, (decision, WorkingSet(none, own), jnp.zeros_like(cascade.lower), anything)
 
 
-def _certified(cascade: _Cascade, stack: Stack, reached: Float[Array, " L"], *, tolerances: Tolerances) -> _Cascade:
-    """What the levels below took from each level's optimum: part of the residual, and the verdict."""
+def certified(end: Descent, stack: Stack, tolerances: Tolerances) -> Descent:
+    """With what the levels below took from each level's optimum: part of the residual, and of the verdict."""
 
     def lost(level: Level, reached: Array) -> tuple[Array, Array]:
-        slack = jnp.sqrt(jnp.sum(level.distance(cascade.x) ** 2))
+        slack = jnp.sqrt(jnp.sum(level.distance(end.x) ** 2))
         more = jnp.maximum(slack - reached, 0.0)
-        allowed = _LOST * tolerances.rank * (level.size * jnp.max(jnp.abs(cascade.x)) + slack)
+        allowed = _LOST * tolerances.rank * (level.size * jnp.max(jnp.abs(end.x)) + slack)
         return level.size * more, more <= allowed
 
-    residual, kept = jax.vmap(lost)(stack.levels, reached)
-    return cascade._replace(
-        residual=jnp.maximum(cascade.residual, jnp.max(residual)), done=cascade.done & jnp.all(kept)
-    )
+    residual, kept = jax.vmap(lost)(stack.levels, end.reached)
+    return end._replace(residual=jnp.maximum(end.residual, jnp.max(residual)), done=end.done & jnp.all(kept))
 
 
 def _row_space(
@@ -358,51 +308,9 @@ def _row_space(
     """
     basis, triangle, _ = jax.scipy.linalg.qr(product(rows, projector).T, mode="economic", pivoting=True)
     pivots = jnp.abs(jnp.diagonal(triangle))
-    known = (jnp.arange(len(pivots)) < decided) & (pivots > _NOTHING * rank)
+    known = (jnp.arange(len(pivots)) < decided) & (pivots > NOTHING * rank)
     keep = jnp.where(decided < 0, pivots > rank, known)
     basis = product(projector, jnp.where(keep, basis, 0.0))
     for _ in range(2):  # a column from a small pivot left the range by rounding over that pivot: back, and orthonormal
         basis = 1.5 * basis - 0.5 * product(basis, product(basis.T, basis))
     return basis, jnp.sum(keep, dtype=jnp.int32)
-
-
-def _finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:
-    """Whether the numbers can be computed with: no NaN, no infinity but as no bound."""
-    checks = [jnp.isfinite(level.matrix).all() for level in levels]
-    checks += [(low < jnp.inf).all() & (high > -jnp.inf).all() for low, high in _bounds(levels, lower, upper)]
-    checks += [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
-    return jnp.stack(checks).all()
-
-
-def _bounds(levels: Sequence[Level], lower: Array, upper: Array) -> list[tuple[Array, Array]]:
-    return [(lower, upper), *((level.lower, level.upper) for level in levels)]
-
-
-def _answer(
-    levels: Sequence[Level],
-    layout: Layout,
-    end: _End,
-    x: Array,
-    sane: Array,
-    possible: Array,
-    lower: Array,
-    upper: Array,
-) -> HQPSolution:
-    cascade = end.cascade
-    at_bound = jnp.where(cascade.box < 0, lower, jnp.where(cascade.box > 0, upper, x))
-    good = sane & jnp.isfinite(x).all()
-    x = inside(jnp.where(good, at_bound, 0.0), lower, upper)
-    status = jnp.where(cascade.done, Status.SOLVED, Status.MAX_ITERATIONS)
-    status = jnp.where(possible, status, Status.INFEASIBLE)
-    return HQPSolution(
-        x=x,
-        slacks=tuple(jnp.where(good, level.distance(x), 0.0) for level in levels),
-        status=jnp.where(good, status, Status.NUMERICAL_ERROR),
-        iterations=cascade.iterations,
-        factorizations=cascade.factorizations,
-        kkt_residual=jnp.where(good, cascade.residual, jnp.inf),
-        active=cascade.box,
-        active_rows=tuple(end.working.own[k, : len(level.lower)] for k, level in enumerate(levels)),
-        multipliers=jnp.where(good, end.multipliers[:-1], 0.0),
-        warm_start=end.working,
-    )

@@ -22,6 +22,7 @@ class Layout(NamedTuple):
     variables: int
     levels: int
     rows: int  # of a level, padded
+    counts: tuple[int, ...]  # rows of each level
     level_of_hard: tuple[int, ...]  # of each hard row; -1 for the box
     place_of_row: tuple[tuple[int, ...], ...]  # of each row of each level among the hard rows; their number for none
 
@@ -84,7 +85,8 @@ def stacked(
         places.append(tuple(place + [h] * (m - count)))
         if not level.equality:
             first, level_of = first + count, level_of + [k] * count
-    layout = Layout(n, len(levels), m, tuple(level_of), tuple(places))
+    counts = tuple(level.matrix.shape[0] for level in levels)
+    layout = Layout(n, len(levels), m, counts, tuple(level_of), tuple(places))
     stack = Stack(
         levels=jax.tree.map(lambda *a: jnp.stack(a), *(_padded(level, m) for level in levels)),
         equal=jnp.stack([jnp.pad(rows, (0, m - len(rows))) for rows in equal]),

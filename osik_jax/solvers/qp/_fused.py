@@ -7,17 +7,16 @@ lanes that fail it are gathered into blocks, and each block goes through the sea
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from functools import cache, partial
-from importlib.util import find_spec
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .. import _cuda
 from .._dense import apply
-from .._lanes import in_lanes
+from .._lanes import in_lanes, with_the_rest
 from .._pivots import EQUALITY, INACTIVE, Noise
 from . import _kernel
 from ._cost import LeastSquares
@@ -25,8 +24,6 @@ from ._kernel import Proposal
 from ._problem import QP, active_targets
 from ._search import Found, optimal_on, possible, scales_of, search
 
-SWITCH = "OSIK_FUSED"
-"""Environment variable; 0 keeps to XLA. It is read when a program is traced."""
 _SHARE, _SMALLEST = 16, 1024
 """Lanes that are left are solved in blocks of a 16th of the batch, of 1,024 lanes at least."""
 
@@ -52,14 +49,10 @@ def searcher(max_iterations: int, gives_way: bool) -> Callable[[QP, Array, Array
 
 def _search_anywhere(qp: QP, guess: Array, tolerance: Array, cap: int, gives_way: bool) -> Found:
     plain = partial(search, max_iterations=cap)
-    if not (gives_way and _fits(qp) and _wanted()):
+    if not (gives_way and _fits(qp) and _cuda.wanted()):
         return plain(qp, guess, tolerance)
     fused = partial(proposed_and_searched, propose=_kernel.propose, max_iterations=cap)
     return jax.lax.platform_dependent(qp, guess, tolerance, cuda=fused, default=plain)
-
-
-def _wanted() -> bool:
-    return os.environ.get(SWITCH, "1") != "0" and find_spec("warp") is not None and _kernel.available()
 
 
 def _fits(qp: QP) -> bool:
@@ -91,17 +84,12 @@ def proposed_and_searched(
     lanes = len(tolerance)
     block = min(lanes, max(_SMALLEST, -(-lanes // _SHARE)))
 
-    def body(found: Found) -> Found:
-        (at,) = jnp.nonzero(~found.done, size=block, fill_value=lanes)
-        at_most = jnp.minimum(at, lanes - 1)
-        part = jax.tree.map(lambda a: a[at_most], (qp, found.active, tolerance))
+    def again(at: Array, found: Found) -> Found:
+        part = jax.tree.map(lambda a: a[at], (qp, found.active, tolerance))
         end = search(*part, max_iterations=max_iterations)
-        end = end._replace(
-            done=jnp.ones_like(end.done), factorizations=end.factorizations + found.factorizations[at_most]
-        )
-        return jax.tree.map(lambda all_, new: all_.at[at].set(new, mode="drop"), found, end)
+        return end._replace(factorizations=end.factorizations + found.factorizations[at])
 
-    return jax.lax.while_loop(lambda found: ~jnp.all(found.done), body, found)
+    return with_the_rest(found, fine, again, block)
 
 
 def _found(qp: QP, proposal: Proposal) -> Found:

@@ -12,7 +12,6 @@ from importlib import import_module
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -123,12 +122,3 @@ def source(shape: Shape) -> str:
     n, m, p = shape
     body = files("osik_jax.solvers.qp").joinpath("_active_set.cu").read_text()
     return f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};\n{body}"
-
-
-def available() -> bool:
-    """Whether the device that JAX computes on where it is not told otherwise is a GPU.
-
-    Beside one, under ``jax.default_device`` of a CPU, there is nothing to compile a kernel for.
-    """
-    device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
-    return getattr(device, "platform", device) in ("gpu", "cuda")

@@ -1,0 +1,830 @@
+// Body of one function: a hierarchy, solved by the warp that calls it, in double precision. _kernel.py names the
+// arguments; what is solved and how a level is judged is that of _cascade.py, _primal.py and _landing.py.
+//
+// Z, an orthonormal basis of what the levels so far leave free, gets narrower from level to level. At each level, rows
+// that are held at a bound are rotated into its first columns by reflections from the right; the level's rows, in the
+// columns that are left, are factored by reflections from the left with pivoting. The working set of the warm start is
+// tried first; else, and where that is not the optimum, a primal active set begins where the level above ended. What is
+// tight at the optimum, and the row space of the level's factor, are rotated to the front and cut off.
+//
+// Variable i belongs to lane i % 32, and so do row i of the level and column i of Z. Constants from _kernel.py: N
+// variables, LEVELS, M rows of the longest level (the last is the identity and has no rows in memory), ROWS of all
+// levels, P hard rows beside the box (at most 32), WARPS a block; COUNT, OFFSET, MIXED of each level; PLACE of each hard
+// row among all rows, and its LEVEL.
+
+constexpr int H = (N + 31) / 32, G = (M + 31) / 32;   // variables and rows a lane
+constexpr int ZD = N | 1, VD = M | 1;                 // lengths of rows in shared memory: odd, so that they meet every bank
+constexpr int MOST_RANK = N < M ? N : M;
+constexpr int LONGEST = (N > M ? N : M) > P ? (N > M ? N : M) : P;
+constexpr int HARD = N + P;
+constexpr int FACTORS = MOST_RANK * (ZD + VD) > N * VD ? MOST_RANK * (ZD + VD) : N * VD;
+constexpr int PATIENCE = 20;                          // steps of no length, before the least index decides
+constexpr unsigned ALL = 0xffffffffu;
+
+__shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * LONGEST + MOST_RANK];
+__shared__ int shared_ints[WARPS][N + MOST_RANK + M];
+
+const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+bool exists[H];
+#pragma unroll
+for (int h = 0; h < H; ++h) exists[h] = lane + 32 * h < N;
+double* const Z = shared_doubles[warp];               // row i: variable i
+double* const V = Z + N * ZD;                         // row k: reflection k of the level's factor, over its rows
+double* const R = V + MOST_RANK * VD;                 // row k of the triangle, over the columns of Z
+double* const E = Z + N * ZD + FACTORS;               // hard rows beside the box, in the basis
+double* const point = E + (P ? P : 1) * ZD;
+double* const turn = point + LONGEST;                 // a reflection, or what is worked out with it
+double* const first_of = turn + LONGEST;
+double* const second_of = first_of + LONGEST;
+double* const strength = second_of + LONGEST;         // of the reflections
+int* const held = shared_ints[warp];                  // the row that column k of the basis is for
+int* const pivot = held + N;
+int* const flags = pivot + MOST_RANK;
+
+auto sum = [&](double a) {
+  for (int far = 16; far; far /= 2) a += __shfl_xor_sync(ALL, a, far);
+  return a;
+};
+auto largest = [&](double a) {
+  for (int far = 16; far; far /= 2) a = fmax(a, __shfl_xor_sync(ALL, a, far));
+  return a;
+};
+auto first_largest = [&](double& a, int& which) {     // everywhere, with the least index among equals
+  for (int far = 16; far; far /= 2) {
+    double other = __shfl_xor_sync(ALL, a, far);
+    int index = __shfl_xor_sync(ALL, which, far);
+    if (other > a || (other == a && index < which)) a = other, which = index;
+  }
+};
+auto any = [&](bool a) { return __any_sync(ALL, a) != 0; };
+auto is = [&](int h, int row) { return exists[h] && lane + 32 * h == row; };  // a row of the box, of this lane
+auto is_finite = [](double a) { return fabs(a) <= 1.7e308; };
+auto clip = [](double a, double low, double high) { return fmin(fmax(a, low), high); };
+
+const size_t problem = pid;
+const double* const A = matrix.data + problem * (size_t)(N * ROWS);  // column i of all rows is at A + i * ROWS
+const double rank_share = tolerances.data[problem * 4], step_share = tolerances.data[problem * 4 + 1];
+const double multiplier_share = tolerances.data[problem * 4 + 2], feasible_share = tolerances.data[problem * 4 + 3];
+
+// ---- the variables
+double x[H], low[H], high[H];
+int side[H], box_label[H];                            // side: held at the lower (-1) or upper (1) bound
+bool frozen[H];
+int width = 0;                                        // columns of Z
+#pragma unroll
+for (int h = 0; h < H; ++h) {
+  const int i = lane + 32 * h;
+  low[h] = exists[h] ? hard_lower.data[problem * HARD + i] : 0.0;
+  high[h] = exists[h] ? hard_upper.data[problem * HARD + i] : 0.0;
+  frozen[h] = !exists[h] || hard_equal.data[problem * HARD + i] != 0;
+  box_label[h] = exists[h] && frozen[h] ? 2 : 0;
+  side[h] = 0;
+  x[h] = clip(0.0, low[h], high[h]);
+  const unsigned loose = __ballot_sync(ALL, !frozen[h]);
+  if (exists[h]) {
+    for (int j = 0; j < ZD; ++j) Z[i * ZD + j] = 0.0;
+    if (!frozen[h]) Z[i * ZD + width + __popc(loose & ((1u << lane) - 1u))] = 1.0;
+  }
+  width += __popc(loose);
+}
+
+// ---- hard rows beside the box: row q belongs to lane q
+const bool has_row = lane < P;
+double row_low = -INFINITY, row_high = INFINITY, row_length = 1.0;
+int row_side = 0, row_level = LEVELS;
+bool row_frozen = true;
+const double* const row_of_lane = A + (P ? PLACE[lane < P ? lane : 0] : 0);
+if (has_row) {
+  row_low = hard_lower.data[problem * HARD + N + lane];
+  row_high = hard_upper.data[problem * HARD + N + lane];
+  row_level = LEVEL[lane];
+  row_frozen = false;
+  double square = 0.0;
+  for (int i = 0; i < N; ++i) square += row_of_lane[i * ROWS] * row_of_lane[i * ROWS];
+  row_length = sqrt(square);
+}
+
+int known = 0;                                        // whether there is a warm start
+for (int e = lane; e < LEVELS * M; e += 32) known |= guess_own.data[problem * (LEVELS * M) + e];
+const bool warm = any(known != 0);
+
+// ---- one level: its numbers, and the factors that it works with
+int level = 0, m = 0, held_count = 0, rank = 0, factorizations = 0, changes = 0;
+const double* B = A;                                  // its first row
+bool identity = false, mixed = false;
+double below[G], above[G], length[G], size = 0.0;
+bool equal[G], counts[G], in_level[G];
+
+auto entry = [&](int a, int i) { return identity ? (a == i ? 1.0 : 0.0) : B[i * ROWS + a]; };
+auto row_times = [&](int a, const double* d) {        // row a of the level times d, in shared memory
+  if (identity) return d[a];
+  double total = 0.0;
+  for (int i = 0; i < N; ++i) total += B[i * ROWS + a] * d[i];
+  return total;
+};
+auto hard_row_times = [&](const double* d) {          // the lane's hard row beside the box
+  double total = 0.0;
+  for (int i = 0; i < N; ++i) total += row_of_lane[i * ROWS] * d[i];
+  return total;
+};
+auto share_out = [&](const double* a) {               // a number of each variable, to `point`
+  __syncwarp();
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+    if (exists[h]) point[lane + 32 * h] = a[h];
+  __syncwarp();
+};
+auto place_of = [&](int row, int column) {            // of a hard row, in the basis
+  return row < N ? Z[row * ZD + column] : E[(row - N) * ZD + column];
+};
+auto along = [&](int from, int to, double* d) {       // sum of columns of Z, times what `turn` says
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    d[h] = 0.0;
+    if (exists[h])
+      for (int j = from; j < to; ++j) d[h] += Z[(lane + 32 * h) * ZD + j] * turn[j];
+  }
+};
+// `turn` becomes the reflection that takes the row in it, from column `at` on, to that column; its strength
+auto reflection = [&](int at, double norm) {
+  const double head = turn[at];
+  __syncwarp();
+  if (lane == 0) turn[at] = head + (head < 0.0 ? -norm : norm);
+  __syncwarp();
+  return 1.0 / (norm * (norm + fabs(head)));
+};
+
+auto hold = [&]() {                                   // rotates the held rows to the front; lets go of dependent ones
+  bool waits[H], row_waits = row_side != 0, some = row_waits;
+#pragma unroll
+  for (int h = 0; h < H; ++h) waits[h] = side[h] != 0, some = some || waits[h];
+  held_count = 0;
+  if (P) {
+    for (int j = lane; j < width; j += 32)
+      for (int q = 0; q < P; ++q) {
+        double total = 0.0;
+        for (int i = 0; i < N; ++i) total += A[i * ROWS + PLACE[q]] * Z[i * ZD + j];
+        E[q * ZD + j] = total;
+      }
+    __syncwarp();
+  }
+  if (!any(some)) return;
+  double own[H][N];
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+#pragma unroll
+    for (int j = 0; j < N; ++j) own[h][j] = exists[h] ? Z[(lane + 32 * h) * ZD + j] : 0.0;
+  while (held_count < width) {
+    double best = -1.0;
+    int which = HARD;
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      double square = 0.0;
+#pragma unroll
+      for (int j = 0; j < N; ++j) square += j >= held_count ? own[h][j] * own[h][j] : 0.0;
+      if (waits[h] && square > best) best = square, which = lane + 32 * h;
+    }
+    if (P && row_waits) {
+      double square = 0.0;
+      for (int j = held_count; j < width; ++j) square += E[lane * ZD + j] * E[lane * ZD + j];
+      square /= row_length > 0.0 ? row_length * row_length : 1.0;
+      if (square > best) best = square, which = N + lane;
+    }
+    first_largest(best, which);
+    if (!(best > rank_share * rank_share)) break;
+    double square = 0.0;
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (is(h, which))
+#pragma unroll
+        for (int j = 0; j < N; ++j) turn[j] = j >= held_count ? own[h][j] : 0.0;
+    if (P && which >= N)
+      for (int j = lane; j < N; j += 32) turn[j] = j >= held_count && j < width ? E[(which - N) * ZD + j] : 0.0;
+    __syncwarp();
+    for (int j = lane; j < N; j += 32) square += turn[j] * turn[j];
+    const double weight = reflection(held_count, sqrt(sum(square)));
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      double total = 0.0;
+#pragma unroll
+      for (int j = 0; j < N; ++j) total += own[h][j] * turn[j];
+      total *= weight;
+#pragma unroll
+      for (int j = 0; j < N; ++j) own[h][j] -= total * turn[j];
+      if (is(h, which)) waits[h] = false;
+    }
+    if (has_row) {
+      double total = 0.0;
+      for (int j = held_count; j < width; ++j) total += E[lane * ZD + j] * turn[j];
+      total *= weight;
+      for (int j = held_count; j < width; ++j) E[lane * ZD + j] -= total * turn[j];
+      if (N + lane == which) row_waits = false;
+    }
+    if (lane == 0) held[held_count] = which;
+    ++held_count;
+    __syncwarp();
+  }
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    if (waits[h]) side[h] = 0;
+    if (exists[h])
+#pragma unroll
+      for (int j = 0; j < N; ++j) Z[(lane + 32 * h) * ZD + j] = own[h][j];
+  }
+  if (row_waits) row_side = 0;
+  __syncwarp();
+};
+
+auto fit = [&]() {                                    // factors the rows that count, within what the held rows leave
+  ++factorizations;
+  double column[H][M];
+#pragma unroll
+  for (int g = 0; g < G; ++g)
+    if (in_level[g])
+      for (int i = 0; i < N; ++i) V[i * VD + lane + 32 * g] = counts[g] ? entry(lane + 32 * g, i) : 0.0;
+  __syncwarp();
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+#pragma unroll
+    for (int a = 0; a < M; ++a) column[h][a] = 0.0;
+  for (int i = 0; i < N; ++i) {
+    double z[H];
+#pragma unroll
+    for (int h = 0; h < H; ++h) z[h] = exists[h] ? Z[i * ZD + lane + 32 * h] : 0.0;
+#pragma unroll
+    for (int a = 0; a < M; ++a)
+      if (a < m)
+#pragma unroll
+        for (int h = 0; h < H; ++h) column[h][a] += V[i * VD + a] * z[h];
+  }
+  __syncwarp();
+  bool waits[H];
+#pragma unroll
+  for (int h = 0; h < H; ++h) waits[h] = lane + 32 * h >= held_count && lane + 32 * h < width;
+  const int most = width - held_count < m ? width - held_count : m;
+  for (rank = 0; rank < most; ++rank) {
+    double best = -1.0;
+    int which = N;
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      double square = 0.0;
+#pragma unroll
+      for (int a = 0; a < M; ++a)
+        if (a < m) square += a >= rank ? column[h][a] * column[h][a] : 0.0;
+      if (waits[h] && square > best) best = square, which = lane + 32 * h;
+    }
+    first_largest(best, which);
+    const double norm = sqrt(best);
+    if (!(norm > rank_share * size)) break;
+    double* const v = V + rank * VD;
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (is(h, which))
+#pragma unroll
+        for (int a = 0; a < M; ++a)
+          if (a < m) v[a] = a >= rank ? column[h][a] : 0.0;
+    __syncwarp();
+    const double head = v[rank], weight = 1.0 / (norm * (norm + fabs(head)));
+    __syncwarp();
+    if (lane == 0) {
+      v[rank] = head + (head < 0.0 ? -norm : norm);
+      strength[rank] = weight;
+      pivot[rank] = which;
+    }
+    __syncwarp();
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      double total = 0.0;
+#pragma unroll
+      for (int a = 0; a < M; ++a)
+        if (a < m) total += column[h][a] * v[a];
+      total *= weight;
+#pragma unroll
+      for (int a = 0; a < M; ++a)
+        if (a < m) column[h][a] -= total * v[a];
+      if (is(h, which)) waits[h] = false;
+    }
+  }
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+#pragma unroll
+    for (int k = 0; k < MOST_RANK; ++k)
+      if (k < rank && exists[h])
+        R[k * ZD + lane + 32 * h] = lane + 32 * h >= held_count && lane + 32 * h < width ? column[h][k] : 0.0;
+  __syncwarp();
+};
+
+auto least_squares = [&](const double* slack, double* d) {  // the step that makes the rows that count least
+  double right[G];
+#pragma unroll
+  for (int g = 0; g < G; ++g) right[g] = in_level[g] && counts[g] ? -slack[g] : 0.0;
+  for (int k = 0; k < rank; ++k) {
+    double total = 0.0;
+#pragma unroll
+    for (int g = 0; g < G; ++g) total += in_level[g] ? V[k * VD + lane + 32 * g] * right[g] : 0.0;
+    total = sum(total) * strength[k];
+#pragma unroll
+    for (int g = 0; g < G; ++g) right[g] -= in_level[g] ? V[k * VD + lane + 32 * g] * total : 0.0;
+  }
+  for (int j = lane; j < N; j += 32) turn[j] = 0.0;
+  __syncwarp();
+  for (int k = rank - 1; k >= 0; --k) {
+    double mine = right[0];
+#pragma unroll
+    for (int g = 1; g < G; ++g) mine = k >> 5 == g ? right[g] : mine;
+    const double z = __shfl_sync(ALL, mine, k & 31) / R[k * ZD + pivot[k]];
+#pragma unroll
+    for (int g = 0; g < G; ++g)
+      if (lane + 32 * g < k) right[g] -= R[(lane + 32 * g) * ZD + pivot[k]] * z;
+    if (lane == 0) turn[pivot[k]] = z;
+  }
+  __syncwarp();
+  along(held_count, width, d);
+  __syncwarp();
+};
+
+auto restore = [&](double* d) {                       // the shortest step that brings held rows to their bounds
+  share_out(x);
+  double gap[H];
+  if (P) {
+    if (has_row) first_of[lane] = (row_side < 0 ? row_low : row_high) - hard_row_times(point);
+    __syncwarp();
+  }
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+    if (exists[h]) second_of[lane + 32 * h] = (side[h] < 0 ? low[h] : high[h]) - x[h];
+  __syncwarp();
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    const int k = lane + 32 * h;
+    gap[h] = k < held_count ? held[k] < N ? second_of[held[k]] : first_of[held[k] - N] : 0.0;
+  }
+  for (int k = 0; k < held_count; ++k) {
+    double mine = gap[0];
+#pragma unroll
+    for (int h = 1; h < H; ++h) mine = k >> 5 == h ? gap[h] : mine;
+    const double y = __shfl_sync(ALL, mine, k & 31) / place_of(held[k], k);
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (lane + 32 * h > k && lane + 32 * h < held_count) gap[h] -= place_of(held[lane + 32 * h], k) * y;
+    if (lane == 0) turn[k] = y;
+  }
+  __syncwarp();
+  along(0, held_count, d);
+  __syncwarp();
+};
+
+double multiplier[H] = {}, row_multiplier = 0.0, steepness = 0.0, residual = 0.0;
+auto judge = [&](const double* slack) {               // multipliers of the held rows, the gradient's norm, stationarity
+#pragma unroll
+  for (int g = 0; g < G; ++g)
+    if (in_level[g]) first_of[lane + 32 * g] = counts[g] ? slack[g] : 0.0;
+  __syncwarp();
+  double gradient[H], square = 0.0;
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    gradient[h] = 0.0;
+    if (exists[h]) {
+      if (identity) gradient[h] = first_of[lane + 32 * h];
+      else
+        for (int a = 0; a < m; ++a) gradient[h] += B[(lane + 32 * h) * ROWS + a] * first_of[a];
+    }
+    square += gradient[h] * gradient[h];
+  }
+  steepness = sqrt(sum(square));
+  share_out(gradient);
+  double pull[H], off = 0.0;
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    const int j = lane + 32 * h;
+    pull[h] = 0.0;
+    if (j < width)
+      for (int i = 0; i < N; ++i) pull[h] -= Z[i * ZD + j] * point[i];
+    if (j >= held_count) off = fmax(off, fabs(pull[h]));
+  }
+  residual = largest(off);
+  for (int k = held_count - 1; k >= 0; --k) {
+    double mine = pull[0];
+#pragma unroll
+    for (int h = 1; h < H; ++h) mine = k >> 5 == h ? pull[h] : mine;
+    const double y = __shfl_sync(ALL, mine, k & 31) / place_of(held[k], k);
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (lane + 32 * h < k) pull[h] -= place_of(held[k], lane + 32 * h) * y;
+    if (lane == 0) turn[k] = y;
+  }
+#pragma unroll
+  for (int h = 0; h < H; ++h) multiplier[h] = 0.0;
+  row_multiplier = 0.0;
+  __syncwarp();
+  for (int k = 0; k < held_count; ++k) {
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (is(h, held[k])) multiplier[h] = turn[k];
+    if (N + lane == held[k]) row_multiplier = turn[k];
+  }
+  __syncwarp();
+};
+
+bool all_done = true;
+double worst_residual = 0.0;
+for (level = 0; level < LEVELS; ++level) {
+  const size_t here = problem * LEVELS + level;
+  m = COUNT[level], mixed = MIXED[level] != 0, identity = level == LEVELS - 1;
+  B = A + OFFSET[level];
+  if (width == 0) {                                   // nothing is left to decide
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (exists[h]) {
+        sides.data[here * HARD + lane + 32 * h] = 0, tight_rows.data[here * HARD + lane + 32 * h] = 0;
+        multipliers.data[here * HARD + lane + 32 * h] = 0.0;
+      }
+    if (has_row) {
+      sides.data[here * HARD + N + lane] = 0, tight_rows.data[here * HARD + N + lane] = 0;
+      multipliers.data[here * HARD + N + lane] = 0.0;
+    }
+    for (int a = lane; a < M; a += 32) missed_rows.data[here * M + a] = 0, own_rows.data[here * M + a] = 0;
+    if (lane == 0) ranks.data[here] = 0, reached.data[here] = INFINITY;
+    continue;
+  }
+#pragma unroll
+  for (int g = 0; g < G; ++g) {
+    const int a = lane + 32 * g;
+    in_level[g] = a < m;
+    below[g] = above[g] = length[g] = 0.0;
+    equal[g] = counts[g] = false;
+    if (in_level[g]) {
+      const size_t at = problem * ROWS + OFFSET[level] + a;
+      below[g] = identity ? 0.0 : rows_lower.data[at];
+      above[g] = identity ? 0.0 : rows_upper.data[at];
+      equal[g] = identity || rows_equal.data[at] != 0;
+      double square = identity ? 1.0 : 0.0;
+      if (!identity)
+        for (int i = 0; i < N; ++i) square += B[i * ROWS + a] * B[i * ROWS + a];
+      length[g] = sqrt(square);
+    }
+  }
+  size = length[0];
+#pragma unroll
+  for (int g = 1; g < G; ++g) size = fmax(size, length[g]);
+  size = largest(size);
+
+  double value[G], slack[G], reach = 0.0, missing = 0.0;
+  auto look = [&]() {                                 // where the level stands at x
+    share_out(x);
+    double far = 0.0, square = 0.0;
+#pragma unroll
+    for (int h = 0; h < H; ++h) far = fmax(far, exists[h] ? fabs(x[h]) : 0.0);
+    reach = largest(far);
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      value[g] = in_level[g] ? row_times(lane + 32 * g, point) : 0.0;
+      slack[g] = in_level[g] ? value[g] - clip(value[g], below[g], above[g]) : 0.0;
+      if (equal[g]) slack[g] = value[g] - below[g];
+      square += slack[g] * slack[g];
+    }
+    missing = sqrt(sum(square));
+  };
+  auto bounded = [&](double a, double b) { return is_finite(a) || is_finite(b); };
+  auto wrong_by = [&](double force, int at, double longest) { return -force * at * longest; };
+  auto floor_of_signs = [&]() {
+    return multiplier_share * steepness + size * step_share * (size * reach + missing);
+  };
+
+  // ---- the working set of the warm start
+  double start[H];
+  int carried[H], row_carried = row_side;
+  bool optimal = false, to_hold = true, to_fit = true;
+#pragma unroll
+  for (int h = 0; h < H; ++h) start[h] = x[h], carried[h] = side[h];
+  if (warm) {
+    double goal[G], d[H];
+    int own[G];
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      int at = exists[h] ? guess_hard.data[here * HARD + lane + 32 * h] : 0;
+      at = at > 0 ? 1 : at < 0 ? -1 : 0;
+      side[h] = !frozen[h] && at != 0 && is_finite(at < 0 ? low[h] : high[h]) ? at : 0;
+    }
+    row_side = 0;
+    if (has_row && !row_frozen && row_level < level) {
+      int at = guess_hard.data[here * HARD + N + lane];
+      at = at > 0 ? 1 : at < 0 ? -1 : 0;
+      row_side = at != 0 && is_finite(at < 0 ? row_low : row_high) ? at : 0;
+    }
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      int at = in_level[g] ? guess_own.data[here * M + lane + 32 * g] : 0;
+      at = at > 0 ? 1 : at < 0 ? -1 : 0;
+      if (!is_finite(at < 0 ? below[g] : above[g])) at = 0;
+      own[g] = equal[g] ? 2 : at;
+      counts[g] = own[g] != 0;
+      goal[g] = own[g] == 1 ? above[g] : below[g];
+    }
+    hold();
+    fit();
+    for (int round = 0; round < 2; ++round) {
+      double off[G];
+      restore(d);
+#pragma unroll
+      for (int h = 0; h < H; ++h) x[h] += d[h];
+      share_out(x);
+#pragma unroll
+      for (int g = 0; g < G; ++g) off[g] = counts[g] ? row_times(lane + 32 * g, point) - goal[g] : 0.0;
+      least_squares(off, d);
+#pragma unroll
+      for (int h = 0; h < H; ++h) x[h] += d[h];
+    }
+    look();
+    double square = 0.0;
+    bool fine = true;
+#pragma unroll
+    for (int g = 0; g < G; ++g)
+      if (in_level[g]) {
+        const double near = feasible_share * (length[g] * reach + fabs(value[g]));
+        const double under = below[g] - value[g], over = value[g] - above[g];
+        fine = fine && (own[g] == 2 || (own[g] == 0 ? fmax(under, over) <= near : (own[g] < 0 ? under : over) >= -near));
+        slack[g] = counts[g] ? value[g] - goal[g] : 0.0;
+        square += slack[g] * slack[g];
+      }
+    missing = sqrt(sum(square));
+    bool inside = true;
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (exists[h] && !frozen[h] && side[h] == 0)
+        inside = inside && fmax(low[h] - x[h], x[h] - high[h]) <= feasible_share * (reach + fabs(x[h]));
+    if (has_row && !row_frozen && row_level < level && row_side == 0) {
+      const double at = hard_row_times(point);
+      inside = inside && fmax(row_low - at, at - row_high) <= feasible_share * (row_length * reach + fabs(at));
+    }
+    const bool feasible = !any(!inside) && is_finite(reach);
+    if (feasible) {
+      judge(slack);
+      const double floor = floor_of_signs();
+      bool wrong = has_row && row_side != 0 && wrong_by(row_multiplier, row_side, row_length) > floor;
+#pragma unroll
+      for (int h = 0; h < H; ++h) wrong = wrong || (side[h] != 0 && wrong_by(multiplier[h], side[h], 1.0) > floor);
+      optimal = !any(wrong || !fine);
+      to_hold = false, to_fit = false;
+    } else {
+#pragma unroll
+      for (int h = 0; h < H; ++h) x[h] = start[h], side[h] = carried[h];
+      row_side = row_carried;
+    }
+  }
+
+  // ---- by hand, from a feasible point
+  int stalled = 0, rounds = 0;
+  while (!optimal && rounds++ < most_changes) {
+    look();
+    if (to_hold) hold();
+    bool turned = to_hold || to_fit;
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      const bool now = in_level[g] && (equal[g] || slack[g] != 0.0);
+      turned = turned || now != counts[g];
+      counts[g] = now;
+    }
+    if (any(turned)) fit();
+    to_hold = to_fit = false;
+    double d[H], rate[G], square = 0.0;
+    least_squares(slack, d);
+    share_out(d);
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      rate[g] = in_level[g] ? row_times(lane + 32 * g, point) : 0.0;
+      square += counts[g] ? rate[g] * rate[g] : 0.0;
+    }
+    if (sqrt(sum(square)) <= step_share * (size * reach + missing)) {  // at rest
+      judge(slack);
+      const double floor = floor_of_signs();
+      double worst = -1.0;
+      int which = HARD;
+#pragma unroll
+      for (int h = 0; h < H; ++h) {
+        const double by = wrong_by(multiplier[h], side[h], 1.0);
+        if (side[h] != 0 && by > floor && (stalled > PATIENCE ? 1.0 : by) > worst)
+          worst = stalled > PATIENCE ? 1.0 : by, which = lane + 32 * h;
+      }
+      if (has_row && row_side != 0) {
+        const double by = wrong_by(row_multiplier, row_side, row_length);
+        if (by > floor && (stalled > PATIENCE ? 1.0 : by) > worst) worst = stalled > PATIENCE ? 1.0 : by, which = N + lane;
+      }
+      first_largest(worst, which);
+      optimal = worst < 0.0;
+      if (optimal) break;
+#pragma unroll
+      for (int h = 0; h < H; ++h)
+        if (is(h, which)) side[h] = 0;
+      if (N + lane == which) row_side = 0;
+      to_hold = true;
+      ++changes;
+      continue;
+    }
+    double far = 0.0, nearest = INFINITY;
+    int blocks = HARD, towards = 0;
+#pragma unroll
+    for (int h = 0; h < H; ++h) far += exists[h] ? d[h] * d[h] : 0.0;
+    const double stride = sqrt(sum(far));
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      if (!exists[h] || frozen[h] || side[h] != 0 || fabs(d[h]) <= rank_share * stride) continue;
+      const double gap = (d[h] > 0.0 ? high[h] : low[h]) - x[h], time = fmax(gap / d[h], 0.0);
+      if (time < nearest) nearest = time, blocks = lane + 32 * h, towards = d[h] > 0.0 ? 1 : -1;
+    }
+    if (P) {
+      const double here_rate = has_row ? hard_row_times(point) : 0.0;
+      share_out(x);
+      if (has_row && !row_frozen && row_level < level && row_side == 0 &&
+          fabs(here_rate) > rank_share * stride * row_length) {
+        const double bound = here_rate > 0.0 ? row_high : row_low;
+        const double time = is_finite(bound) ? fmax((bound - hard_row_times(point)) / here_rate, 0.0) : INFINITY;
+        if (time < nearest) nearest = time, blocks = N + lane, towards = here_rate > 0.0 ? 1 : -1;
+      }
+    }
+    double soonest = -nearest;
+    first_largest(soonest, blocks);
+    const double limit = -soonest;
+    double ideal = 1.0;
+    if (mixed) {                                      // an exact line search: rows enter and leave their intervals
+      __syncwarp();
+#pragma unroll
+      for (int g = 0; g < G; ++g)
+        if (in_level[g]) first_of[lane + 32 * g] = value[g], second_of[lane + 32 * g] = rate[g];
+      __syncwarp();
+      auto slope = [&](double t) {
+        double total = 0.0;
+        for (int a = 0; a < m; ++a) {
+          const size_t at = problem * ROWS + OFFSET[level] + a;
+          const double v = first_of[a] + t * second_of[a];
+          const bool same = rows_equal.data[at] != 0;
+          total += second_of[a] * (v - (same ? rows_lower.data[at] : clip(v, rows_lower.data[at], rows_upper.data[at])));
+        }
+        return total;
+      };
+      double knot[2 * G + 1], before = 0.0, after = INFINITY;
+#pragma unroll
+      for (int g = 0; g < G; ++g) {
+        const bool moving = in_level[g] && rate[g] != 0.0;
+        knot[2 * g] = moving && is_finite(below[g]) ? fmax((below[g] - value[g]) / rate[g], 0.0) : 1.0;
+        knot[2 * g + 1] = moving && is_finite(above[g]) ? fmax((above[g] - value[g]) / rate[g], 0.0) : 1.0;
+      }
+      knot[2 * G] = lane == 0 ? 0.0 : 1.0;
+#pragma unroll
+      for (int e = 0; e < 2 * G + 1; ++e)
+        if (slope(knot[e]) < 0.0) before = fmax(before, knot[e]);
+      before = largest(before);
+#pragma unroll
+      for (int e = 0; e < 2 * G + 1; ++e)
+        if (knot[e] > before) after = fmin(after, knot[e]);
+      after = -largest(-after);
+      const double probe = is_finite(after) ? 0.5 * (before + after) : before + 1.0;
+      const double at_first = slope(before), at_last = slope(probe);
+      const bool rising = at_last > at_first;
+      ideal = rising ? fmax(before - at_first * (probe - before) / (at_last - at_first), 0.0) : before;
+    }
+    const bool blocked = limit <= ideal;
+    const double share = blocked ? limit : ideal;
+    double moved = 0.0;
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      if (exists[h]) x[h] += share * d[h], moved = fmax(moved, share * fabs(d[h]));
+      if (blocked && is(h, blocks)) side[h] = towards;
+    }
+    if (blocked && N + lane == blocks) row_side = towards;
+    stalled = largest(moved) > 0.0 ? 0 : stalled + 1;
+    to_hold = blocked;
+    changes += blocked;
+  }
+  all_done = all_done && optimal;
+  worst_residual = fmax(worst_residual, residual);
+
+  // ---- what the level decides: rows that push, and its own that miss their intervals, are equalities from here on
+  look();
+  const double floor = floor_of_signs();
+  bool same = true, all_tight = true, row_tight = has_row && row_side != 0 && fabs(row_multiplier) * row_length > floor;
+  bool now_counts[G], is_tight[H];
+#pragma unroll
+  for (int g = 0; g < G; ++g) {
+    const double small = multiplier_share * (length[g] * reach + missing);
+    now_counts[g] = in_level[g] && (equal[g] || fabs(slack[g]) > small);
+    same = same && now_counts[g] == counts[g];
+  }
+#pragma unroll
+  for (int h = 0; h < H; ++h) {
+    is_tight[h] = exists[h] && side[h] != 0 && fabs(multiplier[h]) > floor;
+    all_tight = all_tight && is_tight[h] == (side[h] != 0);
+  }
+  all_tight = !any(!all_tight || row_tight != (row_side != 0));
+  same = !any(!same);
+  const int rank_there = rank;
+  int ended[H], row_ended = row_side;
+#pragma unroll
+  for (int h = 0; h < H; ++h) ended[h] = side[h];
+  if (!(same && all_tight)) {
+#pragma unroll
+    for (int h = 0; h < H; ++h) side[h] = is_tight[h] ? side[h] : 0;
+    row_side = row_tight ? row_side : 0;
+#pragma unroll
+    for (int g = 0; g < G; ++g) counts[g] = now_counts[g];
+    hold();
+    fit();
+  }
+  const bool tie = same && rank != rank_there;
+
+#pragma unroll
+  for (int h = 0; h < H; ++h)
+    if (exists[h]) {
+      const size_t at = here * HARD + lane + 32 * h;
+      sides.data[at] = ended[h];
+      tight_rows.data[at] = is_tight[h] || tie ? ended[h] : 0;
+      multipliers.data[at] = multiplier[h];
+      box_label[h] = ended[h] != 0 ? ended[h] : frozen[h] ? box_label[h] : 0;
+      frozen[h] = frozen[h] || is_tight[h];
+      side[h] = is_tight[h] ? 0 : ended[h];
+    }
+#pragma unroll
+  for (int g = 0; g < G; ++g) {
+    const int a = lane + 32 * g;
+    const int miss = now_counts[g] ? slack[g] > 0.0 ? 1 : -1 : 0;
+    if (a < M) {
+      missed_rows.data[here * M + a] = miss;
+      own_rows.data[here * M + a] = equal[g] ? 2 : miss;
+    }
+    if (in_level[g]) flags[a] = now_counts[g];
+  }
+  __syncwarp();
+  if (has_row) {
+    const size_t at = here * HARD + N + lane;
+    sides.data[at] = row_ended;
+    tight_rows.data[at] = row_tight || tie ? row_ended : 0;
+    multipliers.data[at] = row_multiplier;
+    row_frozen = row_frozen || row_tight;
+    row_side = row_tight ? 0 : row_ended;
+    if (row_level == level) {
+      const double at_x = hard_row_times(point);
+      row_low = fmin(row_low, at_x), row_high = fmax(row_high, at_x);
+      row_frozen = row_frozen || flags[PLACE[lane] - OFFSET[level]] != 0;
+    }
+  }
+  if (lane == 0) ranks.data[here] = tie ? rank_there : rank, reached.data[here] = missing;
+
+  // ---- and are cut off: the row space of the factor goes to the front, after what is tight
+  {
+    double own[H][N], triangle[H][N];
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+#pragma unroll
+      for (int j = 0; j < N; ++j) {
+        own[h][j] = exists[h] ? Z[(lane + 32 * h) * ZD + j] : 0.0;
+        triangle[h][j] = lane + 32 * h < rank ? R[(lane + 32 * h) * ZD + j] : 0.0;
+      }
+    for (int k = 0; k < rank; ++k) {
+      const int at = held_count + k;
+#pragma unroll
+      for (int h = 0; h < H; ++h)
+        if (lane + 32 * h == k)
+#pragma unroll
+          for (int j = 0; j < N; ++j) turn[j] = j >= at ? triangle[h][j] : 0.0;
+      __syncwarp();
+      double square = 0.0;
+      for (int j = lane; j < N; j += 32) square += turn[j] * turn[j];
+      const double weight = reflection(at, sqrt(sum(square)));
+#pragma unroll
+      for (int h = 0; h < H; ++h) {
+        double first = 0.0, second = 0.0;
+#pragma unroll
+        for (int j = 0; j < N; ++j) first += own[h][j] * turn[j], second += triangle[h][j] * turn[j];
+        first *= weight, second *= weight;
+#pragma unroll
+        for (int j = 0; j < N; ++j) own[h][j] -= first * turn[j], triangle[h][j] -= second * turn[j];
+      }
+      __syncwarp();
+    }
+    const int gone = held_count + rank;
+    width -= gone;
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (exists[h]) {
+        double* const row = Z + (lane + 32 * h) * ZD;
+#pragma unroll
+        for (int j = 0; j < N; ++j)
+          if (j >= gone) row[j - gone] = j - gone < width ? own[h][j] : 0.0;
+        for (int j = N - gone; j < N; ++j) row[j] = 0.0;
+      }
+    __syncwarp();
+  }
+}
+
+#pragma unroll
+for (int h = 0; h < H; ++h)
+  if (exists[h]) {
+    solution.data[problem * N + lane + 32 * h] = x[h];
+    box.data[problem * N + lane + 32 * h] = box_label[h];
+  }
+if (lane == 0) {
+  residuals.data[problem] = worst_residual;
+  report.data[problem * 3] = all_done;
+  report.data[problem * 3 + 1] = changes;
+  report.data[problem * 3 + 2] = factorizations;
+}
