@@ -19,6 +19,7 @@ constexpr int LONGEST = (N > M ? N : M) > P ? (N > M ? N : M) : P;
 constexpr int HARD = N + P;
 constexpr int FACTORS = MOST_RANK * (ZD + VD) > N * VD ? MOST_RANK * (ZD + VD) : N * VD;
 constexpr int PATIENCE = 20;                          // steps of no length, before the least index decides
+constexpr double DAMPING = 1e-9;                      // of the longest row, squared, as in _proposal.py
 constexpr unsigned ALL = 0xffffffffu;
 
 __shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * LONGEST + MOST_RANK];
@@ -374,7 +375,7 @@ auto restore = [&](double* d) {                       // the shortest step that 
   __syncwarp();
 };
 
-double multiplier[H] = {}, row_multiplier = 0.0, steepness = 0.0, residual = 0.0;
+double multiplier[H] = {}, downhill[H] = {}, row_multiplier = 0.0, steepness = 0.0, residual = 0.0;
 auto judge = [&](const double* slack) {               // multipliers of the held rows, the gradient's norm, stationarity
 #pragma unroll
   for (int g = 0; g < G; ++g)
@@ -393,7 +394,7 @@ auto judge = [&](const double* slack) {               // multipliers of the held
   }
   steepness = sqrt(sum(square));
   share_out(gradient);
-  double pull[H], off = 0.0;
+  double pull[H], off = 0.0;                          // the way downhill, in the basis
 #pragma unroll
   for (int h = 0; h < H; ++h) {
     const int j = lane + 32 * h;
@@ -401,6 +402,7 @@ auto judge = [&](const double* slack) {               // multipliers of the held
     if (j < width)
       for (int i = 0; i < N; ++i) pull[h] -= Z[i * ZD + j] * point[i];
     if (j >= held_count) off = fmax(off, fabs(pull[h]));
+    downhill[h] = pull[h];
   }
   residual = largest(off);
   for (int k = held_count - 1; k >= 0; --k) {
@@ -487,9 +489,9 @@ for (level = 0; level < LEVELS; ++level) {
   };
   auto bounded = [&](double a, double b) { return is_finite(a) || is_finite(b); };
   auto wrong_by = [&](double force, int at, double longest) { return -force * at * longest; };
-  auto floor_of_signs = [&]() {
-    return multiplier_share * steepness + size * step_share * (size * reach + missing);
-  };
+  auto noise = [&]() { return size * step_share * (size * reach + missing); };
+  auto floor_of_signs = [&]() { return multiplier_share * steepness + noise(); };
+  auto at_rest = [&]() { return residual <= 10.0 * (multiplier_share * size * missing + noise()); };
 
   // ---- the working set of the warm start
   double start[H];
@@ -564,7 +566,7 @@ for (level = 0; level < LEVELS; ++level) {
       bool wrong = has_row && row_side != 0 && wrong_by(row_multiplier, row_side, row_length) > floor;
 #pragma unroll
       for (int h = 0; h < H; ++h) wrong = wrong || (side[h] != 0 && wrong_by(multiplier[h], side[h], 1.0) > floor);
-      optimal = !any(wrong || !fine);
+      optimal = !any(wrong || !fine) && at_rest();
       to_hold = false, to_fit = false;
     } else {
 #pragma unroll
@@ -575,6 +577,7 @@ for (level = 0; level < LEVELS; ++level) {
 
   // ---- by hand, from a feasible point
   int stalled = 0, rounds = 0;
+  bool tried = false;                                 // what was too weak for the factor
   while (!optimal && rounds++ < most_changes) {
     look();
     if (to_hold) hold();
@@ -595,8 +598,21 @@ for (level = 0; level < LEVELS; ++level) {
       rate[g] = in_level[g] ? row_times(lane + 32 * g, point) : 0.0;
       square += counts[g] ? rate[g] * rate[g] : 0.0;
     }
-    if (sqrt(sum(square)) <= step_share * (size * reach + missing)) {  // at rest
+    const bool stands = sqrt(sum(square)) <= step_share * (size * reach + missing);
+    bool weak = false;
+    if (stands) {
       judge(slack);
+      weak = !tried && !at_rest();
+    }
+    if (weak) {                                       // a damped step along what the factor's tolerance left out
+      tried = true;
+#pragma unroll
+      for (int h = 0; h < H; ++h)
+        if (exists[h]) turn[lane + 32 * h] = downhill[h] / (DAMPING * size * size);
+      __syncwarp();
+      along(held_count, width, d);
+      share_out(d);
+    } else if (stands) {
       const double floor = floor_of_signs();
       double worst = -1.0;
       int which = HARD;
@@ -646,7 +662,7 @@ for (level = 0; level < LEVELS; ++level) {
     first_largest(soonest, blocks);
     const double limit = -soonest;
     double ideal = 1.0;
-    if (mixed) {                                      // an exact line search: rows enter and leave their intervals
+    if (mixed && !weak) {                                      // an exact line search: rows enter and leave their intervals
       __syncwarp();
 #pragma unroll
       for (int g = 0; g < G; ++g)
@@ -694,6 +710,7 @@ for (level = 0; level < LEVELS; ++level) {
     if (blocked && N + lane == blocks) row_side = towards;
     stalled = largest(moved) > 0.0 ? 0 : stalled + 1;
     to_hold = blocked;
+    tried = tried && !blocked;
     changes += blocked;
   }
   all_done = all_done && optimal;
