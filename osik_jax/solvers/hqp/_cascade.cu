@@ -4,8 +4,9 @@
 // Z, an orthonormal basis of what the levels so far leave free, gets narrower from level to level. At each level, rows
 // that are held at a bound are rotated into its first columns by reflections from the right; the level's rows, in the
 // columns that are left, are factored by reflections from the left with pivoting. The working set of the warm start is
-// tried first; else, and where that is not the optimum, a primal active set begins where the level above ended. What is
-// tight at the optimum, and the row space of the level's factor, are rotated to the front and cut off.
+// tried first; else, and where that is not the optimum, a primal active set begins where the level above ended. Where it
+// rests on a direction that the factor's tolerance left out, it takes one damped step along it. What is tight at the
+// optimum, and the row space of the level's factor, are rotated to the front and cut off.
 //
 // Variable i belongs to lane i % 32, and so do row i of the level and column i of Z. Constants from _kernel.py: N
 // variables, LEVELS, M rows of the longest level (the last is the identity and has no rows in memory), ROWS of all

@@ -1,0 +1,154 @@
+"""The hierarchy's kernel beside XLA, without a GPU: what it answers is taken only where it passes the check."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hierarchy_families import inequality_levels
+
+from osik_jax.solvers import Level, Tolerances, _cuda, solve_hqp
+from osik_jax.solvers.hqp import _cascade, _fused, _kernel
+from osik_jax.solvers.hqp._kernel import Shape
+from osik_jax.solvers.hqp._stack import Layout, Stack, stacked
+
+COUNT, CAP = 12, 200
+
+
+class Batch(NamedTuple):
+    layout: Layout
+    stack: Stack
+    tolerances: Tolerances
+    answers: _cascade.Descent
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    p = inequality_levels(np.random.default_rng(2), COUNT)
+    layouts = []
+
+    def stack_of(levels, lower, upper):
+        given = [Level(*level) for level in levels]
+        layout, stack = stacked(given, [level.equal for level in given], lower, upper, lower >= upper)
+        layouts.append(layout)
+        return stack
+
+    last = (np.broadcast_to(np.eye(10), (COUNT, 10, 10)), np.zeros((COUNT, 10)))
+    stack = jax.vmap(stack_of)([*map(tuple, p.levels), last], jnp.asarray(p.lower), jnp.asarray(p.upper))
+    tolerances = jax.tree.map(lambda a: jnp.full(COUNT, a), Tolerances())
+    layout = layouts[0]
+    answers = jax.jit(lambda s, t: _cascade.descend_all(layout, CAP, s, t, None))(stack, tolerances)
+    assert answers.done.all() and (answers.box != 0).any(1).all()
+    return Batch(layout, stack, tolerances, answers)
+
+
+def completed(batch, answer, monkeypatch):
+    """The end, and the lanes in which the kernel's answer was taken."""
+    marked = answer._replace(factorizations=jnp.full_like(answer.factorizations, 1000))
+    monkeypatch.setattr(_kernel, "solve", lambda *_: marked)
+    end = jax.jit(lambda s, t: _fused.descended_and_checked(batch.layout, CAP, s, t, None))(*batch[1:3])
+    return end, end.factorizations == 1000
+
+
+def some(count=COUNT):
+    return jnp.arange(count) % 3 == 0
+
+
+def beside_its_box(batch):
+    n = batch.answers.x.shape[1]
+    room = jnp.where(jnp.isfinite(batch.stack.hard_upper[:, :n]), batch.stack.hard_upper[:, :n], batch.answers.x)
+    return batch.answers._replace(x=jnp.where(some()[:, None], room + 1e-6, batch.answers.x))
+
+
+def worse_above(batch):
+    """Inside the box, and a level does not keep what it had reached."""
+    return batch.answers._replace(
+        reached=jnp.where(some()[:, None], 0.9 * batch.answers.reached - 1e-3, batch.answers.reached)
+    )
+
+
+def changed(**how):
+    def change(batch):
+        right = batch.answers
+        return right._replace(
+            **{
+                name: jnp.where(some().reshape(-1, *[1] * (getattr(right, name).ndim - 1)), value, getattr(right, name))
+                for name, value in how.items()
+            }
+        )
+
+    return change
+
+
+WRONG = {
+    "not done": changed(done=False),
+    "NaN": changed(x=jnp.nan),
+    "NaN multipliers": changed(multipliers=jnp.nan),
+    "infinite residual": changed(residual=jnp.inf),
+    "outside": beside_its_box,
+    "a level lost": worse_above,
+}
+
+
+def test_right_answers_are_taken(batch, monkeypatch):
+    end, taken = completed(batch, batch.answers, monkeypatch)
+    assert taken.all()
+    np.testing.assert_array_equal(end.x, batch.answers.x)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_wrong_answers_are_not(batch, wrong, monkeypatch):
+    """They are wrong in every third lane; blocks of 3, so that the last one is not full."""
+    monkeypatch.setattr(_fused, "_BLOCK", 3)
+    end, taken = completed(batch, WRONG[wrong](batch), monkeypatch)
+    np.testing.assert_array_equal(taken, ~some())
+    assert end.done.all()
+    np.testing.assert_allclose(end.x, batch.answers.x, rtol=0, atol=1e-12)
+
+
+def test_when_the_kernel_is_asked(monkeypatch):
+    asked = []
+
+    def solve(layout, stack, tolerances, warm, cap):
+        asked.append(Shape.of(layout))
+        return _cascade.descend_all(layout, cap, stack, tolerances, warm)
+
+    monkeypatch.setattr(_kernel, "solve", solve)
+    monkeypatch.setattr(_cuda, "find_spec", lambda name: name)
+
+    def trace(n=3):
+        _fused.descender.cache_clear()
+        jax.clear_caches()
+        levels = [Level(np.ones((1, n)), [-1.0], [1.0]), Level(np.ones((2, n)), [1.0, 2.0])]
+        jax.jit(lambda low: solve_hqp(levels, low, -low).x).lower(-np.ones(n))
+
+    trace()
+    assert asked == []  # no GPU
+    monkeypatch.setattr(_cuda, "available", lambda: True)
+    trace()
+    assert asked[-1] == Shape(3, 3, (1, 2, 3), (True, False, False), (0,), (0,))
+    count = len(asked)
+    trace(65)  # too many variables
+    monkeypatch.setenv(_cuda.SWITCH, "0")
+    trace()
+    assert len(asked) == count
+    _fused.descender.cache_clear()
+    jax.clear_caches()
+
+
+@pytest.mark.parametrize(
+    ("shape", "warps"),
+    [
+        (Shape(31, 31, (12, 3, 3, 25, 31), (False,) * 5, (), ()), 1),
+        (Shape(10, 10, (4, 10), (True, False), (0, 1, 2, 3), (0,) * 4), 2),
+        (Shape(64, 64, (12, 64), (False,) * 2, (), ()), 0),
+        (Shape(10, 10, (40, 10), (True, False), tuple(range(40)), (0,) * 40), 0),
+        (Shape(10, 10, (10,), (False,), (), ()), 0),
+    ],
+)
+def test_what_the_text_is_compiled_for(shape, warps):
+    assert shape.warps == warps
+    if warps:
+        head = _kernel.source(shape).splitlines()[:6]
+        assert head[0] == f"constexpr int N = {shape.variables};" and head[5] == f"constexpr int WARPS = {warps};"
