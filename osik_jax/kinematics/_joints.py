@@ -53,9 +53,10 @@ def _forest(
         for joint, owner in enumerate(joint_bodies):
             if owner == body:
                 element.add_joint(type=mujoco.mjtJoint(joint_types[joint]), armature=1.0)  # or MuJoCo warns
+    here = jax.local_devices()[0]  # MJX would take the first device of all hosts
     with jax.ensure_compile_time_eval():
-        model = mjx.put_model(spec.compile(), impl="jax")
-        return model, mjx.make_data(model, impl="jax")
+        model = mjx.put_model(spec.compile(), device=here, impl="jax")
+        return model, mjx.make_data(model, device=here, impl="jax")
 
 
 def dof_kinds(tree: KinematicTree) -> tuple[np.ndarray, np.ndarray]:

@@ -126,8 +126,8 @@ class ShardedFunction:
         places = {axis: NamedSharding(self.mesh, self._spec(None if axis == _SHARED else axis)) for axis in batch.axes}
         wanted = [places[axis] for axis in batch.axes]
         away = [i for i, (a, place) in enumerate(zip(whole, wanted, strict=True)) if not _is_there(a, place)]
-        moved = _moved([whole[i] for i in away], [wanted[i] for i in away])
-        for i, a in zip(away, moved, strict=True):
+        there = moved([whole[i] for i in away], [wanted[i] for i in away])
+        for i, a in zip(away, there, strict=True):
             whole[i] = a
         return jax.tree.unflatten(batch.structure, whole)
 
@@ -170,7 +170,8 @@ def _is_there(leaf: Any, place: NamedSharding) -> bool:
     return known and leaf.committed and leaf.sharding == place
 
 
-def _moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:
+def moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:
+    """Arrays on the devices where they are wanted, of other hosts too, each of which has them whole."""
     if not leaves:
         return []
     if jax.process_count() == 1:

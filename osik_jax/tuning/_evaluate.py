@@ -10,9 +10,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from .._structure import Static, put_together, taken_apart
+from ..scaling._sharded import moved
 from ..solvers import Status
 from ._loop import Loop
 from ._losses import LossFunction
@@ -43,11 +45,12 @@ class Evaluation(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """What is minimised: a loss of a loop, over a space of parameters."""
+    """What is minimised: a loss of a loop, over a space of parameters, its scenarios split over devices."""
 
     loss: LossFunction
     loop: Loop
     space: ParameterSpace
+    mesh: Mesh | None = eqx.field(static=True, default=None)
 
     def one(self, vector: Float[Array, " p"], scenario: Scenarios) -> tuple[Float[Array, ""], Bool[Array, ""]]:
         """Loss of one scenario, and whether it can be kept."""
@@ -56,7 +59,12 @@ class Problem(eqx.Module):
 
     def value(self, vector: Float[Array, " p"], scenarios: Scenarios, chunk: int) -> Evaluation:
         """Losses at a vector of parameters."""
-        return Evaluation(*in_chunks(partial(self.one, vector), scenarios, chunk))
+        numbers, static = taken_apart(self)
+
+        def one(shared: Any, scenario: Scenarios) -> Any:
+            return put_together(shared[0], static).one(shared[1], scenario)
+
+        return Evaluation(*over_scenarios(one, (numbers, vector), scenarios, chunk, self.mesh))
 
     def slope(
         self, vector: Float[Array, " p"], scenarios: Scenarios, chunk: int
@@ -65,9 +73,12 @@ class Problem(eqx.Module):
 
         Each scenario has a gradient of its own, so that one which is not finite is left out and spoils nothing.
         """
-        (losses, kept), slopes = in_chunks(
-            lambda scenario: jax.value_and_grad(self.one, has_aux=True)(vector, scenario), scenarios, chunk
-        )
+        numbers, static = taken_apart(self)
+
+        def one(shared: Any, scenario: Scenarios) -> Any:
+            return jax.value_and_grad(put_together(shared[0], static).one, has_aux=True)(shared[1], scenario)
+
+        (losses, kept), slopes = over_scenarios(one, (numbers, vector), scenarios, chunk, self.mesh)
         kept = kept & jnp.isfinite(slopes).all(1)
         total = jnp.sum(jnp.where(kept[:, None], slopes, 0.0), 0)
         return Evaluation(losses, kept), total / jnp.maximum(jnp.sum(kept), 1)
@@ -83,6 +94,56 @@ def scenario_loss(loss: LossFunction, loop: Loop, scenario: Scenarios) -> tuple[
     return value, jnp.isfinite(value) & sound
 
 
+def over_scenarios(
+    function: Callable[[Any, Any], Any], shared: Any, scenarios: Scenarios, chunk: int, mesh: Mesh | None
+) -> Any:
+    """``function(shared, scenario)`` of each, some at a time, on each device of a mesh its own share.
+
+    What the devices do not divide is filled up with copies of the last scenario, which are cut off again.
+    """
+    if mesh is None:
+        return in_chunks(partial(function, shared), scenarios, chunk)
+    count = len(scenarios)
+    whole = (
+        scenarios[jnp.minimum(jnp.arange(count + -count % mesh.size), count - 1)] if count % mesh.size else scenarios
+    )
+    everywhere, split = PartitionSpec(), PartitionSpec(mesh.axis_names)
+    # As in ``scaling.sharded``: loops inside the solvers begin with constants, which do not vary over the mesh.
+    mapped = jax.shard_map(
+        lambda shared, own: in_chunks(partial(function, shared), own, chunk),
+        mesh=mesh,
+        in_specs=(everywhere, split),
+        out_specs=split,
+        check_vma=False,
+    )
+    return jax.tree.map(lambda a: a[:count], mapped(shared, whole))
+
+
+def shares(scenarios: Scenarios, mesh: Mesh | None) -> Scenarios:
+    """The scenarios on the devices of a mesh: each has its own, or all where they do not divide."""
+    uneven = mesh is not None and len(scenarios) % mesh.size
+    return _placed(scenarios, mesh, PartitionSpec() if mesh is None or uneven else PartitionSpec(mesh.axis_names))
+
+
+def replicas(numbers: Any, mesh: Mesh | None) -> Any:
+    """Numbers on all devices of a mesh. Python's stay where they are, for they have no precision of their own."""
+    return _placed(numbers, mesh, PartitionSpec())
+
+
+def replicated(results: Any, mesh: Mesh | None) -> Any:
+    """Results of a program on all devices of a mesh, constants too, which it would leave on one."""
+    return results if mesh is None else jax.lax.with_sharding_constraint(results, NamedSharding(mesh, PartitionSpec()))
+
+
+def _placed(tree: Any, mesh: Mesh | None, spec: PartitionSpec) -> Any:
+    if mesh is None:
+        return tree
+    arrays, rest = eqx.partition(tree, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    there = moved(leaves, [NamedSharding(mesh, spec)] * len(leaves))
+    return eqx.combine(jax.tree.unflatten(structure, there), rest)
+
+
 def in_chunks(function: Callable[[Any], Any], batch: Any, chunk: int) -> Any:
     """``vmap(function)(batch)``, some lanes at a time; what the last chunk lacks is filled up with its first lane."""
     count = jax.tree.leaves(batch)[0].shape[0]
@@ -95,7 +156,9 @@ def in_chunks(function: Callable[[Any], Any], batch: Any, chunk: int) -> Any:
     return jax.tree.map(lambda a: a.reshape(blocks * chunk, *a.shape[2:])[:count], out)
 
 
-def evaluate(loss: LossFunction, loop: Loop, scenarios: Scenarios, *, chunk: int | None = None) -> Evaluation:
+def evaluate(
+    loss: LossFunction, loop: Loop, scenarios: Scenarios, *, chunk: int | None = None, mesh: Mesh | None = None
+) -> Evaluation:
     """What a loop costs on scenarios; compiled once for a loss and a structure.
 
     Args:
@@ -103,20 +166,26 @@ def evaluate(loss: LossFunction, loop: Loop, scenarios: Scenarios, *, chunk: int
         loop: what is run.
         scenarios: what it is run on.
         chunk: scenarios that run at a time; see ``tune``.
+        mesh: devices that the scenarios are split over; see ``tune``.
 
     Raises:
         KeyError, ValueError: scenarios that do not fit the loop.
-        TypeError: a loss that takes other arguments.
+        TypeError: a loss that takes other arguments, or a mesh that is none.
     """
     check_loss(loss)
+    check_mesh(mesh)
     numbers, static = taken_apart((loss, loop))
-    return _evaluate(numbers, scenarios.fitted(loop), static=static, chunk=chunk_size(chunk, len(scenarios)))
+    numbers, own = replicas(numbers, mesh), shares(scenarios.fitted(loop), mesh)
+    return _evaluate(numbers, own, static=static, chunk=chunk_size(chunk, len(scenarios), mesh), mesh=mesh)
 
 
-@partial(jax.jit, static_argnames=("static", "chunk"))
-def _evaluate(numbers: Any, scenarios: Scenarios, *, static: Static, chunk: int) -> Evaluation:
-    loss, loop = put_together(numbers, static)
-    return Evaluation(*in_chunks(lambda scenario: scenario_loss(loss, loop, scenario), scenarios, chunk))
+@partial(jax.jit, static_argnames=("static", "chunk", "mesh"))
+def _evaluate(numbers: Any, scenarios: Scenarios, *, static: Static, chunk: int, mesh: Mesh | None) -> Evaluation:
+    def one(numbers: Any, scenario: Scenarios) -> Any:
+        loss, loop = put_together(numbers, static)
+        return scenario_loss(loss, loop, scenario)
+
+    return Evaluation(*over_scenarios(one, numbers, scenarios, chunk, mesh))
 
 
 def check_loss(loss: Any) -> None:
@@ -129,8 +198,15 @@ def check_loss(loss: Any) -> None:
         raise TypeError(f"the loss {loss!r} has to take two arguments: the trajectory and the loop") from None
 
 
-def chunk_size(chunk: int | None, count: int) -> int:
-    """How many scenarios run at a time: all on an accelerator, some on a CPU, whose cache holds no more."""
+def check_mesh(mesh: Any) -> None:
+    """Raises TypeError where a mesh is none."""
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as osik_jax.scaling.device_mesh()")
+
+
+def chunk_size(chunk: int | None, count: int, mesh: Mesh | None = None) -> int:
+    """How many scenarios run at a time on a device: all on an accelerator, some on a CPU, whose cache holds no more."""
+    count = -(-count // mesh.size) if mesh is not None else count
     if chunk is None:
         return min(count, 64) if jax.default_backend() == "cpu" else count
     if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:

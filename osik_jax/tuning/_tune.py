@@ -12,10 +12,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from .._structure import Static, put_together, taken_apart
-from ._evaluate import Evaluation, Problem, check_loss, chunk_size
+from ._evaluate import Evaluation, Problem, check_loss, check_mesh, chunk_size, replicas, replicated, shares
 from ._history import History, State, load_state, save_state
 from ._loop import Loop
 from ._losses import LossFunction
@@ -75,6 +76,7 @@ def tune(
     patience: int | None = None,
     improvement: float = 1e-3,
     chunk: int | None = None,
+    mesh: Mesh | None = None,
     resume: Tuning | str | os.PathLike[str] | None = None,
     save: str | os.PathLike[str] | None = None,
     progress: bool = True,
@@ -94,10 +96,12 @@ def tune(
         iterations: gradients taken, those of a resumed state among them.
         patience: stops after so many iterations without a better training loss; None: never.
         improvement: a share by which a loss has to be lower to be better, for ``patience``.
-        chunk: scenarios that run at a time. Fewer take less memory. Default: 64 on a CPU, all elsewhere.
+        chunk: scenarios that run at a time on a device. Fewer take less memory. Default: 64 on a CPU, all elsewhere.
+        mesh: devices that the scenarios are split over, as ``osik_jax.scaling.device_mesh()`` makes one; each has all
+            parameters, and gradients are summed over them. Default: one device.
         resume: goes on from this result, or from a file that ``save`` wrote; the loss, the scenarios and the numbers
             that are not tuned may be others, the parameters and the optimiser may not.
-        save: a .npz file, written after each iteration.
+        save: a .npz file, written after each iteration; where there are several processes, by the first.
         progress: whether to show a bar with the loss.
         callback: told the history after each iteration.
 
@@ -111,17 +115,18 @@ def tune(
         ValueError: parameters, bounds, scenarios or a saved state that do not fit; no training scenario can be kept.
     """
     check_loss(loss)
+    check_mesh(mesh)
     space = ParameterSpace(loop, parameters)
     overlap(space, loop, scenarios.values | (held_out.values if held_out is not None else {}))
     rule = _optimizer(optimizer)
     state = _first_state(space, rule, resume)
-    step = _compiled_step(Problem(loss, loop, space), scenarios, held_out, rule, chunk)
+    step = _compiled_step(Problem(loss, loop, space, mesh), scenarios, held_out, rule, chunk)
     stopped = "iterations"
-    with reported(iterations, shown=progress) as show:
+    with reported(iterations, shown=progress and jax.process_index() == 0) as show:
         show(state.history)
         while len(state.history) < iterations:
             state = step(state)
-            if save is not None:
+            if save is not None and jax.process_index() == 0:
                 save_state(save, state, space)
             show(state.history)
             if callback is not None:
@@ -164,15 +169,17 @@ def _compiled_step(
     chunk: int | None,
 ) -> Callable[[State], State]:
     """One iteration, on the host."""
+    mesh = problem.mesh
     numbers, static = taken_apart(problem)
-    batches = [each.fitted(problem.loop) for each in (scenarios, *([] if held_out is None else [held_out]))]
-    chunks = tuple(chunk_size(chunk, len(each)) for each in batches)
+    numbers = replicas(numbers, mesh)
+    given = [scenarios] if held_out is None else [scenarios, held_out]
+    batches = [shares(each.fitted(problem.loop), mesh) for each in given]
+    chunks = tuple(chunk_size(chunk, len(each), mesh) for each in given)
 
     def step(state: State) -> State:
         start = time.perf_counter()
-        vector, memory, row = _step(
-            numbers, state.vector, state.optimizer, batches, static=static, chunks=chunks, optimizer=optimizer
-        )
+        at, memory = replicas((state.vector, state.optimizer), mesh)
+        vector, memory, row = _step(numbers, at, memory, batches, static=static, chunks=chunks, optimizer=optimizer)
         row = {name: np.asarray(value) for name, value in row.items()}
         if row["dropped"] == len(scenarios):
             raise ValueError(
@@ -220,7 +227,7 @@ def _step(
         "held_out_dropped": held.dropped,
         "gradient_norm": jnp.linalg.norm(gradient),
     }
-    return vector + updates, memory, row
+    return replicated((vector + updates, memory, row), problem.mesh)
 
 
 def _result(loop: Loop, space: ParameterSpace, state: State, stopped: str) -> Tuning:
