@@ -110,6 +110,22 @@ def test_pinned_variables_and_duplicated_rows(rng):
     assert s.x[2] == 0.7
 
 
+def test_rows_that_hold_the_answer_at_nought_hold():
+    """The answer is 0, so its rounding is that of what pulls at it; the second row says what the first does."""
+    for rows, strength in (([[0.0, 1.0]], 1.0), ([[0.0, 1.0], [0.0, 1.0]], 1.0), ([[0.0, 1.0], [0.0, 1.0]], 1e-9)):
+        zero, free = jnp.zeros(len(rows)), jnp.full(2, jnp.inf)
+        solution = solve_least_squares_qp(
+            *(jnp.zeros((0, 2)), zero[:0], zero[:0], -free, free),
+            rows=jnp.array(rows),
+            rows_lower=zero,
+            rows_upper=zero,
+            damping=jnp.array([strength, 1.0]),
+            center=jnp.array([0.0, 1.0]),
+        )
+        assert solution.status == Status.SOLVED
+        np.testing.assert_allclose(solution.x, 0.0, atol=1e-15)
+
+
 def test_contradictions_are_infeasible_and_leave_the_box_alone(rng):
     H, g, *_ = planted(rng, 6, 0, 0)
     C = np.ones((2, 6))

@@ -155,11 +155,15 @@ def possible(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
 
 
 def scales_of(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
-    """Invariant to the units of the variables: each is measured by the root of its curvature, from H's diagonal."""
+    """Invariant to the units of the variables: each is measured by the root of its curvature, from H's diagonal.
+
+    A variable is as large as what the rows pull at it, too: where they hold it at 0, that is what its rounding is of.
+    """
     root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
+    size = jnp.maximum(jnp.abs(x), jnp.abs(apply(qp.rows.T, y)) / root**2)
     reach = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
     span = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])
-    floor = jnp.minimum(jnp.max(jnp.abs(x) * root) * reach, jnp.max(jnp.abs(x)) * span)
+    floor = jnp.minimum(jnp.max(size * root) * reach, jnp.max(size) * span)
     values = jnp.concatenate([x, apply(qp.rows, x)])
     bounds = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (qp.lower, qp.upper)]
     nearest = jnp.minimum(*bounds)
