@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from task_checks import assert_every_number_counts, assert_jacobians, at_each, rows_of_each
 
 import osik_jax as osik
+from osik_jax.kinematics._rates import kinematics_rates
 
 ROBOT = """
 <mujoco><worldbody>
@@ -24,6 +25,18 @@ ROBOT = """
     </body>
   </body>
 </worldbody></mujoco>
+"""
+JOINTS = """
+<mujoco><worldbody>
+  <body pos="0 0 1"><geom size="0.1"/>
+    <joint name="x" type="slide" axis="1 0 0"/><joint name="turn" axis="0 1 1" pos="0.1 0 0"/>
+    <joint name="y" type="slide" axis="0 1 0"/><joint name="roll" axis="1 0 1" pos="0 0.2 0.1"/>
+    <body pos="0.3 0 0.1"><geom size="0.1"/>
+      <joint name="s" type="slide" axis="1 2 0"/><joint name="ball" type="ball" pos="0.1 0.2 0"/>
+      <body pos="0.2 0 0"><joint name="last" axis="0 0 1"/><geom size="0.1"/></body>
+    </body>
+  </body>
+</worldbody><equality><joint joint1="last" joint2="turn" polycoef="0.1 2 0 0 0"/></equality></mujoco>
 """
 
 
@@ -97,6 +110,22 @@ def configurations(robot):
 @pytest.fixture(scope="module")
 def found(robot, tasks, configurations):
     return at_each(robot, tasks, configurations)
+
+
+def test_how_kinematics_change_is_what_differentiating_them_gives():
+    """A body with four joints, one with a slide and a ball joint, a follower: every field, along every entry of v."""
+    robot = osik.Robot.from_mjcf(JOINTS)
+    assert robot.nv == 8
+    q = osik.integrate(robot, robot.q0, jnp.cos(jnp.arange(8.0)))
+
+    @jax.jit
+    def both(q):
+        expected = jax.jacfwd(lambda v: osik.forward_kinematics(robot, osik.integrate(robot, q, v)))(jnp.zeros(8))
+        return kinematics_rates(robot, osik.forward_kinematics(robot, q)), expected
+
+    for ours, expected in zip(*map(jax.tree.leaves, both(q)), strict=True):
+        np.testing.assert_allclose(ours, expected, atol=1e-14)
+        assert np.abs(expected).max() > 0.1
 
 
 class TestRows:

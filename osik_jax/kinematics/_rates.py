@@ -1,0 +1,64 @@
+"""How kinematics change with the velocity."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._tree import BALL, FREE, KinematicTree
+from ..robot import Robot
+from ._forward import Kinematics, independent_columns
+from ._joints import dof_kinds
+from ._rigid import cross
+
+
+def kinematics_rates(robot: Robot, kinematics: Kinematics) -> Kinematics:
+    """The derivative of ``forward_kinematics`` along the tangent: every field with a last axis more, of length nv.
+
+    What autodiff through the kinematics gives, from the motion axes that are known already: a body turns and moves with
+    every dof above it, an axis and its anchor with every dof of the joints before them.
+    """
+    tree = robot.tree
+    kinds, number = dof_kinds(tree)
+    in_world = (kinds == FREE) & (number < 3)  # a free joint's translations are along the world's axes
+    axes, anchors = _movers(tree)
+    fields = (
+        _velocity(kinematics, kinematics.body_position, tree.moves),
+        _turning(kinematics, kinematics.body_rotation, tree.moves),
+        _turning(kinematics, kinematics.dof_linear[..., None], axes & ~in_world[:, None])[:, :, 0],
+        _turning(kinematics, kinematics.dof_angular[..., None], axes)[:, :, 0],
+        _velocity(kinematics, kinematics.dof_anchor, anchors),
+    )
+    return Kinematics(*(independent_columns(tree, field) for field in fields))
+
+
+def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Bool[np.ndarray, "nvfull nvfull"]]:
+    """Which dofs (columns) turn the axis of each dof, and which move its anchor.
+
+    Hinges and slides sit where the joints before them have brought their body; the axes of ball and free joints are
+    those of the body itself. A free joint's anchor is its body's origin.
+    """
+    kinds, _ = dof_kinds(tree)
+    joint = tree.dof_joint
+    above = tree.moves[tree.dof_body]
+    before = above & (joint[None, :] < joint[:, None])
+    own = (joint[None, :] == joint[:, None]) & (kinds == FREE)[:, None]
+    return np.where(np.isin(kinds, (BALL, FREE))[:, None], above, before), before | own
+
+
+def _velocity(
+    kinematics: Kinematics, points: Float[Array, "k 3"], moved: Bool[np.ndarray, "k nvfull"]
+) -> Float[Array, "k 3 nvfull"]:
+    """Of points, with each dof that moves them."""
+    axis = kinematics.dof_angular.T
+    velocity = kinematics.dof_linear.T + cross(axis, points[:, :, None] - kinematics.dof_anchor.T, along=-2)
+    return jnp.where(moved[:, None, :], velocity, 0.0)
+
+
+def _turning(
+    kinematics: Kinematics, vectors: Float[Array, "k 3 n"], turned: Bool[np.ndarray, "k nvfull"]
+) -> Float[Array, "k 3 n nvfull"]:
+    """Of column vectors, with each dof that turns them."""
+    axis = kinematics.dof_angular.T[None, :, None, :]
+    return jnp.where(turned[:, None, None, :], cross(axis, vectors[..., None], along=1), 0.0)
