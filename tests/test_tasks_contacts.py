@@ -151,7 +151,7 @@ class TestContacts:
 
     def test_every_number_counts_and_gradients_are_finite(self, walker, contacts, configurations):
         assert_every_number_counts(walker, contacts, configurations[0])
-        assert_finite_gradients(rows_of_each, *alone(walker, contacts, walker.q0))
+        assert_finite_gradients(rows_of_each, *alone(walker, {"plane": contacts["plane"]}, walker.q0))
 
     def test_mistakes(self, walker):
         with pytest.raises(ValueError, match="contact is 'line'"):
