@@ -18,10 +18,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from ._blocks import in_blocks
+
+
+FOUND = "found by a search"
+"""What ``jax.checkpoint`` may keep by this name: it takes a search to compute it anew, and the reverse mode needs it."""
+
+
+def found(tree: Any) -> Any:
+    """The arrays as they are, under the name ``FOUND``."""
+    return jax.tree.map(lambda a: checkpoint_name(a, FOUND), tree)
 
 
 def custom_jvp(function: Callable[..., Any]) -> Ruled:

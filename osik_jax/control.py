@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._blocks import BLOCK
 from ._joint_selection import concrete, scalar_layout
-from ._rules import blocked
+from ._rules import FOUND, blocked
 from ._sanity import cleaned
 from ._structure import Static, put_together, taken_apart
 from .kinematics import Kinematics, forward_kinematics, integrate
@@ -276,7 +276,7 @@ def _rollout(
 
     ticks = (time, targets, measured)
     cold = _cold_start(lambda now: tick((q0, None, None), now)[0][1:], ticks)
-    thrifty = jax.checkpoint(tick, prevent_cse=False)
+    thrifty = jax.checkpoint(tick, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
     _, (q, solution) = jax.lax.scan(thrifty, (q0, *cold), ticks, length=steps)
     return Trajectory(time, jnp.concatenate([q0[None], q]), solution)
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from ... import _rules
 from .._box import inside, uncrossed
 from .._status import Status
 from ._cascade import NOTHING, Descent
@@ -69,7 +70,7 @@ def solve_hqp(
     scaled, equal = [*scaled, _smallest(len(low), dtype)], [*equal, jnp.ones(len(low), bool)]
     layout, stack = stacked(scaled, equal, low, high, (lower >= upper) & sane)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
-    end = descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start)))
+    end = _rules.found(descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start))))
     nothing = jnp.maximum(NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
     x = with_derivative(end.x, end.decisions, stack, nothing)
     return _answer(levels, end, x, sane, possible, lower, upper)

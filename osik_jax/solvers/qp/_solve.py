@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from ... import _rules
 from .._box import inside, uncrossed
 from .._dense import apply
 from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
@@ -177,7 +178,7 @@ def _solve(
     safe = replace(safe, lower=low, upper=high)
     cold = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
     search = searcher(20 * m if max_iterations is None else max_iterations, gives_way)
-    found = search(*jax.lax.stop_gradient((safe, cold, allowed)))
+    found = _rules.found(search(*jax.lax.stop_gradient((safe, cold, allowed))))
     solved = replace(safe, compliance=jnp.where(found.infeasible, found.compliance, safe.compliance))
     x, y = differentiable(found.x, found.row_multipliers, found.active, solved)
     finite = sane & jnp.isfinite(x).all() & jnp.isfinite(y).all()
