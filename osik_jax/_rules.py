@@ -24,9 +24,8 @@ from jax.interpreters import ad, batching, mlir
 
 from ._blocks import in_blocks
 
-
 FOUND = "found by a search"
-"""What ``jax.checkpoint`` may keep by this name: it takes a search to compute it anew, and the reverse mode needs it."""
+"""By this name ``jax.checkpoint`` may keep what the reverse mode needs and only a search could compute anew."""
 
 
 def found(tree: Any) -> Any:

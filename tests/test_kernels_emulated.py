@@ -112,3 +112,30 @@ def test_recorded_qps(robot, on_emulated_gpu):
         off = np.einsum("bmn,bn->bm", p.A[pick], np.asarray(s.x, float) - p.solution[pick])
         assert (np.abs(off).max(1) / np.abs(p.b[pick]).max(1)).max() < 1e-5
         start = s.active
+
+
+@pytest.mark.parametrize("soft", [0, 3])
+def test_derivatives_of_recorded_qps(soft, on_emulated_gpu, rng):
+    """Those of single precision by the kernel, beside those of double precision by XLA."""
+    p = recorded_qps("nao")
+    pick = slice(None, None, 64)
+    A, b, lower, upper = (a[pick] for a in (p.A, p.b, p.lower, p.upper))
+    count, _, n = A.shape
+    rows, high = rng.normal(size=(count, soft, n)), np.full((count, soft), 0.1)
+    rates = tuple(rng.normal(size=a.shape) for a in (A, b, lower))
+
+    def x(A, b, lower, upper, rows, high):
+        given = dict(rows=rows, rows_lower=-high, rows_upper=high, rows_compliance=high) if soft else {}
+        return solve_least_squares_qp(A, b, jnp.ones_like(b), lower, upper, damping=1e-3, **given).x
+
+    def rate(precision):
+        given = [jnp.asarray(a, precision) for a in (A, b, lower, upper, rows, high)]
+        move = [jnp.asarray(a, precision) for a in rates]
+        forward = jax.jvp(lambda *a: jax.vmap(x)(*a, *given[3:]), given[:3], move)[1]
+        loss = lambda *a: jnp.sum(jax.vmap(x)(*a, *given[3:]) ** 2)  # noqa: E731
+        return forward, *jax.grad(loss, (0, 1))(*given[:3])
+
+    for ours, expected in zip(jax.jit(rate, static_argnums=0)("float32"), rate("float64"), strict=True):
+        size = np.abs(expected).reshape(count, -1).max(1)
+        off = np.abs(np.asarray(ours, float) - expected).reshape(count, -1).max(1)
+        assert (off <= 1e-3 * size).all()

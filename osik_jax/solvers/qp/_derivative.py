@@ -15,7 +15,7 @@ from jaxtyping import Array, Int
 from ..._rules import custom_jvp
 from .._dense import apply
 from .._pivots import INACTIVE
-from ._factor import factorize, solve_system
+from ._fused import system_solver
 from ._problem import QP, active_targets
 
 
@@ -58,16 +58,10 @@ def _linear_solve(qp: QP, active: Int[Array, " m"], slope: Array, gap: Array) ->
         bottom = -apply(qp.rows, x) - qp.compliance * y
         return jnp.where(counts, jnp.concatenate([top, bottom]), point)
 
-    still = jax.lax.stop_gradient(qp)
-    factor = factorize(still, still.cost.hessian(), active)
+    inverse = system_solver(jax.lax.stop_gradient(qp), active)
 
     def solve(matvec: Callable[[Array], Array], right: Array) -> Array:
-        """One refinement: products with A keep what the factor of A'WA has lost."""
-        point = jnp.where(counts, 0.0, right)
-        for _ in range(2):
-            rest = jnp.where(counts, right - matvec(point), 0.0)
-            point = point + jnp.concatenate(solve_system(factor, rest[:n], -rest[n:]))
-        return point
+        return jnp.where(counts, inverse(right), right)
 
     # one vector: a transposition wants all of the right side or nothing of it
     point = jax.lax.custom_linear_solve(symmetric, jnp.concatenate([slope, -gap]), solve, symmetric=True)

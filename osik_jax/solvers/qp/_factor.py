@@ -6,6 +6,7 @@ positive definite system of the free variables.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -95,6 +96,26 @@ def solve_system(
     apart = apply(factor.through.T, jnp.where(factor.free, slope, 0.0))
     dy = apply(factor.schur_half.T, apply(factor.schur_half, jnp.where(factor.held, gap - apart, 0.0)))
     return step + apply(factor.through, dy), dy
+
+
+def system_inverse(qp: QP, active: Int[Array, " n+p"]) -> Callable[[Float[Array, " n+p"]], Float[Array, " n+p"]]:
+    """From slope and -gap to dx and dy as in ``solve_system``; 0 for active variables and for rows that are not held.
+
+    One refinement: products with A keep what the factor of A'WA has lost.
+    """
+    factor = factorize(qp, qp.cost.hessian(), active)
+    n = len(factor.free)
+
+    def solve(right: Array) -> Array:
+        x, y = jnp.zeros_like(right[:n]), jnp.zeros_like(right[n:])
+        for _ in range(2):
+            slope = right[:n] - qp.cost.curvature(x) + apply(qp.rows.T, y)
+            gap = -right[n:] - apply(qp.rows, x) - qp.compliance * y
+            dx, dy = solve_system(factor, slope, jnp.where(factor.held, gap, 0.0))
+            x, y = jnp.where(factor.free, x + dx, 0.0), jnp.where(factor.held, y + dy, 0.0)
+        return jnp.concatenate([x, y])
+
+    return solve
 
 
 def half_inverse(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:

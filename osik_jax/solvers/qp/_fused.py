@@ -8,6 +8,7 @@ lanes that fail it are gathered into blocks, and each block goes through the sea
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 
 import jax
@@ -20,12 +21,16 @@ from .._lanes import in_lanes, with_the_rest
 from .._pivots import EQUALITY, INACTIVE, Noise
 from . import _kernel
 from ._cost import LeastSquares
+from ._factor import system_inverse
 from ._kernel import Proposal
 from ._problem import QP, active_targets
 from ._search import Found, optimal_on, possible, scales_of, search
 
 _SHARE, _SMALLEST = 16, 1024
 """Lanes that are left are solved in blocks of a 16th of the batch, of 1,024 lanes at least."""
+
+_TIGHTEST = 1e-7
+"""Tolerance of the kernel where there are no bounds that a point could be near."""
 
 _NEARLY, _SIGN = 30.0, 2.0
 """Tolerances that a certified value may be off its bound by, or a slope off nought; and a multiplier of the wrong sign.
@@ -55,6 +60,49 @@ def _search_anywhere(qp: QP, guess: Array, tolerance: Array, cap: int, gives_way
     return jax.lax.platform_dependent(qp, guess, tolerance, cuda=fused, default=plain)
 
 
+def system_solver(qp: QP, active: Int[Array, " m"]) -> Callable[[Array], Array]:
+    """The inverse of the optimality conditions at an active set, as ``system_inverse``, by the kernel where it can."""
+    lanes = jax.tree.map(lambda a: jax.ShapeDtypeStruct((1, *a.shape), a.dtype), qp)
+    if not (_fits(lanes) and _cuda.wanted()):
+        return system_inverse(qp, active)
+    return lambda right: _solve_anywhere()(qp, active, right)
+
+
+@cache
+def _solve_anywhere() -> Callable[[QP, Array, Array], Array]:
+    def plain(qp: QP, active: Array, right: Array) -> Array:
+        return system_inverse(qp, active)(right)
+
+    return in_lanes(partial(jax.lax.platform_dependent, cuda=_solved_by_kernel, default=jax.vmap(plain)))
+
+
+def _solved_by_kernel(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
+    """The system as a QP of one active set: what is held is pinned, what is free has no bounds."""
+    cost = qp.cost
+    assert isinstance(cost, LeastSquares)
+    n = cost.damping.shape[1]
+    free, held = active[:, :n] == INACTIVE, active[:, n:] != INACTIVE
+    center = jnp.where(free, right[:, :n], 0.0) / cost.damping
+    at = jnp.concatenate([jnp.zeros_like(center), -right[:, n:]], 1)
+    pinned = jnp.concatenate([~free, held], 1)
+    system = replace(
+        qp,
+        cost=replace(cost, target=jnp.zeros_like(cost.target), center=center),
+        lower=jnp.where(pinned, at, -jnp.inf),
+        upper=jnp.where(pinned, at, jnp.inf),
+    )
+    tolerance = jnp.full(len(active), _TIGHTEST, center.dtype)
+    found = _kernel.propose(system, jnp.where(pinned, EQUALITY, INACTIVE), tolerance, 0)
+    point = jnp.concatenate([found.x, jnp.where(held, found.row_multipliers, 0.0)], 1)
+    done = (found.settled != 0) & jnp.isfinite(point).all(1)
+
+    def again(at: Array, point: Array) -> Array:
+        part = jax.tree.map(lambda a: a[at], (qp, active, right))
+        return jax.vmap(lambda qp, active, right: system_inverse(qp, active)(right))(*part)
+
+    return with_the_rest(point, done, again, _block(len(active)))
+
+
 def _fits(qp: QP) -> bool:
     """Whether the kernel is for such problems."""
     if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float32:
@@ -81,15 +129,17 @@ def proposed_and_searched(
     fine = (proposal.settled != 0) & (proposal.iterations <= max_iterations)
     fine &= jax.vmap(_certified)(qp, found, tolerance)
     found = found._replace(done=fine, optimal=fine)
-    lanes = len(tolerance)
-    block = min(lanes, max(_SMALLEST, -(-lanes // _SHARE)))
 
     def again(at: Array, found: Found) -> Found:
         part = jax.tree.map(lambda a: a[at], (qp, found.active, tolerance))
         end = search(*part, max_iterations=max_iterations)
         return end._replace(factorizations=end.factorizations + found.factorizations[at])
 
-    return with_the_rest(found, fine, again, block)
+    return with_the_rest(found, fine, again, _block(len(tolerance)))
+
+
+def _block(lanes: int) -> int:
+    return min(lanes, max(_SMALLEST, -(-lanes // _SHARE)))
 
 
 def _found(qp: QP, proposal: Proposal) -> Found:
