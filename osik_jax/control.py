@@ -194,8 +194,8 @@ def rollout(
 ) -> Trajectory:
     """The closed loop: solve, integrate, repeat, in one compiled scan.
 
-    Differentiable in both modes. The reverse mode keeps the state of each tick alone, a configuration and an active
-    set, and solves each tick again on its way back: a long path costs little memory.
+    Differentiable in both modes. The reverse mode keeps of each tick the configuration and what the solver found, and
+    computes the rest of it again on its way back: a long path costs little memory.
 
     Args:
         robot: the robot.
