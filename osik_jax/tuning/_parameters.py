@@ -19,6 +19,7 @@ from ._loop import Loop
 _NEVER_NEGATIVE = {
     *("weight", "position_weight", "orientation_weight", "gain", "maximum", "minimum", "decay"),
     *("damping", "potential_gain", "margin", "rank_tolerance", "velocity", "body_mass", "velocity_limit", "dt"),
+    *("dof_armature", "radius", "torque_scale"),
 }
 """Numbers that have no meaning below zero."""
 
