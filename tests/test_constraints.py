@@ -242,6 +242,20 @@ class TestContradictions:
             assert 0.5 < ours.box_violation[3] <= 1.0 + 1e-9
 
 
+class TestRest:
+    @pytest.mark.parametrize("name", SCHEMES)
+    def test_nothing_to_do_is_no_contradiction(self, arm, lanes, name):
+        """Where all is met to rounding the velocity is rounding, and what it misses of the constraints as large."""
+        rng = np.random.default_rng(9)
+        place = 10.0 ** rng.uniform(-16, -8, (LANES, 1)) * rng.normal(size=(LANES, 3))
+        q, ones = jnp.tile(arm.q0, (LANES, 1)), jnp.ones((LANES, 3))
+        still = cases(arm, (q, jnp.asarray(place), lanes[2], -ones, ones))
+        ours = solve_lanes(still, SCHEMES[name])
+        assert (ours.status == Status.SOLVED).all()
+        if name != "null-space":
+            assert np.abs(ours.velocity).max() < 1e-5
+
+
 class TestPrograms:
     def test_other_numbers_compile_nothing(self, arm, lanes):
         """Rows, bounds, weights and gains of constraints are traced."""

@@ -19,6 +19,8 @@ from ..tasks._leaves import as_scalar
 
 _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 """A hard row that is missed by less, of what its numbers amount to, holds."""
+_STANDING = 1e-4
+"""Speed [rad/s or m/s] that counts at least: of a robot at rest, rounding is all that there is."""
 
 
 class VelocityProblem(eqx.Module):
@@ -106,7 +108,8 @@ def status_with(
     level = constraints.scaled()
     finite = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (level.lower, level.upper)]
     nearest = jnp.minimum(*finite)
-    size = level.length * jnp.max(jnp.abs(velocity)) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
+    fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), _STANDING)
+    size = level.length * fastest + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
     missed = jnp.abs(level.distance(velocity)) > _HOLDS[velocity.dtype] * size
     if start is not None:
         missed &= level.equal | (level.distance(start) != 0.0)
