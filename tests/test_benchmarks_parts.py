@@ -1,12 +1,14 @@
-"""Benchmarks of parts and of rollouts: all is there, compiled and timed; a profile names operations of the program."""
+"""Parts, rollouts and long jobs: all is there, compiled and timed; a profile names operations of the program."""
 
 import json
 import sys
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from benchmarks import parts, rollouts
+from benchmarks import job, parts, rollouts
+from osik_jax import scaling
 
 
 def test_rows_of_all_parts(tmp_path, monkeypatch, capsys):
@@ -42,3 +44,19 @@ def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
     assert (forward["part"], gradient["part"]) == ("forward", "gradient")
     assert forward["finite"] and gradient["finite"]
     assert 0.0 < forward["seconds"] < gradient["seconds"]
+
+
+def test_a_job_goes_on_where_it_was(tmp_path, monkeypatch, capsys):
+    """Of three chunks the middle one is lost: it alone is run, and comes out as it was."""
+    command = ["job", str(tmp_path), "--robot", "arm7", "--steps", "18", "--ticks", "2", "--chunk", "3"]
+    monkeypatch.setattr(sys, "argv", command)
+    monkeypatch.setattr(job, "cores", lambda: (0,))
+    job.main()
+    assert "18 steps in" in capsys.readouterr().out
+    before = scaling.load(tmp_path)[:]
+    assert before["solved"].all() and 0.0 < before["error"].max() < 1.0 and len(before["error"]) == 9
+    (tmp_path / "00000001.npz").unlink()
+    job.main()
+    assert "6 steps in" in capsys.readouterr().out
+    for name, array in scaling.load(tmp_path)[:].items():
+        np.testing.assert_array_equal(array, before[name])
