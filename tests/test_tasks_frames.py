@@ -403,9 +403,9 @@ class TestBatchesAndCompilation:
     def test_a_float32_robot_has_float32_tasks(self, robot):
         small = jax.tree.map(lambda x: x.astype(jnp.float32), robot)
         made = (
-            osik.RelativeFrameTask(small, "hand", "camera", lower=-1.0),
-            osik.LookAtTask(small, "camera", half_angle=0.3),
-            osik.AxisAlignTask(small, "hand", target_frame="head"),
+            osik.RelativeFrameTask(small, "hand", "camera", target=np.eye(4), lower=-1.0),
+            osik.LookAtTask(small, "camera", target=np.ones(3), half_angle=0.3),
+            osik.AxisAlignTask(small, "hand", target=np.ones(3), target_frame="head"),
         )
         for leaf in jax.tree.leaves(made):
             assert leaf.dtype == jnp.float32

@@ -101,6 +101,12 @@ class TestRows:
         np.testing.assert_allclose(rows["bounds"].lower, [4.0 * (-0.5 - 0.55)], rtol=1e-14)
         np.testing.assert_allclose(rows["bounds"].upper, [4.0 * (0.1 - 0.55)], rtol=1e-14)
 
+    def test_the_order_of_ratios_is_that_of_v(self, robot, tasks):
+        task = tasks["coupling"]
+        np.testing.assert_array_equal(task.ratios, [1.0, -2.0])
+        other = osik.JointCouplingTask(robot, {"elbow": 1.0, "grip": -2.0})
+        assert jax.tree.structure(other) == jax.tree.structure(task)
+
     def test_coupling_against_central_differences(self, robot, tasks, configurations):
         chosen = {name: tasks[name] for name in ("coupling", "bounds")}
         assert_jacobians(*at_each(robot, chosen, configurations))
