@@ -97,6 +97,7 @@ def started(
         "JAX_COMPILATION_CACHE_DIR": str(cache),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "WARP_CACHE_PATH": str(cache / "warp"),
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",  # several processes share a GPU
         "PYTHONPATH": os.pathsep.join([str(ROOT), *_own_path(python)]),
     }
     command = [python, "-m", "benchmarks.worker", peer, str(workload), json.dumps(dict(options))]

@@ -43,5 +43,12 @@ class Peer(Protocol):
 
 
 def versions(packages: tuple[str, ...]) -> dict[str, str]:
-    """Of distributions."""
-    return {name: importlib.metadata.version(name) for name in packages}
+    """Of distributions; "unknown" of what is importable without being installed, such as a checkout."""
+    return {name: _version(name) for name in packages}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
