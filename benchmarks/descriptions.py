@@ -67,19 +67,17 @@ ROBOTS = {
     "arm7": Description(
         root="link0",
         hand="hand",
-        amplitude=(0.10, 0.12, 0.10),
+        amplitude=(0.07, 0.08, 0.07),
         arms=("joint",),
-        costs=Costs(posture=0.02),
     ),
     "panda": Description(
         root="panda_link0",
         hand="panda_link8",
-        amplitude=(0.10, 0.12, 0.10),
+        amplitude=(0.07, 0.08, 0.07),
         arms=("joint",),
         urdf="panda_description/urdf/panda.urdf",
         posture=dict(panda_joint2=-0.5, panda_joint4=-2.0, panda_joint6=1.6, panda_joint7=0.8),
         removed=("panda_finger_joint1", "panda_finger_joint2"),
-        costs=Costs(posture=0.02),
     ),
 }
 
