@@ -29,7 +29,7 @@ _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 _SOFT = {jnp.dtype("float64"): (1e-6, 1e-12), jnp.dtype("float32"): (1e-3, 1e-4)}
 """Compliance of rows that contradict, first and last, as a share of their own; each stage starts where one ended."""
 _NOUGHT = 100.0
-"""Roundings of what pulls at it; an answer that is no larger is 0."""
+"""Roundings of what the cost pulls at it; an answer that is no larger is 0."""
 
 
 class Found(NamedTuple):
@@ -159,10 +159,10 @@ def possible(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
 def scales_of(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
     """Invariant to the units of the variables: each is measured by the root of its curvature, from H's diagonal.
 
-    Where the rows hold all of x at 0, its rounding is that of what they pull at it.
+    Where the constraints hold all of x at 0, its rounding is that of what the cost pulls at it.
     """
     root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
-    pulled = jnp.abs(apply(qp.rows.T, y)) / root**2
+    pulled = jnp.abs(qp.cost.gradient(x)) / root**2
     nought = jnp.max(jnp.abs(x) * root) <= _NOUGHT * jnp.finfo(x.dtype).eps * jnp.max(pulled * root)
     size = jnp.where(nought, pulled, jnp.abs(x))
     reach = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
