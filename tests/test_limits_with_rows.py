@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mink
@@ -144,6 +145,8 @@ class TestBarrier:
             np.testing.assert_allclose(rows.jacobian, normals @ jacobian, atol=1e-12)
             np.testing.assert_allclose(rows.lower, 3.0 * (lower - value), atol=1e-12)
             np.testing.assert_allclose(rows.upper, 3.0 * (upper - value), atol=1e-12)
+        steep = eqx.tree_at(lambda limit: limit.gain, wall, jnp.asarray(1e6))
+        np.testing.assert_allclose(asked(flying, steep, q)[1].upper, (upper - value) / DT, rtol=1e-12, atol=1e-10)
 
     def test_a_hand_that_wants_through(self, arm):
         """The hand slides along the walls, and does not pass them by more than the path curves in a tick."""

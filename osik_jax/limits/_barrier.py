@@ -25,9 +25,9 @@ class PositionBarrier(Limit):
 
         gain (lower - normals p)  <=  normals J v  <=  gain (upper - normals p)
 
-    With ``gain dt <= 1`` a step from inside ends inside, but for the curvature of the path, which is of second order in
-    ``v dt``; from outside p comes back by ``gain`` a second. Without normals the planes are a box along the world's
-    axes. One normal and one bound make a half-space.
+    A gain of more than ``1 / dt`` counts as that, so that a step from inside ends inside, but for the curvature of the
+    path, which is of second order in ``v dt``; from outside p comes back by ``gain`` a second. Without normals the
+    planes are a box along the world's axes. One normal and one bound make a half-space.
 
     Args:
         robot: the robot.
@@ -74,16 +74,18 @@ class PositionBarrier(Limit):
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows:
         """One row for each normal."""
-        del q, dt
+        del q
+        rate = jnp.minimum(self.gain, 1.0 / dt)
         position, _ = kinematics.frame_pose(robot, self.frame)
         value = jnp.matmul(self.normals, position, precision="highest")
         jacobian = jnp.matmul(self.normals, frame_jacobian(robot, kinematics, self.frame)[:3], precision="highest")
-        return LimitRows(jacobian, self._rate(self.lower, value), self._rate(self.upper, value))
+        return LimitRows(jacobian, _approach(rate, self.lower, value), _approach(rate, self.upper, value))
 
-    def _rate(self, bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
-        """``gain (bound - value)``; an infinite bound stays so, with gradients 0."""
-        free = jnp.isinf(bound)
-        return jnp.where(free, bound, self.gain * (jnp.where(free, 0.0, bound) - value))
+
+def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
+    """``rate (bound - value)``; an infinite bound stays so, with gradients 0."""
+    free = jnp.isinf(bound)
+    return jnp.where(free, bound, rate * (jnp.where(free, 0.0, bound) - value))
 
 
 def _normals(value: Any, dtype: Any) -> Float[Array, "m 3"]:
