@@ -111,7 +111,7 @@ def test_pinned_variables_and_duplicated_rows(rng):
 
 
 def test_rows_that_hold_the_answer_at_nought_hold():
-    """The answer is 0, so its rounding is that of what the cost pulls at it; the second row says what the first does."""
+    """The answer is 0, so its rounding is that of the cost's pull; the second row says what the first does."""
     for rows, strength in (([[0.0, 1.0]], 1.0), ([[0.0, 1.0], [0.0, 1.0]], 1.0), ([[0.0, 1.0], [0.0, 1.0]], 1e-9)):
         zero, free = jnp.zeros(len(rows)), jnp.full(2, jnp.inf)
         solution = solve_least_squares_qp(
