@@ -224,8 +224,8 @@ def _search(a: Float[Array, "v 3"], b: Float[Array, "w 3"]) -> tuple[Int[Array, 
         i, j = support(state.way)
         reach = _dot(b[j] - a[i], state.way)
         square = _dot(state.way, state.way)
-        slot = jnp.argmin(state.weights)
-        ids = state.ids_a.at[slot].set(i), state.ids_b.at[slot].set(j)
+        spare = jnp.arange(4) == jnp.argmin(state.weights)
+        ids = jnp.where(spare, i, state.ids_a), jnp.where(spare, j, state.ids_b)
         points = _corners(a, b, ids)
         weights = _weights(points)
         way = weights @ points
