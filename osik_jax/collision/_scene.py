@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._tree import KinematicTree
 from ..kinematics import Kinematics
@@ -155,15 +155,19 @@ def _cores(scene: Scene, ids: tuple[int, ...], placed: Placed, hulls: UnitCore |
 
 
 def separation_jacobian(
-    tree: KinematicTree, kinematics: Kinematics, near: Nearest, bodies: tuple[Int[Array, " k"], Int[Array, " k"]]
+    tree: KinematicTree, kinematics: Kinematics, near: Nearest, bodies: Int[np.ndarray, "k 2"]
 ) -> Float[Array, "k nv"]:
-    """``d distance / dt = J v`` of pairs whose shapes are fixed to these bodies: ``normal' (J_b - J_a)``."""
-    moves = jnp.asarray(tree.moves)
+    """``d distance / dt = J v`` of pairs whose shapes are fixed to these bodies: ``normal' (J_b - J_a)``.
 
-    def along(points: Float[Array, "k 3"], body: Int[Array, " k"]) -> Float[Array, "k nvfull"]:
-        arm = points[:, None] - kinematics.dof_anchor
-        velocity = kinematics.dof_linear + cross(jnp.broadcast_to(kinematics.dof_angular, arm.shape), arm)
-        return jnp.where(moves[body], jnp.sum(velocity * near.normal[:, None], -1), 0.0)
+    A point's velocity along the normal is the dof's at the robot's root, and its turning times the arm from there.
+    """
+    root = kinematics.body_position[tree.root]
+    at_root = kinematics.dof_linear + cross(kinematics.dof_anchor - root, kinematics.dof_angular)
+    straight = jnp.matmul(near.normal, at_root.T, precision="highest")
 
-    rate = along(near.point_b, bodies[1]) - along(near.point_a, bodies[0])
+    def along(points: Float[Array, "k 3"], moves: Bool[np.ndarray, "k nvfull"]) -> Float[Array, "k nvfull"]:
+        turned = jnp.matmul(cross(points - root, near.normal), kinematics.dof_angular.T, precision="highest")
+        return jnp.where(moves, straight + turned, 0.0)
+
+    rate = along(near.point_b, tree.moves[bodies[:, 1]]) - along(near.point_a, tree.moves[bodies[:, 0]])
     return independent_columns(tree, rate)
