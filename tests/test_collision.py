@@ -210,7 +210,7 @@ def test_depth_is_that_of_coal_or_more(zoo):
     for kinds in (("capsule", "box"), ("box", "box")):
         assert np.abs(off[kinds]).max() < 1e-6, kinds
     for kinds in (("capsule", "mesh"), ("box", "mesh"), ("mesh", "mesh")):
-        assert np.min(off[kinds]) > -1e-6 and np.max(off[kinds]) < 0.01 and np.mean(off[kinds]) < 1e-3, kinds
+        assert np.min(off[kinds]) > -1e-6 and np.max(off[kinds]) < 0.02 and np.mean(off[kinds]) < 1e-3, kinds
 
 
 def test_points_are_as_far_apart_as_the_distance(zoo):
@@ -222,9 +222,11 @@ def test_points_are_as_far_apart_as_the_distance(zoo):
 
 
 def test_distances_in_single_precision(zoo):
-    robot, limit, q, ours = zoo
-    robot, limit = jax.tree.map(lambda a: a.astype(jnp.float32), (robot, limit))
-    got = jax.jit(jax.vmap(lambda q: limit.distances(robot, osik.forward_kinematics(robot, q))))(q.astype(np.float32))
+    _, limit, q, ours = zoo
+    with jax.enable_x64(False):
+        robot = osik.Robot.from_mjcf(_zoo())
+        single = jax.tree.map(lambda a: a.astype(jnp.float32), limit)
+        got = jax.vmap(_distances, in_axes=(None, None, 0))(single, robot, jnp.asarray(q, jnp.float32))
     assert got.dtype == jnp.float32
     exact = [k for kinds in EXACT + APART for k in _columns(limit, *kinds)]
     apart = ours.distance[:, exact] > 1e-3
