@@ -81,7 +81,7 @@ def setting() -> Setting:
 
 def targets(motions: int) -> np.ndarray:
     """Of both hands [m], seed 0. (motions, 2, 3)."""
-    return np.random.default_rng(0).uniform(*REACH, (motions, 2, 3))
+    return np.random.default_rng(0).uniform(REACH[0], REACH[1], (motions, 2, 3))
 
 
 def aimed(given: Setting, points: Any) -> dict[str, osik.Task]:
@@ -136,6 +136,7 @@ class Judge:
 
 def run_motions(given: Setting, points: np.ndarray, ticks: int, batch: int, avoiding: bool) -> dict[str, np.ndarray]:
     """Configurations, statuses and the hands' last errors of all motions, and how many programs were compiled."""
+    traced = []
 
     @jax.jit
     def run(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -152,12 +153,13 @@ def run_motions(given: Setting, points: np.ndarray, ticks: int, batch: int, avoi
             errors = [jnp.linalg.norm(out.solution.error[hand][-1]) for hand in HANDS]
             return out.q, out.solution.status, jnp.stack(errors)
 
+        traced.append(points.shape)
         return jax.vmap(one)(points)
 
     starts = range(0, len(points), batch)
     parts = [jax.tree.map(np.asarray, run(points[k : k + batch])) for k in track(starts, "motions")]
     q, status, errors = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return dict(q=q, status=status, errors=errors, programs=np.array(run._cache_size()))
+    return dict(q=q, status=status, errors=errors, programs=np.array(len(traced)))
 
 
 def judged(given: Setting, run: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -430,13 +430,10 @@ def test_longer_links_have_larger_geoms(arm):
     np.testing.assert_allclose(got, [0.4 - 0.16, 0.4 - 0.32], atol=1e-12)
 
 
-TASKS = dict(rows="position", gain=8.0)
-
-
 def _reach(arm, target, limits, scheme=None, steps=150):
     """An arm whose tip is sent to a target."""
     tasks = {
-        "tip": osik.FrameTask(arm, "tip", target=(target, jnp.eye(3)), **TASKS),
+        "tip": osik.FrameTask(arm, "tip", target=(target, jnp.eye(3)), rows="position", gain=8.0),
         "posture": osik.PostureTask(arm, weight=1e-3, priority=2),
     }
     return osik.rollout(arm, arm.q0, tasks, scheme=scheme or osik.WeightedQP(), limits=limits, dt=0.01, steps=steps)
@@ -494,7 +491,7 @@ def test_moving_obstacles_and_numbers_compile_nothing(arm, avoidance):
 
 def test_a_batch_of_obstacles_equals_a_loop(arm, avoidance):
     places = np.random.default_rng(7).uniform(-0.5, 0.5, (5, 3))
-    q = np.array([0.2, 0.8, -0.4])
+    q = jnp.array([0.2, 0.8, -0.4])
 
     def rows(place):
         limit = avoidance.moved("ball", position=place)
