@@ -137,7 +137,7 @@ def _match(scene: Sequence[Member], pattern: str) -> list[int]:
             for k, member in enumerate(scene)
             if fits(member.name, pattern) or (member.solid and any(fits(alias, pattern) for alias in member.aliases))
         ]
-        if found or pattern == "*":
+        if found:
             return found
     names = {name: None for member in scene for name in (member.name, *member.aliases) if name}
     raise unknown_name("geom, shape or body", pattern, tuple(names))

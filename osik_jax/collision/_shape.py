@@ -49,7 +49,7 @@ class CollisionShape(eqx.Module):
         Raises:
             ValueError: a size that is not positive, or a wrong shape.
         """
-        return cls(Kind.SEGMENT, frame, _vector(position, "position"), jnp.eye(3), _sizes(radius, 0.0, 0.0))
+        return cls(Kind.SEGMENT, frame, _vector(position, "position"), jnp.eye(3), _sizes(radius))
 
     @classmethod
     def capsule(
@@ -64,7 +64,7 @@ class CollisionShape(eqx.Module):
         length = jnp.linalg.norm(end - start)
         _check_positive(length, "the length of a capsule")
         rotation = _turned_to((end - start) / length)
-        return cls(Kind.SEGMENT, frame, 0.5 * (start + end), rotation, _sizes(radius, 0.5 * length, 0.0))
+        return cls(Kind.SEGMENT, frame, 0.5 * (start + end), rotation, _sizes(radius, 0.5 * length))
 
     @classmethod
     def box(
@@ -102,7 +102,7 @@ class CollisionShape(eqx.Module):
         length = jnp.linalg.norm(end - start)
         _check_positive(length, "the length of a cylinder")
         rotation = _turned_to((end - start) / length)
-        return cls(Kind.CYLINDER, frame, 0.5 * (start + end), rotation, _sizes(radius, 0.5 * length, 0.0))
+        return cls(Kind.CYLINDER, frame, 0.5 * (start + end), rotation, _sizes(radius, 0.5 * length))
 
     @classmethod
     def half_space(cls, point: ArrayLike | Array, normal: ArrayLike | Array, *, frame: str | None = None) -> Self:
@@ -153,10 +153,10 @@ def _vector(value: Any, what: str) -> Float[Array, "3"]:
 
 
 def _sizes(*sizes: Any) -> Float[Array, "3"]:
+    """MuJoCo's sizes: those that are given, which have to be positive, and zeros."""
     for size in sizes:
-        if not isinstance(size, float) or size != 0.0:
-            _check_positive(size, "a size")
-    return jnp.stack([jnp.asarray(size, float) for size in sizes])
+        _check_positive(size, "a size")
+    return jnp.stack([jnp.asarray(size, float) for size in (*sizes, 0.0, 0.0)[:3]])
 
 
 def _check_positive(value: Any, what: str) -> None:
