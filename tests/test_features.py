@@ -77,3 +77,12 @@ def test_names_of_ours_exist():
                 assert hasattr(osik, first), name
                 assert all(hasattr(getattr(osik, first), part) for part in rest), name
     assert checked > 20
+
+
+def test_every_task_limit_and_scheme_of_ours_is_in_it():
+    ours = " ".join(row[1] for row in ROWS)
+    bases = osik.Task, osik.Limit, osik.Scheme
+    public = [getattr(osik, name) for name in dir(osik) if not name.startswith("_")]
+    kinds = [kind for kind in public if isinstance(kind, type) and issubclass(kind, bases) and kind not in bases]
+    assert len(kinds) >= 8
+    assert [kind.__name__ for kind in kinds if f"`{kind.__name__}" not in ours] == []
