@@ -59,9 +59,10 @@ extern "C" void solve(int problems, int cap, {arguments}) {{
         shapes = tuple(jax.ShapeDtypeStruct(output_dims[name], _TYPES[kind]) for name, kind in outputs.items())
 
         def on_host(*given: Any) -> Any:
-            given = [np.ascontiguousarray(a, _TYPES[kind]) for a, kind in zip(given, inputs.values(), strict=True)]
+            pairs = zip(given, inputs.values(), strict=True)
+            taken = [np.ascontiguousarray(a, _TYPES[kind]) for a, kind in pairs]
             results = [np.full(s.shape, 77, s.dtype) for s in shapes]  # nothing may be left unwritten
-            native.solve(launch_dims // 32, cap, *(a.ctypes.data_as(ctypes.c_void_p) for a in (*given, *results)))
+            native.solve(launch_dims // 32, cap, *(a.ctypes.data_as(ctypes.c_void_p) for a in (*taken, *results)))
             return tuple(results)
 
         return jax.pure_callback(on_host, shapes, *given)
