@@ -6,6 +6,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from benchmarks import job, parts, rollouts
 from osik_jax import scaling
@@ -36,6 +37,7 @@ def test_an_operation_is_found_where_it_is():
     assert seconds > 2.0 * sum(others for _, others in rest)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
     path = tmp_path / "rollouts.json"
     monkeypatch.setattr(sys, "argv", ["rollouts", str(path), "--robot", "arm7", "--robots", "2", "--ticks", "3"])

@@ -221,6 +221,18 @@ def test_points_are_as_far_apart_as_the_distance(zoo):
     np.testing.assert_allclose((ours.point_b - ours.point_a)[:, exact], expected[:, exact], atol=1e-8)
 
 
+def test_distances_in_single_precision(zoo):
+    _, limit, q, ours = zoo
+    with jax.enable_x64(False):
+        robot = osik.Robot.from_mjcf(_zoo())
+        single = jax.tree.map(lambda a: a.astype(jnp.float32), limit)
+        got = jax.vmap(_distances, in_axes=(None, None, 0))(single, robot, jnp.asarray(q, jnp.float32))
+    assert got.dtype == jnp.float32
+    exact = [k for kinds in EXACT + APART for k in _columns(limit, *kinds)]
+    apart = ours.distance[:, exact] > 1e-3
+    np.testing.assert_allclose(np.asarray(got)[:, exact][apart], ours.distance[:, exact][apart], atol=2e-6)
+
+
 def _soonest(distances, slopes):
     """Pairs in the order in which they could come within 2 cm, all joints being equally fast."""
     return np.argsort((distances - 0.02) / (np.abs(slopes).sum(-1) + 1e-3), axis=1)
@@ -259,6 +271,65 @@ def test_gain_counts_up_to_one_over_the_tick(arm, avoidance):
     finite = np.isfinite(rows[0])
     assert finite.any()
     np.testing.assert_allclose(rows[2][finite] * 5.0, rows[0][finite], rtol=1e-12)
+
+
+def _named(limit):
+    return {frozenset(pair) for pair in limit.pairs}
+
+
+def _slopes(robot, limit):
+    """Derivatives of all that rows are made of, both modes."""
+
+    def numbers(q):
+        rows = limit.rows(robot, osik.forward_kinematics(robot, q), q, 0.01)
+        return jnp.concatenate([jnp.ravel(rows.jacobian), limit.distances(robot, osik.forward_kinematics(robot, q))])
+
+    return jax.jit(jax.vmap(lambda q: (jax.jacfwd(numbers)(q), jax.jacrev(numbers)(q))))
+
+
+@pytest.mark.slow
+def test_derivatives_of_rows(arm, avoidance):
+    """Second derivatives too: against differences of the rows' Jacobians, where nothing jumps."""
+    q = np.random.default_rng(3).uniform(-1.5, 1.5, (30, 3))
+    forward, backward = _slopes(arm, avoidance)(q)
+    np.testing.assert_allclose(forward, backward, atol=1e-9)
+
+    rows, h, checked = jax.vmap(_rows, in_axes=(None, None, 0, None)), 1e-6, 0
+    apart = np.repeat(np.asarray(rows(avoidance, arm, q, 0.01).lower) < 0.3, 3, axis=1)
+    for dof, step in enumerate(np.eye(3) * h):
+        after, before = (rows(avoidance, arm, q + sign * step, 0.01).jacobian.reshape(30, 18) for sign in (1, -1))
+        slope = np.asarray(after - before) / (2.0 * h)
+        smooth = apart & (np.abs(slope) < 1e3)  # else nearest points jump, or pairs change places
+        np.testing.assert_allclose(np.where(smooth, forward[:, :18, dof] - slope, 0.0), 0.0, atol=2e-5)
+        checked += smooth.sum()
+    assert checked > 1000
+
+
+def _coincident():
+    """Two bodies of the same geoms, each on a slide and a hinge."""
+
+    def body(name, slide, hinge):
+        sizes = dict(ball="0.1", rod="0.1 0.2", block="0.1 0.1 0.1", can="0.1 0.1", egg="0.1 0.1 0.1")
+        types = dict(ball="sphere", rod="capsule", block="box", can="cylinder", egg="ellipsoid")
+        geoms = "".join(f'<geom name="{name}_{k}" type="{types[k]}" size="{sizes[k]}"/>' for k in sizes)
+        joints = f'<joint type="slide" axis="{slide}"/><joint type="hinge" axis="{hinge}"/>'
+        return f'<body name="{name}">{joints}{geoms}</body>'
+
+    bodies = body("a", "1 0 0", "0 0 1") + body("b", "0 1 0", "1 0 0")
+    return osik.Robot.from_mjcf(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+
+
+@pytest.mark.slow
+def test_everything_is_finite_where_centres_coincide():
+    """And where boxes touch face to face, edge to edge, and capsules lie side by side."""
+    robot = _coincident()
+    limit = osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf, max_pairs=25)
+    q = np.array([[0, 0, 0, 0], [0.2, 0, 0, 0], [0.2, 0, 0.2, 0], [0.0, np.pi / 4, 0.1, 0.0], [0.5, 0, 0, 0]])
+    slopes = _slopes(robot, limit)(q)
+    assert all(np.isfinite(a).all() for a in slopes)
+    distances = dict(zip(limit.pairs, _distances(limit, robot, q[0]), strict=True))
+    for pair in (("a_ball", "b_ball"), ("a_rod", "b_rod"), ("a_block", "b_block"), ("a_ball", "b_block")):
+        assert distances[pair] == pytest.approx(-0.2)
 
 
 def _named(limit):
@@ -364,6 +435,35 @@ def test_longer_links_have_larger_geoms(arm):
     np.testing.assert_allclose(got, [0.4 - 0.16, 0.4 - 0.32], atol=1e-12)
 
 
+def _reach(arm, target, limits, scheme=None, steps=100):
+    """An arm whose tip is sent to a target."""
+    tasks = {
+        "tip": osik.FrameTask(arm, "tip", target=(target, jnp.eye(3)), rows="position", gain=8.0),
+        "posture": osik.PostureTask(arm, weight=1e-3, priority=2),
+    }
+    return osik.rollout(arm, arm.q0, tasks, scheme=scheme or osik.WeightedQP(), limits=limits, dt=0.01, steps=steps)
+
+
+@pytest.mark.slow
+def test_closed_loop_never_goes_below_the_minimum_distance(arm, avoidance):
+    """Targets in and around the obstacles: with the limit 15 mm are never lost, without it there is contact."""
+    targets = np.random.default_rng(6).uniform([-0.6, -0.7, -0.1], [0.7, 0.7, 0.9], (30, 3))
+    box = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)
+
+    def run(target, limits):
+        q = _reach(arm, target, limits)
+        return jax.vmap(lambda q: avoidance.distances(arm, osik.forward_kinematics(arm, q)))(
+            q.q
+        ).min(), q.solution.status
+
+    kept, status = jax.jit(jax.vmap(lambda target: run(target, (*box, avoidance))))(targets)
+    free, _ = jax.jit(jax.vmap(lambda target: run(target, box)))(targets)
+    assert (np.asarray(free) < 0.0).sum() >= 5
+    assert np.asarray(kept).min() > 0.015
+    assert (np.asarray(status) == osik.Status.SOLVED).all()
+
+
+@pytest.mark.slow
 def test_pairs_that_start_too_near_come_apart(arm, avoidance):
     """From inside the ball at the speed of recovery, until the distance is kept."""
     inside = avoidance.moved("ball", position=np.array([0.55, 0.02, 0.4]), size=np.array([0.05, 0.0, 0.0]))

@@ -73,7 +73,17 @@ def heading_anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if BLOCK.search(page.read_text())], ids=relative)
+LONG = {"docs/batches.md", "docs/tasks_and_limits.md"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=relative(page), marks=[pytest.mark.slow] if relative(page) in LONG else [])
+        for page in PAGES
+        if BLOCK.search(page.read_text())
+    ],
+)
 def test_code_runs(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = page.read_text()
     namespace: dict[str, Any] = {"__name__": "documentation"}

@@ -352,6 +352,7 @@ class TestManipulability:
         assert index.min() > 0.05 - 1e-3
         assert index[-1] == pytest.approx(0.05, abs=1e-5)
 
+    @pytest.mark.slow
     def test_finite_where_it_is_singular(self, planar):
         """Stretched out; and close to it, where nothing but the size of the index changes."""
         tasks = {
