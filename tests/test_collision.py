@@ -221,18 +221,6 @@ def test_points_are_as_far_apart_as_the_distance(zoo):
     np.testing.assert_allclose((ours.point_b - ours.point_a)[:, exact], expected[:, exact], atol=1e-8)
 
 
-def test_distances_in_single_precision(zoo):
-    _, limit, q, ours = zoo
-    with jax.enable_x64(False):
-        robot = osik.Robot.from_mjcf(_zoo())
-        single = jax.tree.map(lambda a: a.astype(jnp.float32), limit)
-        got = jax.vmap(_distances, in_axes=(None, None, 0))(single, robot, jnp.asarray(q, jnp.float32))
-    assert got.dtype == jnp.float32
-    exact = [k for kinds in EXACT + APART for k in _columns(limit, *kinds)]
-    apart = ours.distance[:, exact] > 1e-3
-    np.testing.assert_allclose(np.asarray(got)[:, exact][apart], ours.distance[:, exact][apart], atol=2e-6)
-
-
 def _soonest(distances, slopes):
     """Pairs in the order in which they could come within 2 cm, all joints being equally fast."""
     return np.argsort((distances - 0.02) / (np.abs(slopes).sum(-1) + 1e-3), axis=1)
@@ -271,10 +259,6 @@ def test_gain_counts_up_to_one_over_the_tick(arm, avoidance):
     finite = np.isfinite(rows[0])
     assert finite.any()
     np.testing.assert_allclose(rows[2][finite] * 5.0, rows[0][finite], rtol=1e-12)
-
-
-def _named(limit):
-    return {frozenset(pair) for pair in limit.pairs}
 
 
 def _slopes(robot, limit):
@@ -433,34 +417,6 @@ def test_longer_links_have_larger_geoms(arm):
     q = np.array([0.0, 0.0, np.pi / 2])
     got = [_distances(limit, r, q)[0] for r in (arm, longer)]
     np.testing.assert_allclose(got, [0.4 - 0.16, 0.4 - 0.32], atol=1e-12)
-
-
-def _reach(arm, target, limits, scheme=None, steps=100):
-    """An arm whose tip is sent to a target."""
-    tasks = {
-        "tip": osik.FrameTask(arm, "tip", target=(target, jnp.eye(3)), rows="position", gain=8.0),
-        "posture": osik.PostureTask(arm, weight=1e-3, priority=2),
-    }
-    return osik.rollout(arm, arm.q0, tasks, scheme=scheme or osik.WeightedQP(), limits=limits, dt=0.01, steps=steps)
-
-
-@pytest.mark.slow
-def test_closed_loop_never_goes_below_the_minimum_distance(arm, avoidance):
-    """Targets in and around the obstacles: with the limit 15 mm are never lost, without it there is contact."""
-    targets = np.random.default_rng(6).uniform([-0.6, -0.7, -0.1], [0.7, 0.7, 0.9], (30, 3))
-    box = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)
-
-    def run(target, limits):
-        q = _reach(arm, target, limits)
-        return jax.vmap(lambda q: avoidance.distances(arm, osik.forward_kinematics(arm, q)))(
-            q.q
-        ).min(), q.solution.status
-
-    kept, status = jax.jit(jax.vmap(lambda target: run(target, (*box, avoidance))))(targets)
-    free, _ = jax.jit(jax.vmap(lambda target: run(target, box)))(targets)
-    assert (np.asarray(free) < 0.0).sum() >= 5
-    assert np.asarray(kept).min() > 0.015
-    assert (np.asarray(status) == osik.Status.SOLVED).all()
 
 
 @pytest.mark.slow
