@@ -135,7 +135,10 @@ def test_derivatives_of_recorded_qps(soft, on_emulated_gpu, rng):
         given = [jnp.asarray(a, precision) for a in (A, b, lower, upper, rows, high)]
         move = [jnp.asarray(a, precision) for a in rates]
         forward = jax.jvp(lambda *a: jax.vmap(solve)(*a, *given[3:]).x, given[:3], move)[1]
-        loss = lambda *a: jnp.sum(jax.vmap(solve)(*a, *given[3:]).x ** 2)  # noqa: E731
+
+        def loss(*moving):
+            return jnp.sum(jax.vmap(solve)(*moving, *given[3:]).x ** 2)
+
         return jax.vmap(solve)(*given).status, (forward, *jax.grad(loss, (0, 1))(*given[:3]))
 
     status, found = jax.jit(rate, static_argnums=0)("float32")

@@ -488,7 +488,6 @@ for (level = 0; level < LEVELS; ++level) {
     }
     missing = sqrt(sum(square));
   };
-  auto bounded = [&](double a, double b) { return is_finite(a) || is_finite(b); };
   auto wrong_by = [&](double force, int at, double longest) { return -force * at * longest; };
   auto noise = [&]() { return size * step_share * (size * reach + missing); };
   auto floor_of_signs = [&]() { return multiplier_share * steepness + noise(); };

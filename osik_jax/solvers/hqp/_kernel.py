@@ -20,7 +20,7 @@ from ._problem import Tolerances, WorkingSet
 from ._replay import Decision
 from ._stack import Layout, Stack
 
-_MOST_VARIABLES, _MOST_ROWS, _MOST_HARD_ROWS = 64, 64, 32
+_MOST_ROWS, _MOST_HARD_ROWS = 64, 32  # the last level has a row a variable
 _SHARED_BYTES = 48 * 1024
 """Shared memory that any CUDA device gives a block without being asked for more."""
 _MOST_WARPS = 2
@@ -63,7 +63,7 @@ class Shape(NamedTuple):
     def warps(self) -> int:
         """How many of them a block can have; 0 for a problem too large for this kernel."""
         n, m, p = self.variables, self.rows, len(self.place)
-        if n > _MOST_VARIABLES or m > _MOST_ROWS or p > _MOST_HARD_ROWS or not self.all_rows:
+        if m > _MOST_ROWS or p > _MOST_HARD_ROWS or not self.all_rows:
             return 0
         row, column = n | 1, m | 1
         doubles = n * row + n * (row + column) + max(p, 1) * row + 4 * max(m, p) + n
