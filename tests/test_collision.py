@@ -221,6 +221,23 @@ def test_points_are_as_far_apart_as_the_distance(zoo):
     np.testing.assert_allclose((ours.point_b - ours.point_a)[:, exact], expected[:, exact], atol=1e-8)
 
 
+def test_distances_in_single_precision(zoo):
+    """To 1e-6 m where shapes are apart, to 1e-5 m where they overlap, half a metre from the origin."""
+    _, limit, q, ours = zoo
+    with jax.enable_x64(False):
+        robot = osik.Robot.from_mjcf(_zoo())
+        single = osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf)
+        got = jax.vmap(_distances, in_axes=(None, None, 0))(single, robot, jnp.asarray(q))
+    assert got.dtype == jnp.float32 and single.pairs == limit.pairs
+    for kinds in EXACT + APART:
+        columns = _columns(limit, *kinds)
+        expected = ours.distance[:, columns]
+        off = np.abs(got[:, columns] - expected)
+        assert off[expected > 1e-3].max() < 1e-6, kinds
+        if kinds in EXACT + APART[:1]:
+            assert off.max() < 1e-5, kinds
+
+
 def _soonest(distances, slopes):
     """Pairs in the order in which they could come within 2 cm, all joints being equally fast."""
     return np.argsort((distances - 0.02) / (np.abs(slopes).sum(-1) + 1e-3), axis=1)
@@ -231,17 +248,11 @@ def test_rows_are_those_of_the_pairs_that_could_meet_soonest(arm, avoidance):
     q = np.random.default_rng(2).uniform(-2.0, 2.0, (40, 3))
     dt, h = 0.01, 1e-6
 
-    @jax.jit
-    @jax.vmap
-    def both(q):
-        def distances(q):
-            return avoidance.distances(arm, osik.forward_kinematics(arm, q))
-
-        steps = h * jnp.eye(3)
-        slopes = jax.vmap(lambda e: (distances(q + e) - distances(q - e)) / (2.0 * h))(steps).T
-        return avoidance.rows(arm, osik.forward_kinematics(arm, q), q, dt), distances(q), slopes
-
-    rows, distances, slopes = jax.tree.map(np.asarray, both(q))
+    at_each = jax.vmap(_distances, in_axes=(None, None, 0))
+    distances = np.asarray(at_each(avoidance, arm, q))
+    slopes = [np.asarray(at_each(avoidance, arm, q + e) - at_each(avoidance, arm, q - e)) for e in h * np.eye(3)]
+    slopes = np.stack(slopes, -1) / (2.0 * h)
+    rows = jax.vmap(_rows, in_axes=(None, None, 0, None))(avoidance, arm, q, dt)
     closest = _soonest(distances, slopes)[:, :6]
     near = np.take_along_axis(distances, closest, 1)
     np.testing.assert_allclose(rows.jacobian, np.take_along_axis(slopes, closest[..., None], 1), atol=1e-7)
@@ -419,19 +430,58 @@ def test_longer_links_have_larger_geoms(arm):
     np.testing.assert_allclose(got, [0.4 - 0.16, 0.4 - 0.32], atol=1e-12)
 
 
-@pytest.mark.slow
-def test_pairs_that_start_too_near_come_apart(arm, avoidance):
+@pytest.fixture(scope="module")
+def among(arm):
+    """A ball and a post in the arm's way, the floor and the arm itself, without boxes: quick to compile."""
+    shapes = {
+        "ball": CollisionShape.sphere(0.1, (0.3, 0.4, 0.4)),
+        "post": CollisionShape.capsule(0.05, (0.45, -0.25, 0.0), (0.45, -0.25, 0.8)),
+    }
+    return osik.CollisionAvoidanceLimit(arm, shapes=shapes, exclude=["bump"], minimum_distance=0.02, max_pairs=6)
+
+
+@jax.jit
+def _reaches(arm, limit, starts, targets):
+    """Closed loops that send the tip from each start to each target: all distances in each tick, and the status."""
+    limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm), limit
+
+    def one(start, target):
+        tasks = {
+            "tip": osik.FrameTask(arm, "tip", target=(target, jnp.eye(3)), rows="position", gain=8.0),
+            "posture": osik.PostureTask(arm, weight=1e-3),
+        }
+        run = osik.rollout(arm, start, tasks, scheme=osik.WeightedQP(), limits=limits, dt=0.01, steps=150)
+        distances = jax.vmap(lambda q: limit.distances(arm, osik.forward_kinematics(arm, q)))(run.q)
+        return distances, run.solution.status
+
+    return jax.vmap(one)(starts, targets)
+
+
+def _tips(arm, q):
+    return jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "tip")[0])(q)
+
+
+def test_no_tick_of_a_closed_loop_penetrates(arm, among):
+    """Forty targets that the arm can reach: with the limit 15 mm are kept, without it more than half hit something."""
+    reachable = np.random.default_rng(6).uniform(-2.0, 2.0, (40, 3))
+    starts, targets = jnp.tile(arm.q0, (40, 1)), _tips(arm, reachable)
+    kept, status = _reaches(arm, among, starts, targets)
+    free, _ = _reaches(arm, among.replace(minimum_distance=-9.0, detection_distance=-8.0), starts, targets)
+    assert (np.asarray(free).min((1, 2)) < 0.0).sum() > 20
+    assert np.asarray(kept).min() > 0.015
+    assert (np.asarray(status) == osik.Status.SOLVED).all()
+
+
+def test_pairs_that_start_too_near_come_apart(arm, among):
     """From inside the ball at the speed of recovery, until the distance is kept."""
-    inside = avoidance.moved("ball", position=np.array([0.55, 0.02, 0.4]), size=np.array([0.05, 0.0, 0.0]))
-    inside = inside.replace(recovery_speed=0.2)
-    tasks = {"posture": osik.PostureTask(arm)}
-    limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm), inside
-    run = osik.rollout(arm, arm.q0, tasks, scheme=osik.WeightedQP(), limits=limits, dt=0.01, steps=300)
-    distance = jax.vmap(lambda q: inside.distances(arm, osik.forward_kinematics(arm, q)).min())(run.q)
-    assert distance[0] < -0.05
-    speed = np.diff(distance) / 0.01
+    around = among.moved("ball", position=np.array([0.55, 0.02, 0.4]), size=np.array([0.05, 0.0, 0.0]))
+    starts = jnp.tile(arm.q0, (40, 1))
+    distances, _ = _reaches(arm, around.replace(recovery_speed=0.2), starts, _tips(arm, starts))
+    nearest = np.asarray(distances)[0].min(1)
+    assert nearest[0] < -0.05
+    speed = np.diff(nearest) / 0.01
     assert speed.max() < 0.22 and (speed[:20] > 0.18).all()
-    assert distance[-1] == pytest.approx(0.02, abs=2e-3)
+    assert nearest[-1] == pytest.approx(0.02, abs=2e-3)
 
 
 def test_moving_obstacles_and_numbers_compile_nothing(arm, avoidance):
@@ -456,13 +506,9 @@ def test_a_batch_of_obstacles_equals_a_loop(arm, avoidance):
     places = np.random.default_rng(7).uniform(-0.5, 0.5, (5, 3))
     q = jnp.array([0.2, 0.8, -0.4])
 
-    def rows(place):
-        limit = avoidance.moved("ball", position=place)
-        return limit.rows(arm, osik.forward_kinematics(arm, q), q, 0.01)
-
-    together = jax.jit(jax.vmap(rows))(places)
-    one = jax.jit(rows)
+    moved = jax.vmap(lambda place: avoidance.moved("ball", position=place))(places)
+    together = jax.vmap(_rows, in_axes=(0, None, None, None))(moved, arm, q, 0.01)
     for k, place in enumerate(places):
-        alone = one(place)
+        alone = _rows(avoidance.moved("ball", position=place), arm, q, 0.01)
         np.testing.assert_allclose(together.jacobian[k], alone.jacobian, atol=1e-12)
         np.testing.assert_allclose(together.lower[k], alone.lower, atol=1e-12)

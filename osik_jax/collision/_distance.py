@@ -23,8 +23,8 @@ _PARALLEL = 1e-6
 """Squared sine of the angle under which segments count as parallel."""
 
 _MOST_ITERATIONS = 48
-_SEGMENTS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
-_TRIANGLES = np.array([(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)])
+_SEGMENTS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)], np.int32)  # in either precision
+_TRIANGLES = np.array([(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)], np.int32)
 
 
 class Nearest(NamedTuple):
