@@ -4,11 +4,48 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 
 _traces: list[int] = []
+
+kinematics_at = jax.jit(osik.forward_kinematics)
+
+
+@jax.jit
+def moved_by(robot, q, v):
+    return osik.integrate(robot, q, v)
+
+
+def anywhere(robot, rng):
+    """Joints anywhere, a base anywhere: the formulas hold outside the joint ranges too."""
+    return np.asarray(moved_by(robot, robot.q0, jnp.asarray(rng.uniform(-1.0, 1.0, robot.nv))))
+
+
+def random_pose(rng, near):
+    return near + rng.normal(size=3) * 0.3, Rotation.from_quat(rng.normal(size=4)).as_matrix()
+
+
+def square(scale=0.1):
+    """A support polygon."""
+    normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    vertices = scale * np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]])
+    return osik.SupportPolygon(jnp.asarray(normals), jnp.full(4, scale), jnp.asarray(vertices))
+
+
+def full_velocities(robot):
+    """Full MuJoCo velocities from v, built from names alone. (full nv, nv)."""
+    model, out = robot.mj_model, np.zeros((robot.mj_model.nv, robot.nv))
+    for joint in range(model.njnt):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+        _, multiplier = robot.mimic_joints.get(name, (name, 1.0))
+        width = 6 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE else 1
+        start, own = model.jnt_dofadr[joint], robot.joint_dof_index(name)
+        out[start : start + width, own : own + width] = multiplier * np.eye(width)
+    return out
 
 
 @jax.jit
@@ -19,6 +56,7 @@ def rows_of_each(robot, tasks, q):
     return {name: task.rows(robot, kinematics, q) for name, task in tasks.items()}
 
 
+@jax.jit
 def rows_and_differences(robot, tasks, q, h=1e-6):
     """The rows, and their errors' Jacobians by central differences along the tangent."""
     steps = h * jnp.concatenate([jnp.zeros((1, robot.nv)), jnp.eye(robot.nv), -jnp.eye(robot.nv)])
