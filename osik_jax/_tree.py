@@ -183,13 +183,13 @@ class KinematicTree:
         return min(1, len(self.body_parents) - 1)
 
     @cached_property
-    def doublings(self) -> tuple[np.ndarray, ...]:
-        """Of each body its parent, then the ancestor 2 above it, 4, 8, ... until that is the world for all."""
+    def doublings(self) -> np.ndarray:
+        """Of each body its parent, then the ancestor 2 above it, 4, ... until that is the world for all. (k, nbody)."""
         rounds, above = [], self.parents
         while above.any():
             rounds.append(above)
             above = above[above]
-        return tuple(rounds)
+        return np.array(rounds, int).reshape(-1, len(self.parents))
 
     @cached_property
     def descendants(self) -> np.ndarray:

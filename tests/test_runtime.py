@@ -36,6 +36,19 @@ def test_the_users_settings_stay():
     assert lapack == [min(2, os.cpu_count() or 1)]
 
 
+def test_programs_run_where_they_are_called_unless_set_back_after_the_import():
+    probe = """
+import jax, osik_jax, jax.numpy as jnp, sys
+if "back" in sys.argv: jax.config.update("jax_cpu_enable_async_dispatch", True)
+program, x = jax.jit(jnp.linalg.inv), jnp.eye(1200)
+jax.block_until_ready(program(x))
+print(program(x).is_ready())
+"""
+    for argument, done_on_return in (("", True), ("back", False)):
+        done = subprocess.run([sys.executable, "-c", probe, argument], capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == str(done_on_return)
+
+
 def test_other_flags_stay_beside_ours():
     other = "--xla_cpu_enable_fast_min_max=true"
     assert runtime(XLA_FLAGS=other)[1] == f"{other} --xla_cpu_enable_concurrency_optimized_scheduler=false"

@@ -28,7 +28,7 @@ def world_poses(tree: KinematicTree, position: Float[Array, "nbody 3"], rotation
     """
     moves = np.arange(len(tree.body_parents)) > 0
     position = jnp.where(moves[:, None], position, 0.0)
-    return _composer(tree)(position, jnp.where(moves[:, None, None], rotation, np.eye(3)))
+    return _composer(tree)(position, jnp.where(moves[:, None, None], rotation, np.eye(3, dtype=rotation.dtype)))
 
 
 @lru_cache(maxsize=64)
@@ -37,11 +37,17 @@ def _composer(tree: KinematicTree) -> Callable[..., Poses]:
 
     @custom_jvp
     def poses(position: Array, rotation: Array) -> Poses:
-        for above in tree.doublings:
-            position, rotation = jax.lax.optimization_barrier((position, rotation))  # or XLA recomputes all rounds
+        rounds = jnp.asarray(tree.doublings, np.int32)
+        if not len(rounds):
+            return position, rotation
+
+        def double(i: Array, poses: Poses) -> Poses:
+            (position, rotation), above = poses, rounds[i]
             turn = rotation[above]
-            position, rotation = position[above] + rotate(turn, position), compose(turn, rotation)
-        return position, rotation
+            return position[above] + rotate(turn, position), compose(turn, rotation)
+
+        # XLA's CPU backend makes one operation of a small loop; its rounds, written out, would be a dozen
+        return jax.lax.fori_loop(np.int32(0), np.int32(len(rounds)), double, (position, rotation))
 
     @poses.defjvp
     def _(local: tuple[Array, Array], rates: tuple[Array, Array]) -> tuple[Poses, Poses]:

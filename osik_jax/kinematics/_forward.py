@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
@@ -16,7 +14,7 @@ from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
 from ..robot import Robot
 from ._composition import world_poses
 from ._joints import dof_kinds, joint_transforms
-from ._rigid import compose, cross, rotate
+from ._rigid import compose, cross, rotate, rotation_matrix
 
 
 class Kinematics(eqx.Module):
@@ -66,8 +64,7 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     """
     robot.check_configuration(q)
     local = joint_transforms(robot, robot.mujoco_qpos(q))
-    turned = jax.vmap(lambda quaternion: jaxlie.SO3(quaternion).as_matrix())(local.xquat)  # of any length
-    position, rotation = world_poses(robot.tree, local.xpos, turned)
+    position, rotation = world_poses(robot.tree, local.xpos, rotation_matrix(local.xquat))
     joint_parents = robot.tree.parents[np.asarray(robot.tree.joint_bodies, int)]
     turn = rotation[joint_parents]
     anchor = position[joint_parents] + rotate(turn, local.xanchor)

@@ -1,4 +1,4 @@
-"""Rotations applied and composed.
+"""Rotations made, applied and composed.
 
 Written out term by term: XLA fuses that into what is around it, never runs it in reduced precision, and makes no
 library call of it, which sums of three numbers do not repay.
@@ -8,7 +8,24 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+_GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)).mT
+"""``[x]``, ``[y]`` and ``[z]``: the matrices of cross products with the axes."""
+
+
+def rotation_matrix(quaternion: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
+    """The rotation of a quaternion w, x, y, z of any length but 0.
+
+    Made of whole arrays, for XLA makes one operation of that, and one for each entry of stacked entries.
+    """
+    dtype = quaternion.dtype
+    half = quaternion * jnp.sqrt(2.0 / jnp.sum(quaternion**2, -1, keepdims=True))  # its products are twice a unit one's
+    (w, x, y, z), v = (half[..., i, None, None] for i in range(4)), half[..., 1:]
+    turn = w * sum(a * generator for a, generator in zip((x, y, z), _GENERATORS.astype(dtype), strict=True))
+    stretch = (1.0 - (x * x + y * y + z * z)) * np.eye(3, dtype=dtype)
+    return stretch + v[..., :, None] * v[..., None, :] + turn
 
 
 def rotate(rotation: Float[Array, "... 3 3"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
