@@ -512,3 +512,132 @@ def test_a_batch_of_obstacles_equals_a_loop(arm, avoidance):
         alone = _rows(avoidance.moved("ball", position=place), arm, q, 0.01)
         np.testing.assert_allclose(together.jacobian[k], alone.jacobian, atol=1e-12)
         np.testing.assert_allclose(together.lower[k], alone.lower, atol=1e-12)
+
+
+@pytest.mark.parametrize("floor", [(1, 0), (0, 1), (2, 1), (2, 4)])
+@pytest.mark.parametrize("ball", [(1, 0), (0, 1), (1, 2), (4, 4)])
+def test_masks_are_those_of_mujoco(floor, ball):
+    """Ball and floor overlap: they are a pair if MuJoCo finds a contact."""
+    masks = [f'contype="{own}" conaffinity="{others}"' for own, others in (floor, ball)]
+    robot = osik.Robot.from_mjcf(f"""<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1" {masks[0]}/>
+      <body><joint type="slide"/><geom name="ball" size="0.1" {masks[1]}/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(robot.mj_model)
+    mujoco.mj_forward(robot.mj_model, data)
+    if data.ncon:
+        assert osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf).pairs == (("floor", "ball"),)
+    else:
+        with pytest.raises(ValueError, match="no pair of shapes is left"):
+            osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf)
+
+
+def test_added_shapes_are_filtered_like_geoms(arm):
+    """A shape on a link keeps away from neither of its neighbours, above or below, and a half-space from no plane."""
+    shapes = {
+        "guard": CollisionShape.sphere(0.05, frame="upper"),
+        "glove": CollisionShape.sphere(0.05, frame="hand"),
+        "lid": CollisionShape.half_space((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), frame="hand"),
+    }
+    limit = osik.CollisionAvoidanceLimit(
+        arm, shapes=shapes, pairs=[(name, "*") for name in shapes], q0_distance=-np.inf
+    )
+    expected = [("guard", "hand"), ("guard", "glove"), ("guard", "lid"), ("guard", "floor"), ("guard", "seen")]
+    expected += [("glove", "upper"), ("glove", "floor"), ("lid", "upper")]
+    assert _named(limit) == {frozenset(pair) for pair in expected}
+
+
+def test_excludes_of_the_model_between_moving_bodies():
+    text = ARM.replace("</mujoco>", '<contact><exclude body1="upper" body2="hand"/></contact></mujoco>')
+    limit = osik.CollisionAvoidanceLimit(osik.Robot.from_mjcf(text), q0_distance=-np.inf)
+    assert _named(limit) == {frozenset(("floor", name)) for name in ("upper", "middle", "bump", "hand")}
+
+
+def test_a_name_with_the_signs_of_a_glob_is_a_name_first(arm):
+    shapes = {name: CollisionShape.sphere(0.1, (0.0, 0.0, 2.0)) for name in ("ball[1]", "ball1")}
+    limit = osik.CollisionAvoidanceLimit(arm, shapes=shapes, pairs=[("ball[1]", "hand")])
+    assert limit.pairs == (("hand", "ball[1]"),)
+
+
+def test_pairs_nearer_than_the_minimum_at_q0_are_left_out_unless_said_otherwise(arm):
+    limit = osik.CollisionAvoidanceLimit(arm, minimum_distance=0.35, detection_distance=0.5)
+    assert limit.pairs == osik.CollisionAvoidanceLimit(arm, q0_distance=0.35).pairs
+    with pytest.raises(ValueError, match="more than minimum_distance"):
+        limit.replace(minimum_distance=0.6)
+
+
+PALM = """
+<body name="palm" pos="0.1 0.03 -0.02" euler="20 -30 50">
+  <geom name="g_capsule" type="capsule" size="0.03" fromto="0.1 0 0.02 0 0.15 0.1" mass="0.1"/>
+  <geom name="g_cylinder" type="cylinder" size="0.03" fromto="0.1 0 0.02 0 0.15 0.1" mass="0.1"/>
+  <geom name="g_box" type="box" size="0.03 0.05 0.02" pos="0.02 0.06 0.1" quat="0.5 0.5 0.5 0.5" mass="0.1"/>
+  <geom name="g_rock" type="mesh" mesh="rock" pos="0.02 0.06 0.1" quat="0.5 0.5 0.5 0.5" mass="0.1"/>
+  <geom name="g_stone" type="mesh" mesh="stone" pos="-0.02 0.01 0.1" mass="0.1"/>
+</body>"""
+
+
+def test_added_shapes_are_the_geoms_that_they_describe():
+    """On a turned frame of the hand, and a slope in the world; distances of both from the upper arm are MuJoCo's."""
+    stones = {"rock": POINTS, "stone": POINTS * [0.5, 1.5, 1.0]}
+    vertices = {name: " ".join(f"{x:.9f}" for x in points.ravel()) for name, points in stones.items()}
+    meshes = "".join(f'<mesh name="{name}" vertex="{text}"/>' for name, text in vertices.items())
+    text = ARM.replace("<worldbody>", f"<asset>{meshes}</asset><worldbody>", 1)
+    text = text.replace(
+        "<geom ", '<geom name="g_slope" type="plane" size="1 1 1" pos="0 0 0.1" zaxis="0.2 -0.3 1"/><geom ', 1
+    )
+    robot = osik.Robot.from_mjcf(text.replace('<site name="tip"', f'{PALM}<site name="tip"'))
+    ends, cyclic = ((0.1, 0.0, 0.02), (0.0, 0.15, 0.1)), np.eye(3)[[2, 0, 1]]
+    on = dict(frame="palm")
+    shapes = {
+        "s_capsule": CollisionShape.capsule(0.03, *ends, **on),
+        "s_cylinder": CollisionShape.cylinder(0.03, *ends, **on),
+        "s_box": CollisionShape.box((0.03, 0.05, 0.02), (0.02, 0.06, 0.1), cyclic, **on),
+        "s_rock": CollisionShape.convex(POINTS, (0.02, 0.06, 0.1), cyclic, **on),
+        "s_stone": CollisionShape.convex(POINTS, (-0.02, 0.01, 0.1), **on),
+        "s_slope": CollisionShape.half_space((0.0, 0.0, 0.1), (0.4, -0.6, 2.0)),
+    }
+    limit = osik.CollisionAvoidanceLimit(robot, shapes=shapes, pairs=[("upper", "[gs]_*")], q0_distance=-np.inf)
+    limit = limit.moved("s_stone", size=np.array([0.5, 1.5, 1.0]))
+    q = np.random.default_rng(8).uniform(-2.5, 2.5, (40, 3))
+    ours = np.asarray(jax.vmap(_distances, in_axes=(None, None, 0))(limit, robot, q))
+    column = {(set(pair) - {"upper"}).pop(): k for k, pair in enumerate(limit.pairs)}
+    given = osik.CollisionAvoidanceLimit(robot, pairs=[("upper", "g_*")], q0_distance=-np.inf)
+    theirs = dict(zip(given.pairs, _mujoco_distances(robot, given, q).T, strict=True))
+    for pair, expected in theirs.items():
+        name = (set(pair) - {"upper"}).pop()
+        atol = 7e-4 if name == "g_cylinder" else 1e-7  # a prism's corners stand out by 2 % of 0.03 m
+        apart = expected > 1e-3
+        assert apart.sum() > 10, name
+        for one in (name, name.replace("g_", "s_")):
+            np.testing.assert_allclose(ours[apart, column[one]], expected[apart], atol=atol, err_msg=one)
+        np.testing.assert_allclose(ours[:, column[name]], ours[:, column[name.replace("g_", "s_")]], atol=atol)
+
+
+def test_followers_move_pairs_with_their_leaders_and_locked_joints_do_not(arm):
+    """Yaw locked, the wrist at 0.3 rad less half of the elbow, whose column is its own less half of the wrist's."""
+    text = ARM.replace(
+        "</mujoco>",
+        """<equality>
+      <joint joint1="wrist" joint2="elbow" polycoef="0.3 -0.5 0 0 0"/></equality></mujoco>""",
+    )
+    tied = osik.Robot.from_mjcf(text, locked_joints=("yaw",))
+    q = np.array([0.0, 0.7, 0.3 - 0.35])
+    shapes = {"ball": CollisionShape.sphere(0.1, (0.3, 0.4, 0.4))}
+    limits = [
+        osik.CollisionAvoidanceLimit(robot, shapes=shapes, pairs=[("ball", "hand"), ("floor", "hand")], max_pairs=2)
+        for robot in (arm, tied)
+    ]
+    free, less = _rows(limits[0], arm, q, 0.01), _rows(limits[1], tied, q[1:2], 0.01)
+    np.testing.assert_allclose(less.lower, free.lower, atol=1e-12)
+    np.testing.assert_allclose(less.jacobian, free.jacobian[:, 1:2] - 0.5 * free.jacobian[:, 2:], atol=1e-12)
+
+
+def test_capsules_side_by_side_are_nearest_in_the_middle():
+    """Of what they have side by side: from x = 0.1 to 0.3."""
+    robot = osik.Robot.from_mjcf("""<mujoco><worldbody>
+      <geom name="a" type="capsule" size="0.05" fromto="-0.3 0 0 0.3 0 0"/>
+      <body><joint type="slide"/><geom name="b" type="capsule" size="0.04" fromto="0.1 0 0.2 0.9 0 0.2"/></body>
+      </worldbody></mujoco>""")
+    limit = osik.CollisionAvoidanceLimit(robot)
+    near = jax.jit(lambda q: limit._nearest(robot, osik.forward_kinematics(robot, q)))(robot.q0)
+    np.testing.assert_allclose(near.distance, [0.11], atol=1e-15)
+    np.testing.assert_allclose(near.point_a, [[0.2, 0.0, 0.05]], atol=1e-15)
+    np.testing.assert_allclose(near.point_b, [[0.2, 0.0, 0.16]], atol=1e-15)
