@@ -1,9 +1,12 @@
 """The table on the page on robots: what loads, how large it is, whether its poses are right, and how fast it is.
 
     python -m benchmarks.robots_table [--robots g1,panda] [--write]
+    python -m benchmarks.robots_table --robots g1_mj_description  # any name of robot_descriptions, which clones it
 
 Poses of all links at random configurations are compared with Pinocchio's (URDFs of example-robot-data) or MuJoCo C's
-(embedded robots). A step is ``solve`` with ``WeightedQP`` and ``integrate`` for the pose of the last body, posture and
+(embedded robots, and those of robot_descriptions).
+
+A step is ``solve`` with ``WeightedQP`` and ``integrate`` for the pose of the last body, posture and
 limits, in float64: the 20th percentile of its calls, which a busy machine disturbs little. Pin the process to one core
 (``taskset -c 0``), as one robot is best run. ``--write`` puts the table into docs/robots.md.
 """
@@ -83,6 +86,8 @@ ROBOTS: dict[str, tuple[str, bool]] = {
     "z1": ("z1_description/urdf/z1.urdf", False),
 }
 """The end of each file's path in example-robot-data, empty for embedded robots, and whether its base floats."""
+OTHER = ("", True)
+"""Of a robot that is in neither; its file says whether its base floats."""
 
 
 class Row(NamedTuple):
@@ -117,8 +122,8 @@ def file_of(name: str) -> Path:
 
 
 def load(name: str) -> osik.Robot:
-    """A robot of the table."""
-    ending, floating = ROBOTS[name]
+    """A robot of the table, or of robot_descriptions."""
+    ending, floating = ROBOTS.get(name, OTHER)
     return osik.Robot.from_urdf(file_of(name), floating_base=floating) if ending else osik.load_robot(name)
 
 
@@ -131,7 +136,7 @@ def pose_error(name: str, robot: osik.Robot) -> float:
         base = np.concatenate([rng.uniform(-1.0, 1.0, (CONFIGURATIONS, 3)), rng.normal(size=(CONFIGURATIONS, 4))], 1)
         base[:, 3:] /= np.linalg.norm(base[:, 3:], axis=1, keepdims=True)
         q[:, :7] = base
-    names, poses = _pinocchio_poses(name, robot, q) if ROBOTS[name][0] else _mujoco_poses(robot, q)
+    names, poses = _pinocchio_poses(name, robot, q) if ROBOTS.get(name, OTHER)[0] else _mujoco_poses(robot, q)
 
     @jax.jit
     @jax.vmap
@@ -175,15 +180,16 @@ def _pinocchio_configuration(model: pin.Model, values: dict[str, np.ndarray]) ->
 
 
 def _mujoco_poses(robot: osik.Robot, q: np.ndarray) -> tuple[tuple[str, ...], tuple[np.ndarray, ...]]:
-    """Bodies, and their positions and rotations."""
+    """Bodies that have names, and their positions and rotations."""
     model = robot.mj_model
+    bodies = [b for b in range(model.nbody) if model.body(b).name in robot.frame_names]
     data, places, axes = mujoco.MjData(model), [], []
     for row in q:
         data.qpos[:] = robot.mujoco_qpos(jnp.asarray(row))
         mujoco.mj_kinematics(model, data)
-        places.append(data.xpos.copy())
-        axes.append(data.xmat.reshape(-1, 3, 3).copy())
-    return tuple(model.body(b).name for b in range(model.nbody)), (np.array(places), np.array(axes))
+        places.append(data.xpos[bodies])
+        axes.append(data.xmat[bodies].reshape(-1, 3, 3))
+    return tuple(model.body(b).name for b in bodies), (np.array(places), np.array(axes))
 
 
 def step_seconds(robot: osik.Robot) -> float:
@@ -237,7 +243,7 @@ def write(text: str, path: Path = PAGE) -> None:
 def main() -> None:
     """Prints the table line by line, and writes it where asked to."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.robots_table", description=__doc__)
-    parser.add_argument("--robots", type=listed(str, ROBOTS), default=tuple(ROBOTS), help="names")
+    parser.add_argument("--robots", type=listed(str), default=tuple(ROBOTS), help="names, of robot_descriptions too")
     parser.add_argument("--write", action="store_true", help="into docs/robots.md")
     given = parser.parse_args()
     if given.write and set(given.robots) != set(ROBOTS):

@@ -68,6 +68,15 @@ def test_mjcf_and_urdf_by_name():
     assert (locked.nv, locked.locked_joints) == (6, ("elbow",))
 
 
+def test_the_command_that_checks_one(monkeypatch: pytest.MonkeyPatch):
+    """Poses against MuJoCo C, as docs/robots.md tells users to do with a robot of Menagerie."""
+    robots_table = importlib.import_module("benchmarks.robots_table")
+    monkeypatch.setattr(robots_table, "CALLS", 2)
+    row = robots_table.row("toy_mj_description")
+    assert row[:4] == ("toy_mj_description", True, 7, 0)
+    assert row.error < robots_table.TOLERANCE
+
+
 def test_a_real_urdf_by_name():
     """That of example-robot-data, which robot_descriptions clones."""
     robot = osik.load_robot("solo12_description")
