@@ -282,7 +282,7 @@ class TestPrograms:
         free = jnp.full(arm.nv, jnp.inf)
         problem = VelocityProblem(rows, (("posture", 1),), -free, free, arm.q0, -free, free)
         assert problem.constraints() is None
-        assert len(problem.levels()) == 1
+        assert len(problem.levels(None)) == 1
 
     def test_single_precision(self, arm, lanes):
         wide = cases(arm, lanes)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from .._home import home_kinematics
 from ..limits import ConfigurationLimit, VelocityLimit
 from ..robot import Robot, load_robot
 from ..tasks import ComTask, PostureTask, Task, support_polygon
-from ..tasks._leaves import home_kinematics
 from ._motion import GAIN, Goal, Motion, Stance, along, blended, circumscribed, contact_corners, tracking
 from ._references import Path, Stroke, minimum_jerk
 

@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._home import home_kinematics
 from .._joint_selection import concrete
+from .._numbers import as_scalar, as_vector
 from .._tree import unknown_name
 from ..collision._distance import Nearest
 from ..collision._geometry import Kind, UnitCore, geom_hull, padded
@@ -21,7 +23,6 @@ from ..collision._scene import Placed, Scene, grouped, nearest, place, separatio
 from ..collision._shape import CollisionShape
 from ..kinematics import Kinematics
 from ..robot import Robot
-from ..tasks._leaves import as_scalar, as_vector, home_kinematics
 from ._box import Limit
 from ._rows import LimitRows
 

@@ -27,7 +27,11 @@ class HierarchicalQP(Scheme):
         """The velocity of one tick; the warm start is the working set of every level."""
         constraints = problem.constraints()
         answer = solve_hqp(
-            problem.levels(), problem.lower, problem.upper, warm_start=warm_start, max_iterations=self.max_iterations
+            problem.levels(constraints),
+            problem.lower,
+            problem.upper,
+            warm_start=warm_start,
+            max_iterations=self.max_iterations,
         )
         status = answer.status
         if constraints is not None:

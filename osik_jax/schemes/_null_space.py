@@ -59,7 +59,8 @@ class NullSpace(Scheme):
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
         """The velocity of one tick."""
-        constraints, levels = problem.constraints(), problem.levels()
+        constraints = problem.constraints()
+        levels = problem.levels(constraints)
         descent = -self.potential_gain * limit_potential_gradient(
             problem.position, problem.position_lower, problem.position_upper, self.margin
         )

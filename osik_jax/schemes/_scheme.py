@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from .._numbers import as_scalar
 from ..limits import LimitRows
 from ..solvers import Level, Status
 from ..solvers._dense import apply
 from ..tasks import TaskRows
-from ..tasks._leaves import as_scalar
 
 _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 """A hard row that is missed by less, of what its numbers amount to, holds."""
@@ -73,11 +73,10 @@ class VelocityProblem(eqx.Module):
         rows = Level(limit.jacobian, limit.lower, limit.upper, jnp.ones_like(limit.lower), (False,) * len(limit.lower))
         return _joined(self.level(self.hard), rows) if self.hard else rows
 
-    def levels(self) -> list[Level]:
+    def levels(self, constraints: Level | None) -> list[Level]:
         """The constraints, if there are any, and the priorities."""
-        first = self.constraints()
         ranked = [self.level(names) for names in self.by_priority()]
-        return ranked if first is None else [first, *ranked]
+        return ranked if constraints is None else [constraints, *ranked]
 
     def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
         """Of each task, J v minus the nearest point of its interval."""

@@ -11,17 +11,16 @@ from numpy.typing import ArrayLike
 
 from ..kinematics._rigid import cross
 from ..robot import Robot
-from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import Pose, as_pose, as_scalar, as_vector, home_kinematics
-from ._plane import as_normal, as_offset, plane_axes
+from ._plane import PlaneTask, as_normal, as_offset, plane_axes
 from ._pointing import across, unit
 from ._pose import option
 from ._rotation import dot
 from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
 
 
-class ContactTask(FramedTask):
+class ContactTask(PlaneTask):
     """Keeps a frame in contact with a plane of the world: a foot on the ground, a hand on a wall.
 
     The plane is all x with ``normal x = offset``, t_1 and t_2 two unit vectors along it; p (3,) is the contact point of
@@ -64,12 +63,9 @@ class ContactTask(FramedTask):
         ValueError: a wrong shape, a direction of length 0, a negative weight, an unknown kind of contact.
     """
 
-    frame: str = eqx.field(static=True)
     contact: str = eqx.field(static=True)
     sliding: bool = eqx.field(static=True)
     point: Float[Array, "3"]
-    normal: Float[Array, "3"]
-    offset: Float[Array, ""]
     anchor: Pose | None
     axis: Float[Array, "3"] | None
 
@@ -107,16 +103,6 @@ class ContactTask(FramedTask):
         self.anchor = None if sliding else held
         standing = dot(held[1].T, self.normal) if axis is None else axis
         self.axis = as_normal(standing, dtype) if contact == "plane" else None
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """The frame."""
-        return (self.frame,)
-
-    @property
-    def bounded(self) -> bool:
-        """No."""
-        return False
 
     def rows_at(
         self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
@@ -162,10 +148,8 @@ class ContactTask(FramedTask):
 
     def _convert(self, name: str, value: Any) -> Any:
         dtype = self.weight.dtype
-        if name in ("normal", "axis"):
+        if name == "axis":
             return as_normal(value, dtype)
-        if name == "offset":
-            return as_offset(value, dtype)
         if name == "anchor":
             return as_pose(value, dtype)
         return super()._convert(name, value)

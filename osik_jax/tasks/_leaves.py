@@ -4,33 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._home import home_kinematics as home_kinematics
 from .._joint_selection import concrete as concrete
 from .._numbers import as_bounds as as_bounds
 from .._numbers import as_scalar as as_scalar
 from .._numbers import as_vector as as_vector
 from .._numbers import check_bounds as check_bounds
 from .._numbers import check_not_negative as check_not_negative
-from ..kinematics import Kinematics, forward_kinematics
-from ..robot import Robot
 
 Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
 """Position [m] and rotation (frame axes to world axes)."""
 
 _ROTATION_TOLERANCE = 1e-4
-
-
-compiled_kinematics = jax.jit(forward_kinematics)
-"""For work outside jit: compiled once for each tree."""
-
-
-def home_kinematics(robot: Robot) -> Kinematics:
-    """Where everything is at the robot's home configuration."""
-    return compiled_kinematics(robot, robot.q0)
 
 
 def as_pose(value: Any, dtype: Any) -> Pose:

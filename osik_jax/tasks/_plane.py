@@ -1,14 +1,37 @@
-"""Planes that frames touch."""
+"""Planes that frames touch, and what tasks on them share."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._framed import FramedTask
 from ._leaves import as_vector
 from ._pointing import across, as_direction, unit
+
+
+class PlaneTask(FramedTask):
+    """Base of tasks that keep one frame on a plane of the world, by equalities: all x with ``normal x = offset``."""
+
+    frame: str = eqx.field(static=True)
+    normal: Float[Array, "3"]
+    offset: Float[Array, ""]
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frame."""
+        return (self.frame,)
+
+    @property
+    def bounded(self) -> bool:
+        """No."""
+        return False
+
+    def _convert(self, name: str, value: Any) -> Any:
+        return as_normal(value, self.weight.dtype) if name == "normal" else super()._convert(name, value)
 
 
 def as_normal(value: Any, dtype: Any) -> Float[Array, "3"]:

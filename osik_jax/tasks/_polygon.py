@@ -11,8 +11,8 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from .._home import compiled_kinematics
 from ..robot import Robot
-from ._leaves import compiled_kinematics
 
 _COLLINEAR = 1e-6
 

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..kinematics._rigid import cross
 from ..robot import Robot
-from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_scalar, as_vector, check_not_negative
-from ._plane import as_normal, as_offset
+from ._plane import PlaneTask, as_normal, as_offset
 from ._pointing import as_direction, unit
 from ._rotation import dot
 from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
 
 
-class WheelTask(FramedTask):
+class WheelTask(PlaneTask):
     """Makes a wheel roll on a plane of the world without slipping.
 
     With a the wheel's axis and n the plane's normal in world axes, the wheel rolls along ``x = a x n / |a x n|``, its
@@ -58,12 +56,9 @@ class WheelTask(FramedTask):
         ValueError: a wrong shape, a direction of length 0, a negative radius or weight.
     """
 
-    frame: str = eqx.field(static=True)
     radius: Float[Array, ""]
     axis: Float[Array, "3"]
     roller_angle: Float[Array, ""] | None
-    normal: Float[Array, "3"]
-    offset: Float[Array, ""]
 
     def __init__(
         self,
@@ -90,16 +85,6 @@ class WheelTask(FramedTask):
         self.axis = unit(as_direction(axis, "axis", dtype))
         self.roller_angle = None if roller_angle is None else as_vector(roller_angle, (), "roller_angle", dtype)
         self.normal, self.offset = as_normal(normal, dtype), as_offset(offset, dtype)
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """The wheel."""
-        return (self.frame,)
-
-    @property
-    def bounded(self) -> bool:
-        """No."""
-        return False
 
     def rows_at(
         self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
@@ -128,8 +113,6 @@ class WheelTask(FramedTask):
             return _as_radius(value, dtype)
         if name == "axis":
             return unit(as_direction(value, name, dtype))
-        if name == "normal":
-            return as_normal(value, dtype)
         return super()._convert(name, value)
 
 
