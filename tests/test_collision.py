@@ -1,5 +1,7 @@
 """Collision avoidance: distances against MuJoCo C and coal, rows against differences, filters, closed loops."""
 
+import functools
+
 import coal
 import jax
 import jax.numpy as jnp
@@ -73,7 +75,7 @@ def zoo():
     q[:, 7:10] *= rng.uniform(0.02, 0.3, (150, 1))
     q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
     q[:, 10:] /= np.linalg.norm(q[:, 10:], axis=1, keepdims=True)
-    ours = jax.jit(jax.vmap(lambda q: limit._nearest(robot, osik.forward_kinematics(robot, q))))(q)
+    ours = _jit(jax.vmap(lambda q: limit._nearest(robot, osik.forward_kinematics(robot, q))))(q)
     return robot, limit, q, jax.tree.map(np.asarray, ours)
 
 
@@ -93,12 +95,16 @@ def avoidance(arm):
     return osik.CollisionAvoidanceLimit(arm, shapes=shapes, minimum_distance=0.02, max_pairs=6)
 
 
-@jax.jit
+# Without XLA's newer fusions, as conftest.py has it, batches of loops in loops have been seen to go on for ever.
+_jit = functools.partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": True})
+
+
+@_jit
 def _distances(limit, robot, q):
     return limit.distances(robot, osik.forward_kinematics(robot, q))
 
 
-@jax.jit
+@_jit
 def _rows(limit, robot, q, dt):
     return limit.rows(robot, osik.forward_kinematics(robot, q), q, dt)
 
@@ -279,7 +285,7 @@ def _slopes(robot, limit):
         rows = limit.rows(robot, osik.forward_kinematics(robot, q), q, 0.01)
         return jnp.concatenate([jnp.ravel(rows.jacobian), limit.distances(robot, osik.forward_kinematics(robot, q))])
 
-    return jax.jit(jax.vmap(lambda q: (jax.jacfwd(numbers)(q), jax.jacrev(numbers)(q))))
+    return _jit(jax.vmap(lambda q: (jax.jacfwd(numbers)(q), jax.jacrev(numbers)(q))))
 
 
 @pytest.mark.slow
