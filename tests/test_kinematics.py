@@ -18,6 +18,7 @@ from mujoco import mjx
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
+from osik_jax.kinematics import _composition
 
 # All joint types, two joints on one body, anchors off the body's origin, references other than 0, branches, links fixed
 # to others, a second tree that hangs from the world, and every kind of frame.
@@ -479,3 +480,16 @@ def test_a_serial_chain_costs_microseconds(robots):
     assert microseconds(pose, batch) < 20.0
     assert microseconds(jax.grad(height), batch) < 60.0
     assert microseconds(pose, one) < 1500.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_way_of_gpus_composes_as_that_of_cpus_does(robots, name):
+    tree = robots[name].tree
+    rng = np.random.default_rng(5)
+    local = rng.normal(size=(len(tree.body_names), 3)), Rotation.random(len(tree.body_names), rng=rng).as_matrix()
+    rounds = jnp.asarray(tree.doublings, np.int32)
+    looped, apart = (jax.jit(way)(*local, rounds) for way in (_composition._in_a_loop, _composition._one_by_one))
+    assert_trees_close(looped, apart, 1e-13)
+    program = jax.jit(lambda q: osik.forward_kinematics(robots[name], q)).trace(robots[name].q0)
+    has_loop = {on: "stablehlo.while" in program.lower(lowering_platforms=(on,)).as_text() for on in ("cpu", "cuda")}
+    assert has_loop == {"cpu": True, "cuda": False}

@@ -38,16 +38,7 @@ def _composer(tree: KinematicTree) -> Callable[..., Poses]:
     @custom_jvp
     def poses(position: Array, rotation: Array) -> Poses:
         rounds = jnp.asarray(tree.doublings, np.int32)
-        if not len(rounds):
-            return position, rotation
-
-        def double(i: Array, poses: Poses) -> Poses:
-            (position, rotation), above = poses, rounds[i]
-            turn = rotation[above]
-            return position[above] + rotate(turn, position), compose(turn, rotation)
-
-        # XLA's CPU backend makes one operation of a small loop; its rounds, written out, would be a dozen
-        return jax.lax.fori_loop(np.int32(0), np.int32(len(rounds)), double, (position, rotation))
+        return jax.lax.platform_dependent(position, rotation, rounds, cpu=_in_a_loop, default=_one_by_one)
 
     @poses.defjvp
     def _(local: tuple[Array, Array], rates: tuple[Array, Array]) -> tuple[Poses, Poses]:
@@ -64,6 +55,29 @@ def _composer(tree: KinematicTree) -> Callable[..., Poses]:
         return (position, rotation), (velocity, cross(angular[:, None, :], rotation.mT).mT)
 
     return poses
+
+
+def _in_a_loop(position: Array, rotation: Array, rounds: Array) -> Poses:
+    """XLA's CPU backend makes one operation of a small loop; its rounds, written out, would be a dozen."""
+    if not len(rounds):
+        return position, rotation
+    return jax.lax.fori_loop(
+        np.int32(0), np.int32(len(rounds)), lambda i, poses: _doubled(*poses, rounds[i]), (position, rotation)
+    )
+
+
+def _one_by_one(position: Array, rotation: Array, rounds: Array) -> Poses:
+    """For GPUs, where a loop waits between its rounds."""
+    for i in range(len(rounds)):
+        poses = jax.lax.optimization_barrier((position, rotation))  # or XLA recomputes all rounds before
+        position, rotation = _doubled(*poses, rounds[i])
+    return position, rotation
+
+
+def _doubled(position: Array, rotation: Array, above: Array) -> Poses:
+    """Poses that reached as far as ``above``, as far again."""
+    turn = rotation[above]
+    return position[above] + rotate(turn, position), compose(turn, rotation)
 
 
 def _axis(skew: Float[Array, "... 3 3"]) -> Float[Array, "... 3"]:
