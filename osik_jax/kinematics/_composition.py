@@ -61,21 +61,21 @@ def _in_a_loop(position: Array, rotation: Array, rounds: Array) -> Poses:
     """XLA's CPU backend makes one operation of a small loop; its rounds, written out, would be a dozen."""
     if not len(rounds):
         return position, rotation
-    return jax.lax.fori_loop(
-        np.int32(0), np.int32(len(rounds)), lambda i, poses: _doubled(*poses, rounds[i]), (position, rotation)
-    )
+    start = position, rotation
+    return jax.lax.fori_loop(np.int32(0), np.int32(len(rounds)), lambda i, poses: _doubled(poses, rounds[i]), start)
 
 
 def _one_by_one(position: Array, rotation: Array, rounds: Array) -> Poses:
     """For GPUs, where a loop waits between its rounds."""
+    poses = position, rotation
     for i in range(len(rounds)):
-        poses = jax.lax.optimization_barrier((position, rotation))  # or XLA recomputes all rounds before
-        position, rotation = _doubled(*poses, rounds[i])
-    return position, rotation
+        poses = _doubled(jax.lax.optimization_barrier(poses), rounds[i])  # or XLA recomputes all rounds before
+    return poses
 
 
-def _doubled(position: Array, rotation: Array, above: Array) -> Poses:
+def _doubled(poses: Poses, above: Array) -> Poses:
     """Poses that reached as far as ``above``, as far again."""
+    position, rotation = poses
     turn = rotation[above]
     return position[above] + rotate(turn, position), compose(turn, rotation)
 
