@@ -3,8 +3,9 @@
     python -m benchmarks.rollouts [results.json] [--robot g1] [--robots 64] [--ticks 100] [--scheme weighted]
                                   [--precision float64]
 
-The setting is that of ``benchmarks.throughput``, closed loop, on the default device. The loss is the mean over robots
-and ticks of the squared distance of the hand to its target. ``forward`` is the loss alone, ``gradient`` both.
+The setting is that of ``benchmarks.throughput``, closed loop, on the default device. The loss is the mean over robots of
+the hand's squared error in the ticks, and of its squared distance to the target where the last tick led. ``forward`` is
+the loss alone, ``gradient`` both.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def measure(robot: str, scheme: str, robots: int, ticks: int) -> list[dict[str, 
     def path(q: jax.Array, point: jax.Array, tasks: dict[str, osik.Task]) -> jax.Array:
         aimed = tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
         run = osik.rollout(given.robot, q, aimed, scheme=SCHEMES[scheme](), limits=given.limits, dt=DT, steps=ticks)
-        return jnp.mean(run.solution.error["hand"] ** 2)
+        end, _ = osik.forward_kinematics(given.robot, run.q[-1]).frame_pose(given.robot, hand.frame)
+        return jnp.mean(run.solution.error["hand"] ** 2) + jnp.sum((end - point) ** 2)
 
     def loss(weights: dict[str, jax.Array], points: jax.Array) -> jax.Array:
         tasks = {name: task.replace(weight=weights[name]) for name, task in given.tasks.items()}
