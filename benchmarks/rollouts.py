@@ -3,9 +3,9 @@
     python -m benchmarks.rollouts [results.json] [--robot g1] [--robots 64] [--ticks 100] [--scheme weighted]
                                   [--precision float64]
 
-The setting is that of ``benchmarks.throughput``, closed loop, on the default device. The loss is the mean over robots of
-the hand's squared error in the ticks, and of its squared distance to the target where the last tick led. ``forward`` is
-the loss alone, ``gradient`` both.
+The setting is that of ``benchmarks.throughput``, closed loop, on the default device. The loss is the mean over robots
+of the hand's squared error in the ticks, and of its squared distance to the target where the last tick led.
+``forward`` is the loss alone, ``gradient`` both.
 """
 
 from __future__ import annotations
