@@ -12,6 +12,7 @@ from benchmarks import job, parts, rollouts
 from osik_jax import scaling
 
 
+@pytest.mark.slow
 def test_rows_of_all_parts(tmp_path, monkeypatch, capsys):
     path = tmp_path / "parts.json"
     monkeypatch.setattr(parts, "SECONDS", 0.0)
@@ -48,6 +49,7 @@ def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
     assert 0.0 < forward["seconds"] < gradient["seconds"]
 
 
+@pytest.mark.slow
 def test_a_job_goes_on_where_it_was(tmp_path, monkeypatch, capsys):
     """Of three chunks the middle one is lost: it alone is run, and comes out as it was."""
     command = ["job", str(tmp_path), "--robot", "arm7", "--steps", "18", "--ticks", "2", "--chunk", "3"]
