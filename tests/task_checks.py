@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import mink
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -46,6 +47,14 @@ def full_velocities(robot):
         start, own = model.jnt_dofadr[joint], robot.joint_dof_index(name)
         out[start : start + width, own : own + width] = multiplier * np.eye(width)
     return out
+
+
+def the_same_in_mink(robot, seed):
+    """The robot, a configuration, the same in mink, a target, and mink's velocities from ours."""
+    rng = np.random.default_rng(seed)
+    q = jnp.asarray(anywhere(robot, rng))
+    configuration = mink.Configuration(robot.mj_model, q=np.asarray(robot.mujoco_qpos(q)))
+    return robot, q, configuration, random_pose(rng, np.zeros(3)), full_velocities(robot)
 
 
 @jax.jit

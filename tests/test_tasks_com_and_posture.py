@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from task_checks import (
     anywhere,
-    full_velocities,
     kinematics_at,
-    random_pose,
     rows_of_each,
     square,
+    the_same_in_mink,
 )
 
 import osik_jax as osik
@@ -26,11 +25,7 @@ def nao():
 
 @pytest.fixture
 def beside_mink(nao):
-    """A configuration, the same in mink, a target, and mink's velocities from ours."""
-    rng = np.random.default_rng(SEED)
-    q = jnp.asarray(anywhere(nao, rng))
-    configuration = mink.Configuration(nao.mj_model, q=np.asarray(nao.mujoco_qpos(q)))
-    return nao, q, configuration, random_pose(rng, np.zeros(3)), full_velocities(nao)
+    return the_same_in_mink(nao, SEED)
 
 
 class TestAgainstMink:
