@@ -41,15 +41,15 @@ def factorize(qp: QP, hessian: Float[Array, "n n"], active: Int[Array, " n+p"]) 
     diagonal = jnp.diagonal(hessian)
     ridge = _RIDGE[hessian.dtype] * unit * jnp.where(diagonal > 0.0, diagonal, jnp.maximum(jnp.max(diagonal), unit))
     square = jnp.where(free[:, None] & free[None, :], hessian, 0.0)
-    lower = _cholesky(square + jnp.diag(jnp.where(free, ridge, 1.0)))
+    lower = cholesky(square + jnp.diag(jnp.where(free, ridge, 1.0)))
     rows = jnp.where(held[:, None] & free[None, :], qp.rows, 0.0)
     if not p:
         return Factor(free, held, lower, rows.T, jnp.zeros((0, 0), hessian.dtype))
-    reach = _forward(lower, rows.T)
+    reach = forward(lower, rows.T)
     schur = product(reach.T, reach) + jnp.diag(jnp.where(held, qp.compliance, 0.0))
     own = jnp.diagonal(schur)
     ridge = jnp.where(held, 10.0 * unit * own + jnp.where(own == 0.0, unit, 0.0), 1.0)
-    return Factor(free, held, lower, _backward(lower, reach), half_inverse(_cholesky(schur + jnp.diag(ridge))))
+    return Factor(free, held, lower, backward(lower, reach), half_inverse(cholesky(schur + jnp.diag(ridge))))
 
 
 def minimize_on(qp: QP, factor: Factor, active: Int[Array, "B n+p"]) -> tuple[Float[Array, "B n"], Float[Array, "B p"]]:
@@ -57,40 +57,69 @@ def minimize_on(qp: QP, factor: Factor, active: Int[Array, "B n+p"]) -> tuple[Fl
 
     Every argument has a leading axis, the lanes; all are refined until the last correction is small in each.
     """
-    limit = _LAST_CORRECTION[qp.lower.dtype]
-    refine = jax.vmap(_refine)
     target = jax.vmap(active_targets)(qp, active)
     n = factor.free.shape[1]
-    x, y = refine(qp, factor, target, jnp.where(factor.free, 0.0, target[:, :n]), jnp.zeros_like(target[:, n:]))[:2]
+
+    def correction(x: Array, y: Array) -> tuple[Array, Array]:
+        return jax.vmap(_correction)(qp, factor, target, x, y)
+
+    x, y = jnp.where(factor.free, 0.0, target[:, :n]), jnp.zeros_like(target[:, n:])
+    dx, dy = correction(x, y)
+    root = jnp.abs(jnp.diagonal(factor.lower, axis1=1, axis2=2))
+    limit = jnp.asarray(_LAST_CORRECTION[x.dtype], x.dtype)
+    return refined(correction, x + dx, y + dy, root=root, limit=limit)[:2]
+
+
+def refined(
+    correction: Callable[[Array, Array], tuple[Array, Array]],
+    x: Float[Array, "B n"],
+    y: Float[Array, "B p"],
+    *,
+    root: Float[Array, "B n"],
+    limit: Float[Array, "..."],
+) -> tuple[Float[Array, "B n"], Float[Array, "B p"], Bool[Array, " B"]]:
+    """x and y with corrections until the last one is small in each lane, and whether it is.
+
+    Args:
+        correction: of all lanes, from exact residuals.
+        x: to be corrected.
+        y: likewise.
+        root: of the curvature; variables times these have one unit.
+        limit: a correction by this share of x is small. () or (B,)
+    """
 
     def go_on(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
-        *_, correction, rounds = state
-        return jnp.any(correction > limit) & (rounds < _MOST_CORRECTIONS)
+        *_, share, rounds = state
+        return jnp.any(share > limit) & (rounds < _MOST_CORRECTIONS)
 
     def again(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        return *refine(qp, factor, target, *state[:2]), state[3] + 1
+        x, y, _, rounds = state
+        dx, dy = correction(x, y)
+        return x + dx, y + dy, jax.vmap(_share)(dx * root, (x + dx) * root), rounds + 1
 
     start = (x, y, jnp.full(len(x), jnp.inf, x.dtype), jnp.asarray(0))
-    return jax.lax.while_loop(go_on, again, start)[:2]
+    x, y, share, _ = jax.lax.while_loop(go_on, again, start)
+    return x, y, share <= limit
 
 
-def _refine(
+def _share(dx: Float[Array, " n"], x: Float[Array, " n"]) -> Float[Array, ""]:
+    return jnp.max(jnp.abs(dx)) / jnp.maximum(jnp.max(jnp.abs(x)), jnp.finfo(x.dtype).tiny)
+
+
+def _correction(
     qp: QP, factor: Factor, target: Float[Array, " n+p"], x: Float[Array, " n"], y: Float[Array, " p"]
-) -> tuple[Float[Array, " n"], Float[Array, " p"], Float[Array, ""]]:
-    """One correction from exact residuals, and its size as a share of x."""
+) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
+    """Of x and y, from exact residuals."""
     slope = apply(qp.rows.T, y) - qp.cost.gradient(x)
     gap = target[len(x) :] - apply(qp.rows, x) - qp.compliance * y
-    dx, dy = solve_system(factor, slope, gap)
-    root = jnp.abs(jnp.diagonal(factor.lower))
-    share = jnp.max(jnp.abs(dx * root)) / jnp.maximum(jnp.max(jnp.abs((x + dx) * root)), jnp.finfo(x.dtype).tiny)
-    return x + dx, y + dy, share
+    return solve_system(factor, slope, gap)
 
 
 def solve_system(
     factor: Factor, slope: Float[Array, " n"], gap: Float[Array, " p"]
 ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
     """dx, dy with H dx - C'dy = slope over the free variables and C dx + D dy = gap over the held rows."""
-    step = _backward(factor.lower, _forward(factor.lower, jnp.where(factor.free, slope, 0.0)))
+    step = backward(factor.lower, forward(factor.lower, jnp.where(factor.free, slope, 0.0)))
     if not len(gap):
         return step, gap
     apart = apply(factor.through.T, jnp.where(factor.free, slope, 0.0))
@@ -120,16 +149,16 @@ def system_inverse(qp: QP, active: Int[Array, " n+p"]) -> Callable[[Float[Array,
 
 def half_inverse(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """F with (lower lower')^-1 = F'F."""
-    return _forward(lower, jnp.eye(len(lower), dtype=lower.dtype))
+    return forward(lower, jnp.eye(len(lower), dtype=lower.dtype))
 
 
-def _cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
-def _forward(lower: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def forward(lower: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     return jax.scipy.linalg.solve_triangular(lower, right, lower=True)
 
 
-def _backward(lower: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def backward(lower: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     return jax.scipy.linalg.solve_triangular(lower, right, lower=True, trans=1)

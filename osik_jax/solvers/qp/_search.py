@@ -14,11 +14,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply
-from .._lanes import choose
+from .._lanes import choose, with_the_rest
 from .._pivots import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, NO_GAP, Noise
 from ._factor import factorize, minimize_on
 from ._problem import QP
 from ._tableau import find
+from ._through_rows import has_few_rows, minimize_through_rows
 
 _ROUNDS = 30
 _NEARLY = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
@@ -28,6 +29,8 @@ _PATIENCE = 5
 _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 _SOFT = {jnp.dtype("float64"): (1e-6, 1e-12), jnp.dtype("float32"): (1e-3, 1e-4)}
 """Compliance of rows that contradict, first and last, as a share of their own; each stage starts where one ended."""
+_FEW = 4
+"""Lanes of a block that are searched together, where most of it needs no search."""
 _NOUGHT = 100.0
 """Roundings of what the cost pulls at it; an answer that is no larger is 0."""
 
@@ -57,12 +60,11 @@ class Scales(NamedTuple):
 
 def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int) -> Found:
     """The search for a batch: every argument has a leading axis, the lanes. A cap on the changes of the active set."""
-    lanes, n = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1]
-    hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
+    lanes, n, dtype = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1], qp.lower.dtype
     nothing = jnp.zeros(lanes, jnp.int32)
     start = Found(
-        x=jnp.zeros((lanes, n), hessian.dtype),
-        row_multipliers=jnp.zeros(qp.rows.shape[:2], hessian.dtype),
+        x=jnp.zeros((lanes, n), dtype),
+        row_multipliers=jnp.zeros(qp.rows.shape[:2], dtype),
         active=jax.vmap(possible)(qp, guess),
         implied=jnp.zeros(guess.shape, bool),
         iterations=nothing,
@@ -74,13 +76,37 @@ def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, m
         compliance=qp.compliance,
     )
 
+    if lanes == 1 or jax.default_backend() != "cpu" or not has_few_rows(qp):
+        return _search(qp, start, tolerance, max_iterations)
+    looked = _first_look(qp, start, tolerance)
+
+    def again(at: Array, found: Found) -> Found:
+        return _search(*jax.tree.map(lambda a: a[at], (qp, found, tolerance)), max_iterations)
+
+    return with_the_rest(looked, looked.done, again, min(lanes, _FEW))
+
+
+def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
+    """Where the guess is right, the answer, for less than a round of the search."""
+    x, y, sound = minimize_through_rows(qp, start.active)
+    scales = jax.vmap(scales_of)(qp, jax.vmap(lambda one: one.cost.diagonal())(qp), x, y)
+    noise = Noise(*(tolerance[:, None] * a for a in scales))
+    optimal = sound & jax.vmap(optimal_on)(qp, start, x, y, noise)
+    end = start._replace(x=x, row_multipliers=y, factorizations=start.factorizations + 1, done=optimal, optimal=optimal)
+    return choose(optimal, end, start)
+
+
+def _search(qp: QP, start: Found, tolerance: Float[Array, " B"], cap: int) -> Found:
+    """Rounds of factoring, checking and pivoting, until every lane is done."""
+    hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
+
     def go_on(state: tuple[Found, Array]) -> Bool[Array, ""]:
         found, rounds = state
         return (rounds < _ROUNDS) & ~jnp.all(found.done)
 
     def body(state: tuple[Found, Array]) -> tuple[Found, Array]:
         found, rounds = state
-        return choose(~found.done, _round(qp, hessian, found, tolerance, max_iterations), found), rounds + 1
+        return choose(~found.done, _round(qp, hessian, found, tolerance, cap), found), rounds + 1
 
     return jax.lax.while_loop(go_on, body, (start, jnp.asarray(0)))[0]
 
