@@ -60,6 +60,7 @@ tasks = {"hand": hand, "posture": osik.PostureTask(arm, priority=2)}
 many = osik.batched(tasks, {"posture.gain": jnp.linspace(1.0, 3.0, 21)})
 axes = (None, 0, osik.batch_axes(tasks, "posture.gain"))
 largest = lambda a, b: max(float(abs(x - y).max()) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+compiled = lambda split: sum(program.run._cache_size() for program in split._known.values())
 found = {"devices": len(jax.devices())}
 for scheme in (osik.WeightedQP(), osik.NullSpace(), osik.HierarchicalQP()):
     tick = lambda robot, q, tasks: osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=0.01)
@@ -68,7 +69,7 @@ for scheme in (osik.WeightedQP(), osik.NullSpace(), osik.HierarchicalQP()):
     exact = largest((a.status, a.warm_start), (b.status, b.warm_start))
     split(arm, q + 0.01, many)
     found[type(scheme).__name__] = dict(
-        error=largest(a, b), exact=exact, lanes=len(a.velocity), compiled=split._program._cache_size()
+        error=largest(a, b), exact=exact, lanes=len(a.velocity), compiled=compiled(split)
     )
 
 def path(gain, q):

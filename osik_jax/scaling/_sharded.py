@@ -71,7 +71,8 @@ class ShardedFunction:
         self, function: Callable[..., Any], in_axes: Any, mesh: Mesh, donate_argnums: int | Sequence[int] = ()
     ):
         self.function, self.in_axes, self.mesh = function, in_axes, mesh
-        self._program = jax.jit(self._shards, donate_argnums=donate_argnums)
+        self._donated = {donate_argnums} if isinstance(donate_argnums, int) else set(donate_argnums)
+        self._known: dict[tuple[Any, ...], _Program] = {}
         functools.update_wrapper(self, function, updated=())
 
     def __call__(self, *args: Any) -> Any:
@@ -83,10 +84,12 @@ class ShardedFunction:
         Raises:
             ValueError: ``in_axes`` does not fit the arguments, lanes differ in number, or there are none.
         """
-        batch = _Batch(args, self.in_axes)
-        count = batch.count
+        leaves, program = self._program(args)
+        count = program.count(leaves)
         missing = -count % self.mesh.size
-        out = self._program(*self._placed(batch, missing))
+        if missing:
+            leaves = [_filled(a, axis, missing) for a, axis in zip(leaves, program.axes, strict=True)]
+        out = program.run(*program.reachable(leaves))
         return jax.tree.map(lambda a: a[:count], out) if missing else out
 
     def place(self, *args: Any) -> tuple[Any, ...]:
@@ -95,77 +98,99 @@ class ShardedFunction:
         Raises:
             ValueError: as a call does, and where the devices do not divide the number of lanes.
         """
-        batch = _Batch(args, self.in_axes)
-        if batch.count % self.mesh.size:
-            raise ValueError(f"{batch.count} lanes do not divide over {self.mesh.size} devices")
-        return self._placed(batch, 0)
+        leaves, program = self._program(args)
+        count = program.count(leaves)
+        if count % self.mesh.size:
+            raise ValueError(f"{count} lanes do not divide over {self.mesh.size} devices")
+        return jax.tree.unflatten(program.structure, program.placed(leaves))
 
-    def _shards(self, *args: Any) -> Any:
-        batch = _Batch(args, self.in_axes)
-        axes = [None if axis == _SHARED else axis for axis in batch.axes]
+    def _program(self, args: tuple[Any, ...]) -> tuple[list[Any], _Program]:
+        """The arrays of the arguments, and the program for what holds them."""
+        leaves, structure = jax.tree.flatten(args)
+        known = self._known.get(structure)
+        if known is None:
+            known = self._known[structure] = _Program(self, args, structure)
+        return leaves, known
 
-        def lane(own: list[Any]) -> Any:
-            return self.function(*jax.tree.unflatten(batch.structure, own))
+
+class _Program:
+    """A function of arrays, for arguments of one structure.
+
+    Attributes:
+        structure: of the arguments.
+        axes: for each array, ``_SHARED`` where it is not split.
+        places: where each array is wanted.
+        run: the compiled function; takes what is elsewhere from the host, but not from another device.
+    """
+
+    def __init__(self, owner: ShardedFunction, args: tuple[Any, ...], structure: Any):
+        self.structure, self.axes = structure, _flat_axes(owner.in_axes, args)
+        self._split = [(i, axis) for i, axis in enumerate(self.axes) if axis != _SHARED]
+        names = owner.mesh.axis_names
+        specs = [PartitionSpec(*[None] * axis, names) if axis != _SHARED else PartitionSpec() for axis in self.axes]
+        self.places = [NamedSharding(owner.mesh, spec) for spec in specs]
+        ends = np.cumsum([0, *(len(jax.tree.leaves(argument)) for argument in args)])
+        donated = [i for k in owner._donated for i in range(ends[k], ends[k + 1])]
+        axes = [None if axis == _SHARED else axis for axis in self.axes]
+
+        def lane(*own: Any) -> Any:
+            return owner.function(*jax.tree.unflatten(structure, own))
 
         # Checks of what varies over the mesh are off: loops inside the solvers begin with constants, which do not.
         mapped = jax.shard_map(
-            jax.vmap(lane, in_axes=(axes,)),
-            mesh=self.mesh,
-            in_specs=([self._spec(axis) for axis in axes],),
-            out_specs=self._spec(0),
+            jax.vmap(lane, in_axes=tuple(axes)),
+            mesh=owner.mesh,
+            in_specs=tuple(specs),
+            out_specs=PartitionSpec(names),
             check_vma=False,
         )
-        return mapped(batch.leaves)
+        self.run = jax.jit(mapped, in_shardings=self.places, donate_argnums=donated)
 
-    def _spec(self, axis: int | None) -> PartitionSpec:
-        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, self.mesh.axis_names)
-
-    def _placed(self, batch: _Batch, missing: int) -> tuple[Any, ...]:
-        """The arguments on their devices, filled up; those that are there already are left alone."""
-        whole = [_filled(a, axis, missing) for a, axis in zip(batch.leaves, batch.axes, strict=True)]
-        places = {axis: NamedSharding(self.mesh, self._spec(None if axis == _SHARED else axis)) for axis in batch.axes}
-        wanted = [places[axis] for axis in batch.axes]
-        away = [i for i, (a, place) in enumerate(zip(whole, wanted, strict=True)) if not _is_there(a, place)]
-        there = moved([whole[i] for i in away], [wanted[i] for i in away])
-        for i, a in zip(away, there, strict=True):
-            whole[i] = a
-        return jax.tree.unflatten(batch.structure, whole)
-
-
-class _Batch:
-    """Arguments taken apart, with an axis for each array, ``_SHARED`` where there is none."""
-
-    def __init__(self, args: tuple[Any, ...], in_axes: Any):
-        self.leaves, self.structure = jax.tree.flatten(args)
-        self.axes = _flat_axes(in_axes, args, self.leaves)
-
-    @property
-    def count(self) -> int:
+    def count(self, leaves: list[Any]) -> int:
         """Number of lanes."""
-        lengths = {np.shape(a)[axis] for a, axis in zip(self.leaves, self.axes, strict=True) if axis != _SHARED}
+        lengths: set[int] = set()
+        for i, axis in self._split:
+            shape = np.shape(leaves[i])
+            if not 0 <= axis < len(shape):
+                raise ValueError(f"in_axes has axis {axis} for an array of shape {shape}")
+            lengths.add(shape[axis])
         if len(lengths) != 1 or 0 in lengths:
             found = ", ".join(str(n) for n in sorted(lengths)) or "none, for in_axes splits no argument"
             raise ValueError(f"the arguments that are split need one number of lanes, at least 1; found: {found}")
         return lengths.pop()
 
+    def reachable(self, leaves: list[Any]) -> list[Any]:
+        """The arrays, those that ``run`` would not take put where they are wanted."""
+        if jax.process_count() > 1:
+            return self.placed(leaves)
+        return self._with_moved(leaves, [isinstance(a, jax.Array) and not isinstance(a, Tracer) for a in leaves])
 
-def _flat_axes(in_axes: Any, args: tuple[Any, ...], leaves: list[Any]) -> list[int]:
+    def placed(self, leaves: list[Any]) -> list[Any]:
+        """The arrays where they are wanted; Python numbers stay, for they take the precision of what they meet."""
+        return self._with_moved(leaves, [not isinstance(a, (bool, int, float, complex)) for a in leaves])
+
+    def _with_moved(self, leaves: list[Any], wanted: list[bool]) -> list[Any]:
+        """The arrays, those that are wanted and are elsewhere put where they belong."""
+        pairs = zip(leaves, self.places, strict=True)
+        away = [i for i, (a, place) in enumerate(pairs) if wanted[i] and not _is_there(a, place)]
+        there = moved([leaves[i] for i in away], [self.places[i] for i in away])
+        whole = list(leaves)
+        for i, a in zip(away, there, strict=True):
+            whole[i] = a
+        return whole
+
+
+def _flat_axes(in_axes: Any, args: tuple[Any, ...]) -> list[int]:
     if isinstance(in_axes, (tuple, list)):
         if len(in_axes) != len(args):
             raise ValueError(f"in_axes has {len(in_axes)} parts, for {len(args)} arguments")
         in_axes = tuple(in_axes)
     marked = jax.tree.map(lambda axis: _SHARED if axis is None else axis, in_axes, is_leaf=lambda axis: axis is None)
-    axes = jax.tree.leaves(jax.tree.broadcast(marked, args))
-    for leaf, axis in zip(leaves, axes, strict=True):
-        if axis != _SHARED and not 0 <= axis < np.ndim(leaf):
-            raise ValueError(f"in_axes has axis {axis} for an array of shape {np.shape(leaf)}")
-    return axes
+    return jax.tree.leaves(jax.tree.broadcast(marked, args))
 
 
 def _is_there(leaf: Any, place: NamedSharding) -> bool:
-    """Whether it is where it is wanted; Python numbers always, for they take the precision of what they meet."""
-    if isinstance(leaf, (bool, int, float, complex)):
-        return True
+    """Whether an array is where it is wanted."""
     known = isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer)
     return known and leaf.committed and leaf.sharding == place
 
