@@ -133,12 +133,9 @@ def test_active_rows(planted, cold, hard):
 def test_rows_that_depend_on_each_other_are_left_to_the_hessian(planted, cold):
     _, data = planted
     qp = problems(data, np.arange(TASKS) < 4)
-    twice = QP(
-        qp.cost,
-        jnp.concatenate([qp.rows, qp.rows[:, :1]], 1),
-        jnp.concatenate([qp.compliance, qp.compliance[:, :1]], 1),
-        *(jnp.concatenate([b, b[:, N : N + 1]], 1) for b in (qp.lower, qp.upper)),
-    )
+    lower, upper = (jnp.concatenate([b, b[:, N : N + 1]], 1) for b in (qp.lower, qp.upper))
+    rows, compliance = (jnp.concatenate([a, a[:, :1]], 1) for a in (qp.rows, qp.compliance))
+    twice = QP(qp.cost, rows, compliance, lower, upper)
     active = jnp.concatenate([cold.active, jnp.full((COUNT, 5), 2)], 1)
     assert not np.asarray(jax.jit(minimize_through_rows)(twice, active)[2]).any()
 
