@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 _SHARED = -1
@@ -133,8 +134,7 @@ class _Program:
         donated = [i for k in owner._donated for i in range(ends[k], ends[k + 1])]
         axes = [None if axis == _SHARED else axis for axis in self.axes]
 
-        def lane(*own: Any) -> Any:
-            return owner.function(*jax.tree.unflatten(structure, own))
+        lane = _making_empty_arrays(lambda *own: owner.function(*jax.tree.unflatten(structure, own)))
 
         # Checks of what varies over the mesh are off: loops inside the solvers begin with constants, which do not.
         mapped = jax.shard_map(
@@ -178,6 +178,25 @@ class _Program:
         for i, a in zip(away, there, strict=True):
             whole[i] = a
         return whole
+
+
+def _making_empty_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, which makes the arrays without entries that it is given or holds anew.
+
+    With jaxlib 0.11.2 such an array that comes into a ``shard_map`` from outside ends the process (a segmentation fault
+    of the Shardy partitioner, on every kind of device); a robot without geoms has some.
+    """
+
+    def anew(a: Any) -> Any:
+        return jnp.zeros(a.shape, a.dtype) if isinstance(a, (jax.Array, np.ndarray)) and a.size == 0 else a
+
+    def inside(*args: Any) -> Any:
+        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+        traced = ClosedJaxpr(traced.jaxpr, [anew(a) for a in traced.consts])
+        results = jaxpr_as_fun(traced)(*(anew(a) for a in args))
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
+
+    return inside
 
 
 def _flat_axes(in_axes: Any, args: tuple[Any, ...]) -> list[int]:
