@@ -210,8 +210,9 @@ def _flat_axes(in_axes: Any, args: tuple[Any, ...]) -> list[int]:
 
 def _is_there(leaf: Any, place: NamedSharding) -> bool:
     """Whether an array is where it is wanted."""
-    known = isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer)
-    return known and leaf.committed and leaf.sharding == place
+    if not isinstance(leaf, jax.Array) or isinstance(leaf, Tracer) or not leaf.committed:
+        return False
+    return leaf.sharding == place or leaf.sharding.is_equivalent_to(place, leaf.ndim)  # a spec has several spellings
 
 
 def moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:

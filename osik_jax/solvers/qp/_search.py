@@ -77,11 +77,11 @@ def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, m
     )
 
     if lanes == 1 or jax.default_backend() != "cpu" or not has_few_rows(qp):
-        return _search(qp, start, tolerance, max_iterations)
+        return _search(qp, start, tolerance, cap=max_iterations)
     looked = _first_look(qp, start, tolerance)
 
     def again(at: Array, found: Found) -> Found:
-        return _search(*jax.tree.map(lambda a: a[at], (qp, found, tolerance)), max_iterations)
+        return _search(*jax.tree.map(lambda a: a[at], (qp, found, tolerance)), cap=max_iterations)
 
     return with_the_rest(looked, looked.done, again, min(lanes, _FEW))
 
@@ -96,7 +96,7 @@ def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
     return choose(optimal, end, start)
 
 
-def _search(qp: QP, start: Found, tolerance: Float[Array, " B"], cap: int) -> Found:
+def _search(qp: QP, start: Found, tolerance: Float[Array, " B"], *, cap: int) -> Found:
     """Rounds of factoring, checking and pivoting, until every lane is done."""
     hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
 
