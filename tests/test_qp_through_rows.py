@@ -7,6 +7,7 @@ import pytest
 from problem_families import WHOLE_BODY, WHOLE_BODY_DAMPING, whole_body
 
 from osik_jax.solvers import Status, solve_least_squares_qp
+from osik_jax.solvers.qp import _search
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._factor import factorize, minimize_on
 from osik_jax.solvers.qp._problem import QP
@@ -57,6 +58,23 @@ def test_right_guesses_need_no_search(planted, cold):
         assert ((p.lower <= s.x) & (s.x <= p.upper)).all()
     assert (warm.iterations == 0).all()
     np.testing.assert_array_equal(warm.active, cold.active)
+
+
+def test_the_search_is_for_the_other_lanes(planted, monkeypatch):
+    data = list(planted[1])
+    data[2] = 1e-2 * data[2]
+    searched = solve(*data, np.zeros((COUNT, N), int))
+    wrong = np.arange(COUNT) % 5 == 2
+    guess = np.where(wrong[:, None], 0, searched.active)
+    monkeypatch.setattr(_search, "_search", lambda qp, start, tolerance, *, cap: start)
+
+    def lane(A, b, weight, lower, upper, damping, center, warm_start):  # a cap of its own, so compiled anew
+        more = dict(damping=damping, center=center, warm_start=warm_start, max_iterations=777)
+        return solve_least_squares_qp(A, b, weight, lower, upper, **more)
+
+    s = jax.jit(jax.vmap(lane))(*data, guess)
+    np.testing.assert_array_equal(s.status == Status.SOLVED, ~wrong)
+    np.testing.assert_allclose(s.x[~wrong], searched.x[~wrong], atol=1e-9)
 
 
 def test_batch_equals_one_by_one(planted, cold):

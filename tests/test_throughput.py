@@ -53,6 +53,7 @@ def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
         throughput.kept(other)
 
 
+@pytest.mark.slow
 def test_the_reference_is_the_rollout():
     """The carried tick is ``rollout``'s: errors after the checked ticks."""
     given = throughput.setting("arm7")
