@@ -73,7 +73,7 @@ class ShardedFunction:
     ):
         self.function, self.in_axes, self.mesh = function, in_axes, mesh
         self._donated = {donate_argnums} if isinstance(donate_argnums, int) else set(donate_argnums)
-        self._known: dict[tuple[Any, ...], _Program] = {}
+        self._known: dict[Any, _Program] = {}  # by the structure of the arguments
         functools.update_wrapper(self, function, updated=())
 
     def __call__(self, *args: Any) -> Any:
@@ -130,7 +130,7 @@ class _Program:
         names = owner.mesh.axis_names
         specs = [PartitionSpec(*[None] * axis, names) if axis != _SHARED else PartitionSpec() for axis in self.axes]
         self.places = [NamedSharding(owner.mesh, spec) for spec in specs]
-        ends = np.cumsum([0, *(len(jax.tree.leaves(argument)) for argument in args)])
+        ends = np.cumsum([0, *(argument.num_leaves for argument in structure.children())])
         donated = [i for k in owner._donated for i in range(ends[k], ends[k + 1])]
         axes = [None if axis == _SHARED else axis for axis in self.axes]
 
@@ -226,7 +226,7 @@ def moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:
 
 def _filled(a: Any, axis: int, missing: int) -> Any:
     """With the last lane repeated."""
-    if axis == _SHARED or not missing:
+    if axis == _SHARED:
         return a
     xp = np if isinstance(a, np.ndarray) else jnp
     last = xp.take(a, xp.asarray([a.shape[axis] - 1]), axis=axis)

@@ -44,7 +44,8 @@ class QPSolution(eqx.Module):
         x: the minimiser; inside its box exactly, whatever the status. (n,)
         status: a ``Status`` code.
         iterations: constraints added to or dropped from the active set.
-        factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search.
+        factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search. A
+            first try through the rows that comes to nothing is not counted.
         kkt_residual: the largest of: stationarity (infinity norm), violated rows, multipliers of the wrong sign.
         slack: of the rows, C x minus the nearest point of its interval; 0 for a row that holds. (p,)
         multipliers: of the box: gradient of the cost = multipliers + C' row_multipliers; positive at a lower bound,

@@ -1,7 +1,8 @@
 """Active set found and certified: guess, factor, check; where the check fails, pivot on from there, and again.
 
-The guess is the warm start, or no active bound at all; where it is right, one factorisation is all there is. The
-answer always comes from a fresh factorisation at the final active set, never from the tableau that found it.
+The guess is the warm start, or no active bound at all; where it is right, one factorisation is all there is. In a batch
+on a CPU a problem of few rows tries it through a system of their size first. The answer always comes from a fresh
+factorisation at the final active set, never from the tableau that found it.
 """
 
 from __future__ import annotations
