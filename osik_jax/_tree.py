@@ -126,6 +126,12 @@ class KinematicTree:
         return sum(DOF_WIDTH[self.joint_types[j]] for j in self.independent)
 
     @cached_property
+    def turning(self) -> np.ndarray:
+        """Entries of v that turn something; the others, of slides and a base's translation, bend no path. (nv,), bool."""
+        parts = {FREE: [False] * 3 + [True] * 3, BALL: [True] * 3, SLIDE: [False], HINGE: [True]}
+        return np.array([turns for j in self.independent for turns in parts[self.joint_types[j]]], bool)
+
+    @cached_property
     def qpos_source(self) -> tuple[np.ndarray, np.ndarray]:
         """``(index, coefficient)``: full qpos = coefficient * q[index] + offset (coefficient 0 where locked)."""
         n = int(self.full_qpos_address[-1])

@@ -334,6 +334,7 @@ def _velocity_problem(
         position_upper=jnp.where(scalar, high, jnp.inf),
         hard=tuple(name for name, task in tasks.items() if task.hard),
         limit_rows=limit_rows(robot, kinematics, q, limits, dt),
+        dt=jnp.asarray(dt, lower.dtype),
     )
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from ..solvers import WorkingSet, solve_hqp
-from ._scheme import Scheme, SchemeAnswer, VelocityProblem, status_with
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
 
 class HierarchicalQP(Scheme):
@@ -17,10 +19,18 @@ class HierarchicalQP(Scheme):
     Equality and inequality tasks may stand at any level; weights trade off tasks of the same priority. Where a level
     cannot be met it is missed by as little as possible, and the levels below use what freedom is left.
 
+    A priority with damping minimises its squared residuals and damping |v|^2 together; what its rows reach is kept by
+    those below it, the freedom that they leave is not damped away.
+
     Attributes:
+        damping: of the velocity at each priority, in the units of weight times J^2; >= 0.
+        curvature_damping: kappa, the share of what each priority's linear model leaves out that is added to its
+            damping; 0 for none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         max_iterations: cap on the active-set iterations of one level (static).
     """
 
+    damping: Float[Array, ""] = eqx.field(default=0.0, converter=as_leaf("damping"), kw_only=True)
+    curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
     max_iterations: int | None = eqx.field(default=None, static=True)
 
     def solve(self, problem: VelocityProblem, warm_start: WorkingSet | None = None) -> SchemeAnswer:
@@ -30,6 +40,7 @@ class HierarchicalQP(Scheme):
             problem.levels(constraints),
             problem.lower,
             problem.upper,
+            damping=self._damping(problem, hard=constraints is not None),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
         )
@@ -44,3 +55,9 @@ class HierarchicalQP(Scheme):
             answer.kkt_residual,
             answer.warm_start,
         )
+
+    def _damping(self, problem: VelocityProblem, *, hard: bool) -> list[Float[Array, ""]]:
+        """Of each level: none of the constraints, which damping would let off a part of what they ask."""
+        bends = [self.curvature_damping * problem.curvature(names) for names in problem.by_priority()]
+        own = [self.damping + bend for bend in bends]
+        return [jnp.zeros_like(self.damping), *own] if hard else own

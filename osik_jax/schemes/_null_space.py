@@ -36,6 +36,8 @@ class NullSpace(Scheme):
         order: "forward" or "reverse" (static).
         saturate: whether the limits are hard (static); needs the forward order.
         damping: of each priority's motion: s / (s^2 + damping) stands for 1 / s; 0 allowed.
+        curvature_damping: kappa, the share of what each priority's linear model leaves out that is added to its
+            damping; 0 for none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         potential_gain: alpha [rad^2/s]; 0 turns the potential off. It needs a ``ConfigurationLimit`` among the limits.
         margin: joints are taken to be at least this share of their range away from either limit.
         rank_tolerance: singular values under this share of the size (Frobenius norm) of a level's weighted rows count
@@ -45,6 +47,7 @@ class NullSpace(Scheme):
     order: Literal["forward", "reverse"] = eqx.field(default="forward", static=True, kw_only=True)
     saturate: bool = eqx.field(default=False, static=True, kw_only=True)
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
+    curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
     potential_gain: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("potential_gain"))
     margin: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("margin"))
     rank_tolerance: Float[Array, ""] = eqx.field(default=1e-5, converter=as_leaf("rank_tolerance"))
@@ -69,7 +72,7 @@ class NullSpace(Scheme):
             *((problem.lower, problem.upper) if self.saturate else ()),
             order=self.order,
             secondary=descent,
-            damping=self.damping if constraints is None else _exact_first(self.damping, len(levels)),
+            damping=self._damping(problem, constraints),
             rank_tolerance=self.rank_tolerance,
         )
         status = answer.status
@@ -82,15 +85,16 @@ class NullSpace(Scheme):
         gradient = first.matrix.T @ first.distance(answer.x)
         return SchemeAnswer(answer.x, status, count, count, jnp.max(jnp.abs(gradient)))
 
+    def _damping(self, problem: VelocityProblem, constraints: Level | None) -> list[Array]:
+        """Of each level: none of the constraints, which damping would let off a part of what they ask."""
+        bends = [self.curvature_damping * problem.curvature(names) for names in problem.by_priority()]
+        own = [self.damping + bend for bend in bends]
+        return own if constraints is None else [jnp.zeros_like(self.damping), *own]
+
     def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
         """Where the first level begins: an inequality row that holds there takes no part in it."""
         nowhere = jnp.zeros_like(problem.position)
         return jnp.clip(nowhere, problem.lower, problem.upper) if self.saturate else nowhere
-
-
-def _exact_first(damping: Float[Array, ""], levels: int) -> list[Array]:
-    """Of each level: none of the constraints, which damping would let off a part of what they ask."""
-    return [jnp.zeros_like(damping)] + [damping] * (levels - 1)
 
 
 def _first_residual(first: Level, answer: NullSpaceSolution, problem: VelocityProblem) -> Float[Array, ""]:

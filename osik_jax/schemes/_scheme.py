@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -36,6 +36,7 @@ class VelocityProblem(eqx.Module):
         position_upper: likewise, inf where free. (nv,)
         hard: names of the tasks that are constraints (static).
         limit_rows: of the limits that are no box, all together; None where there are none.
+        dt: time of the tick [s].
     """
 
     rows: dict[str, TaskRows]
@@ -47,6 +48,7 @@ class VelocityProblem(eqx.Module):
     position_upper: Float[Array, " nv"]
     hard: tuple[str, ...] = eqx.field(default=(), static=True)
     limit_rows: LimitRows | None = None
+    dt: Float[Array, ""] = eqx.field(default=0.0, converter=jnp.asarray)
 
     def soft(self) -> dict[str, TaskRows]:
         """Rows of the tasks that are no constraints."""
@@ -56,6 +58,13 @@ class VelocityProblem(eqx.Module):
         """Names of the tasks of each priority, most important first; without those that are constraints."""
         ranked = [(name, rank) for name, rank in self.priorities if name not in self.hard]
         return [[name for name, own in ranked if own == rank] for rank in sorted({rank for _, rank in ranked})]
+
+    def curvature(self, names: Iterable[str]) -> Float[Array, ""]:
+        """Damping of the velocity that makes up for what the linear model of these tasks leaves out.
+
+        A tick leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``.
+        """
+        return self.dt * sum((self.rows[name].curvature for name in names), jnp.zeros((), self.lower.dtype))
 
     def level(self, names: Sequence[str]) -> Level:
         """The rows of some tasks as one level."""

@@ -26,10 +26,13 @@ class WeightedQP(Scheme):
 
     Attributes:
         damping: of the velocity, in the units of weight times J^2; > 0.
+        curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
+            none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         max_iterations: cap on changes of the active set (static).
     """
 
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
+    curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
     max_iterations: int | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
@@ -41,12 +44,13 @@ class WeightedQP(Scheme):
         """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
+        damping = self.damping + self.curvature_damping * problem.curvature(problem.soft())
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
             problem.upper,
             **_rows(intervals, problem.constraints()),
-            **_pulls([rows for rows in equalities if rows.dofs is not None], problem, self.damping),
+            **_pulls([rows for rows in equalities if rows.dofs is not None], problem, damping),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
         )

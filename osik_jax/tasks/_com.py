@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..kinematics import Kinematics, center_of_mass, com_jacobian
 from ..robot import Robot
+from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, home_kinematics
 from ._polygon import SupportPolygon
@@ -95,8 +98,9 @@ class ComTask(Task):
         del q
         point = center_of_mass(robot, kinematics, self.subtree)
         jacobian = com_jacobian(robot, kinematics, self.subtree)
+        bend = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
         if self.polygon is not None:
-            return self._polygon_rows(self.polygon, point, jacobian)
+            return self._polygon_rows(self.polygon, point, jacobian, bend)
         axes = np.array(["xyz".index(axis) for axis in self.axes])
         value = point[axes] if self.target is None else point[axes] - self.target
         return task_rows(
@@ -107,9 +111,12 @@ class ComTask(Task):
             lower=self.lower,
             upper=self.upper,
             feedforward=self.target_velocity,
+            curvature=bend,
         )
 
-    def _polygon_rows(self, polygon: SupportPolygon, point: Array, jacobian: Array) -> TaskRows:
+    def _polygon_rows(
+        self, polygon: SupportPolygon, point: Array, jacobian: Array, bend: Callable[[Array], Array]
+    ) -> TaskRows:
         value = jnp.matmul(polygon.normals, point[:2], precision="highest")
         return task_rows(
             value,
@@ -118,6 +125,7 @@ class ComTask(Task):
             upper=polygon.offsets,
             gain=self.gain,
             weight=jnp.broadcast_to(self.weight, value.shape),
+            curvature=bend,
         )
 
     def _along_axes(self, value: Any, what: str) -> Float[Array, " m"]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..kinematics._rigid import cross
 from ..robot import Robot
+from ._curvature import jacobian_curvature, pose_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import Pose, as_pose, as_scalar, as_vector, home_kinematics
 from ._plane import PlaneTask, as_normal, as_offset, plane_axes
@@ -111,14 +112,20 @@ class ContactTask(PlaneTask):
         turn, axes = rotations[0], plane_axes(self.normal)
         arm = dot(turn, self.point)
         linear = jacobians[0, :3] + cross(jacobians[0, 3:], arm[:, None], along=-2)
-        error, jacobian = self._place(positions[0] + arm, axes), dot(axes, linear)
-        if self.sliding:
-            error, jacobian = error[2:], jacobian[2:]
+        moves = jnp.concatenate([linear, jacobians[0, 3:]])
+        held = axes[2:] if self.sliding else axes
+        error, jacobian = self._place(positions[0] + arm, axes)[3 - len(held) :], dot(held, linear)
         if self.axis is not None:
             tilt, spin = self._tilt(self.axis, turn, axes)
             error, jacobian = jnp.concatenate([error, tilt]), jnp.concatenate([jacobian, dot(spin, jacobians[0, 3:])])
+
+        def bend(pull: Float[Array, " m"]) -> Float[Array, ""]:
+            force, tilts = pull[: len(held)], pull[len(held) :]
+            bent = pose_curvature(dot(force, held), jnp.zeros(3, pull.dtype), moves)
+            return bent + jacobian_curvature(tilts, jacobians[0, 3:])
+
         weight = jnp.broadcast_to(self.weight, error.shape)
-        return task_rows(error, jacobian, gain=self.gain, weight=weight)
+        return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bend)
 
     def _place(self, point: Float[Array, "3"], axes: Float[Array, "3 3"]) -> Float[Array, "3"]:
         """Along the plane from the anchor, and above the plane."""

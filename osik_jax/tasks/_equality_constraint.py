@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from ..kinematics import Kinematics, frame_jacobians
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
 from ..robot import Robot
+from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_scalar
 from ._rotation import cross_matrix
@@ -112,7 +114,9 @@ class EqualityConstraintTask(Task):
         by_kind = {"joint": iter(self._joint_rows(robot, q)), **self._spatial_rows(robot, kinematics)}
         parts = [next(by_kind[constraint.kind]) for constraint in self.constraints]
         error, jacobian = (jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        return task_rows(error, jacobian, gain=self.gain, weight=jnp.broadcast_to(self.weight, error.shape))
+        weight = jnp.broadcast_to(self.weight, error.shape)
+        bend = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
+        return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bend)
 
     def _spatial_rows(self, robot: Robot, kinematics: Kinematics) -> dict[str, Any]:
         """Of connects, and of welds."""

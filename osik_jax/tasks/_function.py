@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Self
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from .._structure import Static, put_together, taken_apart
 from ..kinematics import Kinematics, forward_kinematics, integrate
 from ..kinematics._rates import kinematics_rates
 from ..robot import Robot
+from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
@@ -118,6 +120,7 @@ class FunctionTask(Task):
             lower=self.lower,
             upper=self.upper,
             feedforward=self.target_velocity,
+            curvature=partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0)),
         )
 
     def replace(self, **changes: Any) -> Self:

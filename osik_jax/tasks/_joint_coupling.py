@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from .._joint_selection import concrete, is_scalar, select_joints
 from ..kinematics import Kinematics
 from ..robot import Robot
+from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
 from ._rotation import dot
@@ -96,6 +97,7 @@ class JointCouplingTask(Task):
             lower=self.lower,
             upper=self.upper,
             feedforward=self.target_velocity,
+            curvature=no_curvature,
         )
 
     def _check(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..robot import Robot
+from ._curvature import jacobian_curvature
 from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain, safe_norm
 from ._leaves import as_scalar, as_vector, concrete
@@ -101,6 +103,7 @@ class PointingTask(FramedTask):
             lower=None if upper is None else jnp.full_like(upper, -jnp.inf),
             upper=upper,
             feedforward=-dot(slope, drift),
+            curvature=partial(jacobian_curvature, jacobian=jacobian),
         )
 
     def _convert(self, name: str, value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from .._tree import unknown_name
 from ..robot import Robot
+from ._curvature import pose_curvature
 from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import Pose, as_bounds, as_pose, as_scalar, as_vector, check_bounds, check_not_negative
@@ -108,7 +110,18 @@ class PoseTask(FramedTask):
             lower=self.lower,
             upper=self.upper,
             feedforward=feedforward,
+            curvature=partial(self._curvature, rotation=rotation, jacobian=jacobian),
         )
+
+    def _curvature(
+        self, pull: Float[Array, " m"], rotation: Float[Array, "3 3"], jacobian: Float[Array, "6 nv"]
+    ) -> Float[Array, ""]:
+        """From the weighted pull of the rows that are kept."""
+        whole = jnp.zeros(6, pull.dtype).at[np.flatnonzero(self.kept)].set(pull)
+        force, torque = whole[:3], whole[3:]
+        if self.axes == "frame":
+            force, torque = dot(rotation, force), dot(rotation, torque)
+        return pose_curvature(force, torque, jacobian)
 
     def _position_outside(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
         del rotation

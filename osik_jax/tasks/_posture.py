@@ -15,6 +15,7 @@ from .._joint_selection import dofs_of, is_scalar, select_all
 from .._tree import BALL, DOF_WIDTH, FREE
 from ..kinematics import Kinematics, difference
 from ..robot import Robot
+from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
 from ._rotation import inverse_left_jacobian
@@ -105,6 +106,7 @@ class PostureTask(Task):
             upper=self.upper,
             feedforward=feedforward,
             dofs=tuple(dofs) if self._adds(robot) else None,
+            curvature=no_curvature,
         )
 
     def _adds(self, robot: Robot) -> bool:

@@ -61,5 +61,5 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
     rows = jax.vmap(type(first).rows_at)(together, *by_task)
     apart = [jax.tree.map(lambda a, i=i: a[i], rows) for i in np.arange(len(tasks))]
     if not first.bounded:  # what makes an equality: one array for both bounds
-        apart = [TaskRows(one.error, one.jacobian, one.lower, one.lower, one.weight) for one in apart]
+        apart = [dataclasses.replace(one, upper=one.lower) for one in apart]
     return dict(zip(tasks, apart, strict=True))

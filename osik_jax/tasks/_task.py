@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Self
 
 import equinox as eqx
@@ -12,6 +14,7 @@ from jaxtyping import Array, Float
 
 from ..kinematics import Kinematics
 from ..robot import Robot
+from ._curvature import jacobian_curvature, no_curvature
 from ._gain import Gain, as_gain, evaluate_gain
 from ._leaves import as_scalar, as_vector
 
@@ -28,6 +31,9 @@ class TaskRows(eqx.Module):
         lower: bound on ``jacobian @ v``. Equality: ``-gain e + x*'``; inequality: ``gain (lower - x) + x*'``. (m,)
         upper: the same as ``lower`` for an equality; inequality: ``gain (upper - x) + x*'``. (m,)
         weight: of the square of each row's residual. (m,)
+        curvature: bound on the second derivative of the task's error along its own pull, ``|sum_i weight_i gain e_i
+            grad^2 e_i|``: times dt, the damping that the schemes add for it (``_curvature.py``). 0 where the task is
+            met, or linear in the joints. ()
         dofs: where each row asks for one dof's velocity as it is, those dofs (static): ``jacobian`` is then those rows
             of the identity, which a scheme may use to save work. None elsewhere.
     """
@@ -37,6 +43,7 @@ class TaskRows(eqx.Module):
     lower: Float[Array, " m"]
     upper: Float[Array, " m"]
     weight: Float[Array, " m"]
+    curvature: Float[Array, ""] = eqx.field(default=0.0, converter=jnp.asarray)
     dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
 
     @property
@@ -136,6 +143,7 @@ def task_rows(
     upper: Float[Array, " m"] | None = None,
     feedforward: Float[Array, " m"] | None = None,
     dofs: tuple[int, ...] | None = None,
+    curvature: Callable[[Float[Array, " m"]], Float[Array, ""]] | None = None,
 ) -> TaskRows:
     """The rows of an equality task, or with bounds of an inequality task on ``error``: what ``Task.rows`` returns.
 
@@ -143,15 +151,19 @@ def task_rows(
     jacobian v <= gain (upper - error) + feedforward``; infinite bounds stay infinite, and an adaptive gain is evaluated
     at the distance of the value to the interval, 0 inside. Rows of weight 0 do not count for the gain. ``dofs``: see
     ``TaskRows``.
+
+    ``curvature`` maps the weighted pull ``weight gain e`` (m,) to the bound that ``TaskRows.curvature`` holds; default:
+    the pull's length times the size of the Jacobian, which is above what a chain of hinges can bend.
     """
     shift = jnp.zeros_like(error) if feedforward is None else feedforward
+    bend = curvature or (no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian))
     if lower is None or upper is None:
-        wanted = shift - evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
-        return TaskRows(error, jacobian, wanted, wanted, weight, dofs)
-    outside = jnp.maximum(lower - error, 0.0) + jnp.maximum(error - upper, 0.0)
+        pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
+        return TaskRows(error, jacobian, shift - pull, shift - pull, weight, bend(weight * pull), dofs)
+    outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
     rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
     low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
-    return TaskRows(error, jacobian, low, high, weight, dofs)
+    return TaskRows(error, jacobian, low, high, weight, bend(weight * rate * outside), dofs)
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..kinematics._rigid import cross
 from ..robot import Robot
+from ._curvature import pose_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_scalar, as_vector, check_not_negative
 from ._plane import PlaneTask, as_normal, as_offset
@@ -98,7 +99,12 @@ class WheelTask(PlaneTask):
         height = dot(self.normal, positions[0] + spoke) - self.offset
         error = jnp.zeros(len(directions), height.dtype).at[-1].set(height)
         weight = jnp.broadcast_to(self.weight, error.shape)
-        return task_rows(error, dot(directions, touching), gain=self.gain, weight=weight)
+        moves = jnp.concatenate([touching, jacobians[0, 3:]])
+
+        def bend(pull: Float[Array, " m"]) -> Float[Array, ""]:
+            return pose_curvature(dot(pull, directions), jnp.zeros(3, pull.dtype), moves)
+
+        return task_rows(error, dot(directions, touching), gain=self.gain, weight=weight, curvature=bend)
 
     def _held(self, ahead: Float[Array, "3"]) -> Float[Array, "m 3"]:
         """Directions along the plane in which the wheel does not slip."""

@@ -131,6 +131,7 @@ def _task(layout: Layout, k: Int[Array, ""], stack: Stack, level: Level, cascade
     bounded = jnp.isfinite(cascade.lower) | jnp.isfinite(cascade.upper)
     return Task(
         level=level,
+        damping=stack.damping[k],
         equal=stack.equal[k],
         matrix=stack.hard,
         lower=cascade.lower,
@@ -240,12 +241,13 @@ def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Toleranc
     n, level = len(task.x), task.level
     value = apply(level.matrix, end.x)
     slack = value - jnp.clip(value, level.lower, level.upper)
-    small = tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + jnp.sqrt(jnp.sum(slack**2)))
-    counts = task.equal | (jnp.abs(slack) > small)
-    gradient = apply(level.matrix.T, jnp.where(counts, slack, 0.0))
+    missing = task.missing(end.x, slack)
+    counts = task.equal | (jnp.abs(slack) > tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + missing))
+    gradient = task.gradient(end.x, jnp.where(counts, slack, 0.0))
     pressure = jnp.abs(end.multiplier) * task.length
-    floor = tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + noise(level, end.x, slack, tolerances)
-    tight = (end.side != 0) & (pressure > floor)
+    floor = tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + noise(task, end.x, slack, tolerances)
+    # a force that the damping explains leaves the levels below room on the face that the level has reached
+    tight = (end.side != 0) & (pressure > floor + task.damping * jnp.sqrt(jnp.sum(end.x**2)))
     rows = jnp.argsort(~tight, stable=True)[:n]
     length = jnp.where(tight, task.length, 1.0)[rows]
     to_freeze = jnp.concatenate(
@@ -274,14 +276,16 @@ def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Toleranc
     own = jnp.where(task.equal, 2, missed).astype(jnp.int32)
     # rows held without a multiplier decide nothing, unless more of the level would count without them (a tie)
     tie = same & (rank - bounds != end.rank)
-    decision = Decision(jnp.where(tight | tie, end.side, 0), missed, jnp.where(tie, end.rank, rank - bounds))
+    kept = jnp.where(tight | tie, end.side, 0)
+    rank = jnp.where(tie, end.rank, rank - bounds)
+    decision = Decision(jnp.where(task.damping > 0.0, end.side, kept), kept, missed, rank)
     return after, (decision, WorkingSet(end.side, own), end.multiplier, jnp.sqrt(jnp.sum(slack**2)))
 
 
 def _skip(cascade: _Cascade, task: Task) -> tuple[_Cascade, _Outcome]:
     """A level that finds no freedom decides nothing."""
     none, own = jnp.zeros_like(cascade.side), jnp.zeros(task.level.lower.shape, jnp.int32)
-    decision = Decision(none, own, jnp.zeros_like(cascade.iterations))
+    decision = Decision(none, none, own, jnp.zeros_like(cascade.iterations))
     anything = jnp.full_like(cascade.residual, jnp.inf)  # x has stopped moving
     return cascade, (decision, WorkingSet(none, own), jnp.zeros_like(cascade.lower), anything)
 

@@ -46,15 +46,15 @@ def land(task: Task, x: Float[Array, " n"], working: WorkingSet, tolerances: Tol
     side = jnp.zeros_like(working.hard).at[held.rows].set(jnp.where(held.valid, working.hard[held.rows], 0))
     counts = working.own != 0
     goal = jnp.where(counts, jnp.where(working.own == 1, level.upper, level.lower), 0.0)
-    descend, rank = least_squares(level, counts, held, tolerances)
+    descend, rank = least_squares(task, counts, held, tolerances)
     for _ in range(_ROUNDS):
         x = x + apply(task.projector, restoring_step(task, held, side, x))
-        x = x + apply(task.projector, descend(jnp.where(counts, apply(level.matrix, x) - goal, 0.0)))
+        x = x + apply(task.projector, descend(x, jnp.where(counts, apply(level.matrix, x) - goal, 0.0)))
     slack = jnp.where(counts, apply(level.matrix, x) - goal, 0.0)
-    gradient = apply(level.matrix.T, slack)
+    gradient = task.gradient(x, slack)
     multiplier = multipliers(task, held, -apply(task.projector, gradient))
     feasible = _feasible(task, side, x, tolerances) & jnp.isfinite(x).all()
-    signs = ~jnp.any(wrong_signs(task, side, multiplier, gradient, noise(level, x, slack, tolerances), tolerances))
+    signs = ~jnp.any(wrong_signs(task, side, multiplier, gradient, noise(task, x, slack, tolerances), tolerances))
     return Landing(
         x=x,
         side=side,
@@ -83,23 +83,28 @@ def nothing_landed(task: Task) -> Landing:
 
 
 def least_squares(
-    level: Level, counts: Bool[Array, " m"], held: Held, tolerances: Tolerances
-) -> tuple[Callable[[Float[Array, " m"]], Float[Array, " n"]], Int[Array, ""]]:
-    """From a slack, the step that makes |A step + slack| least over the rows that count and moves no held row.
+    task: Task, counts: Bool[Array, " m"], held: Held, tolerances: Tolerances
+) -> tuple[Callable[[Float[Array, " n"], Float[Array, " m"]], Float[Array, " n"]], Int[Array, ""]]:
+    """From x and its slack, the step z that makes the level's cost least and moves no held row.
 
-    And the rank of those rows among such steps.
+    And the rank of the rows that count among such steps. With C those rows in the null space of the held ones and
+    ``C' = Q R`` by pivoted QR, the cost ``|A (x + z) + ...|^2 + damping |x + z|^2`` over ``z = Q y - P x`` is a least
+    squares of the size of R: ``[R'; sqrt(damping) I] y = [goal; 0]``. Without damping, what no row moves stays.
     """
-    n = held.projector.shape[0]
+    level, damping = task.level, task.damping
     rows = jnp.where(counts[:, None], product(level.matrix, held.projector), 0.0)
-    basis, triangle, order = jax.scipy.linalg.qr(rows, mode="economic", pivoting=True)
-    k = min(rows.shape)
+    basis, triangle, order = jax.scipy.linalg.qr(rows.T, mode="economic", pivoting=True)
     keep = jnp.abs(jnp.diagonal(triangle)) > tolerances.rank * level.size
-    square = jnp.where(keep[:, None] & keep[None, :], triangle[:, :k], jnp.eye(k, dtype=rows.dtype))
+    small = jnp.where(keep[:, None], triangle, 0.0).T
+    damped = jnp.concatenate([small, jnp.diag(jnp.where(keep, jnp.sqrt(damping), 1.0))])
+    left, square = jnp.linalg.qr(jax.lax.optimization_barrier(damped))
+    left = left[: small.shape[0]]
 
-    def step(slack: Float[Array, " m"]) -> Float[Array, " n"]:
-        right = jnp.where(keep, -apply(basis.T, slack), 0.0)
-        out = jnp.zeros(n, rows.dtype).at[order[:k]].set(jax.scipy.linalg.solve_triangular(square, right))
-        return apply(held.projector, out)
+    def step(x: Float[Array, " n"], slack: Float[Array, " m"]) -> Float[Array, " n"]:
+        present = jnp.where(damping > 0.0, apply(held.projector, x), 0.0)
+        goal = apply(rows, present) - slack
+        y = jax.scipy.linalg.solve_triangular(square, apply(left.T, goal[order]))
+        return apply(basis, jnp.where(keep, y, 0.0)) - present
 
     return step, jnp.sum(keep, dtype=jnp.int32)
 
@@ -117,16 +122,16 @@ def wrong_signs(
     return (side != 0) & (pressure < -tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) - floor)
 
 
-def noise(level: Level, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances) -> Float[Array, ""]:
+def noise(task: Task, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances) -> Float[Array, ""]:
     """Slopes of the level's cost under this are rounding."""
-    return level.size * rounding(level.size, x, slack, tolerances)
+    return task.size * rounding(task, x, slack, tolerances)
 
 
 def rounding(
-    scale: Float[Array, ""], x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances
+    task: Task, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances
 ) -> Float[Array, ""]:
     """Changes of the level's rows under this are noise."""
-    return tolerances.step * (scale * jnp.max(jnp.abs(x)) + jnp.sqrt(jnp.sum(slack**2)))
+    return tolerances.step * (task.size * jnp.max(jnp.abs(x)) + task.missing(x, slack))
 
 
 def _feasible(task: Task, side: Int[Array, " h"], x: Float[Array, " n"], tolerances: Tolerances) -> Bool[Array, ""]:

@@ -57,12 +57,12 @@ def solve_level(task: Task, start: LevelState, tolerances: Tolerances, max_itera
         slack = value - jnp.clip(value, level.lower, level.upper)
         counts = (slack != 0.0) | task.equal
         held = jax.lax.optimization_barrier(hold(task, s.side, tolerances.rank))
-        descend, rank = least_squares(level, counts, held, tolerances)
-        step = apply(task.projector, descend(slack))
+        descend, rank = least_squares(task, counts, held, tolerances)
+        step = apply(task.projector, descend(s.x, slack))
         change = jnp.where(counts, apply(level.matrix, step), 0.0)
-        floor = rounding(level.size, s.x, slack, tolerances)
-        still = jnp.sqrt(jnp.sum(change**2)) <= floor
-        at_rest = _drop(task, s, apply(level.matrix.T, slack), floor * level.size, held, tolerances)
+        floor = rounding(task, s.x, slack, tolerances)
+        still = task.missing(step, change) <= floor
+        at_rest = _drop(task, s, task.gradient(s.x, slack), floor * task.size, held, tolerances)
         moved = _advance(task, s, step, tolerances)
         out = jax.tree.map(lambda a, b: jnp.where(still, a, b), at_rest, moved)
         return out._replace(counts=counts, rank=rank, iterations=s.iterations + 1)
@@ -105,7 +105,8 @@ def _advance(task: Task, s: LevelState, step: Float[Array, " n"], tolerances: To
     safe = jnp.where(towards, rate, 1.0)
     times = jnp.where(towards, jnp.maximum(jnp.where(towards, bound - value, jnp.inf) / safe, 0.0), jnp.inf)
     limit = jnp.min(times, initial=jnp.inf)
-    ideal = _line_search(apply(level.matrix, s.x), apply(level.matrix, step), level.lower, level.upper)
+    along = task.damping * jnp.stack([jnp.sum(s.x * step), jnp.sum(step**2)])
+    ideal = _line_search(apply(level.matrix, s.x), apply(level.matrix, step), level.lower, level.upper, along)
     blocked = limit <= ideal
     length = jnp.minimum(limit, ideal)
     first = first_smallest(times)  # the least index among ties
@@ -115,8 +116,13 @@ def _advance(task: Task, s: LevelState, step: Float[Array, " n"], tolerances: To
     return s._replace(x=x, side=side, stalled=stalled)
 
 
-def _line_search(value: Array, rate: Array, lower: Array, upper: Array) -> Float[Array, ""]:
-    """Exact minimiser t >= 0 of |dist(value + t rate, [lower, upper])|^2, a convex piecewise quadratic."""
+def _line_search(
+    value: Array, rate: Array, lower: Array, upper: Array, along: Float[Array, "2"]
+) -> Float[Array, ""]:
+    """Exact minimiser t >= 0 of 1/2 |dist(value + t rate, [lower, upper])|^2 + along_0 t + 1/2 along_1 t^2.
+
+    That is a convex piecewise quadratic, along the damping's part of it.
+    """
     moving = rate != 0.0
     safe = jnp.where(moving, rate, 1.0)
     ends = [
@@ -127,7 +133,7 @@ def _line_search(value: Array, rate: Array, lower: Array, upper: Array) -> Float
 
     def slope(t: Array) -> Array:
         at = value + t * rate
-        return jnp.sum(rate * (at - jnp.clip(at, lower, upper)))
+        return jnp.sum(rate * (at - jnp.clip(at, lower, upper))) + along[0] + t * along[1]
 
     slopes = jax.vmap(slope)(knots)
     before = jnp.max(jnp.where(slopes < 0.0, knots, 0.0), initial=0.0)

@@ -1,6 +1,6 @@
 """A proposal for the working set of a level: the dual method on the level made strictly convex by a little damping.
 
-    min 1/2 |A_e d + r|^2 + damping/2 |d|^2 + 1/2 |t|^2
+    min 1/2 |A_e d + r|^2 + 1/2 damping |x + d|^2 + 1/2 little |d|^2 + 1/2 |t|^2
 
 over d in the frozen rows' null space, with the hard rows kept and the level's inequality rows held up to t.
 Its tableau over the rows alone costs one factorisation, and each change of the working set one rank-1 update. What it
@@ -19,6 +19,7 @@ from ._problem import WorkingSet
 from ._stack import Task
 
 _DAMPING = 1e-9
+"""Of the level, whatever its own: the tableau needs some."""
 _NOISE = 1e-10
 
 
@@ -34,14 +35,16 @@ def propose(
 
 def _tableau(task: Task) -> tuple[Limits, Float[Array, " h"], Dual]:
     level, x, dtype = task.level, task.x, task.x.dtype
-    scale = 1.0 / jnp.where(level.size > 0.0, level.size, 1.0)
+    scale = 1.0 / jnp.where(task.size > 0.0, task.size, 1.0)
+    damping = task.damping * scale**2
     cost = jnp.where(task.equal[:, None], product(level.matrix * scale, task.projector), 0.0)
     residual = scale * jnp.where(task.equal, apply(level.matrix, x) - jnp.where(task.equal, level.lower, 0.0), 0.0)
-    hessian = product(cost.T, cost) + _DAMPING * jnp.eye(len(x), dtype=dtype)
+    hessian = product(cost.T, cost) + (damping + _DAMPING) * jnp.eye(len(x), dtype=dtype)
     factor = jax.lax.linalg.cholesky(hessian, symmetrize_input=False)
     unit = jnp.where(task.own, scale, 1.0)  # the rows of the level in the units of its cost
     rows = product(task.matrix * unit[:, None], task.projector)
-    right = jnp.concatenate([rows.T, apply(cost.T, residual)[:, None]], 1)
+    downhill = apply(cost.T, residual) + damping * apply(task.projector, x)
+    right = jnp.concatenate([rows.T, downhill[:, None]], 1)
     half = jax.scipy.linalg.solve_triangular(factor, right, lower=True)
     half, slope = half[:, :-1], half[:, -1]
     tableau = product(half.T, half) + jnp.diag(task.soft.astype(dtype))

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from ..._rules import custom_jvp
 from .._dense import apply, product
-from .._inverses import row_space_and_motion_of_rank
+from .._inverses import row_space_and_motion, row_space_and_motion_of_rank
 from ._problem import Level
 from ._stack import Stack
 
@@ -24,7 +24,8 @@ from ._stack import Stack
 class Decision(NamedTuple):
     """What one level decided: 0 for rows without a part in it, -1 at the lower bound, 1 at the upper."""
 
-    tight: Int[Array, " h"]  # hard rows that stop the level at a bound
+    held: Int[Array, " h"]  # hard rows that stop the level at a bound
+    tight: Int[Array, " h"]  # of these, those that stop the levels below too
     counts: Int[Array, " m"]  # the level's own rows that count in its cost
     rank: Int[Array, ""]  # of the rows that count, within what frozen and tight rows leave free
 
@@ -55,13 +56,18 @@ def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, "
     hard = (stack.hard, stack.hard_lower, stack.hard_upper)
     pinned = stack.hard_equal[:n]
 
-    def descend(state: tuple[Array, Array], now: tuple[Decision, Level]) -> tuple[tuple[Array, Array], None]:
-        decision, level = now
-        state = _block(*_independent(*hard, decision.tight), n, *state, nothing)
-        return _block(level.matrix, level.lower, level.upper, decision.counts, decision.rank, *state, nothing), None
+    def descend(state: tuple[Array, Array], now: tuple[Decision, Level, Array]) -> tuple[tuple[Array, Array], None]:
+        decision, level, damping = now
+        x, projector = state
+        x, held = _block(*_independent(*hard, decision.held), n, x, projector, nothing)
+        _, left = _block(*_independent(*hard, decision.tight), n, x, projector, nothing)
+        own = level.matrix, level.lower, level.upper, decision.counts, decision.rank
+        x, _ = _block(*own, x, held, nothing, damping)
+        _, left = _block(*own, x, left, nothing)
+        return (x, left), None
 
     start = jnp.where(pinned, stack.hard_lower[:n], 0.0), jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(stack.hard.dtype))
-    return jax.lax.scan(descend, start, (decisions, stack.levels))[0][0]
+    return jax.lax.scan(descend, start, (decisions, stack.levels, stack.damping))[0][0]
 
 
 def _independent(matrix: Array, lower: Array, upper: Array, side: Array) -> tuple[Array, Array, Array, Array]:
@@ -79,14 +85,23 @@ def _block(
     x: Array,
     projector: Array,
     nothing: Array,
+    damping: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Moves x in the projector's range so that the chosen rows, of that rank at most, come nearest to their bounds."""
+    """Moves x in the projector's range so that the chosen rows, of that rank at most, come nearest to their bounds.
+
+    With damping, what is least is the sum of squares of what they miss and of damping |x|^2.
+    """
     on = side != 0
     target = jnp.where(side < 0, _finite(lower, side < 0), _finite(upper, side > 0))
     chosen = jnp.where(on[:, None], matrix, 0.0)
     longest = jnp.max(jnp.abs(jax.lax.stop_gradient(chosen)))
     gap = jnp.where(on, target - apply(chosen, x), 0.0)
-    space, motion = row_space_and_motion_of_rank(product(chosen, projector), gap, rank, nothing * longest)
+    rows, cutoff = product(chosen, projector), nothing * longest
+    space, motion = row_space_and_motion_of_rank(rows, gap, rank, cutoff)
+    if damping is not None:
+        damped = damping > 0.0
+        _, whole = row_space_and_motion(rows, gap + apply(rows, x), cutoff, jnp.where(damped, damping, 1.0))
+        motion = jnp.where(damped, whole - x, motion)
     # as in the projection (eq. 7): rounding over small singular values has left the projector's range
     return x + apply(projector, motion), projector - product(projector, product(space, projector))
 

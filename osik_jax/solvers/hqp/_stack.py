@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._dense import apply
 from ._problem import Level
 
 
@@ -35,6 +36,7 @@ class Stack(NamedTuple):
     """
 
     levels: Level  # with a leading axis; rows of zeros without bounds fill up
+    damping: Float[Array, " L"]  # of each level
     equal: Bool[Array, "L m"]  # rows that are equalities
     hard: Float[Array, "h n"]
     hard_lower: Float[Array, " h"]
@@ -46,6 +48,7 @@ class Task(NamedTuple):
     """One level, as it stands below those that are done."""
 
     level: Level
+    damping: Float[Array, ""]  # of x, part of the level's cost
     equal: Bool[Array, " m"]  # the level's equalities; their bounds are one number, but for rounding
     matrix: Float[Array, "h n"]  # the hard rows
     lower: Float[Array, " h"]
@@ -62,6 +65,19 @@ class Task(NamedTuple):
         """Euclidean norm of each hard row."""
         return jnp.sqrt(jnp.sum(self.matrix**2, -1))
 
+    @property
+    def size(self) -> Float[Array, ""]:
+        """Of the longest row of the level's cost, the damping's among them."""
+        return jnp.maximum(self.level.size, jnp.sqrt(self.damping))
+
+    def gradient(self, x: Float[Array, " n"], slack: Float[Array, " m"]) -> Float[Array, " n"]:
+        """Of the level's cost, 1/2 |slack|^2 + 1/2 damping |x|^2."""
+        return apply(self.level.matrix.T, slack) + self.damping * x
+
+    def missing(self, x: Float[Array, " n"], slack: Float[Array, " m"]) -> Float[Array, ""]:
+        """Root of twice the level's cost."""
+        return jnp.sqrt(jnp.sum(slack**2) + self.damping * jnp.sum(x**2))
+
     def spread(self, flags: Bool[Array, " m"]) -> Bool[Array, " h"]:
         """Flags of the level's rows at their places among the hard ones."""
         return jnp.zeros(len(self.lower) + 1, bool).at[self.place].max(flags)[:-1]
@@ -73,6 +89,7 @@ def stacked(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     pinned: Bool[Array, " n"],
+    damping: Float[Array, " L"],
 ) -> tuple[Layout, Stack]:
     """Layout and numbers of a hierarchy whose weights are multiplied in; which rows, and variables, are equalities."""
     n, m = lower.shape[0], max(level.matrix.shape[0] for level in levels)
@@ -89,6 +106,7 @@ def stacked(
     layout = Layout(n, len(levels), m, counts, tuple(level_of), tuple(places))
     stack = Stack(
         levels=jax.tree.map(lambda *a: jnp.stack(a), *(_padded(level, m) for level in levels)),
+        damping=damping,
         equal=jnp.stack([jnp.pad(rows, (0, m - len(rows))) for rows in equal]),
         hard=jnp.concatenate([jnp.eye(n, dtype=lower.dtype), *(level.matrix for level in mixed)]),
         hard_lower=jnp.concatenate([lower, *(level.lower for level in mixed)]),

@@ -1,0 +1,59 @@
+"""How much a task bends: bounds on the second derivative of its error along its own pull.
+
+A tick of dt changes the error by ``dt J v + dt^2/2 (grad^2 e)[v, v] + ...``, and a solver minimises
+``1/2 w |J v + gain e|^2`` as if the second term were not there. What it leaves out of the cost is, to first order,
+
+    1/2 dt p . (grad^2 e)[v, v]  <=  1/2 dt c |v|^2,    p = w gain e (the weighted pull),    c >= |sum_i p_i grad^2 e_i|,
+
+so a damping ``dt c`` on the velocity makes the model an upper bound of the true cost, as a majoriser or a trust region
+does: a step never buys a better model at the price of a worse error. It vanishes with the error, so that convergence
+stays fast (J. Fan, Y. Yuan, "On the quadratic convergence of the Levenberg-Marquardt method without nonsingularity
+assumption", Computing 74, 2005).
+
+For the position p of a frame and dofs i before j on its chain the second derivative is ``w_i x J_j``, w_i the axis of
+dof i and J_j the linear Jacobian's column: the matrix with the entries ``p . (w_i x J_j)``, all i and j, is at least as
+large as the symmetric one, within a few per cent of the worst configurations, and its Frobenius norm costs two 3 x 3
+products. The norms of single columns of J are too small: the entries off the diagonal count.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..kinematics._rigid import cross
+from ._gain import safe_norm
+from ._rotation import dot
+
+
+def pose_curvature(
+    pull: Float[Array, "3"], torque: Float[Array, "3"], jacobian: Float[Array, "6 nv"]
+) -> Float[Array, ""]:
+    """Bound for a frame that is pulled at its origin and turned, both in the axes of its Jacobian [linear; angular].
+
+    A position bends by ``w_i x J_j``, an orientation by ``1/2 w_i x w_j``. Columns that turn nothing are left out: a
+    base or a carriage that only translates bends no path.
+    """
+    linear, angular = jacobian[:3], jacobian[3:]
+    turns = jnp.any(angular != 0.0, axis=0)
+    bent = _paired(pull, angular, jnp.where(turns, linear, 0.0))
+    twisted = _paired(torque, angular, angular)
+    return bent + 0.5 * twisted
+
+
+def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 n"], arms: Float[Array, "3 n"]) -> Float[Array, ""]:
+    """Frobenius norm of the matrix with the entries ``pull . (axis_i x arm_j)``; its gradient at 0 is 0."""
+    turned = cross(pull[:, None], axes, along=0)
+    squared = jnp.sum(dot(turned, turned.T) * dot(arms, arms.T))
+    positive = squared > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+
+def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "m nv"]) -> Float[Array, ""]:
+    """Bound for any rows: the pull's length times the size (Frobenius norm) of their Jacobian."""
+    return safe_norm(pull) * safe_norm(jacobian.ravel())
+
+
+def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:
+    """Of rows that are linear in the joints."""
+    return jnp.zeros((), pull.dtype)
