@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..solvers import WorkingSet, solve_hqp
+from ..solvers import Damping, WorkingSet, solve_hqp
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
 
@@ -56,8 +55,7 @@ class HierarchicalQP(Scheme):
             answer.warm_start,
         )
 
-    def _damping(self, problem: VelocityProblem, *, hard: bool) -> list[Float[Array, ""]]:
+    def _damping(self, problem: VelocityProblem, *, hard: bool) -> list[Damping]:
         """Of each level: none of the constraints, which damping would let off a part of what they ask."""
-        bends = [self.curvature_damping * problem.curvature(names) for names in problem.by_priority()]
-        own = [self.damping + bend for bend in bends]
-        return [jnp.zeros_like(self.damping), *own] if hard else own
+        own = [problem.damping(names, self.damping, self.curvature_damping) for names in problem.by_priority()]
+        return [Damping(), *own] if hard else own

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..solvers import Level, NullSpaceSolution, solve_nullspace
+from ..solvers import Damping, Level, NullSpaceSolution, solve_nullspace
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
 
@@ -85,11 +85,10 @@ class NullSpace(Scheme):
         gradient = first.matrix.T @ first.distance(answer.x)
         return SchemeAnswer(answer.x, status, count, count, jnp.max(jnp.abs(gradient)))
 
-    def _damping(self, problem: VelocityProblem, constraints: Level | None) -> list[Array]:
+    def _damping(self, problem: VelocityProblem, constraints: Level | None) -> list[Damping]:
         """Of each level: none of the constraints, which damping would let off a part of what they ask."""
-        bends = [self.curvature_damping * problem.curvature(names) for names in problem.by_priority()]
-        own = [self.damping + bend for bend in bends]
-        return own if constraints is None else [jnp.zeros_like(self.damping), *own]
+        own = [problem.damping(names, self.damping, self.curvature_damping) for names in problem.by_priority()]
+        return own if constraints is None else [Damping(), *own]
 
     def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
         """Where the first level begins: an inequality row that holds there takes no part in it."""

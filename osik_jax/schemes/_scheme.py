@@ -13,9 +13,10 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from .._numbers import as_scalar
 from ..limits import LimitRows
-from ..solvers import Level, Status
+from ..solvers import Damping, Level, Status
 from ..solvers._dense import apply
 from ..tasks import TaskRows
+from ..tasks._gain import safe_norm
 
 _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 """A hard row that is missed by less, of what its numbers amount to, holds."""
@@ -62,9 +63,15 @@ class VelocityProblem(eqx.Module):
     def curvature(self, names: Iterable[str]) -> Float[Array, ""]:
         """Damping of the velocity that makes up for what the linear model of these tasks leaves out.
 
-        A tick leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``.
+        A tick leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
+        different chains, so their parts add up like the sides of a right angle.
         """
-        return self.dt * sum((self.rows[name].curvature for name in names), jnp.zeros((), self.lower.dtype))
+        return self.dt * safe_norm(jnp.stack([self.rows[name].curvature for name in names]))
+
+    def damping(self, names: Sequence[str], constant: Float[Array, ""], curvature: Float[Array, ""] | float) -> Damping:
+        """Of a priority, from the damping that a scheme has anyway and the share of the curvature that it takes."""
+        pulls = [jnp.sqrt(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
+        return Damping(constant, curvature * self.curvature(names), safe_norm(jnp.concatenate(pulls)))
 
     def level(self, names: Sequence[str]) -> Level:
         """The rows of some tasks as one level."""

@@ -1,9 +1,10 @@
 """Array-level solvers, no robot inside: quadratic programs, hierarchies, null-space projection."""
 
+from ._damping import Damping as Damping
+from ._level import Level as Level
 from ._status import Status as Status
 from ._status import raise_if_failed as raise_if_failed
 from .hqp import HQPSolution as HQPSolution
-from .hqp import Level as Level
 from .hqp import Tolerances as Tolerances
 from .hqp import WorkingSet as WorkingSet
 from .hqp import solve_hqp as solve_hqp

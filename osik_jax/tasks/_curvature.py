@@ -3,7 +3,7 @@
 A tick of dt changes the error by ``dt J v + dt^2/2 (grad^2 e)[v, v] + ...``, and a solver minimises
 ``1/2 w |J v + gain e|^2`` as if the second term were not there. What it leaves out of the cost is, to first order,
 
-    1/2 dt p . (grad^2 e)[v, v]  <=  1/2 dt c |v|^2,    p = w gain e (the weighted pull),    c >= |sum_i p_i grad^2 e_i|,
+    1/2 dt p . (grad^2 e)[v, v]  <=  1/2 dt c |v|^2,    p = w gain e,    c >= |sum_i p_i grad^2 e_i|,
 
 so a damping ``dt c`` on the velocity makes the model an upper bound of the true cost, as a majoriser or a trust region
 does: a step never buys a better model at the price of a worse error. It vanishes with the error, so that convergence
@@ -11,12 +11,15 @@ stays fast (J. Fan, Y. Yuan, "On the quadratic convergence of the Levenberg-Marq
 assumption", Computing 74, 2005).
 
 For the position p of a frame and dofs i before j on its chain the second derivative is ``w_i x J_j``, w_i the axis of
-dof i and J_j the linear Jacobian's column: the matrix with the entries ``p . (w_i x J_j)``, all i and j, is at least as
-large as the symmetric one, within a few per cent of the worst configurations, and its Frobenius norm costs two 3 x 3
-products. The norms of single columns of J are too small: the entries off the diagonal count.
+dof i and J_j the linear Jacobian's column. The matrix with the entries ``p . (w_i x J_j)`` for all i and j has each of
+them twice, and its Frobenius norm costs two 3 x 3 products; over the root of 2 it is 0.7 to 2 times the symmetric
+matrix's greatest eigenvalue in random configurations of two humanoids and two arms. A step is stable from half of that
+eigenvalue on. The norms of single columns of J are too small: the entries off the diagonal count.
 """
 
 from __future__ import annotations
+
+import math
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -38,7 +41,7 @@ def pose_curvature(
     turns = jnp.any(angular != 0.0, axis=0)
     bent = _paired(pull, angular, jnp.where(turns, linear, 0.0))
     twisted = _paired(torque, angular, angular)
-    return bent + 0.5 * twisted
+    return (bent + 0.5 * twisted) / math.sqrt(2.0)
 
 
 def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 n"], arms: Float[Array, "3 n"]) -> Float[Array, ""]:

@@ -34,6 +34,7 @@ class TaskRows(eqx.Module):
         curvature: bound on the second derivative of the task's error along its own pull, ``|sum_i weight_i gain e_i
             grad^2 e_i|``: times dt, the damping that the schemes add for it (``_curvature.py``). 0 where the task is
             met, or linear in the joints. ()
+        pull: ``gain e`` of each row, without the target's own velocity; of an inequality, what it is outside by. (m,)
         dofs: where each row asks for one dof's velocity as it is, those dofs (static): ``jacobian`` is then those rows
             of the identity, which a scheme may use to save work. None elsewhere.
     """
@@ -44,6 +45,7 @@ class TaskRows(eqx.Module):
     upper: Float[Array, " m"]
     weight: Float[Array, " m"]
     curvature: Float[Array, ""] = eqx.field(default=0.0, converter=jnp.asarray)
+    pull: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
 
     @property
@@ -159,11 +161,13 @@ def task_rows(
     bend = curvature or (no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian))
     if lower is None or upper is None:
         pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
-        return TaskRows(error, jacobian, shift - pull, shift - pull, weight, bend(weight * pull), dofs)
+        wanted = shift - pull
+        return TaskRows(error, jacobian, wanted, wanted, weight, bend(weight * pull), pull, dofs)
     outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
     rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
     low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
-    return TaskRows(error, jacobian, low, high, weight, bend(weight * rate * outside), dofs)
+    pull = rate * outside
+    return TaskRows(error, jacobian, low, high, weight, bend(weight * pull), pull, dofs)
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:

@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._damping import effective
 from .._dense import apply, product
 from .._lanes import choose
+from .._level import Level
 from ._held import independent
 from ._landing import Landing, land, noise, nothing_landed
 from ._primal import LevelState, solve_level
-from ._problem import Level, Tolerances, WorkingSet
+from ._problem import Tolerances, WorkingSet
 from ._proposal import propose
 from ._replay import Decision
 from ._stack import Layout, Stack, Task
@@ -129,9 +131,11 @@ def _task(layout: Layout, k: Int[Array, ""], stack: Stack, level: Level, cascade
     """Level k, and the rows that it must not touch."""
     of = jnp.asarray(layout.level_of_hard)
     bounded = jnp.isfinite(cascade.lower) | jnp.isfinite(cascade.upper)
+    n = len(cascade.x)
+    own = jax.tree.map(lambda a: a[k], stack.damping)
     return Task(
         level=level,
-        damping=stack.damping[k],
+        damping=effective(own, level, cascade.x, cascade.projector, stack.hard_lower[:n], stack.hard_upper[:n]),
         equal=stack.equal[k],
         matrix=stack.hard,
         lower=cascade.lower,

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply, product
+from .._level import Level
 from ._held import Held, hold, multipliers, restoring_step
-from ._problem import Level, Tolerances, WorkingSet
+from ._problem import Tolerances, WorkingSet
 from ._stack import Task
 
 _ROUNDS = 2
@@ -127,9 +128,7 @@ def noise(task: Task, x: Float[Array, " n"], slack: Float[Array, " m"], toleranc
     return task.size * rounding(task, x, slack, tolerances)
 
 
-def rounding(
-    task: Task, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances
-) -> Float[Array, ""]:
+def rounding(task: Task, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances) -> Float[Array, ""]:
     """Changes of the level's rows under this are noise."""
     return tolerances.step * (task.size * jnp.max(jnp.abs(x)) + task.missing(x, slack))
 

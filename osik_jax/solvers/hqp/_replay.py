@@ -15,9 +15,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..._rules import custom_jvp
+from .._damping import Damping, effective
 from .._dense import apply, product
 from .._inverses import row_space_and_motion, row_space_and_motion_of_rank
-from ._problem import Level
+from .._level import Level
 from ._stack import Stack
 
 
@@ -56,9 +57,10 @@ def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, "
     hard = (stack.hard, stack.hard_lower, stack.hard_upper)
     pinned = stack.hard_equal[:n]
 
-    def descend(state: tuple[Array, Array], now: tuple[Decision, Level, Array]) -> tuple[tuple[Array, Array], None]:
+    def descend(state: tuple[Array, Array], now: tuple[Decision, Level, Damping]) -> tuple[tuple[Array, Array], None]:
         decision, level, damping = now
         x, projector = state
+        damping = effective(damping, level, x, projector, stack.hard_lower[:n], stack.hard_upper[:n])
         x, held = _block(*_independent(*hard, decision.held), n, x, projector, nothing)
         _, left = _block(*_independent(*hard, decision.tight), n, x, projector, nothing)
         own = level.matrix, level.lower, level.upper, decision.counts, decision.rank

@@ -11,10 +11,12 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ... import _rules
 from .._box import inside, uncrossed
+from .._damping import Damping, one_each
+from .._level import Level
 from .._status import Status
 from ._cascade import NOTHING, Descent
 from ._fused import descender
-from ._problem import HQPSolution, Level, Tolerances, WorkingSet
+from ._problem import HQPSolution, Tolerances, WorkingSet
 from ._replay import with_derivative
 from ._stack import stacked
 
@@ -28,7 +30,7 @@ def solve_hqp(
     lower: Float[ArrayLike, " n"],
     upper: Float[ArrayLike, " n"],
     *,
-    damping: Float[ArrayLike, ""] | Sequence[Float[ArrayLike, ""]] = 0.0,
+    damping: Float[ArrayLike, ""] | Damping | Sequence[Float[ArrayLike, ""] | Damping] = 0.0,
     warm_start: WorkingSet | None = None,
     max_iterations: int | None = None,
     tolerances: Tolerances | None = None,
@@ -50,7 +52,8 @@ def solve_hqp(
         lower: box, -inf where unbounded. (n,)
         upper: box, inf where unbounded. (n,)
         damping: of each level, or one for all: the level minimises ``1/2 |w_k|^2 + 1/2 damping |x|^2``, and the levels
-            below it keep what its rows have reached, A_k x. >= 0.
+            below it keep what its rows have reached, A_k x. >= 0. A ``Damping`` has a part that vanishes where the
+            level can be met.
         warm_start: that of the solution of a problem nearby with the same levels. It changes the time, not the answer.
         max_iterations: cap on the active-set iterations of one level (static); default 10 (n + rows of the level).
         tolerances: what counts as zero; the default rank tolerance depends on the precision of the data.
@@ -63,8 +66,8 @@ def solve_hqp(
     lower, upper = jnp.asarray(lower), jnp.asarray(upper)
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
     tolerances = Tolerances(rank=_RANK[dtype]) if tolerances is None else tolerances
-    damped = _one_each(damping, len(levels), dtype)
-    sane = _finite(levels, lower, upper) & jnp.all(jnp.isfinite(damped) & (damped >= 0.0))
+    damped = one_each(damping, len(levels), dtype)
+    sane = _finite(levels, lower, upper) & jnp.stack([(jnp.isfinite(a) & (a >= 0.0)).all() for a in damped]).all()
     equal = [level.equal | ~sane for level in levels]
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True) if levels else ((), ())
     low, high, empty = uncrossed(lower, upper)
@@ -72,7 +75,10 @@ def solve_hqp(
     low, high = (jnp.where(sane, b, side).astype(dtype) for b, side in ((low, -1.0), (high, 1.0)))
     scaled = [jax.tree.map(lambda leaf: jnp.where(sane, leaf, 0.0), level.scaled()) for level in levels]
     scaled, equal = [*scaled, _no_rows(len(low), dtype)], [*equal, jnp.ones(0, bool)]
-    damped = jnp.append(jnp.where(sane, damped, 0.0), jnp.ones(1, dtype))  # the last level: the smallest norm
+    # the last level has nothing but damping: the smallest norm
+    damped = Damping(
+        *(jnp.append(jnp.where(sane, a, 0.0), last) for a, last in zip(damped, (1.0, 0.0, 0.0), strict=True))
+    )
     layout, stack = stacked(scaled, equal, low, high, (lower >= upper) & sane, damped)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
     end = _rules.found(descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start))))
@@ -83,14 +89,6 @@ def solve_hqp(
 
 def _no_rows(n: int, dtype: jnp.dtype) -> Level:
     return Level(jnp.zeros((0, n), dtype), jnp.zeros(0, dtype))
-
-
-def _one_each(damping: ArrayLike | Sequence[ArrayLike], count: int, dtype: jnp.dtype) -> Float[Array, " L"]:
-    if not isinstance(damping, Sequence):
-        return jnp.full(count, jnp.asarray(damping, dtype))
-    if len(damping) != count:
-        raise ValueError(f"there are {len(damping)} dampings and {count} levels")
-    return jnp.stack([jnp.asarray(one, dtype) for one in damping]) if count else jnp.zeros(0, dtype)
 
 
 def _finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._damping import Damping
 from .._dense import apply
-from ._problem import Level
+from .._level import Level
 
 
 class Layout(NamedTuple):
@@ -36,7 +37,7 @@ class Stack(NamedTuple):
     """
 
     levels: Level  # with a leading axis; rows of zeros without bounds fill up
-    damping: Float[Array, " L"]  # of each level
+    damping: Damping  # with a leading axis
     equal: Bool[Array, "L m"]  # rows that are equalities
     hard: Float[Array, "h n"]
     hard_lower: Float[Array, " h"]
@@ -89,7 +90,7 @@ def stacked(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     pinned: Bool[Array, " n"],
-    damping: Float[Array, " L"],
+    damping: Damping,
 ) -> tuple[Layout, Stack]:
     """Layout and numbers of a hierarchy whose weights are multiplied in; which rows, and variables, are equalities."""
     n, m = lower.shape[0], max(level.matrix.shape[0] for level in levels)

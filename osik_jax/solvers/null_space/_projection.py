@@ -17,6 +17,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._damping import Damping, effective
 from .._dense import apply, product
 from .._inverses import row_space_and_motion
 from ..hqp import Level
@@ -24,7 +25,7 @@ from ._problem import Demand
 
 
 def solve_forward(
-    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Sequence[Array], rank: Array | float
+    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Sequence[Damping], rank: Array | float
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The answer, and the projector onto what no level asks for."""
     x, projector = jnp.zeros_like(secondary), jnp.eye(len(secondary), dtype=secondary.dtype)
@@ -35,12 +36,14 @@ def solve_forward(
 
 
 def level_motion(
-    level: Level, x: Float[Array, " n"], projector: Float[Array, "n n"], damping: Array, rank: Array | float
+    level: Level, x: Float[Array, " n"], projector: Float[Array, "n n"], damping: Damping, rank: Array | float
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """What one level adds to x, and the projector for the next."""
     if not level.matrix.shape[0]:
         return jnp.zeros_like(x), projector
     demand = Demand.of(level, x, rank)
-    space, motion = row_space_and_motion(product(demand.rows, projector), demand.wanted, demand.cutoff, damping)
+    unbounded = jnp.full_like(x, jnp.inf)
+    strength = effective(damping, level, x, projector, -unbounded, unbounded)
+    space, motion = row_space_and_motion(product(demand.rows, projector), demand.wanted, demand.cutoff, strength)
     # what rounding adds outside the projector's range, as much more as singular values are small, is taken off again
     return apply(projector, motion), projector - product(projector, product(space, projector))

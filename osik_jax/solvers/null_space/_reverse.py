@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._damping import Damping
 from .._dense import apply, product
 from .._inverses import regularised_inverse, row_space_and_motion
 from ..hqp import Level
@@ -35,12 +36,13 @@ from ._problem import Demand
 
 
 def solve_reverse(
-    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Sequence[Array], rank: Array | float
+    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Sequence[Damping], rank: Array | float
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The answer, and the projector onto what no level asks for. The secondary motion comes first of all."""
     x, eye = secondary, jnp.eye(len(secondary), dtype=secondary.dtype)
     below: list[tuple[Array, Array]] = []
-    for level, own in zip(reversed(levels), reversed(damping), strict=True):
+    strengths = [own.constant + own.unmet for own in damping]
+    for level, own in zip(reversed(levels), reversed(strengths), strict=True):
         if not level.matrix.shape[0]:
             continue
         demand = Demand.of(level, x, rank)
@@ -50,7 +52,7 @@ def solve_reverse(
     if not below:
         return x, eye
     rows = jnp.concatenate([rows for rows, _ in below])
-    return x, eye - row_space_and_motion(rows, jnp.zeros(len(rows), x.dtype), _cutoff(rows, rank), damping[-1])[0]
+    return x, eye - row_space_and_motion(rows, jnp.zeros(len(rows), x.dtype), _cutoff(rows, rank), strengths[-1])[0]
 
 
 def _least_disturbing(

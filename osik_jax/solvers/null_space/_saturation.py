@@ -29,6 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._box import inside
+from .._damping import Damping
 from .._dense import product
 from .._lanes import in_lanes
 from ..hqp import Level
@@ -52,7 +53,7 @@ def solve_saturated(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     secondary: Float[Array, " n"] | None,
-    damping: Sequence[Array],
+    damping: Sequence[Damping],
     rank: Array | float,
     max_iterations: int,
 ) -> Saturated:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._box import clip_to_box, uncrossed
+from .._damping import Damping, one_each
 from .._status import Status
 from ..hqp import Level
 from ._problem import RANK, NullSpaceSolution, sane
@@ -29,7 +30,7 @@ def solve_nullspace(
     *,
     order: Literal["forward", "reverse"] = "forward",
     secondary: Float[Array, " n"] | None = None,
-    damping: Float[Array, ""] | float | Sequence[Float[Array, ""]] = 0.0,
+    damping: Float[Array, ""] | float | Damping | Sequence[Float[Array, ""] | Damping] = 0.0,
     rank_tolerance: Float[Array, ""] | float | None = None,
     max_iterations: int | None = None,
 ) -> NullSpaceSolution:
@@ -55,7 +56,8 @@ def solve_nullspace(
         secondary: motion in what all levels leave free, such as a potential's descent; with bounds, x comes as near to
             it as levels and bounds allow. (n,)
         damping: of the motion of each level, in squared singular values: s / (s^2 + damping) stands for 1 / s. One for
-            all, or a list with one for each level.
+            all, or a list with one for each level. A ``Damping`` has a part that vanishes where the level can be met;
+            in the reverse order all of it counts.
         rank_tolerance: singular values of A P under this share of the Frobenius norm of A (P projects onto what the
             levels before leave free) count as zero; default 1e-10 (1e-5 in float32). Against A and not A P, so that
             a level which repeats one above it has rank 0, not the rank of its rounding.
@@ -74,10 +76,10 @@ def solve_nullspace(
     pull = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True)
     possible = ~jnp.stack(crossed).any()
-    given = jax.tree.map(lambda number: jnp.asarray(number, dtype), damping)
-    good = sane(levels, pull, *jax.tree.leaves(given)) & (True if box is None else _exists(*box))
+    given = one_each(damping, len(levels), dtype)
+    good = sane(levels, pull, *given) & (True if box is None else _exists(*box))
     clean, pull, damped = _where(good, (list(levels), pull, given))
-    damped = _one_each(damped, len(levels))
+    damped = [Damping(*parts) for parts in zip(*damped, strict=True)]
     scaled = [level.scaled() for level in clean]
     rank = RANK[dtype] if rank_tolerance is None else rank_tolerance
     if box is None:
@@ -94,14 +96,6 @@ def solve_nullspace(
 def _where(good: Array, tree: Any) -> Any:
     """The numbers as they are, or zeros."""
     return jax.tree.map(lambda leaf: jnp.where(good, leaf, 0.0), tree)
-
-
-def _one_each(damping: Array | Sequence[Array], count: int) -> list[Array]:
-    if isinstance(damping, Array):
-        return [damping] * count
-    if len(damping) != count:
-        raise ValueError(f"there are {len(damping)} dampings and {count} levels")
-    return list(damping)
 
 
 def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] | None:

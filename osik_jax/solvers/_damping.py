@@ -1,0 +1,90 @@
+"""The damping of a level: a constant part, and one in proportion to what the level's model cannot meet.
+
+A linear model is wrong by ``1/2 dt^2 (grad^2 e)[v, v]``, and what that costs is its product with the residual that the
+model leaves. Where a step meets the level's demand there is no residual, so nothing has to be damped; where the demand
+is out of reach, all of it is left. So the second part is damping x share with ``share = |residual| / |demand|``, and
+the residual is that of the damped step itself: a fixed point, found from share 1 downwards. In one dimension it is
+``max(0, unmet - s^2)`` for a singular value s: a threshold on singular values, without an SVD.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ._dense import apply, product
+from ._level import Level
+
+PASSES = 3
+"""Steps towards the fixed point; each makes what is damped too much smaller by the factor unmet / s^2."""
+_RIDGE = 1e-13
+"""Of the rows' squares: keeps the system of dependent rows from breaking the factorisation."""
+
+
+class Damping(NamedTuple):
+    """Of one level: it minimises ``1/2 |w|^2 + 1/2 (constant + share unmet) |x|^2``.
+
+    ``share`` is the size of the residual w that the level's step leaves, as a part of ``demand``, and 1 at most. The
+    step is judged by itself, clipped into the box.
+    """
+
+    constant: Float[Array, ""] | float = 0.0
+    unmet: Float[Array, ""] | float = 0.0
+    demand: Float[Array, ""] | float = 0.0
+
+
+def one_each(damping: ArrayLike | Damping | Sequence[ArrayLike | Damping], count: int, dtype: jnp.dtype) -> Damping:
+    """Of each of ``count`` levels, from one for all or from one for each: every field has an axis of levels."""
+    single = isinstance(damping, Damping) or not isinstance(damping, Sequence)
+    given = [damping] * count if single else list(damping)
+    if len(given) != count:
+        raise ValueError(f"there are {len(given)} dampings and {count} levels")
+    whole = [one if isinstance(one, Damping) else Damping(one) for one in given]
+    return Damping(*(jnp.array([jnp.asarray(part, dtype) for part in parts], dtype) for parts in _fields(whole)))
+
+
+def _fields(whole: Sequence[Damping]) -> list[list]:
+    return [[getattr(one, name) for one in whole] for name in Damping._fields]
+
+
+def effective(
+    damping: Damping,
+    level: Level,
+    x: Float[Array, " n"],
+    projector: Float[Array, "n n"],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+) -> Float[Array, ""]:
+    """The damping of a level whose weights are multiplied in, below levels that leave it the projector's range.
+
+    Args:
+        damping: of the level.
+        level: the level.
+        x: where the levels above have ended.
+        projector: onto what they leave free.
+        lower: of the box, -inf where unbounded.
+        upper: of the box, inf where unbounded.
+    """
+    base = x - apply(projector, x)
+    goal = -level.distance(base)
+    counts = level.equal | (goal != 0.0)
+    rows = jnp.where(counts[:, None], product(level.matrix, projector), 0.0)
+    gram = product(rows, rows.T)
+    eye = jnp.eye(len(goal), dtype=gram.dtype)
+    ridge = _RIDGE * jnp.trace(gram)
+    demand = jnp.where(damping.demand > 0.0, damping.demand, 1.0)
+    share = jnp.ones_like(damping.unmet)
+    for _ in range(PASSES):
+        strength = damping.constant + damping.unmet * share + ridge
+        factor = jnp.linalg.cholesky(gram + jnp.where(strength > 0.0, strength, 1.0) * eye)
+        end = jnp.clip(base + apply(rows.T, cho_solve((factor, True), goal)), lower, upper)
+        missed = jnp.sum(level.distance(end) ** 2)
+        some = missed > 0.0
+        root = jnp.where(some, jnp.sqrt(jnp.where(some, missed, 1.0)), 0.0)
+        share = jnp.minimum(root / demand, 1.0)
+    return damping.constant + damping.unmet * share
