@@ -127,7 +127,7 @@ class KinematicTree:
 
     @cached_property
     def turning(self) -> np.ndarray:
-        """Entries of v that turn something; the others, of slides and a base's translation, bend no path. (nv,), bool."""
+        """Entries of v that turn something; slides and a base's translation bend no path. (nv,), bool."""
         parts = {FREE: [False] * 3 + [True] * 3, BALL: [True] * 3, SLIDE: [False], HINGE: [True]}
         return np.array([turns for j in self.independent for turns in parts[self.joint_types[j]]], bool)
 

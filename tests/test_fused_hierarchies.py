@@ -9,6 +9,7 @@ import pytest
 from hierarchy_families import inequality_levels
 
 from osik_jax.solvers import Level, Tolerances, _cuda, solve_hqp
+from osik_jax.solvers._damping import one_each
 from osik_jax.solvers.hqp import _cascade, _fused, _kernel
 from osik_jax.solvers.hqp._kernel import Shape
 from osik_jax.solvers.hqp._stack import Layout, Stack, stacked
@@ -30,7 +31,8 @@ def batch() -> Batch:
 
     def stack_of(levels, lower, upper):
         given = [Level(*level) for level in levels]
-        layout, stack = stacked(given, [level.equal for level in given], lower, upper, lower >= upper)
+        none = one_each(0.0, len(given), lower.dtype)
+        layout, stack = stacked(given, [level.equal for level in given], lower, upper, lower >= upper, none)
         layouts.append(layout)
         return stack
 

@@ -8,9 +8,11 @@
 // rests on a direction that the factor's tolerance left out, it takes one damped step along it. What is tight at the
 // optimum, and the row space of the level's factor, are rotated to the front and cut off.
 //
+// A level may have damping (_damping.py): its cost is 1/2 |slack|^2 + 1/2 damping |x|^2. The last level has no rows and
+// damping 1: the smallest norm.
+//
 // Variable i belongs to lane i % 32, and so do row i of the level and column i of Z. Constants from _kernel.py: N
-// variables, LEVELS, M rows of the longest level (the last is the identity and has no rows in memory), ROWS of all
-// levels, P hard rows beside the box (at most 32), WARPS a block; COUNT, OFFSET, MIXED of each level; PLACE of each hard
+// variables, LEVELS, M rows of the longest level, ROWS of all levels, PASSES to the fixed point of a damping, P hard rows beside the box (at most 32), WARPS a block; COUNT, OFFSET, MIXED of each level; PLACE of each hard
 // row among all rows, and its LEVEL.
 
 constexpr int H = (N + 31) / 32, G = (M + 31) / 32;   // variables and rows a lane
@@ -19,11 +21,12 @@ constexpr int MOST_RANK = N < M ? N : M;
 constexpr int LONGEST = (N > M ? N : M) > P ? (N > M ? N : M) : P;
 constexpr int HARD = N + P;
 constexpr int FACTORS = MOST_RANK * (ZD + VD) > N * VD ? MOST_RANK * (ZD + VD) : N * VD;
+constexpr int SMALL = M * (VD > ZD ? VD : ZD);        // a square of the level's rows, or those rows in the basis
 constexpr int PATIENCE = 20;                          // steps of no length, before the least index decides
 constexpr double DAMPING = 1e-9;                      // of the longest row, squared, as in _proposal.py
 constexpr unsigned ALL = 0xffffffffu;
 
-__shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * LONGEST + MOST_RANK];
+__shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * LONGEST + MOST_RANK + 2 * SMALL];
 __shared__ int shared_ints[WARPS][N + MOST_RANK + M];
 
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
@@ -39,6 +42,8 @@ double* const turn = point + LONGEST;                 // a reflection, or what i
 double* const first_of = turn + LONGEST;
 double* const second_of = first_of + LONGEST;
 double* const strength = second_of + LONGEST;         // of the reflections
+double* const square_of = strength + MOST_RANK;       // Cholesky factor below, what is factored above; rows of VD
+double* const rows_of = square_of + SMALL;            // the level's rows in the basis; rows of ZD
 int* const held = shared_ints[warp];                  // the row that column k of the basis is for
 int* const pivot = held + N;
 int* const flags = pivot + MOST_RANK;
@@ -113,13 +118,12 @@ const bool warm = any(known != 0);
 // ---- one level: its numbers, and the factors that it works with
 int level = 0, m = 0, held_count = 0, rank = 0, factorizations = 0, changes = 0;
 const double* B = A;                                  // its first row
-bool identity = false, mixed = false;
-double below[G], above[G], length[G], size = 0.0;
+bool mixed = false;
+double below[G], above[G], length[G], size = 0.0, damping = 0.0;
 bool equal[G], counts[G], in_level[G];
 
-auto entry = [&](int a, int i) { return identity ? (a == i ? 1.0 : 0.0) : B[i * ROWS + a]; };
+auto entry = [&](int a, int i) { return B[i * ROWS + a]; };
 auto row_times = [&](int a, const double* d) {        // row a of the level times d, in shared memory
-  if (identity) return d[a];
   double total = 0.0;
   for (int i = 0; i < N; ++i) total += B[i * ROWS + a] * d[i];
   return total;
@@ -154,6 +158,55 @@ auto reflection = [&](int at, double norm) {
   if (lane == 0) turn[at] = head + (head < 0.0 ? -norm : norm);
   __syncwarp();
   return 1.0 / (norm * (norm + fabs(head)));
+};
+
+// Cholesky factor of the first `count` rows of `square_of`, whose upper triangle with the diagonal is the matrix, plus
+// `ridge` on the diagonal; the factor goes below, its diagonal to `first_of`
+auto cholesky = [&](int count, double ridge) {
+  for (int a = lane; a < count; a += 32)
+    for (int b = 0; b < a; ++b) square_of[a * VD + b] = square_of[b * VD + a];
+  for (int a = lane; a < count; a += 32) first_of[a] = square_of[a * VD + a] + ridge;
+  __syncwarp();
+  for (int k = 0; k < count; ++k) {
+    const double root = sqrt(fmax(first_of[k], 1e-300));
+    __syncwarp();
+    for (int a = lane; a < count; a += 32)
+      if (a > k) square_of[a * VD + k] /= root;
+    if (lane == 0) first_of[k] = root;
+    __syncwarp();
+    for (int a = lane; a < count; a += 32)
+      if (a > k) {
+        for (int b = k + 1; b < a; ++b) square_of[a * VD + b] -= square_of[a * VD + k] * square_of[b * VD + k];
+        first_of[a] -= square_of[a * VD + k] * square_of[a * VD + k];
+      }
+    __syncwarp();
+  }
+};
+auto cholesky_solve = [&](int count, double* right) { // entry a of lane a % 32
+  for (int k = 0; k < count; ++k) {
+    double mine = right[0];
+#pragma unroll
+    for (int g = 1; g < G; ++g) mine = k >> 5 == g ? right[g] : mine;
+    const double y = __shfl_sync(ALL, mine, k & 31) / first_of[k];
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      const int a = lane + 32 * g;
+      if (a == k) right[g] = y;
+      if (a > k && a < count) right[g] -= square_of[a * VD + k] * y;
+    }
+  }
+  for (int k = count - 1; k >= 0; --k) {
+    double mine = right[0];
+#pragma unroll
+    for (int g = 1; g < G; ++g) mine = k >> 5 == g ? right[g] : mine;
+    const double y = __shfl_sync(ALL, mine, k & 31) / first_of[k];
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      const int a = lane + 32 * g;
+      if (a == k) right[g] = y;
+      if (a < k) right[g] -= square_of[k * VD + a] * y;
+    }
+  }
 };
 
 auto hold = [&]() {                                   // rotates the held rows to the front; lets go of dependent ones
@@ -237,6 +290,17 @@ auto hold = [&]() {                                   // rotates the held rows t
   __syncwarp();
 };
 
+auto soften = [&]() {                                 // the squares of the factor's rows, and the damping: for `least_squares`
+  for (int k = lane; k < rank; k += 32)
+    for (int l = k; l < rank; ++l) {
+      double total = 0.0;
+      for (int j = held_count; j < width; ++j) total += R[k * ZD + j] * R[l * ZD + j];
+      square_of[k * VD + l] = total;
+    }
+  __syncwarp();
+  cholesky(rank, damping + 1e-14 * size * size);
+};
+
 auto fit = [&]() {                                    // factors the rows that count, within what the held rows leave
   ++factorizations;
   double column[H][M];
@@ -316,7 +380,8 @@ auto fit = [&]() {                                    // factors the rows that c
   __syncwarp();
 };
 
-auto least_squares = [&](const double* slack, double* d) {  // the step that makes the rows that count least
+// the step that makes the level's cost least; x has to be in `point`
+auto least_squares = [&](const double* slack, double* d) {
   double right[G];
 #pragma unroll
   for (int g = 0; g < G; ++g) right[g] = in_level[g] && counts[g] ? -slack[g] : 0.0;
@@ -327,6 +392,40 @@ auto least_squares = [&](const double* slack, double* d) {  // the step that mak
     total = sum(total) * strength[k];
 #pragma unroll
     for (int g = 0; g < G; ++g) right[g] -= in_level[g] ? V[k * VD + lane + 32 * g] * total : 0.0;
+  }
+  if (damping > 0.0) {                                // x + d is in the row space of the factor, as its rows weigh it
+    for (int j = lane; j < width; j += 32) {
+      double total = 0.0;
+      for (int i = 0; i < N; ++i) total += Z[i * ZD + j] * point[i];
+      second_of[j] = j >= held_count ? total : 0.0;
+    }
+    __syncwarp();
+    soften();
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      const int k = lane + 32 * g;
+      if (k >= rank) right[g] = 0.0;
+      else
+        for (int j = held_count; j < width; ++j) right[g] += R[k * ZD + j] * second_of[j];
+    }
+    cholesky_solve(rank, right);
+    __syncwarp();
+#pragma unroll
+    for (int g = 0; g < G; ++g)
+      if (lane + 32 * g < rank) first_of[lane + 32 * g] = right[g];
+    __syncwarp();
+    for (int j = lane; j < N; j += 32) {
+      double total = 0.0;
+      if (j >= held_count && j < width) {
+        for (int k = 0; k < rank; ++k) total += R[k * ZD + j] * first_of[k];
+        total -= second_of[j];
+      }
+      turn[j] = total;
+    }
+    __syncwarp();
+    along(held_count, width, d);
+    __syncwarp();
+    return;
   }
   for (int j = lane; j < N; j += 32) turn[j] = 0.0;
   __syncwarp();
@@ -387,9 +486,8 @@ auto judge = [&](const double* slack) {               // multipliers of the held
   for (int h = 0; h < H; ++h) {
     gradient[h] = 0.0;
     if (exists[h]) {
-      if (identity) gradient[h] = first_of[lane + 32 * h];
-      else
-        for (int a = 0; a < m; ++a) gradient[h] += B[(lane + 32 * h) * ROWS + a] * first_of[a];
+      gradient[h] = damping * x[h];
+      for (int a = 0; a < m; ++a) gradient[h] += B[(lane + 32 * h) * ROWS + a] * first_of[a];
     }
     square += gradient[h] * gradient[h];
   }
@@ -433,7 +531,7 @@ bool all_done = true;
 double worst_residual = 0.0;
 for (level = 0; level < LEVELS; ++level) {
   const size_t here = problem * LEVELS + level;
-  m = COUNT[level], mixed = MIXED[level] != 0, identity = level == LEVELS - 1;
+  m = COUNT[level], mixed = MIXED[level] != 0;
   B = A + OFFSET[level];
   if (width == 0) {                                   // nothing is left to decide
 #pragma unroll
@@ -447,7 +545,7 @@ for (level = 0; level < LEVELS; ++level) {
       multipliers.data[here * HARD + N + lane] = 0.0;
     }
     for (int a = lane; a < M; a += 32) missed_rows.data[here * M + a] = 0, own_rows.data[here * M + a] = 0;
-    if (lane == 0) ranks.data[here] = 0, reached.data[here] = INFINITY;
+    if (lane == 0) ranks.data[here] = 0, reached.data[here] = INFINITY, strengths.data[here] = 0.0;
     continue;
   }
 #pragma unroll
@@ -458,12 +556,11 @@ for (level = 0; level < LEVELS; ++level) {
     equal[g] = counts[g] = false;
     if (in_level[g]) {
       const size_t at = problem * ROWS + OFFSET[level] + a;
-      below[g] = identity ? 0.0 : rows_lower.data[at];
-      above[g] = identity ? 0.0 : rows_upper.data[at];
-      equal[g] = identity || rows_equal.data[at] != 0;
-      double square = identity ? 1.0 : 0.0;
-      if (!identity)
-        for (int i = 0; i < N; ++i) square += B[i * ROWS + a] * B[i * ROWS + a];
+      below[g] = rows_lower.data[at];
+      above[g] = rows_upper.data[at];
+      equal[g] = rows_equal.data[at] != 0;
+      double square = 0.0;
+      for (int i = 0; i < N; ++i) square += B[i * ROWS + a] * B[i * ROWS + a];
       length[g] = sqrt(square);
     }
   }
@@ -472,7 +569,86 @@ for (level = 0; level < LEVELS; ++level) {
   for (int g = 1; g < G; ++g) size = fmax(size, length[g]);
   size = largest(size);
 
-  double value[G], slack[G], reach = 0.0, missing = 0.0;
+  // ---- its damping: the constant part, and the other by what a step by itself, clipped into the box, would miss
+  const double* const given_damping = dampings.data + problem * (LEVELS * 3) + level;
+  const double constant = given_damping[0], unmet = given_damping[LEVELS], demand = given_damping[2 * LEVELS];
+  damping = constant;
+  if (unmet > 0.0) {
+    double base[H], goal[G], d[H], trace = 0.0, share = 1.0;
+    auto distance = [&](int g) {                      // of row lane + 32 g from its interval, at `point`
+      const double at = row_times(lane + 32 * g, point);
+      return equal[g] ? at - below[g] : at - clip(at, below[g], above[g]);
+    };
+    share_out(x);
+    for (int j = lane; j < N; j += 32) {
+      double total = 0.0;
+      if (j < width)
+        for (int i = 0; i < N; ++i) total += Z[i * ZD + j] * point[i];
+      turn[j] = total;
+    }
+    __syncwarp();
+    along(0, width, d);
+#pragma unroll
+    for (int h = 0; h < H; ++h) base[h] = x[h] - d[h];
+    share_out(base);
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      goal[g] = in_level[g] ? -distance(g) : 0.0;
+      if (in_level[g]) second_of[lane + 32 * g] = equal[g] || goal[g] != 0.0 ? 1.0 : 0.0;
+    }
+    __syncwarp();
+    for (int j = lane; j < width; j += 32)
+      for (int a = 0; a < m; ++a) {
+        double total = 0.0;
+        for (int i = 0; i < N; ++i) total += entry(a, i) * Z[i * ZD + j];
+        rows_of[a * ZD + j] = second_of[a] * total;
+      }
+    __syncwarp();
+    for (int a = lane; a < m; a += 32) {
+      for (int b = a; b < m; ++b) {
+        double total = 0.0;
+        for (int j = 0; j < width; ++j) total += rows_of[a * ZD + j] * rows_of[b * ZD + j];
+        square_of[a * VD + b] = total;
+      }
+      trace += square_of[a * VD + a];
+    }
+    trace = sum(trace);
+    __syncwarp();
+    for (int pass = 0; pass < PASSES; ++pass) {
+      double y[G], missed = 0.0;
+      const double ridge = constant + unmet * share + 1e-13 * trace;
+      cholesky(m, ridge > 0.0 ? ridge : 1.0);
+#pragma unroll
+      for (int g = 0; g < G; ++g) y[g] = goal[g];
+      cholesky_solve(m, y);
+      __syncwarp();
+#pragma unroll
+      for (int g = 0; g < G; ++g)
+        if (in_level[g]) second_of[lane + 32 * g] = y[g];
+      __syncwarp();
+      for (int j = lane; j < N; j += 32) {
+        double total = 0.0;
+        if (j < width)
+          for (int a = 0; a < m; ++a) total += rows_of[a * ZD + j] * second_of[a];
+        turn[j] = total;
+      }
+      __syncwarp();
+      along(0, width, d);
+#pragma unroll
+      for (int h = 0; h < H; ++h) d[h] = exists[h] ? clip(base[h] + d[h], low[h], high[h]) : 0.0;
+      share_out(d);
+#pragma unroll
+      for (int g = 0; g < G; ++g) {
+        const double off = in_level[g] ? distance(g) : 0.0;
+        missed += off * off;
+      }
+      share = fmin(sqrt(sum(missed)) / (demand > 0.0 ? demand : 1.0), 1.0);
+    }
+    damping = constant + unmet * share;
+  }
+  size = fmax(size, sqrt(damping));
+
+  double value[G], slack[G], reach = 0.0, missing = 0.0, missing_rows = 0.0;
   auto look = [&]() {                                 // where the level stands at x
     share_out(x);
     double far = 0.0, square = 0.0;
@@ -486,7 +662,12 @@ for (level = 0; level < LEVELS; ++level) {
       if (equal[g]) slack[g] = value[g] - below[g];
       square += slack[g] * slack[g];
     }
-    missing = sqrt(sum(square));
+    square = sum(square);
+    missing_rows = sqrt(square);
+    double own = 0.0;
+#pragma unroll
+    for (int h = 0; h < H; ++h) own += exists[h] ? x[h] * x[h] : 0.0;
+    missing = sqrt(square + damping * sum(own));
   };
   auto wrong_by = [&](double force, int at, double longest) { return -force * at * longest; };
   auto noise = [&]() { return size * step_share * (size * reach + missing); };
@@ -549,7 +730,10 @@ for (level = 0; level < LEVELS; ++level) {
         slack[g] = counts[g] ? value[g] - goal[g] : 0.0;
         square += slack[g] * slack[g];
       }
-    missing = sqrt(sum(square));
+    double own_size = 0.0;
+#pragma unroll
+    for (int h = 0; h < H; ++h) own_size += exists[h] ? x[h] * x[h] : 0.0;
+    missing = sqrt(sum(square) + damping * sum(own_size));
     bool inside = true;
 #pragma unroll
     for (int h = 0; h < H; ++h)
@@ -598,7 +782,12 @@ for (level = 0; level < LEVELS; ++level) {
       rate[g] = in_level[g] ? row_times(lane + 32 * g, point) : 0.0;
       square += counts[g] ? rate[g] * rate[g] : 0.0;
     }
-    const bool stands = sqrt(sum(square)) <= step_share * (size * reach + missing);
+    double along_x = 0.0, along_d = 0.0;
+#pragma unroll
+    for (int h = 0; h < H; ++h)
+      if (exists[h]) along_x += x[h] * d[h], along_d += d[h] * d[h];
+    along_x = damping * sum(along_x), along_d = damping * sum(along_d);
+    const bool stands = sqrt(sum(square) + along_d) <= step_share * (size * reach + missing);
     bool weak = false;
     if (stands) {
       judge(slack);
@@ -608,7 +797,7 @@ for (level = 0; level < LEVELS; ++level) {
       tried = true;
 #pragma unroll
       for (int h = 0; h < H; ++h)
-        if (exists[h]) turn[lane + 32 * h] = downhill[h] / (DAMPING * size * size);
+        if (exists[h]) turn[lane + 32 * h] = downhill[h] / (DAMPING * size * size + damping);
       __syncwarp();
       along(held_count, width, d);
       share_out(d);
@@ -669,7 +858,7 @@ for (level = 0; level < LEVELS; ++level) {
         if (in_level[g]) first_of[lane + 32 * g] = value[g], second_of[lane + 32 * g] = rate[g];
       __syncwarp();
       auto slope = [&](double t) {
-        double total = 0.0;
+        double total = along_x + t * along_d;
         for (int a = 0; a < m; ++a) {
           const size_t at = problem * ROWS + OFFSET[level] + a;
           const double v = first_of[a] + t * second_of[a];
@@ -718,7 +907,11 @@ for (level = 0; level < LEVELS; ++level) {
 
   // ---- what the level decides: rows that push, and its own that miss their intervals, are equalities from here on
   look();
-  const double floor = floor_of_signs();
+  double far_x = 0.0;
+#pragma unroll
+  for (int h = 0; h < H; ++h) far_x += exists[h] ? x[h] * x[h] : 0.0;
+  // a force that the damping explains leaves the levels below room on the face that the level has reached
+  const double floor = floor_of_signs() + damping * sqrt(sum(far_x));
   bool same = true, all_tight = true, row_tight = has_row && row_side != 0 && fabs(row_multiplier) * row_length > floor;
   bool now_counts[G], is_tight[H];
 #pragma unroll
@@ -747,7 +940,7 @@ for (level = 0; level < LEVELS; ++level) {
     hold();
     fit();
   }
-  const bool tie = same && rank != rank_there;
+  const bool tie = same && rank != rank_there && damping == 0.0;
 
 #pragma unroll
   for (int h = 0; h < H; ++h)
@@ -784,7 +977,7 @@ for (level = 0; level < LEVELS; ++level) {
       row_frozen = row_frozen || flags[PLACE[lane] - OFFSET[level]] != 0;
     }
   }
-  if (lane == 0) ranks.data[here] = tie ? rank_there : rank, reached.data[here] = missing;
+  if (lane == 0) ranks.data[here] = tie ? rank_there : rank, reached.data[here] = missing_rows, strengths.data[here] = damping;
 
   // ---- and are cut off: the row space of the factor goes to the front, after what is tight
   {

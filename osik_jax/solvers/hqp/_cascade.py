@@ -279,7 +279,7 @@ def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Toleranc
     )
     own = jnp.where(task.equal, 2, missed).astype(jnp.int32)
     # rows held without a multiplier decide nothing, unless more of the level would count without them (a tie)
-    tie = same & (rank - bounds != end.rank)
+    tie = same & (rank - bounds != end.rank) & (task.damping == 0.0)
     kept = jnp.where(tight | tie, end.side, 0)
     rank = jnp.where(tie, end.rank, rank - bounds)
     decision = Decision(jnp.where(task.damping > 0.0, end.side, kept), kept, missed, rank)

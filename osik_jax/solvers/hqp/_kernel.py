@@ -15,23 +15,24 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._damping import PASSES
 from ._cascade import Descent
 from ._problem import Tolerances, WorkingSet
 from ._replay import Decision
 from ._stack import Layout, Stack
 
-_MOST_ROWS, _MOST_HARD_ROWS = 64, 32  # the last level has a row a variable
+_MOST_ROWS, _MOST_HARD_ROWS = 64, 32
 _SHARED_BYTES = 48 * 1024
 """Shared memory that any CUDA device gives a block without being asked for more."""
 _MOST_WARPS = 2
 _INPUTS = (
     dict(matrix="double", rows_lower="double", rows_upper="double", rows_equal="int")
     | dict(hard_lower="double", hard_upper="double", hard_equal="int")
-    | dict(guess_hard="int", guess_own="int", tolerances="double")
+    | dict(guess_hard="int", guess_own="int", dampings="double", tolerances="double")
 )
 _OUTPUTS = dict(
     solution="double", box="int", sides="int", tight_rows="int", missed_rows="int", own_rows="int", ranks="int"
-) | dict(multipliers="double", reached="double", residuals="double", report="int")
+) | dict(multipliers="double", reached="double", strengths="double", residuals="double", report="int")
 
 
 class Shape(NamedTuple):
@@ -46,7 +47,7 @@ class Shape(NamedTuple):
 
     @classmethod
     def of(cls, layout: Layout) -> Shape:
-        """Of a hierarchy whose last level is the smallest norm."""
+        """Of a hierarchy."""
         n, h = layout.variables, len(layout.level_of_hard)
         offsets = [sum(layout.counts[:k]) for k in range(layout.levels)]
         at = {q: offsets[k] + a for k, places in enumerate(layout.place_of_row) for a, q in enumerate(places) if q < h}
@@ -56,8 +57,8 @@ class Shape(NamedTuple):
 
     @property
     def all_rows(self) -> int:
-        """Of all levels but the last, whose matrix is the identity."""
-        return sum(self.counts[:-1])
+        """Of all levels."""
+        return sum(self.counts)
 
     @property
     def warps(self) -> int:
@@ -66,7 +67,9 @@ class Shape(NamedTuple):
         if m > _MOST_ROWS or p > _MOST_HARD_ROWS or not self.all_rows:
             return 0
         row, column = n | 1, m | 1
-        doubles = n * row + n * (row + column) + max(p, 1) * row + 4 * max(m, p) + n
+        rank = min(n, m)
+        factors = max(rank * (row + column), n * column)
+        doubles = n * row + factors + max(p, 1) * row + 4 * max(n, m, p) + rank + 2 * m * max(row, column)
         return min(_MOST_WARPS, _SHARED_BYTES // (8 * doubles + 4 * (2 * n + m)))
 
 
@@ -80,18 +83,19 @@ def solve(
     guess = WorkingSet(jnp.zeros((lanes, count, h), int), jnp.zeros((lanes, count, m), int)) if warm is None else warm
 
     def rows(a: Array) -> Array:
-        return jnp.concatenate([a[:, k, :size] for k, size in enumerate(shape.counts[:-1])], 1)
+        return jnp.concatenate([a[:, k, :size] for k, size in enumerate(shape.counts)], 1)
 
     given = (
         jnp.swapaxes(rows(stack.levels.matrix), 1, 2),
         *(rows(a) for a in (stack.levels.lower, stack.levels.upper, stack.equal.astype(jnp.int32))),
         *(stack.hard_lower, stack.hard_upper, stack.hard_equal.astype(jnp.int32)),
         *(a.astype(jnp.int32) for a in guess),
+        jnp.stack(stack.damping, 1),
         jnp.stack(tolerances, -1),
     )
     sizes = dict(solution=n, box=n, sides=count * h, tight_rows=count * h, missed_rows=count * m, own_rows=count * m)
-    sizes |= dict(ranks=count, multipliers=count * h, reached=count, residuals=1, report=3)
-    x, box, sides, tight, missed, own, ranks, multipliers, reached, residual, report = _kernel(shape)(
+    sizes |= dict(ranks=count, multipliers=count * h, reached=count, strengths=count, residuals=1, report=3)
+    x, box, sides, tight, missed, own, ranks, multipliers, reached, strengths, residual, report = _kernel(shape)(
         *(a.reshape(lanes, -1) for a in given),
         max_iterations,
         launch_dims=32 * lanes,
@@ -102,7 +106,7 @@ def solve(
     return Descent(
         x=x,
         box=box,
-        decisions=Decision(tight, missed, ranks),
+        decisions=Decision(jnp.where(strengths[:, :, None] > 0.0, sides, tight), tight, missed, ranks),
         working=WorkingSet(sides, own),
         multipliers=multipliers,
         reached=reached,
@@ -123,8 +127,8 @@ def _kernel(shape: Shape) -> Callable[..., Any]:
 
     def solve_by_warp(
         matrix, rows_lower, rows_upper, rows_equal, hard_lower, hard_upper, hard_equal, guess_hard, guess_own,
-        tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks, multipliers,
-        reached, residuals, report, pid,
+        dampings, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks, multipliers,
+        reached, strengths, residuals, report, pid,
     ): ...  # fmt: skip
 
     solve_by_warp.__annotations__ = inputs | outputs | dict(pid=warp.int32)
@@ -132,13 +136,13 @@ def _kernel(shape: Shape) -> Callable[..., Any]:
 
     def solve_all(
         matrix, rows_lower, rows_upper, rows_equal, hard_lower, hard_upper, hard_equal, guess_hard, guess_own,
-        tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks, multipliers,
-        reached, residuals, report,
+        dampings, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks, multipliers,
+        reached, strengths, residuals, report,
     ):  # fmt: skip
         native(
             matrix, rows_lower, rows_upper, rows_equal, hard_lower, hard_upper, hard_equal, guess_hard, guess_own,
-            tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks, multipliers,
-            reached, residuals, report, warp.tid() // 32,
+            dampings, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks,
+            multipliers, reached, strengths, residuals, report, warp.tid() // 32,
         )  # fmt: skip
 
     solve_all.__annotations__ = inputs | outputs
@@ -154,7 +158,7 @@ def source(shape: Shape) -> str:
     """The CUDA text of a shape."""
     offsets = [sum(shape.counts[:k]) for k in range(len(shape.counts))]
     numbers = dict(N=shape.variables, LEVELS=len(shape.counts), M=shape.rows, ROWS=shape.all_rows)
-    numbers |= dict(P=len(shape.place), WARPS=shape.warps)
+    numbers |= dict(P=len(shape.place), WARPS=shape.warps, PASSES=PASSES)
     lists = dict(COUNT=shape.counts, OFFSET=offsets, MIXED=[int(a) for a in shape.mixed])
     lists |= dict(PLACE=shape.place or (0,), LEVEL=shape.level or (0,))
     head = [f"constexpr int {name} = {value};" for name, value in numbers.items()]

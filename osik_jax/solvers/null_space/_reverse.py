@@ -14,7 +14,9 @@ hierarchical QP give them.
 
 With damping no rank is decided between levels: in the null space N of level k, (N B' B N + damping I)^-1 N B' stands
 for (B N)^+, for the levels below in the projector too, which so are kept in the measure of the damping. The answer is
-then bounded and smooth wherever each J_k by itself keeps its rank.
+then bounded and smooth wherever each J_k by itself keeps its rank. The part of a damping that is for what a level
+cannot meet is large where it is not 0: it acts on motions alone, for in the projector it would hand what a level is to
+keep to the levels below that one.
 
 When not to use it: from the third level down the sum of least changes is not the least in all, as it is in the forward
 order and in ``solve_hqp``; hard bounds (``_saturation.py``).
@@ -40,25 +42,26 @@ def solve_reverse(
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The answer, and the projector onto what no level asks for. The secondary motion comes first of all."""
     x, eye = secondary, jnp.eye(len(secondary), dtype=secondary.dtype)
-    below: list[tuple[Array, Array]] = []
-    strengths = [own.constant + own.unmet for own in damping]
-    for level, own in zip(reversed(levels), reversed(strengths), strict=True):
+    below: list[tuple[Array, Damping]] = []
+    for level, own in zip(reversed(levels), reversed(damping), strict=True):
         if not level.matrix.shape[0]:
             continue
         demand = Demand.of(level, x, rank)
-        space, motion = row_space_and_motion(demand.rows, demand.wanted, demand.cutoff, own)
+        space, motion = row_space_and_motion(demand.rows, demand.wanted, demand.cutoff, own.constant + own.unmet)
         x = x + _least_disturbing(motion, eye - space, below, rank)
         below.append((demand.rows, own))
     if not below:
         return x, eye
     rows = jnp.concatenate([rows for rows, _ in below])
-    return x, eye - row_space_and_motion(rows, jnp.zeros(len(rows), x.dtype), _cutoff(rows, rank), strengths[-1])[0]
+    return x, eye - row_space_and_motion(
+        rows, jnp.zeros(len(rows), x.dtype), _cutoff(rows, rank), damping[-1].constant
+    )[0]
 
 
 def _least_disturbing(
     change: Float[Array, " n"],
     free: Float[Array, "n n"],
-    below: Sequence[tuple[Array, Array]],
+    below: Sequence[tuple[Array, Damping]],
     rank: Array | float,
 ) -> Float[Array, " n"]:
     """The change of a level with what its null space can do for the rows below, the highest of them first.
@@ -67,8 +70,10 @@ def _least_disturbing(
     """
     for rows, damping in reversed(below):
         restricted = product(rows, free)
-        inverse = regularised_inverse(restricted, _cutoff(rows, rank), damping)
-        change = change - apply(free, apply(inverse, apply(rows, change)))
+        cutoff = _cutoff(rows, rank)
+        whole = regularised_inverse(restricted, cutoff, damping.constant + damping.unmet)
+        change = change - apply(free, apply(whole, apply(rows, change)))
+        inverse = regularised_inverse(restricted, cutoff, damping.constant)
         free = free - product(free, product(inverse, restricted))
     return change
 

@@ -1,0 +1,163 @@
+"""What the linear model leaves out, damped: bounds against MuJoCo, calm out of reach, exact inside, differentiable."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import osik_jax as osik
+
+DT = 0.005
+SCHEMES = {
+    "weighted": osik.WeightedQP,
+    "hierarchical": osik.HierarchicalQP,
+    "null-space": osik.NullSpace,
+    "reverse": lambda **numbers: osik.NullSpace(order="reverse", **numbers),
+}
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+def bent(arm):
+    return arm.configuration({name: 0.4 * (-1) ** k for k, name in enumerate(arm.joint_names)})
+
+
+def second_derivative(model, q, pull, body, h=1e-5):
+    """pull . grad^2 p of a body's origin, by central differences of MuJoCo's Jacobian."""
+    data, rows = mujoco.MjData(model), []
+    for j in range(model.nv):
+        ends = []
+        for sign in (1.0, -1.0):
+            data.qpos[:] = q
+            data.qpos[j] += sign * h
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            jacobian = np.zeros((3, model.nv))
+            mujoco.mj_jacBody(model, data, jacobian, None, body)
+            ends.append(jacobian)
+        rows.append(pull @ (ends[0] - ends[1]) / (2.0 * h))
+    return np.array(rows)
+
+
+def test_the_bound_is_near_the_greatest_curvature(arm, rng):
+    """Half of the greatest eigenvalue is what a step needs to be stable; here it is never less than 0.6 of it."""
+    model = arm.mj_model
+    last = model.nbody - 1
+    frame = model.body(last).name
+    ratios = []
+    for _ in range(40):
+        q = rng.uniform(0.9 * arm.position_lower, 0.9 * arm.position_upper)
+        error = rng.normal(size=3)
+        kinematics = osik.forward_kinematics(arm, q)
+        p, rotation = kinematics.frame_pose(arm, frame)
+        task = osik.FrameTask(arm, frame, rows="position", target=(p - error, rotation), weight=2.0, gain=3.0)
+        bound = task.rows(arm, kinematics, jnp.asarray(q)).curvature
+        exact = second_derivative(model, q, 2.0 * 3.0 * error, last)
+        np.testing.assert_allclose(exact, exact.T, atol=1e-6)
+        ratios.append(float(bound) / np.abs(np.linalg.eigvalsh(exact)).max())
+    assert 0.6 < min(ratios) and max(ratios) < 3.0
+
+
+def test_met_and_linear_tasks_bend_nothing(arm):
+    q = bent(arm)
+    kinematics = osik.forward_kinematics(arm, q)
+    met = osik.FrameTask(arm, "hand", target=kinematics.frame_pose(arm, "hand")).rows(arm, kinematics, q)
+    assert met.curvature == 0.0
+    assert osik.PostureTask(arm).rows(arm, kinematics, q).curvature == 0.0
+
+
+@pytest.fixture(scope="module")
+def beyond(arm):
+    """Of each scheme: two seconds towards a point that is half a metre out of reach, damped and not."""
+    q0 = bent(arm)
+    p, rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")
+    away = jnp.array([1.0, 0.3, 0.2]) / jnp.linalg.norm(jnp.array([1.0, 0.3, 0.2]))
+    task = osik.FrameTask(arm, "hand", rows="position", target=(1.5 * away, rotation), gain=50.0)
+    limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)
+
+    def run(make):
+        @jax.jit
+        @jax.vmap
+        def motion(kappa):
+            return osik.rollout(
+                arm, q0, {"hand": task}, scheme=make(curvature_damping=kappa), limits=limits, dt=DT, steps=400
+            )
+
+        return motion(jnp.array([1.0, 0.0]))
+
+    return {name: run(make) for name, make in SCHEMES.items()}
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_out_of_reach_it_comes_to_rest(scheme, beyond):
+    v = np.asarray(beyond[scheme].solution.velocity)[:, 200:]
+    calm, shaking = np.sqrt((v**2).mean((1, 2)))
+    assert calm < 0.1 and shaking > 1.0
+    assert np.isfinite(np.asarray(beyond[scheme].q)).all()
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_inside_it_is_as_exact_as_without(scheme, arm):
+    """A hand that follows a circle, the whole error asked for in one tick."""
+    q0 = bent(arm)
+    p, rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")
+    t = 2.0 * np.pi * np.arange(200) * DT
+    path = p + 0.05 * np.c_[1.0 - np.cos(t), np.sin(t), 0.0 * t]
+    targets = {"hand": (path, np.broadcast_to(rotation, (200, 3, 3)))}
+    tasks = {"hand": osik.FrameTask(arm, "hand", rows="position", gain=1.0 / DT)}
+
+    @jax.jit
+    @jax.vmap
+    def errors(kappa):
+        scheme_ = SCHEMES[scheme](curvature_damping=kappa)
+        motion = osik.rollout(arm, q0, tasks, scheme=scheme_, limits=(), dt=DT, steps=200, targets=targets)
+        ends = jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "hand")[0])(motion.q[1:])
+        return jnp.linalg.norm(ends - path, axis=1)
+
+    damped, plain = np.asarray(errors(jnp.array([1.0, 0.0])))
+    assert damped.max() < (1.2 if scheme in ("hierarchical", "null-space") else 10.0) * plain.max()
+    assert damped.max() < 2e-4
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_derivatives_with_the_damping_on(scheme, arm):
+    """By target, gain, configuration and the damping's own share, against central differences; second ones too."""
+    q0 = bent(arm)
+    p, rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")
+    posture = osik.PostureTask(arm, weight=0.1, gain=1.0, priority=2)
+
+    @jax.jit
+    def velocity(t):
+        hand = osik.FrameTask(
+            arm, "hand", rows="position", target=(p + jnp.array([0.5, 0.2, 0.1 + t]), rotation), gain=20.0 + t
+        )
+        q = q0 + 0.1 * t * jnp.arange(7.0)
+        made = SCHEMES[scheme](curvature_damping=1.0 + t)
+        return osik.solve(arm, q, {"hand": hand, "posture": posture}, scheme=made, limits=(), dt=DT).velocity
+
+    for function, h in ((velocity, 1e-5), (jax.jit(jax.jacfwd(velocity)), 1e-5)):
+        expected = (function(h) - function(-h)) / (2.0 * h)
+        found = jax.jvp(function, (0.0,), (1.0,))[1]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        jax.jacrev(velocity)(0.0), jax.jacfwd(velocity)(0.0), rtol=0, atol=1e-9 * np.abs(expected).max()
+    )
+
+
+def test_its_share_is_traced(arm):
+    with pytest.raises(ValueError, match="curvature_damping"):
+        osik.HierarchicalQP(curvature_damping=-1.0)
+    traces = []
+
+    @jax.jit
+    def velocity(scheme):
+        traces.append(1)
+        return osik.solve(arm, arm.q0, {"posture": osik.PostureTask(arm)}, scheme=scheme, limits=()).velocity
+
+    for kappa in (0.0, 0.5, 1.0):
+        velocity(osik.WeightedQP(curvature_damping=kappa))
+    assert len(traces) == 1

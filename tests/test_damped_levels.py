@@ -1,0 +1,119 @@
+"""Levels with damping: against quadprog, against projections in NumPy, and the damping that vanishes with the miss."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import quadprog
+
+from osik_jax.solvers import Damping, Level, Status, solve_hqp, solve_nullspace
+
+COUNT, N = 40, 7
+ROWS = (3, 2, 4)
+DAMPINGS = (0.3, 0.0, 0.05)
+
+
+@pytest.fixture(scope="module")
+def levels():
+    rng = np.random.default_rng(3)
+    return [(rng.normal(size=(COUNT, m, N)), rng.normal(size=(COUNT, m))) for m in ROWS]
+
+
+@jax.jit
+def solved(levels, lower, upper, damping):
+    return jax.vmap(
+        lambda levels, lower, upper: solve_hqp([Level(*one) for one in levels], lower, upper, damping=damping)
+    )(levels, lower, upper)
+
+
+def projected(levels, damping):
+    """The cascade without bounds, by normal equations in bases of null spaces."""
+    free, x = np.eye(N), np.zeros(N)
+    for (A, b), strength in zip(levels, damping, strict=True):
+        if not free.shape[1]:
+            break
+        B = A @ free
+        whole = np.linalg.pinv(np.r_[B, np.sqrt(strength) * np.eye(B.shape[1])])
+        x = x + free @ (whole[:, : len(b)] @ (b - A @ x))
+        _, s, vt = np.linalg.svd(B)
+        free = free @ vt[np.sum(s > 1e-9 * np.linalg.norm(A)) :].T
+    return x
+
+
+def test_free_levels_reach_what_projections_do(levels):
+    unbounded = np.full((COUNT, N), np.inf)
+    found = solved(levels, -unbounded, unbounded, DAMPINGS)
+    assert (found.status == Status.SOLVED).all()
+    for i in range(COUNT):
+        expected = projected([(A[i], b[i]) for A, b in levels], DAMPINGS)
+        np.testing.assert_allclose(found.x[i], expected, rtol=0, atol=1e-9)
+
+
+def test_the_projection_method_damps_likewise(levels):
+    @jax.jit
+    @jax.vmap
+    def solve(levels):
+        return solve_nullspace([Level(*one) for one in levels], damping=list(DAMPINGS)).x
+
+    unbounded = np.full((COUNT, N), np.inf)
+    np.testing.assert_allclose(solve(levels), solved(levels, -unbounded, unbounded, DAMPINGS).x, rtol=0, atol=1e-9)
+
+
+def test_a_bounded_level_is_the_damped_least_squares(levels):
+    """Each level's optimum is quadprog's on what the levels above have reached; later levels keep it."""
+    upper = np.full((COUNT, N), 0.25)
+    found = solved(levels[:2], -upper, upper, (0.3, 0.1))
+    assert (found.status == Status.SOLVED).all()
+    assert (np.abs(found.active) == 1).sum(1).max() > 2
+    for i in range(COUNT):
+        (A, b), (C, d) = ((A[i], b[i]) for A, b in levels[:2])
+        x, near = np.asarray(found.x[i]), np.r_[np.eye(N), -np.eye(N)].T
+        best = quadprog.solve_qp(A.T @ A + 0.3 * np.eye(N), A.T @ b, near, -np.full(2 * N, 0.25))[0]
+        np.testing.assert_allclose(A @ x, A @ best, rtol=0, atol=1e-8)
+        second = quadprog.solve_qp(
+            C.T @ C + 0.1 * np.eye(N), C.T @ d, np.c_[A.T, near], np.r_[A @ best, -np.full(2 * N, 0.25)], 3
+        )
+        cost = lambda y: np.sum((C @ y - d) ** 2) + 0.1 * np.sum(y**2)  # noqa: B023, E731
+        if not (np.abs(np.asarray(found.multipliers[i, 0])) > 0.0).any():  # nothing was frozen by the first level
+            assert cost(x) <= cost(second[0]) + 0.1 * np.sum(x**2) + 1e-8
+
+
+def test_derivatives_are_those_of_the_values(levels):
+    upper = jnp.full(N, 0.4)
+    (A, b), (C, d), _ = [(A[0], b[0]) for A, b in levels]
+    rates = np.random.default_rng(1).normal(size=b.shape), np.random.default_rng(2).normal(size=A.shape)
+
+    @jax.jit
+    def x(t):
+        given = [Level(A + t * rates[1], b + t * rates[0]), Level(C, d)]
+        return solve_hqp(given, -upper, upper, damping=[Damping(0.1, 0.3 + t, 2.0), 0.02 * (1.0 + t)]).x
+
+    h = 1e-5
+    expected = (x(h) - x(-h)) / (2.0 * h)
+    forward = jax.jvp(x, (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(jax.jacrev(x)(0.0), forward, rtol=0, atol=1e-11)
+
+
+def test_what_a_level_can_meet_is_not_damped():
+    """In one dimension: max(0, unmet - s^2) at a demand of the size of the goal."""
+    unbounded = jnp.full(1, jnp.inf)
+
+    @jax.jit
+    @jax.vmap
+    def found(s):
+        return solve_hqp([Level(s[None, None], jnp.ones(1))], -unbounded, unbounded, damping=Damping(0.0, 1.0, 1.0)).x[
+            0
+        ]
+
+    s = jnp.array([1e-3, 0.03, 0.1, 3.0, 10.0, 100.0])
+    x = found(s)
+    assert (x[:3] < 1.01 * s[:3]).all()  # as good as s / (s^2 + 1)
+    np.testing.assert_allclose(s[3:] * x[3:], 1.0, rtol=0, atol=2e-3)
+
+
+def test_a_damping_that_is_none_is_refused(levels):
+    with pytest.raises(ValueError, match="3 levels"):
+        solve_hqp([Level(A[0], b[0]) for A, b in levels], jnp.zeros(N), jnp.ones(N), damping=[0.1])
+    failed = solve_hqp([Level(levels[0][0][0], levels[0][1][0])], -jnp.ones(N), jnp.ones(N), damping=-1.0)
+    assert failed.status == Status.NUMERICAL_ERROR
