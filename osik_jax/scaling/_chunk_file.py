@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 _RESULT = "result."
-_JOB, _PART, _LANES = "job", "part", "lanes"
+_JOB, _PART, _NAMES, _LANES = "job", "part", "names", "lanes"
 _FILE = re.compile(r"(\d{8,})(?:\.(\d+)-of-(\d+))?\.npz")
 
 Block = tuple[int, int]
@@ -88,7 +88,12 @@ def write_chunk(folder: Path, part: Part, job: str, blocks: Sequence[Block], arr
     """
     for name, array in arrays.items():
         _check_type(name, array.dtype)
-    marks = {_JOB: np.array(job), _PART: np.array(part, np.int64), _LANES: np.array(blocks, np.int64).reshape(-1, 2)}
+    marks = {
+        _JOB: np.array(job),
+        _PART: np.array(part, np.int64),
+        _NAMES: np.array(list(arrays)),
+        _LANES: np.array(blocks, np.int64).reshape(-1, 2),
+    }
     named = {_RESULT + name: array for name, array in arrays.items()}
     with whole_file(folder / part.file_name) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **marks, **named)
@@ -180,13 +185,16 @@ def read_chunk(
 
 def result_names(file: Any) -> tuple[str, ...]:
     """Names of the results in an opened file."""
-    return tuple(key.removeprefix(_RESULT) for key in file.files if key.startswith(_RESULT))
+    return tuple(file[_NAMES].tolist())
 
 
 def _check_marks(file: Any, path: Path, part: Part, job: str) -> None:
-    """Raises where a file is not of this part of this job."""
-    if _JOB not in file.files or str(file[_JOB]) != job:
+    """Raises where a file is not of this part of this job, or where a damaged directory hides some of its arrays."""
+    if file.files and (_JOB not in file.files or str(file[_JOB]) != job):
         raise OtherJob(f"{path} has results of another job; name another folder, or take the file out of this one")
     found = Part(*file[_PART].tolist())
     if found != part:
         raise DamagedFile(path, f"has the content of {found.file_name}")
+    hidden = {_LANES, *(_RESULT + name for name in result_names(file))}.difference(file.files)
+    if hidden:
+        raise DamagedFile(path, f"is damaged ({min(hidden)} is not in its directory)")
