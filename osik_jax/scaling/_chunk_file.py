@@ -159,7 +159,7 @@ def check_chunk(path: Path, part: Part, job: str) -> None:
 
     Raises:
         DamagedFile: a byte that matters has changed, or the file is of another chunk.
-        OtherJob: the file is sound, and of another job.
+        OtherJob: the file is whole, and of another job.
     """
     with opened(path) as file:
         broken = file.zip.testzip()

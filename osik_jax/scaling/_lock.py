@@ -41,7 +41,8 @@ def only_job(folder: Path, process: int = 0) -> Iterator[bool]:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = _taken(path)
     except BlockingIOError as error:
-        raise BlockingIOError(errno.EWOULDBLOCK, f"{_owner(path)} works in the folder", str(folder)) from error
+        message = f"{_owner(path)} works in the folder; wait until it ends, or name another folder"
+        raise BlockingIOError(errno.EWOULDBLOCK, message, str(folder)) from error
     except OSError as error:
         raise unwritable(folder, "the folder for the results cannot be made or written to", error) from error
     try:
