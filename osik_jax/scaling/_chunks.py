@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,12 @@ import jax
 import numpy as np
 
 from .._names import leaf_names
-from ._fingerprint import differences, fingerprint
-from ._progress import reported
-from ._saved import FORMAT, Block, Saved, file_name, finished_chunks, read_manifest, write_chunk, write_manifest
+from ._chunk_file import Block, Part, read_chunk, remove_partial_files, write_chunk
+from ._fingerprint import differences, fingerprint, identifier
+from ._folder import check_space, claim
+from ._lock import only_job
+from ._progress import Progress, check_progress, reported
+from ._saved import FORMAT, Saved
 
 Batch = Any
 """A pytree of arrays with the lanes in front, or a function from first and last lane (exclusive) to such a pytree."""
@@ -29,7 +32,7 @@ def run_in_chunks(
     count: int | None = None,
     out: str | os.PathLike[str] | None = None,
     label: str = "",
-    progress: bool = True,
+    progress: Progress = True,
 ) -> Any:
     """``function(batch, *shared)``, some lanes at a time; on disk, a job that was killed goes on where it was.
 
@@ -37,10 +40,11 @@ def run_in_chunks(
     one is filled up with copies of its last lane), so one program does for all.
 
     With ``out``, each chunk is a file of that folder, under its name only when complete, beside a manifest. Call it
-    again with the same arguments and it runs only the chunks that are missing. Different ones are refused: compared are
-    the number of lanes and of those in a chunk, precision, version, ``label``, and names, shapes and numbers of
-    ``batch`` and ``shared``. What the function holds besides is not seen: pass it through ``shared``, or name it in
-    ``label``.
+    again with the same arguments and it runs only the chunks that are missing or damaged: each file that is there is
+    read once, against its checksums, and has to be of this chunk and this job. Different arguments are refused:
+    compared are the number of lanes and of those in a chunk, precision, version, ``label``, and names, shapes and
+    numbers of ``batch`` and ``shared``. What the function holds besides is not seen: pass it through ``shared``, or
+    name it in ``label``. One job works in a folder at a time.
 
     On several hosts (``jax.distributed``), each calls it with the same arguments and a function that ``sharded`` made;
     each writes the lanes that its own devices have.
@@ -55,33 +59,53 @@ def run_in_chunks(
         count: number of lanes, where ``batch`` is a function.
         out: folder for the results. Default: none; they are gathered in memory.
         label: a word for what the function does, kept in the manifest.
-        progress: whether to show a bar.
+        progress: whether to show a bar; or a function of the number of lanes that are done and of all, called after
+            each chunk, when it is written (on several hosts by the first process).
 
     Returns:
         With ``out``, a ``Saved``; without, the results as NumPy arrays.
 
+    Warns:
+        UserWarning: a damaged file was found; the message names it, and its chunk is run again.
+
     Raises:
         ValueError: arguments that do not fit, a folder with another job in it (the message names what differs),
-            or results that do not have the lanes in front.
+            or results that do not have the lanes in front, are of another type or shape than in other chunks, or of a
+            type that a ``.npz`` does not keep.
+        BlockingIOError: another process works in the folder; the message has its number and host.
+        OSError: the folder cannot be made or written to, or its disk is too small for the results that are missing.
+            Before the first chunk is run, where it can be known; later, what is finished stays.
     """
+    check_progress(progress)
     job = _Job(function, batch, shared, _lanes(batch, count), _positive(chunk, "chunk"))
     if out is None:
         return _in_memory(job, progress)
     folder = Path(out)
-    _claim(folder, job.manifest(label))
-    process, processes = jax.process_index(), jax.process_count()
-    todo = _agreed(job.chunks, finished_chunks(folder, process, processes))
-    done = job.count - sum(job.size(k) for k in todo)
-    structure = None
-    with reported(job.count, done, shown=progress and process == 0) as advance:
+    with only_job(folder, jax.process_index()) as alone:
+        if alone:
+            remove_partial_files(folder)
+        return Saved(folder, _to_disk(job, folder, label, progress))
+
+
+def _to_disk(job: _Job, folder: Path, label: str, progress: Progress) -> Any:
+    """Runs the chunks that are missing; returns a pytree of the structure of the results."""
+    process, processes, manifest = jax.process_index(), jax.process_count(), job.manifest(label)
+    finished = claim(folder, manifest, process, processes)
+    todo = _agreed(job.chunks, set(finished))
+    like, missing = job.expected(), sum(job.size(k) for k in todo)
+    check_space(folder, _bytes(like) * missing // job.chunk // processes)
+    layout = _Layout()
+    if finished and todo:
+        part = next(iter(finished.values()))[0]
+        layout.check(read_chunk(folder / part.file_name, part, manifest["job"])[1], part.chunk)
+    with reported(job.count, job.count - missing, progress if process == 0 else False) as advance:
         for k, result in _one_ahead(job, todo):
             blocks, arrays = _rows(result, job.size(k), job.chunk)
-            write_chunk(folder / file_name(k, process, processes), blocks, arrays)
-            structure = jax.tree.map(lambda _: 0, result)
+            layout.check(arrays, k)
+            write_chunk(folder, Part(k, process, processes), manifest["job"], blocks, arrays)
+            like = jax.tree.map(lambda _: 0, result)
             advance(job.size(k))
-    if structure is None:
-        structure = jax.eval_shape(function, job.inputs(0), *shared)
-    return Saved(folder, structure)
+    return like if like is not None else job.run(0)
 
 
 class _Job:
@@ -117,11 +141,18 @@ class _Job:
         """Results of a chunk, perhaps still being computed."""
         return self.function(self.inputs(k), *self.shared)
 
+    def expected(self) -> Any:
+        """Shapes and types of a chunk's results, without computing them; None where JAX cannot trace the function."""
+        try:
+            return jax.eval_shape(self.function, self.inputs(0), *self.shared)
+        except Exception:  # a function of NumPy, or one that is wrong: then running it says how
+            return None
+
     def manifest(self, label: str) -> dict[str, Any]:
-        """What has to be the same for the job to go on."""
+        """What has to be the same for the job to go on, and an identifier of it, which each chunk carries."""
         first, last = (fingerprint(self.lanes(k)) for k in (0, self.chunks - 1)) if callable(self.batch) else ({}, {})
         inputs = {"first chunk": first, "last chunk": last} if callable(self.batch) else fingerprint(self.batch)
-        return {
+        said = {
             "format": FORMAT,
             "osik_jax": version("osik-jax"),
             "label": label,
@@ -131,6 +162,7 @@ class _Job:
             "batch": inputs,
             "shared": fingerprint(self.shared),
         }
+        return said | {"job": identifier(said)}
 
 
 def _lengths(tree: Any) -> set[int]:
@@ -157,18 +189,6 @@ def _positive(value: Any, name: str) -> int:
     return int(value)
 
 
-def _claim(folder: Path, manifest: dict[str, Any]) -> None:
-    """Makes the folder, or raises where another job is in it."""
-    old = read_manifest(folder)
-    if old is None:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_manifest(folder, manifest)
-        return
-    changed = differences(old, manifest)
-    if changed:
-        raise ValueError(f"{folder} has another job in it; name another folder. What differs: {'; '.join(changed)}")
-
-
 def _agreed(chunks: int, finished: set[int]) -> list[int]:
     """Chunks that one process or another lacks: all run the same ones, for the program is of all of them."""
     lacking = np.array([k not in finished for k in range(chunks)])
@@ -180,10 +200,15 @@ def _agreed(chunks: int, finished: set[int]) -> list[int]:
 
 
 def _one_ahead(job: _Job, todo: Sequence[int]) -> Iterator[tuple[int, Any]]:
-    """Results in order; the next chunk is under way while one is used."""
+    """Results in order; the next chunk is under way while one is used. If it fails, the one before is used first."""
     waiting: tuple[int, Any] | None = None
     for k in todo:
-        result = job.run(k)
+        try:
+            result = job.run(k)
+        except BaseException:  # Ctrl-C too
+            if waiting is not None:
+                yield waiting
+            raise
         if waiting is not None:
             yield waiting
         waiting = k, result
@@ -198,6 +223,9 @@ def _rows(result: Any, size: int, chunk: int) -> tuple[list[Block], dict[str, np
     if wrong or not leaves:
         found = f"{wrong[0] or 'it'} does not" if wrong else "there are none"
         raise ValueError(f"the function's results have the lanes in front, {chunk} of them: {found}")
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"two arrays of the function's results are called {twice!r}")
     parts = [_blocks(leaf, chunk) for leaf in leaves]
     if any(part.keys() != parts[0].keys() for part in parts):
         raise ValueError("the function's results are split over devices in different ways; make it with sharded")
@@ -219,13 +247,37 @@ def _blocks(leaf: Any, chunk: int) -> dict[int, Any]:
     return {start: np.asarray(data) for start, data in shards.items()}
 
 
-def _in_memory(job: _Job, progress: bool) -> Any:
+class _Layout:
+    """Names, types and shapes of the arrays, which have to be the same in every chunk."""
+
+    def __init__(self) -> None:
+        self.known: tuple[int, dict[str, str]] | None = None
+
+    def check(self, arrays: Mapping[str, np.ndarray], chunk: int) -> None:
+        """Raises ValueError where a chunk is not like the first one given."""
+        found = {name or "it": f"{array.dtype} {array.shape[1:]}" for name, array in arrays.items()}
+        if self.known is None:
+            self.known = chunk, found
+        first, known = self.known
+        if known != found:
+            changed = "; ".join(differences(known, found))
+            raise ValueError(f"the function's results of chunk {chunk} are not like those of chunk {first}: {changed}")
+
+
+def _bytes(tree: Any) -> int:
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def _in_memory(job: _Job, progress: Progress) -> Any:
     if jax.process_count() > 1:
         raise ValueError("several processes have no memory in common: name a folder, out=...")
-    parts: list[Any] = []
-    with reported(job.count, 0, shown=progress) as advance:
+    parts: list[dict[str, np.ndarray]] = []
+    layout, result = _Layout(), None
+    with reported(job.count, 0, progress) as advance:
         for k, result in _one_ahead(job, range(job.chunks)):
             _, arrays = _rows(result, job.size(k), job.chunk)
-            parts.append(jax.tree.unflatten(jax.tree.structure(result), list(arrays.values())))
+            layout.check(arrays, k)
+            parts.append(arrays)
             advance(job.size(k))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    whole = [np.concatenate([part[name] for part in parts]) for name in parts[0]]
+    return jax.tree.unflatten(jax.tree.structure(result), whole)

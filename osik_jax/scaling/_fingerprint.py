@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -21,6 +22,12 @@ def fingerprint(tree: Any) -> dict[str, str]:
     }
     structure = re.sub(r"0x[0-9a-f]+", "", str(jax.tree.structure(tree)))  # less addresses of objects
     return found | {"structure": _digest(structure.encode())}
+
+
+def identifier(manifest: Mapping[str, Any]) -> str:
+    """A hash of all that a manifest says; what is under "job", where it is kept, does not count."""
+    said = {key: value for key, value in manifest.items() if key != "job"}
+    return _digest(json.dumps(said, sort_keys=True).encode())
 
 
 def _described(array: np.ndarray) -> str:

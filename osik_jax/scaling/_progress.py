@@ -1,26 +1,37 @@
-"""A bar with the lanes done."""
+"""Tells how many lanes are done: by a bar, or to a function of the user."""
 
 from __future__ import annotations
 
 import contextlib
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from .._progress import progress_bar
 
+Progress = bool | Callable[[int, int], Any]
+"""Whether to show a bar; or a function of the lanes that are done and of all."""
+
+
+def check_progress(progress: Any) -> None:
+    """Raises TypeError for what is neither True, False nor a function."""
+    if not isinstance(progress, bool) and not callable(progress):
+        raise TypeError(f"progress is {progress!r}; it is True, False, or a function of the lanes done and of all")
+
 
 @contextlib.contextmanager
-def reported(total: int, done: int, *, shown: bool) -> Iterator[Callable[[int], None]]:
-    """A function to tell how many more lanes are done; it draws a bar if wanted."""
-    if not shown:
-        yield lambda more: None
-        return
-    with progress_bar(total, done) as update:
-        start, own = time.perf_counter(), [0]
+def reported(total: int, done: int, progress: Progress) -> Iterator[Callable[[int], None]]:
+    """A function to tell how many more lanes are done; it draws a bar, or calls the function given."""
+    with contextlib.ExitStack() as stack:
+        update = stack.enter_context(progress_bar(total, done)) if progress is True else None
+        start, own = time.perf_counter(), 0
 
         def advance(more: int) -> None:
-            own[0] += more
-            rate = own[0] / (time.perf_counter() - start)
-            update(done + own[0], f"{rate:,.0f} lanes/s")
+            nonlocal own
+            own += more
+            if update is not None:
+                update(done + own, f"{own / (time.perf_counter() - start):,.0f} lanes/s")
+            elif callable(progress):
+                progress(done + own, total)
 
         yield advance

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -15,77 +14,44 @@ import jax
 import numpy as np
 
 from .._names import leaf_names
+from ._chunk_file import Block, DamagedFile, Part, chunk_files, complete, opened, read_chunk, result_names, whole_file
+from ._fingerprint import identifier
 
-FORMAT = 1
+FORMAT = 2
 MANIFEST = "manifest.json"
-_LANES = "lanes"
-_RESULT = "result."
-_FILE = re.compile(r"(\d{8})(?:\.(\d+)-of-(\d+))?\.npz")
-
-Block = tuple[int, int]
-"""First lane, and the one after the last."""
 
 
-def file_name(chunk: int, process: int, processes: int) -> str:
-    """Of the results that one process has of a chunk."""
-    return f"{chunk:08d}.npz" if processes == 1 else f"{chunk:08d}.{process}-of-{processes}.npz"
-
-
-def write_chunk(path: Path, blocks: Sequence[Block], arrays: Mapping[str, np.ndarray]) -> None:
-    """Results of some lanes; the file has its name only when it is complete and on the disk."""
-    named = {_RESULT + name: array for name, array in arrays.items()}
-    with _whole(path) as partial, partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **{_LANES: np.array(blocks, np.int64).reshape(-1, 2)}, **named)
+def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Writes what the chunks are of."""
+    with whole_file(folder / MANIFEST) as partial, partial.open("w") as file:
+        json.dump(manifest, file, indent=1)
         file.flush()
         os.fsync(file.fileno())
 
 
-def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """What the chunks are of."""
-    with _whole(folder / MANIFEST) as partial:
-        partial.write_text(json.dumps(manifest, indent=1) + "\n")
-
-
-class _whole:
-    """A file under another name, which gets its own when all went well."""
-
-    def __init__(self, path: Path):
-        self.path, self.partial = path, path.with_name(f".{path.name}.{jax.process_index()}.partial")
-
-    def __enter__(self) -> Path:
-        return self.partial
-
-    def __exit__(self, kind: Any, *_: Any) -> None:
-        if kind is None:
-            self.partial.replace(self.path)
-        else:
-            self.partial.unlink(missing_ok=True)
-
-
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """What the chunks are of; None if there are none yet.
+    """What the chunks are of; None if there is no manifest.
 
     Raises:
-        ValueError: this version cannot read it.
+        DamagedFile: it is not as it was written.
+        ValueError: it is of another version.
     """
     path = folder / MANIFEST
     if not path.exists():
         return None
-    manifest = json.loads(path.read_text())
-    if manifest.get("format") != FORMAT:
-        raise ValueError(f"{folder} has format {manifest.get('format')!r}, and this version reads {FORMAT}")
+    try:
+        manifest = json.loads(path.read_bytes())
+        form = manifest["format"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise DamagedFile(path, f"is damaged ({error})") from error
+    if form != FORMAT:
+        raise ValueError(
+            f"{folder} has format {form!r}, and this version reads and writes {FORMAT}: name another folder for a job; "
+            "np.load opens the files of this one"
+        )
+    if manifest.get("job") != identifier(manifest):
+        raise DamagedFile(path, "is damaged (its checksum, called job, is wrong)")
     return manifest
-
-
-def finished_chunks(folder: Path, process: int, processes: int) -> set[int]:
-    """Chunks of which this process needs to write nothing: its own part is there, or all parts of another number."""
-    parts: dict[tuple[int, int], set[int]] = {}
-    for path in folder.iterdir() if folder.exists() else ():
-        match = _FILE.fullmatch(path.name)
-        if match:
-            chunk, own, of = (int(part) for part in match.groups(default="-1"))
-            parts.setdefault((chunk, of), set()).add(own)
-    return {k for (k, of), own in parts.items() if len(own) == abs(of) or (of == processes and process in own)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,15 +88,15 @@ class Saved:
     @property
     def missing(self) -> tuple[int, ...]:
         """Chunks that are not there."""
-        there = {k for k in range(self.chunks) if self._complete(k)}
+        there = complete(chunk_files(self.folder))
         return tuple(k for k in range(self.chunks) if k not in there)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Of the arrays: ``velocity``, ``slack.hand``."""
-        for path in sorted(self.folder.glob("*.npz")):
-            with np.load(path, allow_pickle=False) as file:
-                return tuple(key.removeprefix(_RESULT) for key in file.files if key != _LANES)
+        for path in chunk_files(self.folder).values():
+            with opened(path) as file:
+                return result_names(file)
         raise ValueError(f"{self.folder} has no finished chunk")
 
     def __getitem__(self, lanes: slice) -> Any:
@@ -166,46 +132,42 @@ class Saved:
             parts = [self._chunk(0, names, 0, 0)]
         return {name: np.concatenate([part[name] for part in parts])[::step] for name in names}
 
-    def _files(self, chunk: int) -> list[Path]:
-        """The files that a chunk is in, one set of them where it was written by different numbers of processes."""
-        alone = self.folder / f"{chunk:08d}.npz"
-        if alone.exists():
+    def _parts(self, chunk: int) -> list[Part]:
+        """The parts that a chunk is in, one set of them where it was written by different numbers of processes."""
+        alone = Part(chunk)
+        if (self.folder / alone.file_name).exists():
             return [alone]
-        sets: dict[int, list[Path]] = {}
-        for path in sorted(self.folder.glob(f"{chunk:08d}.*-of-*.npz")):
-            match = _FILE.fullmatch(path.name)
-            if match:
-                sets.setdefault(int(match[3]), []).append(path)
-        return next((paths for of, paths in sets.items() if len(paths) == of), [])
-
-    def _complete(self, chunk: int) -> bool:
-        return bool(self._files(chunk))
+        paths = self.folder.glob(f"{chunk:08d}.*-of-*.npz")
+        return complete(part for path in paths if (part := Part.of(path))).get(chunk, [])
 
     def _chunk(self, chunk: int, names: Sequence[str], start: int, stop: int) -> dict[str, np.ndarray]:
         """Lanes start to stop of a chunk, counted from its first."""
-        paths = self._files(chunk)
-        if not paths:
+        parts = self._parts(chunk)
+        if not parts:
             count = len(self.missing)
             raise ValueError(
                 f"chunk {chunk} of {self.folder} is missing, with {count - 1} more of {self.chunks}: call "
                 "run_in_chunks again, it goes on where it was; if hosts wrote to folders of their own, join them"
             )
+        job = self.manifest["job"]
+        read = [read_chunk(self.folder / part.file_name, part, job, names) for part in parts]
         own = min(self.manifest["chunk"], len(self) - chunk * self.manifest["chunk"])
+        lanes = np.concatenate([np.arange(*block) for blocks, _ in read for block in blocks])
+        if not np.array_equal(np.sort(lanes), np.arange(own)):
+            raise DamagedFile(self.folder / parts[0].file_name, f"and its like do not have each of {own} lanes once")
         whole: dict[str, np.ndarray] = {}
-        for path in paths:
-            with np.load(path, allow_pickle=False) as file:
-                blocks = file[_LANES]
-                for name in names:
-                    _fill(whole, name, file[_RESULT + name], blocks, own)
+        for blocks, arrays in read:
+            for name, array in arrays.items():
+                _fill(whole, name, array, blocks, own)
         return {name: array[start:stop] for name, array in whole.items()}
 
 
-def _fill(whole: dict[str, np.ndarray], name: str, array: np.ndarray, blocks: np.ndarray, own: int) -> None:
+def _fill(whole: dict[str, np.ndarray], name: str, array: np.ndarray, blocks: list[Block], own: int) -> None:
     """Puts the rows of an array where they belong."""
     if name not in whole:
         whole[name] = np.zeros((own, *array.shape[1:]), array.dtype)
     row = 0
-    for first, last in blocks.tolist():
+    for first, last in blocks:
         whole[name][first:last] = array[row : row + last - first]
         row += last - first
 

@@ -1,0 +1,200 @@
+"""The file of a chunk: arrays in a plain ``.npz``, which says itself of which job and which chunk they are."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+_RESULT = "result."
+_JOB, _PART, _NAMES, _LANES = "job", "part", "names", "lanes"
+_FILE = re.compile(r"(\d{8,})(?:\.(\d+)-of-(\d+))?\.npz")
+
+Block = tuple[int, int]
+"""First lane, and the one after the last, counted within the chunk."""
+
+
+class DamagedFile(ValueError):
+    """A file cannot be read, or holds something else than its name says.
+
+    Attributes:
+        found: which file, and what is wrong with it.
+    """
+
+    def __init__(self, path: Path, wrong: str):
+        self.found = f"{path} {wrong}"
+        super().__init__(f"{self.found}; call run_in_chunks again with the same arguments, it makes the file anew")
+
+
+class OtherJob(ValueError):
+    """A file has results of another job."""
+
+
+class Part(NamedTuple):
+    """The lanes of a chunk that one of several processes has; a process alone has all of them."""
+
+    chunk: int
+    process: int = 0
+    processes: int = 1
+
+    @property
+    def file_name(self) -> str:
+        """Name of the file that the part is kept in."""
+        own = f".{self.process}-of-{self.processes}" if self.processes > 1 else ""
+        return f"{self.chunk:08d}{own}.npz"
+
+    @classmethod
+    def of(cls, path: Path) -> Part | None:
+        """The part that a file has by its name, None if it is no file of a chunk."""
+        match = _FILE.fullmatch(path.name)
+        part = cls(*(int(number) for number in match.groups() if number is not None)) if match else None
+        return part if part and part.file_name == path.name else None
+
+
+def chunk_files(folder: Path) -> dict[Part, Path]:
+    """All files of chunks in a folder, in order."""
+    found = {part: path for path in folder.iterdir() if (part := Part.of(path))} if folder.is_dir() else {}
+    return dict(sorted(found.items()))
+
+
+def complete(parts: Iterable[Part]) -> dict[int, list[Part]]:
+    """The chunks of which all parts are there: one set of parts for each, where several numbers of processes wrote."""
+    sets: dict[tuple[int, int], list[Part]] = {}
+    for part in sorted(parts):
+        sets.setdefault((part.chunk, part.processes), []).append(part)
+    return {k: own for (k, processes), own in sorted(sets.items(), reverse=True) if len(own) == processes}
+
+
+def write_chunk(folder: Path, part: Part, job: str, blocks: Sequence[Block], arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes the results of some lanes.
+
+    Args:
+        folder: where to.
+        part: which lanes they are.
+        job: identifier of the job.
+        blocks: ranges of lanes that the rows of the arrays are.
+        arrays: by name, with the lanes in front.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: an array is of a type that a ``.npz`` does not keep.
+    """
+    for name, array in arrays.items():
+        _check_type(name, array.dtype)
+    marks = {
+        _JOB: np.array(job),
+        _PART: np.array(part, np.int64),
+        _NAMES: np.array(list(arrays)),
+        _LANES: np.array(blocks, np.int64).reshape(-1, 2),
+    }
+    named = {_RESULT + name: array for name, array in arrays.items()}
+    with whole_file(folder / part.file_name) as partial, partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, **marks, **named)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _check_type(name: str, dtype: np.dtype) -> None:
+    """Raises for Python objects, which only pickle keeps, and types that come back as bytes, such as bfloat16."""
+    known = not dtype.hasobject and np.dtype(dtype.str) == dtype
+    if not known and dtype.names is None:
+        raise ValueError(f"{name or 'the result'} is of type {dtype}, which no .npz keeps; NumPy's own numbers do")
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Another name to write a file under, which is like no other; the file gets its own name if all goes well."""
+    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+    try:
+        yield partial
+        partial.replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise unwritable(path.parent, f"{path.name} cannot be written", error) from error
+        raise
+
+
+def remove_partial_files(folder: Path) -> None:
+    """Removes what killed processes left half written; no other process may be writing."""
+    for path in folder.glob(".*.npz.*.partial"):
+        path.unlink(missing_ok=True)
+
+
+def unwritable(folder: Path, what: str, error: OSError) -> OSError:
+    """An error of the same kind that names the folder and says what becomes of the job."""
+    message = f"{what}: {error.strerror or error}; chunks that are finished stay, call again when this is cured"
+    return OSError(error.errno or errno.EIO, message, str(folder))
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """The arrays of a file, to be read inside the block.
+
+    Raises:
+        DamagedFile: one of them cannot be read.
+        OSError: the file is not there, or may not be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            yield file
+    except (DamagedFile, OtherJob, MemoryError):
+        raise
+    except Exception as error:  # whatever the bytes of a damaged file lead zipfile and NumPy to
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
+        raise DamagedFile(path, f"is damaged ({error})") from error
+
+
+def check_chunk(path: Path, part: Part, job: str) -> None:
+    """Reads a file once, against its checksums.
+
+    Raises:
+        DamagedFile: a byte that matters has changed, or the file is of another chunk.
+        OtherJob: the file is whole, and of another job.
+    """
+    with opened(path) as file:
+        broken = file.zip.testzip()
+        if broken is not None:
+            raise DamagedFile(path, f"is damaged (the checksum of {broken} is wrong)")
+        _check_marks(file, path, part, job)
+
+
+def read_chunk(
+    path: Path, part: Part, job: str, names: Sequence[str] | None = None
+) -> tuple[list[Block], dict[str, np.ndarray]]:
+    """The lanes that a file has, and some of its arrays by name, or all.
+
+    Raises:
+        DamagedFile: something of it cannot be read, or it is of another chunk.
+        OtherJob: it is of another job.
+    """
+    with opened(path) as file:
+        _check_marks(file, path, part, job)
+        wanted = result_names(file) if names is None else names
+        return [(a, b) for a, b in file[_LANES].tolist()], {name: file[_RESULT + name] for name in wanted}
+
+
+def result_names(file: Any) -> tuple[str, ...]:
+    """Names of the results in an opened file."""
+    return tuple(file[_NAMES].tolist())
+
+
+def _check_marks(file: Any, path: Path, part: Part, job: str) -> None:
+    """Raises where a file is not of this part of this job, or where a damaged directory hides some of its arrays."""
+    if file.files and (_JOB not in file.files or str(file[_JOB]) != job):
+        raise OtherJob(f"{path} has results of another job; name another folder, or take the file out of this one")
+    found = Part(*file[_PART].tolist())
+    if found != part:
+        raise DamagedFile(path, f"has the content of {found.file_name}")
+    hidden = {_LANES, *(_RESULT + name for name in result_names(file))}.difference(file.files)
+    if hidden:
+        raise DamagedFile(path, f"is damaged ({min(hidden)} is not in its directory)")

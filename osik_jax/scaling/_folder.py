@@ -1,0 +1,99 @@
+"""A job finds its folder: another job's, a new one, or what an earlier run of it has finished."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from ._chunk_file import DamagedFile, Part, check_chunk, chunk_files, complete
+from ._fingerprint import differences
+from ._saved import read_manifest, write_manifest
+
+
+def claim(folder: Path, manifest: Mapping[str, Any], process: int, processes: int) -> dict[int, list[Part]]:
+    """Makes a folder that of a job, and reads every finished chunk once, to see that it is of this job and whole.
+
+    Damaged files are removed, with a warning, so that they are made anew.
+
+    Args:
+        folder: that exists, and that no other job writes to.
+        manifest: of the job.
+        process: index of this process.
+        processes: how many the job has.
+
+    Returns:
+        The chunks of which this process needs to write nothing, each with parts that it has checked: its own part is
+        there, or all parts of another number of processes.
+
+    Raises:
+        ValueError: there is another job in the folder.
+    """
+    old = _old_manifest(folder)
+    changed = [line for line in differences(old or manifest, manifest) if not line.startswith("job was")]
+    if changed:
+        raise ValueError(f"{folder} has another job in it; name another folder. What differs: {'; '.join(changed)}")
+    found = _undamaged(folder, manifest["job"], process, processes)
+    if old is None:
+        write_manifest(folder, manifest)
+    own = {part.chunk: [part] for part in found if part.processes == processes}
+    return complete(part for part in found if part.processes != processes) | own
+
+
+def _old_manifest(folder: Path) -> dict[str, Any] | None:
+    """The manifest that is there; a damaged one counts as none, for each chunk says of which job it is."""
+    try:
+        return read_manifest(folder)
+    except DamagedFile as damaged:
+        _report(damaged)
+        return None
+
+
+def _undamaged(folder: Path, job: str, process: int, processes: int) -> list[Part]:
+    """This process's parts and those of other numbers of processes, without the damaged ones, which are removed."""
+    parts = [part for part in chunk_files(folder) if part.processes != processes or part.process == process]
+
+    def damage(part: Part) -> DamagedFile | None:
+        try:
+            check_chunk(folder / part.file_name, part, job)
+        except DamagedFile as damaged:
+            return damaged
+        return None
+
+    with ThreadPoolExecutor() as pool:
+        damages = list(pool.map(damage, parts))
+    for part, damaged in zip(parts, damages, strict=True):
+        if damaged is not None:
+            _report(damaged)
+            (folder / part.file_name).unlink(missing_ok=True)
+    return [part for part, damaged in zip(parts, damages, strict=True) if damaged is None]
+
+
+def _report(damaged: DamagedFile) -> None:
+    warnings.warn(f"{damaged.found}; it is made anew", stacklevel=6)
+
+
+def check_space(folder: Path, needed: int) -> None:
+    """Raises where results do not fit into a folder.
+
+    Args:
+        folder: where they go.
+        needed: bytes.
+
+    Raises:
+        OSError: the disk has less than that left.
+    """
+    disk = shutil.disk_usage(folder)
+    if disk.total and disk.free < needed:  # some network file systems say 0 of 0
+        message = (
+            f"the results that are missing take {_size(needed)}, and the folder's disk has {_size(disk.free)} left"
+        )
+        raise OSError(errno.ENOSPC, message, str(folder))
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**30:,.1f} GiB" if count >= 2**30 else f"{count / 2**20:,.1f} MiB"
