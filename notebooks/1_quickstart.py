@@ -23,13 +23,14 @@
 # %%
 import os
 import tempfile
+from base64 import b64encode
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import Image, display
+from IPython.display import HTML, Image, display
 from matplotlib.colors import LogNorm
 
 import osik_jax as osik
@@ -180,7 +181,8 @@ assert slip < 1e-4 and room.min() > -1e-4  # a tenth of a millimetre: what a tic
 # %% [markdown]
 # ## A film
 #
-# `animate` writes a GIF, or an MP4 where the program ffmpeg is installed.
+# `animate` writes a GIF, or an MP4 where the program ffmpeg is installed. As a part of the page it is kept when the
+# notebook is made into one by `jupyter nbconvert --to html`, which passes over outputs that are GIFs themselves.
 
 # %%
 film = animate(
@@ -193,7 +195,8 @@ film = animate(
     trails=["l_gripper"],
     caption="NAO reaches forward",
 )
-display(Image(film))
+encoded = b64encode(film.read_bytes()).decode()
+display(HTML(f'<img alt="NAO reaches forward" src="data:image/gif;base64,{encoded}">'))
 
 
 # %% [markdown]

@@ -1,12 +1,16 @@
 """Functions with rules of their own: for the derivative, which survives loops, and for long batches.
 
-Linearising a ``scan`` moves what does not change out of its body, and ``jax.custom_jvp`` does not come through that
-(seen with jax 0.10): the body keeps the plain operations and forgets the rule. First derivatives are right, but the
-second ones of a loop are then those of the plain operations, silently; for a solver whose search is cut off from
-differentiation, that is 0. A primitive of its own keeps its rule.
+Linearising a ``scan`` moves what does not change out of its body, and before jax 0.12 ``jax.custom_jvp`` does not come
+through that: the body keeps the plain operations and forgets the rule. First derivatives are right, but the second ones
+of a loop are then those of the plain operations, silently; for a solver whose search is cut off from differentiation,
+that is 0. A primitive of its own keeps its rule. Python 3.11 has no jax from 0.11 on, so the primitive is needed for as
+long as that Python is supported.
 
 A primitive may also go through a batch in its own way. On a CPU, arrays of a thousand lanes do not stay in the cache
 from one operation to the next; ``blocked`` runs all operations on some lanes, then on the next.
+
+This is the only file that uses ``jax.interpreters``, and a new release of jax breaks it first:
+``tests/test_rules.py`` takes each rule of the primitive through each transformation.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from ._blocks import in_blocks
@@ -76,7 +80,7 @@ _ruled = Primitive("ruled")
 _ruled.multiple_results = True
 
 
-def _run(*leaves: jax.Array, body: ClosedJaxpr, **_: Any) -> list[jax.Array]:
+def _run(*leaves: jax.Array, body: Any, **_: Any) -> list[jax.Array]:
     return jaxpr_as_fun(body)(*leaves)
 
 
@@ -84,7 +88,7 @@ def _differentiate(
     leaves: Sequence[jax.Array],
     rates: Sequence[Any],
     *,
-    body: ClosedJaxpr,
+    body: Any,
     rule: Callable[..., tuple[Any, Any]],
     tree: Any,
     lanes: tuple[tuple[int | None, ...], ...],
@@ -106,14 +110,14 @@ def _apply(rule: Callable[..., tuple[Any, Any]], tree: Any, leaves: list[Any], r
     pairs = zip(leaves, rates, strict=True)
     rates = [np.zeros(jnp.shape(leaf), jax.dtypes.float0) if rate is None else rate for leaf, rate in pairs]
     results, moved = (jax.tree.leaves(out) for out in rule(tree.unflatten(leaves), tree.unflatten(rates)))
-    return results, [None if m.dtype == jax.dtypes.float0 else m for m in moved]
+    return results, [None if jnp.result_type(m) == jax.dtypes.float0 else m for m in moved]
 
 
 def _batch(
     leaves: Sequence[jax.Array],
     axes: Sequence[int | None],
     *,
-    body: ClosedJaxpr,
+    body: Any,
     lanes: tuple[tuple[int | None, ...], ...],
     block: int | None,
     **rest: Any,
@@ -141,6 +145,7 @@ def _in_blocks(wide: Callable[..., Any], axes: tuple[int | None, ...], size: int
 
 
 _ruled.def_impl(_run)
+_ruled.to_lojax = _run  # jax 0.12 expands some operations, as nonzero, before it compiles what is around them
 _ruled.def_abstract_eval(lambda *_, body, **__: body.out_avals)
 mlir.register_lowering(_ruled, mlir.lower_fun(_run, multiple_results=True))
 ad.primitive_jvps[_ruled] = _differentiate

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from importlib.metadata import version
+from importlib.util import find_spec
 
 # Most of the suite's time is XLA's: without its optimiser and with its older fusions compiling takes a quarter of that.
 # The gate runs the recorded problems and the demos as users do.
@@ -21,6 +22,16 @@ import osik_jax
 
 assert osik_jax  # imported before the first computation, as its users do: it sets up XLA's CPU client
 jax.config.update("jax_enable_x64", True)
+
+
+WITH_TORCH = "test_beside_pytorch_kinematics.py"
+collect_ignore = [] if find_spec("pytorch_kinematics") else [WITH_TORCH]
+
+
+def pytest_report_header() -> list[str]:
+    """Says with which JAX, and what is left out where an oracle is not installed."""
+    without = [f"NOT RUN, for pytorch-kinematics is not installed: {name}" for name in collect_ignore]
+    return [f"jax {version('jax')}, jaxlib {version('jaxlib')}, mujoco {version('mujoco')}", *without]
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Collision avoidance: distances against MuJoCo C and coal, rows against differences, filters, closed loops."""
 
 import functools
+import os
 
 import coal
 import jax
@@ -96,7 +97,8 @@ def avoidance(arm):
 
 
 # Without XLA's newer fusions, as conftest.py has it, batches of loops in loops have been seen to go on for ever.
-_jit = functools.partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": True})
+_EMITTERS = "xla_cpu_use_fusion_emitters"  # on again where conftest.py has switched them off
+_jit = functools.partial(jax.jit, compiler_options={_EMITTERS: True} if _EMITTERS in os.environ["XLA_FLAGS"] else {})
 
 
 @_jit

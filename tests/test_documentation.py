@@ -44,6 +44,10 @@ OPTIONAL = (
 
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+REPOSITORY = "https://github.com/osik-jax/osik-jax"
+IN_REPOSITORY = re.compile(  # as a package index shows the README, its links have to be whole
+    rf"(?:{REPOSITORY}/(?:blob|tree)|https://raw\.githubusercontent\.com/osik-jax/osik-jax)/main/"
+)
 NAMED = re.compile(r"^::: (\S+)$", re.MULTILINE)
 
 
@@ -104,16 +108,40 @@ def test_readme_is_short() -> None:
     assert len(README.read_text().splitlines()) <= 120
 
 
+def assert_leads_somewhere(target: str, page: Path) -> None:
+    """A link to a file of the repository, from a page or as a whole address; others are not followed."""
+    inside, count = IN_REPOSITORY.subn("", target, count=1)
+    if re.match(r"[a-z]+:", inside):
+        return
+    path, _, anchor = inside.partition("#")
+    there = ((ROOT if count else page.parent) / path).resolve() if path else page
+    assert there.exists(), f"{target} does not exist"
+    if anchor:
+        assert anchor in heading_anchors(there), f"{target}: no such heading"
+
+
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=relative)
 def test_links_lead_somewhere(page: Path) -> None:
     for target in LINK.findall(page.read_text()):
-        if re.match(r"[a-z]+:", target):
-            continue
-        path, _, anchor = target.partition("#")
-        there = (page.parent / path).resolve() if path else page
-        assert there.exists(), f"{target} does not exist"
-        if anchor:
-            assert anchor in heading_anchors(there), f"{target}: no such heading"
+        assert_leads_somewhere(target, page)
+
+
+def test_a_link_that_leads_nowhere_is_seen() -> None:
+    for target in (
+        "docs/nowhere.md",
+        f"{REPOSITORY}/blob/main/docs/nowhere.md",
+        f"{REPOSITORY}/blob/main/README.md#no",
+    ):
+        with pytest.raises(AssertionError, match="does not exist|no such heading"):
+            assert_leads_somewhere(target, README)
+
+
+def test_readme_is_a_page_of_a_package_index_too() -> None:
+    """Which knows nothing of the files beside it: every address is whole, and pictures are the files themselves."""
+    text = README.read_text()
+    assert [target for target in LINK.findall(text) if not target.startswith("https://")] == []
+    for picture in re.findall(r"!\[[^\]]*\]\(([^)\s]+)\)", text):
+        assert picture.startswith("https://raw.githubusercontent.com/")
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=relative)
@@ -166,6 +194,16 @@ def test_one_version_everywhere() -> None:
     assert f"\nversion: {project['version']}\n" in citation
     assert f"\nlicense: {project['license']}\n" in citation
     assert project["version"] in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_one_repository_everywhere() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["urls"]["Repository"] == REPOSITORY
+    for address in project["urls"].values():
+        assert address.startswith(REPOSITORY)
+        assert_leads_somewhere(address, README)
+    assert f"\nrepository-code: {REPOSITORY}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"\nrepo_url: {REPOSITORY}\n" in (ROOT / "mkdocs.yml").read_text()
 
 
 def test_import_is_light() -> None:

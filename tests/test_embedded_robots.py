@@ -2,17 +2,13 @@
 
 import json
 from importlib import resources
-from importlib.metadata import files
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import pytorch_kinematics
-import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -192,19 +188,6 @@ def test_arm7_flange_equals_the_denavit_hartenberg_product(arm7_flange, arm7_q):
     expected = np.array([dh_product(q) for q in arm7_q])
     np.testing.assert_allclose(position, expected[:, :3, 3], atol=1e-12, rtol=0)
     np.testing.assert_allclose(rotation, expected[:, :3, :3], atol=1e-12, rtol=0)
-
-
-def test_arm7_flange_equals_the_public_panda_urdf(arm7_flange, arm7_q):
-    """Pytorch-kinematics on the panda.urdf of example-robot-data; its Jacobian is in the base's axes as ours is."""
-    urdf = next(f for f in files("example-robot-data") or () if f.match("panda_description/urdf/panda.urdf"))
-    chain: Any = pytorch_kinematics.build_serial_chain_from_urdf(urdf.read_binary(), "panda_link8")
-    chain = chain.to(dtype=torch.float64)
-    angles = torch.tensor(arm7_q)
-    pose = chain.forward_kinematics(angles).get_matrix().numpy()
-    position, rotation, jacobian = arm7_flange(arm7_q)
-    np.testing.assert_allclose(position, pose[:, :3, 3], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(rotation, pose[:, :3, :3], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(jacobian, chain.jacobian(angles).numpy(), atol=1e-6, rtol=0)
 
 
 def test_arm7_limits_are_the_published_ones(arm7):

@@ -1,9 +1,8 @@
-"""Kinematics against MuJoCo C, MJX, pytorch-kinematics and central differences."""
+"""Kinematics against MuJoCo C, MJX, Pinocchio and central differences."""
 
 import copy
 import time
 from importlib.metadata import files
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,8 +11,6 @@ import mujoco
 import numpy as np
 import pinocchio
 import pytest
-import pytorch_kinematics
-import torch
 from mujoco import mjx
 from scipy.spatial.transform import Rotation
 
@@ -278,19 +275,6 @@ def panda():
 
     assert robot.joint_names[:7] == tuple(f"panda_joint{i}" for i in range(1, 8))
     return urdf, robot, q, tcp(q)
-
-
-def test_panda_from_urdf_equals_pytorch_kinematics(panda):
-    """To 1e-7: pytorch-kinematics reads the URDF's angles in single precision, so its frames are 4e-8 off."""
-    urdf, _, q, (position, rotation, jacobian) = panda
-    chain: Any = pytorch_kinematics.build_serial_chain_from_urdf(urdf.read_binary(), "panda_hand_tcp")
-    chain = chain.to(dtype=torch.float64)
-    angles = torch.tensor(q[:, :7])
-    pose = chain.forward_kinematics(angles).get_matrix().numpy()
-    np.testing.assert_allclose(position, pose[:, :3, 3], atol=1e-7, rtol=0)
-    np.testing.assert_allclose(rotation, pose[:, :3, :3], atol=1e-7, rtol=0)
-    np.testing.assert_allclose(jacobian[..., :7], chain.jacobian(angles).numpy(), atol=1e-7, rtol=0)
-    np.testing.assert_array_equal(jacobian[..., 7:], 0.0)
 
 
 def test_panda_from_urdf_equals_pinocchio(panda):

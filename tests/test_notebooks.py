@@ -1,6 +1,8 @@
 """The notebooks run, in their fast mode, and beside each lies what it gives when it is run in full."""
 
 import re
+from base64 import b64decode
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,8 @@ import matplotlib
 import matplotlib.pyplot as plt
 import nbformat
 import pytest
+from nbconvert import HTMLExporter
+from PIL import Image, ImageSequence
 from prose import assert_fit_to_read
 
 ROOT = Path(__file__).parent.parent
@@ -34,7 +38,8 @@ def outputs(notebook: Any) -> list[Any]:
 
 
 def shown_text(output: Any) -> str:
-    return output.get("text", "") + "".join(v for k, v in output.get("data", {}).items() if k.startswith("text/"))
+    text = output.get("text", "") + "".join(v for k, v in output.get("data", {}).items() if k.startswith("text/"))
+    return re.sub(r"base64,[\w+/=]+", "", text)  # pictures inside a page
 
 
 @pytest.mark.parametrize(
@@ -80,6 +85,22 @@ def test_outputs_are_clean_and_have_figures(source: Path) -> None:
     assert not [output.text for output in everything if output.get("name") == "stderr"]
     assert [output for output in everything if "image/png" in output.get("data", {})]
     assert source.with_suffix(".ipynb").stat().st_size < MOST_BYTES
+
+
+def test_the_film_is_a_part_of_the_page_made_of_its_notebook() -> None:
+    """By nbconvert, which leaves out outputs of a kind that it does not know, GIFs among them."""
+    page, _ = HTMLExporter().from_notebook_node(executed(SOURCES[0]))
+    (film,) = re.findall(r'<img[^>]* src="data:image/gif;base64,([\w+/=]+)"', page)
+    frames = [frame.convert("L").tobytes() for frame in ImageSequence.Iterator(Image.open(BytesIO(b64decode(film))))]
+    assert len(frames) >= 20  # two seconds at ten a second
+    assert frames[0] != frames[-1]
+
+
+@each_notebook
+def test_nbconvert_shows_every_output(source: Path) -> None:
+    shown = set(HTMLExporter().config.NbConvertBase.display_data_priority) - {"text/plain"}
+    hidden = [output.data for output in outputs(executed(source)) if "data" in output and not shown & set(output.data)]
+    assert [data for data in hidden if set(data) != {"text/plain"}] == []
 
 
 @each_notebook

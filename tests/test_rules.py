@@ -58,20 +58,116 @@ def test_derivatives_of_a_batch_in_blocks():
         np.testing.assert_allclose(ours, plainly, rtol=1e-13)
 
 
-def test_a_rule_holds_in_a_loop_to_second_order():
-    """The rule is deliberately wrong by a factor, so that it shows whether it is used."""
+@custom_jvp
+def cube(x):
+    """Its rule is wrong by a factor of 2 on purpose, so that it shows where the rule is used."""
+    return x**3
 
-    @custom_jvp
-    def cube(x):
-        return x**3
 
-    @cube.defjvp
-    def _(primals, rates):
-        (x,), (rate,) = primals, rates
-        return cube(x), 6.0 * x**2 * rate
+@cube.defjvp
+def _(primals, rates):
+    (x,), (rate,) = primals, rates
+    return cube(x), 6.0 * x**2 * rate
 
-    def chain(x):
-        return jax.lax.scan(lambda carry, _: (cube(carry) + x, None), x, None, length=1)[0]
 
-    assert jax.grad(chain)(2.0) == pytest.approx(25.0)
-    assert jax.grad(jax.grad(chain))(2.0) == pytest.approx(24.0)
+def chain(x):
+    """Two steps, for only from the second one on does a result of the first go into what is differentiated twice."""
+    return jax.lax.scan(lambda carry, _: (cube(carry) + x, None), x, None, length=2)[0]
+
+
+def chain_with_checkpoints(x):
+    step = jax.checkpoint(lambda carry, _: (cube(carry) + x, None))
+    return jax.lax.scan(step, x, None, length=2)[0]
+
+
+def reverse_over_forward(f):
+    return jax.grad(lambda x: jax.jvp(f, (x,), (1.0,))[1])
+
+
+def forward_over_reverse(f):
+    return lambda x: jax.jvp(jax.grad(f), (x,), (1.0,))[1]
+
+
+def forward_over_forward(f):
+    return lambda x: jax.jvp(lambda y: jax.jvp(f, (y,), (1.0,))[1], (x,), (1.0,))[1]
+
+
+def reverse_over_reverse(f):
+    return jax.grad(jax.grad(f))
+
+
+LOOPS = {
+    "unrolled": lambda x: cube(cube(x) + x) + x,
+    "scan": chain,
+    "jit": jax.jit(chain),
+    "checkpoint": jax.checkpoint(chain),
+    "checkpoints": chain_with_checkpoints,
+    "vmap": lambda x: jax.vmap(chain)(jnp.stack([x, 2.0 * x]))[0],
+    "cond": lambda x: jax.lax.cond(x > 0.0, chain, lambda x: x, x),
+}
+SECOND = [reverse_over_forward, forward_over_reverse, forward_over_forward, reverse_over_reverse]
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_a_rule_holds_in_a_loop_to_second_order(loop):
+    """Against the chain rule written out, with the cube's derivative replaced by 6 x^2."""
+    x, f = 1.1, LOOPS[loop]
+    y = x**3 + x
+    dy, ddy = 6 * x**2 + 1, 12 * x
+    assert float(f(x)) == pytest.approx(y**3 + x, rel=1e-12)
+    first = 6 * y**2 * dy + 1
+    assert float(jax.grad(f)(x)) == pytest.approx(first, rel=1e-12)
+    assert float(jax.jvp(f, (x,), (1.0,))[1]) == pytest.approx(first, rel=1e-12)
+    for derivative in SECOND:
+        assert float(derivative(f)(x)) == pytest.approx(12 * y * dy**2 + 6 * y**2 * ddy, rel=1e-12), derivative
+
+
+def stepwise(gains, x):
+    """A body with operations of jax that have rules of their own, and some that jax 0.12 expands when it compiles."""
+    index = jnp.searchsorted(jnp.asarray([0.0, 1.0]), x)
+    (first,) = jnp.nonzero(jnp.arange(3) == index, size=1)
+    return gains[first[0]] * jax.nn.relu(x) + cube(x)
+
+
+piecewise_gain = custom_jvp(stepwise)
+piecewise_gain.defjvp(lambda primals, rates: jax.jvp(stepwise, primals, rates))
+GAINS = jnp.asarray([2.0, 3.0, 5.0])
+SLOPES = {-0.5: 0.0, 0.7: 3.0, 1.5: 5.0}
+
+
+@pytest.mark.parametrize("transformed", [lambda f: f, jax.jit])
+def test_a_body_may_have_rules_of_jax(transformed):
+    for x, slope in SLOPES.items():
+        value, (by_gains, by_x) = transformed(jax.value_and_grad(piecewise_gain, argnums=(0, 1)))(GAINS, x)
+        assert float(value) == pytest.approx(slope * x + x**3, rel=1e-12)
+        np.testing.assert_array_equal(by_gains, np.where(slope == GAINS, x, 0.0))
+        assert float(by_x) == pytest.approx(slope + 6 * x**2, rel=1e-12)
+
+
+@pytest.mark.parametrize("transformed", [lambda f: f, jax.jit])
+def test_such_a_body_in_a_batch_and_in_a_loop(transformed):
+    x, slopes = np.array(list(SLOPES)), np.array(list(SLOPES.values()))
+    wide = jax.vmap(piecewise_gain, in_axes=(None, 0))
+    np.testing.assert_allclose(transformed(wide)(GAINS, x), slopes * x + x**3, rtol=1e-12)
+
+    def in_turn(x):
+        return jax.lax.map(jax.checkpoint(lambda x: piecewise_gain(GAINS, x)), x)
+
+    np.testing.assert_allclose(transformed(in_turn)(x), slopes * x + x**3, rtol=1e-12)
+    rates = transformed(jax.jacrev(in_turn))(x)
+    np.testing.assert_allclose(rates, np.diag(slopes + 6 * x**2), rtol=1e-12)
+
+
+def test_linear_maps_of_a_rule_are_each_others_transposes():
+    _, forward = jax.linearize(piecewise_gain, GAINS, 0.7)
+    _, backward = jax.vjp(piecewise_gain, GAINS, 0.7)
+    row = [forward(gains, rate) for gains, rate in zip(np.eye(4, 3), np.eye(4)[3], strict=True)]
+    np.testing.assert_allclose(row, [0.0, 0.7, 0.0, 3.0 + 6 * 0.7**2], rtol=1e-12)
+    np.testing.assert_allclose(jnp.append(*backward(1.0)), row, rtol=1e-12)
+
+
+def test_shapes_are_known_without_running():
+    out = jax.eval_shape(jax.vmap(piecewise), X[:9, 0], X[:9, 1])
+    assert (out["wave"].shape, out["wave"].dtype) == ((9, 2), jnp.float64)
+    assert (out["count"].shape, out["count"].dtype) == ((9,), jnp.int32)
+    assert jax.eval_shape(jax.hessian(chain), 1.0).shape == ()

@@ -4,6 +4,10 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
+
+from osik_jax._runtime import _UNTRIED_JAXLIB
 
 PROBE = """
 import json, os, numpy, osik_jax, threadpoolctl
@@ -52,3 +56,11 @@ print(program(x).is_ready())
 def test_other_flags_stay_beside_ours():
     other = "--xla_cpu_enable_fast_min_max=true"
     assert runtime(XLA_FLAGS=other)[1] == f"{other} --xla_cpu_enable_concurrency_optimized_scheduler=false"
+
+
+def test_flags_are_set_for_every_jax_that_may_be_installed():
+    """A flag that XLA does not know ends the process, so a new jax is tried with ours before it is allowed."""
+    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
+    (bounds,) = [d.removeprefix("jax").split(",") for d in project["dependencies"] if d.startswith("jax>")]
+    major, minor = _UNTRIED_JAXLIB
+    assert f"<{major}.{minor}" in bounds

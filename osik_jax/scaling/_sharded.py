@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 _SHARED = -1
@@ -192,7 +192,7 @@ def _making_empty_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def inside(*args: Any) -> Any:
         traced, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
-        traced = ClosedJaxpr(traced.jaxpr, [anew(a) for a in traced.consts])
+        traced = traced.replace(consts=[anew(a) for a in traced.consts])
         results = jaxpr_as_fun(traced)(*(anew(a) for a in args))
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 

@@ -26,7 +26,12 @@ _ROUNDS = 30
 _NEARLY = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
 """Noises; an answer that the search does not change is accepted with violations up to this."""
 _PATIENCE = 5
-"""Searches that end at a contradiction before it is believed; one that does not move from fresh factors is enough."""
+"""Searches that end at a contradiction before it is believed; one that does not move from fresh factors is enough.
+
+A search that neither moves nor ends at an answer is taken for one too: more constraints are active there than can be
+independent. Where the rows do not contradict each other after all, they hold once they are soft, and are made hard
+again.
+"""
 _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 _SOFT = {jnp.dtype("float64"): (1e-6, 1e-12), jnp.dtype("float32"): (1e-3, 1e-4)}
 """Compliance of rows that contradict, first and last, as a share of their own; each stage starts where one ended."""
@@ -131,12 +136,13 @@ def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Floa
             iterations=found.iterations,
             max_iterations=cap,
         )
+        rests = jnp.all(end.active == found.active, 1)
         return found._replace(
             active=end.active,
             implied=end.implied,
             iterations=end.iterations,
             contradictions=found.contradictions
-            + end.contradicted * jnp.where(jnp.all(end.active == found.active, 1), _PATIENCE, 1),
+            + jnp.where(rests & (end.contradicted | ~nearly), _PATIENCE, end.contradicted.astype(jnp.int32)),
         )
 
     after = jax.lax.cond(jnp.any(searching), lambda: choose(searching, look(), found), lambda: found)
