@@ -129,9 +129,9 @@ def test_when_the_kernel_is_asked(monkeypatch):
     assert asked == []  # no GPU
     monkeypatch.setattr(_cuda, "available", lambda: True)
     trace()
-    assert asked[-1] == Shape(3, 3, (1, 2, 3), (True, False, False), (0,), (0,))
+    assert asked[-1] == Shape(3, 2, (1, 2, 0), (True, False, False), (0,), (0,))
     count = len(asked)
-    trace(65)  # too many variables
+    trace(130)  # too many variables
     monkeypatch.setenv(_cuda.SWITCH, "0")
     trace()
     assert len(asked) == count
@@ -142,11 +142,12 @@ def test_when_the_kernel_is_asked(monkeypatch):
 @pytest.mark.parametrize(
     ("shape", "warps"),
     [
-        (Shape(31, 31, (12, 3, 3, 25, 31), (False,) * 5, (), ()), 1),
-        (Shape(10, 10, (4, 10), (True, False), (0, 1, 2, 3), (0,) * 4), 2),
-        (Shape(64, 64, (12, 64), (False,) * 2, (), ()), 0),
-        (Shape(10, 10, (40, 10), (True, False), tuple(range(40)), (0,) * 40), 0),
-        (Shape(10, 10, (10,), (False,), (), ()), 0),
+        (Shape(31, 12, (12, 3, 3, 0), (False,) * 4, (), ()), 2),
+        (Shape(31, 25, (12, 3, 3, 25, 0), (False,) * 5, (), ()), 1),
+        (Shape(10, 4, (4, 0), (True, False), (0, 1, 2, 3), (0,) * 4), 2),
+        (Shape(64, 65, (65, 0), (False,) * 2, (), ()), 0),
+        (Shape(10, 40, (40, 0), (True, False), tuple(range(40)), (0,) * 40), 0),
+        (Shape(10, 0, (0,), (False,), (), ()), 0),
     ],
 )
 def test_what_the_text_is_compiled_for(shape, warps):

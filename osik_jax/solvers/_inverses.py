@@ -143,7 +143,6 @@ def _transposed_rate(
     return wide - apply(a, apply(X, wide)) + tall - apply(X.T, apply(da.T, y))
 
 
-@custom_jvp
 def regularised_inverse(
     matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
 ) -> Float[Array, "n m"]:
@@ -151,6 +150,7 @@ def regularised_inverse(
     return _with_gram(matrix, cutoff, damping)[0]
 
 
+@custom_jvp
 def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array]:
     """The inverse D, and K with D = K A': (A'A + damping I)^-1, or (A'A)^+ for a damping of 0."""
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
@@ -163,12 +163,17 @@ def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Arr
     return inverse, gram + outside * jnp.eye(matrix.shape[1], dtype=matrix.dtype)
 
 
-@regularised_inverse.defjvp
-def _regularised_inverse_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-    """Of K A' where it is damped; of the Moore-Penrose inverse at constant rank (Golub, Pereyra 1973) where not."""
+@_with_gram.defjvp
+def _with_gram_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+    """Of K A' and K where damped; of the Moore-Penrose inverse at constant rank (Golub, Pereyra 1973) where not."""
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
     D, K = _with_gram(a, cutoff, damping)
+    damped = damping > 0.0
     rest = da.T - product(product(da.T, a), D)  # da' (I - A D)
     turned = product(da.T, product(D.T, D))
-    turn = jnp.where(damping > 0.0, 0.0, turned - product(D, product(a, turned)))  # (I - D A) da' D' D
-    return D, product(K, rest) - product(D, product(da, D)) + turn - d_damping * product(K, D)
+    turn = jnp.where(damped, 0.0, turned - product(D, product(a, turned)))  # (I - D A) da' D' D
+    dD = product(K, rest) - product(D, product(da, D)) + turn - d_damping * product(K, D)
+    half = product(D, product(da, K))  # K A' da K
+    flat = product(dD, D.T)
+    dK = jnp.where(damped, -half - half.T - d_damping * product(K, K), flat + flat.T)
+    return (D, K), (dD, dK)
