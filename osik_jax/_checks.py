@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ._errors import warn
 from ._joint_selection import concrete
 from ._made_for import check_made_for, check_robot
 from .limits import Limit
@@ -31,14 +32,16 @@ def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
 
 
 def _check_precision(robot: Robot) -> None:
+    """In single precision all can be float64 numbers no longer; in double precision float32 is possible, and slower."""
     own, now = robot.q0.dtype, jnp.result_type(float)
-    if own != now:
-        switch = "on" if now == jnp.dtype("float64") else "off"
-        raise ValueError(
-            f"the robot's numbers are {own}, for it was made before jax_enable_x64 was switched {switch}: take "
-            "robot.astype(float), or load it again, and make tasks, limits and scheme after that; or leave "
-            "jax_enable_x64 as it was, and set it before anything is made"
-        )
+    if own == now:
+        return
+    cure = "take robot.astype(float), or load it again, and make tasks, limits and scheme after that"
+    if own == jnp.dtype("float64"):
+        raise ValueError(f"the robot's numbers are float64, and jax_enable_x64 was switched off since: {cure}")
+    warn(
+        f"the robot's numbers are {own} while jax_enable_x64 is on: if it was made before that was switched on, {cure}"
+    )
 
 
 def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
@@ -62,12 +65,14 @@ def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
 
 
 def check_dt(dt: Any) -> None:
-    """Raises TypeError where dt is no number, ValueError where it is seen not to be positive and finite."""
+    """Raises TypeError where dt is no number, ValueError where it is seen not to be one, positive and finite."""
     seen = concrete(dt)
+    if seen is not None and seen.dtype.kind not in "iuf":
+        raise TypeError(f"dt is {dt!r}; it is a number, in seconds")
+    if jnp.shape(dt) != ():
+        raise ValueError(f"dt has shape {jnp.shape(dt)}; it is one number, in seconds. Batch with jax.vmap.")
     if seen is None:
         return
-    if seen.dtype.kind not in "iuf":
-        raise TypeError(f"dt is {dt!r}; it is a number, in seconds")
     if not ((seen > 0.0) & np.isfinite(seen)).all():
         raise ValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
 
@@ -180,5 +185,5 @@ def check_rows(rows: Mapping[str, Any], tasks: Mapping[str, Task], robot: Robot)
         if len(count) != 1 or any(shape != count for shape in shapes.values()) or jacobian != (*count, robot.nv):
             raise ValueError(
                 f"tasks[{name!r}]: the rows of {kind} do not fit each other: jacobian has shape {jacobian}, expected "
-                f"(m, {robot.nv}), and {', '.join(f'{field} {shape}' for field, shape in shapes.items())}, expected (m,)"
+                f"(m, {robot.nv}), and {', '.join(f'{field} {own}' for field, own in shapes.items())}, expected (m,)"
             )

@@ -47,7 +47,7 @@ def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:
         raise TypeError(f"joints is {patterns!r}; it is a sequence of names and globs")
     found = sorted({joint for pattern in patterns for joint in select_joints(robot, pattern)})
     if not found:
-        raise ValueError(f"joints is empty; None: all of them: {robot.tree.dof_owners}")
+        raise ValueError(f"joints is empty; name at least one joint, or None for all of {robot.tree.dof_owners}")
     return found
 
 

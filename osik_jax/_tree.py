@@ -41,7 +41,7 @@ class ModelHolder:
 _Arrays = TypeVar("_Arrays")
 
 
-class cached_arrays(Generic[_Arrays]):  # noqa: N801 (a decorator, as cached_property is)
+class cached_arrays(Generic[_Arrays]):
     """A ``cached_property`` for NumPy arrays: computed once, and copied at each access.
 
     JAX remembers in which precision it has read an array object. Where ``jax_enable_x64`` changes while a robot lives,

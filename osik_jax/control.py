@@ -123,8 +123,11 @@ def solve(
     Raises:
         TypeError: something that is no robot, task, scheme or limit, or no number.
         ValueError: q of the wrong length, not finite or with a quaternion of zeros; no task; dt <= 0; a task or limit
-            that was made for another robot, the warm start of another problem; a robot that is a stack, or was made in
-            another precision.
+            that was made for another robot, the warm start of another problem; a robot that is a stack, or that has
+            float64 numbers while ``jax_enable_x64`` is off.
+
+    Warns:
+        OsikWarning: a robot that has float32 numbers while ``jax_enable_x64`` is on.
     """
     check_setting("solve(robot, q, tasks)", robot, scheme, dt)
     limits = checked_limits(robot, limits)
@@ -145,7 +148,7 @@ def _solve(
     dt: Array | float,
     warm_start: Any = None,
 ) -> Solution:
-    scheme, limits = WeightedQP() if scheme is None else scheme, _own_limits(robot, limits)
+    scheme, limits = _own_scheme(q, scheme), _own_limits(robot, limits)
     dt = positive(dt)
     raw_box = jax.lax.stop_gradient(limit_box(robot, q, limits, dt))
     (robot, q), posed = cleaned((robot, q))
@@ -315,7 +318,7 @@ def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, mov
 def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
     """Where a tick leads; nowhere if q or dt is NaN."""
     (clean, tick), fine = cleaned((q, jnp.asarray(dt)))
-    return jnp.where(fine, integrate(robot, clean, v, tick), q)
+    return jnp.where(fine, integrate(robot, clean, v, tick).astype(q.dtype), q)
 
 
 def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:
@@ -368,6 +371,11 @@ def _tick(dt: Any, q: Array) -> Any:
 def _checked(tasks: Any, robot: Robot) -> dict[str, Task]:
     check_tasks(tasks, robot)
     return dict(tasks)
+
+
+def _own_scheme(q: Array, scheme: Scheme | None) -> Scheme:
+    """The scheme that is given, or a weighted QP in the precision of q."""
+    return jax.tree.map(lambda leaf: leaf.astype(q.dtype), WeightedQP()) if scheme is None else scheme
 
 
 def _own_limits(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Limit, ...]:

@@ -464,6 +464,8 @@ def load_robot(
     Warns:
         OsikWarning: as in ``Robot.from_mjcf`` and ``Robot.from_urdf``.
     """
+    if not isinstance(name, str):
+        raise TypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, _loading.ROBOTS))}")
     load = _loading.embedded if name in _loading.ROBOTS else _loading.described
     fields = load(
         name,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
 import warnings
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def joint(name: str, parent: str, child: str, *, inner: str = LIMIT, kind: str =
 def chain(*links: str, limits: tuple[str, ...] = ()) -> str:
     """Links one after the other; the joint to a link is called like it."""
     inner = dict(zip(links[1:], limits, strict=False))
-    joints = [joint(f"to_{b}", a, b, inner=inner.get(b, LIMIT)) for a, b in zip(links, links[1:], strict=False)]
+    joints = [joint(f"to_{b}", a, b, inner=inner.get(b, LIMIT)) for a, b in itertools.pairwise(links)]
     return f'<robot name="r">{"".join(map(link, links))}{"".join(joints)}</robot>'
 
 
@@ -53,7 +54,7 @@ FREE = ARM.replace("</robot>", link("odom") + joint("free", "odom", "base", kind
 
 
 class TestBase:
-    """One rule: as asked, else as the file says, else by what looks like feet; the last, where it fixes, with a word."""
+    """One rule: as asked, else as the file says, else by feet; what has none is fixed, with a word."""
 
     @pytest.mark.parametrize(
         ("text", "asked", "floats"),
@@ -257,19 +258,31 @@ class TestPrecision:
         with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
             nao.astype("float64")
 
-    @pytest.mark.parametrize("first", [False, True])
-    def test_a_robot_of_the_other_precision_is_refused_and_cast(self, first):
-        """Each robot is used in its own precision first, so that JAX has met its arrays in it."""
-        with jax.enable_x64(first):
-            robot = osik.load_robot("arm7")
-            osik.FrameTask(robot, "hand")
-        with jax.enable_x64(not first):
-            tasks = {"hand": osik.FrameTask(robot.astype(float), "hand", rows="position")}
+    def test_double_precision_switched_off(self):
+        """A robot is used in its own precision first, so that JAX has met its arrays in it."""
+        robot = osik.load_robot("arm7")
+        osik.FrameTask(robot, "hand")
+        with jax.enable_x64(False):
+            cast = robot.astype(float)
+            tasks = {"hand": osik.FrameTask(cast, "hand", rows="position")}
             for run in (osik.solve, lambda *given: osik.rollout(*given, steps=2)):
                 with pytest.raises(ValueError, match="jax_enable_x64.*robot.astype"):
                     run(robot, robot.q0, tasks)
-            cast = robot.astype(float)
-            solution = osik.solve(cast, cast.q0, tasks)
-            assert solution.status == 0 and solution.velocity.dtype == jnp.result_type(float)
-            path = osik.rollout(cast, cast.q0, tasks, steps=2)
-            assert path.q.dtype == jnp.result_type(float)
+            self.assert_at_rest(cast, tasks, jnp.float32)
+
+    def test_double_precision_switched_on(self):
+        with jax.enable_x64(False):
+            robot = osik.load_robot("arm7")
+            old = {"hand": osik.FrameTask(robot, "hand", rows="position")}
+        cast = robot.astype(float)
+        self.assert_at_rest(cast, {"hand": osik.FrameTask(cast, "hand", rows="position")}, jnp.float64)
+        with pytest.warns(osik.OsikWarning, match="jax_enable_x64.*robot.astype"):
+            self.assert_at_rest(robot, old, jnp.float32)
+
+    @staticmethod
+    def assert_at_rest(robot, tasks, dtype):
+        solution = osik.solve(robot, robot.q0, tasks)
+        path = osik.rollout(robot, robot.q0, tasks, steps=2)
+        assert solution.status == 0 and (path.solution.status == 0).all()
+        assert solution.velocity.dtype == path.q.dtype == dtype
+        np.testing.assert_allclose(path.q[-1], robot.q0, atol=1e-5)

@@ -163,6 +163,12 @@ def _match(scene: Sequence[Member], pattern: str) -> list[int]:
         ]
         if found:
             return found
+    seen = [member.name for member in scene if pattern in member.aliases]
+    if seen:
+        raise ValueError(
+            f"nothing of {pattern!r} is there to be met: contype and conaffinity of its geoms are 0. Name the geoms "
+            f"themselves to keep them apart ({', '.join(seen)}), or add shapes to it"
+        )
     names = {name: None for member in scene for name in (member.name, *member.aliases) if name}
     raise unknown_name("geom, shape or body", pattern, tuple(names))
 

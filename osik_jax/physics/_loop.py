@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._structure import is_number
 from .._checks import check_targets
+from .._structure import is_number
 from ..control import Solution, Targets, Tasks, aim, remembering, solve
 from ..kinematics import integrate
 from ..limits import Limit

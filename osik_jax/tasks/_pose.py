@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._tree import unknown_name
 from ..robot import Robot
 from ._curvature import pose_curvature
 from ._framed import FramedTask
@@ -190,7 +191,7 @@ def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
     """
     if isinstance(rows, str):
         if rows not in _ROWS:
-            raise ValueError(f"rows is {rows!r}; it is one of {', '.join(map(repr, _ROWS))}, or six booleans")
+            raise ValueError(unknown_name("row set", rows, tuple(_ROWS)).args[0])
         return _ROWS[rows]
     mask = tuple(bool(row) for row in rows)
     if len(mask) != 6 or not any(mask):
