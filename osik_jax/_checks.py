@@ -140,7 +140,9 @@ def check_warm_start(warm_start: Any) -> None:
     """Raises TypeError where it is not made of integers; whether it fits is seen when the tick is compiled."""
     for leaf in jax.tree.leaves(warm_start):
         if not hasattr(leaf, "dtype") or not jnp.issubdtype(leaf.dtype, jnp.integer):
-            raise TypeError(f"warm_start is {warm_start!r}; it is the warm_start of the Solution of the tick before")
+            raise TypeError(
+                f"warm_start is a {type(warm_start).__name__}; it is the warm_start of the tick before's Solution"
+            )
 
 
 def solved_with(scheme: Scheme, problem: VelocityProblem, warm_start: Any) -> SchemeAnswer:

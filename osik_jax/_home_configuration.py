@@ -38,7 +38,7 @@ def home_configuration(robot: Robot, home: Home) -> Float[Array, " nq"]:
         q = _with_joints(robot, home)
     else:
         q = _as_array(home, robot.q0.dtype)
-    robot.check_configuration(q)
+    robot.check_configuration(q, "home")
     q = _with_unit_quaternions(robot, jnp.asarray(q, robot.q0.dtype))
     return q if isinstance(q, Tracer) else _inside(robot, np.asarray(q))
 
@@ -76,11 +76,13 @@ def _keyframe(robot: Robot, home: Any) -> np.ndarray:
 
 def _with_joints(robot: Robot, values: Mapping[str, Any]) -> Array:
     """``q0`` with the named joints set: a number each, or all entries of a free (7) or ball joint (4)."""
-    single, several = {}, {}
+    single: dict[str, Any] = {}
+    several: dict[str, Any] = {}
     for name, value in values.items():
         turning = robot.tree.joint_types[robot.tree.joint(name)] in (FREE, BALL)
         (several if turning else single)[name] = value
-    q = robot.configuration({name: _as_array(value, robot.q0.dtype) for name, value in single.items()})
+    numbers: Any = {name: _as_array(value, robot.q0.dtype) for name, value in single.items()}
+    q = robot.configuration(numbers)
     for name, value in several.items():
         start, width = robot.joint_qpos_index(name), QPOS_WIDTH[robot.tree.joint_types[robot.tree.joint(name)]]
         entries = _as_array(value, q.dtype)

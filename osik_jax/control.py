@@ -148,20 +148,20 @@ def _solve(
     dt: Array | float,
     warm_start: Any = None,
 ) -> Solution:
-    scheme, limits = _own_scheme(q, scheme), _own_limits(robot, limits)
+    chosen, bounds = _own_scheme(q, scheme), _own_limits(robot, limits)
     dt = positive(dt)
-    raw_box = jax.lax.stop_gradient(limit_box(robot, q, limits, dt))
+    raw_box = jax.lax.stop_gradient(limit_box(robot, q, bounds, dt))
     (robot, q), posed = cleaned((robot, q))
-    (scheme, limits, dt), set_up = cleaned((scheme, limits, dt))
+    (chosen, bounds, dt), set_up = cleaned((chosen, bounds, dt))
     looked_at = {name: cleaned(task) for name, task in tasks.items()}
     tasks, sound = (
         {k: task for k, (task, _) in looked_at.items()},
         {k: posed & own for k, (_, own) in looked_at.items()},
     )
     kinematics = forward_kinematics(robot, q)
-    problem = _velocity_problem(robot, kinematics, q, tasks, limits, dt)
+    problem = _velocity_problem(robot, kinematics, q, tasks, bounds, dt)
     given = _spoiled(problem, raw_box, jnp.stack([set_up, *sound.values()]).all())
-    answer = solved_with(scheme, given, warm_start)
+    answer = solved_with(chosen, given, warm_start)
     v = answer.velocity
     failed = answer.status == Status.NUMERICAL_ERROR
     return Solution(

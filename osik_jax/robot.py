@@ -409,27 +409,32 @@ class Robot(eqx.Module):
             Path(path).write_text(text, encoding="utf-8")
         return text
 
-    def check_configuration(self, q: Float[Array, " nq"]) -> None:
-        """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion."""
+    def check_configuration(self, q: Float[Array, " nq"], name: str = "q") -> None:
+        """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
+
+        Args:
+            q: what should be a configuration. (nq,)
+            name: what the message calls it.
+        """
         shape = jnp.shape(q)
         if shape != (self.nq,):
             raise ValueError(
-                f"q has shape {shape}, this robot's configurations have shape ({self.nq},): "
+                f"{name} has shape {shape}, this robot's configurations have shape ({self.nq},): "
                 f"{', '.join(self.tree.joint_names[j] for j in self.tree.independent)}. Batch with jax.vmap."
             )
         if isinstance(q, jax.core.Tracer):
             return
         values = np.asarray(q)
         if not np.isfinite(values).all():
-            raise ValueError(f"q is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
+            raise ValueError(f"{name} is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
         for joint, start in self.tree.qpos_address.items():
             kind = self.tree.joint_types[joint]
             if kind in (FREE, BALL):
                 first = start + (3 if kind == FREE else 0)
                 if np.linalg.norm(values[first : first + 4]) < _UNIT_QUATERNION_TOLERANCE:
                     raise ValueError(
-                        f"q[{first}:{first + 4}], the quaternion of joint {self.tree.joint_names[joint]!r}, is zero; "
-                        "the identity is (1, 0, 0, 0)"
+                        f"{name}[{first}:{first + 4}], the quaternion of joint {self.tree.joint_names[joint]!r}, is "
+                        "zero; the identity is (1, 0, 0, 0)"
                     )
 
 

@@ -612,7 +612,7 @@ class TestTooNearAtHome:
         with pytest.raises(ValueError, match=r"\('upper', 'middle'\).*neighbouring"):
             osik.CollisionAvoidanceLimit(arm, pairs=[("upper", "middle"), ("floor", "hand")])
         with pytest.raises(TypeError, match="pairs of names"):
-            osik.CollisionAvoidanceLimit(arm, pairs=["hand"])
+            osik.CollisionAvoidanceLimit(arm, pairs=["hand"])  # pyright: ignore[reportArgumentType]
 
 
 def test_pairs_nearer_than_the_minimum_at_q0_are_left_out_unless_said_otherwise(arm):

@@ -1,5 +1,6 @@
 """Robots, tasks and ticks that are right but for one thing."""
 
+# pyright: reportArgumentType=false
 from __future__ import annotations
 
 import functools

@@ -1,5 +1,6 @@
 """Problems, limits, and what is seen only inside a program."""
 
+# pyright: reportArgumentType=false
 from __future__ import annotations
 
 import jax.numpy as jnp
@@ -42,14 +43,14 @@ def problems(add: Add) -> None:
     add("a posture of another robot", lambda: solve({"p": osik.PostureTask(nao())}), V, "another robot")
     add("a centre of mass of another robot", lambda: solve({"com": osik.ComTask(nao())}), V, "another robot")
     add("a function of time that returns no tasks", lambda: rollout(lambda t: posture(), steps=2), T, "dict")
-    add("the scheme's class", lambda: solve(scheme=W), T, "WeightedQP()")  # pyright: ignore
-    add("scheme='weighted'", lambda: solve(scheme="weighted"), T, "WeightedQP()")  # pyright: ignore
+    add("the scheme's class", lambda: solve(scheme=W), T, "WeightedQP()")
+    add("scheme='weighted'", lambda: solve(scheme="weighted"), T, "WeightedQP()")
     add("damping 0", lambda: W(damping=0.0), V, "positive")
     add("a negative damping", lambda: N(damping=-1.0), V, "not negative")
     add("a damping for each joint", lambda: W(damping=np.ones(7)), V, "scalar")
-    add("max_iterations=10.0", lambda: W(max_iterations=10.0), V, "integer")  # pyright: ignore
+    add("max_iterations=10.0", lambda: W(max_iterations=10.0), V, "integer")
     add("max_iterations=-1", lambda: H(max_iterations=-1), V, "integer")
-    add("an order that does not exist", lambda: N(order="backward"), V, "reverse")  # pyright: ignore
+    add("an order that does not exist", lambda: N(order="backward"), V, "reverse")
     add("dt 0", lambda: solve(dt=0.0), V, "positive")
     add("dt negative", lambda: solve(dt=-0.01), V, "positive")
     add("dt NaN", lambda: solve(dt=np.nan), V, "finite")
@@ -128,7 +129,7 @@ def limits(add: Add) -> None:
         V,
         "another robot",
     )
-    add("no limit as a task", lambda: osik.LimitTask(arm(), 3.0), T, "Limit")  # pyright: ignore
+    add("no limit as a task", lambda: osik.LimitTask(arm(), 3.0), T, "Limit")
     add("an acceleration of 0", lambda: osik.AccelerationLimit(arm(), {"*": 0.0}), V, "joint1")
     add(
         "a barrier for a frame that does not exist",
@@ -153,7 +154,7 @@ def limits(add: Add) -> None:
         lambda: osik.CollisionAvoidanceLimit(arm(), pairs=["hand"]),
         T,
         "pairs of names",
-    )  # pyright: ignore
+    )
     add(
         "collisions of neighbours alone",
         lambda: osik.CollisionAvoidanceLimit(arm(), pairs=[("geom3", "geom6")]),

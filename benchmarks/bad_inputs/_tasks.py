@@ -1,5 +1,6 @@
 """Configurations, targets and tasks."""
 
+# pyright: reportArgumentType=false
 from __future__ import annotations
 
 from functools import partial
@@ -19,11 +20,11 @@ def configurations(add: Add) -> None:
     add("q with a NaN", lambda: solve(q=q.at[0].set(jnp.nan)), V, "indices [0]")
     add("q of strings", lambda: solve(q=["a"] * 7), T, "7 numbers")
     add("q a dict", lambda: solve(q={"joint1": 0.0}), T, "7 numbers")
-    add("q=None", lambda: osik.solve(arm(), None, {"p": posture()}), T, "7 numbers")  # pyright: ignore
+    add("q=None", lambda: osik.solve(arm(), None, {"p": posture()}), T, "7 numbers")
     add("a quaternion of zeros", lambda: solve(robot=nao(), q=nao().q0.at[3:7].set(0.0)), V, "floating_base")
-    add("robot=None", lambda: osik.solve(None, q, {"p": posture()}), T, "load_robot")  # pyright: ignore
-    add("robot a name", lambda: osik.FrameTask("nao", "l_sole"), T, "load_robot")  # pyright: ignore
-    add("a robot's class", lambda: osik.forward_kinematics(osik.Robot, q), T, "load_robot")  # pyright: ignore
+    add("robot=None", lambda: osik.solve(None, q, {"p": posture()}), T, "load_robot")
+    add("robot a name", lambda: osik.FrameTask("nao", "l_sole"), T, "load_robot")
+    add("a robot's class", lambda: osik.forward_kinematics(osik.Robot, q), T, "load_robot")
     add(
         "two robots stacked, no vmap",
         lambda: osik.solve(osik.stack([arm(), arm()]), q, {"p": posture()}),
@@ -84,15 +85,15 @@ def tasks(add: Add) -> None:
     add("gain=None", lambda: hand(gain=None), T, "gain")
     add("a frame with a slip of the pen", lambda: osik.FrameTask(arm(), "hnd"), K, "did you mean 'hand'")
     add("a frame of another robot", lambda: osik.FrameTask(nao(), "tool0"), K, "l_ankle")
-    add("frame=None", lambda: osik.FrameTask(arm(), None), K, "hand")  # pyright: ignore
-    add("a frame's number", lambda: osik.FrameTask(arm(), 3), K, "hand")  # pyright: ignore
+    add("frame=None", lambda: osik.FrameTask(arm(), None), K, "hand")
+    add("a frame's number", lambda: osik.FrameTask(arm(), 3), K, "hand")
     add("a joint that does not exist", lambda: posture(joints=("elbow",)), K, "joint1")
     add("joints='joint1'", lambda: posture(joints="joint1"), T, "('joint1',)")
     add("joints=()", lambda: posture(joints=()), V, "joint1")
     add("joints=3", lambda: posture(joints=3), T, "names and globs")
     add("priority 0", lambda: hand(priority=0), V, "1 for the most important")
     add("priority 1.5", lambda: hand(priority=1.5), V, "integer")
-    add("priority a JAX array", lambda: hand(priority=jnp.asarray(2)), V, "integer")
+    add("priority a JAX array", lambda: hand(priority=jnp.asarray(2)), V, "got Array(2", foreign=True)
     add("priority=True", lambda: hand(priority=True), V, "integer")
     add("priority, by replace", lambda: hand().replace(priority=2), T, "target, target_velocity")
     add("hard='yes'", lambda: hand(hard="yes"), T, "True")
@@ -106,7 +107,13 @@ def tasks(add: Add) -> None:
     add("a bound that is NaN, by replace", lambda: hand(lower=0.0).replace(lower=np.nan), V, "NaN")
     add("a target and bounds", lambda: posture(target=arm().q0, lower=0.0), T, "not both")
     add("a function of one argument", lambda: osik.FunctionTask(arm(), lambda q: q), T, "(robot, kinematics, q)")
-    add("a function that returns a matrix", lambda: osik.FunctionTask(arm(), lambda r, k, q: jnp.eye(2)), V, "(m,)")
-    add("no function", lambda: osik.FunctionTask(arm(), 3.0), T, "(robot, kinematics, q)")  # pyright: ignore
+    add(
+        "a function that returns a matrix",
+        lambda: osik.FunctionTask(arm(), lambda r, k, q: jnp.eye(2)),
+        V,
+        "the function returns",
+        foreign=True,
+    )
+    add("no function", lambda: osik.FunctionTask(arm(), 3.0), T, "(robot, kinematics, q)")
     add("a task of one's own, its Jacobian too narrow", lambda: solve({"own": OddRows()}), V, "expected (m, 7)")
     add("a task of one's own that returns nothing", lambda: solve({"own": NoRows()}), T, "task_rows")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 
@@ -108,7 +108,7 @@ def candidate_pairs(
 
 def _checked(pairs: Patterns) -> list[tuple[str, str]]:
     """The pairs of names, if that is what they are."""
-    checked = [pairs] if isinstance(pairs, str) else list(pairs)
+    checked: list[Any] = [pairs] if isinstance(pairs, str) else list(pairs)
     for pair in checked:
         if not isinstance(pair, tuple | list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
             raise TypeError(f"pairs is a sequence of pairs of names, such as [('hand', 'torso')]; got {pairs!r}")

@@ -82,7 +82,7 @@ class PostureTask(Task):
         self.target = None
         if self.lower is None:
             self.target = as_array(robot.q0 if target is None else target, "target", dtype)
-            robot.check_configuration(self.target)
+            robot.check_configuration(self.target, "target")
         else:
             _check_bounded(robot, self.joints, target)
 
