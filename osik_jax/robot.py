@@ -360,7 +360,7 @@ class Robot(eqx.Module):
         wanted = np.dtype(jnp.result_type(float) if dtype is float else dtype)
         if not jnp.issubdtype(wanted, np.floating):
             raise TypeError(f"dtype is {dtype!r}; a robot's numbers are floating-point: float32 or float64")
-        if wanted == np.float64 and not jax.config.read("jax_enable_x64"):
+        if wanted == np.float64 and jnp.result_type(float) != wanted:
             raise ValueError("float64 needs jax.config.update('jax_enable_x64', True) first")
         return jax.tree.map(lambda leaf: leaf.astype(wanted), self)
 

@@ -36,7 +36,7 @@ class Case:
         error: exception that comes back; None: none does.
         words: what the message says among other things; of an input that is accepted, why.
         status: that the answer has, of an input that raises nothing; None: it is no solution.
-        foreign: whether the message ends in words of a parser or of MuJoCo, which the page leaves out.
+        foreign: whether the message goes on in words that are not ours or may change, which the page leaves out.
     """
 
     group: str

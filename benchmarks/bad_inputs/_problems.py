@@ -67,13 +67,15 @@ def problems(add: Add) -> None:
         "a hierarchy's warm start for a weighted QP",
         lambda: solve({"h": hand()}, warm_start=warm(H())),
         V,
-        "WeightedQP",
+        "that of another problem or scheme",
+        foreign=True,
     )
     add(
         "a hierarchy's warm start with other tasks",
         lambda: solve({"h": hand(), "p": posture(priority=2)}, scheme=H(), warm_start=warm(H())),
         V,
-        "HierarchicalQP",
+        "that of another problem or scheme",
+        foreign=True,
     )
     add("a warm start for a null space", lambda: solve({"h": hand()}, scheme=N(), warm_start=warm(W())), V, "NullSpace")
     add("warm_start=True", lambda: solve(warm_start=True), T, "Solution")
