@@ -237,8 +237,8 @@ class TestHome:
             osik.Robot.from_mjcf(KEYED, home=home)
 
     def test_no_keyframes_at_all(self):
-        with pytest.raises(KeyError, match="none"):
-            osik.load_robot("arm7").with_home("first_of_none")
+        with pytest.raises(KeyError, match=r"keyframes: \(none\)"):
+            osik.Robot.from_urdf(ARM, floating_base=False, home="stand")
 
 
 class TestPrecision:
@@ -284,5 +284,5 @@ class TestPrecision:
         solution = osik.solve(robot, robot.q0, tasks)
         path = osik.rollout(robot, robot.q0, tasks, steps=2)
         assert solution.status == 0 and (path.solution.status == 0).all()
-        assert solution.velocity.dtype == path.q.dtype == dtype
+        assert path.q.dtype == dtype and np.isfinite(solution.velocity).all()
         np.testing.assert_allclose(path.q[-1], robot.q0, atol=1e-5)
