@@ -4,6 +4,7 @@ from . import _runtime as _runtime  # first: it sets up XLA's CPU client
 from ._batches import batch_axes as batch_axes
 from ._batches import batched as batched
 from ._batches import stack as stack
+from ._errors import OsikWarning as OsikWarning
 from .collision import CollisionShape as CollisionShape
 from .control import Solution as Solution
 from .control import Trajectory as Trajectory

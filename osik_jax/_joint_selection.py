@@ -24,7 +24,7 @@ def select_joints(robot: Robot, pattern: str) -> list[int]:
     names = {robot.tree.joint_names[j]: j for j in robot.tree.independent}
     if pattern in names:
         return [names[pattern]]
-    matches = [j for name, j in names.items() if fnmatch.fnmatchcase(name, pattern)]
+    matches = [j for name, j in names.items() if fnmatch.fnmatchcase(name, str(pattern))]
     found = [j for j in matches if robot.tree.joint_types[j] != FREE]
     if not found:
         raise unknown_name("joint", pattern, tuple(names))
@@ -36,13 +36,19 @@ def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:
 
     Raises:
         KeyError: a pattern matches no joint.
-        TypeError: one string instead of a sequence of them.
+        TypeError: one string instead of a sequence of them, or no sequence.
+        ValueError: an empty sequence.
     """
     if patterns is None:
         return [j for j in robot.tree.independent if robot.tree.joint_types[j] != FREE]
     if isinstance(patterns, str):
         raise TypeError(f"joints is a sequence of names and globs, not one string: use ({patterns!r},)")
-    return sorted({joint for pattern in patterns for joint in select_joints(robot, pattern)})
+    if not isinstance(patterns, Iterable):
+        raise TypeError(f"joints is {patterns!r}; it is a sequence of names and globs")
+    found = sorted({joint for pattern in patterns for joint in select_joints(robot, pattern)})
+    if not found:
+        raise ValueError(f"joints is empty; name at least one joint, or None for all of {robot.tree.dof_owners}")
+    return found
 
 
 def dofs_of(robot: Robot, joints: Sequence[int]) -> list[int]:
@@ -87,15 +93,29 @@ def dof_values(robot: Robot, given: Any, default: Float[Array, " nv"], what: str
         for pattern, value in given.items():
             for joint in select_joints(robot, pattern):
                 dof = robot.tree.dof_address[joint]
-                values = values.at[dof : dof + DOF_WIDTH[robot.tree.joint_types[joint]]].set(value)
+                width = DOF_WIDTH[robot.tree.joint_types[joint]]
+                values = values.at[dof : dof + width].set(as_array(value, f"{what}[{pattern!r}]", dtype))
         return values
-    values = jnp.asarray(given, dtype)
+    values = as_array(given, what, dtype)
     if values.shape != (robot.nv,):
         raise ValueError(
             f"{what} has shape {values.shape}, expected ({robot.nv},), one entry for each of "
             f"{', '.join(dof_names(robot))}; or give a mapping from joint names to values"
         )
     return values
+
+
+def as_array(value: Any, what: str, dtype: Any) -> Array:
+    """The value as an array of this type.
+
+    Raises:
+        TypeError: it is made of something else than numbers.
+    """
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError):
+        shown = repr(value)
+        raise TypeError(f"{what} is {shown[:80]}; it is a number, or an array of numbers") from None
 
 
 def concrete(value: Any) -> np.ndarray | None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._joint_selection import concrete
+from ._joint_selection import as_array, concrete
 
 
 def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
@@ -30,13 +30,29 @@ def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Arra
     """An array of this shape; a scalar is repeated.
 
     Raises:
-        ValueError: any other shape.
+        TypeError: no numbers.
+        ValueError: any other shape, or NaN that can be seen.
     """
-    out = jnp.asarray(value, dtype)
+    out = as_array(value, what, dtype)
     if out.shape not in ((), shape):
         expected = "a scalar" if shape == () else f"{shape} or a scalar"
         raise ValueError(f"{what} has shape {out.shape}, expected {expected}. Batch with jax.vmap.")
+    check_not_nan(out, what)
     return jnp.broadcast_to(out, shape)
+
+
+def check_not_nan(value: Array, what: str) -> None:
+    """Raises ValueError where a value can be seen to be NaN, which no number of a problem is."""
+    seen = concrete(value)
+    if seen is not None and np.isnan(seen).any():
+        raise ValueError(f"{what} is {seen}; it has to be numbers, not NaN")
+
+
+def check_finite(value: Array, what: str) -> None:
+    """Raises ValueError where a value can be seen not to be finite."""
+    seen = concrete(value)
+    if seen is not None and not np.isfinite(seen).all():
+        raise ValueError(f"{what} is {seen}; it has to be finite")
 
 
 def check_not_negative(value: Array, what: str) -> None:

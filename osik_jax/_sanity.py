@@ -34,6 +34,12 @@ def cleaned(tree: Any) -> tuple[Any, Bool[Array, ""]]:
     return eqx.combine(clean, rest), flags[0] & flags[1]
 
 
+def positive(dt: Any) -> Array:
+    """dt, or NaN where it is not positive: nothing can be computed with that either."""
+    dt = jnp.asarray(dt)
+    return jnp.where(dt > 0.0, dt, jnp.nan)
+
+
 def _joined(arrays: list[Array]) -> Array:
     """One array, to be looked at by one operation."""
     return jnp.concatenate(arrays) if arrays else jnp.zeros(0)

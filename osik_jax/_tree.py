@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+from collections.abc import Callable
 from functools import cached_property
+from typing import Any, Generic, TypeVar, cast
 
+import jax
 import mujoco
 import numpy as np
 
@@ -33,6 +36,28 @@ class ModelHolder:
 
     def __hash__(self) -> int:
         return 0
+
+
+_Arrays = TypeVar("_Arrays")
+
+
+class cached_arrays(Generic[_Arrays]):
+    """A ``cached_property`` for NumPy arrays: computed once, and copied at each access.
+
+    JAX remembers in which precision it has read an array object. Where ``jax_enable_x64`` changes while a robot lives,
+    an object that was read before would have the wrong one.
+    """
+
+    def __init__(self, compute: Callable[[Any], _Arrays]):
+        self.compute, self.name, self.__doc__ = compute, f"_cached_{compute.__name__}", compute.__doc__
+
+    def __get__(self, tree: Any, owner: type | None = None) -> _Arrays:
+        """A copy of the arrays; they are computed on the first access."""
+        if tree is None:
+            return cast(_Arrays, self)
+        if self.name not in tree.__dict__:
+            tree.__dict__[self.name] = self.compute(tree)
+        return jax.tree.map(np.copy, tree.__dict__[self.name])
 
 
 def unknown_name(kind: str, name: object, available: tuple[str, ...]) -> KeyError:
@@ -94,11 +119,16 @@ class KinematicTree:
         return tuple(j for j in range(len(self.joint_names)) if j not in dependent)
 
     @cached_property
+    def dof_owners(self) -> str:
+        """Names of the joints that own entries of v, in its order: robots for which they differ do not mix."""
+        return ", ".join(self.joint_names[j] for j in self.independent)
+
+    @cached_arrays
     def full_qpos_address(self) -> np.ndarray:
         """Where each joint starts in the MuJoCo model's qpos; one past the end is last."""
         return np.cumsum([0, *(QPOS_WIDTH[t] for t in self.joint_types)])
 
-    @cached_property
+    @cached_arrays
     def full_dof_address(self) -> np.ndarray:
         """Where each joint starts in the MuJoCo model's qvel; one past the end is last."""
         return np.cumsum([0, *(DOF_WIDTH[t] for t in self.joint_types)])
@@ -125,13 +155,13 @@ class KinematicTree:
         """Length of v."""
         return sum(DOF_WIDTH[self.joint_types[j]] for j in self.independent)
 
-    @cached_property
+    @cached_arrays
     def turning(self) -> np.ndarray:
         """Entries of v that turn something; slides and a base's translation bend no path. (nv,), bool."""
         parts = {FREE: [False] * 3 + [True] * 3, BALL: [True] * 3, SLIDE: [False], HINGE: [True]}
         return np.array([turns for j in self.independent for turns in parts[self.joint_types[j]]], bool)
 
-    @cached_property
+    @cached_arrays
     def qpos_source(self) -> tuple[np.ndarray, np.ndarray]:
         """``(index, coefficient)``: full qpos = coefficient * q[index] + offset (coefficient 0 where locked)."""
         n = int(self.full_qpos_address[-1])
@@ -145,7 +175,7 @@ class KinematicTree:
             coefficient[self.full_qpos_address[follower]] = multiplier
         return index, coefficient
 
-    @cached_property
+    @cached_arrays
     def dof_columns(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
         """How full Jacobian columns add up to columns of v: ``sum of J_full[:, index] * coefficient``.
 
@@ -168,17 +198,17 @@ class KinematicTree:
             free[0][dof], free[1][dof] = self.full_dof_address[follower], multiplier
         return tuple(terms)
 
-    @cached_property
+    @cached_arrays
     def dof_joint(self) -> np.ndarray:
         """The joint that each full dof belongs to."""
         return np.repeat(np.arange(len(self.joint_types)), [DOF_WIDTH[t] for t in self.joint_types])
 
-    @cached_property
+    @cached_arrays
     def dof_body(self) -> np.ndarray:
         """The body that each full dof moves."""
         return np.asarray(self.joint_bodies, int)[self.dof_joint]
 
-    @cached_property
+    @cached_arrays
     def parents(self) -> np.ndarray:
         """``body_parents`` as an array, of JAX's integers in either precision."""
         return np.asarray(self.body_parents, np.int32)
@@ -188,7 +218,7 @@ class KinematicTree:
         """The first moving body, or the world where nothing moves."""
         return min(1, len(self.body_parents) - 1)
 
-    @cached_property
+    @cached_arrays
     def doublings(self) -> np.ndarray:
         """Of each body its parent, then the ancestor 2 above it, 4, ... until that is the world for all. (k, nbody)."""
         rounds, above = [], self.parents
@@ -197,7 +227,7 @@ class KinematicTree:
             above = above[above]
         return np.array(rounds, int).reshape(-1, len(self.parents))
 
-    @cached_property
+    @cached_arrays
     def descendants(self) -> np.ndarray:
         """``descendants[a, b]``: body b is a or below it. (nbody, nbody), bool."""
         n = len(self.body_parents)
@@ -206,10 +236,10 @@ class KinematicTree:
             below[self.body_parents[body]] |= below[body]
         return below
 
-    @cached_property
+    @cached_arrays
     def moves(self) -> np.ndarray:
         """``moves[b, i]``: full dof i moves body b. (nbody, full nv), bool."""
-        return self.descendants[self.dof_body].T.copy()
+        return self.descendants[self.dof_body].T
 
     def frame(self, name: str) -> int:
         """Index of a frame.

@@ -6,6 +6,7 @@ import dataclasses
 import importlib.metadata
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,7 +45,8 @@ class Demo:
     robot: str | None = None
     """A URDF or MJCF file (or nao, arm7) to move instead."""
     base: Literal["auto", "floating", "fixed"] = "auto"
-    """With --robot: whether its root moves freely. auto: as the file says; a URDF without feet is fixed."""
+    """With --robot: whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has
+    feet (or --support)."""
     frame: str | None = None
     """With --robot: the frame that moves. Default: the floating base, or the tip of a robot that is bolted down."""
     support: tuple[str, ...] = ()
@@ -72,7 +74,7 @@ class Info:
     robot: Annotated[str, tyro.conf.Positional]
     """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
     base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF says nothing, and floats."""
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -88,14 +90,35 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     jax.config.update("jax_enable_x64", True)
     try:
-        if isinstance(command, Info):
-            _info(command)
-        else:
-            _demo(command)
+        with _notes():
+            if isinstance(command, Info):
+                _info(command)
+            else:
+                _demo(command)
     except CommandError as error:
         print(f"osik: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+@contextmanager
+def _notes() -> Iterator[None]:
+    """Tells this package's warnings in one line each, in the words of the command line."""
+    from ._errors import OsikWarning
+
+    told = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
+        if not issubclass(category, OsikWarning):
+            return told(message, category, *where, **options)
+        text = str(message).replace("floating_base=False", "--base fixed")
+        text = text.replace("floating_base=True", "--base floating")
+        print(f"osik: note: {text}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", OsikWarning)
+        warnings.showwarning = show
+        yield
 
 
 @contextmanager
@@ -130,21 +153,20 @@ def read_robot(source: str, base: str = "auto") -> Robot:
             if source.endswith("_description"):
                 return load_robot(source, floating_base=floating)
             raise FileNotFoundError(f"no such file: {source} (embedded robots: {', '.join(_EMBEDDED)})")
-        text = path.read_text(encoding="utf-8", errors="replace")
-        if "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]:
+        if _is_mjcf(path):
             return Robot.from_mjcf(path, floating_base=floating)
         return Robot.from_urdf(path, floating_base=floating)
 
 
-def _read_demo_robot(command: Demo, source: str) -> Robot:
-    """The robot to move; a URDF that was let float only by default, and has no feet, is bolted down."""
-    from .demo import guess_feet
+def _is_mjcf(path: Path) -> bool:
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]
 
-    robot = read_robot(source, command.base)
-    guessed = command.base == "auto" and source not in _EMBEDDED and not command.support
-    if guessed and robot.floating_base and not guess_feet(robot):
-        return read_robot(source, "fixed")
-    return robot
+
+def _read_demo_robot(command: Demo, source: str) -> Robot:
+    """The robot to move; a URDF that does not say whether its base moves floats if --support names what stands."""
+    stands = command.base == "auto" and command.support and Path(source).is_file() and not _is_mjcf(Path(source))
+    return read_robot(source, "floating" if stands else command.base)
 
 
 def _info(command: Info) -> None:

@@ -14,14 +14,25 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._blocks import BLOCK
-from ._joint_selection import concrete, scalar_layout
+from ._checks import (
+    check_rows,
+    check_setting,
+    check_steps,
+    check_targets,
+    check_tasks,
+    check_warm_start,
+    checked_configuration,
+    checked_limits,
+    solved_with,
+)
+from ._joint_selection import scalar_layout
 from ._rules import FOUND, blocked
-from ._sanity import cleaned
+from ._sanity import cleaned, positive
 from ._structure import Static, put_together, taken_apart
 from .kinematics import Kinematics, forward_kinematics, integrate
-from .limits import ConfigurationLimit, Limit, limit_box, limit_rows
+from .limits import ConfigurationLimit, Limit, VelocityLimit, limit_box, limit_rows
 from .robot import Robot
-from .schemes import Scheme, VelocityProblem
+from .schemes import Scheme, VelocityProblem, WeightedQP
 from .solvers import Status
 from .tasks import Task
 from .tasks._rows import rows_of
@@ -83,8 +94,8 @@ def solve(
     q: Float[Array, " nq"],
     tasks: Tasks,
     *,
-    scheme: Scheme,
-    limits: Sequence[Limit] = (),
+    scheme: Scheme | None = None,
+    limits: Sequence[Limit] | None = None,
     dt: Float[Array, ""] | float = 0.005,
     warm_start: Any = None,
 ) -> Solution:
@@ -97,24 +108,33 @@ def solve(
         robot: the robot.
         q: configuration. (nq,)
         tasks: by name; the names come back in ``slack`` and ``error``.
-        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
-        limits: hard bounds on the velocity. Those that remember the last tick's velocity, such as
+        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``. Default: ``WeightedQP()``.
+        limits: hard bounds on the velocity. Default: the robot's own, ``(ConfigurationLimit(robot),
+            VelocityLimit(robot))``; ``()``: none. Those that remember the last tick's velocity, such as
             ``AccelerationLimit``, need it each time: ``limit.after(solution.velocity)``.
         dt: time until the next tick [s].
         warm_start: that of the tick before (``Solution.warm_start``), with the same tasks, scheme and limits. It saves
-            time and does not change the answer; a wrong one costs time only.
+            time and does not change the answer; one with wrong numbers costs time only.
 
     Returns:
-        The answer; never raises inside jit: look at ``status``, or call ``osik_jax.solvers.raise_if_failed`` outside.
+        The answer. What can be known of numbers only when they are there, such as a traced dt <= 0, raises nothing:
+        look at ``status``, or call ``osik_jax.solvers.raise_if_failed`` outside jit.
 
     Raises:
-        TypeError: something that is no task, scheme or limit.
-        ValueError: outside jit: q of the wrong length, not finite or with a quaternion of zeros; no task; dt <= 0.
+        TypeError: something that is no robot, task, scheme or limit, or no number.
+        ValueError: q of the wrong length, not finite or with a quaternion of zeros; no task; dt <= 0; a task or limit
+            that was made for another robot, the warm start of another problem; a robot that is a stack, or that has
+            float64 numbers while ``jax_enable_x64`` is off.
+
+    Warns:
+        OsikWarning: a robot that has float32 numbers while ``jax_enable_x64`` is on.
     """
-    _check_tasks(tasks)
-    _check_settings(scheme, limits, dt)
-    q = _configuration(robot, q)
-    return _solve(robot, q, dict(tasks), scheme, tuple(limits), _tick(dt, q), warm_start)
+    check_setting("solve(robot, q, tasks)", robot, scheme, dt)
+    limits = checked_limits(robot, limits)
+    check_tasks(tasks, robot)
+    check_warm_start(warm_start)
+    q = checked_configuration(robot, q)
+    return _solve(robot, q, dict(tasks), scheme, limits, _tick(dt, q), warm_start)
 
 
 @jax.jit
@@ -123,23 +143,25 @@ def _solve(
     robot: Robot,
     q: Array,
     tasks: dict[str, Task],
-    scheme: Scheme,
-    limits: tuple[Limit, ...],
+    scheme: Scheme | None,
+    limits: tuple[Limit, ...] | None,
     dt: Array | float,
     warm_start: Any = None,
 ) -> Solution:
-    raw_box = jax.lax.stop_gradient(limit_box(robot, q, limits, dt))
+    chosen, bounds = _own_scheme(q, scheme), _own_limits(robot, limits)
+    dt = positive(dt)
+    raw_box = jax.lax.stop_gradient(limit_box(robot, q, bounds, dt))
     (robot, q), posed = cleaned((robot, q))
-    (scheme, limits, dt), set_up = cleaned((scheme, limits, dt))
+    (chosen, bounds, dt), set_up = cleaned((chosen, bounds, dt))
     looked_at = {name: cleaned(task) for name, task in tasks.items()}
     tasks, sound = (
         {k: task for k, (task, _) in looked_at.items()},
         {k: posed & own for k, (_, own) in looked_at.items()},
     )
     kinematics = forward_kinematics(robot, q)
-    problem = _velocity_problem(robot, kinematics, q, tasks, limits, dt)
+    problem = _velocity_problem(robot, kinematics, q, tasks, bounds, dt)
     given = _spoiled(problem, raw_box, jnp.stack([set_up, *sound.values()]).all())
-    answer = scheme.solve(given, warm_start)
+    answer = solved_with(chosen, given, warm_start)
     v = answer.velocity
     failed = answer.status == Status.NUMERICAL_ERROR
     return Solution(
@@ -185,8 +207,8 @@ def rollout(
     q0: Float[Array, " nq"],
     tasks: Tasks | Callable[[Array], Tasks],
     *,
-    scheme: Scheme,
-    limits: Sequence[Limit] = (),
+    scheme: Scheme | None = None,
+    limits: Sequence[Limit] | None = None,
     dt: Float[Array, ""] | float = 0.005,
     steps: int,
     targets: Targets | None = None,
@@ -203,8 +225,8 @@ def rollout(
         tasks: by name, or a function from time [s] to tasks (the same ones each time, with other numbers). A function
             that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers (arrays and
             floats; integers are static) without compiling; any other function compiles once for each object.
-        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
-        limits: hard bounds on the velocity. Limits and tasks that remember the last velocity get it at each tick; the
+        scheme: as in ``solve``.
+        limits: as in ``solve``. Limits and tasks that remember the last velocity get it at each tick; the
             first takes them as they are.
         dt: time of one tick [s].
         steps: number of ticks (static).
@@ -221,9 +243,10 @@ def rollout(
         TypeError, ValueError: as in ``solve``; ``targets``, ``feedback`` or ``steps`` do not fit.
         KeyError: ``targets`` names a task that does not exist.
     """
-    _check_settings(scheme, limits, dt)
-    _check_steps(steps)
-    check_targets(tasks, targets, steps)
+    check_setting("rollout(robot, q0, tasks)", robot, scheme, dt)
+    limits = checked_limits(robot, limits)
+    check_steps(steps)
+    check_targets(tasks, targets, steps, robot)
     if feedback is not None and not callable(feedback):
         feedback = jnp.asarray(feedback)
         if feedback.shape != (steps, robot.nq):
@@ -231,13 +254,13 @@ def rollout(
                 f"feedback has shape {feedback.shape}; it is one configuration a tick, {(steps, robot.nq)}"
             )
     numbers, static = taken_apart((tasks if callable(tasks) else dict(tasks), feedback))
-    q0 = _configuration(robot, q0)
+    q0 = checked_configuration(robot, q0)
     return _rollout(
         robot,
         q0,
         numbers,
         scheme,
-        tuple(limits),
+        limits,
         _tick(dt, q0),
         targets,
         static=static,
@@ -250,8 +273,8 @@ def _rollout(
     robot: Robot,
     q0: Array,
     numbers: Any,
-    scheme: Scheme,
-    limits: tuple[Limit, ...],
+    scheme: Scheme | None,
+    limits: tuple[Limit, ...] | None,
     dt: Array | float,
     targets: Targets | None,
     *,
@@ -265,10 +288,10 @@ def _rollout(
     def tick(state: _Carry, now: tuple[Array, Targets | None, Array | None]) -> tuple[_Carry, tuple[Array, Solution]]:
         (q, velocity, warm_start), (t, target, sensed) = state, now
         if callable(feedback):
-            q = _configuration(robot, feedback(t, q))
+            q = checked_configuration(robot, feedback(t, q))
         elif sensed is not None:
             q = sensed.astype(q.dtype)
-        todo = _checked(tasks(t)) if callable(tasks) else aim(tasks, target)
+        todo = _checked(tasks(t), robot) if callable(tasks) else aim(tasks, target)
         todo, kept = remembering((todo, limits), velocity, t > 0.0)
         solution = _solve(robot, q, todo, scheme, kept, dt, warm_start)
         q = _move(robot, q, solution.velocity, dt)
@@ -295,7 +318,7 @@ def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, mov
 def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
     """Where a tick leads; nowhere if q or dt is NaN."""
     (clean, tick), fine = cleaned((q, jnp.asarray(dt)))
-    return jnp.where(fine, integrate(robot, clean, v, tick), q)
+    return jnp.where(fine, integrate(robot, clean, v, tick).astype(q.dtype), q)
 
 
 def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:
@@ -324,8 +347,10 @@ def _velocity_problem(
     for limit in limits:
         if isinstance(limit, ConfigurationLimit):
             low, high = jnp.maximum(low, limit.lower), jnp.minimum(high, limit.upper)
+    rows = rows_of(robot, kinematics, q, {name: task.during(dt) for name, task in tasks.items()})
+    check_rows(rows, tasks, robot)
     return VelocityProblem(
-        rows=rows_of(robot, kinematics, q, {name: task.during(dt) for name, task in tasks.items()}),
+        rows=rows,
         priorities=tuple((name, task.priority) for name, task in tasks.items()),
         lower=lower,
         upper=upper,
@@ -338,58 +363,21 @@ def _velocity_problem(
     )
 
 
-def _configuration(robot: Robot, q: Any) -> Float[Array, " nq"]:
-    """q, checked, as floats at least as precise as the robot's."""
-    q = jnp.asarray(q)
-    robot.check_configuration(q)
-    return q.astype(jnp.result_type(q, robot.q0))
-
-
 def _tick(dt: Any, q: Array) -> Any:
     """The tick in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
     return dt.astype(q.dtype) if isinstance(dt, jax.Array) else np.asarray(dt, q.dtype)
 
 
-def _checked(tasks: Any) -> dict[str, Task]:
-    _check_tasks(tasks)
+def _checked(tasks: Any, robot: Robot) -> dict[str, Task]:
+    check_tasks(tasks, robot)
     return dict(tasks)
 
 
-def _check_tasks(tasks: Any) -> None:
-    if not isinstance(tasks, Mapping):
-        raise TypeError(f"tasks is a {type(tasks).__name__}; it is a dict from names to tasks")
-    if not tasks:
-        raise ValueError("there is no task: give at least one, such as a PostureTask")
-    for name, task in tasks.items():
-        if not isinstance(task, Task):
-            raise TypeError(f"tasks[{name!r}] is a {type(task).__name__}, not a Task")
+def _own_scheme(q: Array, scheme: Scheme | None) -> Scheme:
+    """The scheme that is given, or a weighted QP in the precision of q."""
+    return jax.tree.map(lambda leaf: leaf.astype(q.dtype), WeightedQP()) if scheme is None else scheme
 
 
-def _check_settings(scheme: Any, limits: Any, dt: Any) -> None:
-    if not isinstance(scheme, Scheme):
-        raise TypeError(f"scheme is {scheme!r}; it is a WeightedQP(), a NullSpace() or a HierarchicalQP()")
-    if isinstance(limits, Limit) or not all(isinstance(limit, Limit) for limit in limits):
-        raise TypeError(f"limits is {limits!r}; it is a sequence, such as (ConfigurationLimit(robot),)")
-    seen = concrete(dt)
-    if seen is not None and not ((seen > 0.0) & np.isfinite(seen)).all():
-        raise ValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
-
-
-def _check_steps(steps: Any) -> None:
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 0:
-        raise ValueError(f"steps is {steps!r}; it is the number of ticks, an integer")
-
-
-def check_targets(tasks: Tasks | Callable[[Array], Tasks], targets: Targets | None, steps: int) -> None:
-    """Raises where tasks are none, or targets by tick do not fit them."""
-    if callable(tasks):
-        if targets is not None:
-            raise ValueError("targets go with a dict of tasks; a function of time sets them itself")
-        return
-    _check_tasks(tasks)
-    for name, target in (targets or {}).items():
-        if name not in tasks:
-            raise KeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(tasks)}")
-        for leaf in jax.tree.leaves(target):
-            if jnp.shape(leaf)[:1] != (steps,):
-                raise ValueError(f"targets[{name!r}] has shape {jnp.shape(leaf)}; its first axis is the ticks, {steps}")
+def _own_limits(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Limit, ...]:
+    """The limits that are given, or the robot's own."""
+    return (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else limits

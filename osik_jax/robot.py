@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -12,13 +13,15 @@ import jax.core
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, DTypeLike, Float
 
 from . import _loading
+from ._home_configuration import Home, home_configuration
 from ._links import Factors, scaled_leaves
 from ._tree import BALL, FREE, KinematicTree, ModelHolder
 
 LockedJoints = Iterable[str] | Mapping[str, float]
+PositionLimits = Mapping[str, tuple[float, float]]
 _UNIT_QUATERNION_TOLERANCE = 1e-8
 
 
@@ -85,7 +88,9 @@ class Robot(eqx.Module):
         *,
         floating_base: bool | None = None,
         velocity_limits: Mapping[str, float] | None = None,
+        position_limits: PositionLimits | None = None,
         locked_joints: LockedJoints = (),
+        home: Home | None = None,
         collision_meshes: bool = False,
         package_dirs: Iterable[str | os.PathLike[str]] = (),
     ) -> Robot:
@@ -102,11 +107,15 @@ class Robot(eqx.Module):
                 radians.
             floating_base: ``True``: put a free joint, ``floating_base``, on the root link unless the URDF has a
                 ``floating`` joint already (below a root link called ``world``: on the one link fixed to it).
-                ``False``: the root link is fixed to the world, and ``floating`` joints are locked. ``None``: as
-                ``True``, but a root link called ``world`` is the world and stays fixed.
+                ``False``: the root link is fixed to the world, and ``floating`` joints are locked. ``None``: as the
+                file says, if it does: a ``floating`` joint floats, and a root link called ``world`` is the world. A
+                URDF that says neither floats if two of its outermost links are called like feet (sole, foot, ankle or
+                toe), and is fixed to the world with an ``OsikWarning`` if not.
             velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; wins over the file's.
+            position_limits: joint name (or glob) to (lower, upper) [rad or m]; wins over the file's. Infinite: free.
             locked_joints: names or globs of joints to freeze at 0, or a mapping from them to the values to freeze at
                 [rad or m]. A mimic joint is locked by locking its leader.
+            home: what ``q0`` is, see ``with_home``. Default: zeros, brought inside the joints' ranges.
             collision_meshes: read the collision shapes that are meshes (STL, OBJ, MSH) too; without, no mesh file is
                 needed.
             package_dirs: folders that are ROS packages or hold some, for ``package://`` addresses. Then
@@ -116,19 +125,23 @@ class Robot(eqx.Module):
             FileNotFoundError: no such file, or with ``collision_meshes`` a mesh is not found; the message says where it
                 was looked for.
             ValueError: the XML or the model in it is broken or cannot be represented (``planar`` joints, several root
-                links); the message says where.
-            KeyError: ``velocity_limits`` or ``locked_joints`` names a joint that does not exist.
+                links), or ``home`` does not fit; the message says where.
+            KeyError: a mapping or ``locked_joints`` names a joint that does not exist.
+
+        Warns:
+            OsikWarning: the base is fixed because nothing in the file looks like feet, or a joint cannot move because
+                its range is a single value.
         """
-        return cls(
-            **_loading.from_urdf(
-                urdf,
-                floating_base=floating_base,
-                velocity_limits=velocity_limits,
-                locked_joints=locked_joints,
-                collision_meshes=collision_meshes,
-                package_dirs=package_dirs,
-            )
+        fields = _loading.from_urdf(
+            urdf,
+            floating_base=floating_base,
+            velocity_limits=velocity_limits,
+            position_limits=position_limits,
+            locked_joints=locked_joints,
+            collision_meshes=collision_meshes,
+            package_dirs=package_dirs,
         )
+        return cls._at_home(fields, home)
 
     @classmethod
     def from_mjcf(
@@ -137,9 +150,11 @@ class Robot(eqx.Module):
         *,
         floating_base: bool | None = None,
         velocity_limits: Mapping[str, float] | None = None,
+        position_limits: PositionLimits | None = None,
         locked_joints: LockedJoints = (),
+        home: Home | None = None,
     ) -> Robot:
-        """Loads an MJCF file or text. The first keyframe is ``q0``.
+        """Loads an MJCF file or text.
 
         Active joint equality constraints that are linear become exact mimic joints, those without a second joint lock
         the first; an ``EqualityConstraintTask`` keeps ``connect``, ``weld`` and the other joint constraints. Tendons
@@ -153,21 +168,29 @@ class Robot(eqx.Module):
                 one. ``False``: free joints are locked where the file has them.
             velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; MJCF has no field for it. A custom
                 numeric ``velocity_limit/JOINT`` in the file is read too.
+            position_limits: as in ``from_urdf``.
             locked_joints: as in ``from_urdf``.
+            home: what ``q0`` is, see ``with_home``: a keyframe's name or number, for instance. Default: the first
+                keyframe, or ``qpos0`` where there is none, brought inside the joints' ranges.
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: the XML or the model in it is broken, or a body takes its mass from a mesh that cannot be read.
-            KeyError: ``velocity_limits`` or ``locked_joints`` names a joint that does not exist.
+            ValueError: the XML or the model in it is broken, a body takes its mass from a mesh that cannot be read, or
+                ``home`` does not fit.
+            KeyError: a mapping or ``locked_joints`` names a joint that does not exist, or ``home`` a keyframe.
+
+        Warns:
+            OsikWarning: a joint cannot move because its range is a single value. MuJoCo reads ``range="0 0"`` as no
+                limit at all, and so does this.
         """
-        return cls(
-            **_loading.from_mjcf(
-                mjcf,
-                floating_base=floating_base,
-                velocity_limits=velocity_limits,
-                locked_joints=locked_joints,
-            )
+        fields = _loading.from_mjcf(
+            mjcf,
+            floating_base=floating_base,
+            velocity_limits=velocity_limits,
+            position_limits=position_limits,
+            locked_joints=locked_joints,
         )
+        return cls._at_home(fields, home)
 
     @classmethod
     def from_mjmodel(
@@ -175,7 +198,9 @@ class Robot(eqx.Module):
         model: mujoco.MjModel,
         *,
         velocity_limits: Mapping[str, float] | None = None,
+        position_limits: PositionLimits | None = None,
         locked_joints: LockedJoints = (),
+        home: Home | None = None,
     ) -> Robot:
         """Takes a compiled MuJoCo model.
 
@@ -183,13 +208,29 @@ class Robot(eqx.Module):
             model: the model.
             velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; wins over custom numerics
                 ``velocity_limit/JOINT`` of the model.
+            position_limits: as in ``from_urdf``.
             locked_joints: as in ``from_urdf``; without a value, joints freeze at ``qpos0``.
+            home: as in ``from_mjcf``.
 
         Raises:
-            ValueError: the model has no moving joint, no moving mass, or a range with lower > upper.
-            KeyError: a name in ``velocity_limits`` or ``locked_joints`` does not exist.
+            TypeError: ``model`` is no ``mujoco.MjModel``.
+            ValueError: the model has no moving joint, no moving mass, or a range with lower > upper, or ``home`` does
+                not fit.
+            KeyError: a name in a mapping or ``locked_joints`` does not exist, or ``home`` names no keyframe.
+
+        Warns:
+            OsikWarning: a joint cannot move because its range is a single value.
         """
-        return cls(**_loading.from_mjmodel(model, velocity_limits=velocity_limits, locked_joints=locked_joints))
+        fields = _loading.from_mjmodel(
+            model, velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked_joints
+        )
+        return cls._at_home(fields, home)
+
+    @classmethod
+    def _at_home(cls, fields: Mapping[str, Any], home: Home | None) -> Self:
+        """The robot with these fields, and with another ``q0`` where one is given."""
+        robot = cls(**fields)
+        return robot if home is None else robot.with_home(home)
 
     @property
     def nq(self) -> int:
@@ -284,6 +325,45 @@ class Robot(eqx.Module):
             q = q.at[index].set((value - self.qpos_offset[full]) / coefficient[full])
         return q
 
+    def with_home(self, home: Home) -> Self:
+        """The same robot with another ``q0``, which is what tasks made from then on aim at by default.
+
+        Works inside ``jit``, where values are not checked; nothing is compiled again.
+
+        Args:
+            home: a configuration (nq,), whose quaternions are normalised; a mapping from joint names to values, a
+                number each [rad or m], or all entries of a free joint (7) or a ball (4), where joints that are not
+                named keep their values of ``q0``; or the name or number of a keyframe of ``mj_model``.
+
+        Raises:
+            KeyError: no such joint or keyframe; the message lists those that exist.
+            TypeError: nothing that a home can be.
+            ValueError: a wrong length, not finite, a quaternion of zeros, or a joint outside its range.
+        """
+        q0 = home_configuration(self, home)
+        return eqx.tree_at(lambda robot: robot.q0, self, q0)
+
+    def astype(self, dtype: DTypeLike) -> Self:
+        """The same robot in another precision: every number is cast, and everything else stays.
+
+        A robot has the precision that was in force when it was made. After ``jax_enable_x64`` was switched on or off,
+        ``robot.astype(float)`` is the robot in the precision now in force; tasks, limits and schemes are to be made
+        anew.
+
+        Args:
+            dtype: ``float`` (JAX's default), ``"float32"`` or ``"float64"``.
+
+        Raises:
+            TypeError: no floating-point type.
+            ValueError: float64 while ``jax_enable_x64`` is off.
+        """
+        wanted = np.dtype(jnp.result_type(float) if dtype is float else dtype)
+        if not jnp.issubdtype(wanted, np.floating):
+            raise TypeError(f"dtype is {dtype!r}; a robot's numbers are floating-point: float32 or float64")
+        if wanted == np.float64 and jnp.result_type(float) != wanted:
+            raise ValueError("float64 needs jax.config.update('jax_enable_x64', True) first")
+        return jax.tree.map(lambda leaf: leaf.astype(wanted), self)
+
     def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
         """The same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
 
@@ -329,27 +409,32 @@ class Robot(eqx.Module):
             Path(path).write_text(text, encoding="utf-8")
         return text
 
-    def check_configuration(self, q: Float[Array, " nq"]) -> None:
-        """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion."""
+    def check_configuration(self, q: Float[Array, " nq"], name: str = "q") -> None:
+        """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
+
+        Args:
+            q: what should be a configuration. (nq,)
+            name: what the message calls it.
+        """
         shape = jnp.shape(q)
         if shape != (self.nq,):
             raise ValueError(
-                f"q has shape {shape}, this robot's configurations have shape ({self.nq},): "
+                f"{name} has shape {shape}, this robot's configurations have shape ({self.nq},): "
                 f"{', '.join(self.tree.joint_names[j] for j in self.tree.independent)}. Batch with jax.vmap."
             )
         if isinstance(q, jax.core.Tracer):
             return
         values = np.asarray(q)
         if not np.isfinite(values).all():
-            raise ValueError(f"q is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
+            raise ValueError(f"{name} is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
         for joint, start in self.tree.qpos_address.items():
             kind = self.tree.joint_types[joint]
             if kind in (FREE, BALL):
                 first = start + (3 if kind == FREE else 0)
                 if np.linalg.norm(values[first : first + 4]) < _UNIT_QUATERNION_TOLERANCE:
                     raise ValueError(
-                        f"q[{first}:{first + 4}], the quaternion of joint {self.tree.joint_names[joint]!r}, is zero; "
-                        "the identity is (1, 0, 0, 0)"
+                        f"{name}[{first}:{first + 4}], the quaternion of joint {self.tree.joint_names[joint]!r}, is "
+                        "zero; the identity is (1, 0, 0, 0)"
                     )
 
 
@@ -358,7 +443,9 @@ def load_robot(
     *,
     floating_base: bool | None = None,
     velocity_limits: Mapping[str, float] | None = None,
+    position_limits: PositionLimits | None = None,
     locked_joints: LockedJoints = (),
+    home: Home | None = None,
 ) -> Robot:
     """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
 
@@ -370,14 +457,26 @@ def load_robot(
         name: of the robot.
         floating_base: as in ``Robot.from_mjcf`` and, for URDFs, ``Robot.from_urdf``.
         velocity_limits: likewise.
+        position_limits: likewise.
         locked_joints: likewise.
+        home: likewise.
 
     Raises:
-        KeyError: no such robot; the message lists those with names like it.
+        KeyError: no such robot; the message lists those with names like it. No such joint or keyframe.
         ImportError: the robot is one of robot_descriptions, which is not installed.
-        ValueError: the robot comes as xacro alone, or its file cannot be read.
+        ValueError: the robot comes as xacro alone, its file cannot be read, or ``home`` does not fit.
+
+    Warns:
+        OsikWarning: as in ``Robot.from_mjcf`` and ``Robot.from_urdf``.
     """
+    if not isinstance(name, str):
+        raise TypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, _loading.ROBOTS))}")
     load = _loading.embedded if name in _loading.ROBOTS else _loading.described
-    return Robot(
-        **load(name, floating_base=floating_base, velocity_limits=velocity_limits, locked_joints=locked_joints)
+    fields = load(
+        name,
+        floating_base=floating_base,
+        velocity_limits=velocity_limits,
+        position_limits=position_limits,
+        locked_joints=locked_joints,
     )
+    return Robot._at_home(fields, home)

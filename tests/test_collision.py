@@ -2,6 +2,7 @@
 
 import functools
 import os
+import warnings
 
 import coal
 import jax
@@ -563,6 +564,55 @@ def test_a_name_with_the_signs_of_a_glob_is_a_name_first(arm):
     shapes = {name: CollisionShape.sphere(0.1, (0.0, 0.0, 2.0)) for name in ("ball[1]", "ball1")}
     limit = osik.CollisionAvoidanceLimit(arm, shapes=shapes, pairs=[("ball[1]", "hand")])
     assert limit.pairs == (("hand", "ball[1]"),)
+
+
+class TestTooNearAtHome:
+    """A ball 5 mm from the hand at q0, where 2 cm are asked for."""
+
+    MINIMUM = 0.02
+
+    @pytest.fixture
+    def shapes(self, arm):
+        hand, _ = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "geom:hand")
+        return {"ball": CollisionShape.sphere(0.05, hand + jnp.array([0.0, 0.06 + 0.05 + 0.005, 0.0]))}
+
+    def test_pairs_asked_for_by_name_are_kept_and_part(self, arm, shapes):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            limit = osik.CollisionAvoidanceLimit(
+                arm, shapes=shapes, pairs=[("hand", "ball"), ("floor", "hand")], minimum_distance=self.MINIMUM
+            )
+        assert {frozenset(pair) for pair in limit.pairs} == {frozenset({"hand", "ball"}), frozenset({"floor", "hand"})}
+        assert limit.left_out == ()
+        tasks = {"posture": osik.PostureTask(arm)}
+        path = osik.rollout(arm, arm.q0, tasks, limits=(limit,), dt=0.01, steps=60)
+        place = limit.pairs.index(("hand", "ball"))
+        gaps = jax.vmap(lambda q: limit.distances(arm, osik.forward_kinematics(arm, q))[place])(path.q)
+        assert abs(gaps[0] - 0.005) < 1e-9 and gaps[-1] > self.MINIMUM - 1e-4 and (path.solution.status == 0).all()
+        assert (np.diff(gaps) < 0.5 * 0.01 + 1e-4).all()  # at recovery_speed, and no faster
+
+    def test_what_a_glob_loses_is_told_with_its_distance(self, arm, shapes):
+        with pytest.warns(osik.OsikWarning, match=r"hand-ball \(0.005 m\)"):
+            limit = osik.CollisionAvoidanceLimit(
+                arm, shapes=shapes, pairs=[("ball", "*"), ("floor", "hand")], minimum_distance=self.MINIMUM
+            )
+        assert limit.left_out == (("hand", "ball"),) and ("hand", "ball") not in limit.pairs
+
+    def test_what_is_chosen_here_is_left_out_and_can_be_seen(self, arm, shapes):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            limit = osik.CollisionAvoidanceLimit(arm, shapes=shapes, minimum_distance=self.MINIMUM)
+            asked = osik.CollisionAvoidanceLimit(
+                arm, shapes=shapes, pairs=[("hand", "ball"), ("floor", "hand")], q0_distance=self.MINIMUM
+            )
+        assert ("hand", "ball") in limit.left_out and ("hand", "ball") not in limit.pairs
+        assert asked.left_out == (("hand", "ball"),)
+
+    def test_a_pair_that_cannot_be_kept_apart_is_named(self, arm):
+        with pytest.raises(ValueError, match=r"\('upper', 'middle'\).*neighbouring"):
+            osik.CollisionAvoidanceLimit(arm, pairs=[("upper", "middle"), ("floor", "hand")])
+        with pytest.raises(TypeError, match="pairs of names"):
+            osik.CollisionAvoidanceLimit(arm, pairs=["hand"])  # pyright: ignore[reportArgumentType]
 
 
 def test_pairs_nearer_than_the_minimum_at_q0_are_left_out_unless_said_otherwise(arm):

@@ -240,7 +240,9 @@ class TestClosedLoop:
                 return jnp.sum((kinematics.frame_pose(robot, "hand")[0] - self.point) ** 2)
 
         distance = osik.FunctionTask(arm, FromPoint(home + jnp.array([0.1, 0.0, 0.05])), target=0.2**2, gain=5.0)
-        run = osik.rollout(arm, arm.q0, {"distance": distance}, scheme=osik.NullSpace(damping=1e-6), dt=0.01, steps=100)
+        run = osik.rollout(
+            arm, arm.q0, {"distance": distance}, scheme=osik.NullSpace(damping=1e-6), dt=0.01, steps=100, limits=()
+        )
         error = np.asarray(run.solution.error["distance"])[:, 0]
         np.testing.assert_allclose(error[0], 0.1**2 + 0.05**2 - 0.2**2, rtol=1e-12)
         assert abs(error[-1]) < 0.01 * abs(error[0])

@@ -101,8 +101,9 @@ class Case:
 
 
 def load(name: str) -> osik.Robot:
-    """UR5's root link is called world, so the default leaves it fixed; the other arm is told so."""
-    return osik.Robot.from_urdf(urdf_path(name), floating_base=False if name == "panda" else None)
+    """Robots with feet float, and UR5's root link is called world: that is said of the others alone."""
+    said = None if name in ("g1", "talos", "romeo", "solo12", "ur5") else ROBOTS[name][1]
+    return osik.Robot.from_urdf(urdf_path(name), floating_base=said)
 
 
 def random_configurations(robot: osik.Robot, rng: np.random.Generator) -> np.ndarray:

@@ -55,9 +55,9 @@ def fingers(mimic: str, *, low: float = -1.0, high: float = 1.0, speed: float = 
 # --- URDF: base, frames, names ---
 
 
-def test_floating_base_by_default_and_on_request():
-    assert Robot.from_urdf(ARM).tree.joint_names == ("floating_base", "a", "b")
-    assert Robot.from_urdf(ARM).nv == 8
+def test_floating_base_on_request():
+    assert Robot.from_urdf(ARM, floating_base=True).tree.joint_names == ("floating_base", "a", "b")
+    assert Robot.from_urdf(ARM, floating_base=True).nv == 8
     fixed = Robot.from_urdf(ARM, floating_base=False)
     assert (fixed.nv, fixed.floating_base) == (2, False)
 
@@ -115,13 +115,13 @@ def test_floating_joint_of_the_file_is_the_base():
 def test_floating_joint_on_a_moving_link_is_refused():
     text = urdf(link("a"), link("b"), link("c"), joint("turn", "a", "b"), joint("free", "b", "c", kind="floating"))
     with pytest.raises(ValueError, match=r"'free' hangs from 'b', which moves"):
-        Robot.from_urdf(text)
+        Robot.from_urdf(text, floating_base=True)
 
 
 def test_odd_names_survive():
     names = ("base/0", "upper arm", "größe-2", "a.b:c")
     text = urdf(*(link(n) for n in names), *(joint(f"j/{n}", p, n) for p, n in itertools.pairwise(names)))
-    robot = Robot.from_urdf(text)
+    robot = Robot.from_urdf(text, floating_base=True)
     assert set(names) <= set(robot.frame_names)
     assert robot.joint_names == ("j/upper arm", "j/größe-2", "j/a.b:c")
 
@@ -150,7 +150,7 @@ def test_massless_links_may_move():
         link("c"),
         *(joint(f"j{x}{y}", x, y) for x, y in (("base", "a"), ("a", "b"), ("b", "c"))),
     )
-    robot = Robot.from_urdf(text)
+    robot = Robot.from_urdf(text, floating_base=True)
     assert float(robot.body_mass.sum()) == pytest.approx(3.0, rel=1e-12, abs=0.0)
     assert robot.mj_model.body_mass.sum() == pytest.approx(3.0, rel=1e-12, abs=0.0)
 
@@ -158,13 +158,15 @@ def test_massless_links_may_move():
 def test_quaternion_origin_equals_angles():
     quat = " ".join(map(repr, Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_quat().tolist()))
     other = ARM.replace('rpy="0.1 0.2 0.3"', f'quat_xyzw="{quat}"')
-    ours, theirs = Robot.from_urdf(other), Robot.from_urdf(ARM)
+    ours, theirs = Robot.from_urdf(other, floating_base=True), Robot.from_urdf(ARM, floating_base=True)
     np.testing.assert_allclose(ours.body_quaternion, theirs.body_quaternion, atol=1e-15)
 
 
 def test_comments_with_dashes_and_foreign_elements_are_skipped():
     extra = "<!-- ---- links ---- --><gazebo><link name='no'/></gazebo><transmission><joint name='no'/></transmission>"
-    assert Robot.from_urdf(ARM.replace('<robot name="r">', f'<robot name="r">{extra}')).joint_names == ("a", "b")
+    assert Robot.from_urdf(
+        ARM.replace('<robot name="r">', f'<robot name="r">{extra}'), floating_base=True
+    ).joint_names == ("a", "b")
 
 
 SHAPES = (
@@ -177,7 +179,8 @@ SHAPES = (
 
 def test_primitives_are_kept_for_drawing_and_meshes_dropped():
     red = '<material name="red"><color rgba="1 0 0 1"/></material>'
-    model = Robot.from_urdf(urdf(red, link("base", INERTIAL + SHAPES), link("tip"), joint("a", "base", "tip"))).mj_model
+    text = urdf(red, link("base", INERTIAL + SHAPES), link("tip"), joint("a", "base", "tip"))
+    model = Robot.from_urdf(text, floating_base=True).mj_model
     kinds = mujoco.mjtGeom
     assert model.geom_type.tolist() == [kinds.mjGEOM_BOX, kinds.mjGEOM_CYLINDER, kinds.mjGEOM_SPHERE]
     np.testing.assert_array_equal(model.geom_size, [[1.0, 2.0, 3.0], [0.5, 1.5, 0.0], [0.25, 0.0, 0.0]])
@@ -209,14 +212,18 @@ def limits(robot: Robot, name: str) -> list[float]:
     ],
 )
 def test_limits_of_a_joint(kind: str, limit: str, expected: list[float]):
-    robot = Robot.from_urdf(urdf(link("base"), link("tip"), joint("a", "base", "tip", limit, kind)))
+    robot = Robot.from_urdf(urdf(link("base"), link("tip"), joint("a", "base", "tip", limit, kind)), floating_base=True)
     np.testing.assert_allclose(limits(robot, "a"), expected, rtol=1e-15)
     assert float(robot.q0[7]) == max(0.0, limits(robot, "a")[0])
 
 
 def test_no_limit_element_means_no_limit():
     text = joint("a", "base", "tip").replace('<limit lower="-1" upper="2" velocity="3" effort="1"/>', "")
-    assert limits(Robot.from_urdf(urdf(link("base"), link("tip"), text)), "a") == [-np.inf, np.inf, np.inf]
+    assert limits(Robot.from_urdf(urdf(link("base"), link("tip"), text), floating_base=True), "a") == [
+        -np.inf,
+        np.inf,
+        np.inf,
+    ]
 
 
 def test_mimic_moves_with_its_leader_and_narrows_its_limits():
@@ -255,7 +262,7 @@ def test_chain_of_mimics_ends_at_the_leader():
 
 
 def test_locked_joints_by_name_glob_and_value():
-    assert Robot.from_urdf(ARM, locked_joints=["a"]).joint_names == ("b",)
+    assert Robot.from_urdf(ARM, locked_joints=["a"], floating_base=True).joint_names == ("b",)
     assert Robot.from_urdf(ARM, floating_base=False, locked_joints=("[b-z]",)).locked_joints == ("b",)
     robot = Robot.from_urdf(ARM, floating_base=False, locked_joints={"b": 0.5})
     free = Robot.from_urdf(ARM, floating_base=False)
@@ -273,14 +280,14 @@ def test_locked_joints_by_name_glob_and_value():
 def test_a_locked_leader_locks_its_followers():
     text = fingers('<mimic joint="a" multiplier="-0.5" offset="0.25"/>')
     for locked in ({"a": 0.5}, {"a": 0.5, "b": 0.0}):
-        robot = Robot.from_urdf(text, locked_joints=locked)
+        robot = Robot.from_urdf(text, locked_joints=locked, floating_base=True)
         assert robot.locked_joints == ("a", "b")
         np.testing.assert_array_equal(robot.mujoco_qpos(robot.q0)[7:], [0.5, 0.0])
-    assert Robot.from_urdf(text, locked_joints=("?",)).locked_joints == ("a", "b")
+    assert Robot.from_urdf(text, locked_joints=("?",), floating_base=True).locked_joints == ("a", "b")
 
 
 def test_locked_floating_base():
-    robot = Robot.from_urdf(ARM, locked_joints=("floating_base",))
+    robot = Robot.from_urdf(ARM, floating_base=True, locked_joints=("floating_base",))
     assert (robot.nv, robot.floating_base, robot.joint_names) == (2, False, ("a", "b"))
 
 
@@ -376,7 +383,7 @@ CHAIN = (link("base"), link("tip"), joint("a", "base", "tip"))
 )
 def test_broken_urdf_is_refused_by_name(text: str, message: str):
     with pytest.raises(ValueError, match=message):
-        Robot.from_urdf(text)
+        Robot.from_urdf(text, floating_base=True)
 
 
 def test_a_model_without_joints_is_refused():
@@ -387,8 +394,8 @@ def test_a_model_without_joints_is_refused():
 
 def test_missing_files_are_named_with_what_lies_there(tmp_path: Path):
     (tmp_path / "robot.urdf").write_text(ARM)
-    assert Robot.from_urdf(tmp_path / "robot.urdf").joint_names == ("a", "b")
-    assert Robot.from_urdf(str(tmp_path / "robot.urdf")).joint_names == ("a", "b")
+    for path in (tmp_path / "robot.urdf", str(tmp_path / "robot.urdf")):
+        assert Robot.from_urdf(path, floating_base=False).joint_names == ("a", "b")
     with pytest.raises(
         FileNotFoundError, match=r"robt.urdf'; did you mean 'robot.urdf'\? .urdf files in .*: robot.urdf"
     ):
@@ -413,15 +420,15 @@ def test_missing_files_are_named_with_what_lies_there(tmp_path: Path):
 )
 def test_wrong_locks_are_refused(locked, error: type[Exception], message: str):
     with pytest.raises(error, match=message):
-        Robot.from_urdf(ARM, locked_joints=locked)
+        Robot.from_urdf(ARM, locked_joints=locked, floating_base=True)
 
 
 def test_a_follower_cannot_be_locked_against_its_leader():
     text = fingers('<mimic joint="a"/>')
     with pytest.raises(ValueError, match=r"'b' cannot be locked alone: it mimics 'a', lock that one"):
-        Robot.from_urdf(text, locked_joints=("b",))
+        Robot.from_urdf(text, locked_joints=("b",), floating_base=True)
     with pytest.raises(ValueError, match=r"'b' cannot be locked at 0.5: it mimics 'a', which puts it at 0.25"):
-        Robot.from_urdf(text, locked_joints={"a": 0.25, "b": 0.5})
+        Robot.from_urdf(text, locked_joints={"a": 0.25, "b": 0.5}, floating_base=True)
 
 
 # --- MJCF ---
@@ -651,7 +658,7 @@ def test_a_site_called_like_its_body_gets_a_prefix():
 
 
 def test_unknown_frames_and_joints_are_named_with_the_nearest():
-    robot = Robot.from_urdf(ARM)
+    robot = Robot.from_urdf(ARM, floating_base=True)
     kin = osik.forward_kinematics(robot, robot.q0)
     with pytest.raises(KeyError, match=r"no frame 'uper'; did you mean 'upper'\? frames: world, base, upper, lower"):
         kin.frame_pose(robot, "uper")
@@ -660,13 +667,13 @@ def test_unknown_frames_and_joints_are_named_with_the_nearest():
     with pytest.raises(KeyError, match=r"no joint 'c'. joints: floating_base, a, b"):
         robot.joint_qpos_index("c")
     with pytest.raises(KeyError, match=r"joint 'a' is locked, so it has no place in q; joints: b"):
-        Robot.from_urdf(ARM, locked_joints=("a",)).joint_dof_index("a")
+        Robot.from_urdf(ARM, locked_joints=("a",), floating_base=True).joint_dof_index("a")
     with pytest.raises(ValueError, match=r"'floating_base' is free or ball: set its entries of q"):
         robot.configuration({"floating_base": 1.0})
 
 
 def test_wrong_configurations_are_refused():
-    robot = Robot.from_urdf(ARM)
+    robot = Robot.from_urdf(ARM, floating_base=True)
     with pytest.raises(ValueError, match=r"shape \(8,\).*\(9,\): floating_base, a, b. Batch with jax.vmap"):
         osik.forward_kinematics(robot, jnp.zeros(8))
     with pytest.raises(ValueError, match=r"q\[3:7\], the quaternion of joint 'floating_base', is zero"):
@@ -681,7 +688,7 @@ def test_wrong_configurations_are_refused():
 def test_robots_of_one_tree_stack_and_vmap():
     """FK, CoM and a step over the stack equal the loop; one program serves all."""
     texts = [ARM.replace("0.1 0 0.2", f"{0.1 * k} {0.05 * k} 0.2").replace("1.5", str(1.0 + k)) for k in range(1, 4)]
-    robots = [Robot.from_urdf(text) for text in texts]
+    robots = [Robot.from_urdf(text, floating_base=True) for text in texts]
     q, traced = jnp.asarray(np.random.default_rng(3).normal(size=(3, 9))), []
 
     @jax.jit

@@ -334,7 +334,11 @@ def test_urdf_as_pinocchio_reads_it():
     follower = joint("follower", "continuous", "robot/base", "e", mimic)
     again = check_with_pinocchio(text.replace("</robot>", f'<link name="e">{INERTIAL}</link>{follower}</robot>'))
     assert again.mimic_joints == {"follower": ("robot/j1", -2.0)}
-    assert Robot.from_urdf(text, velocity_limits={"*/*": 1.0}).velocity_limit[6:].tolist() == [1.0, 1.0, 3.0]
+    assert Robot.from_urdf(text, floating_base=True, velocity_limits={"*/*": 1.0}).velocity_limit[6:].tolist() == [
+        1.0,
+        1.0,
+        3.0,
+    ]
 
 
 def test_two_roots_are_named():
@@ -378,8 +382,8 @@ def vertices(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 def test_collision_meshes_are_read_where_asked_for(package: Path):
     path = package / "urdf" / "bot.urdf"
-    assert Robot.from_urdf(path).mj_model.ngeom == 0
-    robot = Robot.from_urdf(path, collision_meshes=True)
+    assert Robot.from_urdf(path, floating_base=False).mj_model.ngeom == 0
+    robot = Robot.from_urdf(path, floating_base=False, collision_meshes=True)
     model = robot.mj_model
     assert (model.ngeom, model.nmesh) == (3, 2)
     corners = np.array(CORNERS, float) * [1.0, 2.0, 1.0]
@@ -406,7 +410,7 @@ def test_packages_are_found(package: Path, where: str, slash: str, monkeypatch: 
         share.mkdir(parents=True)
         package.rename(share / package.name)
         monkeypatch.setenv(where, f"/not/there:{share.parent}")
-    robot = Robot.from_urdf(address, package_dirs=folders, collision_meshes=True)
+    robot = Robot.from_urdf(address, package_dirs=folders, floating_base=False, collision_meshes=True)
     assert (robot.joint_names, robot.mj_model.ngeom) == (("j",), 3)
 
 
@@ -441,7 +445,7 @@ def test_collision_meshes_of_a_known_robot():
     """Every STL of a G1 lies in its link's frame where the URDF puts it: the same box around its corners."""
     (file,) = (f for f in importlib.metadata.files("example-robot-data") or [] if f.name == "g1_29dof_rev_1_0.urdf")
     path = Path(str(file.locate()))
-    model = Robot.from_urdf(path, collision_meshes=True).mj_model
+    model = Robot.from_urdf(path, floating_base=False, collision_meshes=True).mj_model
     geoms = iter(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).tolist())
     shapes = ElementTree.parse(path).getroot().findall("link/collision")
     meshes = [(shape, mesh) for shape in shapes if (mesh := shape.find("geometry/mesh")) is not None]

@@ -178,7 +178,14 @@ def test_a_fall_ends_the_run(nao, nao_world):
         simulation.push("torso", (0.0, 60.0, 0.0) if t > 0.1 else (0.0, 0.0, 0.0))
 
     recording = physics.simulate(
-        simulation, posture, scheme=osik.WeightedQP(), dt=DT, steps=400, command=physics.Integrated(), before_tick=push
+        simulation,
+        posture,
+        scheme=osik.WeightedQP(),
+        dt=DT,
+        steps=400,
+        command=physics.Integrated(),
+        before_tick=push,
+        limits=(),
     )
     assert recording.fell and simulation.fallen()
     assert 20 < len(recording.command) < 300
@@ -224,7 +231,7 @@ def test_other_gains_compile_nothing(arm, arm_world):
         task = {"posture": osik.PostureTask(arm, gain=gain)}
         command = physics.Lookahead(time)
         simulation = physics.Simulation(arm_world)
-        return physics.simulate(simulation, task, scheme=osik.WeightedQP(), dt=DT, steps=3, command=command)
+        return physics.simulate(simulation, task, scheme=osik.WeightedQP(), dt=DT, steps=3, command=command, limits=())
 
     seen = Compilations()
     logging.getLogger("jax").addHandler(seen)
@@ -262,7 +269,9 @@ def test_mistakes_are_told(nao, arm, arm_world):
     with pytest.raises(KeyError, match="bodies: link0"):
         simulation.push("torso", (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="one tick"):
-        physics.simulate(simulation, {"posture": osik.PostureTask(arm)}, scheme=osik.WeightedQP(), dt=DT, steps=0)
+        physics.simulate(
+            simulation, {"posture": osik.PostureTask(arm)}, scheme=osik.WeightedQP(), dt=DT, steps=0, limits=()
+        )
 
 
 def test_joints_without_a_servo_are_named():

@@ -167,7 +167,9 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
     def run(speed, start, amount):
         tasks = Push(osik.PostureTask(arm), start, speed)
         scheme = osik.WeightedQP()
-        return osik.rollout(arm, arm.q0, tasks, scheme=scheme, dt=0.01, steps=STEPS, feedback=Drift(amount)).q
+        return osik.rollout(
+            arm, arm.q0, tasks, scheme=scheme, dt=0.01, steps=STEPS, feedback=Drift(amount), limits=()
+        ).q
 
     a = run(0.1, np.zeros(7), 0.0)
     with Compilations() as count:
@@ -179,7 +181,7 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
 def test_what_is_static_compiles_again(arm):
     """The counter counts: an iteration cap, a priority, a task more, another number of ticks."""
     task, scheme = osik.PostureTask(arm), osik.WeightedQP()
-    osik.solve(arm, arm.q0, {"posture": task}, scheme=scheme)
+    osik.solve(arm, arm.q0, {"posture": task}, scheme=scheme, limits=())
     changes = (
         ({"posture": task}, osik.WeightedQP(max_iterations=50)),
         ({"posture": osik.PostureTask(arm, priority=4)}, scheme),
@@ -187,9 +189,9 @@ def test_what_is_static_compiles_again(arm):
     )
     for tasks, other in changes:
         with Compilations() as count:
-            osik.solve(arm, arm.q0, tasks, scheme=other)
+            osik.solve(arm, arm.q0, tasks, scheme=other, limits=())
         assert count.names.count("jit(_solve)") == 1
     for steps in (2, 3):
         with Compilations() as count:
-            osik.rollout(arm, arm.q0, {"posture": task}, scheme=scheme, steps=steps)
+            osik.rollout(arm, arm.q0, {"posture": task}, scheme=scheme, steps=steps, limits=())
         assert count.names.count("jit(_rollout)") == 1

@@ -213,7 +213,7 @@ class TestWeightedQP:
     def test_a_row_of_weight_zero_costs_nothing(self, arm):
         """An inequality that is violated however the arm moves, and no other task of weight: nothing moves."""
         tasks = {"position": osik.FrameTask(arm.robot, "hand", rows="position", lower=1.0, weight=0.0)}
-        ours = osik.solve(arm.robot, arm.robot.q0, tasks, scheme=osik.WeightedQP(damping=1e-6), dt=DT)
+        ours = osik.solve(arm.robot, arm.robot.q0, tasks, scheme=osik.WeightedQP(damping=1e-6), dt=DT, limits=())
         np.testing.assert_allclose(ours.velocity, 0.0, rtol=0, atol=1e-12)
         assert int(ours.status) == osik.Status.SOLVED
 

@@ -345,7 +345,7 @@ class TestClosedLoop:
 
         def run(field, posture):
             tasks = {"field": field, "posture": posture}
-            out = osik.rollout(head, head.q0, tasks, scheme=scheme, dt=0.01, steps=200)
+            out = osik.rollout(head, head.q0, tasks, scheme=scheme, dt=0.01, steps=200, limits=())
             return out.solution.error["field"][:, 0], out.q[-1]
 
         angle, end = run(field, posture)
@@ -366,7 +366,9 @@ class TestClosedLoop:
             "together": together.replace(target=(Rr.T @ (p - pr), np.eye(3))),
             "turn": osik.PostureTask(robot, joints=("pan", "tilt"), target=robot.q0 + 0.3, gain=2.0, priority=2),
         }
-        run = osik.rollout(robot, robot.q0.at[-2].set(0.6), tasks, scheme=osik.NullSpace(), dt=0.01, steps=150)
+        run = osik.rollout(
+            robot, robot.q0.at[-2].set(0.6), tasks, scheme=osik.NullSpace(), dt=0.01, steps=150, limits=()
+        )
         apart = np.linalg.norm(run.solution.error["together"], axis=1)
         assert apart[0] > 0.05
         assert apart[-1] < 1e-4
@@ -393,7 +395,7 @@ class TestBatchesAndCompilation:
             spoiled.append(eqx.tree_at(lambda t, name=name: getattr(t, name), task, leaf))
 
         def solve(task):
-            return osik.solve(head, head.q0, {"look": task}, scheme=osik.WeightedQP())
+            return osik.solve(head, head.q0, {"look": task}, scheme=osik.WeightedQP(), limits=())
 
         solutions = jax.jit(jax.vmap(solve))(osik.stack(spoiled))
         np.testing.assert_array_equal(solutions.status == osik.Status.NUMERICAL_ERROR, [False, True, True, True, True])

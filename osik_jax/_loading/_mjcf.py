@@ -20,6 +20,7 @@ def from_mjcf(
     *,
     floating_base: bool | None = None,
     velocity_limits: Mapping[str, float] | None = None,
+    position_limits: Mapping[str, tuple[float, float]] | None = None,
     locked_joints: Iterable[str] | Mapping[str, float] = (),
 ) -> dict[str, Any]:
     """The fields of a Robot from an MJCF file or text; see ``Robot.from_mjcf``."""
@@ -32,7 +33,7 @@ def from_mjcf(
     locked = as_mapping(locked_joints)
     if floating_base is False:
         locked = dict.fromkeys(_free_joints(model)) | locked
-    return from_mjmodel(model, velocity_limits=velocity_limits, locked_joints=locked)
+    return from_mjmodel(model, velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked)
 
 
 def _model(source: Source, floating_base: bool | None) -> mujoco.MjModel:

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._errors import warn
 from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder, unknown_name
 
 VELOCITY_LIMIT_PREFIX = "velocity_limit/"
@@ -22,6 +23,9 @@ LEAST_INERTIA = 2e-15
 
 _MASSLESS = 1e-14
 """Mass per body [kg] that counts as none: MuJoCo itself demands 1e-15 of every moving body."""
+
+_ONE_VALUE = 1e-10
+"""A range that is not wider is a single value [rad or m]; the bound is pink's."""
 
 _LOCK_TOLERANCE = 1e-9
 """How far the value asked of a locked follower may be from where its leader puts it [rad or m]."""
@@ -55,9 +59,12 @@ def from_mjmodel(
     model: mujoco.MjModel,
     *,
     velocity_limits: Mapping[str, float] | None = None,
+    position_limits: Mapping[str, tuple[float, float]] | None = None,
     locked_joints: Iterable[str] | Mapping[str, float] = (),
 ) -> dict[str, Any]:
     """The fields of a Robot from a MuJoCo model; see ``Robot.from_mjmodel``."""
+    if not isinstance(model, mujoco.MjModel):
+        raise TypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
     names = element_names(model, mujoco.mjtObj.mjOBJ_JOINT, "joint", model.njnt)
     body_names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
     _check(model, names, body_names)
@@ -81,7 +88,9 @@ def from_mjmodel(
     )
     if tree.nv == 0:
         raise ValueError(f"the model has no joint left to move; joints: {', '.join(names)}, all locked")
-    lower, upper, speed = _limits(model, tree, followers, _speeds(model, names, velocity_limits or {}))
+    low, high = _ranges(model, names, position_limits or {})
+    lower, upper, speed = _limits(tree, followers, low, high, _speeds(model, names, velocity_limits or {}))
+    _warn_of_frozen(tree, lower, upper, position_limits or {})
     home = model.key_qpos[0] if model.nkey else model.qpos0
     arrays = dict(
         **_body_arrays(model, bodies, placement),
@@ -348,13 +357,39 @@ def _set_speed(speeds: np.ndarray, names: tuple[str, ...], pattern: str, value: 
         speeds[joint] = value
 
 
+def _ranges(
+    model: mujoco.MjModel, names: tuple[str, ...], given: Mapping[str, tuple[float, float]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limit of each joint: from the model, then from ``given``."""
+    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    scalar = np.isin(model.jnt_type, (HINGE, SLIDE))
+    limited = model.jnt_limited.astype(bool) & scalar
+    low[limited], high[limited] = model.jnt_range[limited].T
+    for pattern, limits in given.items():
+        joints = [joint for joint in match_joints(pattern, names) if scalar[joint] or names[joint] == pattern]
+        lower, upper = _range(limits, pattern)
+        for joint in joints:
+            if not scalar[joint]:
+                raise ValueError(f"joint {pattern!r} is free or ball; only hinges and slides have a range")
+            low[joint], high[joint] = lower, upper
+    return low, high
+
+
+def _range(limits: tuple[float, float], pattern: str) -> tuple[float, float]:
+    try:
+        lower, upper = (float(value) for value in limits)
+    except (TypeError, ValueError):
+        raise TypeError(f"position_limits[{pattern!r}] is {limits!r}; it is a pair (lower, upper)") from None
+    if not lower <= upper:
+        raise ValueError(f"position_limits[{pattern!r}] is {limits!r}; lower has to be less than upper")
+    return lower, upper
+
+
 def _limits(
-    model: mujoco.MjModel, tree: KinematicTree, followers: list[Follower], speed: np.ndarray
+    tree: KinematicTree, followers: list[Follower], low: np.ndarray, high: np.ndarray, speed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position and velocity limits over v; a leader's are narrowed by those of its followers."""
-    low, high, speed = np.full(len(speed), -np.inf), np.full(len(speed), np.inf), speed.copy()
-    limited = model.jnt_limited.astype(bool) & np.isin(model.jnt_type, (HINGE, SLIDE))
-    low[limited], high[limited] = model.jnt_range[limited].T
+    low, high, speed = low.copy(), high.copy(), speed.copy()
     for joint, leader, multiplier, offset in followers:
         a, b = sorted(((low[joint] - offset) / multiplier, (high[joint] - offset) / multiplier))
         low[leader], high[leader] = max(low[leader], a), min(high[leader], b)
@@ -367,6 +402,22 @@ def _limits(
     width = [DOF_WIDTH[tree.joint_types[j]] for j in tree.independent]
     lower, upper, velocity = (np.repeat(a[list(tree.independent)], width) for a in (low, high, speed))
     return lower, upper, velocity
+
+
+def _warn_of_frozen(
+    tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, given: Mapping[str, tuple[float, float]]
+) -> None:
+    """Names the joints whose range is one value, but for those whose range the user gave."""
+    stated = {joint for pattern in given for joint in match_joints(pattern, tree.joint_names)}
+    frozen = [j for j, dof in tree.dof_address.items() if upper[dof] - lower[dof] <= _ONE_VALUE and j not in stated]
+    if frozen:
+        names = [tree.joint_names[j] for j in frozen]
+        shown = ", ".join(f"{tree.joint_names[j]} [{lower[tree.dof_address[j]]:g}]" for j in frozen)
+        warn(
+            f"these joints cannot move, for their range is a single value: {shown}. Say what is meant: "
+            f"locked_joints={names!r} takes them out of q; position_limits={{{names[0]!r}: (-inf, inf)}} frees them, "
+            "as pink and MuJoCo do"
+        )
 
 
 def _home(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

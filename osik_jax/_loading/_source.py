@@ -31,7 +31,13 @@ def read_source(given: str | os.PathLike[str], kind: str) -> Source:
 
     Raises:
         FileNotFoundError: no such file; the message lists the files of the same suffix that lie there.
+        TypeError: neither a path nor text.
+        ValueError: an empty text.
     """
+    if not isinstance(given, str | os.PathLike):
+        raise TypeError(f"{given!r} is no {kind}: give a path, or the XML text itself")
+    if not str(given).strip():
+        raise ValueError(f"the {kind} is an empty text: give a path, or the XML text itself")
     if isinstance(given, str) and given.lstrip("\ufeff \t\r\n").startswith("<"):
         return Source("the XML text", given.lstrip("\ufeff \t\r\n"), None)
     path = Path(given)

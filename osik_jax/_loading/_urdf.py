@@ -12,6 +12,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from .._errors import warn
+from .._feet import find_feet
 from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, as_mapping, from_mjmodel, quaternion
 from ._packages import Packages, is_uri
 from ._source import check_root, parse_xml, read_source
@@ -35,6 +37,7 @@ def from_urdf(
     *,
     floating_base: bool | None = None,
     velocity_limits: Mapping[str, float] | None = None,
+    position_limits: Mapping[str, tuple[float, float]] | None = None,
     locked_joints: Iterable[str] | Mapping[str, float] = (),
     collision_meshes: bool = False,
     package_dirs: Iterable[str | os.PathLike[str]] = (),
@@ -45,7 +48,7 @@ def from_urdf(
     root = parse_xml(source)
     check_root(root, "robot", source)
     try:
-        description = _with_base(read_urdf(root), floating_base)
+        description = _with_base(read_urdf(root), floating_base, source.label)
         spec = urdf_spec(description)
         if collision_meshes:
             _add_meshes(spec, description, packages, source.path)
@@ -55,13 +58,13 @@ def from_urdf(
     locked = as_mapping(locked_joints)
     if floating_base is False:
         locked = {j.name: None for j in description.joints if j.kind == "floating"} | locked
-    return from_mjmodel(model, velocity_limits=velocity_limits, locked_joints=locked)
+    return from_mjmodel(model, velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked)
 
 
-def _with_base(urdf: Urdf, floating_base: bool | None) -> Urdf:
+def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
     """Adds the floating base, as a joint from the world to the root link, where there should be one."""
     has_one = any(joint.kind == "floating" for joint in urdf.joints)
-    wanted = urdf.root != WORLD if floating_base is None else floating_base
+    wanted = _guess_floats(urdf, has_one, label) if floating_base is None else floating_base
     if urdf.root == WORLD:
         return _freed_from_world(urdf) if wanted and not has_one else urdf
     kind = "floating" if wanted and not has_one else "fixed"
@@ -70,6 +73,28 @@ def _with_base(urdf: Urdf, floating_base: bool | None) -> Urdf:
         raise ValueError(f"only the root link may be called {WORLD!r}, and the root link is {urdf.root!r}")
     world = Link(WORLD, 0.0, IDENTITY, np.zeros((3, 3)), ())
     return Urdf(urdf.name, {WORLD: world, **urdf.links}, (base, *urdf.joints), WORLD)
+
+
+def _guess_floats(urdf: Urdf, has_free_joint: bool, label: str) -> bool:
+    """Whether the base floats where nobody says so: with feet it does, and where it does not for want of feet warns."""
+    if urdf.root == WORLD or has_free_joint:
+        return False
+    bodies = {urdf.root: 0}
+    parents = [0]
+    for joint in urdf.joints:
+        if joint.kind == "fixed":
+            bodies[joint.child] = bodies[joint.parent]
+        else:
+            bodies[joint.child] = len(parents)
+            parents.append(bodies[joint.parent])
+    if find_feet(bodies.items(), parents):
+        return True
+    warn(
+        f"{label}: the URDF does not say whether its base moves, and no two of its outermost links are called like "
+        f"feet: the root link {urdf.root!r} is fixed to the world. Say what is meant: floating_base=False, or "
+        "floating_base=True"
+    )
+    return False
 
 
 def _freed_from_world(urdf: Urdf) -> Urdf:

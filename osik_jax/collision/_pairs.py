@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 
@@ -75,14 +75,23 @@ def candidate_pairs(
         ValueError: a geom that no distance can be computed to takes part, or nothing is left.
     """
     welds, parents = _welds(robot.tree)
+    pairs = None if pairs is None else _checked(pairs)
     wanted = _default_pairs(scene) if pairs is None else _named_pairs(scene, pairs)
-    unwanted = _excluded(scene, exclude) | _model_excludes(robot, scene)
+    excluded = _excluded(scene, exclude)
+    unwanted = excluded | _model_excludes(robot, scene)
     found = []
     for i, j in sorted(wanted - unwanted):
         a, b = welds[scene[i].body], welds[scene[j].body]
         neighbours = a and b and (a == parents[b] or b == parents[a])
         if a != b and not neighbours and {scene[i].kind, scene[j].kind} != {Kind.PLANE}:
             found.append((i, j))
+    for pattern in pairs or ():
+        asked = _named_pairs(scene, [pattern]) - excluded
+        if asked and asked.isdisjoint(found) and found:
+            raise ValueError(
+                f"pairs asks for {pattern!r}, none of which can be kept apart: what is on one body or on neighbouring "
+                "ones, on two planes, or what the model's <exclude> names does not count"
+            )
     odd = sorted({scene[k].name for pair in found for k in pair if scene[k].kind is None})
     if odd:
         raise ValueError(
@@ -97,6 +106,15 @@ def candidate_pairs(
     return found
 
 
+def _checked(pairs: Patterns) -> list[tuple[str, str]]:
+    """The pairs of names, if that is what they are."""
+    checked: list[Any] = [pairs] if isinstance(pairs, str) else list(pairs)
+    for pair in checked:
+        if not isinstance(pair, tuple | list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
+            raise TypeError(f"pairs is a sequence of pairs of names, such as [('hand', 'torso')]; got {pairs!r}")
+    return [(first, second) for first, second in checked]
+
+
 def _default_pairs(scene: Sequence[Member]) -> set[tuple[int, int]]:
     """What MuJoCo would let collide."""
     return {
@@ -108,6 +126,12 @@ def _meet(a: Member, b: Member) -> bool:
     if a.masks is None or b.masks is None:
         return True
     return bool(a.masks[0] & b.masks[1] or b.masks[0] & a.masks[1])
+
+
+def exact_pairs(scene: Sequence[Member], patterns: Patterns | None) -> set[tuple[int, int]]:
+    """Of the pairs that are asked for, those that are asked for by their names rather than by globs."""
+    names = {name for member in scene for name in (member.name, *member.aliases)}
+    return _named_pairs(scene, [pair for pair in patterns or () if names.issuperset(pair)])
 
 
 def _named_pairs(scene: Sequence[Member], patterns: Patterns) -> set[tuple[int, int]]:
@@ -139,6 +163,12 @@ def _match(scene: Sequence[Member], pattern: str) -> list[int]:
         ]
         if found:
             return found
+    seen = [member.name for member in scene if pattern in member.aliases]
+    if seen:
+        raise ValueError(
+            f"nothing of {pattern!r} is there to be met: contype and conaffinity of its geoms are 0. Name the geoms "
+            f"themselves to keep them apart ({', '.join(seen)}), or add shapes to it"
+        )
     names = {name: None for member in scene for name in (member.name, *member.aliases) if name}
     raise unknown_name("geom, shape or body", pattern, tuple(names))
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._tree import KinematicTree
+from .._tree import KinematicTree, cached_arrays
 from ..kinematics import Kinematics
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
@@ -62,12 +62,12 @@ class Scene:
         """Computed once: every call of a jitted function asks for it."""
         return hash(tuple(getattr(self, field.name) for field in dataclasses.fields(self)))
 
-    @cached_property
+    @cached_arrays
     def pairs(self) -> np.ndarray:
         """Shapes of each pair, in the order of the distances. (pairs, 2), int."""
         return np.concatenate([np.array([group.first, group.second]).T for group in self.groups])
 
-    @cached_property
+    @cached_arrays
     def pair_bodies(self) -> np.ndarray:
         """Moving bodies of each pair. (pairs, 2), int."""
         return np.asarray(self.bodies, int)[self.pairs]

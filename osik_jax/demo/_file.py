@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._feet import find_feet
 from .._tree import HINGE, SLIDE
 from ..kinematics import forward_kinematics, frame_jacobian, integrate
 from ..limits import ConfigurationLimit, VelocityLimit
@@ -24,7 +25,6 @@ SWAY = 0.05
 _MARGIN = 0.01
 _SINK = 0.05
 """A standing robot first bends its legs: its waist goes down by this part of its height over the feet."""
-_FEET = (r"sole(?!.*corner)", r"foot", r"ankle")
 _HANDS = (r"tcp|tool|gripper|end_?effector|\bee\b", r"hand", r"flange|wrist")
 
 
@@ -55,7 +55,8 @@ def file_motion(
         robot.tree.frame(chosen)
     if robot.floating_base and not standing:
         raise ValueError(
-            "none of the frames looks like a foot: say which ones stand with --support NAME...; "
+            "the base floats and none of the frames looks like a foot: say which ones stand with --support NAME..., or "
+            "--base fixed; "
             f"frames: {', '.join(robot.frame_names)}"
         )
     if moving in standing:
@@ -107,15 +108,7 @@ def guess_feet(robot: Robot) -> tuple[str, ...]:
     )
     if with_corners:
         return with_corners
-    last = set(range(1, len(tree.body_names))) - set(tree.body_parents)
-    for pattern in _FEET:
-        found: dict[int, str] = {}
-        for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True):
-            if body in last and re.search(pattern, name, re.IGNORECASE):
-                found.setdefault(body, name)
-        if len(found) > 1:
-            return tuple(found.values())
-    return ()
+    return find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
 
 
 def _corners(robot: Robot, foot: str) -> Float[np.ndarray, "k 3"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from .._made_for import check_robot
 from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
 from ..robot import Robot
 from ._composition import world_poses
@@ -60,8 +61,11 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     """Poses of all bodies and motion axes of all dofs at configuration q. Quaternions are normalised first.
 
     Raises:
-        ValueError: q has the wrong length, or (outside jit) is not finite or holds a quaternion of zeros.
+        TypeError: robot is no Robot.
+        ValueError: q has the wrong length, or (outside jit) is not finite or holds a quaternion of zeros; robot is a
+            stack of robots.
     """
+    check_robot(robot, "forward_kinematics(robot, q)")
     robot.check_configuration(q)
     local = joint_transforms(robot, robot.mujoco_qpos(q))
     position, rotation = world_poses(robot.tree, local.xpos, rotation_matrix(local.xquat))

@@ -7,6 +7,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._made_for import check_robot
 from .._tree import BALL, FREE
 from ..robot import Robot
 
@@ -21,6 +22,7 @@ def integrate(
     Raises:
         ValueError: q or v has the wrong length, or (outside jit) q is not finite or holds a quaternion of zeros.
     """
+    check_robot(robot, "integrate(robot, q, v)")
     robot.check_configuration(q)
     if jnp.shape(v) != (robot.nv,):
         raise ValueError(f"v has shape {jnp.shape(v)}, this robot's velocities have shape ({robot.nv},)")
@@ -42,6 +44,7 @@ def difference(robot: Robot, qa: Float[Array, " nq"], qb: Float[Array, " nq"]) -
     Raises:
         ValueError: as in ``integrate``.
     """
+    check_robot(robot, "difference(robot, qa, qb)")
     robot.check_configuration(qa)
     robot.check_configuration(qb)
     dtype = jnp.result_type(qa, qb, float)

@@ -12,13 +12,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import warn
 from .._home import home_kinematics
 from .._joint_selection import concrete
 from .._numbers import as_scalar, as_vector
 from .._tree import unknown_name
 from ..collision._distance import Nearest
 from ..collision._geometry import Kind, UnitCore, geom_hull, padded
-from ..collision._pairs import Member, Patterns, candidate_pairs, members
+from ..collision._pairs import Member, Patterns, candidate_pairs, exact_pairs, members
 from ..collision._scene import Placed, Scene, grouped, nearest, place, separation_jacobian
 from ..collision._shape import CollisionShape
 from ..kinematics import Kinematics
@@ -52,7 +53,8 @@ class CollisionAvoidanceLimit(Limit):
     Args:
         robot: the robot; its geoms are what is kept apart.
         pairs: which to keep apart: pairs of names or globs of geoms, shapes, links or bodies (``"world"``), such as
-            ``[("*hand*", "torso")]``. Masks then do not count. None: all that may collide.
+            ``[("*hand*", "torso")]``. Masks then do not count, and pairs asked for by their names, not by a glob, are
+            kept however near they are. None: all that may collide.
         exclude: names or globs of what is left out, or pairs of them.
         shapes: obstacles, and shapes of links that have no geoms, by name. They meet all that has masks.
         minimum_distance: [m]; may be negative.
@@ -61,12 +63,19 @@ class CollisionAvoidanceLimit(Limit):
         recovery_speed: at which pairs that are too near have to part, if they are near enough to need it [m/s]. 0: they
             have to come no nearer.
         q0_distance: pairs that are nearer than this at ``q0`` are left out [m]: the soles on the floor, links whose
-            geoms overlap by construction. None: ``minimum_distance``. ``-inf``: none is.
+            geoms overlap by construction; ``left_out`` has them. ``-inf``: none is. None: ``minimum_distance``, and
+            none that ``pairs`` asks for by name; such a pair is asked to part at ``recovery_speed`` at most.
         max_pairs: how many rows there are (static).
 
     Raises:
         KeyError: a name matches nothing.
         ValueError: no pair is left, or a number or shape does not fit.
+
+    Warns:
+        OsikWarning: pairs that a glob of ``pairs`` asks for are left out, as they are too near at ``q0``.
+
+    Attributes:
+        left_out: names of the shapes of the pairs that are not kept apart because they are too near at ``q0`` (static).
     """
 
     kind: ClassVar[Literal["velocity", "position"]] = "velocity"
@@ -78,6 +87,7 @@ class CollisionAvoidanceLimit(Limit):
     hulls: UnitCore | None
     scene: Scene = eqx.field(static=True, repr=False)
     max_pairs: int = eqx.field(static=True)
+    left_out: tuple[tuple[str, str], ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -101,11 +111,15 @@ class CollisionAvoidanceLimit(Limit):
         self.gain = _number(gain, "gain", dtype)
         self.recovery_speed = _number(recovery_speed, "recovery_speed", dtype)
         self._check_distances()
-        shapes = dict(shapes or {})
+        shapes, pairs = dict(shapes or {}), None if pairs is None else list(pairs)
         found = members(robot, shapes)
         possible = candidate_pairs(robot, found, pairs, exclude)
         least = self.minimum_distance if q0_distance is None else q0_distance
-        kept = _apart_at_home(robot, found, shapes, possible, least)
+        whatever = exact_pairs(found, pairs) if q0_distance is None else set()
+        kept, near = _apart_at_home(robot, found, shapes, possible, least, whatever)
+        self.left_out = tuple((found[i].name, found[j].name) for i, j in near)
+        if pairs is not None and q0_distance is None and near:
+            _warn_of_left_out(self.left_out, list(near.values()), self.minimum_distance)
         self.scene, self.shapes, self.hulls = _assembled(robot, found, shapes, kept)
         self.max_pairs = min(max_pairs, len(kept))
 
@@ -224,26 +238,40 @@ def _apart_at_home(
     shapes: Mapping[str, CollisionShape],
     possible: Sequence[tuple[int, int]],
     least: Float[Array, ""] | float,
-) -> list[tuple[int, int]]:
-    """Pairs that are no nearer than ``least`` at q0."""
-    if isinstance(least, float) and least == -np.inf:
-        return list(possible)
+    whatever: set[tuple[int, int]],
+) -> tuple[list[tuple[int, int]], dict[tuple[int, int], float]]:
+    """Pairs that are no nearer than ``least`` at q0, or are kept whatever they are; and the others' distances [m]."""
+    if (isinstance(least, float) and least == -np.inf) or whatever.issuperset(possible):
+        return list(possible), {}
     scene, added, hulls = _assembled(robot, found, shapes, possible)
     distances = concrete(_home_distances(robot, scene, added, hulls)), concrete(least)
     if distances[0] is None or distances[1] is None:
         raise TypeError("which pairs are apart at q0 cannot be told from traced numbers; give q0_distance=-inf")
     taking_part = _taking_part(possible)
-    kept = [
-        (taking_part[i], taking_part[j])
+    apart = {
+        tuple(sorted((taking_part[i], taking_part[j]))): float(distance)
         for (i, j), distance in zip(scene.pairs, distances[0], strict=True)
-        if distance >= distances[1]
-    ]
-    if not kept:
+    }
+    near = {pair: apart[pair] for pair in possible if pair not in whatever and apart[pair] < distances[1]}
+    if len(near) == len(possible):
         raise ValueError(
             f"all {len(possible)} pairs are nearer than {least} m at q0; a smaller q0_distance keeps them: "
-            f"{', '.join('-'.join(names) for names in scene.pair_names)}"
+            f"{_shown([(found[i].name, found[j].name) for i, j in near], list(near.values()))}"
         )
-    return kept
+    return [pair for pair in possible if pair not in near], near
+
+
+def _warn_of_left_out(names: Sequence[tuple[str, str]], distances: Sequence[float], least: Float[Array, ""]) -> None:
+    warn(
+        f"these pairs are asked for and not kept apart, for at q0 they are nearer than {float(least):g} m: "
+        f"{_shown(names, distances)}. Say what is meant: their names instead of a glob keep them, q0_distance=-inf "
+        f"keeps all, exclude or q0_distance={float(least):g} leaves them out"
+    )
+
+
+def _shown(names: Sequence[tuple[str, str]], distances: Sequence[float]) -> str:
+    """Pairs with their distances."""
+    return ", ".join(f"{a}-{b} ({d:.3g} m)" for (a, b), d in zip(names, distances, strict=True))
 
 
 def _home_distances(robot: Robot, scene: Scene, added: Placed, hulls: UnitCore | None) -> Float[Array, " pairs"]:

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._checks import check_targets
 from .._structure import is_number
-from ..control import Solution, Targets, Tasks, aim, check_targets, remembering, solve
+from ..control import Solution, Targets, Tasks, aim, remembering, solve
 from ..kinematics import integrate
 from ..limits import Limit
 from ..robot import Robot
@@ -103,8 +104,8 @@ def simulate(
     simulation: Simulation,
     tasks: Tasks | Callable[[Array], Tasks],
     *,
-    scheme: Scheme,
-    limits: Sequence[Limit] = (),
+    scheme: Scheme | None = None,
+    limits: Sequence[Limit] | None = None,
     dt: float = 0.005,
     steps: int,
     targets: Targets | None = None,
@@ -119,7 +120,7 @@ def simulate(
     Args:
         simulation: the robot in its world; it is left where the run ended.
         tasks: by name, or a function from time [s] to tasks, as in ``rollout``.
-        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
+        scheme: as in ``rollout``.
         limits: hard bounds on the velocity, as in ``rollout``.
         dt: control period [s], a whole number of the world's timesteps.
         steps: number of ticks.
@@ -137,7 +138,8 @@ def simulate(
     robot = simulation.world.robot
     numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), is_number)
     leaves, treedef = jax.tree.flatten(structure)
-    program = partial(_tick, robot, numbers, scheme, tuple(limits), command or Integrated(), np.asarray(dt))
+    own = None if limits is None else tuple(limits)
+    program = partial(_tick, robot, numbers, scheme, own, command or Integrated(), np.asarray(dt))
     tick = partial(program, static=(tuple(leaves), treedef))
     held = jnp.asarray(simulation.sense())
     paths = jax.tree.map(np.asarray, targets)
@@ -161,8 +163,8 @@ def simulate(
 def _tick(
     robot: Robot,
     numbers: Any,
-    scheme: Scheme,
-    limits: tuple[Limit, ...],
+    scheme: Scheme | None,
+    limits: tuple[Limit, ...] | None,
     command: Command,
     dt: Array,
     t: Array,

@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from ..solvers import Damping, WorkingSet, solve_hqp
-from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf, status_with
 
 
 class HierarchicalQP(Scheme):
@@ -30,7 +30,7 @@ class HierarchicalQP(Scheme):
 
     damping: Float[Array, ""] = eqx.field(default=0.0, converter=as_leaf("damping"), kw_only=True)
     curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
-    max_iterations: int | None = eqx.field(default=None, static=True)
+    max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
 
     def solve(self, problem: VelocityProblem, warm_start: WorkingSet | None = None) -> SchemeAnswer:
         """The velocity of one tick; the warm start is the working set of every level."""

@@ -156,6 +156,19 @@ class Scheme(eqx.Module):
         """
 
 
+def as_cap(value: Any) -> int | None:
+    """A cap on iterations: an integer from 0 up, Python's or NumPy's, or None.
+
+    Raises:
+        ValueError: anything else.
+    """
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+        raise ValueError(f"max_iterations is {value!r}; it is an integer, or None for the solver's own cap")
+    return int(value)
+
+
 def as_leaf(name: str) -> Callable[[ArrayLike | Array], Float[Array, ""]]:
     """Converter of a scheme's number to a traced leaf; negative or not finite raises ValueError with its name."""
     return lambda value: as_scalar(value, name)

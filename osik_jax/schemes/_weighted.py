@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from .._joint_selection import concrete
 from ..solvers import Level, solve_least_squares_qp
 from ..tasks import TaskRows
-from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
 
 
 class WeightedQP(Scheme):
@@ -33,7 +33,7 @@ class WeightedQP(Scheme):
 
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
     curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
-    max_iterations: int | None = eqx.field(default=None, static=True)
+    max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
 
     def __check_init__(self) -> None:
         seen = concrete(self.damping)

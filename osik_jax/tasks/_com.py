@@ -17,7 +17,7 @@ from ..kinematics import Kinematics, center_of_mass, com_jacobian
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, home_kinematics
+from ._leaves import as_array, as_bounds, as_scalar, as_vector, check_bounds, check_finite, home_kinematics
 from ._polygon import SupportPolygon
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
@@ -130,7 +130,8 @@ class ComTask(Task):
 
     def _along_axes(self, value: Any, what: str) -> Float[Array, " m"]:
         """One entry for each axis, from that, from a scalar, or from a vector x, y, z."""
-        value = jnp.asarray(value, self.weight.dtype)
+        value = as_array(value, what, self.weight.dtype)
+        check_finite(value, what)
         if value.shape == (3,) and len(self.axes) < 3:
             value = value[np.array(["xyz".index(axis) for axis in self.axes])]
         return as_vector(value, (len(self.axes),), what, self.weight.dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Self
@@ -79,6 +80,7 @@ class FunctionTask(Task):
     ):
         if not callable(function):
             raise TypeError(f"function is a {type(function).__name__}; it is called with (robot, kinematics, q)")
+        _check_signature(function)
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         numbers, self.structure = taken_apart(function)
@@ -158,6 +160,18 @@ class FunctionTask(Task):
 
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
+
+
+def _check_signature(function: Function) -> None:
+    """Raises TypeError where it can be told that the function does not take three arguments."""
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # some built-in functions have none
+        return
+    try:
+        signature.bind(None, None, None)
+    except TypeError as error:
+        raise TypeError(f"the function takes {signature}; it is called with (robot, kinematics, q): {error}") from None
 
 
 def _length(robot: Robot, function: Function) -> int:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._home import home_kinematics as home_kinematics
+from .._joint_selection import as_array as as_array
 from .._joint_selection import concrete as concrete
 from .._numbers import as_bounds as as_bounds
 from .._numbers import as_scalar as as_scalar
 from .._numbers import as_vector as as_vector
 from .._numbers import check_bounds as check_bounds
+from .._numbers import check_finite as check_finite
 from .._numbers import check_not_negative as check_not_negative
 
 Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
@@ -29,9 +30,9 @@ def as_pose(value: Any, dtype: Any) -> Pose:
         ValueError: neither, or the rotation is not one.
     """
     if isinstance(value, (tuple, list)) and len(value) == 2:
-        position, rotation = (jnp.asarray(part, dtype) for part in value)
+        position, rotation = (as_array(part, "target", dtype) for part in value)
     else:
-        matrix = jnp.asarray(value, dtype)
+        matrix = as_array(value, "target", dtype)
         if matrix.shape != (4, 4):
             raise ValueError(f"a pose is (position (3,), rotation (3, 3)) or a (4, 4) matrix, got shape {matrix.shape}")
         position, rotation = matrix[:3, 3], matrix[:3, :3]
@@ -40,6 +41,7 @@ def as_pose(value: Any, dtype: Any) -> Pose:
             f"a pose is (position (3,), rotation (3, 3)), got shapes {position.shape} and {rotation.shape}. "
             "Batch with jax.vmap."
         )
+    check_finite(position, "the target's position")
     _check_rotation(rotation)
     return position, rotation
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._made_for import check_made_for
 from ..kinematics import Kinematics
 from ..limits import Limit, limit_box, limit_rows
 from ..robot import Robot
@@ -32,7 +33,7 @@ class LimitTask(Task):
 
     Raises:
         TypeError: something that is no limit.
-        ValueError: a negative weight.
+        ValueError: a negative weight, or a limit that was made for another robot.
     """
 
     limit: Limit
@@ -49,6 +50,7 @@ class LimitTask(Task):
     ):
         if not isinstance(limit, Limit):
             raise TypeError(f"limit is a {type(limit).__name__}, not a Limit")
+        check_made_for(limit, robot, "limit")
         self.limit = limit
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype

@@ -191,7 +191,7 @@ def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
     """
     if isinstance(rows, str):
         if rows not in _ROWS:
-            raise ValueError(str(unknown_name("set of rows", rows, tuple(_ROWS))))
+            raise ValueError(unknown_name("row set", rows, tuple(_ROWS)).args[0])
         return _ROWS[rows]
     mask = tuple(bool(row) for row in rows)
     if len(mask) != 6 or not any(mask):

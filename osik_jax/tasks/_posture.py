@@ -17,7 +17,7 @@ from ..kinematics import Kinematics, difference
 from ..robot import Robot
 from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._leaves import as_array, as_bounds, as_scalar, as_vector, check_bounds, check_finite
 from ._rotation import inverse_left_jacobian
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
@@ -81,8 +81,8 @@ class PostureTask(Task):
         self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
         self.target = None
         if self.lower is None:
-            self.target = jnp.asarray(robot.q0 if target is None else target, dtype)
-            robot.check_configuration(self.target)
+            self.target = as_array(robot.q0 if target is None else target, "target", dtype)
+            robot.check_configuration(self.target, "target")
         else:
             _check_bounded(robot, self.joints, target)
 
@@ -138,7 +138,8 @@ class PostureTask(Task):
     def _convert(self, name: str, value: Any) -> Any:
         if name != "target" or self.target is None:
             return super()._convert(name, value)
-        target = jnp.asarray(value, self.weight.dtype)
+        target = as_array(value, name, self.weight.dtype)
+        check_finite(target, name)
         if target.shape != self.target.shape:
             raise ValueError(f"target has shape {target.shape}, expected {self.target.shape}. Batch with jax.vmap.")
         return target

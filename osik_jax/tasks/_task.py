@@ -10,8 +10,10 @@ from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from .._made_for import MadeForRobot
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._curvature import jacobian_curvature, no_curvature
@@ -54,7 +56,7 @@ class TaskRows(eqx.Module):
         return self.lower is self.upper
 
 
-class Task(eqx.Module):
+class Task(MadeForRobot):
     """Base of all tasks: an immutable pytree. Make your own: subclass it, add fields, write ``rows`` (``task_rows``).
 
     Attributes:
@@ -69,6 +71,11 @@ class Task(eqx.Module):
     gain: Gain = eqx.field(default=DEFAULT_GAIN, converter=lambda value: as_gain(value), kw_only=True)
     priority: int = eqx.field(default=1, static=True, kw_only=True)
     hard: bool = eqx.field(default=False, static=True, kw_only=True)
+
+    def __check_init__(self) -> None:
+        check_priority(self.priority)
+        if not isinstance(self.hard, bool | np.bool_):
+            raise TypeError(f"hard is {self.hard!r}; it is True (a constraint, above every priority) or False")
 
     @abc.abstractmethod
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
@@ -129,10 +136,10 @@ class Task(eqx.Module):
 
 
 def check_priority(priority: int) -> int:
-    """The priority, if it is an integer from 1 up."""
-    if isinstance(priority, bool) or not isinstance(priority, int) or priority < 1:
+    """The priority as an int, if it is an integer from 1 up, Python's or NumPy's."""
+    if isinstance(priority, bool) or not isinstance(priority, int | np.integer) or priority < 1:
         raise ValueError(f"a priority is an integer, 1 for the most important task, 2 for the next; got {priority!r}")
-    return priority
+    return int(priority)
 
 
 def task_rows(

@@ -12,9 +12,9 @@ from jaxtyping import Array, ArrayLike, Float
 from .._names import leaf_names, replace_named
 from .._structure import is_number
 from ..control import Targets, Tasks, Trajectory, rollout
-from ..limits import Limit
+from ..limits import ConfigurationLimit, Limit, VelocityLimit
 from ..robot import Robot
-from ..schemes import Scheme
+from ..schemes import Scheme, WeightedQP
 
 _PARTS = ("robot", "scheme", "limits", "dt")
 
@@ -29,8 +29,8 @@ class Loop(eqx.Module):
     Attributes:
         robot: the robot.
         tasks: by name; or a function of time that returns them, of which an ``equinox.Module``'s fields have names.
-        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``.
-        limits: joint position and velocity limits.
+        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``; default: the first.
+        limits: hard bounds on the velocity; default: the robot's own, as in ``rollout``.
         dt: time of one tick [s].
         steps: number of ticks (static).
 
@@ -50,12 +50,14 @@ class Loop(eqx.Module):
         robot: Robot,
         tasks: Tasks | Callable[[Array], Tasks],
         *,
-        scheme: Scheme,
-        limits: Sequence[Limit] = (),
+        scheme: Scheme | None = None,
+        limits: Sequence[Limit] | None = None,
         dt: ArrayLike | Array = 0.005,
         steps: int,
     ):
-        self.robot, self.scheme, self.limits, self.steps = robot, scheme, tuple(limits), steps
+        own = (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else limits
+        self.robot, self.limits, self.steps = robot, tuple(own), steps
+        self.scheme = WeightedQP() if scheme is None else scheme
         self.tasks = tasks if callable(tasks) else dict(tasks)
         self.dt = jnp.asarray(dt, robot.q0.dtype)
         taken = [name for name in _PARTS if not callable(tasks) and name in tasks]
