@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._joint_selection import concrete
+from .._replace import Replaceable
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._rows import LimitRows
@@ -20,7 +20,7 @@ _ROUNDINGS = 4.0
 _ORDER: tuple[Kind, ...] = ("acceleration", "velocity", "braking", "position")
 
 
-class Limit(eqx.Module):
+class Limit(Replaceable):
     """Base of all limits: subclass it and write ``box``, ``rows`` or both to make your own.
 
     A box always exists; rows may contradict it or each other, and the answer is then INFEASIBLE.

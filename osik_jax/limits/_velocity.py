@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -33,11 +33,7 @@ class VelocityLimit(Limit):
 
     def __init__(self, robot: Robot, *, velocity: ArrayLike | Array | Mapping[str, float] | None = None):
         self.velocity = dof_values(robot, velocity, robot.velocity_limit, "velocity")
-        seen = concrete(self.velocity)
-        if seen is not None and not (seen >= 0.0).all():
-            bad = np.flatnonzero(~(seen >= 0.0))
-            names = [f"{dof_names(robot)[i]} ({seen[i]})" for i in bad]
-            raise ValueError(f"velocity limits have to be 0 or more: {', '.join(names)}")
+        self._check(dof_names(robot))
 
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
@@ -45,3 +41,9 @@ class VelocityLimit(Limit):
         """(-velocity, velocity)."""
         del robot, q, dt
         return -self.velocity, self.velocity
+
+    def _check(self, names: Sequence[str] | None = None) -> None:
+        seen = concrete(self.velocity)
+        if seen is not None and not (seen >= 0.0).all():
+            bad = [f"{names[i] if names else f'entry {i}'} ({seen[i]})" for i in np.flatnonzero(~(seen >= 0.0))]
+            raise ValueError(f"velocity limits have to be 0 or more: {', '.join(bad)}")

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from .._numbers import as_scalar
+from .._replace import Replaceable
 from ..limits import LimitRows
 from ..solvers import Damping, Level, Status
 from ..solvers._dense import apply
@@ -142,7 +143,7 @@ class SchemeAnswer(eqx.Module):
     warm_start: Any = None
 
 
-class Scheme(eqx.Module):
+class Scheme(Replaceable):
     """Base of the schemes: how tasks that cannot all be met share the robot."""
 
     @abc.abstractmethod
@@ -154,6 +155,9 @@ class Scheme(eqx.Module):
             warm_start: what the answer to a tick nearby had in ``warm_start``; integers, all zeros for a cold start. It
                 changes the time that the answer takes, and not the answer.
         """
+
+    def _convert(self, name: str, value: Any) -> Any:
+        return as_scalar(value, name, getattr(self, name).dtype)
 
 
 def as_leaf(name: str) -> Callable[[ArrayLike | Array], Float[Array, ""]]:
