@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, Self
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from ._numbers import as_vector
 
@@ -47,7 +48,7 @@ class Replaceable(eqx.Module):
     def _convert(self, name: str, value: Any) -> Any:
         """A new value for a field, in the precision of the one that it replaces."""
         old = getattr(self, name)
-        return as_vector(value, old.shape, name, old.dtype)
+        return as_vector(value, jnp.shape(old), name, jnp.result_type(old, float))
 
     def _check(self) -> None:
         """Raises ValueError where a number is not what it may be, or fields do not fit each other."""

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import _loading
+from ._describe import described
 from ._links import Factors, scaled_leaves
 from ._tree import BALL, FREE, KinematicTree, ModelHolder
 
@@ -190,6 +191,10 @@ class Robot(eqx.Module):
             KeyError: a name in ``velocity_limits`` or ``locked_joints`` does not exist.
         """
         return cls(**_loading.from_mjmodel(model, velocity_limits=velocity_limits, locked_joints=locked_joints))
+
+    def __repr__(self) -> str:
+        """The robot in five lines."""
+        return described(self)
 
     @property
     def nq(self) -> int:

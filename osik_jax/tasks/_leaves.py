@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,6 +23,19 @@ from ..robot import Robot
 
 WeightLike = ArrayLike | Array | Mapping[str, float]
 """One weight, one for each row, or weights by the names of joints."""
+
+
+def as_own_weight(value: Any) -> Float[Array, "..."]:
+    """A weight in its own precision, for a field: what a class of one's own is given, or what a task has converted.
+
+    Raises:
+        ValueError: it is neither a scalar nor a vector, or negative or not finite.
+    """
+    rows = jnp.shape(value)
+    if len(rows) > 1:
+        raise ValueError(f"weight has shape {rows}, expected a scalar or a vector. Batch with jax.vmap.")
+    own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
+    return as_weight(value, rows[0] if rows else None, value.dtype if own else float)
 
 
 def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...] = ()) -> Float[Array, "..."]:

@@ -13,24 +13,32 @@ import numpy as np
 def short_repr(task: Any) -> str:
     """The names and options of a task, its weight and its gain; arrays are left out.
 
-    ``FrameTask(frame='l_gripper', axes='world', priority=3, weight=2.0, gain=10.0)``
+    ``FrameTask(frame='l_gripper', rows='position', axes='world', weight=2, gain=10, priority=3)``
     """
-    parts = [f"{name}={shown}" for name, shown in _options(task)]
-    parts += [f"{name}={_number(getattr(task, name))}" for name in ("weight", "gain")]
+    options = _options(task)
+    last = [options.pop(name) for name in ("priority", "hard") if name in options]
+    parts = [*options.values(), *(f"{name}={_number(getattr(task, name))}" for name in ("weight", "gain")), *last]
     return f"{type(task).__name__}({', '.join(parts)})"
 
 
-def _options(task: Any) -> list[tuple[str, str]]:
-    """Static fields that say something in a few words."""
-    found = []
+_ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
+_SILENT = ("row_count", "orientation_jacobian")
+"""Fields that follow from others or that few change."""
+
+
+def _options(task: Any) -> dict[str, str]:
+    """Static fields that say something in a few words, by name."""
+    found = {}
     for field in dataclasses.fields(task):
-        value = getattr(task, field.name)
-        if not field.metadata.get("static") or value is None or value is False:
+        value, name = getattr(task, field.name), field.name
+        if not field.metadata.get("static") or name in _SILENT or value is None or value is False:
             continue
-        if field.name == "joints":
-            found.append(("joints", f"<{len(value)}>"))
+        if name in ("joints", "dofs"):
+            found[name] = f"{name}=<{len(value)}>"
+        elif name == "kept":
+            found[name] = f"rows={_ROWS.get(value, value)!r}"
         elif isinstance(value, (str, bool, int)) or _is_short(value):
-            found.append((field.name, repr(value)))
+            found[name] = f"{name}={value!r}"
     return found
 
 

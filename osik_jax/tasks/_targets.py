@@ -37,8 +37,9 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> 
     if parts is None:
         array = _array(value, dtype)
         if array.shape == (4, 4):
-            _check_last_row(array)
             parts = array[:3, 3], array[:3, :3]
+            _check_matrix(parts[1])
+            _check_last_row(array)
         elif array.shape == (3,) and rest[1] is not None:
             parts = array, jnp.asarray(rest[1], dtype)
         elif array.shape in ((3, 3), (4,)) and rest[0] is not None:
@@ -69,7 +70,7 @@ def _array(value: Any, dtype: Any) -> Array:
     try:
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError):
-        raise TypeError(f"a {type(value).__name__} is no pose; {_ACCEPTED}") from None
+        raise TypeError(f"got {type(value).__name__}, which is no pose; {_ACCEPTED}") from None
 
 
 _ACCEPTED = (

@@ -17,7 +17,7 @@ from ..kinematics import Kinematics
 from ..robot import Robot
 from ._curvature import jacobian_curvature, no_curvature
 from ._gain import Gain, as_gain, evaluate_gain
-from ._leaves import as_scalar, as_weight
+from ._leaves import as_own_weight, as_weight
 from ._repr import short_repr
 
 DEFAULT_GAIN = 10.0
@@ -68,9 +68,7 @@ class Task(Replaceable):
         gain: [1/s], a constant or an ``AdaptiveGain``: the wanted error rate is ``-gain * error``.
     """
 
-    weight: Float[Array, "..."] = eqx.field(
-        default=1.0, converter=lambda value: as_scalar(value, "weight"), kw_only=True
-    )
+    weight: Float[Array, "..."] = eqx.field(default=1.0, converter=as_own_weight, kw_only=True)
     gain: Gain = eqx.field(default=DEFAULT_GAIN, converter=lambda value: as_gain(value), kw_only=True)
     priority: int = eqx.field(default=1, static=True, kw_only=True)
     hard: bool = eqx.field(default=False, static=True, kw_only=True)
