@@ -391,5 +391,10 @@ def check_targets(tasks: Tasks | Callable[[Array], Tasks], targets: Targets | No
         if name not in tasks:
             raise KeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(tasks)}")
         for leaf in jax.tree.leaves(target):
+            if not eqx.is_array_like(leaf):
+                raise TypeError(
+                    f"targets[{name!r}] holds objects of type {type(leaf).__name__}; it is made of arrays, such as "
+                    "positions (steps, 3) and rotation matrices (steps, 3, 3) or quaternions (steps, 4)"
+                )
             if jnp.shape(leaf)[:1] != (steps,):
                 raise ValueError(f"targets[{name!r}] has shape {jnp.shape(leaf)}; its first axis is the ticks, {steps}")

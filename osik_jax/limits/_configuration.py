@@ -78,7 +78,7 @@ class ConfigurationLimit(Limit):
         return jnp.where(free, bound, self.gain * way / dt)
 
     def _convert(self, name: str, value: Any) -> Any:
-        if name == "gain" and jnp.shape(value) == self.lower.shape:
+        if name == "gain" and np.shape(value) == self.lower.shape:
             return jnp.asarray(value, self.gain.dtype)
         return super()._convert(name, value)
 
@@ -89,7 +89,7 @@ class ConfigurationLimit(Limit):
 
 def _as_gain(robot: Robot, value: ArrayLike | Array | Mapping[str, float]) -> Float[Array, ""] | Float[Array, " nv"]:
     """One for all joints as a scalar, others over v."""
-    if isinstance(value, Mapping) or jnp.ndim(value):
+    if isinstance(value, Mapping) or np.ndim(value):
         gain = dof_values(robot, value, jnp.ones(robot.nv), "gain")
     else:
         gain = jnp.asarray(value, robot.q0.dtype)

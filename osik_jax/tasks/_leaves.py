@@ -31,7 +31,7 @@ def as_own_weight(value: Any) -> Float[Array, "..."]:
     Raises:
         ValueError: it is neither a scalar nor a vector, or negative or not finite.
     """
-    rows = jnp.shape(value)
+    rows = np.shape(value)
     if len(rows) > 1:
         raise ValueError(f"weight has shape {rows}, expected a scalar or a vector. Batch with jax.vmap.")
     own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
