@@ -8,12 +8,11 @@ from typing import ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete, dof_names, dof_values, scalar_layout
-from .._numbers import check_bounds
+from .._numbers import check_bounds, entries
 from ..robot import Robot
 from ._box import Kind, Limit, limit_box
 from ._configuration import ConfigurationLimit
@@ -91,8 +90,7 @@ class AccelerationLimit(Limit):
         check_bounds(self.lower, self.upper)
         seen = concrete(self.acceleration)
         if seen is not None and not (seen > 0.0).all():
-            bad = [f"{names[i] if names else f'entry {i}'} ({seen[i]})" for i in np.flatnonzero(~(seen > 0.0))]
-            raise ValueError(f"accelerations have to be positive: {', '.join(bad)}")
+            raise ValueError(f"accelerations have to be positive: {entries(seen, ~(seen > 0.0), names)}")
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
         """The limit for the next tick, once this one's answer is ``velocity``."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete, dof_names, dof_values
+from .._numbers import entries
 from ..robot import Robot
 from ._box import Kind, Limit
 
@@ -45,5 +45,4 @@ class VelocityLimit(Limit):
     def _check(self, names: Sequence[str] | None = None) -> None:
         seen = concrete(self.velocity)
         if seen is not None and not (seen >= 0.0).all():
-            bad = [f"{names[i] if names else f'entry {i}'} ({seen[i]})" for i in np.flatnonzero(~(seen >= 0.0))]
-            raise ValueError(f"velocity limits have to be 0 or more: {', '.join(bad)}")
+            raise ValueError(f"velocity limits have to be 0 or more: {entries(seen, ~(seen >= 0.0), names)}")

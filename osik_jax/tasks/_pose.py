@@ -31,6 +31,8 @@ _ROWS = {
 _Parts = tuple[Float[Array, "3"], Float[Array, "3 nv"], Float[Array, "3"]]
 _Blocks = list[tuple[Sequence[bool], tuple[Array, Array, Array, Array]]]
 """Which rows of a block are kept; their error, Jacobian, feed-forward and weight."""
+_Wrench = Float[Array, "6 6"] | None
+"""From a pull on all six rows to force and torque on the frame, in the outer axes; None: they are the pull."""
 
 
 class PoseTask(FramedTask):
@@ -121,7 +123,7 @@ class PoseTask(FramedTask):
             curvature=partial(self._curvature, wrench=wrench, jacobian=jacobian),
         )
 
-    def _twist_parts(self, position: Array, rotation: Array, jacobian: Array) -> tuple[_Blocks, Float[Array, "6 6"]]:
+    def _twist_parts(self, position: Array, rotation: Array, jacobian: Array) -> tuple[_Blocks, _Wrench]:
         """Of the logarithm of the pose in the target."""
         wanted, own = self.target[1].T, rotation.T
         offset, between = dot(wanted, position - self.target[0]), dot(wanted, rotation)
@@ -132,9 +134,7 @@ class PoseTask(FramedTask):
         weight = jnp.concatenate([self.position_weight, self.orientation_weight])
         return [(self.kept, (error, dot(factor, twist), feedforward, weight))], dot(_twice(rotation), factor.T)
 
-    def _decoupled_parts(
-        self, position: Array, rotation: Array, jacobian: Array
-    ) -> tuple[_Blocks, Float[Array, "6 6"]]:
+    def _decoupled_parts(self, position: Array, rotation: Array, jacobian: Array) -> tuple[_Blocks, _Wrench]:
         """Of the position and of the orientation, those that are kept."""
         parts = []
         if any(self.kept[:3]):
@@ -143,13 +143,12 @@ class PoseTask(FramedTask):
         if any(self.kept[3:]):
             angular = self._orientation_in_frame if self.axes == "frame" else self._orientation_outside
             parts.append((self.kept[3:], (*angular(rotation, jacobian[3:]), self.orientation_weight)))
-        return parts, _twice(rotation) if self.axes == "frame" else jnp.eye(6, dtype=rotation.dtype)
+        return parts, _twice(rotation) if self.axes == "frame" else None
 
-    def _curvature(
-        self, pull: Float[Array, " m"], wrench: Float[Array, "6 6"], jacobian: Float[Array, "6 nv"]
-    ) -> Float[Array, ""]:
-        """From the weighted pull of the rows that are kept, and what makes a wrench in the outer axes of six."""
-        whole = dot(wrench, jnp.zeros(6, pull.dtype).at[np.flatnonzero(self.kept)].set(pull))
+    def _curvature(self, pull: Float[Array, " m"], wrench: _Wrench, jacobian: Float[Array, "6 nv"]) -> Float[Array, ""]:
+        """From the weighted pull of the rows that are kept."""
+        whole = jnp.zeros(6, pull.dtype).at[np.flatnonzero(self.kept)].set(pull)
+        whole = whole if wrench is None else dot(wrench, whole)
         return pose_curvature(whole[:3], whole[3:], jacobian)
 
     def _position_outside(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
