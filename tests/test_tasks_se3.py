@@ -140,7 +140,8 @@ class TestClosedLoop:
             ),
             "posture": osik.PostureTask(arm, weight=0.01, gain=0.1 / DT),
         }
-        solution = osik.solve(arm, q, ours, scheme=osik.WeightedQP(damping=1e-12, curvature_damping=0.0), dt=DT)
+        scheme = osik.WeightedQP(damping=1e-12, curvature_damping=0.0)
+        solution = osik.solve(arm, q, ours, scheme=scheme, dt=DT)
         np.testing.assert_allclose(solution.velocity, expected, atol=1e-8)
         assert np.abs(expected).max() > 0.5
         apart = {
