@@ -28,6 +28,7 @@ class G1:
         self._theirs = np.array([(joint.idx_q, joint.idx_v) for joint in joints])
         indices = [(self.robot.joint_qpos_index(name), self.robot.joint_dof_index(name)) for name in names]
         self._ours = np.array(indices)
+        self.knees = [joint.idx_q for joint, name in zip(joints, names, strict=True) if "knee" in name]
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration as ours: the quaternion begins with w."""

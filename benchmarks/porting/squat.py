@@ -28,7 +28,8 @@ def report() -> Iterator[str]:
     g1 = G1()
     yield (
         "knees at the start | solved by | steps with a joint at its speed limit [%] | joint speed, rms [rad/s] | "
-        "feet off [mm] | centre of mass off [mm] | apart from pink, at most [rad] | at the end [rad]"
+        "feet off [mm] | centre of mass off [mm] | knees, least and most [rad] | apart from pink, at most [rad] | at "
+        "the end [rad]"
     )
     for bend in (0.0, 0.2):
         q = g1.standing(0.72, bend)
@@ -117,12 +118,14 @@ def _measured(g1: G1, start: np.ndarray, motion: np.ndarray, reference: np.ndarr
         for foot, pose in g1.poses(q, FEET).items()
     ]
     com = [np.linalg.norm(g1.com(q) - com_at(k)) for k, q in enumerate(motion[late + 1 :], late)]
+    knees = motion[late:, g1.knees]
     apart = np.abs(motion - reference)[:, 7:].max(axis=1)
     return [
         f"{100.0 * at_limit.mean():.0f}",
         f"{np.sqrt(np.mean(speeds**2)):.2f}",
         f"{1e3 * max(feet):.2f}",
         f"{1e3 * max(com):.2f}",
+        f"{knees.min():.3f} to {knees.max():.3f}",
         f"{apart.max():.1e}",
         f"{apart[-1]:.1e}",
     ]
