@@ -67,7 +67,8 @@ class VelocityProblem(eqx.Module):
         A tick leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
         different chains, so their parts add up like the sides of a right angle.
         """
-        return self.dt * safe_norm(jnp.stack([self.rows[name].curvature for name in names]))
+        bends = [self.rows[name].curvature for name in names]  # none where all tasks are hard
+        return self.dt * safe_norm(jnp.stack([jnp.zeros_like(self.dt), *bends]))
 
     def damping(self, names: Sequence[str], constant: Float[Array, ""], curvature: Float[Array, ""] | float) -> Damping:
         """Of a priority, from the damping that a scheme has anyway and the share of the curvature that it takes."""
