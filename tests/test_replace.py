@@ -94,7 +94,8 @@ class TestSchemes:
         assert (float(scheme.margin), float(scheme.potential_gain)) == (0.1, 0.0)
 
     def test_inside_jit_and_in_batches(self, arm):
-        scheme, task = osik.WeightedQP(curvature_damping=0.0), {"hand": osik.FrameTask(arm, "hand", target=(np.ones(3), np.eye(3)))}
+        scheme = osik.WeightedQP(curvature_damping=0.0)
+        task = {"hand": osik.FrameTask(arm, "hand", target=(np.ones(3), np.eye(3)))}
         dampings = jnp.array([1e-4, 1.0, 1e4])
 
         def speed(damping):
@@ -108,7 +109,12 @@ class TestSchemes:
         [
             (osik.WeightedQP(), dict(damping=0.0), ValueError, "needs it positive"),
             (osik.WeightedQP(), dict(damping=-1.0), ValueError, "damping is"),
-            (osik.WeightedQP(), dict(max_iterations=3), TypeError, "no 'max_iterations' to replace; it has: damping, curvature_damping"),
+            (
+                osik.WeightedQP(),
+                dict(max_iterations=3),
+                TypeError,
+                "to replace; it has: damping, curvature_damping",
+            ),
             (osik.NullSpace(), dict(order="reverse"), TypeError, "structure is fixed"),
         ],
     )

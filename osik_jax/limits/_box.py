@@ -23,6 +23,8 @@ _ORDER: tuple[Kind, ...] = ("acceleration", "velocity", "braking", "position")
 class Limit(Replaceable):
     """Base of all limits: subclass it and write ``box``, ``rows`` or both to make your own.
 
+    ``limit.replace(name=value, ...)`` is the same limit with other numbers, those that ``limit.replaceable`` lists.
+
     A box always exists; rows may contradict it or each other, and the answer is then INFEASIBLE.
 
     Attributes:

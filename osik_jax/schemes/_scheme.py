@@ -145,7 +145,10 @@ class SchemeAnswer(eqx.Module):
 
 
 class Scheme(Replaceable):
-    """Base of the schemes: how tasks that cannot all be met share the robot."""
+    """Base of the schemes: how tasks that cannot all be met share the robot.
+
+    ``scheme.replace(name=value, ...)`` is the same scheme with other numbers, those that ``scheme.replaceable`` lists.
+    """
 
     @abc.abstractmethod
     def solve(self, problem: VelocityProblem, warm_start: Any = None) -> SchemeAnswer:
