@@ -59,8 +59,8 @@ class TaskRows(eqx.Module):
 class Task(Replaceable):
     """Base of all tasks: an immutable pytree. Make your own: subclass it, add fields, write ``rows`` (``task_rows``).
 
-    ``task.replace(name=value, ...)`` is the same task with other numbers, those that ``task.replaceable`` lists, checked
-    as on construction; it works inside ``jit`` and compiles nothing again.
+    ``task.replace(name=value, ...)`` is the same task with other numbers, of those that ``task.replaceable`` lists,
+    checked as on construction; it works inside ``jit`` and compiles nothing again.
 
     Attributes:
         priority: 1 is the most important; static.
