@@ -208,7 +208,7 @@ class TestGain:
         lower, upper = osik.limit_box(robot, q, (osik.ConfigurationLimit(robot, gain=gain),), dt)
         full = mink.Configuration(model, q=np.asarray(robot.mujoco_qpos(jnp.asarray(q))))
         theirs = mink.ConfigurationLimit(model, gain=gain)
-        bound = theirs.compute_qp_inequalities(full, dt).h / dt
+        bound = np.asarray(theirs.compute_qp_inequalities(full, dt).h) / dt
         assert model.nv == robot.nv + 1  # one joint of the model follows another
         leaders = {model.joint(name).dofadr[0]: robot.joint_dof_index(name) for name in robot.joint_names}
         rows = [(row, leaders[dof]) for row, dof in enumerate(theirs.indices) if dof in leaders]

@@ -1,5 +1,7 @@
 """Targets: every way to write a pose is the same pose, and a configuration sets any target."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -68,7 +70,7 @@ class TestWays:
     def test_at_every_tick_of_a_rollout(self, arm, way):
         task, steps = osik.FrameTask(arm, "hand"), 3
         targets = jax.tree.map(lambda part: jnp.stack([jnp.asarray(part)] * steps), WAYS[way])
-        options = dict(scheme=osik.WeightedQP(), steps=steps)
+        options: Any = dict(scheme=osik.WeightedQP(), steps=steps)
         path = osik.rollout(arm, arm.q0, {"hand": task}, targets={"hand": targets}, **options)
         alike = osik.rollout(arm, arm.q0, {"hand": task.replace(target=(POSITION, R))}, **options)
         np.testing.assert_allclose(path.q, alike.q, atol=1e-12)
@@ -113,7 +115,7 @@ class TestParts:
         task, steps = osik.FrameTask(arm, "hand", rows="position"), 4
         p = np.asarray(task.target[0])
         points = p + np.linspace(0.0, 0.1, steps)[:, None]
-        options = dict(scheme=osik.WeightedQP(), steps=steps)
+        options: Any = dict(scheme=osik.WeightedQP(), steps=steps)
         path = osik.rollout(arm, arm.q0, {"hand": task}, targets={"hand": points}, **options)
         whole = (points, np.tile(np.eye(3), (steps, 1, 1)))
         alike = osik.rollout(arm, arm.q0, {"hand": task}, targets={"hand": whole}, **options)
@@ -156,7 +158,7 @@ class TestMistakes:
             osik.FrameTask(arm, "hand", rows="position", target=np.zeros(2))
 
     def test_of_a_rollout(self, arm):
-        options = dict(scheme=osik.WeightedQP(), steps=3)
+        options: Any = dict(scheme=osik.WeightedQP(), steps=3)
         tasks = {"hand": osik.FrameTask(arm, "hand")}
         with pytest.raises(ValueError, match=r"shape \(3,\); a pose is"):
             osik.rollout(arm, arm.q0, tasks, targets={"hand": np.zeros((3, 3))}, **options)
@@ -181,6 +183,8 @@ def nao():
 def tasks(nao):
     """Every task with a target, none of them met at q0's neighbours."""
 
+    kind: Any = Reach
+
     def height(robot, kinematics, q):
         return kinematics.frame_pose(robot, "l_gripper")[0][2:]
 
@@ -194,7 +198,7 @@ def tasks(nao):
         "posture": osik.PostureTask(nao, joints=("*",)),
         "coupling": osik.JointCouplingTask(nao, {"HeadYaw": 1.0, "HeadPitch": 2.0}),
         "function": osik.FunctionTask(nao, height),
-        "own": Reach(nao, height),
+        "own": kind(nao, height),
         "manipulability": osik.ManipulabilityTask(nao, "l_gripper", target=0.1, rows="position"),
         "look": osik.LookAtTask(nao, "Head", axis=(1.0, 0.0, 0.0)),
         "look at a hand": osik.LookAtTask(nao, "Head", axis=(1.0, 0.0, 0.0), target_frame="l_gripper"),
@@ -222,8 +226,10 @@ class TestAt:
         frame = mink.RelativeFrameTask("l_gripper", "body", "Head", "body", 1.0, 1.0)
         frame.set_target_from_configuration(configuration)
         found = tasks["relative"].at(nao, q).target
-        np.testing.assert_allclose(found[0], frame.transform_target_to_root.translation(), atol=1e-9)
-        np.testing.assert_allclose(found[1], frame.transform_target_to_root.rotation().as_matrix(), atol=1e-9)
+        expected = frame.transform_target_to_root
+        assert expected is not None
+        np.testing.assert_allclose(found[0], expected.translation(), atol=1e-9)
+        np.testing.assert_allclose(found[1], expected.rotation().as_matrix(), atol=1e-9)
 
     def test_at_home_is_the_default(self, nao, tasks):
         for name in ("frame", "relative", "com", "posture", "look", "axis beside", "sole"):
@@ -257,4 +263,4 @@ class TestAt:
 
     def test_a_wrong_configuration_is_told(self, arm):
         with pytest.raises(ValueError, match=r"q has shape \(3,\)"):
-            osik.FrameTask(arm, "hand").at(arm, np.zeros(3))
+            osik.FrameTask(arm, "hand").at(arm, jnp.zeros(3))

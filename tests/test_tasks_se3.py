@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +43,7 @@ def pinocchio_arm():
 def tasks(arm, rng):
     """Of a frame in the world and in another frame, whole and in parts, with targets that stand still."""
     poses = [random_pose(rng, np.array([0.3, 0.1, 0.4])) for _ in range(4)]
-    weights = dict(position_weight=[1.0, 2.0, 3.0], orientation_weight=[0.5, 0.0, 2.0])
+    weights: Any = dict(position_weight=[1.0, 2.0, 3.0], orientation_weight=[0.5, 0.0, 2.0])
     return {
         "whole": osik.FrameTask(arm, "hand", target=poses[0], error="se3", **weights),
         "position": osik.FrameTask(arm, "hand", target=poses[1], error="se3", rows="position"),
@@ -132,7 +133,7 @@ class TestClosedLoop:
             theirs[name].set_target(pin.SE3(rotation, position))
         configuration = pink.Configuration(pinocchio_arm, pinocchio_arm.createData(), q)
         expected = pink.solve_ik(configuration, theirs.values(), DT, solver="daqp", limits=[])
-        squared = dict(position_weight=np.square([1.0, 2.0, 0.5]), orientation_weight=np.square([0.3, 0.1, 0.0]))
+        squared: Any = dict(position_weight=np.square([1.0, 2.0, 0.5]), orientation_weight=np.square([0.3, 0.1, 0.0]))
         ours = {
             "hand": osik.FrameTask(arm, "hand", target=hand, error="se3", gain=0.1 / DT, **squared),
             "elbow": osik.FrameTask(
@@ -144,9 +145,10 @@ class TestClosedLoop:
         solution = osik.solve(arm, q, ours, scheme=scheme, dt=DT)
         np.testing.assert_allclose(solution.velocity, expected, atol=1e-8)
         assert np.abs(expected).max() > 0.5
+        forms: Any = (("hand", ours["hand"], "pose"), ("elbow", ours["elbow"], "position"))
         apart = {
             name: osik.FrameTask(arm, task.frame, target=task.target, weight=task.weight, gain=task.gain, rows=rows)
-            for name, task, rows in (("hand", ours["hand"], "pose"), ("elbow", ours["elbow"], "position"))
+            for name, task, rows in forms
         }
         decoupled = osik.solve(
             arm, q, ours | apart, scheme=osik.WeightedQP(damping=1e-12, curvature_damping=0.0), dt=DT

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pink
 import pinocchio as pin
@@ -97,7 +98,7 @@ def _in_osik(g1: G1, start: np.ndarray, error: Any, limit_gain: float, curvature
     }
     path = osik.rollout(
         robot,
-        g1.configuration(start),
+        jnp.asarray(g1.configuration(start)),
         tasks,
         scheme=osik.WeightedQP(damping=DAMPING, curvature_damping=curvature),
         limits=(osik.ConfigurationLimit(robot, gain=limit_gain), osik.VelocityLimit(robot)),

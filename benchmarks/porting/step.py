@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pink
 import pinocchio as pin
@@ -93,5 +94,5 @@ def _in_osik(
             tasks[frame] = osik.FrameTask(robot, frame, rows="position", weight=4.0, **options)
     scheme = osik.WeightedQP(damping=1e-9, curvature_damping=0.0)
     limits = osik.ConfigurationLimit(robot, gain=limit_gain), osik.VelocityLimit(robot)
-    answer = osik.solve(robot, g1.configuration(q), tasks, scheme=scheme, limits=limits, dt=DT)
+    answer = osik.solve(robot, jnp.asarray(g1.configuration(q)), tasks, scheme=scheme, limits=limits, dt=DT)
     return np.asarray(answer.velocity)
