@@ -5,6 +5,7 @@ from ._batches import batch_axes as batch_axes
 from ._batches import batched as batched
 from ._batches import stack as stack
 from ._errors import OsikWarning as OsikWarning
+from ._version import installed_version as _installed_version
 from .collision import CollisionShape as CollisionShape
 from .control import Solution as Solution
 from .control import Trajectory as Trajectory
@@ -63,3 +64,5 @@ from .tasks import TaskRows as TaskRows
 from .tasks import WheelTask as WheelTask
 from .tasks import support_polygon as support_polygon
 from .tasks import task_rows as task_rows
+
+__version__ = _installed_version()

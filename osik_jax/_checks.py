@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,6 +133,11 @@ def check_targets(
         if name not in tasks:
             raise KeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(tasks)}")
         for leaf in jax.tree.leaves(target):
+            if not eqx.is_array_like(leaf):
+                raise TypeError(
+                    f"targets[{name!r}] holds objects of type {type(leaf).__name__}; it is made of arrays, such as "
+                    "positions (steps, 3) and rotation matrices (steps, 3, 3) or quaternions (steps, 4)"
+                )
             if jnp.shape(leaf)[:1] != (steps,):
                 raise ValueError(f"targets[{name!r}] has shape {jnp.shape(leaf)}; its first axis is the ticks, {steps}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -80,3 +81,9 @@ def check_bounds(lower: Array | None, upper: Array | None) -> None:
     if (low > high).any():
         rows = np.flatnonzero(low > high)
         raise ValueError(f"lower > upper in rows {rows.tolist()}: lower {low[rows]}, upper {high[rows]}")
+
+
+def entries(values: np.ndarray, which: np.ndarray, names: Sequence[str] | None = None) -> str:
+    """For messages: some entries of an array, by name where there are names."""
+    found = np.flatnonzero(which).tolist()
+    return ", ".join(f"{names[i] if names else f'entry {i}'} ({values[i]})" for i in found)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 
 from . import _loading
+from ._describe import described
 from ._home_configuration import Home, home_configuration
 from ._links import Factors, scaled_leaves
 from ._tree import BALL, FREE, KinematicTree, ModelHolder
@@ -231,6 +232,10 @@ class Robot(eqx.Module):
         """The robot with these fields, and with another ``q0`` where one is given."""
         robot = cls(**fields)
         return robot if home is None else robot.with_home(home)
+
+    def __repr__(self) -> str:
+        """The robot in five lines."""
+        return described(self)
 
     @property
     def nq(self) -> int:

@@ -1,10 +1,14 @@
 """The box on the velocity: its formula, exactness in both precisions, gradients."""
 
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
+import mink
 import numpy as np
+import pink
+import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -180,6 +184,84 @@ class Cautious(osik.Limit):
 
     def box(self, robot, q, dt):
         return jnp.full(robot.nv, -self.bound), jnp.full(robot.nv, self.bound) / (1 + dt)
+
+
+class TestGain:
+    """The share of the way to a limit that a step may take."""
+
+    def test_one_is_the_default_to_the_last_bit(self, typed, rng):
+        q = _at(typed, rng.uniform(-1.5, 1.5, 3))
+        alike = osik.ConfigurationLimit(typed), osik.ConfigurationLimit(typed, gain=1.0)
+        plain, given = (_box(typed, q, (limit,), 1 / 300) for limit in alike)
+        scalar = np.asarray(typed.position_upper)[SCALAR_V]
+        reach = (scalar.astype(q.dtype) - np.asarray(q)[SCALAR_Q]) / np.asarray(1 / 300, q.dtype)
+        for a, b in zip(plain, given, strict=True):
+            np.testing.assert_array_equal(a, b)
+        np.testing.assert_allclose(plain[1][SCALAR_V], reach, rtol=1e-5)
+
+    @pytest.mark.parametrize("gain", [0.5, 0.95, 1.0])
+    def test_are_minks_and_pinks_bounds(self, gain, rng):
+        """On a NAO, and beyond the ends of the ranges too."""
+        robot, dt = osik.load_robot("nao"), 0.004
+        model = robot.mj_model
+        q = np.asarray(robot.q0) + np.r_[np.zeros(7), rng.uniform(-0.5, 0.5, robot.nq - 7)]
+        lower, upper = osik.limit_box(robot, q, (osik.ConfigurationLimit(robot, gain=gain),), dt)
+        full = mink.Configuration(model, q=np.asarray(robot.mujoco_qpos(jnp.asarray(q))))
+        theirs = mink.ConfigurationLimit(model, gain=gain)
+        bound = np.asarray(theirs.compute_qp_inequalities(full, dt).h) / dt
+        assert model.nv == robot.nv + 1  # one joint of the model follows another
+        leaders = {model.joint(name).dofadr[0]: robot.joint_dof_index(name) for name in robot.joint_names}
+        rows = [(row, leaders[dof]) for row, dof in enumerate(theirs.indices) if dof in leaders]
+        most, least = np.split(bound, 2)
+        for row, dof in rows:
+            np.testing.assert_allclose((upper[dof], lower[dof]), (most[row], -least[row]), rtol=1e-9, atol=1e-9)
+        assert len(rows) == len(robot.joint_names)
+
+        arm = osik.load_robot("arm7")
+        own = np.asarray(arm.q0) + rng.uniform(-3.0, 3.0, 7)
+        pinocchio = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robots" / "arm7.xml"))
+        limit = pink.limits.ConfigurationLimit(pinocchio, config_limit_gain=gain)
+        configuration = pink.Configuration(pinocchio, pinocchio.createData(), own)
+        bound = limit.compute_qp_inequalities(configuration, dt)[1] / dt
+        lower, upper = osik.limit_box(arm, own, (osik.ConfigurationLimit(arm, gain=gain),), dt)
+        np.testing.assert_allclose(np.concatenate([upper, -lower]), bound, rtol=1e-9, atol=1e-9)
+
+    def test_by_joint(self, robot):
+        limit = osik.ConfigurationLimit(robot, gain={"elbow": 0.25})
+        whole = _box(robot, robot.q0, (osik.ConfigurationLimit(robot),), 0.01)
+        share = _box(robot, robot.q0, (limit,), 0.01)
+        for a, b in zip(whole, share, strict=True):
+            np.testing.assert_allclose(np.asarray(b)[SCALAR_V], np.asarray(a)[SCALAR_V] * [0.25, 1.0, 1.0])
+            np.testing.assert_array_equal(np.isinf(a), np.isinf(b))
+        array = osik.ConfigurationLimit(robot, gain=limit.gain)
+        np.testing.assert_array_equal(array.gain, limit.gain)
+
+    @pytest.mark.parametrize("gain", [0.5, 1.0])
+    def test_a_joint_outside_comes_back(self, robot, gain):
+        """Each step leaves at most the share that the gain says, whatever the tasks want; the speed limit holds."""
+        dt, steps = 0.05, 40
+        outward = {"posture": osik.PostureTask(robot, target=_at(robot, [4.0, 2.0, 0.0]), gain=20.0)}
+        limits = osik.ConfigurationLimit(robot, gain=gain), osik.VelocityLimit(robot)
+        start = _at(robot, [2.0, 0.5, 0.0])
+        path = osik.rollout(robot, start, outward, scheme=osik.WeightedQP(), limits=limits, dt=dt, steps=steps)
+        upper = np.asarray(robot.position_upper)[SCALAR_V][:2]
+        outside = np.asarray(path.q)[:, SCALAR_Q[:2]] - upper
+        assert (path.solution.status == osik.Status.SOLVED).all()
+        assert (outside[0] > 0.0).all()
+        assert (outside[-1] < 1e-6).all()
+        allowed = np.maximum((1.0 - gain) * outside[:-1], outside[:-1] - dt * np.array([2.0, 0.5]))
+        assert (outside[1:] <= allowed + 1e-12).all()
+
+    def test_derivative_by_hand(self, robot):
+        def bound(gain):
+            return osik.limit_box(robot, robot.q0, (osik.ConfigurationLimit(robot).replace(gain=gain),), 0.1)[1][9]
+
+        np.testing.assert_allclose(jax.grad(bound)(0.3), np.pi / 2 / 0.1, rtol=1e-9)
+
+    @pytest.mark.parametrize("gain", [0.0, 1.1, -0.5, np.nan, {"elbow": 2.0}])
+    def test_mistakes_are_told(self, robot, gain):
+        with pytest.raises(ValueError, match="above 0 and up to 1"):
+            osik.ConfigurationLimit(robot, gain=gain)
 
 
 class TestOwnLimits:

@@ -8,11 +8,11 @@ from typing import ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete, dof_names, dof_values, scalar_layout
+from .._numbers import check_bounds, entries
 from ..robot import Robot
 from ._box import Kind, Limit, limit_box
 from ._configuration import ConfigurationLimit
@@ -76,11 +76,7 @@ class AccelerationLimit(Limit):
         self.velocity = dof_values(robot, velocity, jnp.zeros(robot.nv), "velocity")
         ranges = ConfigurationLimit(robot, lower=lower, upper=upper)
         self.lower, self.upper = ranges.lower, ranges.upper
-        seen = concrete(self.acceleration)
-        if seen is not None and not (seen > 0.0).all():
-            bad = np.flatnonzero(~(seen > 0.0))
-            names = [f"{dof_names(robot)[i]} ({seen[i]})" for i in bad]
-            raise ValueError(f"accelerations have to be positive: {', '.join(names)}")
+        self._check(dof_names(robot))
 
     def parts(self) -> Sequence[Limit]:
         """The accelerations themselves, and the braking; a velocity limit comes in between."""
@@ -89,6 +85,12 @@ class AccelerationLimit(Limit):
     def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
         """Both parts together."""
         return limit_box(robot, q, self.parts(), dt)
+
+    def _check(self, names: Sequence[str] | None = None) -> None:
+        check_bounds(self.lower, self.upper)
+        seen = concrete(self.acceleration)
+        if seen is not None and not (seen > 0.0).all():
+            raise ValueError(f"accelerations have to be positive: {entries(seen, ~(seen > 0.0), names)}")
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
         """The limit for the next tick, once this one's answer is ``velocity``."""

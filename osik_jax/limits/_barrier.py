@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete
-from .._numbers import as_bounds, as_scalar
+from .._numbers import as_bounds, as_scalar, check_bounds
 from ..kinematics import Kinematics, frame_jacobian
 from ..robot import Robot
 from ._box import Limit
@@ -60,15 +58,15 @@ class PositionBarrier(Limit):
     ):
         robot.tree.frame(frame)
         self.frame, dtype = frame, robot.q0.dtype
-        self.normals = _normals(np.eye(3) if normals is None else normals, dtype)
+        self.normals = jnp.atleast_2d(jnp.asarray(np.eye(3) if normals is None else normals, dtype))
+        if self.normals.ndim != 2 or self.normals.shape[1] != 3:
+            raise ValueError(f"normals has shape {self.normals.shape}, expected (m, 3) or (3,)")
         low, high = as_bounds(lower, upper, len(self.normals), dtype)
         if low is None or high is None:
             raise ValueError("a PositionBarrier needs lower, upper or both")
         self.lower, self.upper = low, high
         self.gain = as_scalar(gain, "gain", dtype)
-        seen = concrete(self.gain)
-        if seen is not None and not seen > 0.0:
-            raise ValueError(f"gain is {seen}; it has to be positive: at 0 the frame could not move")
+        self._check()
 
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
@@ -81,18 +79,16 @@ class PositionBarrier(Limit):
         jacobian = jnp.matmul(self.normals, frame_jacobian(robot, kinematics, self.frame)[:3], precision="highest")
         return LimitRows(jacobian, _approach(rate, self.lower, value), _approach(rate, self.upper, value))
 
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)
+        gain, normals = concrete(self.gain), concrete(self.normals)
+        if gain is not None and not gain > 0.0:
+            raise ValueError(f"gain is {gain}; it has to be positive: at 0 the frame could not move")
+        if normals is not None and not (np.isfinite(normals).all() and (np.abs(normals).max(1) > 0.0).all()):
+            raise ValueError(f"normals have to be finite and not 0: {normals}")
+
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
     """``rate (bound - value)``; an infinite bound stays so, with gradients 0."""
     free = jnp.isinf(bound)
     return jnp.where(free, bound, rate * (jnp.where(free, 0.0, bound) - value))
-
-
-def _normals(value: Any, dtype: Any) -> Float[Array, "m 3"]:
-    normals = jnp.atleast_2d(jnp.asarray(value, dtype))
-    if normals.ndim != 2 or normals.shape[1] != 3:
-        raise ValueError(f"normals has shape {np.shape(value)}, expected (m, 3) or (3,)")
-    seen = concrete(normals)
-    if seen is not None and not (np.isfinite(seen).all() and (np.abs(seen).max(1) > 0.0).all()):
-        raise ValueError(f"normals have to be finite and not 0: {seen}")
-    return normals

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._joint_selection import concrete
 from .._made_for import MadeForRobot
+from .._replace import Replaceable
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._rows import LimitRows
@@ -20,8 +21,10 @@ _ROUNDINGS = 4.0
 _ORDER: tuple[Kind, ...] = ("acceleration", "velocity", "braking", "position")
 
 
-class Limit(MadeForRobot):
+class Limit(MadeForRobot, Replaceable):
     """Base of all limits: subclass it and write ``box``, ``rows`` or both to make your own.
+
+    ``limit.replace(name=value, ...)`` is the same limit with other numbers, those that ``limit.replaceable`` lists.
 
     A box always exists; rows may contradict it or each other, and the answer is then INFEASIBLE.
 

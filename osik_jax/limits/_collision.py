@@ -110,7 +110,7 @@ class CollisionAvoidanceLimit(Limit):
         self.detection_distance = _number(detection_distance, "detection_distance", dtype)
         self.gain = _number(gain, "gain", dtype)
         self.recovery_speed = _number(recovery_speed, "recovery_speed", dtype)
-        self._check_distances()
+        self._check()
         shapes, pairs = dict(shapes or {}), None if pairs is None else list(pairs)
         found = members(robot, shapes)
         possible = candidate_pairs(robot, found, pairs, exclude)
@@ -145,25 +145,13 @@ class CollisionAvoidanceLimit(Limit):
         lower = jnp.where(near.distance < self.detection_distance, lower, -jnp.inf)[soonest]
         return LimitRows(jacobian[soonest], lower, jnp.full_like(lower, jnp.inf))
 
-    def replace(self, **changes: ArrayLike | Array) -> Self:
-        """The same limit with another ``minimum_distance``, ``detection_distance``, ``gain`` or ``recovery_speed``.
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Names that ``replace`` takes; ``moved`` changes shapes."""
+        return _NUMBERS
 
-        Works inside ``jit``; nothing is compiled again.
-
-        Raises:
-            TypeError: any other name.
-            ValueError: as on construction.
-        """
-        for name in changes:
-            if name not in _NUMBERS:
-                raise TypeError(f"a CollisionAvoidanceLimit has no {name!r} to replace; it has: {', '.join(_NUMBERS)}")
-        names = tuple(changes)
-        if not names:
-            return self
-        values = [_number(changes[name], name, self.gain.dtype) for name in names]
-        new = eqx.tree_at(lambda limit: [getattr(limit, name) for name in names], self, values)
-        new._check_distances()
-        return new
+    def _convert(self, name: str, value: Any) -> Any:
+        return _number(value, name, self.gain.dtype)
 
     def moved(
         self,
@@ -203,7 +191,7 @@ class CollisionAvoidanceLimit(Limit):
     def _nearest(self, robot: Robot, kinematics: Kinematics) -> Nearest:
         return nearest(self.scene, place(self.scene, robot, kinematics, self.shapes), self.hulls)
 
-    def _check_distances(self) -> None:
+    def _check(self) -> None:
         least, most = concrete(self.minimum_distance), concrete(self.detection_distance)
         if least is not None and most is not None and not (most > least).all():
             raise ValueError(f"detection_distance is {most}; it has to be more than minimum_distance, {least}")

@@ -87,6 +87,10 @@ class FloatingBaseVelocityLimit(Limit):
         jacobian = jnp.zeros((3, robot.nv), turn.dtype).at[:, start : start + 3].set(turn)
         return LimitRows(jacobian, -speeds, speeds)
 
+    def _check(self) -> None:
+        for what in self.replaceable:
+            _check_speeds(getattr(self, what), what)
+
 
 def _free_joint(robot: Robot, name: str | None) -> int:
     """Index of the free joint of that name, or of the only one."""
@@ -105,7 +109,11 @@ def _speeds(robot: Robot, value: ArrayLike | Array | None, what: str) -> Float[A
     if value is None:
         return None
     speeds = as_vector(value, (3,), what, robot.q0.dtype)
+    _check_speeds(speeds, what)
+    return speeds
+
+
+def _check_speeds(speeds: Float[Array, "3"], what: str) -> None:
     seen = concrete(speeds)
     if seen is not None and not np.all(seen >= 0.0):
         raise ValueError(f"{what} is {seen}; speeds have to be 0 or more")
-    return speeds

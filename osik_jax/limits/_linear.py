@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete
-from .._numbers import as_bounds
+from .._numbers import as_bounds, check_bounds
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._box import Limit
@@ -43,13 +43,11 @@ class LinearLimit(Limit):
         self.matrix = jnp.asarray(matrix, dtype)
         if self.matrix.ndim != 2 or self.matrix.shape[1] != robot.nv:
             raise ValueError(f"matrix has shape {self.matrix.shape}, expected (m, {robot.nv}): a row acts on v")
-        seen = concrete(self.matrix)
-        if seen is not None and not np.isfinite(seen).all():
-            raise ValueError(f"matrix is not finite in rows {np.flatnonzero(~np.isfinite(seen).all(1)).tolist()}")
         low, high = as_bounds(lower, upper, len(self.matrix), dtype)
         if low is None or high is None:
             raise ValueError("a LinearLimit needs lower, upper or both")
         self.lower, self.upper = low, high
+        self._check()
 
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
@@ -57,3 +55,9 @@ class LinearLimit(Limit):
         """The rows as they are."""
         del robot, kinematics, q, dt
         return LimitRows(self.matrix, self.lower, self.upper)
+
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)
+        seen = concrete(self.matrix)
+        if seen is not None and not np.isfinite(seen).all():
+            raise ValueError(f"matrix is not finite in rows {np.flatnonzero(~np.isfinite(seen).all(1)).tolist()}")

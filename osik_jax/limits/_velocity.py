@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._joint_selection import concrete, dof_names, dof_values
+from .._numbers import entries
 from ..robot import Robot
 from ._box import Kind, Limit
 
@@ -33,11 +33,7 @@ class VelocityLimit(Limit):
 
     def __init__(self, robot: Robot, *, velocity: ArrayLike | Array | Mapping[str, float] | None = None):
         self.velocity = dof_values(robot, velocity, robot.velocity_limit, "velocity")
-        seen = concrete(self.velocity)
-        if seen is not None and not (seen >= 0.0).all():
-            bad = np.flatnonzero(~(seen >= 0.0))
-            names = [f"{dof_names(robot)[i]} ({seen[i]})" for i in bad]
-            raise ValueError(f"velocity limits have to be 0 or more: {', '.join(names)}")
+        self._check(dof_names(robot))
 
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
@@ -45,3 +41,8 @@ class VelocityLimit(Limit):
         """(-velocity, velocity)."""
         del robot, q, dt
         return -self.velocity, self.velocity
+
+    def _check(self, names: Sequence[str] | None = None) -> None:
+        seen = concrete(self.velocity)
+        if seen is not None and not (seen >= 0.0).all():
+            raise ValueError(f"velocity limits have to be 0 or more: {entries(seen, ~(seen >= 0.0), names)}")

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from .._numbers import as_scalar
+from .._replace import Replaceable
 from ..limits import LimitRows
 from ..solvers import Damping, Level, Status
 from ..solvers._dense import apply
@@ -66,7 +67,8 @@ class VelocityProblem(eqx.Module):
         A tick leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
         different chains, so their parts add up like the sides of a right angle.
         """
-        return self.dt * safe_norm(jnp.stack([self.rows[name].curvature for name in names]))
+        bends = [self.rows[name].curvature for name in names]  # none where all tasks are hard
+        return self.dt * safe_norm(jnp.stack([jnp.zeros_like(self.dt), *bends]))
 
     def damping(self, names: Sequence[str], constant: Float[Array, ""], curvature: Float[Array, ""] | float) -> Damping:
         """Of a priority, from the damping that a scheme has anyway and the share of the curvature that it takes."""
@@ -142,8 +144,11 @@ class SchemeAnswer(eqx.Module):
     warm_start: Any = None
 
 
-class Scheme(eqx.Module):
-    """Base of the schemes: how tasks that cannot all be met share the robot."""
+class Scheme(Replaceable):
+    """Base of the schemes: how tasks that cannot all be met share the robot.
+
+    ``scheme.replace(name=value, ...)`` is the same scheme with other numbers, those that ``scheme.replaceable`` lists.
+    """
 
     @abc.abstractmethod
     def solve(self, problem: VelocityProblem, warm_start: Any = None) -> SchemeAnswer:
@@ -154,6 +159,9 @@ class Scheme(eqx.Module):
             warm_start: what the answer to a tick nearby had in ``warm_start``; integers, all zeros for a cold start. It
                 changes the time that the answer takes, and not the answer.
         """
+
+    def _convert(self, name: str, value: Any) -> Any:
+        return as_scalar(value, name, getattr(self, name).dtype)
 
 
 def as_cap(value: Any) -> int | None:

@@ -36,6 +36,9 @@ class WeightedQP(Scheme):
     max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
 
     def __check_init__(self) -> None:
+        self._check()
+
+    def _check(self) -> None:
         seen = concrete(self.damping)
         if seen is not None and not (seen > 0.0).all():
             raise ValueError(f"damping is {seen}; a WeightedQP needs it positive, or the velocity is not unique")

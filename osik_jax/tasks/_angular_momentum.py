@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ..kinematics import Kinematics, centroidal_momentum_matrix
 from ..robot import Robot
 from ._com import check_axes
-from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._leaves import as_bounds, as_scalar, as_vector, as_weight, check_bounds
 from ._task import Task, TaskRows, check_priority
 
 
@@ -34,7 +34,7 @@ class AngularMomentumTask(Task):
         lower: makes an inequality task: lower bounds [kg m^2/s], one for each axis, or a scalar.
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
         axes: which of the world's axes, e.g. ``"xyz"``, ``"z"``.
-        weight: of each squared row.
+        weight: of each squared row: a scalar, or one for each.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -65,7 +65,7 @@ class AngularMomentumTask(Task):
         self.axes = check_axes(axes)
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.weight = as_scalar(weight, "weight", dtype)
+        self.weight = as_weight(weight, self._weight_rows, dtype)
         self.gain = as_scalar(0.0, "gain", dtype)
         self.lower, self.upper = as_bounds(lower, upper, len(axes), dtype)
         self.target = self._along_axes(0.0 if target is None else target) if self.lower is None else None
@@ -86,6 +86,10 @@ class AngularMomentumTask(Task):
     def replaceable(self) -> tuple[str, ...]:
         """Names that ``replace`` takes."""
         return tuple(name for name in super().replaceable if name != "gain")
+
+    @property
+    def _weight_rows(self) -> int:
+        return len(self.axes)
 
     def _along_axes(self, value: Any) -> Float[Array, " m"]:
         """One entry for each axis, from that, from a scalar, or from a vector x, y, z."""

@@ -7,6 +7,7 @@ from typing import Any
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
@@ -58,7 +59,8 @@ class AxisAlignTask(PointingTask):
         hard: bool = False,
     ):
         check_frames(robot, frame, target_frame)
-        direction = _home(robot, frame, target_frame, axis) if target is None else target
+        home = home_kinematics(robot)
+        direction = _pointed(robot, home, frame, target_frame, axis) if target is None else target
         super().__init__(
             robot,
             frame,
@@ -86,15 +88,21 @@ class AxisAlignTask(PointingTask):
         turned = dot(turn, cross_matrix(direction))
         return self.pointing_rows(dot(turn, direction), dot(turned, spin), -dot(turned, velocity))
 
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        del q
+        return dict(target=_pointed(robot, kinematics, self.frame, self.target_frame, self.axis))
+
     def _convert(self, name: str, value: Any) -> Any:
         if name == "target":
             return as_direction(value, name, self.weight.dtype)
         return super()._convert(name, value)
 
 
-def _home(robot: Robot, frame: str, target_frame: str | None, axis: ArrayLike | Array) -> Float[Array, "3"]:
-    """Where the axis points at the robot's home configuration."""
+def _pointed(
+    robot: Robot, kinematics: Kinematics, frame: str, target_frame: str | None, axis: ArrayLike | Array
+) -> Float[Array, "3"]:
+    """Where the axis points."""
     names = (frame,) if target_frame is None else (frame, target_frame)
-    _, rotations = home_kinematics(robot).frame_poses(robot, names)
+    _, rotations = kinematics.frame_poses(robot, names)
     direction = dot(rotations[0], unit(as_direction(axis, "axis", rotations.dtype)))
     return direction if target_frame is None else dot(rotations[1].T, direction)

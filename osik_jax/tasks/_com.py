@@ -17,7 +17,7 @@ from ..kinematics import Kinematics, center_of_mass, com_jacobian
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_array, as_bounds, as_scalar, as_vector, check_bounds, check_finite, home_kinematics
+from ._leaves import as_array, as_bounds, as_vector, as_weight, check_bounds, check_finite, home_kinematics
 from ._polygon import SupportPolygon
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
@@ -40,7 +40,7 @@ class ComTask(Task):
         polygon: makes an inequality task on the ground projection instead; see ``support_polygon``.
         axes: which of the world's axes, e.g. ``"xyz"``, ``"xy"``, ``"z"``.
         subtree: name of a body: the centre of mass of it and all that hangs from it. Default: the whole robot.
-        weight: of each squared row.
+        weight: of each squared row: a scalar, or one for each axis or edge of the polygon.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
@@ -81,10 +81,10 @@ class ComTask(Task):
         self.axes, self.subtree = check_axes(axes), subtree
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)
         self.lower, self.upper = as_bounds(lower, upper, len(axes), dtype)
         self.polygon = None if polygon is None else _cast(polygon, dtype)
+        self.weight = as_weight(weight, self._weight_rows, dtype)
         self.target = self.target_velocity = None
         if polygon is None:
             velocity = 0.0 if target_velocity is None else target_velocity
@@ -127,6 +127,15 @@ class ComTask(Task):
             weight=jnp.broadcast_to(self.weight, value.shape),
             curvature=bend,
         )
+
+    @property
+    def _weight_rows(self) -> int:
+        return len(self.axes) if self.polygon is None else len(self.polygon.offsets)
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        if self.target is None:
+            return super()._held(robot, kinematics, q)
+        return dict(target=center_of_mass(robot, kinematics, self.subtree))
 
     def _along_axes(self, value: Any, what: str) -> Float[Array, " m"]:
         """One entry for each axis, from that, from a scalar, or from a vector x, y, z."""

@@ -9,15 +9,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..kinematics import Kinematics
 from ..kinematics._rigid import cross
 from ..robot import Robot
 from ._curvature import jacobian_curvature, pose_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import Pose, as_pose, as_scalar, as_vector, home_kinematics
+from ._leaves import as_vector, as_weight, home_kinematics
 from ._plane import PlaneTask, as_normal, as_offset, plane_axes
 from ._pointing import across, unit
 from ._pose import option
 from ._rotation import dot
+from ._targets import Pose, PoseLike, as_pose
 from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
 
 
@@ -49,11 +51,11 @@ class ContactTask(PlaneTask):
         point: the contact point in the frame's axes [m]; default: its origin.
         normal: of the plane, in the world, of any length.
         offset: of the plane along its normal [m]; default: where the contact point is in the anchor.
-        anchor: pose of the frame that the contact holds, ``(p (3,), R (3, 3))`` or a (4, 4) matrix: the position along
-            the plane and the turn about the normal. Default: the pose at ``robot.q0``.
+        anchor: pose of the frame that the contact holds, in any of the forms that a ``FrameTask``'s target has: the
+            position along the plane and the turn about the normal. Default: the pose at ``robot.q0``.
         axis: the frame's axis that stands on the plane (``"plane"`` alone), in the frame's axes, of any length.
             Default: the one along the normal in the anchor.
-        weight: of each squared row.
+        weight: of each squared row: a scalar, or one for each.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
@@ -80,7 +82,7 @@ class ContactTask(PlaneTask):
         point: ArrayLike | Array = (0.0, 0.0, 0.0),
         normal: ArrayLike | Array = (0.0, 0.0, 1.0),
         offset: ArrayLike | Array | None = None,
-        anchor: tuple[ArrayLike | Array, ArrayLike | Array] | ArrayLike | Array | None = None,
+        anchor: PoseLike | None = None,
         axis: ArrayLike | Array | None = None,
         weight: ArrayLike | Array = 1.0,
         gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
@@ -94,7 +96,7 @@ class ContactTask(PlaneTask):
             raise TypeError("a contact at a point has no axis that stands on the plane; contact='plane' has")
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.weight = as_scalar(weight, "weight", dtype)
+        self.weight = as_weight(weight, self._weight_rows, dtype)
         self.gain = as_gain(gain, dtype)
         self.point = as_vector(point, (3,), "point", dtype)
         self.normal = as_normal(normal, dtype)
@@ -104,6 +106,12 @@ class ContactTask(PlaneTask):
         self.anchor = None if sliding else held
         standing = dot(held[1].T, self.normal) if axis is None else axis
         self.axis = as_normal(standing, dtype) if contact == "plane" else None
+
+    @property
+    def _weight_rows(self) -> int:
+        return {("point", True): 1, ("point", False): 3, ("plane", True): 3, ("plane", False): 6}[
+            self.contact, self.sliding
+        ]
 
     def rows_at(
         self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
@@ -152,6 +160,17 @@ class ContactTask(PlaneTask):
     def _along(direction: Float[Array, "3"], normal: Float[Array, "3"]) -> Float[Array, "3"]:
         """The part of a direction that is along the plane."""
         return direction - dot(normal, direction) * normal
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        """The anchor there, and the plane through the contact point."""
+        del q
+        position, rotation = kinematics.frame_pose(robot, self.frame)
+        held: dict[str, Any] = dict(offset=dot(self.normal, position + dot(rotation, self.point)))
+        if self.anchor is not None:
+            held["anchor"] = position, rotation
+        if self.axis is not None:
+            held["axis"] = dot(rotation.T, self.normal)
+        return held
 
     def _convert(self, name: str, value: Any) -> Any:
         dtype = self.weight.dtype

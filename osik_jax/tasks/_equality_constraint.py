@@ -22,7 +22,7 @@ from ..kinematics._rigid import compose, cross, rotate
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_scalar
+from ._leaves import as_weight
 from ._rotation import cross_matrix
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
@@ -62,7 +62,7 @@ class EqualityConstraintTask(Task):
         constraints: names of constraints; one without a name is called by its number, ``"equality0"``. Default: all
             active ones of the three kinds, but for joint constraints that the robot already has as mimic or locked
             joints.
-        weight: of each squared row.
+        weight: of each squared row: a scalar, or one for each constraint.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
@@ -97,7 +97,7 @@ class EqualityConstraintTask(Task):
         self.constraints = tuple(_structure(robot, e) for e in chosen)
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.weight = as_scalar(weight, "weight", dtype)
+        self.weight = as_weight(weight, self._weight_rows, dtype)
         self.gain = as_gain(gain, dtype)
         model = robot.mj_model
         kinds = [constraint.kind for constraint in self.constraints]
@@ -114,9 +114,14 @@ class EqualityConstraintTask(Task):
         by_kind = {"joint": iter(self._joint_rows(robot, q)), **self._spatial_rows(robot, kinematics)}
         parts = [next(by_kind[constraint.kind]) for constraint in self.constraints]
         error, jacobian = (jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        weight = jnp.broadcast_to(self.weight, error.shape)
+        counts = np.array([len(own) for own, _ in parts])
+        weight = jnp.broadcast_to(self.weight, counts.shape)[np.repeat(np.arange(len(counts)), counts)]
         bend = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
         return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bend)
+
+    @property
+    def _weight_rows(self) -> int:
+        return len(self.constraints)
 
     def _spatial_rows(self, robot: Robot, kinematics: Kinematics) -> dict[str, Any]:
         """Of connects, and of welds."""

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
-from ._pose import PoseLike, PoseTask
+from ._pose import PoseTask
+from ._targets import PoseLike
 from ._task import DEFAULT_GAIN, TaskRows
 
 
@@ -25,6 +27,10 @@ class FrameTask(PoseTask):
     - ``axes="frame"``, the frame's own axes: ``e = [R' (p - p*); log(R*' R)]`` and
       ``e' = [R' (J_lin + [p - p*] J_ang); E R' J_ang] v - [R' v*; E R' w*]``, with E the inverse right Jacobian at
       ``log(R*' R)``. Leaving a row out frees, for instance, the rotation of a tool about its own z axis.
+    - ``error="se3"``: the logarithm on SE(3) of the pose in the target, ``e = log(T*^-1 T)``, [linear; angular] along
+      the frame's own axes, and ``e' = L (twist - Ad twist*)``, with L Pinocchio's ``Jlog6`` at e. It is what pink and
+      mink use (their error is -e). Position and orientation are coupled: the linear rows are ``E R*' (p - p*)``, so
+      that the target's rotation counts in them too, also where the orientation rows are left out or weigh nothing.
 
     The task asks for ``e' = -gain(e) e`` (``AdaptiveGain`` is Ramos, eq. 3). As an inequality
     (``lower``, ``upper``) it keeps the same e, the pose relative to the target, within bounds:
@@ -33,7 +39,9 @@ class FrameTask(PoseTask):
     Args:
         robot: the robot.
         frame: name of a body, link, site or geom.
-        target: ``(p (3,), R (3, 3))`` or a (4, 4) matrix; default: the frame's pose at ``robot.q0``.
+        target: ``(p (3,), R (3, 3))``, ``(p (3,), quaternion w x y z (4,))``, a (4, 4) matrix or a ``jaxlie.SE3`` (or
+            mink's, or Pinocchio's); default: the frame's pose at ``robot.q0``. With position rows alone p will do, with
+            orientation rows alone R or the quaternion; what is left out stays as it is.
         target_velocity: of the target, (6,), [linear; angular] in world axes [m/s, rad/s]; default 0.
         lower: makes an inequality task: lower bounds on the rows of e, one for each row that is kept, or a scalar.
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
@@ -42,7 +50,8 @@ class FrameTask(PoseTask):
         weight: multiplies all rows' weights.
         rows: ``"pose"``, ``"position"``, ``"orientation"``, or six booleans (x, y, z, rotation about x, y, z): the rows
             that the task has. Static; weights are not.
-        axes: ``"world"`` or ``"frame"``.
+        axes: ``"world"`` or ``"frame"``; default: the world's, the frame's for ``error="se3"``.
+        error: ``"decoupled"``: position and orientation apart. ``"se3"``: the coupled error of pink and mink.
         orientation_jacobian: ``"analytic"`` (exact), or ``"geometric"``: E = I. Both ask for the same motion where
             the task can be met; where it cannot, they weigh the residual across the error's axis differently, by a
             factor (angle/2) / sin(angle/2), at most pi/2.
@@ -68,7 +77,8 @@ class FrameTask(PoseTask):
         orientation_weight: ArrayLike | Array = 1.0,
         weight: ArrayLike | Array = 1.0,
         rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
-        axes: Literal["world", "frame"] = "world",
+        axes: Literal["world", "frame"] | None = None,
+        error: Literal["decoupled", "se3"] = "decoupled",
         orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
         gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
         priority: int = 1,
@@ -78,7 +88,8 @@ class FrameTask(PoseTask):
         super().__init__(
             robot,
             frame,
-            target=home_kinematics(robot).frame_pose(robot, frame) if target is None else target,
+            home=home_kinematics(robot).frame_pose(robot, frame),
+            target=target,
             target_velocity=target_velocity,
             lower=lower,
             upper=upper,
@@ -88,6 +99,7 @@ class FrameTask(PoseTask):
             rows=rows,
             axes=axes,
             outer_axes="world",
+            error=error,
             orientation_jacobian=orientation_jacobian,
             gain=gain,
             priority=priority,
@@ -104,3 +116,7 @@ class FrameTask(PoseTask):
     ) -> TaskRows:
         """Rows in the order x, y, z, rotation x, y, z, those left out skipped (m <= 6)."""
         return self.pose_rows(positions[0], rotations[0], jacobians[0])
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        del q
+        return dict(target=kinematics.frame_pose(robot, self.frame))

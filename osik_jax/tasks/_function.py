@@ -19,7 +19,7 @@ from ..kinematics._rates import kinematics_rates
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._leaves import as_bounds, as_vector, as_weight, check_bounds
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
 Function = Callable[[Robot, Kinematics, Float[Array, " nq"]], Float[Array, " m"] | Float[Array, ""]]
@@ -47,7 +47,7 @@ class FunctionTask(Task):
         target_velocity: of the target, or of the bounds, in the units of x a second; default 0.
         lower: makes an inequality task: lower bounds on x, one for each row, or a scalar.
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
-        weight: of each squared row.
+        weight: of each squared row: a scalar, or one for each.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
@@ -85,9 +85,9 @@ class FunctionTask(Task):
         dtype = robot.q0.dtype
         numbers, self.structure = taken_apart(function)
         self.numbers = jax.tree.map(lambda a: jnp.asarray(a, dtype if isinstance(a, float) else None), numbers)
-        self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)
         rows = _length(robot, function)
+        self.weight = as_weight(weight, rows, dtype)
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
         self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
@@ -124,6 +124,15 @@ class FunctionTask(Task):
             feedforward=self.target_velocity,
             curvature=partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0)),
         )
+
+    @property
+    def _weight_rows(self) -> int:
+        return len(self.target_velocity)
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        if self.target is None:
+            return super()._held(robot, kinematics, q)
+        return dict(target=jnp.atleast_1d(self.function(robot, kinematics, q)))
 
     def replace(self, **changes: Any) -> Self:
         """The same task with other numbers; ``function`` takes one of the same structure. See ``Task.replace``.

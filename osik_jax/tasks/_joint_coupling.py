@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -86,9 +87,8 @@ class JointCouplingTask(Task):
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """One row."""
         del kinematics
-        tree = robot.tree
-        places, dofs = (np.array([at[j] for j in self.joints]) for at in (tree.qpos_address, tree.dof_address))
-        value = dot(self.ratios, q[places])[None]
+        dofs = np.array([robot.tree.dof_address[joint] for joint in self.joints])
+        value = self._value(robot, q)
         return task_rows(
             value if self.target is None else value - self.target,
             jnp.zeros((1, robot.nv), self.ratios.dtype).at[0, dofs].set(self.ratios),
@@ -99,6 +99,15 @@ class JointCouplingTask(Task):
             feedforward=self.target_velocity,
             curvature=no_curvature,
         )
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        if self.target is None:
+            return super()._held(robot, kinematics, q)
+        return dict(target=self._value(robot, q))
+
+    def _value(self, robot: Robot, q: Float[Array, " nq"]) -> Float[Array, "1"]:
+        """The weighted sum."""
+        return dot(self.ratios, q[np.array([robot.tree.qpos_address[joint] for joint in self.joints])])[None]
 
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from .._joint_selection import dofs_of, select_all
 from ..kinematics import Kinematics
 from ..robot import Robot
-from ._leaves import as_scalar, as_vector
+from ._leaves import WeightLike, as_joint_weight, as_scalar, as_vector
 from ._task import Task, TaskRows, check_priority
 
 
@@ -26,13 +26,14 @@ class VelocityTask(Task):
     """
 
     joints: tuple[int, ...] = eqx.field(static=True)
+    row_count: int = eqx.field(static=True)
 
-    def __init__(
-        self, robot: Robot, joints: Iterable[str] | None, *, weight: ArrayLike | Array, priority: int, hard: bool
-    ):
+    def __init__(self, robot: Robot, joints: Iterable[str] | None, *, weight: WeightLike, priority: int, hard: bool):
         self.joints = tuple(select_all(robot, joints))
         self.priority, self.hard = check_priority(priority), hard
-        self.weight = as_scalar(weight, "weight", robot.q0.dtype)
+        dofs = dofs_of(robot, self.joints)
+        self.row_count = len(dofs)
+        self.weight = as_joint_weight(robot, weight, dofs)
         self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
 
     @abc.abstractmethod
@@ -58,6 +59,10 @@ class VelocityTask(Task):
         """Names that ``replace`` takes."""
         return tuple(name for name in super().replaceable if name != "gain")
 
+    @property
+    def _weight_rows(self) -> int:
+        return self.row_count
+
 
 class DampingTask(VelocityTask):
     """Wants joints to stand still, at a low weight: of the motions that serve the other tasks, a slow one.
@@ -69,7 +74,8 @@ class DampingTask(VelocityTask):
         robot: the robot.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
             to take part.
-        weight: of each squared row. Several damping tasks give several weights.
+        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
+            globs to weights, in which a joint that is not named has 0.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -83,7 +89,7 @@ class DampingTask(VelocityTask):
         robot: Robot,
         *,
         joints: Iterable[str] | None = None,
-        weight: ArrayLike | Array = 1e-3,
+        weight: WeightLike = 1e-3,
         priority: int = 1,
         hard: bool = False,
     ):
@@ -103,7 +109,8 @@ class FreezeTask(VelocityTask):
     Args:
         robot: the robot.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; the free base by its name.
-        weight: of each squared row.
+        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
+            globs to weights, in which a joint that is not named has 0.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -117,7 +124,7 @@ class FreezeTask(VelocityTask):
         robot: Robot,
         joints: Iterable[str],
         *,
-        weight: ArrayLike | Array = 1.0,
+        weight: WeightLike = 1.0,
         priority: int = 1,
         hard: bool = False,
     ):
@@ -140,7 +147,8 @@ class JointVelocityTask(VelocityTask):
             own.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
             to take part.
-        weight: of each squared row.
+        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
+            globs to weights, in which a joint that is not named has 0.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -157,12 +165,12 @@ class JointVelocityTask(VelocityTask):
         target: ArrayLike | Array,
         *,
         joints: Iterable[str] | None = None,
-        weight: ArrayLike | Array = 1.0,
+        weight: WeightLike = 1.0,
         priority: int = 1,
         hard: bool = False,
     ):
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
-        self.target = as_vector(target, (len(dofs_of(robot, self.joints)),), "target", robot.q0.dtype)
+        self.target = as_vector(target, (self.row_count,), "target", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
         """The target."""
@@ -182,7 +190,8 @@ class LowAccelerationTask(VelocityTask):
         velocity: that of the tick before (nv,) [rad/s or m/s], or a scalar; default 0, a robot at rest.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
             to take part.
-        weight: of each squared row.
+        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
+            globs to weights, in which a joint that is not named has 0.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -199,7 +208,7 @@ class LowAccelerationTask(VelocityTask):
         *,
         velocity: ArrayLike | Array = 0.0,
         joints: Iterable[str] | None = None,
-        weight: ArrayLike | Array = 1e-3,
+        weight: WeightLike = 1e-3,
         priority: int = 1,
         hard: bool = False,
     ):

@@ -2,54 +2,66 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from .._home import home_kinematics as home_kinematics
 from .._joint_selection import as_array as as_array
 from .._joint_selection import concrete as concrete
+from .._joint_selection import dof_values
 from .._numbers import as_bounds as as_bounds
 from .._numbers import as_scalar as as_scalar
 from .._numbers import as_vector as as_vector
 from .._numbers import check_bounds as check_bounds
 from .._numbers import check_finite as check_finite
 from .._numbers import check_not_negative as check_not_negative
+from ..robot import Robot
 
-Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
-"""Position [m] and rotation (frame axes to world axes)."""
-
-_ROTATION_TOLERANCE = 1e-4
+WeightLike = ArrayLike | Array | Mapping[str, float]
+"""One weight, one for each row, or weights by the names of joints."""
 
 
-def as_pose(value: Any, dtype: Any) -> Pose:
-    """A pose from ``(position, rotation matrix)`` or a 4 x 4 matrix.
+def as_own_weight(value: Any) -> Float[Array, "..."]:
+    """A weight in its own precision, for a field: what a class of one's own is given, or what a task has converted.
 
     Raises:
-        ValueError: neither, or the rotation is not one.
+        ValueError: it is neither a scalar nor a vector, or negative or not finite.
     """
-    if isinstance(value, (tuple, list)) and len(value) == 2:
-        position, rotation = (as_array(part, "target", dtype) for part in value)
-    else:
-        matrix = as_array(value, "target", dtype)
-        if matrix.shape != (4, 4):
-            raise ValueError(f"a pose is (position (3,), rotation (3, 3)) or a (4, 4) matrix, got shape {matrix.shape}")
-        position, rotation = matrix[:3, 3], matrix[:3, :3]
-    if position.shape != (3,) or rotation.shape != (3, 3):
-        raise ValueError(
-            f"a pose is (position (3,), rotation (3, 3)), got shapes {position.shape} and {rotation.shape}. "
-            "Batch with jax.vmap."
-        )
-    check_finite(position, "the target's position")
-    _check_rotation(rotation)
-    return position, rotation
+    rows = np.shape(value)
+    if len(rows) > 1:
+        raise ValueError(f"weight has shape {rows}, expected a scalar or a vector. Batch with jax.vmap.")
+    own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
+    return as_weight(value, rows[0] if rows else None, value.dtype if own else float)
 
 
-def _check_rotation(rotation: Array) -> None:
-    seen = concrete(rotation)
-    if seen is None:
-        return
-    residual = np.abs(seen @ seen.T - np.eye(3)).max()
-    if not (residual < _ROTATION_TOLERANCE and np.linalg.det(seen) > 0.0):
-        raise ValueError(f"the target's rotation is not one (R R' = I to {_ROTATION_TOLERANCE}, det R = 1):\n{seen}")
+def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...] = ()) -> Float[Array, "..."]:
+    """A weight for all rows, or one for each; a scalar takes the shape ``like``. ``rows=None``: a scalar alone.
+
+    Raises:
+        ValueError: any other shape, or a weight that is negative or not finite.
+    """
+    out = as_array(value, "weight", dtype)
+    if out.shape not in ((), (rows,)):
+        each = "" if rows is None else f", or ({rows},): one for each row"
+        raise ValueError(f"weight has shape {out.shape}, expected a scalar{each}. Batch with jax.vmap.")
+    check_not_negative(out, "weight")
+    return out if out.shape else jnp.broadcast_to(out, like)
+
+
+def as_joint_weight(robot: Robot, value: Any, dofs: list[int]) -> Float[Array, "..."]:
+    """A weight for all rows of some dofs, or one for each, given in the order of these rows, of v, or by joint names.
+
+    Raises:
+        KeyError: a name that is none of the joints'.
+        ValueError: any other shape, or a weight that is negative or not finite.
+    """
+    dtype = robot.q0.dtype
+    if isinstance(value, Mapping) or (np.shape(value) == (robot.nv,) and len(dofs) != robot.nv):
+        value = dof_values(robot, value, jnp.zeros(robot.nv), "weight")[np.array(dofs, int)]
+    return as_weight(value, len(dofs), dtype)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
@@ -62,7 +65,7 @@ class LookAtTask(PointingTask):
     ):
         check_frames(robot, frame, target_frame)
         if target is None:
-            target = 0.0 if target_frame is not None else _ahead(robot, frame, axis)
+            target = 0.0 if target_frame is not None else _ahead(robot, home_kinematics(robot), frame, axis)
         super().__init__(
             robot,
             frame,
@@ -97,8 +100,17 @@ class LookAtTask(PointingTask):
         rate = dot(narrowing, moves - jacobian[:3]) + dot(cross_matrix(sight), jacobian[3:])
         return self.pointing_rows(dot(rotation.T, sight), dot(turn, rate), dot(turn, dot(narrowing, velocity)))
 
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        """A point 1 m ahead, in the frame that carries it."""
+        del q
+        point = _ahead(robot, kinematics, self.frame, self.axis)
+        if self.target_frame is not None:
+            position, rotation = kinematics.frame_pose(robot, self.target_frame)
+            point = dot(rotation.T, point - position)
+        return dict(target=point)
 
-def _ahead(robot: Robot, frame: str, axis: ArrayLike | Array) -> Float[Array, "3"]:
-    """The point 1 m along the axis at the robot's home configuration."""
-    position, rotation = home_kinematics(robot).frame_pose(robot, frame)
+
+def _ahead(robot: Robot, kinematics: Kinematics, frame: str, axis: ArrayLike | Array) -> Float[Array, "3"]:
+    """The point 1 m along the axis."""
+    position, rotation = kinematics.frame_pose(robot, frame)
     return position + dot(rotation, unit(as_direction(axis, "axis", position.dtype)))

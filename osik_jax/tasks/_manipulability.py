@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -145,6 +145,9 @@ class ManipulabilityTask(Task):
             parts = (jnp.matmul(turn, part, precision="highest") for part in (jacobian[:3], jacobian[3:]))
             jacobian = jnp.concatenate(list(parts))
         return _volume(jacobian[np.flatnonzero(self.kept)], log=self.log)
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        return super()._held(robot, kinematics, q) if self.target is None else dict(target=self.value(robot, q))
 
     def _climb(self, robot: Robot, gradient: Float[Array, " nv"]) -> TaskRows:
         dofs = np.array(self.dofs)

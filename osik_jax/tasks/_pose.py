@@ -17,18 +17,22 @@ from ..robot import Robot
 from ._curvature import pose_curvature
 from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import Pose, as_bounds, as_pose, as_scalar, as_vector, check_bounds, check_not_negative
+from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
+from ._targets import Pose, PoseLike, as_pose
 from ._task import TaskRows, check_priority, task_rows
+from ._twist import pose_log, seen_from
 
 _ROWS = {
     "pose": (True,) * 6,
     "position": (True,) * 3 + (False,) * 3,
     "orientation": (False,) * 3 + (True,) * 3,
 }
-PoseLike = tuple[ArrayLike | Array, ArrayLike | Array] | ArrayLike | Array
-"""``(p (3,), R (3, 3))`` or a (4, 4) matrix."""
 _Parts = tuple[Float[Array, "3"], Float[Array, "3 nv"], Float[Array, "3"]]
+_Blocks = list[tuple[Sequence[bool], tuple[Array, Array, Array, Array]]]
+"""Which rows of a block are kept; their error, Jacobian, feed-forward and weight."""
+_Wrench = Float[Array, "6 6"] | None
+"""From a pull on all six rows to force and torque on the frame, in the outer axes; None: they are the pull."""
 
 
 class PoseTask(FramedTask):
@@ -37,6 +41,7 @@ class PoseTask(FramedTask):
     frame: str = eqx.field(static=True)
     kept: tuple[bool, ...] = eqx.field(static=True)
     axes: str = eqx.field(static=True)
+    error: str = eqx.field(static=True)
     orientation_jacobian: str = eqx.field(static=True)
     target: Pose
     target_velocity: Float[Array, "6"]
@@ -50,7 +55,8 @@ class PoseTask(FramedTask):
         robot: Robot,
         frame: str,
         *,
-        target: PoseLike,
+        home: Pose,
+        target: PoseLike | None,
         target_velocity: ArrayLike | Array | None,
         lower: ArrayLike | Array | None,
         upper: ArrayLike | Array | None,
@@ -58,8 +64,9 @@ class PoseTask(FramedTask):
         orientation_weight: ArrayLike | Array,
         weight: ArrayLike | Array,
         rows: Literal["pose", "position", "orientation"] | Sequence[bool],
-        axes: str,
+        axes: str | None,
         outer_axes: str,
+        error: Literal["decoupled", "se3"],
         orientation_jacobian: Literal["analytic", "geometric"],
         gain: ArrayLike | Array | AdaptiveGain,
         priority: int,
@@ -67,11 +74,14 @@ class PoseTask(FramedTask):
     ):
         self.frame = frame
         self.kept = row_mask(rows)
-        self.axes = option("axes", axes, (outer_axes, "frame"))
+        self.error = option("error", error, ("decoupled", "se3"))
+        self.axes = _axes(axes, outer_axes, self.error)
         self.orientation_jacobian = option("orientation_jacobian", orientation_jacobian, ("analytic", "geometric"))
+        if self.coupled and self.orientation_jacobian == "geometric":
+            raise ValueError("error='se3' has its own Jacobian; orientation_jacobian='geometric' goes with 'decoupled'")
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.target = as_pose(target, dtype)
+        self.target = as_pose(home if target is None else target, dtype, rest=self._rest(home))
         self.target_velocity = as_vector(
             0.0 if target_velocity is None else target_velocity, (6,), "target_velocity", dtype
         )
@@ -86,6 +96,11 @@ class PoseTask(FramedTask):
         """Whether the task keeps the pose within bounds."""
         return self.lower is not None
 
+    @property
+    def coupled(self) -> bool:
+        """Whether the error is the logarithm on SE(3)."""
+        return self.error == "se3"
+
     def pose_rows(
         self, position: Float[Array, "3"], rotation: Float[Array, "3 3"], jacobian: Float[Array, "6 nv"]
     ) -> TaskRows:
@@ -93,13 +108,8 @@ class PoseTask(FramedTask):
 
         Pose, target and Jacobian are in the outer axes: the world's, or those of the frame that the pose is in.
         """
-        parts = []
-        if any(self.kept[:3]):
-            linear = self._position_in_frame if self.axes == "frame" else self._position_outside
-            parts.append((self.kept[:3], (*linear(position, rotation, jacobian), self.position_weight)))
-        if any(self.kept[3:]):
-            angular = self._orientation_in_frame if self.axes == "frame" else self._orientation_outside
-            parts.append((self.kept[3:], (*angular(rotation, jacobian[3:]), self.orientation_weight)))
+        form = self._twist_parts if self.coupled else self._decoupled_parts
+        parts, wrench = form(position, rotation, jacobian)
         chosen = [_chosen(kept, arrays) for kept, arrays in parts]
         error, rows, feedforward, weight = (jnp.concatenate(arrays) for arrays in zip(*chosen, strict=True))
         return task_rows(
@@ -110,18 +120,36 @@ class PoseTask(FramedTask):
             lower=self.lower,
             upper=self.upper,
             feedforward=feedforward,
-            curvature=partial(self._curvature, rotation=rotation, jacobian=jacobian),
+            curvature=partial(self._curvature, wrench=wrench, jacobian=jacobian),
         )
 
-    def _curvature(
-        self, pull: Float[Array, " m"], rotation: Float[Array, "3 3"], jacobian: Float[Array, "6 nv"]
-    ) -> Float[Array, ""]:
+    def _twist_parts(self, position: Array, rotation: Array, jacobian: Array) -> tuple[_Blocks, _Wrench]:
+        """Of the logarithm of the pose in the target."""
+        wanted, own = self.target[1].T, rotation.T
+        offset, between = dot(wanted, position - self.target[0]), dot(wanted, rotation)
+        error, factor = pose_log(offset, between)
+        twist = jnp.concatenate([dot(own, jacobian[:3]), dot(own, jacobian[3:])])
+        target_twist = jnp.concatenate([dot(wanted, self.target_velocity[:3]), dot(wanted, self.target_velocity[3:])])
+        feedforward = dot(factor, seen_from(offset, between, target_twist))
+        weight = jnp.concatenate([self.position_weight, self.orientation_weight])
+        return [(self.kept, (error, dot(factor, twist), feedforward, weight))], dot(_twice(rotation), factor.T)
+
+    def _decoupled_parts(self, position: Array, rotation: Array, jacobian: Array) -> tuple[_Blocks, _Wrench]:
+        """Of the position and of the orientation, those that are kept."""
+        parts = []
+        if any(self.kept[:3]):
+            linear = self._position_in_frame if self.axes == "frame" else self._position_outside
+            parts.append((self.kept[:3], (*linear(position, rotation, jacobian), self.position_weight)))
+        if any(self.kept[3:]):
+            angular = self._orientation_in_frame if self.axes == "frame" else self._orientation_outside
+            parts.append((self.kept[3:], (*angular(rotation, jacobian[3:]), self.orientation_weight)))
+        return parts, _twice(rotation) if self.axes == "frame" else None
+
+    def _curvature(self, pull: Float[Array, " m"], wrench: _Wrench, jacobian: Float[Array, "6 nv"]) -> Float[Array, ""]:
         """From the weighted pull of the rows that are kept."""
         whole = jnp.zeros(6, pull.dtype).at[np.flatnonzero(self.kept)].set(pull)
-        force, torque = whole[:3], whole[3:]
-        if self.axes == "frame":
-            force, torque = dot(rotation, force), dot(rotation, torque)
-        return pose_curvature(force, torque, jacobian)
+        whole = whole if wrench is None else dot(wrench, whole)
+        return pose_curvature(whole[:3], whole[3:], jacobian)
 
     def _position_outside(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
         del rotation
@@ -152,13 +180,35 @@ class PoseTask(FramedTask):
 
     def _convert(self, name: str, value: Any) -> Any:
         if name == "target":
-            return as_pose(value, self.weight.dtype)
+            return as_pose(value, self.weight.dtype, rest=self._rest(self.target))
         if name in ("position_weight", "orientation_weight"):
             return _row_weight(value, name, self.weight.dtype)
         return super()._convert(name, value)
 
+    def _rest(self, pose: Pose) -> tuple[Any, Any]:
+        """The parts of a pose that the rows do not depend on, which a target may leave out."""
+        position, rotation = pose
+        if self.coupled:
+            return None, None
+        return (None if any(self.kept[:3]) else position), (None if any(self.kept[3:]) else rotation)
+
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
+
+
+def _axes(axes: str | None, outer_axes: str, error: str) -> str:
+    """Along which the rows are: by default the outer ones, and for a twist the frame's, which it always has."""
+    if error == "se3":
+        if axes not in (None, "frame"):
+            raise ValueError(f"axes is {axes!r}; the rows of error='se3' are along the frame's own axes, 'frame'")
+        return "frame"
+    return outer_axes if axes is None else option("axes", axes, (outer_axes, "frame"))
+
+
+def _twice(rotation: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
+    """Turns a wrench or a twist: the rotation for each half."""
+    zero = jnp.zeros_like(rotation)
+    return jnp.block([[rotation, zero], [zero, rotation]])
 
 
 def _chosen(kept: Sequence[bool], arrays: Sequence[Array]) -> list[Array]:

@@ -17,7 +17,7 @@ from ..kinematics import Kinematics, difference
 from ..robot import Robot
 from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_array, as_bounds, as_scalar, as_vector, check_bounds, check_finite
+from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_bounds, check_finite
 from ._rotation import inverse_left_jacobian
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
@@ -39,13 +39,14 @@ class PostureTask(Task):
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; rows are in the order of v whatever the order here.
             Default: all but the free base, which has to be named to take part.
-        weight: of each squared row: a scalar. Several posture tasks give several weights.
+        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
+            globs to weights, in which a joint that is not named has 0.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
     Raises:
-        KeyError: no such joint, or it is locked or a mimic follower.
+        KeyError: no such joint, or it is locked or a mimic follower; in ``joints`` or ``weight``.
         TypeError: arguments that exclude each other.
         ValueError: a wrong shape, a negative weight, lower > upper, bounds on a ball or free joint.
     """
@@ -65,7 +66,7 @@ class PostureTask(Task):
         lower: ArrayLike | Array | None = None,
         upper: ArrayLike | Array | None = None,
         joints: Iterable[str] | None = None,
-        weight: ArrayLike | Array = 1.0,
+        weight: WeightLike = 1.0,
         gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
         priority: int = 1,
         hard: bool = False,
@@ -73,9 +74,10 @@ class PostureTask(Task):
         self.joints = tuple(select_all(robot, joints))
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)
-        rows = len(dofs_of(robot, self.joints))
+        dofs = dofs_of(robot, self.joints)
+        rows = len(dofs)
+        self.weight = as_joint_weight(robot, weight, dofs)
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
         self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
@@ -108,6 +110,13 @@ class PostureTask(Task):
             dofs=tuple(dofs) if self._adds(robot) else None,
             curvature=no_curvature,
         )
+
+    @property
+    def _weight_rows(self) -> int:
+        return len(self.target_velocity)
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        return super()._held(robot, kinematics, q) if self.target is None else dict(target=q)
 
     def _adds(self, robot: Robot) -> bool:
         """Whether all joints are hinges and slides, whose values simply add up."""

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
-from ._leaves import Pose, home_kinematics
-from ._pose import PoseLike, PoseTask
+from ._leaves import home_kinematics
+from ._pose import PoseTask
 from ._rotation import cross_matrix, dot
+from ._targets import Pose, PoseLike
 from ._task import DEFAULT_GAIN, TaskRows
 
 
@@ -30,7 +32,8 @@ class RelativeFrameTask(PoseTask):
         robot: the robot.
         frame: name of a body, link, site or geom.
         root: the frame that the pose is in; another one.
-        target: ``(p (3,), R (3, 3))`` or a (4, 4) matrix, in the root; default: what holds at ``robot.q0``.
+        target: the pose in the root, in any of the forms that ``FrameTask`` takes; default: what holds at
+            ``robot.q0``.
         target_velocity: of the target in the root, (6,), [linear; angular] in the root's axes [m/s, rad/s]; default 0.
         lower: makes an inequality task: lower bounds on the rows of e, one for each row that is kept, or a scalar.
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
@@ -39,7 +42,8 @@ class RelativeFrameTask(PoseTask):
         weight: multiplies all rows' weights.
         rows: ``"pose"``, ``"position"``, ``"orientation"``, or six booleans (x, y, z, rotation about x, y, z): the rows
             that the task has. Static; weights are not.
-        axes: ``"root"`` or ``"frame"``.
+        axes: ``"root"`` or ``"frame"``; default: the root's, the frame's for ``error="se3"``.
+        error: ``"decoupled"`` or ``"se3"``, see ``FrameTask``.
         orientation_jacobian: ``"analytic"`` or ``"geometric"``, see ``FrameTask``.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
@@ -67,7 +71,8 @@ class RelativeFrameTask(PoseTask):
         orientation_weight: ArrayLike | Array = 1.0,
         weight: ArrayLike | Array = 1.0,
         rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
-        axes: Literal["root", "frame"] = "root",
+        axes: Literal["root", "frame"] | None = None,
+        error: Literal["decoupled", "se3"] = "decoupled",
         orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
         gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
         priority: int = 1,
@@ -81,7 +86,8 @@ class RelativeFrameTask(PoseTask):
         super().__init__(
             robot,
             frame,
-            target=_home(robot, frame, root) if target is None else target,
+            home=_pose_in(robot, home_kinematics(robot), frame, root),
+            target=target,
             target_velocity=target_velocity,
             lower=lower,
             upper=upper,
@@ -91,6 +97,7 @@ class RelativeFrameTask(PoseTask):
             rows=rows,
             axes=axes,
             outer_axes="root",
+            error=error,
             orientation_jacobian=orientation_jacobian,
             gain=gain,
             priority=priority,
@@ -112,9 +119,13 @@ class RelativeFrameTask(PoseTask):
         jacobian = jnp.concatenate([dot(turn, linear), dot(turn, frame[3:] - root[3:])])
         return self.pose_rows(dot(turn, apart), dot(turn, rotations[0]), jacobian)
 
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        del q
+        return dict(target=_pose_in(robot, kinematics, self.frame, self.root))
 
-def _home(robot: Robot, frame: str, root: str) -> Pose:
-    """The frame's pose in the root at the robot's home configuration."""
-    positions, rotations = home_kinematics(robot).frame_poses(robot, (frame, root))
+
+def _pose_in(robot: Robot, kinematics: Kinematics, frame: str, root: str) -> Pose:
+    """The frame's pose in the root."""
+    positions, rotations = kinematics.frame_poses(robot, (frame, root))
     turn = rotations[1].T
     return dot(turn, positions[0] - positions[1]), dot(turn, rotations[0])

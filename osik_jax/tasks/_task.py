@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Self
@@ -13,12 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._home import compiled_kinematics
 from .._made_for import MadeForRobot
+from .._replace import Replaceable
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._curvature import jacobian_curvature, no_curvature
 from ._gain import Gain, as_gain, evaluate_gain
-from ._leaves import as_scalar, as_vector
+from ._leaves import as_own_weight, as_weight
+from ._repr import short_repr
 
 DEFAULT_GAIN = 10.0
 """[1/s]. The error falls by 1/e in 0.1 s; Euler steps are monotone up to dt = 0.1 s and stable up to 0.2 s."""
@@ -56,18 +58,22 @@ class TaskRows(eqx.Module):
         return self.lower is self.upper
 
 
-class Task(MadeForRobot):
+class Task(MadeForRobot, Replaceable):
     """Base of all tasks: an immutable pytree. Make your own: subclass it, add fields, write ``rows`` (``task_rows``).
+
+    ``task.replace(name=value, ...)`` is the same task with other numbers, of those that ``task.replaceable`` lists,
+    checked as on construction; it works inside ``jit`` and compiles nothing again.
 
     Attributes:
         priority: 1 is the most important; static.
         hard: whether the task is a constraint, above every priority (static): it is met to rounding, or the answer is
             INFEASIBLE and misses it, with all that is hard, by least squares with their weights.
-        weight: of the task's squared residual against others in the same weighted problem or level.
+        weight: of the task's squared residual against others in the same weighted problem or level; where a task says
+            so, one for each of its rows.
         gain: [1/s], a constant or an ``AdaptiveGain``: the wanted error rate is ``-gain * error``.
     """
 
-    weight: Float[Array, ""] = eqx.field(default=1.0, converter=lambda value: as_scalar(value, "weight"), kw_only=True)
+    weight: Float[Array, "..."] = eqx.field(default=1.0, converter=as_own_weight, kw_only=True)
     gain: Gain = eqx.field(default=DEFAULT_GAIN, converter=lambda value: as_gain(value), kw_only=True)
     priority: int = eqx.field(default=1, static=True, kw_only=True)
     hard: bool = eqx.field(default=False, static=True, kw_only=True)
@@ -91,48 +97,40 @@ class Task(MadeForRobot):
         del velocity
         return self
 
-    def replace(self, **changes: Any) -> Self:
-        """The same task with other numbers, checked and converted as on construction.
+    def at(self, robot: Robot, q: Float[Array, " nq"]) -> Self:
+        """The same task with the target that holds at configuration q, so that its error there is 0.
 
-        Works inside ``jit`` and changes no structure, so nothing is compiled again:
-        ``task.replace(target=(p, R), gain=5.0)``. A batch of tasks is a vmapped replace:
-        ``jax.vmap(lambda p: task.replace(target=(p, R)))(positions)``.
+        What mink and pink call ``set_target_from_configuration``, as a new task. Works inside ``jit`` and under
+        ``vmap``, and compiles nothing again.
+
+        Args:
+            robot: the robot.
+            q: configuration. (nq,)
 
         Raises:
-            TypeError: a name that is not one of this task's numbers; the message lists those that are.
-            ValueError: a wrong shape or value.
+            TypeError: the task has no target that a configuration could set: it has bounds, or wants a velocity.
+            ValueError: q has the wrong length or, outside jit, is not finite.
         """
-        for name in changes:
-            if name not in self.replaceable:
-                raise TypeError(
-                    f"{type(self).__name__} has no {name!r} to replace; "
-                    f"it has: {', '.join(self.replaceable)} (structure is fixed at construction)"
-                )
-        names = tuple(changes)
-        values = [self._convert(name, value) for name, value in changes.items()]
-        if not names:
-            return self
-        new = eqx.tree_at(lambda task: [getattr(task, name) for name in names], self, values)
-        new._check()
-        return new
+        robot.check_configuration(q)
+        return self.replace(**self._held(robot, compiled_kinematics(robot, jnp.asarray(q)), jnp.asarray(q)))
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        """The numbers with which the error at q is 0, by name."""
+        raise TypeError(f"this {type(self).__name__} has no target that a configuration could set")
 
     @property
-    def replaceable(self) -> tuple[str, ...]:
-        """Names that ``replace`` takes: the fields that hold numbers."""
-        fields = dataclasses.fields(self)
-        return tuple(f.name for f in fields if not f.metadata.get("static") and getattr(self, f.name) is not None)
+    def _weight_rows(self) -> int | None:
+        """How many numbers ``weight`` may be; None: one alone."""
+        return None
 
     def _convert(self, name: str, value: Any) -> Any:
         """A new value for a field, in the task's precision."""
-        dtype = self.weight.dtype
         if name == "weight":
-            return as_scalar(value, name, dtype)
-        if name == "gain":
-            return as_gain(value, dtype)
-        return as_vector(value, getattr(self, name).shape, name, dtype)
+            return as_weight(value, self._weight_rows, self.weight.dtype, like=self.weight.shape)
+        return as_gain(value, self.weight.dtype) if name == "gain" else super()._convert(name, value)
 
-    def _check(self) -> None:
-        """Raises ValueError where fields do not fit each other."""
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def check_priority(priority: int) -> int:

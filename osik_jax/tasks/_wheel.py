@@ -12,7 +12,7 @@ from ..kinematics._rigid import cross
 from ..robot import Robot
 from ._curvature import pose_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_scalar, as_vector, check_not_negative
+from ._leaves import as_vector, as_weight, check_not_negative
 from ._plane import PlaneTask, as_normal, as_offset
 from ._pointing import as_direction, unit
 from ._rotation import dot
@@ -47,7 +47,7 @@ class WheelTask(PlaneTask):
             [rad]: 0 for an omniwheel, +-pi/4 for most mecanum wheels. Default: a plain wheel.
         normal: of the plane, in the world, towards the wheel, of any length.
         offset: of the plane along its normal [m].
-        weight: of each squared row.
+        weight: of each squared row: a scalar, or one for each.
         gain: of the height [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
@@ -80,12 +80,12 @@ class WheelTask(PlaneTask):
         self.frame = frame
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)
         self.radius = _as_radius(radius, dtype)
         self.axis = unit(as_direction(axis, "axis", dtype))
         self.roller_angle = None if roller_angle is None else as_vector(roller_angle, (), "roller_angle", dtype)
         self.normal, self.offset = as_normal(normal, dtype), as_offset(offset, dtype)
+        self.weight = as_weight(weight, self._weight_rows, dtype)
 
     def rows_at(
         self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
@@ -95,7 +95,7 @@ class WheelTask(PlaneTask):
         ahead = unit(cross(axle, self.normal))
         spoke = self.radius * cross(axle, ahead)
         touching = jacobians[0, :3] + cross(jacobians[0, 3:], spoke[:, None], along=-2)
-        directions = jnp.concatenate([self._held(ahead), self.normal[None]])
+        directions = jnp.concatenate([self._rolling(ahead), self.normal[None]])
         height = dot(self.normal, positions[0] + spoke) - self.offset
         error = jnp.zeros(len(directions), height.dtype).at[-1].set(height)
         weight = jnp.broadcast_to(self.weight, error.shape)
@@ -106,7 +106,11 @@ class WheelTask(PlaneTask):
 
         return task_rows(error, dot(directions, touching), gain=self.gain, weight=weight, curvature=bend)
 
-    def _held(self, ahead: Float[Array, "3"]) -> Float[Array, "m 3"]:
+    @property
+    def _weight_rows(self) -> int:
+        return 3 if self.roller_angle is None else 2
+
+    def _rolling(self, ahead: Float[Array, "3"]) -> Float[Array, "m 3"]:
         """Directions along the plane in which the wheel does not slip."""
         aside = cross(self.normal, ahead)
         if self.roller_angle is None:

@@ -1,0 +1,56 @@
+"""Tasks in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.core
+import numpy as np
+
+
+def short_repr(task: Any) -> str:
+    """The names and options of a task, its weight and its gain; arrays are left out.
+
+    ``FrameTask(frame='l_gripper', rows='position', axes='world', weight=2, gain=10, priority=3)``
+    """
+    options = _options(task)
+    last = [options.pop(name) for name in ("priority", "hard") if name in options]
+    parts = [*options.values(), *(f"{name}={_number(getattr(task, name))}" for name in ("weight", "gain")), *last]
+    return f"{type(task).__name__}({', '.join(parts)})"
+
+
+_ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
+_SILENT = ("row_count", "orientation_jacobian")
+"""Fields that follow from others or that few change."""
+
+
+def _options(task: Any) -> dict[str, str]:
+    """Static fields that say something in a few words, by name."""
+    found = {}
+    for field in dataclasses.fields(task):
+        value, name = getattr(task, field.name), field.name
+        if not field.metadata.get("static") or name in _SILENT or value is None or value is False:
+            continue
+        if name in ("joints", "dofs"):
+            found[name] = f"{name}=<{len(value)}>"
+        elif name == "kept":
+            found[name] = f"rows={_ROWS.get(value, value)!r}"
+        elif isinstance(value, (str, bool, int)) or _is_short(value):
+            found[name] = f"{name}={value!r}"
+    return found
+
+
+def _is_short(value: Any) -> bool:
+    return isinstance(value, tuple) and len(value) <= 6 and all(isinstance(part, (str, bool)) for part in value)
+
+
+def _number(value: Any) -> str:
+    """A number in full, an array by its shape."""
+    if isinstance(value, eqx.Module):
+        numbers = (_number(getattr(value, field.name)) for field in dataclasses.fields(value))
+        return f"{type(value).__name__}({', '.join(numbers)})"
+    if isinstance(value, jax.core.Tracer) or np.ndim(value) > 0:
+        return f"<{'x'.join(map(str, np.shape(value)))}>" if np.shape(value) else "<traced>"
+    return f"{float(value):g}"

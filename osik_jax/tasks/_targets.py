@@ -1,0 +1,117 @@
+"""From the many ways in which a pose is written to a position and a rotation matrix."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from ._leaves import check_finite, concrete
+
+Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
+"""Position [m] and rotation (frame axes to world axes)."""
+PoseLike = tuple[ArrayLike | Array, ArrayLike | Array] | ArrayLike | Array | jaxlie.SE3 | Any
+"""``(p (3,), R (3, 3))``, ``(p (3,), quaternion w x y z (4,))``, a (4, 4) matrix, a ``jaxlie.SE3`` or another object
+with ``as_matrix()`` (mink's) or ``homogeneous`` (Pinocchio's); p or R alone where the other does not matter."""
+
+_TOLERANCE = 1e-4
+
+
+def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> Pose:
+    """A pose from any of the ways to write one, see ``PoseLike``.
+
+    Args:
+        value: the pose.
+        dtype: of the result.
+        rest: what a rotation alone has as its position, and a position alone as its rotation; None: it has to be given.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: numbers that are no pose, or a rotation or quaternion that is not one.
+    """
+    parts = _parts(value, dtype)
+    if parts is None:
+        array = _array(value, dtype)
+        if array.shape == (4, 4):
+            parts = array[:3, 3], array[:3, :3]
+            _check_matrix(parts[1])
+            _check_last_row(array)
+        elif array.shape == (3,) and rest[1] is not None:
+            parts = array, jnp.asarray(rest[1], dtype)
+        elif array.shape in ((3, 3), (4,)) and rest[0] is not None:
+            parts = jnp.asarray(rest[0], dtype), array
+        else:
+            raise _unfit(f"an array of shape {array.shape}", rest)
+    position, rotation = parts
+    if position.shape != (3,) or rotation.shape not in ((3, 3), (4,)):
+        raise _unfit(f"a pair of shapes {position.shape} and {rotation.shape}", rest)
+    check_finite(position, "the target's position")
+    return position, _rotation(rotation)
+
+
+def _parts(value: Any, dtype: Any) -> tuple[Array, Array] | None:
+    """Position and rotation, of what has two parts."""
+    if isinstance(value, jaxlie.SE3):  # its quaternion, so that no other normalisation comes in between
+        return jnp.asarray(value.translation(), dtype), jnp.asarray(value.rotation().wxyz, dtype)
+    if isinstance(value, (tuple, list)) and len(value) == 2:
+        return _array(value[0], dtype), _array(value[1], dtype)
+    return None
+
+
+def _array(value: Any, dtype: Any) -> Array:
+    """The numbers of an array, or of an object that has a matrix."""
+    if callable(getattr(value, "as_matrix", None)):
+        value = value.as_matrix()
+    elif hasattr(value, "homogeneous"):
+        value = value.homogeneous
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError):
+        raise TypeError(f"got {type(value).__name__}, which is no pose; {_ACCEPTED}") from None
+
+
+_ACCEPTED = (
+    "a pose is (position (3,), rotation matrix (3, 3)), (position (3,), quaternion w x y z (4,)), a (4, 4) matrix or a "
+    "jaxlie.SE3"
+)
+
+
+def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
+    alone = "; here a position (3,) alone will do" if rest[1] is not None else ""
+    alone += "; here a rotation alone will do" if rest[0] is not None else ""
+    return ValueError(f"got {what}; {_ACCEPTED}{alone}. Batch with jax.vmap.")
+
+
+def _rotation(given: Float[Array, "3 3"] | Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """The rotation matrix of itself or of a quaternion."""
+    if given.shape == (4,):
+        _check_quaternion(given)
+        norm = jnp.sqrt(jnp.sum(given**2))
+        return jaxlie.SO3(given / norm).as_matrix()
+    _check_matrix(given)
+    return given
+
+
+def _check_quaternion(wxyz: Float[Array, "4"]) -> None:
+    seen = concrete(wxyz)
+    if seen is not None and not abs(np.linalg.norm(seen) - 1.0) < _TOLERANCE:
+        raise ValueError(f"the target's quaternion (w, x, y, z) has to be of length 1 to {_TOLERANCE}, got {seen}")
+
+
+def _check_matrix(rotation: Float[Array, "3 3"]) -> None:
+    seen = concrete(rotation)
+    if seen is None:
+        return
+    residual = np.abs(seen @ seen.T - np.eye(3)).max()
+    if not (residual < _TOLERANCE and np.linalg.det(seen) > 0.0):
+        raise ValueError(f"the target's rotation is not one (R R' = I to {_TOLERANCE}, det R = 1):\n{seen}")
+
+
+def _check_last_row(matrix: Float[Array, "4 4"]) -> None:
+    seen = concrete(matrix)
+    if seen is not None and not np.abs(seen[3] - [0.0, 0.0, 0.0, 1.0]).max() < _TOLERANCE:
+        raise ValueError(f"the last row of a pose's matrix is 0 0 0 1, got {seen[3]}; is it transposed?")

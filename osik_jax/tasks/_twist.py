@@ -1,0 +1,37 @@
+"""The logarithm of a pose and the matrix that turns the twist of a moving frame into its rate."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
+
+
+def pose_log(
+    position: Float[Array, "3"], rotation: Float[Array, "3 3"]
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+    """The logarithm (6,) of a pose T, [linear; angular], and L (6, 6) with ``log(T)' = L twist``.
+
+    The twist is the frame's own, [linear; angular] in its own axes: ``T' = T [twist]``. With phi = log(R) and E the
+    inverse left Jacobian of SO(3) at phi, the logarithm is (E p, phi). Its rate is
+
+        phi' = E' w        (E p)' = E R v + d(E p)/d(phi) phi' = E' v + D E' w
+
+    because E R = E', the inverse right Jacobian. L is Pinocchio's ``Jlog6`` and mink's ``jlog``, the inverse right
+    Jacobian of SE(3) at log(T).
+    """
+    angle = rotation_log(rotation)
+    left = inverse_left_jacobian(angle)
+    bend = jax.jacfwd(lambda phi: dot(inverse_left_jacobian(phi), position))(angle)
+    right = left.T
+    top = jnp.concatenate([right, dot(bend, right)], axis=1)
+    bottom = jnp.concatenate([jnp.zeros_like(right), right], axis=1)
+    return jnp.concatenate([dot(left, position), angle]), jnp.concatenate([top, bottom])
+
+
+def seen_from(position: Float[Array, "3"], rotation: Float[Array, "3 3"], twist: Float[Array, "6 ..."]) -> Array:
+    """Twists (6, ...) of a frame in its own axes, as those of a second frame whose pose in the first is given."""
+    linear, angular = twist[:3], twist[3:]
+    return jnp.concatenate([dot(rotation.T, linear - dot(cross_matrix(position), angular)), dot(rotation.T, angular)])
