@@ -233,10 +233,10 @@ def read_table(page: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.strip().splitlines()[2:]]
 
 
-def write(text: str, path: Path = PAGE) -> None:
-    """Puts a table into a page, in place of the one there."""
+def write(text: str, path: Path = PAGE, *, start: str = START, end: str = END) -> None:
+    """Puts a table into a page, in place of the one between two marks."""
     page = path.read_text(encoding="utf-8")
-    before, after = page[: page.index(START) + len(START)], page[page.index(END) :]
+    before, after = page[: page.index(start) + len(start)], page[page.index(end) :]
     path.write_text(f"{before}\n{text}\n{after}", encoding="utf-8")
 
 

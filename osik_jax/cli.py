@@ -20,10 +20,11 @@ if TYPE_CHECKING:
 
     from .demo import Motion
     from .robot import Robot
+    from .viewer import Look
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
 _EMBEDDED = ("nao", "arm7")
-_USER_ERRORS = (OSError, KeyError, ValueError)
+_USER_ERRORS = (OSError, KeyError, ValueError, ImportError)
 
 
 class CommandError(Exception):
@@ -38,8 +39,8 @@ class Demo:
     own robot goes 5 cm to its left and back.
     """
 
-    motion: Literal["double-support", "single-support"] = "double-support"
-    """What NAO does."""
+    motion: Literal["double-support", "single-support"] | None = None
+    """What NAO does. Default: double-support. Any other robot sways."""
     physics: bool = False
     """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every tick."""
     robot: str | None = None
@@ -78,7 +79,10 @@ class Info:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code: 0, or 2 after a mistake of the user's (told on stderr)."""
+    """Runs the command line; returns the exit code.
+
+    0, or 2 after what the user can set right (told on stderr in one line), or 130 where it was interrupted.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments == ["--version"]:
         print(f"osik-jax {importlib.metadata.version('osik-jax')}")
@@ -86,19 +90,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = tyro.extras.subcommand_cli_from_dict(
         {"demo": Demo, "info": Info}, prog="osik", description=_DESCRIPTION, args=arguments or ["--help"]
     )
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
     try:
         with _notes():
-            if isinstance(command, Info):
-                _info(command)
-            else:
-                _demo(command)
+            _run(command)
     except CommandError as error:
         print(f"osik: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print(f"osik: interrupted{_left_behind(command)}", file=sys.stderr)
+        return 130
     return 0
+
+
+def _run(command: Demo | Info) -> None:
+    """Runs a command in double precision."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if isinstance(command, Info):
+        _info(command)
+    else:
+        _demo(command)
+
+
+def _left_behind(command: Demo | Info) -> str:
+    """A remark where an interrupted command has written something."""
+    if not isinstance(command, Demo) or not command.out.is_dir() or not os.listdir(command.out):
+        return ""
+    return f"; what is in {command.out} may be incomplete"
 
 
 @contextmanager
@@ -151,22 +170,49 @@ def read_robot(source: str, base: str = "auto") -> Robot:
         path, floating = Path(source), {"auto": None, "floating": True, "fixed": False}[base]
         if not path.is_file():
             if source.endswith("_description"):
-                return load_robot(source, floating_base=floating)
-            raise FileNotFoundError(f"no such file: {source} (embedded robots: {', '.join(_EMBEDDED)})")
+                return _described(source, floating)
+            raise FileNotFoundError(
+                f"no such file: {source} (embedded robots: {', '.join(_EMBEDDED)}; names of robot_descriptions end in "
+                "_description)"
+            )
         if _is_mjcf(path):
             return Robot.from_mjcf(path, floating_base=floating)
         return Robot.from_urdf(path, floating_base=floating)
 
 
-def _is_mjcf(path: Path) -> bool:
-    text = path.read_text(encoding="utf-8", errors="replace")
-    return "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]
+def _described(name: str, floating: bool | None) -> Robot:
+    """A robot of robot_descriptions, whose git may fail in ways of its own."""
+    from .robot import load_robot
+
+    try:
+        return load_robot(name, floating_base=floating)
+    except _USER_ERRORS:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise CommandError(f"{name} could not be fetched: {type(error).__name__}: {reason}") from error
 
 
 def _read_demo_robot(command: Demo, source: str) -> Robot:
     """The robot to move; a URDF that does not say whether its base moves floats if --support names what stands."""
     stands = command.base == "auto" and command.support and Path(source).is_file() and not _is_mjcf(Path(source))
     return read_robot(source, "floating" if stands else command.base)
+
+
+def _look(source: str) -> Look | None:
+    """What a URDF shows; an MJCF's own shapes are in its model already."""
+    from ._loading import urdf_of_description
+    from .viewer import read_look
+
+    if os.path.isfile(source):
+        return None if _is_mjcf(Path(source)) else read_look(source)
+    urdf = None if source in _EMBEDDED else urdf_of_description(source)
+    return None if urdf is None else read_look(urdf[0], package_dirs=urdf[1])
+
+
+def _is_mjcf(path: Path) -> bool:
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]
 
 
 def _info(command: Info) -> None:
@@ -204,28 +250,30 @@ def _right(header: str) -> Column:
 
 def _demo(command: Demo) -> None:
     from rich.console import Console
+    from rich.markup import escape
 
     from . import demo
 
     console = Console()
-    motion, out = _motion(command), _folder(command.out)
+    motion, dt = _motion(command), 1.0 / command.frequency
+    with _told():
+        out = demo.writable_folder(command.out, demo.needed_bytes(motion, len(command.schemes), dt))
     for note in motion.notes:
-        console.print(f"[yellow]note:[/yellow] {note}")
-    settings: Any = dict(
-        schemes=command.schemes,
-        dt=1.0 / command.frequency,
-        animation=command.animation,
-        renderer=command.renderer,
-    )
-    with _progress(console) as announce:
+        console.print(f"[yellow]note:[/yellow] {escape(note)}")
+    settings: Any = dict(schemes=command.schemes, dt=dt, animation=command.animation)
+    seconds = demo.estimate_seconds(motion, physics=command.physics, **settings)
+    console.print(f"{escape(motion.title)}: this will take about {_spoken(seconds)}")
+    settings["renderer"] = command.renderer
+    with _writing(out), _progress(console) as announce:
         if command.physics:
             summary, simulated = demo.run_physics_demo(motion, out, announce=announce, **settings)
             last, table = simulated[-1].run, demo.physics_table(summary)
         else:
             summary, runs = demo.run_demo(motion, out, announce=announce, **settings)
             last, table = runs[-1], demo.table(summary)
-    if command.picture:
-        demo.draw_picture(motion, last, command.out / "picture.png")
+        if command.picture:
+            announce("drawing the picture", 1.0)
+            demo.draw_picture(motion, last, out / "picture.png")
     console.print(table)
     console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
 
@@ -244,8 +292,9 @@ def _motion(command: Demo) -> Motion:
                 frame=command.frame,
                 support=command.support,
                 duration=command.duration,
+                look=_look(command.robot),
             )
-    make = demo.double_support if command.motion == "double-support" else demo.single_support
+    make = demo.single_support if command.motion == "single-support" else demo.double_support
     return make(command.duration)
 
 
@@ -253,6 +302,11 @@ def _check(command: Demo) -> None:
     """Options that exclude each other, and values out of range."""
     if command.robot is None and (command.frame is not None or command.support):
         raise CommandError("--frame and --support go with --robot FILE; NAO's motions choose their own")
+    if command.robot is not None and command.motion is not None:
+        raise CommandError(
+            f"--motion {command.motion} is NAO's, and --robot moves another: its waist or its tip sways; "
+            "--frame, --support and --duration say what, on what and how long"
+        )
     if command.physics and command.robot is not None:
         raise CommandError("--physics goes with NAO's motions; for a robot of yours, see osik_jax.physics")
     if not command.frequency > 0.0:
@@ -270,11 +324,20 @@ def _check(command: Demo) -> None:
             raise CommandError(f"--renderer mujoco: {' '.join(str(error).split())}; use auto or raycast") from error
 
 
-def _folder(path: Path) -> Path:
-    """Makes the folder to write to."""
-    with _told():
-        path.mkdir(parents=True, exist_ok=True)
-    return path
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Tells in one line that a file could not be written, as on a full disk."""
+    try:
+        yield
+    except OSError as error:
+        raise CommandError(f"cannot write to {folder}: {error.strerror or error}; it may be incomplete") from error
+
+
+def _spoken(seconds: float) -> str:
+    """A time as one says it: no more exact than it is known."""
+    if seconds < 90.0:
+        return f"{max(5 * round(seconds / 5.0), 5)} s"
+    return f"{0.5 * round(seconds / 30.0):g} min"
 
 
 @contextmanager

@@ -1,6 +1,10 @@
 """The command line: what it prints, and how it refuses."""
 
 import json
+import os
+import resource
+import shutil
+import signal
 import subprocess
 import sys
 
@@ -9,7 +13,8 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
-from osik_jax import cli
+from osik_jax import cli, demo
+from osik_jax.demo import _folder
 from osik_jax.viewer import _opengl
 
 ARM = """<mujoco><worldbody><body name="base"><geom type="box" size=".1 .1 .1"/>
@@ -91,6 +96,8 @@ def test_options_that_make_no_sense_are_explained(capsys, arm_file):
     assert "--robot" in refused(capsys, "demo", "--frame", "torso")
     assert "--frequency is 0" in refused(capsys, "demo", "--frequency", "0")
     assert "two control ticks" in refused(capsys, "demo", "--duration", "0")
+    line = refused(capsys, "demo", "--robot", str(arm_file), "--motion", "single-support")
+    assert "--motion single-support is NAO's" in line and "--frame" in line
     assert "--base goes with a file" in refused(capsys, "info", "nao", "--base", "fixed")
 
 
@@ -107,6 +114,67 @@ def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path, arm_file):
     blocked = _written(tmp_path / "file", "")
     line = refused(capsys, "demo", "--robot", str(arm_file), "--out", str(blocked / "out"))
     assert str(blocked) in line
+
+
+def test_folders_that_cannot_take_the_files_are_found_before_the_work(capsys, tmp_path, arm_file, monkeypatch):
+    """No file can be made in /proc, not even by root; a disk with hardly any room is told apart."""
+
+    def worked(*args, **kwargs):
+        raise AssertionError("the work has begun")
+
+    monkeypatch.setattr(demo, "run_demo", worked)
+    monkeypatch.setattr(demo, "estimate_seconds", worked)
+    if os.path.isdir("/proc/self"):
+        assert "cannot write to /proc" in refused(capsys, "demo", "--robot", str(arm_file), "--out", "/proc")
+    free = shutil.disk_usage(tmp_path)._replace(free=3_000_000)
+    monkeypatch.setattr(_folder.shutil, "disk_usage", lambda path: free)
+    line = refused(capsys, "demo", "--robot", str(arm_file), "--out", str(tmp_path / "out"))
+    assert "has 3.0 MB of room left" in line and "MB are needed" in line
+
+
+def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path, arm_file):
+    """The system refuses to write files of more than 32 kB: smaller than the comparison."""
+    words = ["demo", "--robot", str(arm_file), "--duration", "1", "--frequency", "20", "--schemes", "weighted"]
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (32_000, hard))
+    try:
+        code = cli.main([*words, "--no-animation", "--out", str(tmp_path / "out")])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    told = capsys.readouterr().err.strip().splitlines()
+    assert code == 2 and len(told) == 1
+    assert told[0] == f"osik: cannot write to {tmp_path / 'out'}: File too large; it may be incomplete"
+
+
+def test_an_interrupt_ends_in_one_line(tmp_path, arm_file):
+    """Ctrl-C once the time that it takes has been told."""
+    words = [sys.executable, "-m", "osik_jax.cli", "demo", "--robot", str(arm_file), "--duration", "60", "--out"]
+    with subprocess.Popen(
+        [*words, str(tmp_path / "out")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        first = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        told = process.stderr.read().strip().splitlines()
+    assert "this will take about" in first
+    assert process.returncode == 130 and len(told) == 1 and told[0].startswith("osik: interrupted")
+
+
+def test_times_are_told_no_more_exactly_than_they_are_known():
+    assert [cli._spoken(seconds) for seconds in (0.2, 42.0, 89.0, 100.0, 340.0)] == [
+        "5 s",
+        "40 s",
+        "90 s",
+        "1.5 min",
+        "5.5 min",
+    ]
+
+
+def test_a_name_without_its_extra_is_one_line(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "robot_descriptions", None)
+    line = refused(capsys, "info", "panda_mj_description")
+    assert "pip install 'osik-jax[descriptions]'" in line
+    assert "names of robot_descriptions end in _description" in refused(capsys, "info", "panda")
 
 
 def test_info_lists_joints_limits_frames_and_mass(capsys):

@@ -279,6 +279,25 @@ def test_film_of_another_kind_is_refused(tmp_path, nao, monkeypatch):
         viewer.animate(tmp_path / "m.mp4", nao, q, dt=0.01)
 
 
+def test_what_ffmpeg_says_is_told(tmp_path, nao, monkeypatch):
+    """A program of that name that reads nothing and complains, as ffmpeg does on a full disk."""
+    program = tmp_path / "ffmpeg"
+    program.write_text("#!/bin/sh\necho no space left >&2\nexit 3\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    with pytest.raises(OSError, match=r"ffmpeg could not write .*m\.mp4: no space left"):
+        viewer.animate(tmp_path / "m.mp4", nao, np.asarray(nao.q0)[None], dt=0.1, size=(64, 36), renderer="raycast")
+
+
+def test_constants_do_not_look_like_curves():
+    """Rounding errors about a constant, and errors that are 0 throughout, on linear and on logarithmic axes."""
+    time = np.linspace(0.0, 1.0, 11)
+    noise = {"one": 0.5 + 1e-16 * np.sin(40.0 * time)}
+    panels = [viewer.Panel("margin", noise, span=0.1), viewer.Panel("error", {"one": 0.0 * time}, floor=1e-5)]
+    linear, log = viewer.compare_figure(time, panels).axes
+    assert np.ptp(linear.get_ylim()) >= 0.1 and log.get_ylim() == pytest.approx((1e-5, 1e-3))
+
+
 def test_without_opengl_rays_are_cast(nao, monkeypatch):
     tries = []
 

@@ -1,6 +1,7 @@
 """From files and MuJoCo models to the fields of a Robot. Host code, run once per robot."""
 
 from ._descriptions import described as described
+from ._descriptions import urdf_of_description as urdf_of_description
 from ._embedded import ROBOTS as ROBOTS
 from ._embedded import embedded as embedded
 from ._mjcf import from_mjcf as from_mjcf

@@ -22,7 +22,7 @@ from ._urdf_elements import IDENTITY, Joint, Link, Pose, Shape, Urdf, read_urdf
 WORLD = "world"
 FLOATING_BASE = "floating_base"
 
-_GEOMS = {
+GEOMS = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -168,8 +168,8 @@ def _add_body(parent: mujoco.MjsBody, pose: Pose, link: Link, *, moving: bool) -
 
 def _add_shapes(body: mujoco.MjsBody, link: Link) -> None:
     for shape in link.shapes:
-        if shape.kind in _GEOMS:
-            _add_geom(body, shape, type=_GEOMS[shape.kind], size=_geom_size(shape))
+        if shape.kind in GEOMS:
+            _add_geom(body, shape, type=GEOMS[shape.kind], size=geom_size(shape))
 
 
 def _add_geom(body: mujoco.MjsBody, shape: Shape, **form: Any) -> None:
@@ -209,7 +209,7 @@ def _check_mesh(path: Path, link: str) -> None:
         )
 
 
-def _geom_size(shape: Shape) -> list[float]:
+def geom_size(shape: Shape) -> list[float]:
     """MuJoCo's sizes: radius first, then half lengths."""
     if shape.kind == "box":
         return [edge / 2.0 for edge in shape.size]

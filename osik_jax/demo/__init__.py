@@ -1,8 +1,11 @@
 """The demonstration behind ``osik demo``: motions, what is measured of them, and the report. Import it by name."""
 
+from ._estimate import estimate_seconds as estimate_seconds
 from ._file import file_motion as file_motion
 from ._file import guess_feet as guess_feet
 from ._file import guess_moving_frame as guess_moving_frame
+from ._folder import needed_bytes as needed_bytes
+from ._folder import writable_folder as writable_folder
 from ._measure import Measurement as Measurement
 from ._measure import measure as measure
 from ._motion import Goal as Goal

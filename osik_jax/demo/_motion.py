@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ..physics._world import contact_corners as contact_corners
 from ..robot import Robot
 from ..tasks import FrameTask, SupportPolygon, Task
+from ..viewer import Look
 from ._references import Path
 
 GAIN = 20.0
@@ -73,6 +74,8 @@ class Motion:
         limits: those that the schemes get.
         balanced: whether a task keeps the centre of mass over the support polygon.
         notes: remarks for the user.
+        look: what pictures show of it; ``None``: the model's own shapes.
+        scale: how large the motion is against one of 5 cm; the errors that are wanted grow with it.
     """
 
     name: str
@@ -86,6 +89,8 @@ class Motion:
     limits: Sequence[Any]
     balanced: bool = True
     notes: tuple[str, ...] = ()
+    look: Look | None = None
+    scale: float = 1.0
 
 
 def tracking(robot: Robot, goal: Goal, *, weight: float, priority: int, gain: float = GAIN) -> FrameTask:

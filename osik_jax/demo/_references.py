@@ -68,12 +68,16 @@ class Path:
         pose = (jnp.asarray(self.position) + shift, _rotation(axis, angle[0]) @ jnp.asarray(self.rotation))
         return pose, jnp.concatenate([velocity, speed * axis])
 
+    @property
+    def strokes(self) -> tuple[Stroke, ...]:
+        """All strokes."""
+        return (*self.moves, *self.turns)
+
     def still(self, t: np.ndarray) -> np.ndarray:
         """Whether the path has moved before, and stands at each time [s] of an array."""
-        strokes = (*self.moves, *self.turns)
         begun = np.zeros(len(t), bool)
         moving = np.zeros(len(t), bool)
-        for stroke in strokes:
+        for stroke in self.strokes:
             begun |= t >= stroke.end
             moving |= (t > stroke.start) & (t < stroke.end)
         return begun & ~moving

@@ -23,7 +23,10 @@ from ._motion import Motion
 from ._schemes import PROMISES_LIMITS, TITLES
 
 DRIFT_POSITION, DRIFT_ORIENTATION, PATH_ERROR = 1e-4, 1e-4, 1e-3
-"""What the hierarchical scheme has to reach: [m] and [rad] for the standing feet, [m] for the first goal."""
+"""What the hierarchical scheme has to reach: [m] and [rad] for the standing feet, [m] for the first goal.
+
+Lengths are those of a motion of 5 cm.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +80,7 @@ def _settings(motion: Motion, dt: float) -> dict[str, Any]:
         "dt_s": dt,
         "steps": round(motion.duration / dt),
         "joints": len(motion.robot.joint_names),
+        "scale": motion.scale,
         "precision": str(motion.robot.q0.dtype),
         "tasks": {
             name: {
@@ -164,10 +168,10 @@ def _reached(motion: Motion, m: Measurement) -> dict[str, bool]:
     """What the hierarchical scheme has to reach; told of every scheme."""
     first = next(iter(m.goals.values()))
     settled = first.position[first.settled]
-    out = {"first_goal": bool(len(settled) and settled.max() <= PATH_ERROR)}
+    out = {"first_goal": bool(len(settled) and settled.max() <= PATH_ERROR * motion.scale)}
     if motion.stances:
         out["standing"] = all(
-            np.nanmax(t.position) <= DRIFT_POSITION and not (t.orientation > DRIFT_ORIENTATION).any()
+            np.nanmax(t.position) <= DRIFT_POSITION * motion.scale and not (t.orientation > DRIFT_ORIENTATION).any()
             for t in m.stances.values()
         )
     if motion.balanced:
@@ -178,7 +182,7 @@ def _reached(motion: Motion, m: Measurement) -> dict[str, bool]:
 def table(summary: Mapping[str, Any]) -> Table:
     """The same for people: what each scheme reached."""
     schemes = list(summary["schemes"].values())
-    return table_of_schemes(summary["title"], schemes, _rows(schemes[0]))
+    return table_of_schemes(summary["title"], schemes, _rows(schemes[0], summary["settings"]["scale"]))
 
 
 def table_of_schemes(title: str, schemes: Sequence[Mapping[str, Any]], rows: Sequence[tuple[str, Any]]) -> Table:
@@ -192,18 +196,18 @@ def table_of_schemes(title: str, schemes: Sequence[Mapping[str, Any]], rows: Seq
     return out
 
 
-def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Labels, and functions from a scheme's figures to what its cell says."""
+def _rows(example: Mapping[str, Any], scale: float) -> list[tuple[str, Any]]:
+    """Labels, and functions from a scheme's figures to what its cell says; wanted lengths grow with the scale."""
     rows: list[tuple[str, Any]] = []
     if example["standing"]:
-        rows.append(("standing feet, drift [mm]", lambda s: number(_worst(s["standing"], "position_mm"), 0.1)))
+        rows.append(("standing feet, drift [mm]", lambda s: number(_worst(s["standing"], "position_mm"), 0.1 * scale)))
     if any("orientation_mrad" in figures for figures in example["standing"].values()):
         rows.append(("standing feet, turn [mrad]", lambda s: number(_worst(s["standing"], "orientation_mrad"), 0.1)))
     if "balance" in example:
         rows.append(("centre of mass inside by [mm]", lambda s: inside(s["balance"]["least_margin_mm"])))
     first = next(iter(example["goals"]))
     for label in example["goals"]:
-        limit = 1.0 if label == first else None
+        limit = scale if label == first else None
         rows.append(
             (
                 f"{label.replace('_', ' ')}, from path [mm]",

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -147,11 +148,11 @@ def comparison_panels(motion: Motion, measured: dict[str, Measurement]) -> list[
     if motion.stances:
         drift = {name: 1e3 * _worst_drift(m) for name, m in measured.items()}
         panels.append(
-            Panel("drift of the standing feet [mm]", drift, floor=1e-7, bound=0.1, bound_label="0.1 mm wanted")
+            Panel("drift of the standing feet [mm]", drift, floor=1e-7 * motion.scale, **_wanted(0.1 * motion.scale))
         )
     error = {name: 1e3 * m.goals[label].position for name, m in measured.items()}
     title = f"{label.replace('_', ' ')} ({goal.frame}) from its path [mm]"
-    panels.append(Panel(title, error, floor=1e-5, bound=1.0, bound_label="1 mm wanted"))
+    panels.append(Panel(title, error, floor=1e-5 * motion.scale, **_wanted(motion.scale)))
     if motion.balanced:
         margin = {name: 1e3 * m.com_margin for name, m in measured.items()}
         panels.append(
@@ -160,6 +161,7 @@ def comparison_panels(motion: Motion, measured: dict[str, Measurement]) -> list[
                 margin,
                 bound=0.0,
                 above=True,
+                span=motion.scale,
                 bound_label="edge of the polygon",
             )
         )
@@ -167,8 +169,13 @@ def comparison_panels(motion: Motion, measured: dict[str, Measurement]) -> list[
         ("joint nearest to a position limit (1: mid-range)", {n: m.position_margin for n, m in measured.items()}),
         ("joint nearest to its top speed (1: at rest)", {n: m.velocity_margin for n, m in measured.items()}),
     ):
-        panels.append(Panel(title, values, bound=0.0, above=True, bound_label="limit"))
+        panels.append(Panel(title, values, bound=0.0, above=True, bound_label="limit", span=0.1))
     return panels
+
+
+def _wanted(bound: float) -> dict[str, Any]:
+    """The line of an error that is wanted [mm]."""
+    return {"bound": bound, "bound_label": f"{bound:.2g} mm wanted"}
 
 
 def _worst_drift(m: Measurement) -> np.ndarray:
@@ -188,9 +195,10 @@ def film(
             run.q,
             dt=dt,
             renderer=renderer,
+            look=motion.look,
             support=run.measurement.support or None,
             trails=[goal.frame for label, goal in motion.goals.items() if label != "waist"],
-            curves=_film_curves(run.measurement),
+            curves=_film_curves(run.measurement, motion.scale),
             caption=f"{motion.title}: {TITLES[run.scheme]}",
             progress=progress,
         )
@@ -209,17 +217,17 @@ def draw_picture(motion: Motion, run: Run, path: str | Path, instants: Sequence[
     ticks = [round(part * (len(run.q) - 1)) for part in instants]
     support = [run.measurement.support[k] for k in ticks] if run.measurement.support else None
     labels = [f"{run.measurement.time[k]:.1f} s" for k in ticks]
-    return hero_picture(path, motion.robot, [run.q[k] for k in ticks], support=support, labels=labels)
+    return hero_picture(path, motion.robot, [run.q[k] for k in ticks], support=support, labels=labels, look=motion.look)
 
 
 _DIRECTIONS = ("forward", "to the left", "up")
 
 
-def _film_curves(m: Measurement) -> Curves:
+def _film_curves(m: Measurement, scale: float) -> Curves:
     """Of up to two goals, the coordinate that moves most [mm]."""
     values, wanted = {}, {}
     for label in list(m.goals)[:2]:
         axis = int(np.argmax(np.ptp(m.wanted[label], axis=0)))
         name = f"{label.replace('_', ' ')} {_DIRECTIONS[axis]}"
         values[name], wanted[name] = 1e3 * m.displacement[label][:, axis], 1e3 * m.wanted[label][:, axis]
-    return Curves("moved from the start [mm], dashed: wanted", values, wanted)
+    return Curves("moved from the start [mm], dashed: wanted", values, wanted, span=scale)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import shutil
@@ -17,13 +18,14 @@ from jaxtyping import Float
 from PIL import Image
 
 from ..robot import Robot
+from ._look import Look
 from ._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
+from ._outline import floor_height
 from ._overlay import Canvas, ComMark, CurvePanel, PlanPanel, polygon_layer
 from ._parts import RobotParts, Style, robot_parts
 from ._raycast import RayCaster
 from ._scene import BLUE, INK
-from ._shapes import robot_surface
 from ._stage import Stage, frame_camera
 
 Polygons = Sequence[Float[np.ndarray, "m 2"]]
@@ -37,11 +39,13 @@ class Curves:
         title: its title, with the unit.
         values: name to one value a configuration. Each (T,)
         wanted: the same for what the controller was asked for, drawn dashed.
+        span: the axis shows this much at least.
     """
 
     title: str
     values: Mapping[str, Float[np.ndarray, " T"]]
     wanted: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
+    span: float = 1e-3
 
 
 def animate(
@@ -54,6 +58,7 @@ def animate(
     size: tuple[int, int] = (720, 405),
     renderer: RendererName = "auto",
     style: Style = "auto",
+    look: Look | None = None,
     support: Polygons | Float[np.ndarray, "m 2"] | None = None,
     trails: Sequence[str] = (),
     curves: Curves | None = None,
@@ -72,7 +77,8 @@ def animate(
         frames_per_second: at most so many pictures a second are taken from ``q``.
         size: width and height [pixels].
         renderer: ``"mujoco"`` (OpenGL), ``"raycast"`` (CPU), or ``"auto"``: the first of them that works.
-        style: ``"geoms"``, ``"sticks"``, or ``"auto"``.
+        style: ``"geoms"``, ``"sticks"``, or ``"auto"``: the look, else geoms, else sticks.
+        look: what the robot's URDF shows, from ``read_look``.
         support: vertices of the support polygon [m], one (m, 2) for all times or one a configuration. With it, the
             centre of mass is drawn too, and a panel shows both from above.
         trails: frames whose paths are drawn.
@@ -87,6 +93,7 @@ def animate(
 
     Raises:
         ValueError: the suffix is neither .gif nor .mp4, or ffmpeg is missing for .mp4.
+        OSError: the file cannot be written.
         RuntimeError: ``renderer="mujoco"`` where OpenGL does not work.
     """
     path = Path(path)
@@ -100,7 +107,7 @@ def animate(
         ticks * dt,
         size,
         renderer,
-        style,
+        robot_parts(robot, style=style, look=look),
         _each(support, ticks),
         trails,
         curves,
@@ -132,12 +139,6 @@ def _each(support: Polygons | Float[np.ndarray, "m 2"] | None, ticks: np.ndarray
     return [np.asarray(support[min(tick, len(support) - 1)]) for tick in ticks]
 
 
-def floor_height(robot: Robot, shape: RobotParts, data: mujoco.MjData) -> float:
-    """Where to put the floor [m]: under the robot's lowest point, or at 0 for a robot that is bolted down above it."""
-    lowest = float(robot_surface(shape, data, 4)[0][..., 2].min())
-    return lowest if robot.floating_base else min(0.0, lowest)
-
-
 class _Film:
     """Everything about an animation that does not change between pictures."""
 
@@ -149,7 +150,7 @@ class _Film:
         time: np.ndarray,
         size: tuple[int, int],
         renderer: RendererName,
-        style: Style,
+        shape: RobotParts,
         support: Polygons | None,
         trails: Sequence[str],
         curves: Curves | None,
@@ -158,15 +159,14 @@ class _Film:
         elevation: float,
     ) -> None:
         self._robot, self._q, self._size, self._time = robot, q[ticks], size, time
-        self._shape = robot_parts(robot, style=style)
+        self._shape = shape
         self._support = support
         points, com, paths = self._survey(trails)
         self._com, self._paths = com, paths
         panels = (support is not None) + (curves is not None)
-        self._floor = floor_height(robot, self._shape, next(mujoco_poses(robot, self._q[0])))
-        window = (0.04, 0.56 if panels else 0.96, 0.06, 0.95)
-        radii = np.tile(self._shape.radii, len(self._q))
-        self._camera = frame_camera(points, radii, size, azimuth, elevation, window)
+        self._floor = floor_height(robot, shape, mujoco_poses(robot, self._q))
+        window = (0.04, 0.54 if panels else 0.96, 0.10 if caption else 0.04, 0.92)
+        self._camera = frame_camera(np.concatenate([points, self._on_floor()]), size, azimuth, elevation, window)
         self._stage = Stage([self._shape], self._camera, floor=self._floor)
         self._renderer = make_renderer(renderer, self._stage, self._camera, size, floor=self._floor)
         self._canvas = Canvas(size)
@@ -176,17 +176,23 @@ class _Film:
         self._under: tuple[Float[np.ndarray, "m 2"], np.ndarray] | None = None
 
     def _survey(self, trails: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """All part positions, the centres of mass and the trails' points, over the motion."""
+        """All that a camera has to see, the centres of mass and the trails' points, over the motion."""
         points, com, paths = [], [], []
         for data in mujoco_poses(self._robot, self._q):
-            points.append(self._shape.poses(data)[0])
+            points.append(self._shape.corners(data))
             com.append(robot_com(self._robot, data))
             paths.append([mujoco_frame_pose(self._robot, data, name)[0] for name in trails])
-        return np.concatenate(points), np.array(com), list(np.swapaxes(np.array(paths), 0, 1)) if trails else []
+        seen = np.concatenate([*points, *(place for place in paths if len(place))])
+        return seen, np.array(com), list(np.swapaxes(np.array(paths), 0, 1)) if trails else []
+
+    def _on_floor(self) -> Float[np.ndarray, "points 3"]:
+        """Corners of the support polygons."""
+        corners = np.concatenate([np.zeros((0, 2)), *(self._support or ())])
+        return np.column_stack([corners, np.full(len(corners), self._floor)])
 
     def _add_text(self, caption: str) -> None:
         scale = self._size[1] / 450
-        self._canvas.page.text(16, 26 * scale, caption, fontsize=11 * scale, color=INK, weight="bold")
+        self._canvas.title(16, 26 * scale, caption, fontsize=11 * scale)
         self._clock = self._canvas.page.text(
             16, self._size[1] - 14 * scale, "", fontsize=9 * scale, color=INK, family="monospace"
         )
@@ -207,8 +213,9 @@ class _Film:
         if curves is not None:
             values, wanted = ({k: v[ticks] for k, v in group.items()} for group in (curves.values, curves.wanted))
             bottom = 0.115 if self._support is not None else 0.32
+            place = (0.60, bottom, 0.38, 0.29)
             self._panels.append(
-                CurvePanel(self._canvas, (0.60, bottom, 0.38, 0.29), curves.title, self._time, values, wanted)
+                CurvePanel(self._canvas, place, curves.title, self._time, values, wanted, span=curves.span)
             )
 
     def pictures(self, progress: Callable[[float], None]) -> Iterator[np.ndarray]:
@@ -272,10 +279,13 @@ def write_gif(path: Path, pictures: Iterable[np.ndarray], period: float) -> None
 def _write_mp4(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], rate: float) -> None:
     command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{rate:g}", "-i", "-", "-pix_fmt", "yuv420p", str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
-        assert process.stdin is not None
-        for picture in pictures:
-            process.stdin.write(picture.tobytes())
-        process.stdin.close()
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        with contextlib.suppress(BrokenPipeError):  # where it has ended early, it says why
+            for picture in pictures:
+                process.stdin.write(picture.tobytes())
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        said = process.stderr.read().decode(errors="replace").split("\n")
     if process.returncode:
-        raise RuntimeError(f"ffmpeg ended with code {process.returncode}")
+        raise OSError(f"ffmpeg could not write {path}: {' '.join(filter(None, said)) or process.returncode}")

@@ -14,9 +14,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ..robot import Robot
-from ._animate import floor_height, paint_over
+from ._animate import paint_over
+from ._look import Look
 from ._mujoco import mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
+from ._outline import floor_height
 from ._overlay import Canvas, ComMark, polygon_layer
 from ._parts import robot_parts
 from ._scene import INK
@@ -24,6 +26,8 @@ from ._stage import Camera, Stage, frame_camera
 
 SCHEME_COLORS = ("#f08c3a", "#8a8f98", "#1565c0", "#2a9d62", "#7b3fa0")
 _BAD = "#d7263d"
+_LONG_LENS = 10.0
+"""Robots in a row look alike from afar."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +41,7 @@ class Panel:
         bound: a line that should not be crossed, and
         above: whether the good side is above it.
         bound_label: what the line means.
+        span: a linear axis shows this much at least, so that rounding errors of a constant do not look like curves.
     """
 
     title: str
@@ -45,6 +50,7 @@ class Panel:
     bound: float | None = None
     above: bool = False
     bound_label: str = ""
+    span: float = 1e-3
 
 
 def compare_figure(
@@ -90,12 +96,21 @@ def _draw_panel(axes: Axes, time: np.ndarray, panel: Panel, palette: Mapping[str
         axes.plot(time[: len(shown)], shown, color=palette[name], lw=width, zorder=3 + order, label=name)
     if panel.floor is not None:
         axes.set_yscale("log")
-        axes.set_ylim(bottom=panel.floor)
+        axes.set_ylim(panel.floor, max(axes.get_ylim()[1], 100.0 * panel.floor))
+    else:
+        _widen(axes, panel.span)
     if panel.bound is not None:
         _draw_bound(axes, panel)
     axes.set_xlim(time[0], time[-1])
     axes.set_xlabel("time [s]", fontsize=9, color=INK)
     _tidy(axes)
+
+
+def _widen(axes: Axes, span: float) -> None:
+    """Makes the axis show so much at least, about the middle of what it shows."""
+    low, high = axes.get_ylim()
+    more = max(span - (high - low), 0.0)
+    axes.set_ylim(low - 0.5 * more, high + 0.5 * more)
 
 
 def _draw_bound(axes: Axes, panel: Panel) -> None:
@@ -166,6 +181,7 @@ def hero_picture(
     *,
     support: Sequence[Float[np.ndarray, "m 2"]] | None = None,
     labels: Sequence[str] = (),
+    look: Look | None = None,
     spacing: float | None = None,
     size: tuple[int, int] = (1600, 720),
     azimuth: float = 20.0,
@@ -180,19 +196,21 @@ def hero_picture(
         configurations: one a figure, left to right. Each (nq,)
         support: of each, the vertices of its support polygon [m]; with it the centre of mass is drawn.
         labels: a line below each.
+        look: what the robot's URDF shows, from ``read_look``.
         spacing: between neighbours' middles [m]; ``None``: a little more than the widest is wide.
         size: width and height [pixels].
         azimuth: of the camera about the vertical, 0 from +x [deg].
         elevation: of the camera above the horizon [deg].
         renderer: as in ``animate``.
     """
-    shape = robot_parts(robot)
+    shape = robot_parts(robot, look=look)
     sources = [next(mujoco_poses(robot, q)) for q in configurations]
-    floor = floor_height(robot, shape, sources[0])
-    shifts = _side_by_side([shape.poses(source)[0] for source in sources], shape.radii, azimuth, spacing)
-    balls = np.concatenate([shape.poses(source)[0] + shift for source, shift in zip(sources, shifts, strict=True)])
+    floor = floor_height(robot, shape, sources)
+    corners = [shape.corners(source) for source in sources]
+    shifts = _side_by_side(corners, azimuth, spacing)
+    seen = [points + shift for points, shift in zip(corners, shifts, strict=True)]
     window = (0.03, 0.97, 0.05, 0.90 if labels else 0.95)
-    camera = frame_camera(balls, np.tile(shape.radii, len(sources)), size, azimuth, elevation, window)
+    camera = frame_camera(np.concatenate(seen), size, azimuth, elevation, window, lens=_LONG_LENS)
     stage = Stage([shape] * len(sources), camera, floor=floor)
     data = stage.pose(sources, shifts)
     drawer = make_renderer(renderer, stage, camera, size, floor=floor)
@@ -201,8 +219,9 @@ def hero_picture(
     canvas = Canvas(size, scale=size[1] / 450)
     for source, shift in zip(sources if support else (), shifts, strict=False):
         ComMark(canvas, camera, floor=floor, moving=False).place(robot_com(robot, source) + shift)
-    for label, source, shift in zip(labels, sources, shifts, strict=False):
-        x, _ = camera.project(shape.poses(source)[0].mean(0) * [1.0, 1.0, 0.0] + shift, size)
+    for label, points in zip(labels, seen, strict=False):
+        across = camera.project(points, size)[:, 0]
+        x = 0.5 * (across.min() + across.max())
         canvas.page.text(x, size[1] - 0.035 * size[1], label, ha="center", fontsize=10, color=INK)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(paint_over(base, canvas.picture())).save(path, optimize=True)
@@ -210,12 +229,12 @@ def hero_picture(
 
 
 def _side_by_side(
-    instants: Sequence[Float[np.ndarray, "n 3"]], radii: Float[np.ndarray, " n"], azimuth: float, spacing: float | None
+    instants: Sequence[Float[np.ndarray, "n 3"]], azimuth: float, spacing: float | None
 ) -> Float[np.ndarray, "k 3"]:
     """Moves on the floor that put robots in a row across the camera's view, their middles evenly spaced."""
     right = Camera((0.0, 0.0, 0.0), 1.0, azimuth, 0.0, 1.0).axes[0]
-    low = np.array([(points @ right - radii).min() for points in instants])
-    high = np.array([(points @ right + radii).max() for points in instants])
-    gap = spacing or 1.04 * float((high - low).max())
+    low = np.array([(points @ right).min() for points in instants])
+    high = np.array([(points @ right).max() for points in instants])
+    gap = spacing or 1.08 * float((high - low).max())
     places = gap * (np.arange(len(instants)) - 0.5 * (len(instants) - 1))
     return (places - 0.5 * (low + high))[:, None] * right

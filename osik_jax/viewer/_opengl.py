@@ -9,10 +9,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ._raster import Rasterizer
 from ._raycast import Image, RayCaster
 from ._stage import Camera, Stage
 
 RendererName = Literal["auto", "mujoco", "raycast"]
+_MANY = 1000
+"""Triangles of meshes from which on they are drawn one by one, and no rays are cast."""
 
 _GL_ERRORS = (mujoco.FatalError, ImportError, AttributeError, OSError, RuntimeError)
 """What MuJoCo's renderer raises without a GL library, without a screen, or with a broken driver."""
@@ -70,7 +73,9 @@ class GlRenderer:
 
 
 def make_renderer(name: RendererName, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float) -> Renderer:
-    """MuJoCo's renderer (``"mujoco"``), the ray caster (``"raycast"``), or the first of them that works (``"auto"``).
+    """MuJoCo's renderer (``"mujoco"``), one on the CPU (``"raycast"``), or the first of them that works (``"auto"``).
+
+    On the CPU rays are cast, unless there are meshes of so many triangles that drawing those is faster.
 
     Raises:
         RuntimeError: ``"mujoco"`` where OpenGL does not work.
@@ -81,7 +86,8 @@ def make_renderer(name: RendererName, stage: Stage, camera: Camera, size: tuple[
         except RuntimeError:
             if name == "mujoco":
                 raise
-    return RayCaster(stage, camera, size, floor=floor)
+    triangles = sum(len(part.mesh[1]) for part in stage.parts if part.mesh is not None)
+    return (Rasterizer if triangles > _MANY else RayCaster)(stage, camera, size, floor=floor)
 
 
 def check_opengl() -> None:

@@ -42,6 +42,12 @@ class Canvas:
         axes.set_ylim(self.size[1], 0)
         return axes
 
+    def title(self, x: float, y: float, words: str, fontsize: float) -> None:
+        """A bold line from (x, y) on, smaller where it would not end in the picture."""
+        text = self.page.text(x, y, words, fontsize=fontsize, color=INK, weight="bold")
+        width = text.get_window_extent(self._canvas.get_renderer()).width
+        text.set_fontsize(fontsize * min(1.0, (self.size[0] - 2.0 * x) / max(width, 1.0)))
+
     def moving(self, artist: Artist) -> None:
         """Marks an artist as one that changes between pictures."""
         artist.set_animated(True)
@@ -120,7 +126,8 @@ class PlanPanel:
         self._com, self._support = 1e3 * com, [1e3 * vertices for vertices in support]
         axes = card(canvas, rectangle, "support and centre of mass from above [mm]")
         points = np.concatenate([self._com[:, :2], *self._support])
-        low, high = points.min(0) - 12.0, points.max(0) + 12.0
+        room = 0.06 * np.ptp(points, axis=0).max()
+        low, high = points.min(0) - room, points.max(0) + room
         axes.set_aspect("equal", adjustable="box", anchor="W")
         axes.set_xlim(high[1], low[1])
         axes.set_ylim(low[0], high[0])
@@ -154,14 +161,17 @@ class CurvePanel:
         time: Float[np.ndarray, " frames"],
         curves: Mapping[str, Float[np.ndarray, " frames"]],
         wanted: Mapping[str, Float[np.ndarray, " frames"]],
+        *,
+        span: float,
     ) -> None:
-        """Draws the still part; every curve has one value a frame."""
+        """Draws the still part; every curve has one value a frame, and the axis shows so much at least."""
         self._time, self._curves, self._lines = time, list(curves.values()), []
         axes = card(canvas, rectangle, title)
         values = np.concatenate([*curves.values(), *wanted.values()])
-        room = max(np.ptp(values), 1e-9)
+        room = max(np.ptp(values), span)
+        middle = 0.5 * (values.min() + values.max())
         axes.set_xlim(time[0], time[-1])
-        axes.set_ylim(values.min() - 0.08 * room, values.max() + 0.42 * room)
+        axes.set_ylim(middle - 0.58 * room, middle + 0.92 * room)
         axes.set_xlabel("time [s]", fontsize=7.5, color=INK, labelpad=1)
         for values, color in zip(wanted.values(), _CURVE_COLORS, strict=False):
             axes.plot(time, values, color=color, lw=1.0, ls=(0, (3, 2)), alpha=0.65)

@@ -1,15 +1,20 @@
-"""What a robot looks like: its geoms, or sticks where it has none, placed by MuJoCo's kinematics."""
+"""What a robot looks like: what its URDF shows, its geoms, or else sticks, placed by MuJoCo's kinematics."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
+from collections.abc import Sequence
 from typing import Literal
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull, QhullError
 
 from ..robot import Robot
+from ._look import Look
 from ._mujoco import model_bodies, mujoco_poses
 
 Style = Literal["auto", "geoms", "sticks"]
@@ -39,7 +44,7 @@ class Part:
     """One shape of a robot.
 
     Attributes:
-        index: which row of ``RobotParts.poses`` places it.
+        index: of the geom, the link or the stick that it is.
         kind: MuJoCo's geom type.
         size: MuJoCo's geom sizes [m]. (3,)
         color: red, green, blue, alpha. (4,)
@@ -52,22 +57,35 @@ class Part:
     color: np.ndarray
     mesh: tuple[np.ndarray, np.ndarray] | None = None
 
-    @property
-    def radius(self) -> float:
-        """Of a ball about its origin that holds it [m]."""
-        if self.mesh is not None:
-            return float(np.linalg.norm(self.mesh[0], axis=-1).max())
+    @functools.cached_property
+    def corners(self) -> Float[np.ndarray, "8 3"]:
+        """Of a box about it, in its own frame [m]."""
+        if self.mesh is None:
+            low, high = -self._half_edges(), self._half_edges()
+        else:
+            low, high = self.mesh[0].min(0), self.mesh[0].max(0)
+        return np.array(list(itertools.product(*zip(low, high, strict=True))))
+
+    @functools.cached_property
+    def hull(self) -> Float[np.ndarray, "k 3"]:
+        """Of a mesh: the points that can be its outermost, in its own frame [m]."""
+        vertices = np.zeros((0, 3)) if self.mesh is None else self.mesh[0]
+        try:
+            return vertices[ConvexHull(vertices).vertices]
+        except (QhullError, ValueError):  # flat, or hardly any points
+            return vertices
+
+    def _half_edges(self) -> Float[np.ndarray, "3"]:
+        radius, length, _ = self.size
         match self.kind:
             case _GEOM.mjGEOM_SPHERE:
-                return float(self.size[0])
+                return np.full(3, radius)
             case _GEOM.mjGEOM_CAPSULE:
-                return float(self.size[0] + self.size[1])
-            case _GEOM.mjGEOM_ELLIPSOID:
-                return float(self.size.max())
+                return np.array([radius, radius, radius + length])
             case _GEOM.mjGEOM_CYLINDER:
-                return float(np.hypot(self.size[0], self.size[1]))
+                return np.array([radius, radius, length])
             case _:
-                return float(np.linalg.norm(self.size))
+                return np.asarray(self.size, float)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,23 +94,43 @@ class RobotParts:
 
     Attributes:
         model: the MuJoCo model.
-        style: ``"geoms"`` or ``"sticks"``.
+        style: ``"look"``, ``"geoms"`` or ``"sticks"``.
         parts: the shapes.
         tips: of sticks: bodies without children, and of each the farthest named point in its frame [m].
+        anchors: of a look: the body of each part, and the part's position and rotation in it.
     """
 
     model: mujoco.MjModel
-    style: Literal["geoms", "sticks"]
+    style: Literal["look", "geoms", "sticks"]
     parts: tuple[Part, ...]
     tips: tuple[np.ndarray, np.ndarray]
+    anchors: tuple[np.ndarray, np.ndarray, np.ndarray] = (np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
     @property
-    def radii(self) -> Float[np.ndarray, " parts"]:
-        """Of balls about the parts' origins that hold them [m]."""
-        return np.array([part.radius for part in self.parts])
+    def bodies(self) -> Int[np.ndarray, " parts"]:
+        """What each part moves with: MuJoCo's index of the body."""
+        index = np.array([part.index for part in self.parts], int)
+        match self.style:
+            case "look":
+                return self.anchors[0]
+            case "geoms":
+                return self.model.geom_bodyid[index]
+            case _:
+                ends = np.concatenate([np.arange(self.model.nbody), self.model.body_parentid, self.tips[0]])
+                return ends[index]
+
+    def corners(self, data: mujoco.MjData) -> Float[np.ndarray, "points 3"]:
+        """Corners of boxes about the parts, in the world [m]: what a camera has to see."""
+        position, rotation = self.poses(data)
+        own = np.array([part.corners for part in self.parts])
+        return (np.einsum("pij,pkj->pki", rotation, own) + position[:, None]).reshape(-1, 3)
 
     def poses(self, data: mujoco.MjData) -> tuple[Float[np.ndarray, "parts 3"], Float[np.ndarray, "parts 3 3"]]:
         """Positions [m] and rotations of the parts in the world, as ``mj_kinematics`` left them in ``data``."""
+        if self.style == "look":
+            bodies, shift, turn = self.anchors
+            frames = data.xmat.reshape(-1, 3, 3)[bodies]
+            return data.xpos[bodies] + np.einsum("pij,pj->pi", frames, shift), frames @ turn
         if self.style == "geoms":
             position, rotation = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3)
         else:
@@ -103,31 +141,60 @@ class RobotParts:
         return position[index], rotation[index]
 
 
-def robot_parts(robot: Robot, *, style: Style = "auto") -> RobotParts:
+def robot_parts(robot: Robot, *, style: Style = "auto", look: Look | None = None) -> RobotParts:
     """The shapes of a robot.
 
     Args:
         robot: the robot.
-        style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``:
-            geoms where most of the bodies that move have a visible one.
+        style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the look,
+            else the geoms, of which most of the bodies that move have a visible one, else sticks.
+        look: what its URDF shows.
 
     Raises:
-        ValueError: ``style="geoms"`` of a model that has no visible geom.
+        ValueError: ``style="geoms"`` of a model that has no visible geom, or a look of another robot.
     """
-    model = robot.mj_model
+    model, tips = robot.mj_model, _tips(robot)
+    if look is not None and style == "auto":
+        bodies = _link_bodies(model, look)
+        if _cover(model, bodies):
+            return _look_parts(model, look, bodies, tips)
     geoms = () if style == "sticks" else tuple(_geom_part(model, g) for g in _visible_geoms(model))
-    if geoms and (style == "geoms" or _cover(model, geoms)):
-        return RobotParts(model, "geoms", geoms, _tips(robot))
+    if geoms and (style == "geoms" or _cover(model, [model.geom_bodyid[part.index] for part in geoms])):
+        return RobotParts(model, "geoms", geoms, tips)
     if style == "geoms":
         raise ValueError("the model has no geom to draw; use style='sticks'")
-    tips = _tips(robot)
     return RobotParts(model, "sticks", _sticks(robot, tips), tips)
 
 
-def _cover(model: mujoco.MjModel, geoms: tuple[Part, ...]) -> bool:
-    """Whether two thirds of the bodies with joints have a geom, on themselves or on what is fixed to them."""
-    drawn = {int(model.body_weldid[model.geom_bodyid[part.index]]) for part in geoms}
-    moving = {int(body) for body in np.flatnonzero(model.body_jntnum)}
+def _link_bodies(model: mujoco.MjModel, look: Look) -> list[int]:
+    """The body of each shape."""
+    bodies = {name: mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in {s.link for s in look.shapes}}
+    strange = sorted(name for name, body in bodies.items() if body < 0)
+    if strange:
+        raise ValueError(f"the look is another robot's: this one has no links {', '.join(strange)}")
+    return [bodies[shape.link] for shape in look.shapes]
+
+
+def _look_parts(
+    model: mujoco.MjModel, look: Look, bodies: list[int], tips: tuple[np.ndarray, np.ndarray]
+) -> RobotParts:
+    parts = tuple(
+        Part(k, shape.kind, shape.size, _PLAIN if shape.color is None else np.asarray(shape.color), shape.mesh)
+        for k, shape in enumerate(look.shapes)
+    )
+    places = np.array([s.position for s in look.shapes]), np.array([s.rotation for s in look.shapes])
+    return RobotParts(model, "look", parts, tips, (np.array(bodies), *places))
+
+
+def _cover(model: mujoco.MjModel, bodies: Sequence[int]) -> bool:
+    """Whether two thirds of the bodies that move are among these, or have one of these fixed to them.
+
+    A body that only joins another to its own place, such as one of three that make a ball joint, does not count.
+    """
+    drawn = {int(model.body_weldid[body]) for body in bodies}
+    children = [np.flatnonzero(model.body_parentid == body) for body in range(model.nbody)]
+    apart = [not len(below) or np.any(model.body_pos[below]) for below in children]
+    moving = {int(body) for body in np.flatnonzero(model.body_jntnum) if apart[body]}
     return 3 * len(drawn & moving) >= 2 * len(moving)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import mujoco
@@ -49,7 +50,7 @@ class RayCaster:
             data: from ``Stage.pose``.
             under: red, green, blue and alpha from 0 to 1, alpha not multiplied in.
         """
-        picture = self._background * self._shadow(data)[..., None]
+        picture = self._background * self._shadow(data, lambda points: self._lit(data, points))[..., None]
         if under is not None:
             picture += under[..., 3:] * (under[..., :3] - picture)
         rows, columns = np.nonzero(self._near_robots(data))
@@ -110,16 +111,12 @@ class RayCaster:
         if not len(seen):
             return color
         n, ray = hits.normal[seen], rays[seen]
+        n = n * np.where(np.sum(n * ray, -1, keepdims=True) > 0.0, -1.0, 1.0)  # meshes may be turned inside out
         point = self.camera.eye + hits.distance[seen, None] * ray
-        lamp = np.clip(n @ TO_LAMP, 0.0, 1.0)
-        turned = np.flatnonzero(lamp)  # only these faces can be in another part's shadow
-        lamp[turned] *= self._lit(data, (point + 1e-3 * self.camera.height * n)[turned])
-        half = TO_LAMP - ray
-        half /= np.linalg.norm(half, axis=-1, keepdims=True)
-        shine = np.clip(np.sum(n * half, -1), 0.0, 1.0) ** 40 * (lamp > 0.0)
-        facing = np.clip(-np.sum(n * ray, -1), 0.0, 1.0)
-        light = 0.40 + 0.13 * n[:, 2] + 0.40 * lamp + 0.14 * facing
-        color[seen] = np.clip(self.stage.colors[hits.geom[seen] - 1] * light[:, None] + 0.16 * shine[:, None], 0.0, 1.0)
+        lit = np.zeros(len(seen))
+        turned = np.flatnonzero(n @ TO_LAMP > 0.0)  # only these faces can be in another part's shadow
+        lit[turned] = self._lit(data, (point + 1e-3 * self.camera.height * n)[turned])
+        color[seen] = light(self.stage.colors[hits.geom[seen] - 1], n, ray, lit)
         return color
 
     def _lit(self, data: mujoco.MjData, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
@@ -129,8 +126,15 @@ class RayCaster:
         hits = self._cast(data, self._lamp, way / length[:, None])
         return (hits.geom < 0) | (hits.distance > length)
 
-    def _shadow(self, data: mujoco.MjData) -> Float[np.ndarray, "height width"]:
-        """How much of the light each pixel of the floor keeps; shadows have soft edges."""
+    def _shadow(
+        self, data: mujoco.MjData, lit: Callable[[Float[np.ndarray, "n 3"]], np.ndarray]
+    ) -> Float[np.ndarray, "height width"]:
+        """How much of the light each pixel of the floor keeps; shadows have soft edges.
+
+        Args:
+            data: from ``Stage.pose``.
+            lit: how much of the lamp each point [m] sees, 0 to 1.
+        """
         center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:, None]
         way = center - self._lamp
         foot = self._lamp + way * ((self._floor - self._lamp[2]) / way[:, 2:])
@@ -138,7 +142,7 @@ class RayCaster:
         step = (high - low) / (_SHADOW_MAP - 1)
         i, j = np.mgrid[:_SHADOW_MAP, :_SHADOW_MAP]
         grid = np.stack([low[0] + i * step[0], low[1] + j * step[1], np.full(i.shape, self._floor)], -1)
-        dark = 1.0 - self._lit(data, grid.reshape(-1, 3)).reshape(i.shape)
+        dark = 1.0 - lit(grid.reshape(-1, 3)).reshape(i.shape)
         soft = ndimage.gaussian_filter(dark, 0.012 * self.camera.height / step)
         place = np.moveaxis((self._ground - low) / step, -1, 0)
         keep = np.ones(self._ground.shape[:2], np.float32)
@@ -167,6 +171,29 @@ class RayCaster:
         distance = np.linalg.norm(point - np.asarray(self.camera.center[:2]), axis=-1) / self.camera.height
         fade = np.clip(distance / 2.2, 0.0, 1.0)[:, None]
         return _TILES[tile] + fade * (_WHITE - _TILES[tile])
+
+
+def light(
+    colors: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    rays: Float[np.ndarray, "n 3"],
+    lit: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
+    """Colours of points under a bright sky and one lamp.
+
+    Args:
+        colors: of their surfaces. (n, 3)
+        normals: unit vectors, towards the camera. (n, 3)
+        rays: unit vectors from the camera. (n, 3)
+        lit: how much of the lamp each sees, 0 to 1. (n,)
+    """
+    lamp = lit * np.clip(normals @ TO_LAMP, 0.0, 1.0)
+    half = TO_LAMP - rays
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    shine = np.clip(np.sum(normals * half, -1), 0.0, 1.0) ** 40 * (lamp > 0.0)
+    facing = np.clip(-np.sum(normals * rays, -1), 0.0, 1.0)
+    shades = 0.40 + 0.13 * normals[:, 2] + 0.40 * lamp + 0.14 * facing
+    return np.clip(colors * shades[:, None] + 0.16 * shine[:, None], 0.0, 1.0)
 
 
 def _round_length(value: float) -> float:

@@ -115,3 +115,28 @@ def robot_surface(shape: RobotParts, data: mujoco.MjData, detail: int) -> tuple[
     ]
     colors = np.repeat([part.color for part in shape.parts], [len(quads) for quads in surfaces], axis=0)
     return np.concatenate(placed), colors
+
+
+def lowest_points(shape: RobotParts, data: mujoco.MjData) -> Float[np.ndarray, " parts"]:
+    """Of each part, the height of its lowest point in the world [m]; exact of meshes, boxes and round shapes."""
+    position, rotation = shape.poses(data)
+    down = -rotation[:, 2]  # in each part's frame
+    return position[:, 2] - np.array([_reach(part, way) for part, way in zip(shape.parts, down, strict=True)])
+
+
+def _reach(part: Part, way: Float[np.ndarray, "3"]) -> float:
+    """How far the part goes from its origin along a unit vector [m]."""
+    if part.mesh is not None:
+        return float((part.hull @ way).max())
+    radius, length, _ = part.size
+    match part.kind:
+        case _GEOM.mjGEOM_SPHERE:
+            return float(radius)
+        case _GEOM.mjGEOM_CAPSULE:
+            return float(radius + length * abs(way[2]))
+        case _GEOM.mjGEOM_CYLINDER:
+            return float(radius * np.hypot(way[0], way[1]) + length * abs(way[2]))
+        case _GEOM.mjGEOM_ELLIPSOID:
+            return float(np.linalg.norm(part.size * way))
+        case _:
+            return float(np.abs(way) @ part.size)

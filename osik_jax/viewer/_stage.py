@@ -14,6 +14,9 @@ from ._parts import Part, RobotParts
 FLOOR_GROUP = 5
 """The floor's geom group: MuJoCo's renderer shows it, the ray caster draws its own."""
 
+LENS = 3.6
+"""How far the camera is, in heights of what it sees."""
+
 TO_LAMP = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
 
 
@@ -82,23 +85,43 @@ class Camera:
 
 def frame_camera(
     points: Float[np.ndarray, "n 3"],
-    radii: Float[np.ndarray, " n"],
     size: tuple[int, int],
     azimuth: float,
     elevation: float,
     window: tuple[float, float, float, float] = (0.04, 0.96, 0.06, 0.94),
+    lens: float = LENS,
 ) -> Camera:
-    """A camera that sees all balls [m] within a window: left, right, top and bottom as parts of the picture."""
+    """The nearest camera that sees all points [m] within a window of its picture.
+
+    Args:
+        points: what has to be seen [m]. (n, 3)
+        size: width and height of the picture [pixels].
+        azimuth: as in ``Camera``.
+        elevation: as in ``Camera``.
+        window: left, right, top and bottom as parts of the picture.
+        lens: how far the camera is, in heights of what it sees at its centre; farther means less perspective.
+    """
     left, right, top, bottom = window
     axes = Camera((0.0, 0.0, 0.0), 1.0, azimuth, elevation, 1.0).axes
-    across, up, deep = axes @ points.T
-    low = np.array([(across - radii).min(), (up - radii).min()])
-    high = np.array([(across + radii).max(), (up + radii).max()])
+    across, up, deep = axes @ np.asarray(points).T
+    middle = 0.5 * (deep.min() + deep.max())
+    behind = (deep - middle) / lens
     aspect = size[0] / size[1]
-    height = float(max((high - low) / ((right - left) * aspect, bottom - top)))
-    x, y = 0.5 * (low + high) + height * np.array([(0.5 - 0.5 * (left + right)) * aspect, 0.5 * (top + bottom) - 0.5])
-    center = np.array([x, y, 0.5 * (deep.min() + deep.max())]) @ axes
-    return Camera((float(center[0]), float(center[1]), float(center[2])), 3.6 * height, azimuth, elevation, height)
+    sides = ((left - 0.5) * aspect, (right - 0.5) * aspect), (0.5 - bottom, 0.5 - top)
+    # With the camera's centre at c, a point is seen at (x - c) / (height + behind), in heights of the picture. So it is
+    # between two sides where c lies between x - side * (height + behind) of them, which is linear in the height.
+    spans = [
+        (np.max(x - high * behind), np.min(x - low * behind))
+        for x, (low, high) in zip((across, up), sides, strict=True)
+    ]
+    tall = max((most - least) / (high - low) for (most, least), (low, high) in zip(spans, sides, strict=True))
+    height = float(max(tall, -1.5 * behind.min(), 1e-9))
+    x, y = (
+        0.5 * (most - high * height + least - low * height)
+        for (most, least), (low, high) in zip(spans, sides, strict=True)
+    )
+    center = np.array([x, y, middle]) @ axes
+    return Camera((float(center[0]), float(center[1]), float(center[2])), lens * height, azimuth, elevation, height)
 
 
 class Stage:
@@ -106,6 +129,7 @@ class Stage:
 
     Attributes:
         model: the MuJoCo model.
+        parts: of all robots; the part k is on the body k + 1.
         colors: of each geom but the floor, red, green and blue. (geoms, 3)
     """
 
@@ -119,7 +143,8 @@ class Stage:
         self._robots = tuple(robots)
         self.model = spec.compile()
         self.model.vis.global_.fovy = camera.view_angle
-        self.colors = np.array([part.color[:3] for robot in robots for part in robot.parts])
+        self.parts = tuple(part for robot in robots for part in robot.parts)
+        self.colors = np.array([part.color[:3] for part in self.parts]).reshape(-1, 3)
 
     def pose(
         self, poses: Sequence[mujoco.MjData], offsets: Float[np.ndarray, "robots 3"] | None = None
@@ -142,12 +167,13 @@ class Stage:
 def _add_part(spec: mujoco.MjSpec, part: Part) -> None:
     body = spec.worldbody.add_body(mocap=True)
     if part.mesh is None:
-        body.add_geom(type=part.kind, size=part.size, rgba=part.color)
+        body.add_geom(type=part.kind, size=part.size, rgba=part.color, contype=0, conaffinity=0)
         return
     name = f"mesh{len(spec.meshes)}"
     vertices, faces = part.mesh
-    spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
-    body.add_geom(type=part.kind, meshname=name, rgba=part.color)
+    mesh = spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # the others want a closed surface
+    body.add_geom(type=part.kind, meshname=name, rgba=part.color, contype=0, conaffinity=0)
 
 
 def _add_surroundings(spec: mujoco.MjSpec, camera: Camera, floor: float) -> None:
@@ -196,5 +222,6 @@ def _add_surroundings(spec: mujoco.MjSpec, camera: Camera, floor: float) -> None
     spec.visual.headlight.specular[:] = 0.0
     spec.visual.quality.shadowsize, spec.visual.map.shadowclip = 4096, 4.0 * camera.height
     spec.visual.map.fogstart, spec.visual.map.fogend = 4.5 * camera.height, 11.0 * camera.height
+    spec.visual.map.znear, spec.visual.map.zfar = 0.1 * camera.height, 40.0 * camera.height
     spec.visual.rgba.fog[:] = 1.0
     spec.stat.extent = 1.0  # the lengths of visual.map are multiples of it

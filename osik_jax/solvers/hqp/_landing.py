@@ -128,9 +128,7 @@ def noise(task: Task, x: Float[Array, " n"], slack: Float[Array, " m"], toleranc
     return task.size * rounding(task, x, slack, tolerances)
 
 
-def rounding(
-    task: Task, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances
-) -> Float[Array, ""]:
+def rounding(task: Task, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances) -> Float[Array, ""]:
     """Changes of the level's rows under this are noise."""
     return tolerances.step * (task.size * jnp.max(jnp.abs(x)) + task.missing(x, slack))
 

@@ -116,9 +116,7 @@ def _advance(task: Task, s: LevelState, step: Float[Array, " n"], tolerances: To
     return s._replace(x=x, side=side, stalled=stalled)
 
 
-def _line_search(
-    value: Array, rate: Array, lower: Array, upper: Array, along: Float[Array, "2"]
-) -> Float[Array, ""]:
+def _line_search(value: Array, rate: Array, lower: Array, upper: Array, along: Float[Array, "2"]) -> Float[Array, ""]:
     """Exact minimiser t >= 0 of 1/2 |dist(value + t rate, [lower, upper])|^2 + along_0 t + 1/2 along_1 t^2.
 
     That is a convex piecewise quadratic, along the damping's part of it.

@@ -1,0 +1,140 @@
+"""Twelve robots of example-robot-data through ``osik demo --robot``: pictures on one sheet, and what was reached.
+
+    python -m benchmarks.contact_sheet [--robots ur5,panda] [--out sheet] [--write]
+
+runs the command for each robot and keeps its folder in ``--out``. ``--write`` puts the table into docs/robots.md and
+the sheet into docs/images.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from PIL import Image
+
+import osik_jax as osik
+from osik_jax import cli, viewer
+
+from .command_line import listed
+from .robots_table import PAGE, ROBOTS, file_of, load, write
+
+SHEET = PAGE.parent / "images" / "robots.png"
+START, END = "<!-- table of demonstrations -->\n", "<!-- end of the demonstrations -->\n"
+HEAD = (
+    "robot", "base", "dofs", "scheme", "what moves", "off its path [mm]", "once there [mm]", "feet drift [mm]",
+    "limits broken", "ticks solved", "CPU time [s]",
+)  # fmt: skip
+NAMES = (
+    "ur5", "panda", "so101", "baxter", "tiago", "talos", "icub", "g1", "romeo", "anymal_b", "solo12", "go1",
+)  # fmt: skip
+SCHEME = "hierarchical"
+DURATION = 4.0
+TILE, COLUMNS = (400, 330), 4
+
+
+class Row(NamedTuple):
+    """A robot's line: ``goal`` and ``figures`` are those of its report."""
+
+    name: str
+    robot: osik.Robot
+    goal: str
+    figures: dict[str, Any]
+    seconds: float
+
+    def text(self) -> str:
+        """As Markdown."""
+        goal, limits, status = (self.figures[key] for key in ("goals", "limits", "solver"))
+        feet = [figures["position_mm"] for figures in self.figures["standing"].values()]
+        solved = status["status"]["SOLVED"]
+        cells = (
+            self.name,
+            "floating" if self.robot.floating_base else "fixed",
+            self.robot.nv,
+            SCHEME,
+            self.goal,
+            f"{goal[self.goal]['position_mm']:.2g}",
+            f"{goal[self.goal]['settled_position_mm']:.2g}",
+            f"{max(feet):.1g}" if feet else "-",
+            limits["position_violations"] + limits["velocity_violations"],
+            f"{solved}/{sum(status['status'].values())}",
+            f"{self.seconds:.0f}",
+        )
+        return f"| {' | '.join(map(str, cells))} |"
+
+
+def demonstrate(name: str, folder: Path) -> Row:
+    """Runs the command.
+
+    Raises:
+        RuntimeError: it failed.
+    """
+    out, started = folder / name, time.process_time()
+    words = ["demo", "--robot", str(file_of(name)), "--schemes", SCHEME, "--duration", f"{DURATION:g}"]
+    code = cli.main([*words, "--picture", "--no-animation", "--out", str(out)])
+    if code:
+        raise RuntimeError(f"osik demo ended with {code} for {name}")
+    seconds = time.process_time() - started
+    figures = json.loads((out / "report.json").read_text(encoding="utf-8"))["schemes"][SCHEME]
+    robot = load(name)
+    if robot.nq != _path(name, folder).shape[1]:  # the command bolts down what floats but has no feet
+        robot = osik.Robot.from_urdf(file_of(name), floating_base=False)
+    return Row(name, robot, next(iter(figures["goals"])), figures, seconds)
+
+
+def _path(name: str, folder: Path) -> np.ndarray:
+    return np.load(folder / name / "motion.npz")[f"q_{SCHEME}"]
+
+
+def tile(row: Row, folder: Path) -> Image.Image:
+    """The robot in the middle of its motion."""
+    path = _path(row.name, folder)
+    look = viewer.read_look(file_of(row.name))
+    picture = viewer.hero_picture(
+        folder / f"{row.name}.png", row.robot, [path[len(path) // 2]], look=look, labels=(row.name,), size=TILE
+    )
+    with Image.open(picture) as image:
+        return image.convert("RGB")
+
+
+def sheet(tiles: list[Image.Image]) -> Image.Image:
+    """All pictures, line by line."""
+    width, height = TILE
+    out = Image.new("RGB", (COLUMNS * width, -(-len(tiles) // COLUMNS) * height), "white")
+    for k, image in enumerate(tiles):
+        out.paste(image, (k % COLUMNS * width, k // COLUMNS * height))
+    return out
+
+
+def table(rows: Iterable[Row]) -> str:
+    """As Markdown."""
+    lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|", *(row.text() for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Runs all robots, and writes the sheet and, where asked to, the page."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.contact_sheet", description=__doc__)
+    parser.add_argument("--robots", type=listed(str, among=tuple(ROBOTS)), default=NAMES)
+    parser.add_argument("--out", type=Path, default=Path("contact-sheet"))
+    parser.add_argument("--write", action="store_true", help="into docs/robots.md and docs/images/robots.png")
+    given = parser.parse_args()
+    rows, tiles = [], []
+    for name in given.robots:
+        rows.append(demonstrate(name, given.out))
+        tiles.append(tile(rows[-1], given.out))
+        print(rows[-1].text(), flush=True)
+        jax.clear_caches()
+    sheet(tiles).save(SHEET if given.write else given.out / "robots.png", optimize=True)
+    if given.write:
+        write(table(rows), start=START, end=END)
+
+
+if __name__ == "__main__":
+    main()

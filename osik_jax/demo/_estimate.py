@@ -1,0 +1,65 @@
+"""How long a demonstration will take, said before it starts."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+
+import jax
+from jaxtyping import Array, Float
+
+from ..kinematics import forward_kinematics
+from ._motion import Motion
+
+_COMPILE = {"weighted": 8.0, "null-space": 5.0, "hierarchical": 12.0}
+"""How much longer a scheme's loop takes to compile than the rows of its tasks."""
+_TICK = 1e-3
+"""Running, simulating and measuring a tick [s]."""
+_SIMULATED = 4.0
+"""So many times as long with physics."""
+_PICTURE, _MESH_PICTURE = 0.15, 0.5
+"""A picture of a film, of simple shapes and of meshes, on one core [s]."""
+_PICTURES_PER_SECOND = 12.5
+
+
+def estimate_seconds(
+    motion: Motion,
+    *,
+    schemes: Sequence[str],
+    dt: float,
+    animation: bool = True,
+    physics: bool = False,
+) -> float:
+    """How long a demonstration will take here and now [s], judged by compiling a part of it.
+
+    Args:
+        motion: what to do.
+        schemes: names from ``SCHEMES``.
+        dt: control period [s].
+        animation: whether a film is drawn.
+        physics: whether MuJoCo simulates the motion.
+    """
+    reference, delay = _reference(motion)
+    compiling = reference * sum(_COMPILE[scheme] for scheme in schemes)
+    ticks = len(schemes) * motion.duration / dt * _TICK * (_SIMULATED if physics else 1.0)
+    picture = _PICTURE if motion.look is None else _MESH_PICTURE
+    pictures = min(_PICTURES_PER_SECOND, 1.0 / dt) * motion.duration if animation else 0.0
+    return compiling + delay * (ticks + pictures * picture / (os.cpu_count() or 1))
+
+
+def _reference(motion: Motion) -> tuple[float, float]:
+    """How long it takes to compile the rows of the tasks [s], which all schemes do and more.
+
+    And how many times longer that takes than this process works, as other programs want the processor too.
+    """
+
+    def rows(q: Float[Array, " nq"]) -> list[Array]:
+        kinematics = forward_kinematics(motion.robot, q)
+        parts = [task.rows(motion.robot, kinematics, q) for task in motion.tasks(0.0).values()]
+        return [part.error for part in parts] + [part.jacobian for part in parts]
+
+    start, worked = time.perf_counter(), time.process_time()
+    jax.jit(rows).lower(motion.q0).compile()
+    seconds = time.perf_counter() - start
+    return seconds, max(1.0, seconds / max(time.process_time() - worked, 1e-3))

@@ -1,0 +1,41 @@
+"""The folder that a demonstration writes to, tried before the work."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from ._motion import Motion
+
+_PICTURES = 12_000_000
+"""More than film, figure, picture and report have taken of any robot [bytes]."""
+
+
+def needed_bytes(motion: Motion, schemes: int, dt: float) -> int:
+    """Room for everything that is written, the motion before it is compressed [bytes]."""
+    steps = round(motion.duration / dt) + 1
+    return _PICTURES + 8 * steps * (1 + schemes * (motion.robot.nq + motion.robot.nv))
+
+
+def writable_folder(path: Path, room: int) -> Path:
+    """Makes the folder, and tries whether files can be written to it.
+
+    Args:
+        path: the folder.
+        room: how much has to fit [bytes].
+
+    Raises:
+        OSError: it cannot be made, nothing can be written to it, or too little room is left on its disk.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        with tempfile.TemporaryFile(dir=path) as file:
+            file.write(b"\0" * 4096)
+            file.flush()
+    except OSError as error:
+        raise OSError(f"cannot write to {path}: {error.strerror or error}") from error
+    free = shutil.disk_usage(path).free
+    if free < room:
+        raise OSError(f"{path} has {free / 1e6:.1f} MB of room left, and up to {room / 1e6:.0f} MB are needed")
+    return path

@@ -1,0 +1,205 @@
+"""COLLADA files (.dae) as triangles with colours, which MuJoCo cannot read: what robot files need of the format."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from PIL import Image
+
+_Element = ElementTree.Element
+_Color = tuple[float, float, float, float]
+
+
+class Triangles(NamedTuple):
+    """Part of a mesh that has one colour.
+
+    Attributes:
+        vertices: [m]. (k, 3)
+        faces: counter-clockwise seen from outside. (m, 3)
+        color: red, green, blue, alpha; ``None`` where the file has none.
+        y_up: whether the file says that its y axis points up; its numbers are left as they are.
+    """
+
+    vertices: Float[np.ndarray, "k 3"]
+    faces: Int[np.ndarray, "m 3"]
+    color: _Color | None
+    y_up: bool = False
+
+
+def read_collada(path: Path) -> list[Triangles]:
+    """The triangles and polygons of the scene in metres, its axes as they are, whatever ``up_axis`` says.
+
+    Skins, splines and lines are left out; of a texture, the mean colour is taken.
+
+    Raises:
+        ValueError: the file is not COLLADA, or holds nothing to draw.
+    """
+    try:
+        root = _without_namespaces(ElementTree.parse(path).getroot())
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path}: broken XML: {error}") from error
+    if root.tag != "COLLADA":
+        raise ValueError(f"{path}: the root element is <{root.tag}>, not <COLLADA>")
+    try:
+        parts = _Document(root, path).parts()
+    except (KeyError, IndexError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: broken COLLADA: {error!r}") from error
+    if not parts:
+        raise ValueError(f"{path}: no triangles in the scene")
+    return parts
+
+
+def _without_namespaces(root: _Element) -> _Element:
+    for element in root.iter():
+        if isinstance(element.tag, str):
+            element.tag = element.tag.rpartition("}")[2]
+    return root
+
+
+class _Document:
+    """A file's elements by their ids."""
+
+    def __init__(self, root: _Element, path: Path) -> None:
+        self._root, self._path = root, path
+        self._y_up = root.findtext("asset/up_axis", "Y_UP").strip() == "Y_UP"
+        self._ids = {element.get("id", ""): element for element in root.iter() if element.get("id")}
+
+    def parts(self) -> list[Triangles]:
+        """Everything that the scene shows."""
+        unit = self._root.find("asset/unit")
+        scale = np.diag([float("1" if unit is None else unit.get("meter", "1"))] * 3 + [1.0])
+        shown = self._root.find("scene/instance_visual_scene")
+        scene = self._root.find("library_visual_scenes/visual_scene") if shown is None else self._linked(shown)
+        return [] if scene is None else [part for node in scene.findall("node") for part in self._node(node, scale)]
+
+    def _linked(self, element: _Element, key: str = "url") -> _Element:
+        return self._ids[element.attrib[key].lstrip("#")]
+
+    def _node(self, node: _Element, above: Float[np.ndarray, "4 4"]) -> Iterator[Triangles]:
+        """The geometries below a node, in the world."""
+        placed = above @ _transform(node)
+        for instance in node.findall("instance_geometry"):
+            yield from self._geometry(instance, placed)
+        for child in (*node.findall("node"), *map(self._linked, node.findall("instance_node"))):
+            yield from self._node(child, placed)
+
+    def _geometry(self, instance: _Element, placed: Float[np.ndarray, "4 4"]) -> Iterator[Triangles]:
+        mesh = self._linked(instance).find("mesh")
+        bound = {e.attrib["symbol"]: self._linked(e, "target") for e in instance.iter("instance_material")}
+        for group in () if mesh is None else mesh:
+            faces = _faces(group)
+            if len(faces):
+                points = self._positions(group) @ placed[:3, :3].T + placed[:3, 3]
+                used, index = np.unique(faces, return_inverse=True)
+                index = index.reshape(-1, 3)
+                turned = index[:, ::-1] if np.linalg.det(placed[:3, :3]) < 0.0 else index
+                yield Triangles(points[used], turned, self._color(bound.get(group.get("material", ""))), self._y_up)
+
+    def _positions(self, group: _Element) -> Float[np.ndarray, "k 3"]:
+        vertices = self._linked(_input(group, "VERTEX"), "source")
+        source = self._linked(_input(vertices, "POSITION"), "source")
+        accessor, array = source.find("technique_common/accessor"), source.find("float_array")
+        stride = 3 if accessor is None else int(accessor.get("stride", "3"))
+        numbers = _numbers(None if array is None else array.text)
+        return numbers.reshape(-1, stride)[:, :3]
+
+    def _color(self, material: _Element | None) -> _Color | None:
+        """The diffuse colour of a material; of a texture, the mean."""
+        effect = None if material is None else material.find("instance_effect")
+        diffuse = None if effect is None else next(self._linked(effect).iter("diffuse"), None)
+        if diffuse is None:
+            return None
+        color, texture = diffuse.find("color"), diffuse.find("texture")
+        if color is not None:
+            red, green, blue, *_ = _numbers(color.text)
+            return float(red), float(green), float(blue), 1.0
+        return None if texture is None or effect is None else self._mean_color(self._linked(effect), texture)
+
+    def _mean_color(self, effect: _Element, texture: _Element) -> _Color | None:
+        """Of a texture: its sampler names a surface, which names an image, which names a file."""
+        parameters = {e.attrib["sid"]: e for e in effect.iter("newparam")}
+        name = texture.attrib["texture"]
+        for kind in ("sampler2D/source", "surface/init_from"):
+            found = parameters[name].findtext(kind) if name in parameters else None
+            name = name if found is None else found.strip()
+        image = self._ids.get(name)
+        file = None if image is None else image.findtext("init_from")
+        beside = None if file is None else self._path.parent / file.strip().removeprefix("file://")
+        if beside is None or not beside.is_file():
+            return None
+        try:
+            with Image.open(beside) as picture:
+                pixels = np.asarray(picture.convert("RGB").resize((16, 16)))
+        except OSError:  # no picture that can be read
+            return None
+        red, green, blue = pixels.reshape(-1, 3).mean(0) / 255.0
+        return float(red), float(green), float(blue), 1.0
+
+
+def _numbers(text: str | None, kind: type = float) -> np.ndarray:
+    return np.array((text or "").split(), kind)
+
+
+def _input(element: _Element, semantic: str) -> _Element:
+    return next(e for e in element.findall("input") if e.get("semantic") == semantic)
+
+
+def _faces(group: _Element) -> Int[np.ndarray, "m 3"]:
+    """Indices of positions, polygons cut into fans; none of an element that has no faces."""
+    if group.tag not in ("triangles", "polylist", "polygons"):
+        return np.zeros((0, 3), int)
+    stride = 1 + max(int(e.get("offset", "0")) for e in group.findall("input"))
+    offset = int(_input(group, "VERTEX").get("offset", "0"))
+    lists = [_numbers(p.text, int).reshape(-1, stride)[:, offset] for p in group.findall("p")]
+    if group.tag == "polygons":
+        return _fans(np.concatenate(lists) if lists else np.zeros(0, int), [len(corners) for corners in lists])
+    corners = lists[0] if lists else np.zeros(0, int)
+    if group.tag == "triangles":
+        return corners.reshape(-1, 3)
+    return _fans(corners, _numbers(group.findtext("vcount"), int))
+
+
+def _fans(corners: np.ndarray, counts: Sequence[int] | np.ndarray) -> Int[np.ndarray, "m 3"]:
+    """Triangles about the first corner of each polygon."""
+    counts = np.asarray(counts, int)
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]]) if len(counts) else np.zeros(0, int)
+    start = np.repeat(first, np.maximum(counts - 2, 0))
+    step = np.concatenate([np.arange(1, count - 1) for count in counts]) if len(counts) else np.zeros(0, int)
+    return np.stack([corners[start], corners[start + step], corners[start + step + 1]], -1)
+
+
+def _transform(node: _Element) -> Float[np.ndarray, "4 4"]:
+    """The product of a node's transforms, in the order of the file."""
+    out = np.eye(4)
+    for element in node:
+        if element.tag in _TRANSFORMS:
+            out = out @ _TRANSFORMS[element.tag](_numbers(element.text))
+    return out
+
+
+def _translation(shift: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    out = np.eye(4)
+    out[:3, 3] = shift
+    return out
+
+
+def _rotation(axis_angle: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """About an axis by an angle [deg]."""
+    x, y, z = axis_angle[:3] / np.linalg.norm(axis_angle[:3])
+    angle = np.deg2rad(axis_angle[3])
+    cross, out = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), np.eye(4)
+    out[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return out
+
+
+_TRANSFORMS: Mapping = {
+    "matrix": lambda numbers: numbers.reshape(4, 4),
+    "translate": _translation,
+    "rotate": _rotation,
+    "scale": lambda numbers: np.diag([*numbers, 1.0]),
+}

@@ -1,0 +1,167 @@
+"""What a URDF says that its links look like: visual shapes and mesh files, which ``Robot.from_urdf`` does not keep."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from .._loading._packages import Packages
+from .._loading._source import check_root, parse_xml, read_source
+from .._loading._urdf import GEOMS, geom_size
+from .._loading._urdf_elements import Link, Shape, Urdf, read_urdf
+from ._collada import Triangles
+from ._meshes import read_mesh
+
+_NEAR = 3
+"""So many folders above a URDF are searched for a mesh whose package has another name there."""
+_Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+@dataclasses.dataclass(frozen=True)
+class LinkShape:
+    """A shape of a link, in the link's frame.
+
+    Attributes:
+        link: its name.
+        kind: MuJoCo's geom type.
+        size: MuJoCo's geom sizes [m]. (3,)
+        position: of a simple shape; meshes are in the link's frame already [m]. (3,)
+        rotation: likewise. (3, 3)
+        color: red, green, blue, alpha; ``None``: not said.
+        mesh: vertices (k, 3) [m] and triangles (m, 3) of a mesh.
+    """
+
+    link: str
+    kind: mujoco.mjtGeom
+    size: Float[np.ndarray, "3"]
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    color: tuple[float, ...] | None
+    mesh: tuple[np.ndarray, np.ndarray] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """What a robot's links look like.
+
+    Attributes:
+        shapes: of all links.
+        missing: addresses of mesh files that were not found or could not be read.
+    """
+
+    shapes: tuple[LinkShape, ...]
+    missing: tuple[str, ...]
+
+
+def read_look(urdf: str | os.PathLike[str], *, package_dirs: Iterable[str | os.PathLike[str]] = ()) -> Look:
+    """The visual shapes of a URDF, with their meshes (DAE, STL, OBJ, MSH).
+
+    Some programs turn COLLADA files whose ``up_axis`` is y, others (RViz) do not, and URDFs are made for either. Of
+    both ways that one is taken that puts the meshes nearer to the joints of their links.
+
+    Of a link whose visual meshes cannot be read, and of all links where the URDF has no visual shape, the collision
+    shapes are taken.
+
+    Args:
+        urdf: path of the file.
+        package_dirs: as in ``Robot.from_urdf``. Last of all, the rest of a ``package://`` address is looked for in the
+            folders above the file, whatever the package is called there.
+
+    Raises:
+        FileNotFoundError: no such URDF.
+        ValueError: the URDF is broken.
+    """
+    source = read_source(urdf, "URDF")
+    root = parse_xml(source)
+    check_root(root, "robot", source)
+    return _Reader(read_urdf(root), Packages(package_dirs), source.path).look()
+
+
+class _Reader:
+    """Reads each file once."""
+
+    def __init__(self, urdf: Urdf, packages: Packages, beside: Path | None) -> None:
+        self._urdf, self._packages, self._beside = urdf, packages, beside
+        self._read: dict[str, list[Triangles]] = {}
+        self._turned = False
+
+    def look(self) -> Look:
+        visible = any(shape.visual for link in self._urdf.links.values() for shape in link.shapes)
+        shapes = self._shapes(visual=visible, turned=False)
+        if any(part.y_up for parts in self._read.values() for part in parts):
+            shapes = min(shapes, self._shapes(visual=visible, turned=True), key=self._from_joints)
+        return Look(shapes, tuple(address for address, parts in self._read.items() if not parts))
+
+    def _shapes(self, *, visual: bool, turned: bool) -> tuple[LinkShape, ...]:
+        self._turned = turned
+        return tuple(shape for link in self._urdf.links.values() for shape in self._link(link, visual=visual))
+
+    def _from_joints(self, shapes: tuple[LinkShape, ...]) -> float:
+        """How far the joints of the links are from boxes about the links' meshes, in all [m]."""
+        ends: dict[str, list[np.ndarray]] = {link: [np.zeros(3)] for link in self._urdf.links}
+        for joint in self._urdf.joints:
+            ends[joint.parent].append(joint.origin.position)
+        points: dict[str, list[np.ndarray]] = {}
+        for shape in shapes:
+            if shape.mesh is not None:
+                points.setdefault(shape.link, []).append(shape.mesh[0])
+        total = 0.0
+        for link, groups in points.items():
+            low, high = np.min([g.min(0) for g in groups], 0), np.max([g.max(0) for g in groups], 0)
+            places = np.array(ends[link])
+            total += float(np.linalg.norm(places - np.clip(places, low, high), axis=-1).sum())
+        return total
+
+    def _link(self, link: Link, *, visual: bool) -> list[LinkShape]:
+        """Its visual shapes; its collision shapes where one of those cannot be read."""
+        wanted = [shape for shape in link.shapes if shape.visual == visual and not _is_transparent(shape)]
+        readable = all(shape.kind != "mesh" or self._triangles(shape) for shape in wanted)
+        if readable or not visual:
+            return [part for shape in wanted for part in self._shape(link.name, shape)]
+        simpler = [part for shape in link.shapes if not shape.visual for part in self._shape(link.name, shape)]
+        return simpler or [part for shape in wanted for part in self._shape(link.name, shape)]
+
+    def _shape(self, link: str, shape: Shape) -> Iterator[LinkShape]:
+        position, rotation = shape.pose
+        if shape.kind != "mesh":
+            yield LinkShape(link, GEOMS[shape.kind], np.array(geom_size(shape)), position, rotation, shape.color)
+            return
+        scale = np.array(shape.size)
+        for part in self._triangles(shape):
+            own = part.vertices @ _Y_TO_Z.T if part.y_up and self._turned else part.vertices
+            vertices = (own * scale) @ rotation.T + position
+            faces = part.faces[:, ::-1] if np.prod(scale) < 0.0 else part.faces
+            yield LinkShape(
+                link, mujoco.mjtGeom.mjGEOM_MESH, np.zeros(3), np.zeros(3), np.eye(3),
+                part.color or shape.color, (vertices, faces),
+            )  # fmt: skip
+
+    def _triangles(self, shape: Shape) -> list[Triangles]:
+        """Of a mesh file; none where it cannot be read."""
+        if shape.file not in self._read:
+            try:
+                self._read[shape.file] = read_mesh(self._path(shape.file))
+            except (OSError, ValueError):
+                self._read[shape.file] = []
+        return self._read[shape.file]
+
+    def _path(self, address: str) -> Path:
+        try:
+            return self._packages.path(address, beside=self._beside)
+        except FileNotFoundError:
+            rest = address.partition("://")[2].lstrip("/").partition("/")[2]
+            above = () if self._beside is None or not rest else self._beside.absolute().parents[: _NEAR + 1]
+            for folder in above:
+                if (folder / rest).is_file():
+                    return folder / rest
+            raise
+
+
+def _is_transparent(shape: Shape) -> bool:
+    return shape.color is not None and shape.color[3] <= 0.0

@@ -1,0 +1,66 @@
+"""Mesh files as triangles in metres: COLLADA and text STL read here, all else by MuJoCo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from ._collada import Triangles, read_collada
+
+SUFFIXES = (".dae", ".stl", ".obj", ".msh")
+_TEXT_STL = b"facet"
+
+
+def read_mesh(path: Path) -> list[Triangles]:
+    """What a mesh file holds that can be drawn, in its own axes.
+
+    Raises:
+        ValueError: the file is of another kind, broken, or empty.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{path}: a mesh has to be one of {', '.join(SUFFIXES)}")
+    if suffix == ".dae":
+        parts = read_collada(path)
+    else:
+        parts = [_text_stl(path) if suffix == ".stl" and _is_text(path) else _by_mujoco(path)]
+    solid = [part for part in parts if _has_area(part)]
+    if not solid:
+        raise ValueError(f"{path}: nothing in it has a surface")
+    return solid
+
+
+def _has_area(part: Triangles) -> bool:
+    """MuJoCo wants four points and a surface of what it draws."""
+    if len(part.vertices) < 4 or not np.isfinite(part.vertices).all():
+        return False
+    a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
+    return bool(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() > 1e-12 * np.ptp(part.vertices, 0).max() ** 2)
+
+
+def _is_text(path: Path) -> bool:
+    """Binary files may start with the word "solid" too."""
+    with path.open("rb") as file:
+        start = file.read(512)
+    return start.lstrip().startswith(b"solid") and _TEXT_STL in start
+
+
+def _text_stl(path: Path) -> Triangles:
+    words = path.read_text(encoding="utf-8", errors="replace").split()
+    starts = [k + 1 for k, word in enumerate(words) if word == "vertex"]
+    corners = np.array([words[k : k + 3] for k in starts], float).reshape(-1, 3)
+    vertices, index = np.unique(corners[: 3 * (len(corners) // 3)], axis=0, return_inverse=True)
+    return Triangles(vertices, index.reshape(-1, 3), None)
+
+
+def _by_mujoco(path: Path) -> Triangles:
+    """Where MuJoCo has moved a mesh to its own centre and axes, it is put back."""
+    spec = mujoco.MjSpec()
+    mesh = spec.add_mesh(name="mesh", file=str(path.absolute()))
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # the others want a closed surface
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0)
+    model, turn = spec.compile(), np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.mesh_quat[0])
+    return Triangles(model.mesh_vert @ turn.reshape(3, 3).T + model.mesh_pos[0], model.mesh_face.copy(), None)

@@ -1,0 +1,62 @@
+"""How large a robot is, how low it reaches, and where its floor is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ..robot import Robot
+from ._look import Look
+from ._mujoco import mujoco_poses
+from ._parts import RobotParts, robot_parts
+from ._shapes import lowest_points
+
+
+class Outline(NamedTuple):
+    """The measures of a robot at one configuration.
+
+    Attributes:
+        size: diagonal of a box about all that is drawn of it [m].
+        lowest: height of its lowest point [m].
+        base: height of the lowest point of what is fixed to the world, 0 where nothing of that is drawn [m].
+    """
+
+    size: float
+    lowest: float
+    base: float
+
+
+def robot_outline(robot: Robot, q: ArrayLike, look: Look | None = None) -> Outline:
+    """The measures of a robot.
+
+    Args:
+        robot: the robot.
+        q: configuration. (nq,)
+        look: what its URDF shows.
+    """
+    shape = robot_parts(robot, look=look)
+    data = next(mujoco_poses(robot, q))
+    heights = lowest_points(shape, data)
+    size = float(np.linalg.norm(np.ptp(shape.corners(data), axis=0)))
+    return Outline(size, float(heights.min()), _base_height(shape, heights))
+
+
+def _base_height(shape: RobotParts, heights: Float[np.ndarray, " parts"]) -> float:
+    base = heights[shape.model.body_weldid[shape.bodies] == 0]
+    return float(base.min()) if len(base) else 0.0
+
+
+def floor_height(robot: Robot, shape: RobotParts, poses: Iterable[mujoco.MjData]) -> float:
+    """Where to put the floor [m]: under the lowest point that a floating robot has at first, else under the base.
+
+    Where a robot that is bolted down reaches below its base, the floor is under the lowest point of all poses.
+    """
+    first, *others = (lowest_points(shape, data) for data in poses)
+    if robot.floating_base:
+        return float(first.min())
+    return min(_base_height(shape, first), *(float(heights.min()) for heights in (first, *others)))

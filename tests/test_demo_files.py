@@ -1,0 +1,146 @@
+"""Motions of robots that somebody brings along: where they start, what moves, and how far."""
+
+import importlib.metadata
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax import demo, viewer
+from osik_jax.demo._start import strides
+from osik_jax.demo._sway import JointPath, sway_of
+
+LINK = """<link name="{0}"><inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>
+</inertial><visual><origin xyz="0 0 {1}"/><geometry><cylinder radius="{2}" length="{3}"/></geometry></visual></link>"""
+JOINT = """<joint name="j{0}" type="{1}"><parent link="{2}"/><child link="l{0}"/><origin xyz="0 0 {3}"/>
+<axis xyz="{4}"/>{5}</joint>"""
+TIP = """<link name="end"/><joint name="t" type="fixed"><parent link="{0}"/><child link="end"/><origin xyz="0 0 {1}"/>
+</joint>"""
+LIMIT = '<limit lower="-0.02" upper="0.3" velocity="1" effort="1"/>'
+X, Y, Z = "1 0 0", "0 1 0", "0 0 1"
+
+
+def chain(length, axes, kind="continuous", limit="", tip=1.0):
+    """A tower of links, each so long [m], on joints about or along the axes."""
+    names = ["base", *(f"l{k}" for k in range(len(axes)))]
+    links = "".join(LINK.format(name, length / 2, length / 10, length) for name in names)
+    joints = "".join(JOINT.format(k, kind, names[k], length, axis, limit) for k, axis in enumerate(axes))
+    return osik.Robot.from_urdf(
+        f'<robot name="x">{links}{joints}{TIP.format(names[-1], tip * length)}</robot>', floating_base=False
+    )
+
+
+def motion_of(robot):
+    return demo.file_motion(robot, name="x", duration=2.0)
+
+
+def joint_path(motion):
+    path = motion.goals["hand"].path
+    assert isinstance(path, JointPath)
+    return path
+
+
+def test_one_joint_takes_its_tip_along_its_arc():
+    """No straight line to the left exists: what is asked is what the joint can do, and its rate is its velocity."""
+    motion = motion_of(chain(0.3, (Y,)))
+    path = joint_path(motion)
+    assert motion.goals["hand"].frame == "end" and motion.goals["hand"].rows == "pose"
+    at, h = jax.jit(path.at), 1e-6
+    (start, _), (top, _) = at(0.0)[0], at(1.0)[0]
+    assert np.linalg.norm(top - start) == pytest.approx(0.05, rel=0.01)
+    np.testing.assert_allclose([np.linalg.norm(p - np.array([0.0, 0.0, 0.3])) for p in (start, top)], 0.3)
+    for t in (0.3, 0.6):
+        rate = (at(t + h)[0][0] - at(t - h)[0][0]) / (2 * h)
+        np.testing.assert_allclose(at(t)[1][:3], rate, atol=1e-8)
+    assert path.still(np.array([0.0, 0.5, 0.9, 1.5, 1.9])).tolist() == [False, False, True, False, True]
+
+
+def test_a_joint_that_turns_its_tip_in_place_turns_it():
+    motion = motion_of(chain(0.3, (Z,)))
+    (start, R0), (there, R1) = (joint_path(motion).at(t)[0] for t in (0.0, 1.0))
+    np.testing.assert_allclose(start, there, atol=1e-12)
+    assert np.arccos((np.trace(R0.T @ R1) - 1.0) / 2.0) == pytest.approx(0.3)
+
+
+def test_a_slide_goes_towards_its_room():
+    """Home is 2 cm above the lower limit and 30 cm below the upper one."""
+    motion = motion_of(chain(0.3, (X,), "prismatic", LIMIT))
+    (start, _), (there, _) = (joint_path(motion).at(t)[0] for t in (0.0, 1.0))
+    np.testing.assert_allclose(there - start, [0.05, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_gantry_goes_left():
+    robot = chain(0.3, (X, Y, Z), "prismatic", '<limit lower="-0.3" upper="0.3" velocity="1" effort="1"/>')
+    goal = motion_of(robot).goals["hand"]
+    assert goal.rows == "position" and not isinstance(goal.path, JointPath)
+    np.testing.assert_allclose(goal.path.at(1.0)[0][0] - goal.path.position, [0.0, 0.05, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("length", "scale"), [(100 / 7, 10.0), (0.01 / 7, 0.0345)])
+def test_huge_and_tiny_robots_move_in_proportion(length, scale):
+    motion = motion_of(chain(length, (Z, Y, Y, X, Y, Z, Y)))
+    assert motion.scale == pytest.approx(scale, rel=0.15)
+    path = motion.goals["hand"].path
+    moved = np.linalg.norm(path.at(1.0)[0][0] - path.position)
+    assert moved == pytest.approx(0.05 * motion.scale)
+    assert moved < 0.2 * 7 * length
+    panels = {panel.title: panel for panel in demo_panels(motion)}
+    (error,) = (panel for title, panel in panels.items() if "from its path" in title)
+    assert error.bound == pytest.approx(motion.scale)
+
+
+def demo_panels(motion):
+    from osik_jax.demo._run import comparison_panels
+
+    q = np.tile(np.asarray(motion.q0), (3, 1))
+    return comparison_panels(motion, {"one": demo.measure(motion, q, 1.0)})
+
+
+def test_sizes_in_between_go_5_cm():
+    assert [sway_of(size) for size in (0.3, 1.0, 10.0)] == pytest.approx([0.05] * 3)
+    assert [sway_of(size) for size in (0.03, 100.0)] == pytest.approx([0.005, 0.5])
+
+
+def test_strides_of_slides_are_lengths():
+    robot = chain(0.3, (X, Y, Z), "prismatic", LIMIT)
+    np.testing.assert_allclose(strides(robot, 2.0), 0.5)
+
+
+def test_an_arm_rises_above_its_base_and_a_hanging_one_hangs():
+    """An arm that lies along the floor at home, and the same one that hangs from the ceiling."""
+    arm = """<mujoco><compiler angle="radian"/><worldbody><body name="foot"><geom type="box" size=".1 .1 .05"/>
+    <body name="a" pos="0 0 .05" euler="{0} 0 0"><joint axis="0 0 1"/>
+    <geom type="capsule" size=".03 .05" pos="0 0 .05"/>
+    <body name="b" pos="0 0 .1"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03"/>
+    <body name="c" pos=".4 0 0"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 {1}" size=".03"/>
+    <site name="tool" pos="0 0 {1}"/></body></body></body></body></worldbody></mujoco>"""
+    for turn, reach, side in ((0.0, -0.3, 1.0), (np.pi, 0.3, -1.0)):
+        robot = osik.Robot.from_mjcf(arm.format(turn, reach))
+        motion = motion_of(robot)
+        height = osik.forward_kinematics(robot, motion.q0).frame_pose(robot, "tool")[0][2]
+        assert side * height > 0.0, (turn, height)
+
+
+def urdf(ending):
+    (found,) = (f for f in importlib.metadata.files("example-robot-data") or [] if str(f).endswith(ending))
+    return Path(str(found.locate()))
+
+
+def test_a_walker_stands_on_the_floor():
+    """Its lowest point is at height 0, and all its feet are within a millimetre of it."""
+    path = urdf("solo_description/robots/solo12.urdf")
+    robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
+    motion = demo.file_motion(robot, name="solo12", look=look)
+    assert viewer.robot_outline(robot, motion.q0, look).lowest == pytest.approx(0.0, abs=1e-9)
+    heights = [osik.forward_kinematics(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
+    assert len(heights) == 4 and np.ptp(heights) < 1e-3 and max(heights) < 0.05
+    assert motion.notes == ()
+
+
+def test_estimates_grow_with_the_work():
+    motion = demo.file_motion(osik.load_robot("arm7"), name="arm7", duration=4.0)
+    short = demo.estimate_seconds(motion, schemes=("weighted",), dt=0.005, animation=False)
+    long = demo.estimate_seconds(motion, schemes=demo.SCHEMES * 3, dt=0.005)
+    assert 0.0 < short < long

@@ -1,0 +1,264 @@
+"""What pictures of URDFs show: mesh files against Coal, triangles against brute force, cameras against projections."""
+
+import importlib.metadata
+import struct
+from pathlib import Path
+
+import coal
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+import osik_jax as osik
+from osik_jax import viewer
+from osik_jax.viewer._collada import read_collada
+from osik_jax.viewer._meshes import read_mesh
+from osik_jax.viewer._mujoco import mujoco_poses
+from osik_jax.viewer._parts import robot_parts
+from osik_jax.viewer._raster import Rasterizer, draw_triangles
+from osik_jax.viewer._raycast import RayCaster
+from osik_jax.viewer._shapes import lowest_points, robot_surface
+from osik_jax.viewer._stage import Stage, frame_camera
+
+COLLADA = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset>
+<library_effects><effect id="e"><profile_COMMON><technique sid="c"><phong><diffuse><color>1 0.5 0 1</color></diffuse>
+</phong></technique></profile_COMMON></effect></library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="pa" count="12">0 0 0 1 0 0 1 1 0 0 1 0</float_array>
+<technique_common><accessor source="#pa" count="4" stride="3"/></technique_common></source>
+<source id="n"><float_array id="na" count="3">0 0 1</float_array>
+<technique_common><accessor source="#na" count="1" stride="3"/></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<polylist count="1" material="red"><input semantic="VERTEX" source="#v" offset="0"/>
+<input semantic="NORMAL" source="#n" offset="1"/><vcount>4</vcount><p>0 0 1 0 2 0 3 0</p></polylist>
+<lines count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1</p></lines>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node><translate>100 0 0</translate><rotate>0 0 1 90</rotate>
+<scale>2 3 1</scale><node><matrix>1 0 0 0 0 1 0 0 0 0 1 50 0 0 0 1</matrix><instance_geometry url="#g">
+<bind_material><technique_common><instance_material symbol="red" target="#m"/></technique_common></bind_material>
+</instance_geometry></node></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+CUBE_OBJ = """v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 0 0 2
+v 1 0 2
+v 1 1 2
+v 0 1 2
+f 4 3 2 1
+f 5 6 7 8
+f 1 2 6 5
+f 2 3 7 6
+f 3 4 8 7
+f 4 1 5 8
+"""
+
+ARM = """<robot name="arm"><link name="base"><visual><geometry><mesh filename="{mesh}" scale="0.1 0.1 0.1"/></geometry>
+</visual><collision><geometry><cylinder radius="0.05" length="0.2"/></geometry></collision></link>
+<link name="upper"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+<visual><origin xyz="0 0 0.1" rpy="0 0 1.5707963267948966"/><geometry><box size="0.1 0.2 0.3"/></geometry>
+<material name="red"><color rgba="0.9 0.1 0.1 1"/></material></visual>
+</link><joint name="j" type="continuous"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.2"/>
+<axis xyz="0 1 0"/></joint></robot>"""
+
+
+def robot_file(ending):
+    (found,) = (f for f in importlib.metadata.files("example-robot-data") or [] if str(f).endswith(ending))
+    return Path(str(found.locate()))
+
+
+def written(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def area(part):
+    a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum()
+
+
+def test_collada_by_hand(tmp_path):
+    """A unit square, stretched to 2 by 3, turned, moved, in centimetres."""
+    (part,) = read_collada(written(tmp_path / "square.dae", COLLADA))
+    np.testing.assert_allclose(part.vertices.min(0), [0.97, 0.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(part.vertices.max(0), [1.0, 0.02, 0.5], atol=1e-12)
+    assert area(part) == pytest.approx(6e-4)
+    assert part.color == (1.0, 0.5, 0.0, 1.0) and not part.y_up
+    a, b, c = part.vertices[part.faces[0]]
+    assert np.cross(b - a, c - a)[2] > 0.0
+
+
+@pytest.mark.parametrize(
+    "ending",
+    [
+        "anymal_b_simple_description/meshes/hip/anymal_hip_l.dae",
+        "icub_description/meshes/upmc/visual/icub_l_thigh.dae",
+        "panda_description/meshes/visual/link0.dae",
+        "hyq_description/meshes/leg/hipassembly.dae",
+        "ur_description/meshes/ur5/visual/forearm.dae",
+    ],
+)
+def test_collada_lies_where_coal_has_it(ending):
+    path = robot_file(ending)
+    points = np.concatenate([part.vertices for part in read_collada(path)])
+    expected = np.asarray(coal.MeshLoader().load(str(path), np.ones(3)).vertices())
+    span = np.ptp(expected, axis=0).max()
+    np.testing.assert_allclose(points.min(0), expected.min(0), atol=1e-6 * span)
+    np.testing.assert_allclose(points.max(0), expected.max(0), atol=1e-6 * span)
+
+
+def test_broken_meshes_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="broken XML"):
+        read_mesh(written(tmp_path / "a.dae", "<COLLADA"))
+    with pytest.raises(ValueError, match="no triangles"):
+        read_mesh(written(tmp_path / "b.dae", "<COLLADA/>"))
+    with pytest.raises(ValueError, match="broken COLLADA"):
+        read_mesh(written(tmp_path / "c.dae", COLLADA.replace('source="#p"', 'source="#gone"')))
+    with pytest.raises(ValueError, match=r"one of \.dae"):
+        read_mesh(written(tmp_path / "d.ply", "ply"))
+
+
+def test_stl_and_obj_hold_the_same_box(tmp_path):
+    obj = read_mesh(written(tmp_path / "box.obj", CUBE_OBJ))[0]
+    triangles = obj.vertices[obj.faces]
+    text = "solid box\n" + "".join(
+        "facet normal 0 0 0\nouter loop\n" + "".join(f"vertex {x} {y} {z}\n" for x, y, z in t) + "endloop\nendfacet\n"
+        for t in triangles
+    )
+    binary = b"solid binary".ljust(80) + struct.pack("<I", len(triangles))
+    binary += b"".join(struct.pack("<12fH", 0, 0, 0, *t.ravel(), 0) for t in triangles)
+    (tmp_path / "binary.stl").write_bytes(binary)
+    for part in (obj, *read_mesh(written(tmp_path / "text.stl", text)), *read_mesh(tmp_path / "binary.stl")):
+        np.testing.assert_allclose(part.vertices.min(0), [0.0, 0.0, 0.0], atol=1e-7)
+        np.testing.assert_allclose(part.vertices.max(0), [1.0, 1.0, 2.0], atol=1e-7)
+        assert area(part) == pytest.approx(10.0, rel=1e-6)
+        a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
+        assert np.sum(np.cross(a, b) * c) / 6.0 == pytest.approx(2.0, rel=1e-6)
+
+
+def test_look_places_shapes_where_mujoco_has_their_links(tmp_path):
+    written(tmp_path / "meshes" / "box.obj", CUBE_OBJ)
+    path = written(tmp_path / "arm.urdf", ARM.format(mesh="package://any_name/meshes/box.obj"))
+    robot, look = osik.Robot.from_urdf(path, floating_base=False), viewer.read_look(path)
+    assert look.missing == () and [shape.link for shape in look.shapes] == ["base", "upper"]
+    shape, data = robot_parts(robot, look=look), next(mujoco_poses(robot, [0.5]))
+    assert shape.style == "look"
+    quads, _ = robot_surface(shape, data, 4)
+    low, high = quads.min((0, 1)), quads.max((0, 1))
+    turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    corners = np.array([(x, z) for x in (-0.1, 0.1) for z in (-0.05, 0.25)]) @ turn.T + [0.0, 0.2]
+    np.testing.assert_allclose(high[[0, 2]], np.maximum(corners.max(0), [0.1, 0.2]), atol=1e-6)
+    np.testing.assert_allclose(low[[0, 2]], np.minimum(corners.min(0), [0.0, 0.0]), atol=1e-6)
+    np.testing.assert_allclose(lowest_points(shape, data), [0.0, corners[:, 1].min()], atol=1e-6)
+    with pytest.raises(ValueError, match="another robot's: this one has no links base, upper"):
+        robot_parts(osik.load_robot("nao"), look=look)
+
+
+def test_collision_shapes_stand_in_for_meshes_that_are_gone(tmp_path):
+    path = written(tmp_path / "arm.urdf", ARM.format(mesh="package://gone/box.stl"))
+    look = viewer.read_look(path)
+    assert look.missing == ("package://gone/box.stl",)
+    assert [shape.kind for shape in look.shapes] == [mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX]
+
+
+def from_joints(robot, look):
+    """How far joints are from boxes about the meshes of the links that they hang from [m]."""
+    model, points = robot.mj_model, {}
+    for shape in look.shapes:
+        points.setdefault(shape.link, []).append(shape.mesh[0])
+    boxes = {link: np.concatenate(groups) for link, groups in points.items()}
+    parents = [model.body(model.body_parentid[body]).name for body in range(model.nbody)]
+    places = [(model.body_pos[k], boxes[parents[k]]) for k in range(2, model.nbody) if parents[k] in boxes]
+    return np.array([np.linalg.norm(place - np.clip(place, box.min(0), box.max(0))) for place, box in places])
+
+
+def test_the_icubs_meshes_are_turned():
+    """All of them say that y is up, and mean it: left as they are, its joints are 6 cm away from them."""
+    path = robot_file("robots/icub.urdf")
+    robot = osik.Robot.from_urdf(path, floating_base=True)
+    away = from_joints(robot, viewer.read_look(path))
+    assert len(away) > 30 and away.mean() < 0.02
+
+
+@pytest.mark.parametrize("elbow", ["0 0 1", "0 -1 0"])
+def test_y_up_is_followed_where_that_brings_meshes_to_joints(tmp_path, elbow):
+    """A blade 1 m along its z axis, which the file calls not up: the next joint is at its end, as it is or turned."""
+    blade = COLLADA.replace("Z_UP", "Y_UP").replace("0 0 0 1 0 0 1 1 0 0 1 0", "0 0 0 1 0 0 1 0 100 0 0 100")
+    blade = blade.replace("100 0 0</translate>", "0 0 0</translate>").replace("0 0 1 50 0 0 0 1", "0 0 1 0 0 0 0 1")
+    written(tmp_path / "meshes" / "blade.dae", blade)
+    text = ARM.format(mesh="meshes/blade.dae").replace("0.1 0.1 0.1", "1 1 1").replace("0 0 0.2", elbow)
+    look = viewer.read_look(written(tmp_path / "arm.urdf", text))
+    (mesh,) = (shape.mesh[0] for shape in look.shapes if shape.mesh is not None)
+    end = np.array([float(x) for x in elbow.split()])
+    assert (mesh @ end).max() == pytest.approx(1.0) and (mesh @ end).min() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_triangles_cover_what_they_cover():
+    rng, width, height = np.random.default_rng(0), 60, 40
+    places = rng.uniform(-20.0, 80.0, (40, 3, 2))
+    places[20:] = places[20:, :1] + 2.0 * rng.normal(size=(20, 3, 2))
+    nearness = rng.uniform(0.1, 1.0, (40, 3))
+    drawn = draw_triangles(places, nearness, (width, height))
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    front, owner = np.zeros((height, width)), np.full((height, width), -1)
+    for k in range(40):
+        weights = np.einsum(
+            "ij,jyx->iyx", np.linalg.inv(np.vstack([places[k].T, np.ones(3)])), np.stack([x, y, np.ones_like(x)])
+        )
+        value = np.einsum("iyx,i->yx", weights, nearness[k])
+        nearer = (weights >= 0.0).all(0) & (value > front)
+        front[nearer], owner[nearer] = value[nearer], k
+    assert (owner >= 0).sum() > 500
+    np.testing.assert_array_equal(drawn.triangle, owner)
+    np.testing.assert_allclose(drawn.nearness, front, atol=1e-12)
+
+
+def test_drawn_triangles_look_like_cast_rays():
+    path = robot_file("hyq_description/robots/hyq_no_sensors.urdf")
+    robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
+    shape, data = robot_parts(robot, look=look), next(mujoco_poses(robot, robot.q0))
+    size, floor = (180, 140), float(lowest_points(shape, data).min())
+    camera = frame_camera(shape.corners(data), size, 30.0, 12.0)
+    stage = Stage([shape], camera, floor=floor)
+    posed = stage.pose([data])
+    cast, drawn = (kind(stage, camera, size, floor=floor).image(posed) for kind in (RayCaster, Rasterizer))
+    empty = np.abs(cast - 1.0).max(-1) < 0.15
+    assert 0.1 < np.mean(~empty) < 0.9
+    assert np.abs(cast - drawn).mean() < 0.01 and np.mean(np.abs(cast - drawn).max(-1) > 0.2) < 0.02
+
+
+@pytest.mark.parametrize("lens", [2.0, 3.6, 10.0])
+def test_camera_holds_everything_and_no_more(lens):
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1.0, 1.0, (200, 3)) * [2.0, 0.3, 1.0]
+    size, window = (300, 200), (0.1, 0.6, 0.2, 0.9)
+    camera = frame_camera(points, size, 25.0, 10.0, window, lens)
+    place = camera.project(points, size) / size
+    low, high = place.min(0), place.max(0)
+    assert (low >= [0.1 - 1e-9, 0.2 - 1e-9]).all() and (high <= [0.6 + 1e-9, 0.9 + 1e-9]).all()
+    assert np.min(np.abs([*(high - low - [0.5, 0.7])])) < 1e-9
+
+
+def test_no_instant_is_cut_and_no_head_is_under_the_title(tmp_path):
+    """A long red arm that reaches towards the camera: nothing red is at the border, nor where the title is."""
+    path = written(tmp_path / "arm.urdf", ARM.format(mesh="none.stl").replace("0.1 0.2 0.3", "1.6 0.2 0.3"))
+    robot = osik.Robot.from_urdf(path, floating_base=False)
+    q = np.linspace(-0.4, 0.4, 9)[:, None]
+    picture = viewer.hero_picture(tmp_path / "h.png", robot, list(q[::4]), size=(320, 144), look=viewer.read_look(path))
+    film = viewer.animate(tmp_path / "f.gif", robot, q, dt=0.1, size=(240, 136), renderer="raycast", caption="a title")
+    pictures = [np.asarray(Image.open(picture).convert("RGB"), float)]
+    with Image.open(film) as frames:
+        for k in range(getattr(frames, "n_frames", 1)):
+            frames.seek(k)
+            pictures.append(np.asarray(frames.convert("RGB"), float))
+    assert len(pictures) == 10
+    for top, image in zip([4] + [12] * 9, pictures, strict=True):
+        red = image[..., 0] - image[..., 1] > 60.0
+        assert red.sum() > 300 and not red[:top].any() and not red[-3:].any() and not red[:, [0, 1, -2, -1]].any()
