@@ -27,7 +27,7 @@ class Rows(NamedTuple):
     equal: Bool[Array, " m"]
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """A x minus the nearest point of its interval; of equalities, which clipping would differentiate wrongly, too."""
+        """A x minus the nearest point of its interval; for equalities too, which a clip would split."""
         value = apply(self.matrix, x)
         return value - jnp.where(self.equal, self.lower, jnp.clip(value, self.lower, self.upper))
 
