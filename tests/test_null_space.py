@@ -270,3 +270,32 @@ class TestPotential:
         )
         np.testing.assert_array_equal(gradient, np.zeros(3))
         assert np.isfinite(np.asarray(rates)).all()
+
+
+class TestDerivativesWhereNothingIsAskedFor:
+    """Every robot starts with errors of exactly 0; clipping between equal bounds would split the derivative there."""
+
+    METHODS = (dict(), dict(order="reverse"), dict(lower=-jnp.ones(N), upper=jnp.ones(N)))
+
+    @pytest.mark.parametrize("method", METHODS, ids=("forward", "reverse", "saturated"))
+    def test_they_are_central_differences_in_both_modes(self, rng, method):
+        """In the targets, along which the errors move away from 0, and in the matrices, along which they do not."""
+        data = random_levels(rng, (3, 2))
+        mix, along = rng.normal(size=N), [rng.normal(size=len(wanted)) for _, wanted, _ in data]
+
+        def cost(t, turn):
+            levels = [
+                equality(matrix + turn * matrix[::-1], t * move, weight)
+                for (matrix, _, weight), move in zip(data, along, strict=True)
+            ]
+            return jnp.sum(jnp.sin(mix * solve_nullspace(levels, damping=1e-3, **method).x))
+
+        value = jax.jit(cost)
+        back = jax.jit(jax.grad(cost, (0, 1)))(0.0, 0.0)
+        _, forward = jax.jit(lambda: jax.jvp(cost, (0.0, 0.0), (1.0, 0.0)))()
+        h = 1e-5
+        expected = (float(value(h, 0.0)) - float(value(-h, 0.0))) / (2.0 * h)
+        assert abs(expected) > 0.1
+        assert float(back[0]) == pytest.approx(expected, rel=1e-7)
+        assert float(forward) == pytest.approx(expected, rel=1e-7)
+        assert float(back[1]) == pytest.approx(0.0, abs=1e-12)

@@ -40,8 +40,8 @@ class NullSpace(Scheme):
             damping; 0 for none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         potential_gain: alpha [rad^2/s]; 0 turns the potential off. It needs a ``ConfigurationLimit`` among the limits.
         margin: joints are taken to be at least this share of their range away from either limit.
-        rank_tolerance: singular values under this share of the size (Frobenius norm) of a level's weighted rows count
-            as zero.
+        rank_tolerance: rows that stand out of the span of others by less than this share of the size (Frobenius norm)
+            of their level's weighted rows count as dependent on them.
     """
 
     order: Literal["forward", "reverse"] = eqx.field(default="forward", static=True, kw_only=True)

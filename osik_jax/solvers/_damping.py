@@ -10,7 +10,7 @@ the residual is that of the damped step itself: a fixed point, found from share 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
@@ -33,9 +33,9 @@ class Damping(NamedTuple):
     step is judged by itself, clipped into the box.
     """
 
-    constant: Float[Array, ""] | float = 0.0
-    unmet: Float[Array, ""] | float = 0.0
-    demand: Float[Array, ""] | float = 0.0
+    constant: Any = 0.0  # Float[Array, ""], and so the following
+    unmet: Any = 0.0
+    demand: Any = 0.0
 
 
 def one_each(damping: ArrayLike | Damping | Sequence[ArrayLike | Damping], count: int, dtype: jnp.dtype) -> Damping:

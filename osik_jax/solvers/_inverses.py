@@ -1,4 +1,4 @@
-"""Inverses of projected rows, from one singular value decomposition each, with derivatives in both modes."""
+"""Inverses of projected rows, from an orthogonal factorisation each, with derivatives in both modes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._rules import custom_jvp
 from ._dense import apply, product
+from ._row_factors import RowFactors, row_factors
 
 
 @custom_jvp
@@ -19,27 +20,34 @@ def row_space_and_motion(
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """Orthogonal projector onto what the rows span, and the damped motion that they ask for.
 
-    Singular values up to the cutoff are left out. The projector comes from singular vectors and not from an inverse, so
-    that it is one to the last digit however small the singular values are. Derivatives are those at constant rank.
+    Rows that stand out of the span of those before them by no more than the cutoff are left out, the longest first. The
+    projector comes from an orthonormal basis and not from an inverse, so that it is one to the last digit however
+    dependent the rows are. Derivatives are those at constant rank.
     """
-    space, _, damped = _by_singular_values(matrix, cutoff, damping)
-    return space, apply(damped, wanted)
+    factors = row_factors(matrix, cutoff, damping)
+    motion = apply(factors.basis.T, _solved(factors, wanted))
+    return product(factors.basis.T, factors.basis), motion
+
+
+def _solved(factors: RowFactors, wanted: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    """y of least |matrix basis' y - wanted|^2 + damping |y|^2."""
+    left = factors.outer[: len(factors.basis)]
+    return jax.scipy.linalg.solve_triangular(factors.triangle, jnp.matmul(left.T, wanted, precision="highest"))
 
 
 @custom_jvp
-def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
+def _by_row_factors(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
     """Row space, Moore-Penrose inverse and damped inverse."""
-    u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    real = s > cutoff
-    vt, s = jnp.where(real[:, None], vt, 0.0), jnp.where(real, s, 1.0)
-    plain, damped = (product(vt.T * factor, u.T) for factor in (1.0 / s, s / (s**2 + damping)))
-    return product(vt.T, vt), plain, damped
+    both = [row_factors(matrix, cutoff, each) for each in (jnp.zeros_like(damping), damping)]
+    eye = jnp.eye(len(matrix), dtype=matrix.dtype)
+    plain, damped = (product(factors.basis.T, _solved(factors, eye)) for factors in both)
+    return product(both[0].basis.T, both[0].basis), plain, damped
 
 
-@_by_singular_values.defjvp
-def _by_singular_values_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+@_by_row_factors.defjvp
+def _by_row_factors_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
-    space, X, D = _by_singular_values(a, cutoff, damping)
+    space, X, D = _by_row_factors(a, cutoff, damping)
     dX = _columns(lambda w: _inverse_rate(a, X, da, w), a)
     dD = _columns(lambda w: _damped_rate(a, X, D, damping, da, d_damping, w), a)
     return (space, X, D), (_space_rate(space, X, da), dX, dD)
@@ -48,7 +56,7 @@ def _by_singular_values_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...
 @row_space_and_motion.defjvp
 def _row_space_and_motion_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     (a, wanted, cutoff, damping), (da, d_wanted, _, d_damping) = primals, tangents
-    space, X, D = _by_singular_values(a, cutoff, damping)
+    space, X, D = _by_row_factors(a, cutoff, damping)
     rate = _damped_rate(a, X, D, damping, da, d_damping, wanted) + apply(D, d_wanted)
     return (space, apply(D, wanted)), (_space_rate(space, X, da), rate)
 

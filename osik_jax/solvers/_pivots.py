@@ -186,7 +186,7 @@ def _add_violated(limits: Limits, s: Dual) -> Dual:
 
     row = s.tableau[k]
     column = jnp.where(held, -row, row)
-    below = below_by[k] > 0.0
+    below = below_by[k] >= above_by[k]  # not > 0: on its way, rounding may have taken it over its bound
     sign = jnp.where(below, 1.0, -1.0).astype(row.dtype)
     gap = jnp.maximum(below_by[k], above_by[k])
     independent = row[k] > DEPENDENT * unit * limits.scale[k]

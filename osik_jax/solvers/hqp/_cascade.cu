@@ -20,13 +20,13 @@ constexpr int ZD = N | 1, VD = M | 1;                 // lengths of rows in shar
 constexpr int MOST_RANK = N < M ? N : M;
 constexpr int LONGEST = (N > M ? N : M) > P ? (N > M ? N : M) : P;
 constexpr int HARD = N + P;
-constexpr int FACTORS = MOST_RANK * (ZD + VD) > N * VD ? MOST_RANK * (ZD + VD) : N * VD;
-constexpr int SMALL = M * (VD > ZD ? VD : ZD);        // a square of the level's rows, or those rows in the basis
+constexpr int AT_LEAST = N * VD > M * ZD ? N * VD : M * ZD;
+constexpr int FACTORS = MOST_RANK * (ZD + VD) > AT_LEAST ? MOST_RANK * (ZD + VD) : AT_LEAST;
 constexpr int PATIENCE = 20;                          // steps of no length, before the least index decides
 constexpr double DAMPING = 1e-9;                      // of the longest row, squared, as in _proposal.py
 constexpr unsigned ALL = 0xffffffffu;
 
-__shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * LONGEST + MOST_RANK + 2 * SMALL];
+__shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * LONGEST + MOST_RANK + M * VD];
 __shared__ int shared_ints[WARPS][N + MOST_RANK + M];
 
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
@@ -43,7 +43,7 @@ double* const first_of = turn + LONGEST;
 double* const second_of = first_of + LONGEST;
 double* const strength = second_of + LONGEST;         // of the reflections
 double* const square_of = strength + MOST_RANK;       // Cholesky factor below, what is factored above; rows of VD
-double* const rows_of = square_of + SMALL;            // the level's rows in the basis; rows of ZD
+double* const rows_of = V;                            // before V and R are: the level's rows in the basis; rows of ZD
 int* const held = shared_ints[warp];                  // the row that column k of the basis is for
 int* const pivot = held + N;
 int* const flags = pivot + MOST_RANK;

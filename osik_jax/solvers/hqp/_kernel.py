@@ -68,8 +68,8 @@ class Shape(NamedTuple):
             return 0
         row, column = n | 1, m | 1
         rank = min(n, m)
-        factors = max(rank * (row + column), n * column)
-        doubles = n * row + factors + max(p, 1) * row + 4 * max(n, m, p) + rank + 2 * m * max(row, column)
+        factors = max(rank * (row + column), n * column, m * row)
+        doubles = n * row + factors + max(p, 1) * row + 4 * max(n, m, p) + rank + m * column
         return min(_MOST_WARPS, _SHARED_BYTES // (8 * doubles + 4 * (2 * n + m)))
 
 

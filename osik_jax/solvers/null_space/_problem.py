@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply
 from ..hqp import Level
+from ._padded import Rows
 
 RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
 
@@ -43,7 +44,8 @@ class NullSpaceSolution(eqx.Module):
 class Demand(NamedTuple):
     """What a level asks for at a point: the rows that count there (the others are 0) and by how much they should move.
 
-    ``cutoff`` is the size under which singular values of these rows, projected, count as zero.
+    ``cutoff`` is the length that these rows, projected, have at least outside of the span of the longer ones; those
+    with less count as dependent.
     """
 
     rows: Float[Array, "m n"]
@@ -51,11 +53,12 @@ class Demand(NamedTuple):
     cutoff: Float[Array, ""]
 
     @classmethod
-    def of(cls, level: Level, x: Float[Array, " n"], rank: Array | float) -> Demand:
+    def of(cls, level: Level | Rows, x: Float[Array, " n"], rank: Array | float) -> Demand:
         """Equalities count always, inequalities where x violates them."""
-        value = apply(level.matrix, x)
-        wanted = jnp.clip(value, level.lower, level.upper) - value
-        counts = level.equal | (wanted != 0.0)
+        value, equal = apply(level.matrix, x), level.equal
+        # clip shares its derivative among bounds that are equal
+        wanted = jnp.where(equal, level.lower, jnp.clip(value, level.lower, level.upper)) - value
+        counts = equal | (wanted != 0.0)
         rows = jnp.where(counts[:, None], level.matrix, 0.0)
         return cls(rows, wanted, rank * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2)))
 

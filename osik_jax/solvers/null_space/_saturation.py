@@ -28,13 +28,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._box import inside
+from ..._rules import found as kept
 from .._damping import Damping
-from .._dense import product
+from .._double import in_double
+from .._inverses import row_space_and_motion
 from .._lanes import in_lanes
 from ..hqp import Level
+from ._at_fixed_sides import Decision, with_derivative
+from ._padded import Problem, Rows, first_room, padded
 from ._projection import level_motion
-from ._search import Found, Room, blocked_scale, dependence, dual_basis, search, settle
+from ._search import Found, Room, search
+
+_INDEPENDENT = 1e-6
+"""Part of a joint's unit vector in the null space and outside the span of others that stop the level; one has less."""
 
 
 class Saturated(NamedTuple):
@@ -57,38 +63,34 @@ def solve_saturated(
     rank: Array | float,
     max_iterations: int,
 ) -> Saturated:
-    """Level after level; then as near to the secondary motion as they leave room."""
-    x = _nearest_to_zero(lower, upper)
-    projector = jnp.diag(jnp.where(lower == upper, 0.0, 1.0).astype(x.dtype))
-    nowhere = jnp.zeros_like(x)
-    fixed = jnp.where(lower == upper, 2, 0)
-    ends = []
-    for level, own in zip(levels, damping, strict=True):
-        motion, projector = level_motion(level, x, projector, own, rank)
-        end = _descend(Room(x, motion, nowhere, projector, lower, upper), fixed, max_iterations)
-        ends.append(end)
-        x, projector, fixed = end.x, end.projector, end.fixed
-    if secondary is not None:
-        ends.append(_descend(Room(x, nowhere, secondary, projector, lower, upper), fixed, max_iterations))
-    return Saturated(
-        x=ends[-1].x,
-        projector=projector,
-        scales=jnp.stack([end.scale for end in ends[: len(levels)]]),
-        active=ends[-1].active,
-        iterations=jnp.sum(jnp.stack([end.iterations for end in ends])),
-        done=jnp.stack([end.done for end in ends]).all(),
-    )
+    """Level after level; then as near to the secondary motion as they leave room.
 
-
-def _nearest_to_zero(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
-    return jnp.where(lower > 0.0, lower, jnp.where(upper < 0.0, upper, jnp.where(lower == upper, lower, 0.0)))
+    The levels are solved in double precision whatever the data are, for a joint is on its bound or is not. What was
+    decided is then differentiated in the precision of the data.
+    """
+    problem = padded(levels, lower, upper, secondary, damping, rank)
+    descend = in_lanes(in_double(partial(_descend, max_iterations)))
+    end = kept(descend(jax.lax.stop_gradient(problem)))
+    x, projector, scales = with_derivative((end.x, end.projector, end.scales), end.decisions, problem)
+    return Saturated(x, projector, scales[: len(levels)], end.active, end.iterations, end.done)
 
 
 class _End(NamedTuple):
-    """What one level came to."""
+    """What all levels came to, and what each decided."""
 
     x: Float[Array, " n"]
-    scale: Float[Array, ""]
+    projector: Float[Array, "n n"]
+    scales: Float[Array, " L"]
+    decisions: Decision  # with a leading axis, the levels
+    active: Int[Array, " n"]
+    iterations: Int[Array, ""]
+    done: Bool[Array, ""]
+
+
+class _State(NamedTuple):
+    """Where the levels so far ended."""
+
+    x: Float[Array, " n"]
     projector: Float[Array, "n n"]  # without the joints that can move no more
     fixed: Int[Array, " n"]  # those, at their side; 2 for the pinned ones
     active: Int[Array, " n"]
@@ -96,52 +98,45 @@ class _End(NamedTuple):
     done: Bool[Array, ""]
 
 
-def _descend(room: Room, fixed: Int[Array, " n"], max_iterations: int) -> _End:
-    """What the search decides, and from that the answer anew, which is differentiable; the start where it fails."""
-    found = in_lanes(jax.vmap(partial(search, max_iterations=max_iterations)))(jax.lax.stop_gradient(room))
-    found = jax.lax.stop_gradient(found)
-    scale, projector, stopped = _stop(room, found)
-    # one factorisation after another: see osik_jax/_runtime.py
-    scale, side = jax.lax.optimization_barrier((scale, jnp.where(found.done, found.side, 0)))
-    x, _ = settle(room, scale, side, dual_basis(room.projector, side))
-    x = inside(jnp.where(side != 0, room.bound(side), x), room.lower, room.upper)
-    done = found.done & jax.lax.stop_gradient(room.holds(x, scale))
-    fixed = jnp.where((fixed == 0) & stopped & done, found.blocking, fixed)
-    return _End(
-        x=jnp.where(done, x, room.start),
-        scale=jnp.where(done, scale, 0.0),
-        projector=projector,
+def _descend(max_iterations: int, problem: Problem) -> _End:
+    """All levels of a batch; every array has a leading axis, the batch, and then perhaps one of levels."""
+    x, projector = jax.vmap(first_room)(problem)
+    fixed = jnp.where(problem.lower == problem.upper, 2, 0)
+    none = jnp.zeros(len(x), jnp.int32)
+
+    def level(state: _State, each: tuple[Rows, Damping, Array]) -> tuple[_State, tuple[Array, Decision]]:
+        room = jax.vmap(_room)(problem, state, *each)
+        found = search(room, max_iterations)
+        after, decision = jax.vmap(_after)(state, room, found)
+        return after, (jnp.where(found.done, found.scale, 0.0), decision)
+
+    start = _State(x, projector, fixed, fixed, none, none == 0)
+    across = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), (problem.rows, problem.damping, problem.targets))
+    end, (scales, decisions) = jax.lax.scan(level, start, across)
+    scales, decisions = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), (scales, decisions))
+    return _End(end.x, end.projector, scales, decisions, end.active, end.iterations, end.done)
+
+
+def _room(problem: Problem, state: _State, rows: Rows, damping: Damping, target: Array) -> Room:
+    """Where the next x may be."""
+    motion, projector = level_motion(rows, state.x, state.projector, damping, problem.rank)
+    return Room(state.x, motion, target, projector, problem.lower, problem.upper)
+
+
+def _after(state: _State, room: Room, found: Found) -> tuple[_State, Decision]:
+    """The start again where the search failed."""
+    side, stops = (jnp.where(found.done, sides, 0) for sides in (found.side, found.blocking))
+    stopped = jnp.where((stops != 0)[:, None], room.projector, 0.0)
+    none = jnp.zeros((), stopped.dtype)
+    space, _ = row_space_and_motion(stopped, stopped[:, 0], none + _INDEPENDENT, none)
+    keep = (stops == 0)[:, None] & (stops == 0)[None, :]
+    fixed = jnp.where(state.fixed == 0, stops, state.fixed)
+    after = _State(
+        x=jnp.where(found.done, found.x, state.x),
+        projector=jnp.where(keep, room.projector - space, 0.0),
         fixed=fixed,
-        active=jnp.where(fixed != 0, fixed, jnp.where(done, side, 0)),
-        iterations=found.iterations,
-        done=done,
+        active=jnp.where(fixed != 0, fixed, side),
+        iterations=state.iterations + found.iterations,
+        done=state.done & found.done,
     )
-
-
-def _stop(room: Room, found: Found) -> tuple[Float[Array, ""], Float[Array, "n n"], Bool[Array, " n"]]:
-    """The scale, and the projector without the joints that stop the motion, and which these are.
-
-    The blocker's column of the projector is the sum of the others' with their shares, so that the same combination of
-    x does not depend on what the null space does.
-    """
-    others = found.blocking.at[found.blocker].set(0)
-    dual = dual_basis(room.projector, others)
-    shares = product(dual, room.projector[:, found.blocker][:, None])[:, 0]
-    normal = (-shares).at[found.blocker].set(1.0)
-    scale = jnp.where(found.blocked, blocked_scale(room, found.blocking, normal), 1.0)
-    matters = jnp.abs(normal) > dependence(normal.dtype)
-    stopped = jax.lax.stop_gradient(found.blocked & found.done & (found.blocking != 0) & matters)
-    frozen = jnp.where(stopped, others, 0)
-    frozen, dual = jax.lax.optimization_barrier((frozen, dual))
-    columns = jnp.where(frozen != 0, room.projector, 0.0)
-    space = product(columns, dual_basis(room.projector, frozen))
-    reduced = room.projector - product(room.projector, product(space, room.projector))
-    keep = ~stopped[:, None] & ~stopped[None, :]
-    return scale, jnp.where(keep, _purified(reduced), 0.0), stopped
-
-
-def _purified(projector: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """3 P^2 - 2 P^3 of a symmetric P: eigenvalues at a distance e from 0 or 1 come as near as 3 e^2."""
-    projector = 0.5 * (projector + projector.T)
-    square = product(projector, projector)
-    return 3.0 * square - 2.0 * product(square, projector)
+    return after, Decision(found.done, side, stops, found.blocker)

@@ -58,9 +58,10 @@ def solve_nullspace(
         damping: of the motion of each level, in squared singular values: s / (s^2 + damping) stands for 1 / s. One for
             all, or a list with one for each level. A ``Damping`` has a part that vanishes where the level can be met;
             in the reverse order all of it counts.
-        rank_tolerance: singular values of A P under this share of the Frobenius norm of A (P projects onto what the
-            levels before leave free) count as zero; default 1e-10 (1e-5 in float32). Against A and not A P, so that
-            a level which repeats one above it has rank 0, not the rank of its rounding.
+        rank_tolerance: rows of A P that stand out of the span of the longer ones by less than this share of the
+            Frobenius norm of A count as dependent on them (P projects onto what the levels before leave free);
+            default 1e-10 (1e-5 in float32). Against A and not A P, so that a level which repeats one above it has
+            rank 0, not the rank of its rounding.
         max_iterations: cap on the search for the saturated joints, for each level (static); default 10 (n + 2).
 
     Raises:
