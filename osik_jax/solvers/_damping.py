@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from ._dense import apply, product
 from ._level import Level
@@ -38,7 +37,7 @@ class Damping(NamedTuple):
     demand: Any = 0.0
 
 
-def one_each(damping: ArrayLike | Damping | Sequence[ArrayLike | Damping], count: int, dtype: jnp.dtype) -> Damping:
+def one_each(damping: Any, count: int, dtype: jnp.dtype) -> Damping:
     """Of each of ``count`` levels, from one for all or from one for each: every field has an axis of levels."""
     single = isinstance(damping, Damping) or not isinstance(damping, Sequence)
     given = [damping] * count if single else list(damping)
