@@ -17,7 +17,7 @@ from ..limits import LimitRows
 from ..solvers import Damping, Level, Status
 from ..solvers._dense import apply
 from ..tasks import TaskRows
-from ..tasks._gain import safe_norm
+from ..tasks._curvature import length
 
 _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 """A hard row that is missed by less, of what its numbers amount to, holds."""
@@ -68,12 +68,12 @@ class VelocityProblem(eqx.Module):
         different chains, so their parts add up like the sides of a right angle.
         """
         bends = [self.rows[name].curvature for name in names]  # none where all tasks are hard
-        return self.dt * safe_norm(jnp.stack([jnp.zeros_like(self.dt), *bends]))
+        return self.dt * length(jnp.stack([jnp.zeros_like(self.dt), *bends]))
 
     def damping(self, names: Sequence[str], constant: Float[Array, ""], curvature: Float[Array, ""] | float) -> Damping:
         """Of a priority, from the damping that a scheme has anyway and the share of the curvature that it takes."""
         pulls = [jnp.sqrt(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
-        return Damping(constant, curvature * self.curvature(names), safe_norm(jnp.concatenate(pulls)))
+        return Damping(constant, curvature * self.curvature(names), length(jnp.concatenate(pulls)))
 
     def level(self, names: Sequence[str]) -> Level:
         """The rows of some tasks as one level."""

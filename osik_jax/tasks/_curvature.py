@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -46,15 +47,28 @@ def pose_curvature(
 
 def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 n"], arms: Float[Array, "3 n"]) -> Float[Array, ""]:
     """Frobenius norm of the matrix with the entries ``pull . (axis_i x arm_j)``; its gradient at 0 is 0."""
-    turned = cross(pull[:, None], axes, along=0)
+    size = _largest(pull)
+    turned = cross((pull / size)[:, None], axes, along=0)
     squared = jnp.sum(dot(turned, turned.T) * dot(arms, arms.T))
     positive = squared > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    return size * jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+
+def length(pull: Float[Array, " m"]) -> Float[Array, ""]:
+    """Euclidean norm, of whatever size; its gradient at 0 is 0."""
+    size = _largest(pull)
+    return size * safe_norm(pull / size)
+
+
+def _largest(pull: Float[Array, " m"]) -> Float[Array, ""]:
+    """Of the absolute entries, 1 where all are 0; a constant for derivatives."""
+    largest = jnp.max(jnp.abs(jax.lax.stop_gradient(pull)), initial=0.0)
+    return jnp.where(largest > 0.0, largest, 1.0)
 
 
 def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "m nv"]) -> Float[Array, ""]:
     """Bound for any rows: the pull's length times the size (Frobenius norm) of their Jacobian."""
-    return safe_norm(pull) * safe_norm(jacobian.ravel())
+    return length(pull) * safe_norm(jacobian.ravel())
 
 
 def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:

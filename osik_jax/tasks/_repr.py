@@ -22,7 +22,7 @@ def short_repr(task: Any) -> str:
 
 
 _ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
-_SILENT = ("row_count", "orientation_jacobian")
+_SILENT = ("row_count", "orientation_jacobian", "made_for")
 """Fields that follow from others or that few change."""
 
 

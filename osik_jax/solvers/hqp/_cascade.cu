@@ -26,7 +26,7 @@ constexpr int PATIENCE = 20;                          // steps of no length, bef
 constexpr double DAMPING = 1e-9;                      // of the longest row, squared, as in _proposal.py
 constexpr unsigned ALL = 0xffffffffu;
 
-__shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * LONGEST + MOST_RANK + M * VD];
+__shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * LONGEST + MOST_RANK + M * VD + M];
 __shared__ int shared_ints[WARPS][N + MOST_RANK + M];
 
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
@@ -43,6 +43,7 @@ double* const first_of = turn + LONGEST;
 double* const second_of = first_of + LONGEST;
 double* const strength = second_of + LONGEST;         // of the reflections
 double* const square_of = strength + MOST_RANK;       // Cholesky factor below, what is factored above; rows of VD
+double* const inverse_of = square_of + M * VD;        // of the diagonal of that factor
 double* const rows_of = V;                            // before V and R are: the level's rows in the basis; rows of ZD
 int* const held = shared_ints[warp];                  // the row that column k of the basis is for
 int* const pivot = held + N;
@@ -161,24 +162,26 @@ auto reflection = [&](int at, double norm) {
 };
 
 // Cholesky factor of the first `count` rows of `square_of`, whose upper triangle with the diagonal is the matrix, plus
-// `ridge` on the diagonal; the factor goes below, its diagonal to `first_of`
+// `ridge` on the diagonal; the factor goes below, its diagonal's inverse to `inverse_of`
 auto cholesky = [&](int count, double ridge) {
-  for (int a = lane; a < count; a += 32)
-    for (int b = 0; b < a; ++b) square_of[a * VD + b] = square_of[b * VD + a];
-  for (int a = lane; a < count; a += 32) first_of[a] = square_of[a * VD + a] + ridge;
+  for (int e = lane; e < count * count; e += 32) {
+    const int a = e / count, b = e % count;
+    if (b < a) square_of[a * VD + b] = square_of[b * VD + a];
+    if (b == a) inverse_of[a] = square_of[a * VD + a] + ridge;
+  }
   __syncwarp();
   for (int k = 0; k < count; ++k) {
-    const double root = sqrt(fmax(first_of[k], 1e-300));
+    const double inverse = 1.0 / sqrt(fmax(inverse_of[k], 1e-300));
+    const int left = count - k - 1;
     __syncwarp();
-    for (int a = lane; a < count; a += 32)
-      if (a > k) square_of[a * VD + k] /= root;
-    if (lane == 0) first_of[k] = root;
+    for (int a = k + 1 + lane; a < count; a += 32) square_of[a * VD + k] *= inverse;
+    if (lane == 0) inverse_of[k] = inverse;
     __syncwarp();
-    for (int a = lane; a < count; a += 32)
-      if (a > k) {
-        for (int b = k + 1; b < a; ++b) square_of[a * VD + b] -= square_of[a * VD + k] * square_of[b * VD + k];
-        first_of[a] -= square_of[a * VD + k] * square_of[a * VD + k];
-      }
+    for (int e = lane; e < left * left; e += 32) {
+      const int a = k + 1 + e / left, b = k + 1 + e % left;
+      if (b < a) square_of[a * VD + b] -= square_of[a * VD + k] * square_of[b * VD + k];
+      if (b == a) inverse_of[a] -= square_of[a * VD + k] * square_of[a * VD + k];
+    }
     __syncwarp();
   }
 };
@@ -187,7 +190,7 @@ auto cholesky_solve = [&](int count, double* right) { // entry a of lane a % 32
     double mine = right[0];
 #pragma unroll
     for (int g = 1; g < G; ++g) mine = k >> 5 == g ? right[g] : mine;
-    const double y = __shfl_sync(ALL, mine, k & 31) / first_of[k];
+    const double y = __shfl_sync(ALL, mine, k & 31) * inverse_of[k];
 #pragma unroll
     for (int g = 0; g < G; ++g) {
       const int a = lane + 32 * g;
@@ -199,7 +202,7 @@ auto cholesky_solve = [&](int count, double* right) { // entry a of lane a % 32
     double mine = right[0];
 #pragma unroll
     for (int g = 1; g < G; ++g) mine = k >> 5 == g ? right[g] : mine;
-    const double y = __shfl_sync(ALL, mine, k & 31) / first_of[k];
+    const double y = __shfl_sync(ALL, mine, k & 31) * inverse_of[k];
 #pragma unroll
     for (int g = 0; g < G; ++g) {
       const int a = lane + 32 * g;
@@ -290,13 +293,14 @@ auto hold = [&]() {                                   // rotates the held rows t
   __syncwarp();
 };
 
-auto soften = [&]() {                                 // the squares of the factor's rows, and the damping: for `least_squares`
-  for (int k = lane; k < rank; k += 32)
-    for (int l = k; l < rank; ++l) {
-      double total = 0.0;
-      for (int j = held_count; j < width; ++j) total += R[k * ZD + j] * R[l * ZD + j];
-      square_of[k * VD + l] = total;
-    }
+auto soften = [&]() {                                 // the squares of the factor's rows, and the damping
+  for (int e = lane; e < rank * rank; e += 32) {
+    const int k = e / rank, l = e % rank;
+    if (l < k) continue;
+    double total = 0.0;
+    for (int j = held_count; j < width; ++j) total += R[k * ZD + j] * R[l * ZD + j];
+    square_of[k * VD + l] = total;
+  }
   __syncwarp();
   cholesky(rank, damping + 1e-14 * size * size);
 };
@@ -378,6 +382,7 @@ auto fit = [&]() {                                    // factors the rows that c
       if (k < rank && exists[h])
         R[k * ZD + lane + 32 * h] = lane + 32 * h >= held_count && lane + 32 * h < width ? column[h][k] : 0.0;
   __syncwarp();
+  if (damping > 0.0) soften();
 };
 
 // the step that makes the level's cost least; x has to be in `point`
@@ -400,7 +405,6 @@ auto least_squares = [&](const double* slack, double* d) {
       second_of[j] = j >= held_count ? total : 0.0;
     }
     __syncwarp();
-    soften();
 #pragma unroll
     for (int g = 0; g < G; ++g) {
       const int k = lane + 32 * g;
@@ -604,17 +608,19 @@ for (level = 0; level < LEVELS; ++level) {
         rows_of[a * ZD + j] = second_of[a] * total;
       }
     __syncwarp();
-    for (int a = lane; a < m; a += 32) {
-      for (int b = a; b < m; ++b) {
-        double total = 0.0;
-        for (int j = 0; j < width; ++j) total += rows_of[a * ZD + j] * rows_of[b * ZD + j];
-        square_of[a * VD + b] = total;
-      }
-      trace += square_of[a * VD + a];
+    for (int e = lane; e < m * m; e += 32) {
+      const int a = e / m, b = e % m;
+      if (b < a) continue;
+      double total = 0.0;
+      for (int j = 0; j < width; ++j) total += rows_of[a * ZD + j] * rows_of[b * ZD + j];
+      square_of[a * VD + b] = total;
+      if (b == a) trace += total;
     }
     trace = sum(trace);
     __syncwarp();
-    for (int pass = 0; pass < PASSES; ++pass) {
+    double before = 0.0;                              // a share that a pass has not changed stays
+    for (int pass = 0; pass < PASSES && share != before; ++pass) {
+      before = share;
       double y[G], missed = 0.0;
       const double ridge = constant + unmet * share + 1e-13 * trace;
       cholesky(m, ridge > 0.0 ? ridge : 1.0);

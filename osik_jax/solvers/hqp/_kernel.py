@@ -69,7 +69,7 @@ class Shape(NamedTuple):
         row, column = n | 1, m | 1
         rank = min(n, m)
         factors = max(rank * (row + column), n * column, m * row)
-        doubles = n * row + factors + max(p, 1) * row + 4 * max(n, m, p) + rank + m * column
+        doubles = n * row + factors + max(p, 1) * row + 4 * max(n, m, p) + rank + m * (column + 1)
         return min(_MOST_WARPS, _SHARED_BYTES // (8 * doubles + 4 * (2 * n + m)))
 
 
