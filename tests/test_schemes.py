@@ -192,7 +192,7 @@ class TestWeightedQP:
     def test_agrees_with_the_textbook_qp(self, name, request, rng):
         case = request.getfixturevalue(name)
         q = configurations(case, rng)
-        ours = solve_lanes(case, q, osik.WeightedQP(damping=DAMPING))
+        ours = solve_lanes(case, q, osik.WeightedQP(damping=DAMPING, curvature_damping=0.0))
         np.testing.assert_array_equal(ours.status, osik.Status.SOLVED)
         bounded = violated = 0
         for k in range(LANES):
@@ -213,7 +213,14 @@ class TestWeightedQP:
     def test_a_row_of_weight_zero_costs_nothing(self, arm):
         """An inequality that is violated however the arm moves, and no other task of weight: nothing moves."""
         tasks = {"position": osik.FrameTask(arm.robot, "hand", rows="position", lower=1.0, weight=0.0)}
-        ours = osik.solve(arm.robot, arm.robot.q0, tasks, scheme=osik.WeightedQP(damping=1e-6), dt=DT, limits=())
+        ours = osik.solve(
+            arm.robot,
+            arm.robot.q0,
+            tasks,
+            scheme=osik.WeightedQP(damping=1e-6, curvature_damping=0.0),
+            dt=DT,
+            limits=(),
+        )
         np.testing.assert_allclose(ours.velocity, 0.0, rtol=0, atol=1e-12)
         assert int(ours.status) == osik.Status.SOLVED
 
@@ -239,7 +246,7 @@ class TestWeightedQP:
             robot,
             robot.q0,
             ours,
-            scheme=osik.WeightedQP(damping=1e-4),
+            scheme=osik.WeightedQP(damping=1e-4, curvature_damping=0.0),
             limits=(osik.ConfigurationLimit(robot), fast),
             dt=DT,
             steps=ticks,
@@ -301,7 +308,7 @@ def unlimited(case):
 
 
 def undamped(gain=0.0):
-    return osik.NullSpace(damping=0.0, potential_gain=gain, rank_tolerance=1e-9)
+    return osik.NullSpace(damping=0.0, curvature_damping=0.0, potential_gain=gain, rank_tolerance=1e-9)
 
 
 class TestNullSpace:
@@ -389,7 +396,7 @@ class TestHierarchicalQP:
         """The arm: the second level contradicts the first. NAO: an inequality at the second. Speeds bind in both."""
         case = request.getfixturevalue(name)
         q = configurations(case, rng)
-        ours = solve_lanes(case, q, osik.HierarchicalQP())
+        ours = solve_lanes(case, q, osik.HierarchicalQP(curvature_damping=0.0))
         np.testing.assert_array_equal(ours.status, osik.Status.SOLVED)
         bounded = 0
         for k in range(LANES):
@@ -407,8 +414,8 @@ class TestHierarchicalQP:
         """The first level misses as much as if it were alone."""
         q = configurations(arm, rng)
         first = dataclasses.replace(arm, tasks={"position": arm.tasks["position"]})
-        alone = solve_lanes(first, q, osik.WeightedQP(damping=1e-12))
-        together = solve_lanes(arm, q, osik.HierarchicalQP())
+        alone = solve_lanes(first, q, osik.WeightedQP(damping=1e-12, curvature_damping=0.0))
+        together = solve_lanes(arm, q, osik.HierarchicalQP(curvature_damping=0.0))
         np.testing.assert_allclose(together.slack["position"], alone.slack["position"], rtol=0, atol=1e-9)
         assert np.abs(together.slack["pose"]).max() > 0.1
         assert np.abs(together.velocity - alone.velocity).max() > 1e-2
@@ -417,7 +424,9 @@ class TestHierarchicalQP:
         """Both are eq. 7, though the second level contradicts the first."""
         case = unlimited(arm)
         q = configurations(case, rng)
-        ours, projection = (solve_lanes(case, q, scheme) for scheme in (osik.HierarchicalQP(), undamped()))
+        ours, projection = (
+            solve_lanes(case, q, scheme) for scheme in (osik.HierarchicalQP(curvature_damping=0.0), undamped())
+        )
         np.testing.assert_allclose(ours.velocity, projection.velocity, rtol=0, atol=1e-8)
         for k in range(LANES):
             expected = projected(levels(case, q[k]), case.robot.nv, np.zeros(case.robot.nv))
@@ -426,19 +435,23 @@ class TestHierarchicalQP:
     def test_one_level_equals_the_weighted_qp(self, arm, rng):
         case = dataclasses.replace(arm, tasks=arm_tasks(arm.robot, (1, 1, 1), (5.0, 2.0, 0.1)))
         q = configurations(case, rng)
-        schemes = osik.HierarchicalQP(), osik.WeightedQP(damping=1e-11)
+        schemes = osik.HierarchicalQP(curvature_damping=0.0), osik.WeightedQP(damping=1e-11, curvature_damping=0.0)
         hierarchical, weighted = (solve_lanes(case, q, scheme) for scheme in schemes)
         np.testing.assert_allclose(hierarchical.velocity, weighted.velocity, rtol=0, atol=1e-8)
 
     def test_growing_weights_tend_to_it(self, arm, rng):
         q = configurations(arm, rng)
-        strict = solve_lanes(arm, q, osik.HierarchicalQP()).velocity
+        strict = solve_lanes(arm, q, osik.HierarchicalQP(curvature_damping=0.0)).velocity
         apart = []
         for k in (1, 2, 3):
             ratio = 10.0 ** (2 * k)
             tasks = {name: t.replace(weight=ratio ** (2 - i)) for i, (name, t) in enumerate(arm.tasks.items())}
             case = dataclasses.replace(arm, tasks=tasks)
-            apart.append(np.abs(solve_lanes(case, q, osik.WeightedQP(damping=1e-10)).velocity - strict).max())
+            apart.append(
+                np.abs(
+                    solve_lanes(case, q, osik.WeightedQP(damping=1e-10, curvature_damping=0.0)).velocity - strict
+                ).max()
+            )
         assert apart[1] < 0.1 * apart[0]
         assert apart[2] < 0.1 * apart[1]
         assert apart[2] < 1e-3
@@ -460,7 +473,15 @@ class TestCentreOfMass:
         outside = {}
         for weight in (0.0, 1.0):
             now = {**tasks, "com": com.replace(weight=weight)}
-            run = osik.rollout(robot, robot.q0, now, scheme=osik.HierarchicalQP(), limits=limits, dt=0.01, steps=150)
+            run = osik.rollout(
+                robot,
+                robot.q0,
+                now,
+                scheme=osik.HierarchicalQP(curvature_damping=0.0),
+                limits=limits,
+                dt=0.01,
+                steps=150,
+            )
             np.testing.assert_array_equal(run.solution.status, osik.Status.SOLVED)
             com_at, feet_at = mujoco_path(robot, np.asarray(run.q), feet)
             beyond = com_at[:, :2] @ np.asarray(polygon.normals).T - np.asarray(polygon.offsets)
