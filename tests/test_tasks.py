@@ -246,8 +246,11 @@ def test_an_own_task(arm):
     assert set(task.replaceable) == {"height", "weight", "gain"}
     theirs = osik.FrameTask(arm, "hand", target=([0, 0, 2.0], np.eye(3)), rows=[i == 2 for i in range(6)], gain=3)
     rows = rows_of_each(arm, {"own": new, "frame": theirs}, arm.q0)
-    for ours, expected in zip(jax.tree.leaves(rows["own"]), jax.tree.leaves(rows["frame"]), strict=True):
+    for name in ("error", "jacobian", "lower", "upper", "weight", "pull"):
+        ours, expected = (getattr(rows[task], name) for task in ("own", "frame"))
         np.testing.assert_allclose(ours, expected, atol=1e-15)
+    pull, jacobian = (np.linalg.norm(getattr(rows["own"], name)) for name in ("pull", "jacobian"))
+    assert float(rows["own"].curvature) == pytest.approx(pull * jacobian, rel=1e-12)
     with pytest.raises(TypeError, match=r"HeightTask has no 'body' to replace; it has: .*height"):
         task.replace(body="link1")
 

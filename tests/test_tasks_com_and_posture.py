@@ -111,5 +111,5 @@ class TestMistakes:
             osik.PostureTask(nao, joints=(base,), lower=0.0)
         with pytest.raises(TypeError, match="not both"):
             osik.PostureTask(nao, target=nao.q0, lower=0.0)
-        with pytest.raises(ValueError, match="q has shape"):
+        with pytest.raises(ValueError, match=r"target has shape \(4,\)"):
             osik.PostureTask(nao, target=np.zeros(4))

@@ -64,7 +64,8 @@ def norms(s):
 
 def test_hierarchies(rng):
     r = recorded_hierarchies(unit_rows=False)
-    none = WorkingSet(jnp.zeros((256, 5, 34), jnp.int32), jnp.zeros((256, 5, 32), jnp.int32))
+    longest = max(level[0].shape[1] for level in r.levels)
+    none = WorkingSet(jnp.zeros((256, 5, 34), jnp.int32), jnp.zeros((256, 5, longest), jnp.int32))
     cold = warm_hierarchy(r.levels, r.lower, r.upper, none)
     warm = warm_hierarchy(r.levels, r.lower, r.upper, cold.warm_start)
     assert np.mean(warm.factorizations) < 0.8 * np.mean(cold.factorizations)
