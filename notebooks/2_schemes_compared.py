@@ -25,6 +25,7 @@
 # %%
 import os
 import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -64,19 +65,20 @@ tasks = {
 home, rotation = tasks["hand"].target
 
 # %% [markdown]
-# Each scheme runs twice: as it comes, and *calmed*. Calmed means damping: directions in which the hand moves less than
-# about 10 cm a radian are used gently (`damping=0.1**2`). `HierarchicalQP` has no damping; it is calmed by moving the
+# Each scheme runs twice: plain, without the curvature damping that all have by default (`curvature_damping=0.0`), so that
+# what the schemes themselves do is seen; and *calmed*, by a constant damping: directions in which the hand moves less than
+# about 10 cm a radian are used gently (`damping=0.1**2`). `HierarchicalQP` is calmed by moving the
 # posture up, with the same weight, to the priority of the elbow, so that level 2 is a compromise of both. The hand
 # still comes first.
 
 # %%
 DAMPING = 0.1**2
 SCHEMES = {
-    "weighted": osik.WeightedQP,
-    "null space": osik.NullSpace,
-    "null space, saturated": lambda **numbers: osik.NullSpace(saturate=True, **numbers),
-    "null space, reverse": lambda **numbers: osik.NullSpace(order="reverse", **numbers),
-    "hierarchical": osik.HierarchicalQP,
+    "weighted": partial(osik.WeightedQP, curvature_damping=0.0),
+    "null space": partial(osik.NullSpace, curvature_damping=0.0),
+    "null space, saturated": partial(osik.NullSpace, saturate=True, curvature_damping=0.0),
+    "null space, reverse": partial(osik.NullSpace, order="reverse", curvature_damping=0.0),
+    "hierarchical": partial(osik.HierarchicalQP, curvature_damping=0.0),
 }
 COLORS = dict(zip(SCHEMES, ("#d55e00", "#999999", "#009e73", "#cc79a7", "#0072b2"), strict=True))
 beside = {**tasks, "posture": osik.PostureTask(arm, gain=1.0, weight=DAMPING, priority=2)}

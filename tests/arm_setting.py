@@ -11,7 +11,7 @@ DT = 0.01
 SCHEMES = {
     "weighted": osik.WeightedQP(damping=1e-3),
     "null-space": osik.NullSpace(damping=1e-3),
-    "hierarchical": osik.HierarchicalQP(),
+    "hierarchical": osik.HierarchicalQP(damping=1e-3),
 }
 
 

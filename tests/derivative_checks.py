@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-_STEPS = (1e-3, 5e-4, 2.5e-4)
+_STEPS = (2e-4, 1e-4, 5e-5)
 _SETTLED = 1e-7
 """Extrapolations that differ by less than this share have no kink and no pole nearby, and are that exact."""
 

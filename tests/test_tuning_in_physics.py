@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
@@ -92,7 +94,8 @@ def test_without_tuning_the_waist_stays_behind(loop):
 def test_what_the_bound_is_for(tuned):
     """The kinematic loop takes gains up to 1 / dt and more; servos and floor do not."""
     names = [f"{name}.gain" for name in tuned.loop.tasks]
-    fell, _, tilt, slip, _ = in_physics(tuned.loop.replace(dict.fromkeys(names, 40.0)), 4.0)
+    loop = eqx.tree_at(lambda loop: loop.scheme.curvature_damping, tuned.loop, jnp.zeros(()))  # which would calm it
+    fell, _, tilt, slip, _ = in_physics(loop.replace(dict.fromkeys(names, 40.0)), 4.0)
     assert fell or tilt > 3.0 or slip > 0.005
 
 

@@ -30,6 +30,9 @@ class Decision(NamedTuple):
     blocker: Int[Array, ""]  # the one of them whose place the others say
 
 
+_DEPENDENT = 1e-7
+"""A saturated joint that the others leave less of its column of the projector has no derivative of its own."""
+
 Answer = tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, " L"]]
 """x, the projector, and the scales."""
 
@@ -109,6 +112,7 @@ def _dual_basis(projector: Float[Array, "n n"], side: Int[Array, " n"]) -> Float
     valid = side[order] != 0
     basis, triangle = jnp.linalg.qr(jnp.where(valid, projector[:, order], 0.0))
     eye = jnp.eye(len(side), dtype=projector.dtype)
+    valid = valid & (jnp.abs(jnp.diagonal(triangle)) > _DEPENDENT)
     both = valid[:, None] & valid[None, :]
     inverse = jax.scipy.linalg.solve_triangular(jnp.where(both, triangle, eye), eye)
     dual = product(jnp.where(both, inverse, 0.0), jnp.where(valid, basis, 0.0).T)
