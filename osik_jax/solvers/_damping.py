@@ -22,7 +22,7 @@ from ._level import Level
 PASSES = 3
 """Steps towards the fixed point; each makes what is damped too much smaller by the factor unmet / s^2."""
 _RIDGE = 1e-13
-"""Of the rows' squares: keeps the system of dependent rows from breaking the factorisation."""
+"""Of the rows' squares, or ten roundings of them: keeps dependent rows from breaking the factorisation."""
 
 
 class Damping(NamedTuple):
@@ -75,7 +75,7 @@ def effective(
     rows = jnp.where(counts[:, None], product(level.matrix, projector), 0.0)
     gram = product(rows, rows.T)
     eye = jnp.eye(len(goal), dtype=gram.dtype)
-    ridge = _RIDGE * jnp.trace(gram)
+    ridge = max(_RIDGE, 10.0 * float(jnp.finfo(gram.dtype).eps)) * jnp.trace(gram)
     demand = jnp.where(damping.demand > 0.0, damping.demand, 1.0)
     share = jnp.ones_like(damping.unmet)
     for _ in range(PASSES):
