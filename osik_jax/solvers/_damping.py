@@ -25,6 +25,10 @@ _RIDGE = 1e-13
 """Of the rows' squares, or ten roundings of them: keeps dependent rows from breaking the factorisation."""
 
 
+_LEAST = 1e-13
+"""Of the square of the level's longest row: a damping under this has slopes under those that rounding has."""
+
+
 class Damping(NamedTuple):
     """Of one level: it minimises ``1/2 |w|^2 + 1/2 (constant + share unmet) |x|^2``.
 
@@ -86,4 +90,6 @@ def effective(
         some = missed > 0.0
         root = jnp.where(some, jnp.sqrt(jnp.where(some, missed, 1.0)), 0.0)
         share = jnp.minimum(root / demand, 1.0)
-    return damping.constant + damping.unmet * share
+    whole = damping.constant + damping.unmet * share
+    longest = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
+    return jnp.where(whole > _LEAST * longest, whole, 0.0)

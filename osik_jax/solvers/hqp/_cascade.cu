@@ -652,6 +652,7 @@ for (level = 0; level < LEVELS; ++level) {
     }
     damping = constant + unmet * share;
   }
+  if (!(damping > 1e-13 * size * size)) damping = 0.0;  // its slopes would be rounding
   size = fmax(size, sqrt(damping));
 
   double value[G], slack[G], reach = 0.0, missing = 0.0, missing_rows = 0.0;

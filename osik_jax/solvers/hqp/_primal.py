@@ -61,8 +61,9 @@ def solve_level(task: Task, start: LevelState, tolerances: Tolerances, max_itera
         step = apply(task.projector, descend(s.x, slack))
         change = jnp.where(counts, apply(level.matrix, step), 0.0)
         floor = rounding(task, s.x, slack, tolerances)
-        still = task.missing(step, change) <= floor
-        at_rest = _drop(task, s, task.gradient(s.x, slack), floor * task.size, held, tolerances)
+        gradient = task.gradient(s.x, slack)
+        still = (task.missing(step, change) <= floor) | ~(jnp.sum(gradient * step) < 0.0)  # or rounding, not downhill
+        at_rest = _drop(task, s, gradient, floor * task.size, held, tolerances)
         moved = _advance(task, s, step, tolerances)
         out = jax.tree.map(lambda a, b: jnp.where(still, a, b), at_rest, moved)
         return out._replace(counts=counts, rank=rank, iterations=s.iterations + 1)
