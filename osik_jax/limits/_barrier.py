@@ -58,9 +58,10 @@ class PositionBarrier(Limit):
     ):
         robot.tree.frame(frame)
         self.frame, dtype = frame, robot.q0.dtype
-        self.normals = jnp.atleast_2d(jnp.asarray(np.eye(3) if normals is None else normals, dtype))
+        given = jnp.asarray(np.eye(3) if normals is None else normals, dtype)
+        self.normals = jnp.atleast_2d(given)
         if self.normals.ndim != 2 or self.normals.shape[1] != 3:
-            raise ValueError(f"normals has shape {np.shape(normals)}, expected (m, 3) or (3,)")
+            raise ValueError(f"normals has shape {given.shape}, expected (m, 3) or (3,)")
         low, high = as_bounds(lower, upper, len(self.normals), dtype)
         if low is None or high is None:
             raise ValueError("a PositionBarrier needs lower, upper or both")
