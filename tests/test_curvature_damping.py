@@ -43,6 +43,7 @@ def second_derivative(model, q, pull, body, h=1e-5):
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_the_bound_is_near_the_greatest_curvature(arm, rng):
     """Half of the greatest eigenvalue is what a step needs to be stable; here it is never less than 0.6 of it."""
     model = arm.mj_model
@@ -124,7 +125,9 @@ def test_inside_it_is_as_exact_as_without(scheme, arm):
     assert damped.max() < 1e-3
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(
+    "scheme", ["weighted", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SCHEMES)[1:])]
+)
 def test_derivatives_with_the_damping_on(scheme, arm):
     """By target, gain, configuration and the damping's own share, against central differences; second ones too."""
     q0 = bent(arm)

@@ -40,6 +40,7 @@ def projected(levels, damping):
     return x
 
 
+@pytest.mark.slow
 def test_free_levels_reach_what_projections_do(levels):
     unbounded = np.full((COUNT, N), np.inf)
     found = solved(levels, -unbounded, unbounded, DAMPINGS)
@@ -72,6 +73,7 @@ def test_a_bounded_level_is_the_damped_least_squares(levels):
         np.testing.assert_allclose(A @ x, A @ best, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_values(levels):
     upper = jnp.full(N, 0.4)
     (A, b), (C, d), _ = [(A[0], b[0]) for A, b in levels]

@@ -128,6 +128,7 @@ def urdf(ending):
     return Path(str(found.locate()))
 
 
+@pytest.mark.slow
 def test_a_walker_stands_on_the_floor():
     """Its lowest point is at height 0, and all its feet are within a millimetre of it."""
     path = urdf("solo_description/robots/solo12.urdf")

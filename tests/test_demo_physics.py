@@ -40,6 +40,7 @@ def judged(motion, run, **changes):
     return physics_figures(demo.measure_physics(motion, run.world, recording, run.plan.q))
 
 
+@pytest.mark.slow
 def test_single_support_reaches_its_numbers(lift):
     """What is wanted: 1 cm, 3 degrees and 5 mm, from the sensed configurations."""
     motion, _, summary, run = lift
@@ -65,6 +66,7 @@ def test_single_support_reaches_its_numbers(lift):
         assert figures["slip_mm"][foot] <= 5.0 and figures["contact_slip_mm"][foot] <= 5.0
 
 
+@pytest.mark.slow
 def test_forces_are_those_of_the_motion(lift):
     """The floor carries the weight on the foot that stands, under the centre of mass, within friction."""
     motion, _, summary, run = lift
@@ -85,6 +87,7 @@ def test_forces_are_those_of_the_motion(lift):
     assert summary["schemes"]["weighted"]["physics"]["least_pressure_margin_mm"] > 0.0
 
 
+@pytest.mark.slow
 def test_torques_are_held_against_the_motors(lift):
     motion, _, summary, run = lift
     model = motion.robot.mj_model
@@ -96,6 +99,7 @@ def test_torques_are_held_against_the_motors(lift):
     assert figures["busiest_joint"] == list(run.world.servos)[int(used.max(0).argmax())]
 
 
+@pytest.mark.slow
 def test_sensed_joints_are_held_against_their_limits(lift):
     """Against the ranges of MuJoCo's model, hinge by hinge."""
     motion, _, summary, run = lift
@@ -117,6 +121,7 @@ def test_sensed_joints_are_held_against_their_limits(lift):
     assert spoiled["furthest_beyond"] == "LKneePitch"
 
 
+@pytest.mark.slow
 def test_the_judge_sees_what_is_wrong(lift):
     motion, _, summary, run = lift
     sunk, turned, slid = run.recording.q.copy(), run.recording.q.copy(), run.recording.contact_points.copy()
@@ -138,6 +143,7 @@ def test_the_judge_sees_what_is_wrong(lift):
     assert "[red]fell at 8.00 s[/red]" in cells
 
 
+@pytest.mark.slow
 def test_files_hold_what_was_recorded(lift):
     _, folder, summary, run = lift
     assert {path.name for path in folder.iterdir()} == {"comparison.png", "motion.npz", "report.json"}

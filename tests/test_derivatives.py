@@ -218,6 +218,7 @@ class TestHessian:
         one, back, two, far = np.split(np.asarray(slopes), 4)
         return (8.0 * (one - back) - (two - far)) / 12e-4, np.concatenate([a[0].ravel() for a in active])
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["quadratic program", "hierarchy", "projections", "saturated"])
     def test_through_a_loop(self, name):
         """The rules of the solvers outlive the linearisation of a scan, also where singular values are equal or 0."""

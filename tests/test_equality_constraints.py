@@ -181,6 +181,7 @@ def linkage():
 
 
 class TestFourBar:
+    @pytest.mark.slow
     @pytest.mark.parametrize("form", ["hard", "first"])
     def test_the_loop_stays_closed_while_the_crank_turns(self, linkage, form):
         """Once round; the end and the top together in MuJoCo, the angles those of the law of cosines."""

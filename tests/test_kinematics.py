@@ -449,6 +449,7 @@ def microseconds(function, q) -> float:
     return 1e6 * min(times) / len(q)
 
 
+@pytest.mark.slow
 def test_a_serial_chain_costs_microseconds(robots):
     """XLA's CPU backend can recompute every parent of every link of a chain: thousands of microseconds for an arm."""
     robot = robots["arm7"]

@@ -42,11 +42,8 @@ def shown_text(output: Any) -> str:
     return re.sub(r"base64,[\w+/=]+", "", text)  # pictures inside a page
 
 
-@pytest.mark.parametrize(
-    "source",
-    [SOURCES[0], *(pytest.param(source, marks=pytest.mark.slow) for source in SOURCES[1:])],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.slow
+@each_notebook
 def test_runs_in_fast_mode(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OSIK_FAST", "1")
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -115,7 +115,9 @@ def test_a_tick_compiles_once(arm, home, name):
     assert np.abs(c.velocity - b.velocity).max() > 1e-6
 
 
-@all_schemes
+@pytest.mark.parametrize(
+    "name", ["weighted", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SCHEMES)[1:])]
+)
 def test_a_rollout_compiles_once(arm, home, name):
     before, after = SCHEMES[name]
 
@@ -178,6 +180,7 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
     assert np.abs(a - b).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_what_is_static_compiles_again(arm):
     """The counter counts: an iteration cap, a priority, a task more, another number of ticks."""
     task, scheme = osik.PostureTask(arm), osik.WeightedQP()

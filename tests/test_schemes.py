@@ -188,7 +188,7 @@ def certify(problem: Numbers, damping: float, v: np.ndarray) -> None:
 
 
 class TestWeightedQP:
-    @pytest.mark.parametrize("name", ["nao", "g1"])
+    @pytest.mark.parametrize("name", ["nao", pytest.param("g1", marks=pytest.mark.slow)])
     def test_agrees_with_the_textbook_qp(self, name, request, rng):
         case = request.getfixturevalue(name)
         q = configurations(case, rng)

@@ -45,7 +45,9 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [pytest.param(name, marks=pytest.mark.slow if name == "saturated" else ()) for name in METHODS]
+)
 def test_the_order_of_joints_and_of_rows(rng, method):
     """Tight boxes: most lanes have a dozen changes of the active set."""
     levels = [(rng.normal(size=(LANES, m, N)), 3.0 * rng.normal(size=(LANES, m))) for m in SIZES]

@@ -223,6 +223,7 @@ class TestKineticEnergy:
             expected = weighted @ np.linalg.solve(linear @ full @ weighted, rate[:3])
             np.testing.assert_allclose(v, expected, atol=1e-9)
 
+    @pytest.mark.slow
     def test_finite_where_a_motion_moves_no_mass(self):
         """Two hinges about one axis, and one about the line on which all the mass is: M has rank 1."""
         robot = osik.Robot.from_mjcf(

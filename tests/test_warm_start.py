@@ -62,6 +62,7 @@ def norms(s):
     return np.stack([np.linalg.norm(w, axis=1) for w in s.slacks], 1)
 
 
+@pytest.mark.slow
 def test_hierarchies(rng):
     r = recorded_hierarchies(unit_rows=False)
     longest = max(level[0].shape[1] for level in r.levels)
@@ -89,7 +90,11 @@ def reaching():
     return arm, tasks, limits
 
 
-@pytest.mark.parametrize("scheme", [osik.WeightedQP(), osik.HierarchicalQP()], ids=["weighted", "hierarchical"])
+@pytest.mark.parametrize(
+    "scheme",
+    [osik.WeightedQP(), pytest.param(osik.HierarchicalQP(), marks=pytest.mark.slow)],
+    ids=["weighted", "hierarchical"],
+)
 def test_the_closed_loop(scheme, reaching):
     """Each tick starts from the one before: the same motion as from cold starts, in one or two factorisations."""
     arm, tasks, limits = reaching
