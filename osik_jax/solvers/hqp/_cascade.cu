@@ -4,7 +4,9 @@
 // Z, an orthonormal basis of what the levels so far leave free, gets narrower from level to level. At each level, rows
 // that are held at a bound are rotated into its first columns by reflections from the right; the level's rows, in the
 // columns that are left, are factored by reflections from the left with pivoting. The working set of the warm start is
-// tried first; else, and where that is not the optimum, a primal active set begins where the level above ended. Where it
+// tried first; where its landing is not the optimum, what it violates is held, what pulls is let go, and it is tried
+// again (M. Hintermueller, K. Ito, K. Kunisch, "The primal-dual active set strategy as a semismooth Newton method",
+// 2003), a few times. Else, and where there is none, a primal active set begins where the level above ended. Where it
 // rests on a direction that the factor's tolerance left out, it takes one damped step along it. What is tight at the
 // optimum, and the row space of the level's factor, are rotated to the front and cut off.
 //
@@ -12,8 +14,9 @@
 // damping 1: the smallest norm.
 //
 // Variable i belongs to lane i % 32, and so do row i of the level and column i of Z. Constants from _kernel.py: N
-// variables, LEVELS, M rows of the longest level, ROWS of all levels, PASSES to the fixed point of a damping, P hard rows beside the box (at most 32), WARPS a block; COUNT, OFFSET, MIXED of each level; PLACE of each hard
-// row among all rows, and its LEVEL.
+// variables, LEVELS, M rows of the longest level, ROWS of all levels, PASSES to the fixed point of a damping, P hard
+// rows beside the box (at most 32), WARPS a block; COUNT, OFFSET, MIXED of each level; PLACE of each hard row among all
+// rows, and its LEVEL.
 
 constexpr int H = (N + 31) / 32, G = (M + 31) / 32;   // variables and rows a lane
 constexpr int ZD = N | 1, VD = M | 1;                 // lengths of rows in shared memory: odd, so that they meet every bank
@@ -22,6 +25,7 @@ constexpr int LONGEST = (N > M ? N : M) > P ? (N > M ? N : M) : P;
 constexpr int HARD = N + P;
 constexpr int AT_LEAST = N * VD > M * ZD ? N * VD : M * ZD;
 constexpr int FACTORS = MOST_RANK * (ZD + VD) > AT_LEAST ? MOST_RANK * (ZD + VD) : AT_LEAST;
+constexpr int ATTEMPTS = 4;                           // at a working set, before it is changed by hand
 constexpr int PATIENCE = 20;                          // steps of no length, before the least index decides
 constexpr double DAMPING = 1e-9;                      // of the longest row, squared, as in _proposal.py
 constexpr unsigned ALL = 0xffffffffu;
@@ -681,15 +685,15 @@ for (level = 0; level < LEVELS; ++level) {
   auto floor_of_signs = [&]() { return multiplier_share * steepness + noise(); };
   auto at_rest = [&]() { return residual <= 10.0 * (multiplier_share * size * missing + noise()); };
 
-  // ---- the working set of the warm start
+  // ---- the working set of the warm start, and what its landing shows to be wrong with it, all changed at once
   double start[H];
   int carried[H], row_carried = row_side;
   bool optimal = false, to_hold = true, to_fit = true;
 #pragma unroll
   for (int h = 0; h < H; ++h) start[h] = x[h], carried[h] = side[h];
   if (warm) {
-    double goal[G], d[H];
     int own[G];
+    const bool row_counts = has_row && !row_frozen && row_level < level;
 #pragma unroll
     for (int h = 0; h < H; ++h) {
       int at = exists[h] ? guess_hard.data[here * HARD + lane + 32 * h] : 0;
@@ -697,7 +701,7 @@ for (level = 0; level < LEVELS; ++level) {
       side[h] = !frozen[h] && at != 0 && is_finite(at < 0 ? low[h] : high[h]) ? at : 0;
     }
     row_side = 0;
-    if (has_row && !row_frozen && row_level < level) {
+    if (row_counts) {
       int at = guess_hard.data[here * HARD + N + lane];
       at = at > 0 ? 1 : at < 0 ? -1 : 0;
       row_side = at != 0 && is_finite(at < 0 ? row_low : row_high) ? at : 0;
@@ -708,58 +712,98 @@ for (level = 0; level < LEVELS; ++level) {
       at = at > 0 ? 1 : at < 0 ? -1 : 0;
       if (!is_finite(at < 0 ? below[g] : above[g])) at = 0;
       own[g] = equal[g] ? 2 : at;
-      counts[g] = own[g] != 0;
-      goal[g] = own[g] == 1 ? above[g] : below[g];
     }
-    hold();
-    fit();
-    for (int round = 0; round < 2; ++round) {
-      double off[G];
-      restore(d);
+    bool feasible = false;
+    for (int attempt = 1;; ++attempt) {
+      double goal[G], d[H];
 #pragma unroll
-      for (int h = 0; h < H; ++h) x[h] += d[h];
-      share_out(x);
+      for (int g = 0; g < G; ++g) counts[g] = own[g] != 0, goal[g] = own[g] == 1 ? above[g] : below[g];
 #pragma unroll
-      for (int g = 0; g < G; ++g) off[g] = counts[g] ? row_times(lane + 32 * g, point) - goal[g] : 0.0;
-      least_squares(off, d);
+      for (int h = 0; h < H; ++h) x[h] = start[h];
+      hold();
+      fit();
+      for (int round = 0; round < 2; ++round) {
+        double off[G];
+        restore(d);
 #pragma unroll
-      for (int h = 0; h < H; ++h) x[h] += d[h];
-    }
-    look();
-    double square = 0.0;
-    bool fine = true;
+        for (int h = 0; h < H; ++h) x[h] += d[h];
+        share_out(x);
 #pragma unroll
-    for (int g = 0; g < G; ++g)
-      if (in_level[g]) {
-        const double near = feasible_share * (length[g] * reach + fabs(value[g]));
-        const double under = below[g] - value[g], over = value[g] - above[g];
-        fine = fine && (own[g] == 2 || (own[g] == 0 ? fmax(under, over) <= near : (own[g] < 0 ? under : over) >= -near));
-        slack[g] = counts[g] ? value[g] - goal[g] : 0.0;
-        square += slack[g] * slack[g];
+        for (int g = 0; g < G; ++g) off[g] = counts[g] ? row_times(lane + 32 * g, point) - goal[g] : 0.0;
+        least_squares(off, d);
+#pragma unroll
+        for (int h = 0; h < H; ++h) x[h] += d[h];
       }
-    double own_size = 0.0;
+      look();
+      double square = 0.0, at_row = 0.0;
+      int better[G];                                  // how the rows of the level had better count
+      bool fine = true;
 #pragma unroll
-    for (int h = 0; h < H; ++h) own_size += exists[h] ? x[h] * x[h] : 0.0;
-    missing = sqrt(sum(square) + damping * sum(own_size));
-    bool inside = true;
+      for (int g = 0; g < G; ++g) {
+        better[g] = own[g];
+        if (in_level[g]) {
+          const double near = feasible_share * (length[g] * reach + fabs(value[g]));
+          const double under = below[g] - value[g], over = value[g] - above[g];
+          const bool right = own[g] == 2 || (own[g] == 0 ? fmax(under, over) <= near : (own[g] < 0 ? under : over) >= -near);
+          if (!right) better[g] = own[g] != 0 ? 0 : under > over ? -1 : 1;
+          fine = fine && right;
+          slack[g] = counts[g] ? value[g] - goal[g] : 0.0;
+          square += slack[g] * slack[g];
+        }
+      }
+      double own_size = 0.0;
 #pragma unroll
-    for (int h = 0; h < H; ++h)
-      if (exists[h] && !frozen[h] && side[h] == 0)
-        inside = inside && fmax(low[h] - x[h], x[h] - high[h]) <= feasible_share * (reach + fabs(x[h]));
-    if (has_row && !row_frozen && row_level < level && row_side == 0) {
-      const double at = hard_row_times(point);
-      inside = inside && fmax(row_low - at, at - row_high) <= feasible_share * (row_length * reach + fabs(at));
-    }
-    const bool feasible = !any(!inside) && is_finite(reach);
-    if (feasible) {
+      for (int h = 0; h < H; ++h) own_size += exists[h] ? x[h] * x[h] : 0.0;
+      missing = sqrt(sum(square) + damping * sum(own_size));
+      if (has_row) at_row = hard_row_times(point);
+      bool outside[H], row_outside = false, inside = true;
+#pragma unroll
+      for (int h = 0; h < H; ++h) {
+        outside[h] = exists[h] && !frozen[h] && side[h] == 0 &&
+                     !(fmax(low[h] - x[h], x[h] - high[h]) <= feasible_share * (reach + fabs(x[h])));
+        inside = inside && !outside[h];
+      }
+      if (row_counts && row_side == 0) {
+        row_outside =
+            !(fmax(row_low - at_row, at_row - row_high) <= feasible_share * (row_length * reach + fabs(at_row)));
+        inside = inside && !row_outside;
+      }
+      if (!is_finite(reach)) {
+        feasible = false;
+        break;
+      }
+      feasible = !any(!inside);
       judge(slack);
       const double floor = floor_of_signs();
-      bool wrong = has_row && row_side != 0 && wrong_by(row_multiplier, row_side, row_length) > floor;
+      bool wrong[H], row_wrong = has_row && row_side != 0 && wrong_by(row_multiplier, row_side, row_length) > floor;
+      bool good = fine && !row_wrong;
 #pragma unroll
-      for (int h = 0; h < H; ++h) wrong = wrong || (side[h] != 0 && wrong_by(multiplier[h], side[h], 1.0) > floor);
-      optimal = !any(wrong || !fine) && at_rest();
-      to_hold = false, to_fit = false;
-    } else {
+      for (int h = 0; h < H; ++h) {
+        wrong[h] = side[h] != 0 && wrong_by(multiplier[h], side[h], 1.0) > floor;
+        good = good && !wrong[h];
+      }
+      optimal = feasible && !any(!good) && at_rest();
+      if (optimal || attempt == ATTEMPTS) break;
+      int turned = 0;
+#pragma unroll
+      for (int h = 0; h < H; ++h) {
+        if (outside[h]) side[h] = x[h] < low[h] ? -1 : 1;
+        else if (wrong[h]) side[h] = 0;
+        turned += __popc(__ballot_sync(ALL, outside[h] || wrong[h]));
+      }
+      if (row_outside) row_side = at_row < row_low ? -1 : 1;
+      else if (row_wrong) row_side = 0;
+      turned += __popc(__ballot_sync(ALL, row_outside || row_wrong));
+#pragma unroll
+      for (int g = 0; g < G; ++g) {
+        turned += __popc(__ballot_sync(ALL, better[g] != own[g]));
+        own[g] = better[g];
+      }
+      if (turned == 0) break;
+      changes += turned;
+    }
+    if (feasible) to_hold = false, to_fit = false;
+    else {
 #pragma unroll
       for (int h = 0; h < H; ++h) x[h] = start[h], side[h] = carried[h];
       row_side = row_carried;
