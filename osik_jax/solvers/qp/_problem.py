@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._dense import apply
 from .._pivots import AT_UPPER, INACTIVE
 from ._cost import LeastSquares, Quadratic
+
+_NOUGHT = 100.0
+"""Roundings of what the cost pulls at it; an answer that is no larger is 0."""
 
 
 class QP(eqx.Module):
@@ -70,3 +76,35 @@ def active_targets(qp: QP, active: Int[Array, " n+p"]) -> Float[Array, " n+p"]:
     """The bound that each active constraint sits at, 0 for the others (never infinite)."""
     at_lower = (active != INACTIVE) & (active != AT_UPPER)
     return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)
+
+
+def forces(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n"]:
+    """What cost and rows pull at each variable with, none against another: rounding is a share of it."""
+    return qp.cost.forces(x) + apply(jnp.abs(qp.rows).T, jnp.abs(y))
+
+
+class Scales(NamedTuple):
+    """Rounding in the values and multipliers of the constraints is this large, times a tolerance."""
+
+    value: Float[Array, " m"]
+    multiplier: Float[Array, " m"]
+
+
+def scales_of(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
+    """Invariant to the units of the variables: each is measured by the root of its curvature, from H's diagonal.
+
+    Where the constraints hold all of x at 0, its rounding is that of what the cost pulls at it.
+    """
+    root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
+    pulled = jnp.abs(qp.cost.gradient(x)) / root**2
+    nought = jnp.max(jnp.abs(x) * root) <= _NOUGHT * jnp.finfo(x.dtype).eps * jnp.max(pulled * root)
+    size = jnp.where(nought, pulled, jnp.abs(x))
+    reach = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
+    span = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])
+    floor = jnp.minimum(jnp.max(size * root) * reach, jnp.max(size) * span)
+    values = jnp.concatenate([x, apply(qp.rows, x)])
+    bounds = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (qp.lower, qp.upper)]
+    nearest = jnp.minimum(*bounds)
+    value = floor + jnp.abs(values) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
+    pull = jnp.concatenate([1e-3 * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
+    return Scales(value, value / jnp.maximum(reach, jnp.finfo(x.dtype).tiny) ** 2 + pull)

@@ -11,17 +11,20 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ... import _rules
-from .._box import inside, uncrossed
+from .._box import inside, outside, uncrossed
+from .._certificate import kkt_share
 from .._dense import apply
 from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._derivative import differentiable
 from ._fused import searcher
-from ._problem import QP, QPSolution
+from ._problem import QP, QPSolution, forces, scales_of
 from ._search import Found
 
-_TOLERANCE = {jnp.dtype("float64"): 1e-12, jnp.dtype("float32"): 1e-7}
+_TOLERANCE = 1e-12
+_CERTIFIED = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
+"""The largest ``kkt_residual`` of an answer that is SOLVED."""
 
 
 @partial(jax.jit, static_argnames="max_iterations")
@@ -56,8 +59,7 @@ def solve_qp(
             t^2 / (2 c). (p,)
         warm_start: ``active`` of the solution of a problem nearby. It changes the time, not the answer. (n + p,)
         max_iterations: cap on changes of the active set (static); default 20 (n + p).
-        tolerance: violation that counts as none, relative to the scale of the constraint; default 1e-12 (1e-7 in
-            float32).
+        tolerance: violation that counts as none, relative to the scale of the constraint; default 1e-12.
 
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
@@ -171,7 +173,7 @@ def _solve(
     """Searches, certifies, and differentiates nothing but the answer; ``gives_way`` where rows may all be soft."""
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
-    allowed = jnp.asarray(_TOLERANCE[dtype] if tolerance is None else tolerance, dtype)
+    allowed = jnp.asarray(_TOLERANCE if tolerance is None else tolerance, dtype)
     sane = _finite(qp)
     safe = _replace_where(~sane, qp)
     low, high, crossed = uncrossed(safe.lower, _upper(safe))
@@ -180,19 +182,22 @@ def _solve(
     search = searcher(20 * m if max_iterations is None else max_iterations, gives_way)
     found = _rules.found(search(*jax.lax.stop_gradient((safe, cold, allowed))))
     solved = replace(safe, compliance=jnp.where(found.infeasible, found.compliance, safe.compliance))
-    x, y = differentiable(found.x, found.row_multipliers, found.active, solved)
+    answered = found.optimal | found.infeasible
+    moving = differentiable(found.x, found.row_multipliers, found.active, solved)
+    x, y = (jnp.where(answered, a, b) for a, b in zip(moving, (found.x, found.row_multipliers), strict=True))
     finite = sane & jnp.isfinite(x).all() & jnp.isfinite(y).all()
     x, y = jnp.where(finite, x, 0.0), jnp.where(finite, y, 0.0)
     x = inside(x, *(jnp.where(sane, b, raw)[:n] for b, raw in ((safe.lower, qp.lower), (safe.upper, qp.upper))))
     slope = jnp.where(finite, safe.cost.gradient(x), 0.0) - apply(safe.rows.T, y)
     multipliers = jnp.where(found.active[:n] != INACTIVE, slope, 0.0)
     value = apply(safe.rows, x)
+    residual = _kkt_residual(safe, x, multipliers, y, slope - multipliers, found.active)
     return QPSolution(
         x=x,
-        status=_status(finite, crossed, found),
+        status=_status(finite, crossed, found, residual),
         iterations=found.iterations,
         factorizations=found.factorizations,
-        kkt_residual=_kkt_residual(safe, x, multipliers, y, slope - multipliers, found.active),
+        kkt_residual=residual,
         slack=value - jnp.clip(value, safe.lower[n:], safe.upper[n:]),
         multipliers=multipliers,
         row_multipliers=y,
@@ -205,8 +210,9 @@ def _upper(qp: QP) -> Float[Array, " n+p"]:
     return qp.upper if qp.known is None else jnp.where(np.array(qp.known), qp.lower, qp.upper)
 
 
-def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found) -> Array:
-    verdict = jnp.where(found.optimal, Status.SOLVED, Status.MAX_ITERATIONS)
+def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found, residual: Float[Array, ""]) -> Array:
+    certified = found.optimal & (residual <= _CERTIFIED[residual.dtype])
+    verdict = jnp.where(certified, Status.SOLVED, Status.MAX_ITERATIONS)
     verdict = jnp.where(found.infeasible | crossed, Status.INFEASIBLE, verdict)
     return jnp.where(finite, verdict, Status.NUMERICAL_ERROR)
 
@@ -228,9 +234,9 @@ def _replace_where(bad: Bool[Array, ""], qp: QP) -> QP:
 
 
 def _kkt_residual(qp: QP, x: Array, box: Array, rows: Array, stationarity: Array, active: Array) -> Float[Array, ""]:
-    """Largest violation of the optimality conditions; multipliers are of the box, then of the rows."""
-    values = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * rows])
-    multipliers = jnp.concatenate([box, rows])
-    outside = jnp.maximum(jnp.maximum(qp.lower - values, values - qp.upper), 0.0)
-    wrong_sign = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, 0.0))
-    return jnp.max(jnp.concatenate([jnp.abs(stationarity), outside, wrong_sign]))
+    """Largest violation of the optimality conditions, as a share; multipliers are of the box, then of the rows."""
+    gap = jnp.abs(outside(apply(qp.rows, x) + qp.compliance * rows, qp.lower[len(x) :], qp.upper[len(x) :]))
+    pushed = jnp.concatenate([box, rows * jnp.max(jnp.abs(qp.rows), 1, initial=0.0)])
+    wrong_sign = jnp.where(active == AT_LOWER, -pushed, jnp.where(active == AT_UPPER, pushed, 0.0))
+    scale = scales_of(qp, qp.cost.diagonal(), x, rows).value[len(x) :]
+    return kkt_share(jnp.concatenate([jnp.abs(stationarity), wrong_sign]), forces(qp, x, rows), gap, scale)
