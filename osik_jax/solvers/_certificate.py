@@ -14,32 +14,34 @@ _ROUNDING = 1e-14
 
 def contradiction(
     rows: Float[Array, "p n"],
+    proof: Float[Array, " p"],
     gap: Float[Array, " p"],
     x: Float[Array, " n"],
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
 ) -> Bool[Array, ""]:
-    """Whether the violations of the rows at x, as a vector of Farkas, prove that nothing in the box satisfies them.
+    """Whether a vector of Farkas proves that nothing in the box satisfies the rows.
 
-    Weighed with the gaps, the rows have to move by |gap|^2 before they can all hold. In the box they move by the sum of
-    |C' gap| times the way to the bound that it pushes to, at most. Where there is no bound, no x counts that is more than
-    a thousand times as large as what is at hand.
+    Weighed with it, the rows have to move by proof'gap before all of them can hold. In the box they move by the sum of
+    |C'proof| times the way to the bound that it pushes to, at most. Where there is no bound, no x counts that is more
+    than a thousand times as large as what is at hand.
 
     Args:
         rows: C.
+        proof: a number for each row, of the sign of its gap; the gaps themselves at the least violation.
         gap: C x minus the nearest points of the intervals; 0 for rows that do not count.
         x: a point in the box.
         lower: of the box.
         upper: of the box.
     """
-    pull = apply(rows.T, gap)
-    rounding = _ROUNDING * apply(jnp.abs(rows).T, jnp.abs(gap))
+    pull = apply(rows.T, proof)
+    rounding = _ROUNDING * apply(jnp.abs(rows).T, jnp.abs(proof))
     pull = jnp.where(jnp.abs(pull) <= rounding, 0.0, pull)
     sizes = [jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0) for a in (x, lower, upper)]
     far = _FAR * jnp.max(jnp.stack(sizes), initial=0.0)
     way = jnp.where(pull > 0.0, x - lower, upper - x)
     reachable = jnp.sum(jnp.abs(pull) * jnp.where(jnp.isfinite(way), way, far))
-    return jnp.sum(gap**2) > reachable
+    return jnp.dot(proof, gap) > reachable
 
 
 def kkt_share(

@@ -34,9 +34,9 @@ _STIFF = 1e5
 _SHORTEST, _LENGTHS = 1e-9, 31
 _ROUNDINGS = 4e-15
 """Share of its forces; a variable that is left with less is at rest."""
-_SMALL = 1e-10
+_SMALL = 1e-13
 """Share of x; a Newton step that is shorter is the last on its face."""
-_BOLD = 30
+_BOLD = 10
 """Iterations in which all bounds that the slope leads away from are left at once; then one at a time."""
 _DAMPED = 1e-2
 """Damping of the step that is taken where there is no answer, of the largest curvature."""
@@ -121,7 +121,7 @@ def careful_step(qp: QP) -> tuple[Float[Array, " n"], Int[Array, " m"]]:
     s = _begin(qp, jnp.zeros_like(qp.lower[: qp.rows.shape[1]]), jnp.asarray(0, jnp.int32), stiff=1.0)
     seen = _view(qp, s)
     damped = replace(qp, cost=qp.cost.damped(_DAMPED * _steepest(qp)))
-    step, lowers, _ = _best(qp, s, seen, _newton(damped, s, seen))
+    step, lowers, *_ = _best(qp, s, seen, _newton(damped, s, seen))
     end = s._replace(x=jnp.where(lowers, _moved(qp, s.x, step), s.x))
     return end.x, jnp.where(jnp.arange(len(qp.lower)) < len(end.x), _end(qp, end).active, INACTIVE)
 
@@ -177,10 +177,10 @@ def _improve(holds: float, qp: QP, s: Point) -> Point:
     root = jnp.sqrt(qp.cost.diagonal())
     small = jnp.max(jnp.abs(newton) * root) <= _SMALL * jnp.max(jnp.abs(s.x) * root)
     flat = jnp.all(~seen.free | (jnp.abs(seen.slope) <= _ROUNDINGS * forces(qp, s.x, seen.multipliers)))
-    step, lowers, whole = _best(qp, s, seen, newton)
+    step, lowers, whole, fits = _best(qp, s, seen, newton)
     rests = small | flat | ~lowers
     last = rests & (s.arrived | ~seen.leaves) & (s.careful | small | flat)
-    step = jnp.where(small, newton, jnp.where(lowers, step, 0.0))
+    step = jnp.where(small | (fits & ~lowers), newton, jnp.where(lowers, step, 0.0))
     moved = s._replace(
         x=_moved(qp, s.x, step),
         iterations=s.iterations + 1,
@@ -223,8 +223,8 @@ def _longest_first(rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
 
 def _best(
     qp: QP, s: Point, seen: View, newton: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Bool[Array, ""], Bool[Array, ""]]:
-    """The step along Newton's direction that lowers the cost most, whether it does, and whether it is the whole one.
+) -> tuple[Float[Array, " n"], Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    """The step along Newton's direction that lowers the cost most; whether it does, is the whole one, and could be.
 
     It is clipped into the box at many lengths, or stops at the first bound.
     """
@@ -237,16 +237,19 @@ def _best(
     )
     steps = jnp.clip(s.x + share[:, None] * newton, lower, upper) - s.x
     changes = jax.vmap(partial(_change, qp, s, seen))(steps)
-    best = first_smallest(changes)
-    rounding = jnp.dot(jnp.abs(steps[best]), forces(qp, s.x, seen.multipliers)) * float(jnp.finfo(s.x.dtype).eps)
-    return steps[best], changes[best] < -rounding, (share[best] == 1.0) & (first >= 1.0)
+    rounding = apply(jnp.abs(steps), forces(qp, s.x, seen.multipliers)) * float(jnp.finfo(s.x.dtype).eps)
+    fits = first >= 1.0
+    whole = fits & (share == 1.0)
+    best = first_smallest(changes - jnp.where(whole, 4.0 * rounding, 0.0))
+    return steps[best], changes[best] < -rounding[best], whole[best], fits
 
 
 def _change(qp: QP, s: Point, seen: View, step: Float[Array, " n"]) -> Float[Array, ""]:
     """Of the cost, from its slope and what bends it: nothing large cancels."""
     lower, upper = qp.lower[len(step) :], qp.upper[len(step) :]
     along, old = apply(qp.rows, step), outside(seen.values, lower, upper)
-    more = outside(seen.values + along, lower, upper) - old
+    new = outside(seen.values + along, lower, upper)
+    more = jnp.where(old * new > 0.0, along, new - old)  # exactly, where the row stays on its side
     bend = jnp.sum((more**2 + 2.0 * old * (more - along)) / (2.0 * s.compliance))
     return jnp.dot(seen.slope, step) + 0.5 * jnp.dot(step, qp.cost.curvature(step)) + bend
 
@@ -259,7 +262,7 @@ def _pulled(holds: float, qp: QP, s: Point) -> Point:
     gap = jnp.where(hard, outside(apply(qp.rows, s.x), qp.lower[n:], qp.upper[n:]), 0.0)
     nothing = holds * scales_of(qp, qp.cost.diagonal(), s.x, seen.multipliers).value[n:]
     missed = jnp.max(jnp.abs(gap) / jnp.where(gap == 0.0, 1.0, nothing), initial=0.0)
-    proven = contradiction(qp.rows, gap, s.x, *_box(qp)) & (missed > 1.0)
+    proven = contradiction(qp.rows, gap / s.compliance, gap, s.x, *_box(qp)) & (missed > 1.0)
     hold = (missed <= 1e-3) | ((missed <= 1.0) & (missed > 0.1 * s.missed))
     turns = proven & ~s.infeasible
     root = jnp.sqrt(qp.cost.diagonal())
@@ -284,7 +287,7 @@ def _pulled(holds: float, qp: QP, s: Point) -> Point:
 def _end(qp: QP, s: Point) -> Descended:
     seen = _view(qp, s)
     n = len(s.x)
-    low, high = _box(qp)
+    low, _ = _box(qp)
     sides = jnp.concatenate(
         [
             jnp.where(seen.free, INACTIVE, jnp.where(s.x <= low, AT_LOWER, AT_UPPER)),
