@@ -5,14 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._joint_selection import concrete
-from ..solvers import Level, solve_least_squares_qp
+from ..solvers import Level, _cuda, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
+
+
+_ROUNDINGS = 4.0
+"""Of the largest weight times row norm squared; a weaker damping is lost in single arithmetic."""
 
 
 class WeightedQP(Scheme):
@@ -25,7 +30,8 @@ class WeightedQP(Scheme):
     another pulls against it.
 
     Attributes:
-        damping: of the velocity, in the units of weight times J^2; > 0.
+        damping: of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, at least a
+            few roundings of the largest weight times row norm squared.
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
             none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         max_iterations: cap on changes of the active set (static).
@@ -48,6 +54,7 @@ class WeightedQP(Scheme):
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
         damping = self.damping + self.curvature_damping * problem.curvature(problem.soft())
+        damping = _above_rounding(damping, problem)
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
@@ -60,6 +67,16 @@ class WeightedQP(Scheme):
         return SchemeAnswer(
             answer.x, answer.status, answer.iterations, answer.factorizations, answer.kkt_residual, answer.active
         )
+
+
+def _above_rounding(damping: Float[Array, ""], problem: VelocityProblem) -> Float[Array, ""]:
+    """The damping, raised above the rounding of the Hessian where a kernel of single precision may do the work."""
+    rows = list(problem.soft().values())
+    if damping.dtype != jnp.float32 or not rows or not _cuda.wanted():
+        return damping
+    steepest = [jnp.max(r.weight * jnp.sum(r.jacobian**2, 1), initial=0.0) for r in rows]
+    least = _ROUNDINGS * float(jnp.finfo(damping.dtype).eps) * jnp.max(jnp.stack(steepest))
+    return jnp.maximum(damping, jax.lax.stop_gradient(least))
 
 
 def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Array, ""]) -> dict[str, Array]:
