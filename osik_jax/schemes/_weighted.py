@@ -15,7 +15,6 @@ from ..solvers import Level, _cuda, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
 
-
 _ROUNDINGS = 4.0
 """Of the largest weight times row norm squared; a weaker damping is lost in single arithmetic."""
 

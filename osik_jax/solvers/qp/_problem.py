@@ -55,8 +55,8 @@ class QPSolution(eqx.Module):
         factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search. A
             first try through the rows that comes to nothing is not counted.
         kkt_residual: without units, at most 1e-9 (1e-5 in float32) where SOLVED. The larger of two: the largest force
-            that nothing holds, or multiplier of the wrong sign, as a share of the largest sum of absolute terms that pull
-            at a variable; the largest violation of a row, as a share of its scale.
+            that nothing holds, or multiplier of the wrong sign, as a share of the largest sum of absolute terms that
+            pull at a variable; the largest violation of a row, as a share of its scale.
         slack: of the rows, C x minus the nearest point of its interval; 0 for a row that holds. (p,)
         multipliers: of the box: gradient of the cost = multipliers + C' row_multipliers; positive at a lower bound,
             negative at an upper. (n,)
