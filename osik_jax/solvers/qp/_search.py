@@ -33,6 +33,8 @@ _HOLDS = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}
 """A hard row that is missed by less, of its scale, holds; by the precision of the data."""
 _SOFT = 1e-12
 """Compliance of hard rows that contradict, of their reach: with it the least violation has a derivative."""
+_EXACT = 1e-10
+"""Share of its scale; where no constraint is off by more, the minimiser on the active set is the descent's."""
 _FEW = 4
 """Lanes of a block that are searched together, where most of it needs no search."""
 
@@ -86,9 +88,14 @@ def _descended(qp: QP, found: Found, *, holds: float, cap: int) -> Found:
     end = descend(qp, start, found.iterations, holds=holds, max_iterations=cap)
     reach = jax.vmap(lambda one: jnp.max(apply(one.rows**2, 1.0 / one.cost.diagonal()), initial=0.0))(qp)
     soft = jnp.maximum(_SOFT * reach[:, None], qp.compliance)
+    hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
+    x, y = minimize_on(qp, jax.vmap(factorize)(qp, hessian, end.active), end.active)
+    noise = Noise(*(_EXACT * a for a in jax.vmap(scales_of)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)))
+    better = end.settled & ~end.infeasible & jax.vmap(optimal_on)(qp, found._replace(active=end.active), x, y, noise)
+    x, y = choose(better, (x, y), (end.x, end.row_multipliers))
     return found._replace(
-        x=end.x,
-        row_multipliers=end.row_multipliers,
+        x=x,
+        row_multipliers=y,
         active=end.active,
         iterations=end.iterations,
         factorizations=found.factorizations + end.iterations - found.iterations,
