@@ -41,6 +41,10 @@ _BOLD = 10
 _DAMPED = 1e-2
 """Damping of the step that is taken where there is no answer, of the largest curvature."""
 _MOST_PULLS = 40
+_STIFFER = 0.1
+"""Compliance of hard rows that contradict, of that before, where a bound keeps x from the least violation."""
+_FLAT = 1e-9
+"""Share of its terms; a slope of the violation that is less is none."""
 _SAME = 1e-9
 """Share of x; the least violation has been found where a pull moves it by less."""
 
@@ -259,19 +263,23 @@ def _pulled(holds: float, qp: QP, s: Point) -> Point:
     n = len(s.x)
     hard = qp.compliance == 0.0
     seen = _view(qp, s)
-    gap = jnp.where(hard, outside(apply(qp.rows, s.x), qp.lower[n:], qp.upper[n:]), 0.0)
+    values = apply(qp.rows, s.x)
+    gap = jnp.where(hard, outside(values, qp.lower[n:], qp.upper[n:]), 0.0)
+    off = jnp.where(hard, values - jnp.clip(seen.values, qp.lower[n:], qp.upper[n:]), 0.0)
     nothing = holds * scales_of(qp, qp.cost.diagonal(), s.x, seen.multipliers).value[n:]
-    missed = jnp.max(jnp.abs(gap) / jnp.where(gap == 0.0, 1.0, nothing), initial=0.0)
+    missed = jnp.max(jnp.abs(off) / jnp.where(off == 0.0, 1.0, nothing), initial=0.0)
     proven = contradiction(qp.rows, gap / s.compliance, gap, s.x, *_box(qp)) & (missed > 1.0)
     hold = (missed <= 1e-3) | ((missed <= 1.0) & (missed > 0.1 * s.missed))
     turns = proven & ~s.infeasible
     root = jnp.sqrt(qp.cost.diagonal())
     still = jnp.max(jnp.abs(s.x - s.before) * root) <= _SAME * jnp.max(jnp.abs(s.x) * root)
-    settled = jnp.where(s.infeasible, still & proven, hold & ~turns)
+    least = _least(qp, s.x, gap)
+    settled = jnp.where(s.infeasible, still & proven & least, hold & ~turns)
     even = jnp.max(jnp.where(hard, s.compliance, 0.0), initial=0.0)
+    stiffer = jnp.where(s.infeasible & still & ~least, _STIFFER, 1.0) * s.compliance
     return s._replace(
         pull=jnp.where(hard & ~turns & ~settled, seen.multipliers, jnp.where(settled, s.pull, 0.0)),
-        compliance=jnp.where(turns & hard, even, s.compliance),
+        compliance=jnp.where(hard, jnp.where(turns, even, stiffer), s.compliance),
         before=s.x,
         pulls=s.pulls + 1,
         since=jnp.zeros_like(s.since),
@@ -282,6 +290,15 @@ def _pulled(holds: float, qp: QP, s: Point) -> Point:
         settled=settled,
         infeasible=s.infeasible | turns,
     )
+
+
+def _least(qp: QP, x: Float[Array, " n"], gap: Float[Array, " p"]) -> Bool[Array, ""]:
+    """Whether no way in the box makes the gaps smaller, in the Euclidean norm."""
+    lower, upper = _box(qp)
+    slope = apply(qp.rows.T, gap)
+    inward = jnp.where(x <= lower, -slope, jnp.where(x >= upper, slope, jnp.abs(slope)))
+    inward = jnp.where(lower == upper, 0.0, inward)
+    return jnp.all(inward <= _FLAT * apply(jnp.abs(qp.rows).T, jnp.abs(gap)))
 
 
 def _end(qp: QP, s: Point) -> Descended:
