@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -45,9 +43,9 @@ class Quadratic(eqx.Module):
         ridge = jnp.where(free, unit * jnp.max(jnp.diagonal(square), initial=unit), 1.0)
         return jax.lax.linalg.cholesky(square + jnp.diag(ridge), symmetrize_input=False).T
 
-    def damped(self, more: Float[Array, ""]) -> Quadratic:
-        """The cost with so much more of |x|^2 / 2."""
-        return Quadratic(self.matrix + more * jnp.eye(len(self.linear), dtype=self.matrix.dtype), self.linear)
+    def bend(self) -> Float[Array, " n"]:
+        """A diagonal matrix that is no less than H: the sums of the absolute numbers in its rows."""
+        return jnp.sum(jnp.abs(self.matrix), 1)
 
     def harmless(self) -> Quadratic:
         """A cost of the same shape that can always be minimised."""
@@ -94,9 +92,10 @@ class LeastSquares(eqx.Module):
         own = jnp.where(free, jnp.sqrt(self.damping), 1.0)
         return jnp.concatenate([jnp.sqrt(self.weight)[:, None] * self.matrix * free, jnp.diag(own)])
 
-    def damped(self, more: Float[Array, ""]) -> LeastSquares:
-        """The cost with so much more of the damping."""
-        return replace(self, damping=self.damping + more)
+    def bend(self) -> Float[Array, " n"]:
+        """A diagonal matrix that is no less than the Hessian."""
+        size = jnp.abs(self.matrix)
+        return apply(size.T, self.weight * jnp.sum(size, 1)) + self.damping
 
     def harmless(self) -> LeastSquares:
         """A cost of the same shape that can always be minimised."""

@@ -13,7 +13,6 @@ each other or the box, these grow along a vector that proves it, and x goes to t
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -27,7 +26,7 @@ from .._dense import apply
 from .._double import first_smallest
 from .._lanes import choose
 from .._pivots import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
-from ._problem import QP, forces, scales_of
+from ._problem import QP, forces, given_way, scales_of
 
 _STIFF = 1e5
 """Curvature of a hard row, of the largest of the cost: what it gives way by is 1e-5 of its pull's due, each time."""
@@ -38,8 +37,6 @@ _SMALL = 1e-13
 """Share of x; a Newton step that is shorter is the last on its face."""
 _BOLD = 10
 """Iterations in which all bounds that the slope leads away from are left at once; then one at a time."""
-_DAMPED = 1e-2
-"""Damping of the step that is taken where there is no answer, of the largest curvature."""
 _MOST_PULLS = 40
 _STIFFER = 0.1
 """Compliance of hard rows that contradict, of that before, where a bound keeps x from the least violation."""
@@ -116,38 +113,15 @@ def descend(
     return jax.vmap(_end)(qp, jax.lax.while_loop(go_on, body, first))
 
 
-def careful_step(qp: QP) -> tuple[Float[Array, " n"], Int[Array, " m"]]:
-    """A velocity for where there is no answer, one problem: in its box, bounded, no worse than none; what is active.
-
-    From the zero vector, clipped into the box, a damped least-squares step, clipped too, as far along as it lowers the
-    cost, to which hard rows add their squared violations at the price of the heaviest direction of the cost.
-    """
-    s = _begin(qp, jnp.zeros_like(qp.lower[: qp.rows.shape[1]]), jnp.asarray(0, jnp.int32), stiff=1.0)
-    seen = _view(qp, s)
-    damped = replace(qp, cost=qp.cost.damped(_DAMPED * _steepest(qp)))
-    step, lowers, *_ = _best(qp, s, seen, _newton(damped, s, seen))
-    end = s._replace(x=jnp.where(lowers, _moved(qp, s.x, step), s.x))
-    return end.x, jnp.where(jnp.arange(len(qp.lower)) < len(end.x), _end(qp, end).active, INACTIVE)
-
-
-def _steepest(qp: QP) -> Float[Array, ""]:
-    """The largest curvature of the cost with the rows that give way, along a variable."""
-    soft = qp.compliance > 0.0
-    price = jnp.where(soft, 1.0 / jnp.where(soft, qp.compliance, 1.0), 0.0)
-    return jnp.max(qp.cost.diagonal() + apply(qp.rows.T**2, price))
-
-
-def _begin(qp: QP, start: Float[Array, " n"], iterations: Int[Array, ""], stiff: float = _STIFF) -> Point:
+def _begin(qp: QP, start: Float[Array, " n"], iterations: Int[Array, ""]) -> Point:
     n = len(start)
     x = jnp.clip(start, qp.lower[:n], qp.upper[:n])
-    length = jnp.sum(qp.rows**2, 1)
-    each = jnp.where(length > 0.0, length, 1.0) / (stiff * _steepest(qp))
     zero = jnp.zeros_like(iterations)
     no = jnp.zeros((), bool)
     return Point(
         x=x,
         pull=jnp.zeros_like(qp.compliance),
-        compliance=jnp.where(qp.compliance > 0.0, qp.compliance, each),
+        compliance=given_way(qp, _STIFF),
         before=x,
         pulls=zero,
         iterations=iterations,
@@ -274,7 +248,8 @@ def _pulled(holds: float, qp: QP, s: Point) -> Point:
     root = jnp.sqrt(qp.cost.diagonal())
     still = jnp.max(jnp.abs(s.x - s.before) * root) <= _SAME * jnp.max(jnp.abs(s.x) * root)
     least = _least(qp, s.x, gap)
-    settled = jnp.where(s.infeasible, still & proven & least, hold & ~turns)
+    last = s.pulls + 1 >= _MOST_PULLS
+    settled = jnp.where(s.infeasible, proven & ((still & least) | last), hold & ~turns)
     even = jnp.max(jnp.where(hard, s.compliance, 0.0), initial=0.0)
     stiffer = jnp.where(s.infeasible & still & ~least, _STIFFER, 1.0) * s.compliance
     return s._replace(
@@ -286,7 +261,7 @@ def _pulled(holds: float, qp: QP, s: Point) -> Point:
         careful=jnp.zeros_like(s.careful),
         arrived=jnp.ones_like(s.arrived),
         missed=missed,
-        searching=~settled & (s.pulls < _MOST_PULLS),
+        searching=~settled & ~last,
         settled=settled,
         infeasible=s.infeasible | turns,
     )

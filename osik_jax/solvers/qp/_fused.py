@@ -158,6 +158,7 @@ def _found(qp: QP, proposal: Proposal) -> Found:
         done=nothing.astype(bool),
         optimal=nothing.astype(bool),
         contradictions=nothing,
+        descended=nothing.astype(bool),
         infeasible=nothing.astype(bool),
         compliance=qp.compliance,
     )

@@ -9,10 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._box import outside
+from .._certificate import kkt_share
 from .._dense import apply
-from .._pivots import AT_UPPER, INACTIVE
+from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
 from ._cost import LeastSquares, Quadratic
 
+CERTIFIED = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
+"""The largest ``kkt_residual`` of an answer that is SOLVED, by the precision of the data."""
 _NOUGHT = 100.0
 """Roundings of what the cost pulls at it; an answer that is no larger is 0."""
 
@@ -82,6 +86,16 @@ def active_targets(qp: QP, active: Int[Array, " n+p"]) -> Float[Array, " n+p"]:
     return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)
 
 
+def given_way(qp: QP, stiff: float) -> Float[Array, " p"]:
+    """Compliances with which hard rows give way too: they bend the cost ``stiff`` times as much as it bends most."""
+    soft = qp.compliance > 0.0
+    price = jnp.where(soft, 1.0 / jnp.where(soft, qp.compliance, 1.0), 0.0)
+    steepest = jnp.max(qp.cost.diagonal() + apply(qp.rows.T**2, price))
+    length = jnp.sum(qp.rows**2, 1)
+    own = jnp.where(length > 0.0, length, 1.0) / (stiff * jnp.where(steepest > 0.0, steepest, 1.0))
+    return jnp.where(soft, qp.compliance, own)
+
+
 def forces(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n"]:
     """What cost and rows pull at each variable with, none against another: rounding is a share of it."""
     return qp.cost.forces(x) + apply(jnp.abs(qp.rows).T, jnp.abs(y))
@@ -112,3 +126,18 @@ def scales_of(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Fl
     value = floor + jnp.abs(values) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
     pull = jnp.concatenate([1e-3 * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
     return Scales(value, value / jnp.maximum(reach, jnp.finfo(x.dtype).tiny) ** 2 + pull)
+
+
+def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: Int[Array, " n+p"]) -> Float[Array, ""]:
+    """Largest violation of the optimality conditions, as a share: see ``QPSolution.kkt_residual``."""
+    n = len(x)
+    slope = qp.cost.gradient(x) - apply(qp.rows.T, y)
+    held = active[:n] != INACTIVE
+    pushed = jnp.concatenate([slope, y * jnp.max(jnp.abs(qp.rows), 1, initial=0.0)])
+    wrong_sign = jnp.where(active == AT_LOWER, -pushed, jnp.where(active == AT_UPPER, pushed, 0.0))
+    values = apply(qp.rows, x) + qp.compliance * y
+    loose = jnp.where((active[n:] != INACTIVE) & (y != 0.0), values - active_targets(qp, active)[n:], 0.0)
+    gap = jnp.maximum(jnp.abs(outside(values, qp.lower[n:], qp.upper[n:])), jnp.abs(loose))
+    scale = scales_of(qp, qp.cost.diagonal(), x, y).value[n:]
+    left = jnp.concatenate([jnp.where(held, 0.0, jnp.abs(slope)), wrong_sign])
+    return kkt_share(left, forces(qp, x, y), gap, scale)

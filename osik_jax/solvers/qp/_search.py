@@ -18,9 +18,10 @@ from .._dense import apply
 from .._double import in_double
 from .._lanes import choose, with_the_rest
 from .._pivots import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, NO_GAP, Noise
-from ._descent import careful_step, descend
+from ._careful import careful_step
+from ._descent import descend
 from ._factor import factorize, minimize_on
-from ._problem import QP, scales_of
+from ._problem import CERTIFIED, QP, kkt_residual, scales_of
 from ._tableau import find
 from ._through_rows import has_few_rows, minimize_through_rows
 
@@ -29,14 +30,10 @@ _NEARLY = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
 """Noises; an answer that the search does not change is accepted with violations up to this."""
 _PATIENCE = 2
 """Searches that end at a contradiction before the pivots are given up; one that moves nothing is enough."""
-_HOLDS = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}
-"""A hard row that is missed by less, of its scale, holds; by the precision of the data."""
 _SOFT = 1e-12
 """Compliance of hard rows that contradict, of their reach: with it the least violation has a derivative."""
-_EXACT = 1e-10
-"""Share of its scale; where no constraint is off by more, the minimiser on the active set is the descent's."""
-_FEW = 4
-"""Lanes of a block that are searched together, where most of it needs no search."""
+_FEW, _MANY = 4, 256
+"""Lanes that are worked on together where most need no more work; many, where there is no CPU."""
 
 
 class Found(NamedTuple):
@@ -51,6 +48,7 @@ class Found(NamedTuple):
     done: Bool[Array, ""]
     optimal: Bool[Array, ""]
     contradictions: Int[Array, ""]  # searches that ended at one
+    descended: Bool[Array, ""]  # the pivots were given up
     infeasible: Bool[Array, ""]  # it is proven that rows contradict each other or the box; x is the least violation
     compliance: Float[Array, " p"]  # of the rows in the problem that ``x`` solves
 
@@ -61,53 +59,14 @@ def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, m
     It is in double precision whatever the data: which bounds are active is yes or no, and a weak damping beside heavy
     rows is below the rounding of single precision.
     """
-    whole = partial(_in_turn, cap=max_iterations, holds=_HOLDS[qp.lower.dtype])
+    whole = partial(_found, cap=max_iterations, holds=CERTIFIED[qp.lower.dtype])
     return in_double(whole)(qp, guess, tolerance)
 
 
-def _in_turn(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, cap: int, holds: float) -> Found:
-    """By pivots; what they leave by descent; where there is no answer then, a careful step."""
-    found = _by_pivots(qp, guess, tolerance, cap)
-    few = min(len(guess), _FEW)
-
-    def down(at: Array, found: Found) -> Found:
-        part, own = jax.tree.map(lambda a: a[at], (qp, found))
-        return _descended(part, own, holds=holds, cap=cap)
-
-    def carefully(at: Array, found: Found) -> Found:
-        part, own = jax.tree.map(lambda a: a[at], (qp, found))
-        x, active = jax.vmap(careful_step)(part)
-        return own._replace(x=x, row_multipliers=jnp.zeros_like(own.row_multipliers), active=active)
-
-    found = with_the_rest(found, found.optimal | (found.iterations >= cap), down, few)
-    return with_the_rest(found, found.optimal | found.infeasible, carefully, few)
-
-
-def _descended(qp: QP, found: Found, *, holds: float, cap: int) -> Found:
-    start = jnp.where(jnp.isfinite(found.x), found.x, 0.0)
-    end = descend(qp, start, found.iterations, holds=holds, max_iterations=cap)
-    reach = jax.vmap(lambda one: jnp.max(apply(one.rows**2, 1.0 / one.cost.diagonal()), initial=0.0))(qp)
-    soft = jnp.maximum(_SOFT * reach[:, None], qp.compliance)
-    hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
-    x, y = minimize_on(qp, jax.vmap(factorize)(qp, hessian, end.active), end.active)
-    noise = Noise(*(_EXACT * a for a in jax.vmap(scales_of)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)))
-    better = end.settled & ~end.infeasible & jax.vmap(optimal_on)(qp, found._replace(active=end.active), x, y, noise)
-    x, y = choose(better, (x, y), (end.x, end.row_multipliers))
-    return found._replace(
-        x=x,
-        row_multipliers=y,
-        active=end.active,
-        iterations=end.iterations,
-        factorizations=found.factorizations + end.iterations - found.iterations,
-        optimal=end.settled & ~end.infeasible,
-        infeasible=end.settled & end.infeasible,
-        compliance=jnp.where((end.settled & end.infeasible)[:, None], soft, qp.compliance),
-    )
-
-
-def _by_pivots(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], cap: int) -> Found:
+def _found(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, cap: int, holds: float) -> Found:
+    """The answers, and where there is none, a careful step."""
     lanes, n, dtype = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1], qp.lower.dtype
-    nothing = jnp.zeros(lanes, jnp.int32)
+    nothing, no = jnp.zeros(lanes, jnp.int32), jnp.zeros(lanes, bool)
     start = Found(
         x=jnp.zeros((lanes, n), dtype),
         row_multipliers=jnp.zeros(qp.rows.shape[:2], dtype),
@@ -115,21 +74,31 @@ def _by_pivots(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], 
         implied=jnp.zeros(guess.shape, bool),
         iterations=nothing,
         factorizations=nothing,
-        done=jnp.zeros(lanes, bool),
-        optimal=jnp.zeros(lanes, bool),
+        done=no,
+        optimal=no,
         contradictions=nothing,
-        infeasible=jnp.zeros(lanes, bool),
+        descended=no,
+        infeasible=no,
         compliance=qp.compliance,
     )
-
+    one = partial(_search, cap=cap, holds=holds)
+    few = min(lanes, _FEW if jax.default_backend() == "cpu" else _MANY)
     if lanes == 1 or jax.default_backend() != "cpu" or not has_few_rows(qp):
-        return _search(qp, start, tolerance, cap=cap)
-    looked = _first_look(qp, start, tolerance)
+        found = one(qp, start, tolerance)
+    else:
+        looked = _first_look(qp, start, tolerance)
+        found = with_the_rest(
+            looked, looked.done, lambda at, found: one(*jax.tree.map(lambda a: a[at], (qp, found, tolerance))), few
+        )
 
-    def again(at: Array, found: Found) -> Found:
-        return _search(*jax.tree.map(lambda a: a[at], (qp, found, tolerance)), cap=cap)
+    def carefully(at: Array, found: Found) -> Found:
+        part, own = jax.tree.map(lambda a: a[at], (qp, found))
+        cold = jax.vmap(possible)(part, jnp.zeros_like(own.active))
+        x, y = jax.vmap(careful_step)(part), jnp.zeros_like(own.row_multipliers)
+        return own._replace(x=x, row_multipliers=y, active=cold, optimal=jnp.zeros_like(own.optimal))
 
-    return with_the_rest(looked, looked.done, again, min(lanes, _FEW))
+    share = jax.vmap(kkt_residual)(qp, found.x, found.row_multipliers, found.active)
+    return with_the_rest(found, (found.optimal & (share <= holds)) | found.infeasible, carefully, few)
 
 
 def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
@@ -142,19 +111,50 @@ def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
     return choose(optimal, end, start)
 
 
-def _search(qp: QP, start: Found, tolerance: Float[Array, " B"], *, cap: int) -> Found:
-    """Rounds of factoring, checking and pivoting, until every lane is done."""
+def _search(qp: QP, start: Found, tolerance: Float[Array, " B"], *, cap: int, holds: float) -> Found:
+    """Rounds of factoring, checking and pivoting, until every lane is done; what is lost on the way goes downhill.
+
+    Where the descent ends there is one more round, so that its answer is the exact minimiser on its active set, if
+    there are digits enough for that.
+    """
     hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
+    few = min(len(start.done), _FEW if jax.default_backend() == "cpu" else _MANY)
+
+    def down(at: Array, found: Found) -> Found:
+        part, own = jax.tree.map(lambda a: a[at], (qp, found))
+        return _descended(part, own, holds=holds, cap=cap)
 
     def go_on(state: tuple[Found, Array]) -> Bool[Array, ""]:
         found, rounds = state
-        return (rounds < _ROUNDS) & ~jnp.all(found.done)
+        return (rounds <= _ROUNDS) & ~jnp.all(found.done)
 
     def body(state: tuple[Found, Array]) -> tuple[Found, Array]:
         found, rounds = state
-        return choose(~found.done, _round(qp, hessian, found, tolerance, cap), found), rounds + 1
+        found = choose(~found.done, _round(qp, hessian, found, tolerance, cap), found)
+        lost = ~(found.done | found.descended) & ((found.contradictions >= _PATIENCE) | (rounds + 1 >= _ROUNDS))
+        return with_the_rest(found, ~lost, down, few), rounds + 1
 
     return jax.lax.while_loop(go_on, body, (start, jnp.asarray(0)))[0]
+
+
+def _descended(qp: QP, found: Found, *, holds: float, cap: int) -> Found:
+    start = jnp.where(jnp.isfinite(found.x), found.x, 0.0)
+    end = descend(qp, start, found.iterations, holds=holds, max_iterations=cap)
+    reach = jax.vmap(lambda one: jnp.max(apply(one.rows**2, 1.0 / one.cost.diagonal()), initial=0.0))(qp)
+    contradicts = end.settled & end.infeasible
+    optimal = end.settled & ~end.infeasible
+    return found._replace(
+        x=end.x,
+        row_multipliers=end.row_multipliers,
+        active=end.active,
+        iterations=end.iterations,
+        factorizations=found.factorizations + end.iterations - found.iterations,
+        done=~optimal,
+        optimal=optimal,
+        descended=jnp.ones_like(optimal),
+        infeasible=contradicts,
+        compliance=jnp.where(contradicts[:, None], jnp.maximum(_SOFT * reach[:, None], qp.compliance), qp.compliance),
+    )
 
 
 def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Float[Array, " B"], cap: int) -> Found:
@@ -166,7 +166,7 @@ def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Floa
     more = Noise(*(_NEARLY[hessian.dtype] * a for a in noise))
     nearly = jax.vmap(optimal_on)(qp, found, x, y, more)
     exhausted = found.iterations >= cap
-    searching = ~(found.done | optimal | exhausted)
+    searching = ~(found.done | optimal | exhausted | found.descended)
 
     def look() -> Found:
         end = find(
@@ -188,12 +188,13 @@ def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Floa
     same = jnp.all(after.active == found.active, 1)
     good = nearly & same & jax.vmap(lambda x, y: jnp.isfinite(x).all() & jnp.isfinite(y).all())(x, y)
     lost = after.contradictions >= _PATIENCE
+    x, y = choose(good | ~found.descended, (x, y), (found.x, found.row_multipliers))
     return after._replace(
         x=x,
         row_multipliers=y,
         factorizations=found.factorizations + 1,
-        done=exhausted | lost | (good & (after.contradictions == found.contradictions)),
-        optimal=good,
+        done=exhausted | found.descended | (good & ((after.contradictions == found.contradictions) | lost)),
+        optimal=good | found.descended,
     )
 
 

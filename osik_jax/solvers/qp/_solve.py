@@ -11,20 +11,17 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ... import _rules
-from .._box import inside, outside, uncrossed
-from .._certificate import kkt_share
+from .._box import inside, uncrossed
 from .._dense import apply
-from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
+from .._pivots import INACTIVE
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._derivative import differentiable
 from ._fused import searcher
-from ._problem import QP, QPSolution, forces, scales_of
+from ._problem import CERTIFIED, QP, QPSolution, kkt_residual
 from ._search import Found
 
 _TOLERANCE = 1e-12
-_CERTIFIED = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
-"""The largest ``kkt_residual`` of an answer that is SOLVED."""
 
 
 @partial(jax.jit, static_argnames="max_iterations")
@@ -191,7 +188,7 @@ def _solve(
     slope = jnp.where(finite, safe.cost.gradient(x), 0.0) - apply(safe.rows.T, y)
     multipliers = jnp.where(found.active[:n] != INACTIVE, slope, 0.0)
     value = apply(safe.rows, x)
-    residual = _kkt_residual(safe, x, multipliers, y, slope - multipliers, found.active)
+    residual = kkt_residual(safe, x, y, found.active)
     return QPSolution(
         x=x,
         status=_status(finite, crossed, found, residual),
@@ -211,7 +208,7 @@ def _upper(qp: QP) -> Float[Array, " n+p"]:
 
 
 def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found, residual: Float[Array, ""]) -> Array:
-    certified = found.optimal & (residual <= _CERTIFIED[residual.dtype])
+    certified = found.optimal & (residual <= CERTIFIED[residual.dtype])
     verdict = jnp.where(certified, Status.SOLVED, Status.MAX_ITERATIONS)
     verdict = jnp.where(found.infeasible | crossed, Status.INFEASIBLE, verdict)
     return jnp.where(finite, verdict, Status.NUMERICAL_ERROR)
@@ -231,12 +228,3 @@ def _replace_where(bad: Bool[Array, ""], qp: QP) -> QP:
         free = jnp.where(np.array(qp.known), 0.0, free)
     harmless = QP(qp.cost.harmless(), jnp.zeros_like(qp.rows), jnp.ones_like(qp.compliance), -free, free, qp.known)
     return jax.tree.map(lambda a, b: jnp.where(bad, a, b), harmless, qp)
-
-
-def _kkt_residual(qp: QP, x: Array, box: Array, rows: Array, stationarity: Array, active: Array) -> Float[Array, ""]:
-    """Largest violation of the optimality conditions, as a share; multipliers are of the box, then of the rows."""
-    gap = jnp.abs(outside(apply(qp.rows, x) + qp.compliance * rows, qp.lower[len(x) :], qp.upper[len(x) :]))
-    pushed = jnp.concatenate([box, rows * jnp.max(jnp.abs(qp.rows), 1, initial=0.0)])
-    wrong_sign = jnp.where(active == AT_LOWER, -pushed, jnp.where(active == AT_UPPER, pushed, 0.0))
-    scale = scales_of(qp, qp.cost.diagonal(), x, rows).value[len(x) :]
-    return kkt_share(jnp.concatenate([jnp.abs(stationarity), wrong_sign]), forces(qp, x, rows), gap, scale)
