@@ -23,7 +23,7 @@ from . import _kernel
 from ._cost import LeastSquares
 from ._factor import system_inverse
 from ._kernel import Proposal
-from ._problem import QP, active_targets, scales_of
+from ._problem import CERTIFIED, QP, active_targets, kkt_residual, scales_of
 from ._search import Found, optimal_on, possible, search
 
 _SHARE, _SMALLEST = 16, 1024
@@ -130,7 +130,7 @@ def proposed_and_searched(
     proposal = propose(qp, start, single, max_iterations)
     found = _found(qp, proposal)
     fine = (proposal.settled != 0) & (proposal.iterations <= max_iterations)
-    fine &= jax.vmap(_certified)(qp, found, single)
+    fine &= jax.vmap(_certified)(qp, found, single) & (found.residual <= CERTIFIED[single.dtype])
     found = found._replace(done=fine, optimal=fine)
 
     def again(at: Array, found: Found) -> Found:
@@ -161,6 +161,7 @@ def _found(qp: QP, proposal: Proposal) -> Found:
         descended=nothing.astype(bool),
         infeasible=nothing.astype(bool),
         compliance=qp.compliance,
+        residual=jax.vmap(kkt_residual)(qp, proposal.x, proposal.row_multipliers, proposal.active),
     )
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply
 from .._double import in_double
-from .._lanes import choose, with_the_rest
+from .._lanes import choose, with_a_few
 from .._pivots import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, NO_GAP, Noise
 from ._careful import careful_step
 from ._descent import descend
@@ -51,6 +51,7 @@ class Found(NamedTuple):
     descended: Bool[Array, ""]  # the pivots were given up
     infeasible: Bool[Array, ""]  # it is proven that rows contradict each other or the box; x is the least violation
     compliance: Float[Array, " p"]  # of the rows in the problem that ``x`` solves
+    residual: Float[Array, ""]  # of the optimality conditions
 
 
 def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int) -> Found:
@@ -80,25 +81,28 @@ def _found(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, c
         descended=no,
         infeasible=no,
         compliance=qp.compliance,
+        residual=jnp.zeros(lanes, dtype),
     )
-    one = partial(_search, cap=cap, holds=holds)
-    few = min(lanes, _FEW if jax.default_backend() == "cpu" else _MANY)
+    search_one = partial(_search, cap=cap, holds=holds)
     if lanes == 1 or jax.default_backend() != "cpu" or not has_few_rows(qp):
-        found = one(qp, start, tolerance)
+        found = search_one((qp, tolerance), start)
     else:
         looked = _first_look(qp, start, tolerance)
-        found = with_the_rest(
-            looked, looked.done, lambda at, found: one(*jax.tree.map(lambda a: a[at], (qp, found, tolerance))), few
-        )
+        found = with_a_few((qp, tolerance), looked, looked.done, search_one, _block())
+    residual = jax.vmap(kkt_residual)(qp, found.x, found.row_multipliers, found.active)
+    found = found._replace(residual=residual, optimal=found.optimal & (residual <= holds))
+    return with_a_few(qp, found, found.optimal | found.infeasible, _carefully, _block())
 
-    def carefully(at: Array, found: Found) -> Found:
-        part, own = jax.tree.map(lambda a: a[at], (qp, found))
-        cold = jax.vmap(possible)(part, jnp.zeros_like(own.active))
-        x, y = jax.vmap(careful_step)(part), jnp.zeros_like(own.row_multipliers)
-        return own._replace(x=x, row_multipliers=y, active=cold, optimal=jnp.zeros_like(own.optimal))
 
-    share = jax.vmap(kkt_residual)(qp, found.x, found.row_multipliers, found.active)
-    return with_the_rest(found, (found.optimal & (share <= holds)) | found.infeasible, carefully, few)
+def _block() -> int:
+    return _FEW if jax.default_backend() == "cpu" else _MANY
+
+
+def _carefully(qp: QP, found: Found) -> Found:
+    cold = jax.vmap(possible)(qp, jnp.zeros_like(found.active))
+    x, y = jax.vmap(careful_step)(qp), jnp.zeros_like(found.row_multipliers)
+    residual = jax.vmap(kkt_residual)(qp, x, y, cold)
+    return found._replace(x=x, row_multipliers=y, active=cold, residual=residual)
 
 
 def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
@@ -111,18 +115,15 @@ def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
     return choose(optimal, end, start)
 
 
-def _search(qp: QP, start: Found, tolerance: Float[Array, " B"], *, cap: int, holds: float) -> Found:
+def _search(given: tuple[QP, Float[Array, " B"]], start: Found, *, cap: int, holds: float) -> Found:
     """Rounds of factoring, checking and pivoting, until every lane is done; what is lost on the way goes downhill.
 
     Where the descent ends there is one more round, so that its answer is the exact minimiser on its active set, if
     there are digits enough for that.
     """
+    qp, tolerance = given
     hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
-    few = min(len(start.done), _FEW if jax.default_backend() == "cpu" else _MANY)
-
-    def down(at: Array, found: Found) -> Found:
-        part, own = jax.tree.map(lambda a: a[at], (qp, found))
-        return _descended(part, own, holds=holds, cap=cap)
+    down = partial(_descended, holds=holds, cap=cap)
 
     def go_on(state: tuple[Found, Array]) -> Bool[Array, ""]:
         found, rounds = state
@@ -132,7 +133,7 @@ def _search(qp: QP, start: Found, tolerance: Float[Array, " B"], *, cap: int, ho
         found, rounds = state
         found = choose(~found.done, _round(qp, hessian, found, tolerance, cap), found)
         lost = ~(found.done | found.descended) & ((found.contradictions >= _PATIENCE) | (rounds + 1 >= _ROUNDS))
-        return with_the_rest(found, ~lost, down, few), rounds + 1
+        return with_a_few(qp, found, ~lost, down, _block()), rounds + 1
 
     return jax.lax.while_loop(go_on, body, (start, jnp.asarray(0)))[0]
 

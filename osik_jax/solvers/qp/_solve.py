@@ -18,7 +18,7 @@ from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._derivative import differentiable
 from ._fused import searcher
-from ._problem import CERTIFIED, QP, QPSolution, kkt_residual
+from ._problem import QP, QPSolution
 from ._search import Found
 
 _TOLERANCE = 1e-12
@@ -188,13 +188,12 @@ def _solve(
     slope = jnp.where(finite, safe.cost.gradient(x), 0.0) - apply(safe.rows.T, y)
     multipliers = jnp.where(found.active[:n] != INACTIVE, slope, 0.0)
     value = apply(safe.rows, x)
-    residual = kkt_residual(safe, x, y, found.active)
     return QPSolution(
         x=x,
-        status=_status(finite, crossed, found, residual),
+        status=_status(finite, crossed, found),
         iterations=found.iterations,
         factorizations=found.factorizations,
-        kkt_residual=residual,
+        kkt_residual=found.residual,
         slack=value - jnp.clip(value, safe.lower[n:], safe.upper[n:]),
         multipliers=multipliers,
         row_multipliers=y,
@@ -207,9 +206,8 @@ def _upper(qp: QP) -> Float[Array, " n+p"]:
     return qp.upper if qp.known is None else jnp.where(np.array(qp.known), qp.lower, qp.upper)
 
 
-def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found, residual: Float[Array, ""]) -> Array:
-    certified = found.optimal & (residual <= CERTIFIED[residual.dtype])
-    verdict = jnp.where(certified, Status.SOLVED, Status.MAX_ITERATIONS)
+def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found) -> Array:
+    verdict = jnp.where(found.optimal, Status.SOLVED, Status.MAX_ITERATIONS)
     verdict = jnp.where(found.infeasible | crossed, Status.INFEASIBLE, verdict)
     return jnp.where(finite, verdict, Status.NUMERICAL_ERROR)
 
