@@ -61,6 +61,7 @@ class Point(NamedTuple):
     infeasible: Bool[Array, ""]
     careful: Bool[Array, ""]  # one bound is left at a time
     arrived: Bool[Array, ""]  # at the minimiser of its face, so that a bound may be left
+    rests: Bool[Array, ""]  # at the minimiser for these pulls
     since: Int[Array, ""]  # iterations since the last change of ``pull``
 
 
@@ -131,6 +132,7 @@ def _begin(qp: QP, start: Float[Array, " n"], iterations: Int[Array, ""]) -> Poi
         infeasible=no,
         careful=no,
         arrived=~no,
+        rests=no,
         since=zero,
     )
 
@@ -149,8 +151,12 @@ def _view(qp: QP, s: Point) -> View:
 
 
 def _improve(holds: float, qp: QP, s: Point) -> Point:
-    """A projected Newton step; where it is as good as none, another pull at the hard rows, or the end."""
+    """A projected Newton step; after one that was as good as none, another pull at the hard rows, or the end."""
     seen = _view(qp, s)
+    return jax.tree.map(partial(jnp.where, s.rests), _pulled(holds, qp, s, seen), _stepped(qp, s, seen))
+
+
+def _stepped(qp: QP, s: Point, seen: View) -> Point:
     newton = _newton(qp, s, seen)
     root = jnp.sqrt(qp.cost.diagonal())
     small = jnp.max(jnp.abs(newton) * root) <= _SMALL * jnp.max(jnp.abs(s.x) * root)
@@ -159,14 +165,14 @@ def _improve(holds: float, qp: QP, s: Point) -> Point:
     rests = small | flat | ~lowers
     last = rests & (s.arrived | ~seen.leaves) & (s.careful | small | flat)
     step = jnp.where(small | (fits & ~lowers), newton, jnp.where(lowers, step, 0.0))
-    moved = s._replace(
+    return s._replace(
         x=_moved(qp, s.x, step),
         iterations=s.iterations + 1,
         since=s.since + 1,
         careful=s.careful | (rests & ~last) | (s.since >= _BOLD),
         arrived=jnp.where(s.careful, rests | whole, small | flat),
+        rests=last,
     )
-    return jax.tree.map(partial(jnp.where, last), _pulled(holds, qp, moved), moved)
 
 
 def _moved(qp: QP, x: Float[Array, " n"], step: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -232,11 +238,10 @@ def _change(qp: QP, s: Point, seen: View, step: Float[Array, " n"]) -> Float[Arr
     return jnp.dot(seen.slope, step) + 0.5 * jnp.dot(step, qp.cost.curvature(step)) + bend
 
 
-def _pulled(holds: float, qp: QP, s: Point) -> Point:
+def _pulled(holds: float, qp: QP, s: Point, seen: View) -> Point:
     """At a minimiser: the end if its hard rows hold; else their multipliers are taken over, and on."""
     n = len(s.x)
     hard = qp.compliance == 0.0
-    seen = _view(qp, s)
     values = apply(qp.rows, s.x)
     gap = jnp.where(hard, outside(values, qp.lower[n:], qp.upper[n:]), 0.0)
     off = jnp.where(hard, values - jnp.clip(seen.values, qp.lower[n:], qp.upper[n:]), 0.0)
@@ -258,6 +263,7 @@ def _pulled(holds: float, qp: QP, s: Point) -> Point:
         before=s.x,
         pulls=s.pulls + 1,
         since=jnp.zeros_like(s.since),
+        rests=jnp.zeros_like(s.rests),
         careful=jnp.zeros_like(s.careful),
         arrived=jnp.ones_like(s.arrived),
         missed=missed,
