@@ -29,8 +29,9 @@ class WeightedQP(Scheme):
     another pulls against it.
 
     Attributes:
-        damping: of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, at least a
-            few roundings of the largest weight times row norm squared.
+        damping: of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, what holds a
+            dof, its damping and its posture together, is at least a few roundings of the largest weight times row norm
+            squared.
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
             none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         max_iterations: cap on changes of the active set (static).
@@ -53,7 +54,6 @@ class WeightedQP(Scheme):
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
         damping = self.damping + self.curvature_damping * problem.curvature(problem.soft())
-        damping = _above_rounding(damping, problem)
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
@@ -68,14 +68,14 @@ class WeightedQP(Scheme):
         )
 
 
-def _above_rounding(damping: Float[Array, ""], problem: VelocityProblem) -> Float[Array, ""]:
-    """The damping, raised above the rounding of the Hessian where a kernel of single precision may do the work."""
+def _least(problem: VelocityProblem) -> Float[Array, ""]:
+    """The weakest damping that a kernel of single precision can tell from the rounding of the Hessian; 0 for none."""
     rows = list(problem.soft().values())
-    if damping.dtype != jnp.float32 or not rows or not _cuda.wanted():
-        return damping
+    dtype = problem.lower.dtype
+    if dtype != jnp.float32 or not rows or not _cuda.wanted():
+        return jnp.zeros((), dtype)
     steepest = [jnp.max(r.weight * jnp.sum(r.jacobian**2, 1), initial=0.0) for r in rows]
-    least = _ROUNDINGS * float(jnp.finfo(damping.dtype).eps) * jnp.max(jnp.stack(steepest))
-    return jnp.maximum(damping, jax.lax.stop_gradient(least))
+    return jax.lax.stop_gradient(_ROUNDINGS * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
 
 
 def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Array, ""]) -> dict[str, Array]:
@@ -88,6 +88,8 @@ def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Arr
         usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of nought is NaN
         weight, wanted = (jnp.append(a, 0.0)[place] for a in (usable, usable * rows.lower))
         strength, pull = strength + weight, pull + wanted
+    least = _least(problem)
+    strength = jnp.where(strength < least, least, strength)
     center = pull / strength
     for rows in singles:
         strength = jnp.where(jnp.isnan(rows.weight).any(), jnp.nan, strength)
