@@ -49,9 +49,9 @@ class Solution(eqx.Module):
 
     Attributes:
         velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. ``WeightedQP`` returns, by
-            status: SOLVED, the best; INFEASIBLE, the one that misses what is hard least; MAX_ITERATIONS, a damped
-            least-squares step, in the box and as far as it is better than standing still; NUMERICAL_ERROR, zero,
-            clipped into the box. (nv,)
+            status: SOLVED, the best; INFEASIBLE, the one that misses what is hard least; MAX_ITERATIONS, a careful
+            step downhill, in the box and no worse than standing still; NUMERICAL_ERROR, zero, clipped into the box.
+            (nv,)
         status: a ``Status`` code.
         iterations: changes of the active set, all levels together.
         factorizations: systems factored, all levels together; 1 in ``WeightedQP`` where the warm start was right.

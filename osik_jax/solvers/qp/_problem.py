@@ -52,8 +52,8 @@ class QPSolution(eqx.Module):
 
     Attributes:
         x: inside its box exactly, whatever the status. SOLVED: the minimiser. INFEASIBLE: the least violation of the
-            hard rows, and of those the least cost. MAX_ITERATIONS: a damped least-squares step, no worse than zero
-            clipped into the box, which NUMERICAL_ERROR has. (n,)
+            hard rows, and of those the least cost. MAX_ITERATIONS: a careful step downhill, no worse than zero clipped
+            into the box, which NUMERICAL_ERROR has. (n,)
         status: a ``Status`` code.
         iterations: constraints added to or dropped from the active set.
         factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search. A
