@@ -127,19 +127,20 @@ def reach(robot, name):
     return tasks | {"balance": osik.ComTask(robot, polygon=polygon, priority=2)}
 
 
-@pytest.mark.parametrize("x64", [False, True], ids=["float32", "float64"])
 @pytest.mark.parametrize("name", REACHES)
-def test_a_reach_is_solved_at_either_precision(name, x64):
-    """A NAO at default settings: hard feet beside a weak posture, and no posture at all."""
-    steps = 60
-    with jax.enable_x64(x64):
-        robot = osik.load_robot("nao")
-        motion = osik.rollout(robot, robot.q0, reach(robot, name), scheme=osik.WeightedQP(), steps=steps)
-    s = motion.solution
-    assert s.velocity.dtype == (np.float64 if x64 else np.float32)
-    np.testing.assert_array_equal(s.status, np.full(steps, Status.SOLVED))
-    assert s.kkt_residual.max() < (1e-9 if x64 else 1e-5)
-    assert np.abs(s.velocity[:, :6]).max() < 2.0 and (s.box_violation < (1e-10 if x64 else 1e-5)).all()
-    assert np.abs(s.error["hand"][-1]).max() < 0.5 * np.abs(s.error["hand"][0]).max()
-    if name != "no_posture":
-        assert max(np.abs(s.slack[foot]).max() for foot in ("l_sole", "r_sole")) < (1e-10 if x64 else 1e-5)
+def test_a_reach_is_solved_at_either_precision(name):
+    """A NAO at default settings, hard feet beside a weak posture or none at all: float32 does what float64 does."""
+    steps, velocities = 60, []
+    for x64, certified, held in ((False, 1e-5, 1e-5), (True, 1e-9, 1e-10)):
+        with jax.enable_x64(x64):
+            robot = osik.load_robot("nao")
+            motion = osik.rollout(robot, robot.q0, reach(robot, name), scheme=osik.WeightedQP(), steps=steps)
+        s = motion.solution
+        velocities.append(np.asarray(s.velocity))
+        assert s.velocity.dtype == (np.float64 if x64 else np.float32)
+        np.testing.assert_array_equal(s.status, np.full(steps, Status.SOLVED))
+        assert s.kkt_residual.max() < certified and s.box_violation.max() < held
+        assert np.abs(s.error["hand"][-1]).max() < 0.5 * np.abs(s.error["hand"][0]).max()
+        if name != "no_posture":
+            assert max(np.abs(s.slack[foot]).max() for foot in ("l_sole", "r_sole")) < held
+    np.testing.assert_allclose(*velocities, rtol=0, atol=1e-4)
