@@ -12,19 +12,29 @@ N, TASKS, ROWS, LANES = 10, 8, 6, 24
 DAMPING = 1e-8
 
 
-def problems(rng, *, soft):
+def problems(rng, *, soft, lanes=LANES):
     """Weights over four decades, a damping of 1e-8, tight boxes, rows that some point of the box satisfies."""
-    A = rng.normal(size=(LANES, TASKS, N)) * (rng.random((LANES, TASKS, N)) < 0.6)
-    b, w = 30.0 * rng.normal(size=(LANES, TASKS)), 10.0 ** rng.uniform(-2, 2, (LANES, TASKS))
-    upper = rng.uniform(0.5, 4.0, (LANES, N))
+    A = rng.normal(size=(lanes, TASKS, N)) * (rng.random((lanes, TASKS, N)) < 0.6)
+    b, w = 30.0 * rng.normal(size=(lanes, TASKS)), 10.0 ** rng.uniform(-2, 2, (lanes, TASKS))
+    upper = rng.uniform(0.5, 4.0, (lanes, N))
     upper[:, :3] = np.inf
-    C = rng.normal(size=(LANES, ROWS, N)) * (rng.random((LANES, ROWS, N)) < 0.5)
+    C = rng.normal(size=(lanes, ROWS, N)) * (rng.random((lanes, ROWS, N)) < 0.5)
     C[:, -1] = C[:, 0] + C[:, 1]
-    inner = np.clip(rng.normal(size=(LANES, N)), -upper, upper)
+    inner = np.clip(rng.normal(size=(lanes, N)), -upper, upper)
     value = np.einsum("bpn,bn->bp", C, inner)
-    low, high = value - 0.1 * rng.random((LANES, ROWS)), value + 0.1 * rng.random((LANES, ROWS))
-    compliance = 10.0 ** rng.uniform(-4, 1, (LANES, ROWS)) if soft else np.zeros((LANES, ROWS))
+    low, high = value - 0.1 * rng.random((lanes, ROWS)), value + 0.1 * rng.random((lanes, ROWS))
+    compliance = 10.0 ** rng.uniform(-4, 1, (lanes, ROWS)) if soft else np.zeros((lanes, ROWS))
     return A, b, w, -upper, upper, C, low, high, compliance
+
+
+def wide_problems(*, soft):
+    """Four hundred of them, with weights over eight decades; one of each kind was once said to be infeasible."""
+    data = list(problems(np.random.default_rng(5), soft=soft, lanes=400))
+    wide = np.random.default_rng(1)
+    data[2] = data[2] * 10.0 ** wide.uniform(-2, 2, data[2].shape)
+    if soft:
+        data[8] = data[8] * 10.0 ** wide.uniform(-2, 2, data[8].shape)
+    return data
 
 
 def one(*data, **options):
@@ -73,6 +83,22 @@ def test_hard_rows_that_can_hold_do(rng):
     assert np.abs(s.slack).max() < 1e-10 and s.kkt_residual.max() < 1e-9
     alone = [one(*(a[i] for a in data)) for i in range(4)]
     np.testing.assert_allclose([a.x for a in alone], s.x[:4], atol=1e-7)
+
+
+def test_rows_that_give_way_beside_weights_over_eight_decades():
+    data = wide_problems(soft=True)
+    s = batched(*data)
+    np.testing.assert_array_equal(s.status, np.full(400, Status.SOLVED))
+    for i in range(0, 400, 4):  # the oracle's own digits are few here: ours costs no more
+        expected = by_bounded_least_squares(data, i)
+        assert cost(data, i, np.asarray(s.x[i])) <= (1.0 + 1e-9) * cost(data, i, expected)
+
+
+def test_hard_rows_beside_weights_over_eight_decades():
+    data = wide_problems(soft=False)
+    s = batched(*data)
+    np.testing.assert_array_equal(s.status, np.full(400, Status.SOLVED))
+    assert np.abs(s.slack).max() < 1e-9
 
 
 def test_the_verdict_is_that_of_a_linear_program(rng):
