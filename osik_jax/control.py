@@ -48,12 +48,16 @@ class Solution(eqx.Module):
     """Answer of one tick (or, with a leading axis, of many).
 
     Attributes:
-        velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. (nv,)
+        velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. ``WeightedQP`` returns, by
+            status: SOLVED, the best; INFEASIBLE, the one that misses what is hard least; MAX_ITERATIONS, a careful
+            step downhill, in the box and no worse than standing still; NUMERICAL_ERROR, zero, clipped into the box.
+            (nv,)
         status: a ``Status`` code.
         iterations: changes of the active set, all levels together.
         factorizations: systems factored, all levels together; 1 in ``WeightedQP`` where the warm start was right.
-        kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``); the
-            largest finite number where the status is NUMERICAL_ERROR.
+        kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``), of
+            ``WeightedQP`` as a share of the forces that the tasks exert: comparable between problems, at most 1e-9
+            (1e-5 in float32) where SOLVED. The largest finite number where the status is NUMERICAL_ERROR.
         box_violation: how far v leaves its box [rad/s or m/s], 0 but for ``NullSpace``; or, where that is more, how far
             it leaves the rows of limits that are no box, in their units: rounding, but for ``NullSpace`` and where the
             status is INFEASIBLE.
@@ -237,7 +241,8 @@ def rollout(
             trajectory holds where the ticks led, not what was measured.
 
     Returns:
-        The trajectory. A tick that failed on a NaN moves nothing: look at ``solution.status``.
+        The trajectory. Every tick applies its velocity, whatever the status (``Solution.velocity`` says what it is);
+        one that failed on a NaN in q or dt moves nothing: look at ``solution.status``.
 
     Raises:
         TypeError, ValueError: as in ``solve``; ``targets``, ``feedback`` or ``steps`` do not fit.

@@ -66,7 +66,7 @@ def test_the_search_is_for_the_other_lanes(planted, monkeypatch):
     searched = solve(*data, np.zeros((COUNT, N), int))
     wrong = np.arange(COUNT) % 5 == 2
     guess = np.where(wrong[:, None], 0, searched.active)
-    monkeypatch.setattr(_search, "_search", lambda qp, start, tolerance, *, cap: start)
+    monkeypatch.setattr(_search, "_search", lambda given, start, **_: start)
 
     def lane(A, b, weight, lower, upper, damping, center, warm_start):  # a cap of its own, so compiled anew
         more = dict(damping=damping, center=center, warm_start=warm_start, max_iterations=777)

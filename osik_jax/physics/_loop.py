@@ -115,7 +115,8 @@ def simulate(
     """Runs the loop from the simulation's present state, until the robot falls at the latest.
 
     Each tick senses the configuration, base and joints, solves for the velocity there, makes a servo target of it and
-    lets MuJoCo run for ``dt``. One compiled program a tick; MuJoCo runs on the host.
+    lets MuJoCo run for ``dt``. One compiled program a tick; MuJoCo runs on the host. As in ``rollout``, every
+    tick applies its velocity, whatever the status.
 
     Args:
         simulation: the robot in its world; it is left where the run ended.

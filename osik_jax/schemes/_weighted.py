@@ -5,14 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._joint_selection import concrete
-from ..solvers import Level, solve_least_squares_qp
+from ..solvers import Level, _cuda, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
+
+_ROUNDINGS = 4.0
+"""Of the largest weight times row norm squared; a weaker damping is lost in single arithmetic."""
 
 
 class WeightedQP(Scheme):
@@ -25,7 +29,9 @@ class WeightedQP(Scheme):
     another pulls against it.
 
     Attributes:
-        damping: of the velocity, in the units of weight times J^2; > 0.
+        damping: of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, what holds a
+            dof, its damping and its posture together, is at least a few roundings of the largest weight times row norm
+            squared.
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
             none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         max_iterations: cap on changes of the active set (static).
@@ -62,6 +68,16 @@ class WeightedQP(Scheme):
         )
 
 
+def _least(problem: VelocityProblem) -> Float[Array, ""]:
+    """The weakest damping that a kernel of single precision can tell from the rounding of the Hessian; 0 for none."""
+    rows = list(problem.soft().values())
+    dtype = problem.lower.dtype
+    if dtype != jnp.float32 or not rows or not _cuda.wanted():
+        return jnp.zeros((), dtype)
+    steepest = [jnp.max(r.weight * jnp.sum(r.jacobian**2, 1), initial=0.0) for r in rows]
+    return jax.lax.stop_gradient(_ROUNDINGS * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
+
+
 def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Array, ""]) -> dict[str, Array]:
     """Rows that each ask for one dof's velocity, with the damping: a strength and a centre for each dof."""
     n = problem.lower.shape[0]
@@ -72,6 +88,8 @@ def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Arr
         usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of nought is NaN
         weight, wanted = (jnp.append(a, 0.0)[place] for a in (usable, usable * rows.lower))
         strength, pull = strength + weight, pull + wanted
+    least = _least(problem)
+    strength = jnp.where(strength < least, least, strength)
     center = pull / strength
     for rows in singles:
         strength = jnp.where(jnp.isnan(rows.weight).any(), jnp.nan, strength)

@@ -35,3 +35,8 @@ def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, A
 def clip_to_box(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
     """x in [lower, upper]; a bound that is none (NaN, an infinity on the wrong side) is passed over."""
     return jnp.clip(x, jnp.where(lower < jnp.inf, lower, -jnp.inf), jnp.where(upper > -jnp.inf, upper, jnp.inf))
+
+
+def outside(values: Float[Array, " m"], lower: Float[Array, " m"], upper: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Values minus the nearest points of their intervals, exactly 0 inside."""
+    return jnp.where(values < lower, values - lower, jnp.where(values > upper, values - upper, 0.0))

@@ -69,6 +69,18 @@ def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, A
     return jax.lax.while_loop(lambda carry: ~jnp.all(carry[1]), body, (state, done))[0]
 
 
+def with_a_few(data: Any, state: Any, done: Bool[Array, " B"], again: Callable[[Any, Any], Any], block: int) -> Any:
+    """As ``with_the_rest``, by a function of the data and the state of a block's lanes; a short batch is one block."""
+    lanes = len(done)
+
+    def gathered(at: Array, state: Any) -> Any:
+        return again(*jax.tree.map(lambda a: a[at], (data, state)))
+
+    if lanes > block:
+        return with_the_rest(state, done, gathered, block)
+    return jax.lax.cond(jnp.all(done), lambda: state, lambda: choose(done, state, again(data, state)))
+
+
 def choose(where: jax.Array, new: Any, old: Any) -> Any:
     """``new`` in the lanes where the flag (one a lane) is set, ``old`` in the others."""
     return jax.tree.map(lambda a, b: jnp.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._dense import apply, product
 
@@ -30,6 +31,21 @@ class Quadratic(eqx.Module):
     def curvature(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """H x."""
         return apply(self.matrix, x)
+
+    def forces(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The terms of the gradient, none against another."""
+        return apply(jnp.abs(self.matrix), jnp.abs(x)) + jnp.abs(self.linear)
+
+    def root(self, free: Bool[Array, " n"]) -> Float[Array, "n n"]:
+        """R with R'R = H over the free variables, ones for the others; a ridge of roundings keeps it from breaking."""
+        unit = 10.0 * float(jnp.finfo(self.matrix.dtype).eps)
+        square = jnp.where(free[:, None] & free[None, :], self.matrix, 0.0)
+        ridge = jnp.where(free, unit * jnp.max(jnp.diagonal(square), initial=unit), 1.0)
+        return jax.lax.linalg.cholesky(square + jnp.diag(ridge), symmetrize_input=False).T
+
+    def bend(self) -> Float[Array, " n"]:
+        """A diagonal matrix that is no less than H: the sums of the absolute numbers in its rows."""
+        return jnp.sum(jnp.abs(self.matrix), 1)
 
     def harmless(self) -> Quadratic:
         """A cost of the same shape that can always be minimised."""
@@ -64,6 +80,22 @@ class LeastSquares(eqx.Module):
     def curvature(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """A'WA x + D x."""
         return apply(self.matrix.T, self.weight * apply(self.matrix, x)) + self.damping * x
+
+    def forces(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The terms of the gradient, none against another."""
+        size = jnp.abs(self.matrix)
+        pulls = self.weight * (apply(size, jnp.abs(x)) + jnp.abs(self.target))
+        return apply(size.T, pulls) + self.damping * (jnp.abs(x) + jnp.abs(self.center))
+
+    def root(self, free: Bool[Array, " n"]) -> Float[Array, "m+n n"]:
+        """R with R'R = H over the free variables, ones for the others; nothing is squared."""
+        own = jnp.where(free, jnp.sqrt(self.damping), 1.0)
+        return jnp.concatenate([jnp.sqrt(self.weight)[:, None] * self.matrix * free, jnp.diag(own)])
+
+    def bend(self) -> Float[Array, " n"]:
+        """A diagonal matrix that is no less than the Hessian."""
+        size = jnp.abs(self.matrix)
+        return apply(size.T, self.weight * jnp.sum(size, 1)) + self.damping
 
     def harmless(self) -> LeastSquares:
         """A cost of the same shape that can always be minimised."""

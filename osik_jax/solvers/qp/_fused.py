@@ -23,11 +23,14 @@ from . import _kernel
 from ._cost import LeastSquares
 from ._factor import system_inverse
 from ._kernel import Proposal
-from ._problem import QP, active_targets
-from ._search import Found, optimal_on, possible, scales_of, search
+from ._problem import CERTIFIED, QP, active_targets, kkt_residual, scales_of
+from ._search import Found, optimal_on, possible, search
 
 _SHARE, _SMALLEST = 16, 1024
 """Lanes that are left are solved in blocks of a 16th of the batch, of 1,024 lanes at least."""
+
+_SINGLE = 1e-7
+"""Tolerance of the kernel, whose arithmetic is single, and of its certificate; the search has the one asked for."""
 
 _TIGHTEST = 1e-7
 """Tolerance of the kernel where there are no bounds that a point could be near."""
@@ -123,11 +126,11 @@ def proposed_and_searched(
         propose: proposes active sets and the minimisers on them.
         max_iterations: cap on the changes of the active set.
     """
-    start = jax.vmap(possible)(qp, guess)
-    proposal = propose(qp, start, tolerance, max_iterations)
+    start, single = jax.vmap(possible)(qp, guess), jnp.maximum(tolerance, _SINGLE)
+    proposal = propose(qp, start, single, max_iterations)
     found = _found(qp, proposal)
     fine = (proposal.settled != 0) & (proposal.iterations <= max_iterations)
-    fine &= jax.vmap(_certified)(qp, found, tolerance)
+    fine &= jax.vmap(_certified)(qp, found, single) & (found.residual <= CERTIFIED[single.dtype])
     found = found._replace(done=fine, optimal=fine)
 
     def again(at: Array, found: Found) -> Found:
@@ -155,8 +158,10 @@ def _found(qp: QP, proposal: Proposal) -> Found:
         done=nothing.astype(bool),
         optimal=nothing.astype(bool),
         contradictions=nothing,
+        descended=nothing.astype(bool),
         infeasible=nothing.astype(bool),
         compliance=qp.compliance,
+        residual=jax.vmap(kkt_residual)(qp, proposal.x, proposal.row_multipliers, proposal.active),
     )
 
 

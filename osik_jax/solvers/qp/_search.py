@@ -7,7 +7,7 @@ factorisation at the final active set, never from the tableau that found it.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,30 +15,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._dense import apply
-from .._lanes import choose, with_the_rest
+from .._double import in_double
+from .._lanes import choose, with_a_few
 from .._pivots import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, NO_GAP, Noise
+from ._careful import careful_step
+from ._descent import descend
 from ._factor import factorize, minimize_on
-from ._problem import QP
+from ._problem import CERTIFIED, QP, kkt_residual, scales_of
 from ._tableau import find
 from ._through_rows import has_few_rows, minimize_through_rows
 
-_ROUNDS = 30
+_ROUNDS = 12
 _NEARLY = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
 """Noises; an answer that the search does not change is accepted with violations up to this."""
-_PATIENCE = 5
-"""Searches that end at a contradiction before it is believed; one that does not move from fresh factors is enough.
-
-A search that neither moves nor ends at an answer is taken for one too: more constraints are active there than can be
-independent. Where the rows do not contradict each other after all, they hold once they are soft, and are made hard
-again.
-"""
-_HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
-_SOFT = {jnp.dtype("float64"): (1e-6, 1e-12), jnp.dtype("float32"): (1e-3, 1e-4)}
-"""Compliance of rows that contradict, first and last, as a share of their own; each stage starts where one ended."""
-_FEW = 4
-"""Lanes of a block that are searched together, where most of it needs no search."""
-_NOUGHT = 100.0
-"""Roundings of what the cost pulls at it; an answer that is no larger is 0."""
+_PATIENCE = 2
+"""Searches that end at a contradiction before the pivots are given up; one that moves nothing is enough."""
+_SOFT = 1e-12
+"""Compliance of hard rows that contradict, of their reach: with it the least violation has a derivative."""
+_FEW, _MANY = 4, 256
+"""Lanes that are worked on together where most need no more work; many, where there is no CPU."""
 
 
 class Found(NamedTuple):
@@ -53,21 +48,26 @@ class Found(NamedTuple):
     done: Bool[Array, ""]
     optimal: Bool[Array, ""]
     contradictions: Int[Array, ""]  # searches that ended at one
-    infeasible: Bool[Array, ""]  # some rows contradict each other or the box: all of them have been made to give way
+    descended: Bool[Array, ""]  # the pivots were given up
+    infeasible: Bool[Array, ""]  # it is proven that rows contradict each other or the box; x is the least violation
     compliance: Float[Array, " p"]  # of the rows in the problem that ``x`` solves
-
-
-class Scales(NamedTuple):
-    """Rounding in the values and multipliers of the constraints is this large, times a tolerance."""
-
-    value: Float[Array, " m"]
-    multiplier: Float[Array, " m"]
+    residual: Float[Array, ""]  # of the optimality conditions
 
 
 def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int) -> Found:
-    """The search for a batch: every argument has a leading axis, the lanes. A cap on the changes of the active set."""
+    """The search for a batch: every argument has a leading axis, the lanes. A cap on the changes of the active set.
+
+    It is in double precision whatever the data: which bounds are active is yes or no, and a weak damping beside heavy
+    rows is below the rounding of single precision.
+    """
+    whole = partial(_found, cap=max_iterations, holds=CERTIFIED[qp.lower.dtype])
+    return in_double(whole)(qp, guess, tolerance)
+
+
+def _found(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, cap: int, holds: float) -> Found:
+    """The answers, and where there is none, a careful step."""
     lanes, n, dtype = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1], qp.lower.dtype
-    nothing = jnp.zeros(lanes, jnp.int32)
+    nothing, no = jnp.zeros(lanes, jnp.int32), jnp.zeros(lanes, bool)
     start = Found(
         x=jnp.zeros((lanes, n), dtype),
         row_multipliers=jnp.zeros(qp.rows.shape[:2], dtype),
@@ -75,21 +75,34 @@ def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, m
         implied=jnp.zeros(guess.shape, bool),
         iterations=nothing,
         factorizations=nothing,
-        done=jnp.zeros(lanes, bool),
-        optimal=jnp.zeros(lanes, bool),
+        done=no,
+        optimal=no,
         contradictions=nothing,
-        infeasible=jnp.zeros(lanes, bool),
+        descended=no,
+        infeasible=no,
         compliance=qp.compliance,
+        residual=jnp.zeros(lanes, dtype),
     )
-
+    search_one = partial(_search, cap=cap, holds=holds)
     if lanes == 1 or jax.default_backend() != "cpu" or not has_few_rows(qp):
-        return _search(qp, start, tolerance, cap=max_iterations)
-    looked = _first_look(qp, start, tolerance)
+        found = search_one((qp, tolerance), start)
+    else:
+        looked = _first_look(qp, start, tolerance)
+        found = with_a_few((qp, tolerance), looked, looked.done, search_one, _block())
+    residual = jax.vmap(kkt_residual)(qp, found.x, found.row_multipliers, found.active)
+    found = found._replace(residual=residual, optimal=found.optimal & (residual <= holds))
+    return with_a_few(qp, found, found.optimal | found.infeasible, _carefully, _block())
 
-    def again(at: Array, found: Found) -> Found:
-        return _search(*jax.tree.map(lambda a: a[at], (qp, found, tolerance)), cap=max_iterations)
 
-    return with_the_rest(looked, looked.done, again, min(lanes, _FEW))
+def _block() -> int:
+    return _FEW if jax.default_backend() == "cpu" else _MANY
+
+
+def _carefully(qp: QP, found: Found) -> Found:
+    cold = jax.vmap(possible)(qp, jnp.zeros_like(found.active))
+    x, y = jax.vmap(careful_step)(qp), jnp.zeros_like(found.row_multipliers)
+    residual = jax.vmap(kkt_residual)(qp, x, y, cold)
+    return found._replace(x=x, row_multipliers=y, active=cold, residual=residual)
 
 
 def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
@@ -102,23 +115,50 @@ def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
     return choose(optimal, end, start)
 
 
-def _search(qp: QP, start: Found, tolerance: Float[Array, " B"], *, cap: int) -> Found:
-    """Rounds of factoring, checking and pivoting, until every lane is done."""
+def _search(given: tuple[QP, Float[Array, " B"]], start: Found, *, cap: int, holds: float) -> Found:
+    """Rounds of factoring, checking and pivoting, until every lane is done; what is lost on the way goes downhill.
+
+    Where the descent ends there is one more round, so that its answer is the exact minimiser on its active set, if
+    there are digits enough for that.
+    """
+    qp, tolerance = given
     hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
+    down = partial(_descended, holds=holds, cap=cap)
 
     def go_on(state: tuple[Found, Array]) -> Bool[Array, ""]:
         found, rounds = state
-        return (rounds < _ROUNDS) & ~jnp.all(found.done)
+        return (rounds <= _ROUNDS) & ~jnp.all(found.done)
 
     def body(state: tuple[Found, Array]) -> tuple[Found, Array]:
         found, rounds = state
-        return choose(~found.done, _round(qp, hessian, found, tolerance, cap), found), rounds + 1
+        found = choose(~found.done, _round(qp, hessian, found, tolerance, cap), found)
+        lost = ~(found.done | found.descended) & ((found.contradictions >= _PATIENCE) | (rounds + 1 >= _ROUNDS))
+        return with_a_few(qp, found, ~lost, down, _block()), rounds + 1
 
     return jax.lax.while_loop(go_on, body, (start, jnp.asarray(0)))[0]
 
 
+def _descended(qp: QP, found: Found, *, holds: float, cap: int) -> Found:
+    start = jnp.where(jnp.isfinite(found.x), found.x, 0.0)
+    end = descend(qp, start, found.iterations, holds=holds, max_iterations=cap)
+    reach = jax.vmap(lambda one: jnp.max(apply(one.rows**2, 1.0 / one.cost.diagonal()), initial=0.0))(qp)
+    contradicts = end.settled & end.infeasible
+    optimal = end.settled & ~end.infeasible
+    return found._replace(
+        x=end.x,
+        row_multipliers=end.row_multipliers,
+        active=end.active,
+        iterations=end.iterations,
+        factorizations=found.factorizations + end.iterations - found.iterations,
+        done=~optimal,
+        optimal=optimal,
+        descended=jnp.ones_like(optimal),
+        infeasible=contradicts,
+        compliance=jnp.where(contradicts[:, None], jnp.maximum(_SOFT * reach[:, None], qp.compliance), qp.compliance),
+    )
+
+
 def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Float[Array, " B"], cap: int) -> Found:
-    stiff, qp = qp, replace(qp, compliance=found.compliance)
     factor = jax.vmap(factorize)(qp, hessian, found.active)
     x, y = minimize_on(qp, factor, found.active)
     scales = jax.vmap(scales_of)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
@@ -127,7 +167,7 @@ def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Floa
     more = Noise(*(_NEARLY[hessian.dtype] * a for a in noise))
     nearly = jax.vmap(optimal_on)(qp, found, x, y, more)
     exhausted = found.iterations >= cap
-    searching = ~(found.done | optimal | exhausted)
+    searching = ~(found.done | optimal | exhausted | found.descended)
 
     def look() -> Found:
         end = find(
@@ -147,34 +187,15 @@ def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Floa
 
     after = jax.lax.cond(jnp.any(searching), lambda: choose(searching, look(), found), lambda: found)
     same = jnp.all(after.active == found.active, 1)
-    end = after._replace(
+    good = nearly & same & jax.vmap(lambda x, y: jnp.isfinite(x).all() & jnp.isfinite(y).all())(x, y)
+    lost = after.contradictions >= _PATIENCE
+    x, y = choose(good | ~found.descended, (x, y), (found.x, found.row_multipliers))
+    return after._replace(
         x=x,
         row_multipliers=y,
         factorizations=found.factorizations + 1,
-        done=exhausted | (nearly & same & (after.contradictions == found.contradictions)),
-        optimal=nearly & same,
-    )
-    return jax.vmap(_give_way)(stiff, hessian, end, scales) if qp.rows.shape[1] else end
-
-
-def _give_way(stiff: QP, hessian: Float[Array, "n n"], found: Found, scales: Scales) -> Found:
-    """Where rows contradict, begins anew with all of them soft, and stiffens them; where they then hold, for good."""
-    softens = (found.contradictions >= _PATIENCE) & ~found.infeasible
-    gap = _gaps(stiff, found.x, jnp.zeros_like(found.row_multipliers))
-    hardens = found.infeasible & found.done & jnp.all(gap <= _HOLDS[hessian.dtype] * scales.value)
-    in_box = jnp.arange(len(found.active)) < len(found.x)
-    pinned = jnp.where(stiff.equality & in_box, EQUALITY, INACTIVE)
-    reach = apply(stiff.rows**2, 1.0 / jnp.where(jnp.diagonal(hessian) > 0.0, jnp.diagonal(hessian), 1.0))
-    first, last = (jnp.maximum(share * jnp.max(reach), stiff.compliance) for share in _SOFT[hessian.dtype])
-    stiffer = jnp.maximum(1e-3 * found.compliance, last)
-    stiffens = found.infeasible & found.done & ~hardens & jnp.any(stiffer < found.compliance)
-    return found._replace(
-        active=jnp.where(softens, pinned, found.active).astype(jnp.int32),
-        implied=found.implied & ~(softens | hardens | stiffens),
-        done=found.done & ~hardens & ~stiffens,
-        contradictions=jnp.where(hardens, -_ROUNDS * _PATIENCE, found.contradictions),
-        infeasible=(found.infeasible | softens) & ~hardens,
-        compliance=jnp.select([softens, hardens, stiffens], [first, stiff.compliance, stiffer], found.compliance),
+        done=exhausted | found.descended | (good & ((after.contradictions == found.contradictions) | lost)),
+        optimal=good | found.descended,
     )
 
 
@@ -187,26 +208,6 @@ def possible(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
     in_box = jnp.arange(len(guess)) < n
     pinned = qp.equality & (in_box | (guess != INACTIVE))
     return jnp.where(pinned, EQUALITY, label).astype(jnp.int32)
-
-
-def scales_of(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
-    """Invariant to the units of the variables: each is measured by the root of its curvature, from H's diagonal.
-
-    Where the constraints hold all of x at 0, its rounding is that of what the cost pulls at it.
-    """
-    root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
-    pulled = jnp.abs(qp.cost.gradient(x)) / root**2
-    nought = jnp.max(jnp.abs(x) * root) <= _NOUGHT * jnp.finfo(x.dtype).eps * jnp.max(pulled * root)
-    size = jnp.where(nought, pulled, jnp.abs(x))
-    reach = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
-    span = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])
-    floor = jnp.minimum(jnp.max(size * root) * reach, jnp.max(size) * span)
-    values = jnp.concatenate([x, apply(qp.rows, x)])
-    bounds = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (qp.lower, qp.upper)]
-    nearest = jnp.minimum(*bounds)
-    value = floor + jnp.abs(values) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
-    pull = jnp.concatenate([1e-3 * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
-    return Scales(value, value / jnp.maximum(reach, jnp.finfo(x.dtype).tiny) ** 2 + pull)
 
 
 def optimal_on(qp: QP, found: Found, x: Float[Array, " n"], y: Float[Array, " p"], noise: Noise) -> Bool[Array, ""]:

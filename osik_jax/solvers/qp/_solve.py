@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from ... import _rules
 from .._box import inside, uncrossed
 from .._dense import apply
-from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
+from .._pivots import INACTIVE
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._derivative import differentiable
@@ -21,7 +21,7 @@ from ._fused import searcher
 from ._problem import QP, QPSolution
 from ._search import Found
 
-_TOLERANCE = {jnp.dtype("float64"): 1e-12, jnp.dtype("float32"): 1e-7}
+_TOLERANCE = 1e-12
 
 
 @partial(jax.jit, static_argnames="max_iterations")
@@ -56,8 +56,7 @@ def solve_qp(
             t^2 / (2 c). (p,)
         warm_start: ``active`` of the solution of a problem nearby. It changes the time, not the answer. (n + p,)
         max_iterations: cap on changes of the active set (static); default 20 (n + p).
-        tolerance: violation that counts as none, relative to the scale of the constraint; default 1e-12 (1e-7 in
-            float32).
+        tolerance: violation that counts as none, relative to the scale of the constraint; default 1e-12.
 
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
@@ -171,7 +170,7 @@ def _solve(
     """Searches, certifies, and differentiates nothing but the answer; ``gives_way`` where rows may all be soft."""
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
-    allowed = jnp.asarray(_TOLERANCE[dtype] if tolerance is None else tolerance, dtype)
+    allowed = jnp.asarray(_TOLERANCE if tolerance is None else tolerance, dtype)
     sane = _finite(qp)
     safe = _replace_where(~sane, qp)
     low, high, crossed = uncrossed(safe.lower, _upper(safe))
@@ -180,7 +179,9 @@ def _solve(
     search = searcher(20 * m if max_iterations is None else max_iterations, gives_way)
     found = _rules.found(search(*jax.lax.stop_gradient((safe, cold, allowed))))
     solved = replace(safe, compliance=jnp.where(found.infeasible, found.compliance, safe.compliance))
-    x, y = differentiable(found.x, found.row_multipliers, found.active, solved)
+    answered = found.optimal | found.infeasible
+    moving = differentiable(found.x, found.row_multipliers, found.active, solved)
+    x, y = (jnp.where(answered, a, b) for a, b in zip(moving, (found.x, found.row_multipliers), strict=True))
     finite = sane & jnp.isfinite(x).all() & jnp.isfinite(y).all()
     x, y = jnp.where(finite, x, 0.0), jnp.where(finite, y, 0.0)
     x = inside(x, *(jnp.where(sane, b, raw)[:n] for b, raw in ((safe.lower, qp.lower), (safe.upper, qp.upper))))
@@ -192,7 +193,7 @@ def _solve(
         status=_status(finite, crossed, found),
         iterations=found.iterations,
         factorizations=found.factorizations,
-        kkt_residual=_kkt_residual(safe, x, multipliers, y, slope - multipliers, found.active),
+        kkt_residual=found.residual,
         slack=value - jnp.clip(value, safe.lower[n:], safe.upper[n:]),
         multipliers=multipliers,
         row_multipliers=y,
@@ -225,12 +226,3 @@ def _replace_where(bad: Bool[Array, ""], qp: QP) -> QP:
         free = jnp.where(np.array(qp.known), 0.0, free)
     harmless = QP(qp.cost.harmless(), jnp.zeros_like(qp.rows), jnp.ones_like(qp.compliance), -free, free, qp.known)
     return jax.tree.map(lambda a, b: jnp.where(bad, a, b), harmless, qp)
-
-
-def _kkt_residual(qp: QP, x: Array, box: Array, rows: Array, stationarity: Array, active: Array) -> Float[Array, ""]:
-    """Largest violation of the optimality conditions; multipliers are of the box, then of the rows."""
-    values = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * rows])
-    multipliers = jnp.concatenate([box, rows])
-    outside = jnp.maximum(jnp.maximum(qp.lower - values, values - qp.upper), 0.0)
-    wrong_sign = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, 0.0))
-    return jnp.max(jnp.concatenate([jnp.abs(stationarity), outside, wrong_sign]))
