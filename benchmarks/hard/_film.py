@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+import osik_jax as osik
 from osik_jax import viewer
 from osik_jax.viewer._animate import paint_over, write_gif
 from osik_jax.viewer._mujoco import mujoco_poses
@@ -33,6 +34,7 @@ TICKS = 200
 SLOWER = 8
 """How many times slower than it was the film shows it; DT times this is a whole number of hundredths, as GIFs count."""
 SIZE = (720, 420)
+NAMES = {"mink": "mink, as it comes", "weighted": "osik-jax, as it comes"}
 APART = 0.62
 """How far each robot is from the middle [m]."""
 AZIMUTH, ELEVATION, LENS = -48.0, 12.0, 10.0
@@ -55,39 +57,37 @@ def _motion(solver: str, work: Workload, case: Case) -> Motion:
 
 
 def _pictures(found: dict[str, Motion], work: Workload, case: Case) -> Iterator[np.ndarray]:
-    """Each with both robots, the target, what they are and how fast their fastest joints turn."""
-    robot, ticks = standing(work), range(TICKS + 1)
+    """Each with both robots, their target, who they are and how fast their fastest joints turn."""
+    robot = standing(work)
     shape = robot_parts(robot, look=viewer.read_look(file_of("g1")))
     places = np.array([robot.joint_qpos_index(name) for name in work.joints])
     paths = [_own(motion.path, places)[: TICKS + 1] for motion in found.values()]
     across = Camera((0.0, 0.0, 0.0), 1.0, AZIMUTH, 0.0, 1.0).axes[0]
     shifts = np.array([-APART * across, APART * across])
     goals = case.hand[0] + shifts
-    sources = [list(mujoco_poses(robot, path)) for path in paths]
-    floor = floor_height(robot, shape, sources[0])
-    seen = [_corners(shape, own, shift) for own, shift in zip(sources, shifts, strict=True)]
+    floor = floor_height(robot, shape, mujoco_poses(robot, paths[0][:1]))
+    seen = [_corners(robot, shape, path, shift) for path, shift in zip(paths, shifts, strict=True)]
     window = (0.05, 0.95, 0.13, 0.86)
     camera = frame_camera(np.concatenate([*seen, goals]), SIZE, AZIMUTH, ELEVATION, window, lens=LENS)
     stage = Stage([shape, shape], camera, floor=floor)
     drawer = make_renderer("raycast", stage, camera, SIZE, floor=floor)
-    names = {"mink": "mink, as it comes", "weighted": "osik-jax, as it comes"}
+    middles = [float(np.mean(camera.project(points, SIZE)[:, 0])) for points in seen]
     speeds = [_shares(motion.path, work.velocity) for motion in found.values()]
-    for frame in ticks:
-        base = drawer.image(stage.pose([own[frame] for own in sources], shifts), None)
+    for frame, sources in enumerate(zip(*(mujoco_poses(robot, path) for path in paths), strict=True)):
         canvas = Canvas(SIZE, scale=SIZE[1] / 450)
         _mark(canvas, camera.project(goals, SIZE))
-        feet = camera.project(shifts + np.array([0.0, 0.0, floor]), SIZE)[:, 0]
-        for x, solver, speed in zip(feet, found, speeds, strict=True):
-            words = f"{names[solver]}\nfastest joint: {speed[frame]:3.0f} % of its top speed"
+        for x, solver, speed in zip(middles, found, speeds, strict=True):
+            words = f"{NAMES[solver]}\nfastest joint: {speed[frame]:3.0f} % of its top speed"
             canvas.page.text(x, SIZE[1] - 14, words, ha="center", va="bottom", fontsize=9.5, color=INK)
-        canvas.title(16, 28, "A hand's target (ring) that is 0.35 m out of reach", fontsize=11)
+        canvas.title(16, 28, "The target of the hand (ring) is 0.35 m out of reach", fontsize=11)
         clock = f"t = {frame * DT:4.2f} s, {SLOWER} times slower"
         canvas.page.text(16, 50, clock, fontsize=9, color=INK, family="monospace")
-        yield paint_over(base, canvas.picture())
+        yield paint_over(drawer.image(stage.pose(sources, shifts), None), canvas.picture())
 
 
-def _corners(shape: RobotParts, sources: list, shift: np.ndarray) -> np.ndarray:
-    return np.concatenate([shape.corners(source) for source in sources[::5]]) + shift
+def _corners(robot: osik.Robot, shape: RobotParts, path: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """What the camera has to see, (points, 3)."""
+    return np.concatenate([shape.corners(source) for source in mujoco_poses(robot, path[::10])]) + shift
 
 
 def _own(path: np.ndarray, places: np.ndarray) -> np.ndarray:
