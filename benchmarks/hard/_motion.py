@@ -26,9 +26,21 @@ GAINS = (10.0, 200.0)
 """Of all tasks [1/s]; 200 asks for the whole error in one tick."""
 
 
-def _slow_posture(tasks: Tasks) -> Tasks:
+def _as_they_are(robot: osik.Robot, tasks: Tasks) -> Tasks:
+    return tasks
+
+
+def _slow_posture(robot: osik.Robot, tasks: Tasks) -> Tasks:
     """The posture with a gain of 1 /s."""
-    return tasks | ({"posture": tasks["posture"].replace(gain=1.0)} if "posture" in tasks else {})
+    return tasks | {"posture": tasks["posture"].replace(gain=1.0)}
+
+
+def _posture_beside(robot: osik.Robot, tasks: Tasks) -> Tasks:
+    """The posture at the hand's priority: both share by weight, as in the weighted scheme."""
+    posture = tasks["posture"]
+    assert isinstance(posture, osik.PostureTask)
+    numbers: dict[str, Any] = dict(target=posture.target, weight=posture.weight, gain=posture.gain)
+    return tasks | {"posture": osik.PostureTask(robot, **numbers, priority=tasks["hand"].priority)}
 
 
 class Ours(NamedTuple):
@@ -40,7 +52,7 @@ class Ours(NamedTuple):
     """
 
     scheme: Callable[[], osik.Scheme]
-    change: Callable[[Tasks], Tasks] = dict
+    change: Callable[[osik.Robot, Tasks], Tasks] = _as_they_are
 
 
 OURS: Mapping[str, Ours] = {
@@ -53,11 +65,12 @@ REMEDIES: Mapping[str, Ours] = {
     "weighted, damping 1e-2": Ours(lambda: osik.WeightedQP(damping=1e-2)),
     "hierarchy, damping 1e-2": Ours(lambda: osik.HierarchicalQP(damping=1e-2)),
     "hierarchy, posture of gain 1": Ours(osik.HierarchicalQP, _slow_posture),
+    "hierarchy, posture beside the hand": Ours(osik.HierarchicalQP, _posture_beside),
     "saturated null space, damping 1e-2": Ours(lambda: osik.NullSpace(saturate=True, damping=1e-2)),
-    "saturated null space, posture of gain 1": Ours(lambda: osik.NullSpace(saturate=True), _slow_posture),
+    "saturated null space, posture beside the hand": Ours(lambda: osik.NullSpace(saturate=True), _posture_beside),
 }
 """For where the default numbers do not come to rest."""
-OF_POSTURES = frozenset(name for name, ours in REMEDIES.items() if ours.change is _slow_posture)
+OF_POSTURES = frozenset(name for name, ours in REMEDIES.items() if ours.change is not _as_they_are)
 """Those that change nothing where there is no posture task."""
 SCHEMES = {**OURS, **REMEDIES}
 PEERS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
@@ -159,7 +172,7 @@ class OurLoop:
         return Motion(case, gain, np.concatenate(parts), float(np.mean(solved)), seconds)
 
     def _chunk(self, q: jax.Array, gain: float, hand: np.ndarray, com: np.ndarray) -> osik.Trajectory:
-        tasks = self.change({name: task.replace(gain=gain) for name, task in self.tasks.items()})
+        tasks = self.change(self.robot, {name: task.replace(gain=gain) for name, task in self.tasks.items()})
         turned = jnp.broadcast_to(jnp.eye(3, dtype=q.dtype), (CHUNK, 3, 3))
         targets: dict[str, Any] = dict(hand=(jnp.asarray(hand, q.dtype), turned))
         if "com" in tasks:
