@@ -100,7 +100,7 @@ class TestOutOfReach:
     @pytest.mark.slow
     def test_a_nao_comes_to_rest_on_its_feet(self, nao, scheme, rest):
         """The hand's target is 0.6 m from where it is; the hierarchy takes 3 s for the last of the way."""
-        tasks = {foot: osik.FrameTask(nao, foot, weight=100.0, priority=1) for foot in FEET}
+        tasks: dict[str, osik.Task] = {foot: osik.FrameTask(nao, foot, weight=100.0, priority=1) for foot in FEET}
         tasks["com"] = osik.ComTask(nao, weight=25.0, priority=2)
         tasks["hand"] = osik.FrameTask(nao, "l_gripper", rows="position", priority=3)
         places, gains = self.lanes(places_of(nao, [nao.q0], "l_gripper")[0], 0.6)
