@@ -29,11 +29,11 @@ from ._motion import Entrant, Motion, motions
 
 FILM = Path(__file__).parents[2] / "docs" / "images" / "beyond_reach.gif"
 GAIN = 200.0
-TICKS = 200
+TICKS = 100
 """That are filmed, each of them: an arm that turns round at each tick is still in every second one."""
 SLOWER = 8
 """How many times slower than it was the film shows it; DT times this is a whole number of hundredths, as GIFs count."""
-SIZE = (720, 420)
+SIZE = (600, 350)
 NAMES = {"mink": "mink, as it comes", "weighted": "osik-jax, as it comes"}
 APART = 0.62
 """How far each robot is from the middle [m]."""
