@@ -32,9 +32,9 @@ class Loop:
     def __init__(self, work: Workload, name: str, options: dict[str, Any]) -> None:
         self.work, self.now = work, 0
         self.batch: int | None = options.get("batch")
-        runner = peer(name)
+        self.made = peer(name)
         started = time.perf_counter()
-        self.runner = runner(work, **options)
+        self.runner = self.made(work, **options)
         self.build_seconds = time.perf_counter() - started
 
     def run(self, ticks: int) -> dict[str, Any]:
@@ -50,6 +50,27 @@ class Loop:
         self.now += ticks
         paths = np.array(motion)[None] if self.batch is None else np.array(motion).swapaxes(0, 1)
         return dict(seconds=seconds, motion=paths.tolist(), solved=self.runner.solved())
+
+    def follow(self, hand: np.ndarray, com: np.ndarray, options: dict[str, Any]) -> dict[str, Any]:
+        """A motion of one robot from the start along given targets; where the library raises, it stands still.
+
+        Args:
+            hand, com: targets at each tick. (ticks, 3)
+            options: of the runner that is made for it.
+        """
+        runner, seconds, failed = self.made(self.work, **options), [], 0
+        motion = [self.work.start]
+        for targets in zip(hand, com, strict=True):
+            started = time.perf_counter()
+            try:
+                found = runner.tick(*targets)
+                motion.append(runner.canonical(found))
+            except Exception as reason:  # whatever a QP solver raises where it finds nothing
+                failed += 1
+                print(f"tick {len(motion)}: {reason}", file=sys.stderr)
+                motion.append(motion[-1])
+            seconds.append(time.perf_counter() - started)
+        return dict(seconds=seconds, motion=np.array(motion).tolist(), solved=1.0 - failed / len(hand))
 
 
 def reference_kernel() -> float:
@@ -71,13 +92,15 @@ def answer(loop: Loop, question: dict[str, Any]) -> dict[str, Any]:
     match question["what"]:
         case "run":
             return loop.run(question["ticks"])
+        case "follow":
+            return loop.follow(np.array(question["hand"]), np.array(question["com"]), question["options"])
         case "kernel":
             return dict(seconds=[reference_kernel() for _ in range(question["times"])])
         case "memory":
             device = loop.runner.device()
             return dict(peak_bytes=peak_bytes(), device=device.name, device_peak_bytes=device.peak_bytes)
         case unknown:
-            raise ValueError(f"a worker knows no {unknown!r}; it knows run, kernel and memory")
+            raise ValueError(f"a worker knows no {unknown!r}; it knows run, follow, kernel and memory")
 
 
 def main() -> None:

@@ -65,11 +65,9 @@ tasks = {
 home, rotation = tasks["hand"].target
 
 # %% [markdown]
-# Each scheme runs twice: as it comes without the curvature damping that all have by default (`curvature_damping=0.0`),
-# so that what the schemes themselves do is seen; and *calmed*, by a constant damping: directions in which the hand
-# moves less than about 10 cm a radian are used gently (`damping=0.1**2`). `HierarchicalQP` is calmed by moving the
-# posture up, with the same weight, to the priority of the elbow, so that level 2 is a compromise of both. The hand
-# still comes first.
+# Each scheme runs twice: *bare*, without the curvature damping that all have by default (`curvature_damping=0.0`), so
+# that what the schemes themselves do is seen; and *calmed*, by a constant damping in its place: directions in which the
+# hand moves less than about 10 cm a radian are used gently (`damping=0.1**2`). What the default does is in section 2.
 
 # %%
 DAMPING = 0.1**2
@@ -81,14 +79,11 @@ SCHEMES = {
     "hierarchical": partial(osik.HierarchicalQP, curvature_damping=0.0),
 }
 COLORS = dict(zip(SCHEMES, ("#d55e00", "#999999", "#009e73", "#cc79a7", "#0072b2"), strict=True))
-beside = {**tasks, "posture": osik.PostureTask(arm, gain=1.0, weight=DAMPING, priority=2)}
 
 
-def settings(name, calm):
-    """A scheme and its tasks, as it comes or calmed."""
-    if name == "hierarchical":
-        return SCHEMES[name](), beside if calm else tasks
-    return SCHEMES[name](damping=DAMPING) if calm else SCHEMES[name](), tasks
+def made(name, calm):
+    """A scheme, bare or calmed."""
+    return SCHEMES[name](damping=DAMPING) if calm else SCHEMES[name]()
 
 
 # %% [markdown]
@@ -139,8 +134,7 @@ def run(scheme, tasks, limits, path, speed):
 
 def arguments(situation, name, calm):
     goal, elbow, box = SITUATIONS[situation]
-    scheme, wished = settings(name, calm)
-    return scheme, {**wished, "elbow": wished["elbow"].replace(weight=elbow)}, box, *there_and_back(goal)
+    return made(name, calm), {**tasks, "elbow": tasks["elbow"].replace(weight=elbow)}, box, *there_and_back(goal)
 
 
 def measured(motion, box):
@@ -217,7 +211,7 @@ def at_wait(situation, name, calm, key):
 
 
 def dumbbell(axes, situation, value, label, scale="log"):
-    """A number of each scheme: as it comes (open) and calmed (filled)."""
+    """A number of each scheme: bare (open) and calmed (filled)."""
     for row, name in enumerate(SCHEMES):
         pair = [value(situation, name, calm) for calm in (False, True)]
         axes.plot(pair, [row, row], color=COLORS[name], lw=2)
@@ -239,13 +233,13 @@ for shift, key, color in ((-0.2, "hand", "#e69f00"), (0.2, "elbow", "#009e73")):
 who.set(xlabel="off by, while the target waits [mm]", title="Who gives way (calmed)")
 who.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
 dumbbell(how, "conflict", number("rms acceleration"), "RMS joint acceleration [rad/s²]")
-how.set_title("How smoothly (open: as it comes; filled: calmed)")
+how.set_title("How smoothly (open: bare; filled: calmed)")
 fig.tight_layout()
 plt.show()
 
 for name in SCHEMES:
     pairs = [[at_wait("conflict", name, calm, key) for key in ("hand", "elbow")] for calm in (False, True)]
-    print(f"{name:>22}: hand {pairs[0][0]:6.2f} mm, elbow {pairs[0][1]:6.1f} mm as it comes;", end=" ")
+    print(f"{name:>22}: hand {pairs[0][0]:6.2f} mm, elbow {pairs[0][1]:6.1f} mm bare;", end=" ")
     print(f"hand {pairs[1][0]:5.2f} mm, elbow {pairs[1][1]:5.1f} mm calmed")
 
 strict = [at_wait("conflict", name, True, "hand") for name in ("null space", "null space, saturated", "hierarchical")]
@@ -259,7 +253,7 @@ for name in SCHEMES:
 # The reverse order, which should keep the first task exact, does so only as far as damping lets it: its last step is a
 # damped correction of what the lower tasks did, and that correction stays incomplete.
 #
-# **How smoothly.** As they come, all schemes use every direction that has any effect, however little. Where a task
+# **How smoothly.** Bare, all schemes use every direction that has any effect, however little. Where a task
 # cannot be met, that is a direction in which the joints race and the task gains nothing: the joints jump from one speed
 # limit to the other at every tick, and without limits (null space) they race off. The accuracy of the answer is not the
 # problem: each of these ticks is solved. Damping ends it, at once and in all schemes.
@@ -275,7 +269,7 @@ for axes, calm in zip(grid, (False, True), strict=True):
         axes.plot(clock, results["conflict", name, calm]["v"][:, j], color=COLORS[name], lw=1, label=name)
     for side in (-1.0, 1.0):
         axes.axhline(side * arm.velocity_limit[j], color="black", ls="--", lw=1)
-    axes.set(xlabel="time [s]", title="calmed" if calm else "as it comes: from limit to limit")
+    axes.set(xlabel="time [s]", title="calmed" if calm else "bare: from limit to limit")
 grid[0].set_ylabel(f"velocity of joint {j + 1} [rad/s]")
 grid[1].legend(loc="upper right")
 fig.tight_layout()
@@ -321,7 +315,7 @@ for name in SCHEMES:
 left.set(xlabel="time [s]", ylabel="hand to target [mm]", title="Calmed: all stretch; not all come back")
 left.legend(loc="upper left", fontsize=8)
 dumbbell(right, "out of reach", number("rms acceleration"), "RMS joint acceleration [rad/s²]")
-right.set_title("Damping calms; a hierarchy has none (filled: calmed)")
+right.set_title("Damping calms all of them (open: bare; filled: calmed)")
 fig.tight_layout()
 plt.show()
 
@@ -329,7 +323,7 @@ for name in SCHEMES:
     for calm in (False, True):
         result, waiting = results["out of reach", name, calm], at_wait("out of reach", name, calm, "hand")
         print(
-            f"{name:>22}, {'calmed' if calm else 'as it comes':>11}: hand off by {waiting:5.1f} mm while waiting,",
+            f"{name:>22}, {'calmed' if calm else 'bare':>6}: hand off by {waiting:5.1f} mm while waiting,",
             end=" ",
         )
         print(f"{result['hand'][-1]:5.1f} mm at the end; joints {result['beyond limit']:.2f} rad beyond their limits")
@@ -338,10 +332,26 @@ calm_miss = [at_wait("out of reach", name, True, "hand") for name in SCHEMES]
 assert max(calm_miss) < 1.02 * min(calm_miss)  # calmed, all are equally near
 
 # %% [markdown]
-# All reach the same distance. Two things to know:
+# Calmed, all reach the same distance. A constant damping has to be chosen, and it damps everywhere. By default there is
+# one that chooses itself: a step bends the path of the hand, the linear model leaves that out, and each task damps the
+# velocity by as much as that can amount to. It grows with the error and is gone where the task is met. The same motions
+# with it, and nothing else:
+
+# %%
+for name in SCHEMES:
+    words = []
+    for situation in ("out of reach", "almost straight"):
+        _, wished, box, path, speed = arguments(situation, name, False)
+        got = measured(run(SCHEMES[name](curvature_damping=1.0), wished, box, path, speed), box)
+        bare, calmed = (results[situation, name, calm] for calm in (False, True))
+        words.append([f"{each['rms acceleration']:6.1f}" for each in (bare, calmed, got)])
+        words.append([f"{each['hand'].max():5.2f}" for each in (bare, calmed, got)])
+    print(f"{name:>22}: out of reach {' -> '.join(words[0])} rad/s²; almost straight {' -> '.join(words[3])} mm off")
+
+# %% [markdown]
+# From bare by calmed to the default. Two things to know:
 #
-# - A hierarchy has nothing to calm here: what cannot be met is its first level, and the posture beside the elbow comes
-#   after it. Damping helps the others, less than with the conflict. Better than any setting: keep targets within reach.
+# - Targets within reach are better than any damping.
 # - A stretched arm may bend back either way. Where it bends the wrong way, a scheme that keeps limits ends with a joint
 #   at its limit and the hand away from its target (above: those that do not return to zero), a local minimum; one that
 #   does not keep them bends the joint in a way that the real arm cannot. Which way it goes is chance: rounding decides.
@@ -357,7 +367,7 @@ fig, (left, right) = plt.subplots(1, 2, figsize=(12, 3.4))
 for name in SCHEMES:
     line = np.maximum(results["almost straight", name, True]["hand"], 1e-4)
     left.semilogy(clock, line, color=COLORS[name], label=f"{name}, calmed")
-left.semilogy(clock, results["almost straight", "hierarchical", False]["hand"], "k:", label="hierarchical, as it comes")
+left.semilogy(clock, results["almost straight", "hierarchical", False]["hand"], "k:", label="hierarchical, bare")
 left.set(xlabel="time [s]", ylabel="hand to target [mm]", title="Damping costs accuracy near the straight arm")
 left.legend(loc="upper center", fontsize=7.5, ncols=2)
 left.set_ylim(1e-2, 3e3)
@@ -369,31 +379,30 @@ plt.show()
 
 for name in SCHEMES:
     pair = [results["almost straight", name, calm]["hand"].max() for calm in (False, True)]
-    print(f"{name:>22}: hand off by at most {pair[0]:5.2f} mm as it comes, {pair[1]:5.2f} mm calmed")
+    print(f"{name:>22}: hand off by at most {pair[0]:5.2f} mm bare, {pair[1]:5.2f} mm calmed")
 for name in SCHEMES:
     assert results["almost straight", name, False]["hand"].max() < 1.0  # [mm]
     assert results["almost straight", name, False]["speed"] < 1.0
 
 # %% [markdown]
-# As long as the target can be reached, even barely, all schemes track it as they come, and no joint reaches its speed
+# As long as the target can be reached, even barely, all schemes track it bare, and no joint reaches its speed
 # limit. Here it is not the singularity that makes joints race, it is asking for what cannot be had. Damping has its
 # price here: it slows down exactly the directions that are needed, the hand falls behind, and catching up is faster
-# than keeping up. (The hierarchy is the same in both: calming moved the posture, which has no part in this.)
+# than keeping up. That is why the damping that is on by default leaves alone what can be met (section 2).
 #
 # How much damping, then? Too little leaves the conflict rough, too much loses the target:
 
 # %%
 dampings = np.logspace(-8, 0, SWEEP)
-names = [name for name in SCHEMES if name != "hierarchical"]
 rough, loss = {}, {}
-for name in names:
+for name in SCHEMES:
     for situation, store, key in (("conflict", rough, "rms acceleration"), ("almost straight", loss, "hand")):
         _, wished, box, path, speed = arguments(situation, name, True)
         each = [measured(run(SCHEMES[name](damping=d), wished, box, path, speed), box)[key] for d in dampings]
         store[name] = [np.max(value) for value in each]
 
 fig, (left, right) = plt.subplots(1, 2, figsize=(11, 3.2))
-for name in names:
+for name in SCHEMES:
     left.loglog(dampings, rough[name], color=COLORS[name], label=name)
     right.loglog(dampings, loss[name], color=COLORS[name])
 for axes in (left, right):
@@ -417,17 +426,17 @@ for width, name in zip((8, 6.5, 5, 3, 1.5), SCHEMES, strict=True):
     left.plot(clock, results["joint limit", name, False]["q"][:-1, 0], color=COLORS[name], lw=width, label=name)
 left.axhspan(0.3, 0.35, color="#d55e00", alpha=0.12, lw=0)
 left.axhline(0.3, color="black", ls="--", lw=1)
-left.set(xlabel="time [s]", ylabel="joint 1 [rad]", title="As they come: who stays inside", ylim=(0.2, 0.33))
+left.set(xlabel="time [s]", ylabel="joint 1 [rad]", title="Bare: who stays inside", ylim=(0.2, 0.33))
 left.legend(loc="lower center", fontsize=8)
 dumbbell(right, "joint limit", number("peak acceleration"), "peak joint acceleration [rad/s²]", scale="linear")
-right.set_title("Stopping at a limit is a jolt (open: as it comes)")
+right.set_title("Stopping at a limit is a jolt (open: bare)")
 fig.tight_layout()
 plt.show()
 
 for name in SCHEMES:
     pair = [results["joint limit", name, calm] for calm in (False, True)]
     miss = [result["hand"].max() for result in pair]
-    print(f"{name:>22}: as it comes {1e3 * pair[0]['beyond limit']:4.1f} mrad beyond the limit,", end=" ")
+    print(f"{name:>22}: bare {1e3 * pair[0]['beyond limit']:4.1f} mrad beyond the limit,", end=" ")
     print(f"calmed {1e3 * pair[1]['beyond limit']:4.1f}; hand off by {miss[0]:.2f} and {miss[1]:.2f} mm")
 for name in ("weighted", "null space, saturated", "hierarchical"):
     assert max(results[s, name, c]["beyond limit"] for s in SITUATIONS for c in (False, True)) < 1e-9
@@ -516,8 +525,8 @@ for name in SCHEMES:
 display(Markdown("\n".join(table)))
 
 # %% [markdown]
-# Single numbers are those of the calmed runs, the worst of all situations for the limits; arrows lead from "as it
-# comes" to "calmed". Accelerations are RMS values over all joints and the whole motion.
+# Single numbers are those of the calmed runs, the worst of all situations for the limits; arrows lead from bare to
+# calmed. Accelerations are RMS values over all joints and the whole motion.
 #
-# Whichever you take: where tasks may conflict, calm them (damping, or in a hierarchy a light posture task at the
-# priority that will lose), and keep targets within reach.
+# Whichever you take: leave the curvature damping on, add a constant one where tasks conflict all the time, and keep
+# targets within reach.

@@ -16,12 +16,19 @@ pink: Any = import_module("pink")  # in the extra "bench" alone
 
 
 class Runner:
-    """One robot in pink's closed loop."""
+    """One robot in pink's closed loop.
+
+    Args:
+        work: what to do.
+        solver: of qpsolvers.
+        damping: of the velocity.
+        gain: share of its error that each task asks for in a tick.
+    """
 
     packages = ("pin-pink", "pin", "daqp", "qpsolvers", "numpy")
 
-    def __init__(self, work: Workload, *, solver: str = "daqp", damping: float = 1e-9) -> None:
-        self.work, self.solver, self.damping = work, solver, damping
+    def __init__(self, work: Workload, *, solver: str = "daqp", damping: float = 1e-9, gain: float = 1.0) -> None:
+        self.work, self.solver, self.damping, self.gain = work, solver, damping, gain
         model = pinocchio_model(work.urdf, work.floating)
         self.configuration = pink.Configuration(model, model.createData(), work.start.copy())
         self._set_up_tasks()
@@ -58,14 +65,14 @@ class Runner:
 
     def _set_up_tasks(self) -> None:
         work, c = self.work, self.work.costs
-        self.hand = pink.tasks.FrameTask(work.hand, c.hand_position, c.hand_rotation, gain=1.0)
-        posture = pink.tasks.PostureTask(c.posture, gain=1.0)
+        self.hand = pink.tasks.FrameTask(work.hand, c.hand_position, c.hand_rotation, gain=self.gain)
+        posture = pink.tasks.PostureTask(c.posture, gain=self.gain)
         posture.set_target(work.start)
         self.tasks = [self.hand, posture]
         for name, p, R in zip(work.feet, work.foot_positions, work.foot_rotations, strict=True):
-            foot = pink.tasks.FrameTask(name, c.foot, c.foot, gain=1.0)
+            foot = pink.tasks.FrameTask(name, c.foot, c.foot, gain=self.gain)
             foot.set_target(pin.SE3(R, p))
             self.tasks.append(foot)
         if work.feet:
-            self.com = pink.tasks.ComTask(c.com, gain=1.0)
+            self.com = pink.tasks.ComTask(c.com, gain=self.gain)
             self.tasks.append(self.com)

@@ -12,9 +12,10 @@ assumption", Computing 74, 2005).
 
 For the position p of a frame and dofs i before j on its chain the second derivative is ``w_i x J_j``, w_i the axis of
 dof i and J_j the linear Jacobian's column. The matrix with the entries ``p . (w_i x J_j)`` for all i and j has each of
-them twice, and its Frobenius norm costs two 3 x 3 products; over the root of 2 it is 0.7 to 2 times the symmetric
-matrix's greatest eigenvalue in random configurations of two humanoids and two arms. A step is stable from half of that
-eigenvalue on. The norms of single columns of J are too small: the entries off the diagonal count.
+them twice, and its Frobenius norm costs two 3 x 3 products. Over the root of 2 it is about the symmetric matrix's
+greatest eigenvalue, and not far under it (``python -m benchmarks.curvature`` tells how far in random configurations). A
+step is stable from half of that eigenvalue on. The norms of single columns of J are too small: the entries off the
+diagonal count.
 """
 
 from __future__ import annotations

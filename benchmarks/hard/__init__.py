@@ -1,0 +1,1 @@
+"""Hard work: targets beyond reach, targets that jump, a stretched arm, a squat; ours and the peers, judged alike."""

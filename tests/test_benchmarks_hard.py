@@ -1,0 +1,189 @@
+"""The benchmark of hard work: what is asked is out of reach, judged numbers are right, the page has its tables."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from benchmarks import curvature
+from benchmarks.hard import _motion, _page, _results
+from benchmarks.hard._cases import BEYOND, CHUNK, Case, cases, directions, without_turning
+from benchmarks.hard._judge import Numbers, judged, worst
+from benchmarks.hard._motion import Entrant, Motion, motions
+from benchmarks.hard._reach import farthest
+from benchmarks.robots import pinocchio_model, workload
+from benchmarks.workload import DT
+
+
+@pytest.fixture(scope="module")
+def work():
+    return workload("arm7")
+
+
+@pytest.fixture(scope="module")
+def humanoid():
+    return workload("nao")
+
+
+def motion_of(path, case, solved=1.0):
+    return Motion(case, 10.0, path, solved, 1e-4)
+
+
+def held(work, place, ticks, judged=0):
+    return Case("beyond", np.tile(place, (ticks, 1)), np.tile(work.com_start, (ticks, 1)), judged)
+
+
+class TestReach:
+    def test_no_configuration_of_an_arm_is_farther(self, work, rng):
+        model = pinocchio_model(work.urdf, False)
+        data, hand = model.createData(), model.getFrameId(work.hand)
+        places = []
+        for _ in range(3000):
+            pin.framesForwardKinematics(model, data, rng.uniform(work.position_lower, work.position_upper))
+            places.append(data.oMf[hand].translation.copy())
+        for u in directions(work):
+            reach, random = u @ farthest(work, u), (np.array(places) @ u).max()
+            assert random < reach + 1e-9 and reach < random + 0.25
+
+    def test_a_humanoid_stands_where_it_reaches(self, humanoid):
+        """The derivatives of the search are central differences, and the far place is farther than the start."""
+        from benchmarks.hard._reach import _Search
+
+        search = _Search(humanoid, directions(humanoid)[0])
+        x, h = np.random.default_rng(0).uniform(-0.2, 0.2, search.model.nv), 1e-6
+        eye = h * np.eye(len(x))
+        slopes = [(search.slips(x + e) - search.slips(x - e)) / (2.0 * h) for e in eye]
+        np.testing.assert_allclose(search.slip_slopes(x).T, slopes, rtol=0, atol=1e-7)
+        slopes = [(search.height(x + e) - search.height(x - e)) / (2.0 * h) for e in eye]
+        np.testing.assert_allclose(search.slope(x), slopes, rtol=0, atol=1e-7)
+        u = directions(humanoid)[2]
+        assert u @ (farthest(humanoid, u) - humanoid.hand_position) > 0.1
+
+    def test_targets_beyond_it_are_out_of_reach(self, work):
+        found = [case for case in cases(work) if case.name == "beyond"]
+        assert len(found) == 3
+        for case, u in zip(found, directions(work), strict=True):
+            assert u @ (case.hand[0] - farthest(work, u)) == pytest.approx(BEYOND)
+            assert (case.hand == case.hand[0]).all()
+
+
+class TestNumbers:
+    """Motions that are made up, whose numbers are known."""
+
+    def path(self, work, ticks):
+        return np.tile(work.start, (ticks + 1, 1))
+
+    def test_of_a_joint_that_turns_round_at_each_step(self, work):
+        ticks, top = 40, work.velocity[1]
+        path = self.path(work, ticks)
+        path[1::2, 1] += DT * top
+        found = judged(work, motion_of(path, held(work, work.hand_position, ticks)))
+        assert found.turns == pytest.approx((ticks - 1) / (ticks * DT))
+        assert found.fastest == pytest.approx(1.0) and found.at_top == 1.0
+        assert found.rms == pytest.approx(top / np.sqrt(7.0))
+        assert found.at_range == found.feet == found.base == 0.0 and found.hand_at_end == pytest.approx(0.0, abs=1e-12)
+
+    def test_only_of_the_ticks_that_are_judged(self, work):
+        path = self.path(work, 20)
+        path[5:10, 3] += 0.01
+        assert judged(work, motion_of(path, held(work, work.hand_position, 20))).rms > 0.0
+        assert judged(work, motion_of(path, held(work, work.hand_position, 20, judged=10))).rms == 0.0
+
+    def test_of_a_joint_at_the_end_of_its_range(self, work):
+        path = self.path(work, 20)
+        path[11:, 2] = work.position_upper[2]
+        found = judged(work, motion_of(path, held(work, work.hand_position, 20)))
+        assert found.at_range == pytest.approx(0.5)
+        assert found.hand > 0.1 and found.hand == found.hand_at_end
+
+    def test_of_feet_and_base(self, humanoid):
+        path = self.path(humanoid, 4)
+        path[3:, 0] += 0.01
+        found = judged(humanoid, motion_of(path, held(humanoid, humanoid.hand_position, 4), solved=0.5))
+        assert found.feet == pytest.approx(0.01) and found.base == pytest.approx(0.01 / DT)
+        assert found.hand == pytest.approx(0.01) and found.solved == 0.5
+
+    def test_of_what_is_no_number(self, work):
+        path = self.path(work, 4)
+        path[2, 0] = np.nan
+        assert judged(work, motion_of(path, held(work, work.hand_position, 4))).rms == np.inf
+
+    def test_the_worst_of_some(self):
+        fine = Numbers(**dict.fromkeys(Numbers._fields, 0.0) | dict(solved=1.0))
+        bad = fine._replace(rms=2.0, solved=0.5)
+        assert worst([fine, bad, fine._replace(feet=1.0)]) == bad._replace(feet=1.0)
+
+
+class TestMotions:
+    def test_ours_and_minks_are_one_inside(self, work, monkeypatch):
+        """Nothing is out of reach in the first second: all that differs is the damping."""
+        work = without_turning(work, posture=True)
+        case = next(case for case in cases(work) if case.name == "inside")
+        case = dataclasses.replace(case, hand=case.hand[:CHUNK], com=case.com[:CHUNK])
+        ours, theirs = (
+            next(m for m in motions(Entrant("arm7", solver, "float64", True), work, [case]) if m.gain == 200.0)
+            for solver in ("weighted", "mink")
+        )
+        assert ours.path.shape == theirs.path.shape == (CHUNK + 1, 7)
+        assert ours.solved == theirs.solved == 1.0 and min(ours.seconds, theirs.seconds) > 0.0
+        np.testing.assert_array_equal(ours.path[0], theirs.path[0])
+        np.testing.assert_allclose(ours.path, theirs.path, rtol=0, atol=5e-3)
+        assert np.abs(ours.path - work.start).max() > 0.05
+
+    def test_what_raises_stands_still(self, work):
+        from benchmarks.worker import Loop
+
+        loop = Loop(work, "mink", {})
+        wrong = np.zeros((2, 2))  # no places
+        found = loop.follow(wrong, np.tile(work.com_start, (2, 1)), {})
+        assert found["solved"] == 0.0 and found["motion"] == np.tile(work.start, (3, 1)).tolist()
+
+
+class TestResults:
+    def test_who_takes_part(self):
+        few, many = (_results.entrants(everything=everything) for everything in (False, True))
+        assert len(set(few)) == len(few) and set(few) < set(many)
+        assert {entrant.solver for entrant in few} == {*_motion.SCHEMES, *_motion.PEERS}
+        assert not [e for e in many if e.solver in _motion.OF_POSTURES and not e.posture]
+        (one,) = _results.entrants(everything=False, only="g1, hierarchy, float64, no")
+        assert one == Entrant("g1", "hierarchy", "float64", False)
+
+    def test_rows_survive_their_file(self, tmp_path):
+        numbers = Numbers(*np.linspace(0.0, 1.0, len(Numbers._fields)).tolist())
+        rows = [_results.Row(Entrant("nao", "mink", "float64", True), "beyond", 10.0, numbers)]
+        _results.keep(tmp_path / "rows.json", rows)
+        assert _results.read(tmp_path / "rows.json") == rows
+        assert _results.read(tmp_path / "none.json") == []
+
+    def test_tables_mark_what_is_too_much(self):
+        fine = Numbers(**dict.fromkeys(Numbers._fields, 0.0) | dict(solved=1.0))
+        entrant = Entrant("nao", "hierarchy", "float64", False)
+        rows = [_results.Row(entrant, "beyond", g, fine._replace(rms=rms)) for g, rms in ((10.0, 0.05), (200.0, 0.2))]
+        found = _page.tables(rows, times=False)
+        assert "| nao | hierarchy | no | 0.05 / **0.2** |" in found["beyond"]
+        assert "| hierarchy | 1 of 2 | 2 of 2 | 2 of 2 | 0 of 0 |" in found["summary"]
+        assert "µs a step" not in found["beyond"] and "µs a step" in _page.tables(rows, times=True)["beyond"]
+
+
+def test_the_page_has_the_tables_of_the_command():
+    """Every solver of the summary, and as many lines in each table as robots, solvers and postures."""
+    text = _page.PAGE.read_text(encoding="utf-8")
+    for name in (*_page.TABLES, "summary"):
+        table = text[text.index(f"<!-- table: {name} -->") : text.index(f"<!-- end: {name} -->")]
+        lines = [line for line in table.splitlines() if line.startswith("|")]
+        assert len(lines) > 2, name
+        if name != "summary":
+            robots = {line.split("|")[1].strip() for line in lines[2:]}
+            assert robots == set(_results.ROBOTS) - ({"arm7"} if name == "squat" else set())
+            assert (
+                lines[0]
+                == "| robot | solved by | posture | " + " | ".join(column.head for column in _page.TABLES[name]) + " |"
+            )
+    assert not re.search(r"\bnan\b|\binf\b", text)
+
+
+def test_the_bound_on_the_curvature_is_near_it():
+    found = curvature.ratios("arm7", 40)
+    assert len(found) == 40 and found.min() > 0.6 and found.max() < 4.0

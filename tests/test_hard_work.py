@@ -1,0 +1,206 @@
+"""Hard work of a whole robot: calm out of reach, feet that stay, derivatives at the start, ticks that are none."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from benchmarks.hard._reach import farthest
+from benchmarks.robots import workload
+from osik_jax.solvers import Damping, Level, Status, solve_hqp
+from osik_jax.solvers._damping import effective
+from osik_jax.viewer import mujoco_frame_pose, mujoco_poses
+
+DT, STEPS = 0.005, 800
+LATE = 400
+"""The first tick of those that are judged."""
+CALM = 0.1
+"""The rms speed of a robot at rest [rad/s]."""
+FEET = ("l_sole", "r_sole")
+SCHEMES = {
+    "weighted": osik.WeightedQP,
+    "hierarchy": osik.HierarchicalQP,
+    "null space": osik.NullSpace,
+    "saturated null space": lambda: osik.NullSpace(saturate=True),
+}
+QUICK_METHODS = {
+    "null space": osik.NullSpace,
+    "damped null space": lambda: osik.NullSpace(damping=1e-4),
+    "reverse order": lambda: osik.NullSpace(order="reverse"),
+}
+METHODS = SCHEMES | QUICK_METHODS
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+@pytest.fixture(scope="module")
+def nao():
+    return osik.load_robot("nao")
+
+
+def places_of(robot, path, frame):
+    """Places of a frame, by MuJoCo C. (T, 3)"""
+    return np.array([mujoco_frame_pose(robot, data, frame)[0] for data in mujoco_poses(robot, np.asarray(path, float))])
+
+
+def held(robot, tasks, scheme, places, gains):
+    """Motions to each place at each gain, one compiled program: joint speeds, statuses, configurations."""
+    rotation = tasks["hand"].target[1]
+
+    @jax.jit
+    @jax.vmap
+    def motion(place, gain):
+        aimed = {name: task.replace(gain=gain) for name, task in tasks.items()}
+        aimed["hand"] = aimed["hand"].replace(target=(place, rotation))
+        run = osik.rollout(robot, robot.q0, aimed, scheme=scheme, dt=DT, steps=STEPS)
+        return run.solution.velocity, run.solution.status, run.q
+
+    return [np.asarray(part) for part in motion(jnp.asarray(places), jnp.asarray(gains))]
+
+
+def assert_calm(robot, velocity, status, rest):
+    """At rest from that tick on, far from top speed after two seconds, and before never above it."""
+    base = 6 if robot.floating_base else 0
+    joints, top = velocity[..., base:], np.asarray(robot.velocity_limit)[base:]
+    assert np.isfinite(velocity).all() and (np.abs(joints) <= top * (1.0 + 1e-9)).all()
+    assert np.sqrt((joints[:, rest:] ** 2).mean((1, 2))).max() < CALM
+    assert (np.abs(joints[:, LATE:]) < 0.2 * top).all()
+    assert (status == Status.SOLVED).all()
+
+
+class TestOutOfReach:
+    DIRECTIONS = np.array([[1.0, 0.0, 0.2], [0.3, 1.0, 0.1], [0.3, 0.3, 1.0]])
+    GAINS = (10.0, 200.0)
+
+    def lanes(self, middle, away):
+        """Places ``away`` from a point, each at each gain."""
+        units = self.DIRECTIONS / np.linalg.norm(self.DIRECTIONS, axis=1, keepdims=True)
+        places = middle + away * units
+        return np.repeat(places, len(self.GAINS), 0), np.tile(self.GAINS, len(places))
+
+    @pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
+    def test_an_arm_comes_to_rest(self, arm, scheme):
+        """The target is 1.4 m from its shoulder; the hand gets as near as Pinocchio's farthest place is."""
+        shoulder = places_of(arm, [arm.q0], "link2")[0]
+        places, gains = self.lanes(shoulder, 1.4)
+        work = workload("arm7")
+        tasks = {"hand": osik.FrameTask(arm, "hand", rows="position")}
+        velocity, status, path = held(arm, tasks, SCHEMES[scheme](), places, gains)
+        assert_calm(arm, velocity, status, LATE)
+        for lane, place in enumerate(places):
+            nearest = farthest(work, (place - shoulder) / 1.4)
+            left = np.linalg.norm(places_of(arm, path[lane, -1:], "hand")[0] - place)
+            assert left == pytest.approx(np.linalg.norm(nearest - place), rel=0.01)
+
+    @pytest.mark.parametrize(("scheme", "rest"), [("weighted", 400), ("hierarchy", 600)])
+    @pytest.mark.slow
+    def test_a_nao_comes_to_rest_on_its_feet(self, nao, scheme, rest):
+        """The hand's target is 0.6 m from where it is; the hierarchy takes 3 s for the last of the way."""
+        tasks: dict[str, osik.Task] = {foot: osik.FrameTask(nao, foot, weight=100.0, priority=1) for foot in FEET}
+        tasks["com"] = osik.ComTask(nao, weight=25.0, priority=2)
+        tasks["hand"] = osik.FrameTask(nao, "l_gripper", rows="position", priority=3)
+        places, gains = self.lanes(places_of(nao, [nao.q0], "l_gripper")[0], 0.6)
+        velocity, status, path = held(nao, tasks, SCHEMES[scheme](), places, gains)
+        assert_calm(nao, velocity, status, rest)
+        for foot in FEET:
+            start = places_of(nao, [nao.q0], foot)[0]
+            for lane in path:
+                assert np.linalg.norm(places_of(nao, lane[LATE::50], foot) - start, axis=1).max() < 2e-3
+
+
+class TestAtTheStart:
+    """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives."""
+
+    @pytest.mark.parametrize(
+        "method", [name if name in QUICK_METHODS else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]
+    )
+    def test_derivatives_are_central_differences(self, arm, rng, method):
+        tasks = {"hand": osik.FrameTask(arm, "hand", rows="position"), "posture": osik.PostureTask(arm, priority=2)}
+        along, mix = rng.normal(size=(2, arm.nv))
+        scheme = METHODS[method]()
+
+        def cost(t):
+            return osik.solve(arm, arm.q0 + t * along, tasks, scheme=scheme, dt=0.01).velocity @ mix
+
+        both, h = jax.jit(jax.value_and_grad(cost)), 1e-5
+        expected = float(both(h)[0] - both(-h)[0]) / (2.0 * h)
+        assert abs(expected) > 1.0
+        assert float(both(0.0)[1]) == pytest.approx(expected, rel=1e-6)
+        assert float(jax.jvp(cost, (0.0,), (1.0,))[1]) == pytest.approx(expected, rel=1e-6)
+
+
+class TestATickThatIsNone:
+    @pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
+    def test_a_traced_dt_that_is_none_moves_nothing(self, arm, scheme):
+        """A dt of 0 would divide, a negative one turn limits round: the status says so, and the robot stays."""
+        place, rotation = jnp.array([0.6, 0.2, 0.5]), jnp.eye(3)
+        tasks = {"hand": osik.FrameTask(arm, "hand", rows="position", target=(place, rotation))}
+        start = arm.q0.at[0].set(0.99 * float(arm.position_upper[0]))
+
+        @jax.jit
+        @jax.vmap
+        def run(dt):
+            motion = osik.rollout(arm, start, tasks, scheme=SCHEMES[scheme](), dt=dt, steps=3)
+            return motion.solution.status, motion.solution.velocity, motion.q
+
+        status, velocity, path = run(jnp.array([DT, 0.0, -DT, jnp.nan, jnp.inf]))
+        assert (status[0] == Status.SOLVED).all() and np.abs(velocity[0]).max() > 0.1
+        assert (status[1:] == Status.NUMERICAL_ERROR).all()
+        np.testing.assert_array_equal(velocity[1:], np.zeros_like(velocity[1:]))
+        np.testing.assert_array_equal(path[1:], np.broadcast_to(start, path[1:].shape))
+
+
+class TestDampingInSinglePrecision:
+    """Dependent rows that ask for what cannot be had, with a damping under the rounding of their squares."""
+
+    COUNT, N, ROWS, RANK = 200, 7, 12, 4
+
+    def problems(self):
+        rng = np.random.default_rng(1)
+        rows = rng.normal(size=(self.COUNT, self.ROWS, self.RANK)) @ rng.normal(size=(self.COUNT, self.RANK, self.N))
+        unmet = 10.0 ** rng.uniform(-10.0, -6.0, self.COUNT) * (rows**2).sum((1, 2))
+        return rows, rng.normal(size=(self.COUNT, self.ROWS)), unmet
+
+    def shares(self, dtype):
+        @jax.jit
+        @jax.vmap
+        def found(rows, goal, unmet):
+            damping = Damping(jnp.zeros((), dtype), unmet, jnp.linalg.norm(goal))
+            everywhere = jnp.full(self.N, jnp.inf, dtype)
+            eye = jnp.eye(self.N, dtype=dtype)
+            return effective(damping, Level(rows, goal), jnp.zeros(self.N, dtype), eye, -everywhere, everywhere)
+
+        rows, goal, unmet = self.problems()
+        return np.asarray(found(*(jnp.asarray(a, dtype) for a in (rows, goal, unmet)))) / unmet
+
+    def test_the_share_is_that_of_least_squares(self):
+        """What the rows leave, by NumPy's lstsq: as little damping changes nothing of it."""
+        rows, goal, _ = self.problems()
+        left = [b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0] for A, b in zip(rows, goal, strict=True)]
+        expected = np.linalg.norm(left, axis=1) / np.linalg.norm(goal, axis=1)
+        assert expected.min() > 0.3
+        np.testing.assert_allclose(self.shares(jnp.float64), expected, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(self.shares(jnp.float32), expected, rtol=0, atol=1e-3)
+
+    def test_such_levels_are_solved(self):
+        """And the answer is about that in double precision."""
+        rows, goal, unmet = self.problems()
+
+        def answers(dtype):
+            @jax.jit
+            @jax.vmap
+            def solved(rows, goal, unmet):
+                box = jnp.full(self.N, 50.0, dtype)
+                damping = Damping(jnp.zeros((), dtype), unmet, jnp.linalg.norm(goal))
+                found = solve_hqp([Level(rows, goal)], -box, box, damping=damping)
+                return found.x, found.status
+
+            return [np.asarray(part) for part in solved(*(jnp.asarray(a, dtype) for a in (rows, goal, unmet)))]
+
+        (single, status), (double, _) = answers(jnp.float32), answers(jnp.float64)
+        assert (status == Status.SOLVED).all()
+        np.testing.assert_allclose(single, double, rtol=0, atol=1e-3)
