@@ -77,6 +77,27 @@ def test_hierarchies(rng):
         np.testing.assert_allclose(norms(other), norms(cold), rtol=0, atol=1e-7)
 
 
+def test_bounds_that_levels_were_at_and_left_are_part_of_the_scale(rng):
+    """A robot at rest: the answer is of the size of rounding, the bounds that a warm start leads through are not."""
+    n, lanes = 8, 20
+    A, B = 20.0 * rng.normal(size=(lanes, 3, n)), rng.normal(size=(lanes, 2, n))
+    a, b = 1e-14 * rng.normal(size=(lanes, 3)), 1e-13 * rng.normal(size=(lanes, 2))
+    lower, upper = -5.0 * np.ones(n), np.linspace(0.3, 2.0, n)
+
+    @jax.jit
+    @jax.vmap
+    def solve(A, a, B, b, warm):
+        return solve_hqp([Level(A, a), Level(B, b)], lower, upper, warm_start=warm)
+
+    none = WorkingSet(jnp.zeros((lanes, 3, n), jnp.int32), jnp.zeros((lanes, 3, 3), jnp.int32))
+    cold = solve(A, a, B, b, none)
+    far = cold.warm_start._replace(hard=cold.warm_start.hard.at[:, 0, 2].set(1).at[:, 1, 4].set(1))
+    warm = solve(A, a, B, b, far)
+    for s in (cold, warm):
+        np.testing.assert_array_equal(s.status, Status.SOLVED)
+    np.testing.assert_allclose(warm.x, cold.x, atol=1e-14)
+
+
 @pytest.fixture(scope="module")
 def reaching():
     """A hand that is told to go faster than its joints can."""

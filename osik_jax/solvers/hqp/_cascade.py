@@ -295,12 +295,20 @@ def _skip(cascade: _Cascade, task: Task) -> tuple[_Cascade, _Outcome]:
 
 
 def certified(end: Descent, stack: Stack, tolerances: Tolerances) -> Descent:
-    """With what the levels below took from each level's optimum: part of the residual, and of the verdict."""
+    """With what the levels below took from each level's optimum: part of the residual, and of the verdict.
+
+    Rounding is that of the largest x on the way: levels may have been at bounds that those below them have left.
+    """
+    length = jnp.sqrt(jnp.sum(stack.hard**2, -1))
+    bound = jnp.where(end.working.hard < 0, stack.hard_lower, stack.hard_upper)
+    held = (end.working.hard != 0) & (length > 0.0)
+    been = jnp.max(jnp.where(held, jnp.abs(bound) / jnp.where(length > 0.0, length, 1.0), 0.0))
+    reach = jnp.maximum(jnp.max(jnp.abs(end.x)), been)
 
     def lost(level: Level, reached: Array) -> tuple[Array, Array]:
         slack = jnp.sqrt(jnp.sum(level.distance(end.x) ** 2))
         more = jnp.maximum(slack - reached, 0.0)
-        allowed = _LOST * tolerances.rank * (level.size * jnp.max(jnp.abs(end.x)) + slack)
+        allowed = _LOST * tolerances.rank * (level.size * reach + slack)
         return level.size * more, more <= allowed
 
     residual, kept = jax.vmap(lost)(stack.levels, end.reached)
