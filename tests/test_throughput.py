@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
-from benchmarks import throughput
+from benchmarks import jumps, throughput
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +80,11 @@ def test_a_sweep_ends_before_a_call_takes_too_long(monkeypatch):
     monkeypatch.setattr(throughput, "measure", lambda *args: dict(batch=args[2], seconds=0.1 * args[2]))
     found = throughput.sweep("arm7", "weighted", "float64", [1, 8, 64, 10])
     assert [row["batch"] for row in found] == [1, 8, 10]
+
+
+@pytest.mark.slow
+def test_jumps_are_counted():
+    row = jumps.measure(throughput.setting("arm7"), osik.WeightedQP(), robots=4, scans=1, radius=0.5)
+    assert row["steps"] == row["statuses"]["SOLVED"] == 4 * 2 * jumps.STEPS
+    assert row["finite"] and row["beyond_limits"] == 0.0 and row["steps_per_second"] > 0.0
+    assert 0.0 < row["fastest"] <= float(osik.load_robot("arm7").velocity_limit.max())

@@ -47,6 +47,10 @@ class Quadratic(eqx.Module):
         """A diagonal matrix that is no less than H: the sums of the absolute numbers in its rows."""
         return jnp.sum(jnp.abs(self.matrix), 1)
 
+    def bends_down(self) -> Bool[Array, ""]:
+        """Whether it is seen to have no minimum: a negative number on the diagonal of H."""
+        return (self.diagonal() < 0.0).any()
+
     def harmless(self) -> Quadratic:
         """A cost of the same shape that can always be minimised."""
         return Quadratic(jnp.eye(len(self.linear), dtype=self.matrix.dtype), jnp.zeros_like(self.linear))
@@ -96,6 +100,10 @@ class LeastSquares(eqx.Module):
         """A diagonal matrix that is no less than the Hessian."""
         size = jnp.abs(self.matrix)
         return apply(size.T, self.weight * jnp.sum(size, 1)) + self.damping
+
+    def bends_down(self) -> Bool[Array, ""]:
+        """Whether it is seen to have no minimum: a negative weight or damping."""
+        return (self.weight < 0.0).any() | (self.damping < 0.0).any()
 
     def harmless(self) -> LeastSquares:
         """A cost of the same shape that can always be minimised."""

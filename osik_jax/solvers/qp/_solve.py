@@ -213,9 +213,9 @@ def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found) -> 
 
 
 def _finite(qp: QP) -> Bool[Array, ""]:
-    """Whether the numbers can be computed with: no NaN anywhere, no infinity but as no bound."""
+    """Whether the numbers can be computed with: no NaN anywhere, no infinity but as no bound, no negative weight."""
     data = jax.tree.leaves((qp.cost, qp.rows, qp.compliance))
-    finite = jnp.stack([jnp.isfinite(a).all() for a in data]).all()
+    finite = jnp.stack([jnp.isfinite(a).all() for a in data]).all() & ~qp.cost.bends_down()
     return finite & jnp.all(qp.lower < jnp.inf) & jnp.all(qp.upper > -jnp.inf)
 
 
