@@ -21,7 +21,7 @@ class Status(enum.IntEnum):
 _ADVICE = {
     Status.MAX_ITERATIONS: "raise max_iterations, or look for nearly parallel rows and rescale them",
     Status.INFEASIBLE: "some bounds cross, or rows cannot hold together with the box: turn one into a task",
-    Status.NUMERICAL_ERROR: "the problem holds a NaN, infinity or negative weight: look at q, targets and gains of that lane",
+    Status.NUMERICAL_ERROR: "a NaN, infinity or negative weight: look at q, targets, gains and weights of that lane",
 }
 
 
