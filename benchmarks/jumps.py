@@ -31,8 +31,8 @@ from .throughput import DT, PRECISIONS, Setting, State, batch_of, machine, setti
 
 SCHEMES = {**throughput.SCHEMES, "saturated": lambda: osik.NullSpace(saturate=True)}
 STEPS = 50
-RADIUS = {"nao": 0.25}
-"""Of the balls [m], where it is not 0.5."""
+RADIUS = {"nao": 0.25, "g1": 0.5, "arm7": 0.5}
+"""Of the balls that suit a robot [m]."""
 
 
 def measure(given: Setting, scheme: osik.Scheme, robots: int, scans: int, radius: float) -> dict[str, Any]:
@@ -59,9 +59,7 @@ def measure(given: Setting, scheme: osik.Scheme, robots: int, scans: int, radius
 
     rng, seconds, seen = np.random.default_rng(0), [], []
     for _ in range(scans + 1):
-        away = rng.normal(size=(robots, 3))
-        away *= radius * rng.random((robots, 1)) ** (1 / 3) / np.linalg.norm(away, axis=1, keepdims=True)
-        points = jnp.asarray(np.asarray(home) + away, home.dtype)
+        points = jnp.asarray(np.asarray(home) + in_ball(rng, robots, radius), home.dtype)
         started = time.perf_counter()
         state, found = jax.block_until_ready(scan(state, points))
         seconds.append(time.perf_counter() - started)
@@ -78,6 +76,12 @@ def measure(given: Setting, scheme: osik.Scheme, robots: int, scans: int, radius
         steps_per_second=robots * STEPS / float(np.median(seconds[1:])),
         first_seconds=seconds[0],
     )
+
+
+def in_ball(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
+    """Uniform in a ball around 0, (count, 3)."""
+    away = rng.normal(size=(count, 3))
+    return away * (radius * rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(away, axis=1, keepdims=True))
 
 
 def main() -> None:

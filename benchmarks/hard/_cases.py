@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
+from ..jumps import RADIUS, STEPS, in_ball
 from ..workload import DT, Workload
 from ._reach import farthest
 
@@ -17,19 +17,11 @@ BEYOND = 0.35
 """How far targets are out of reach [m]."""
 OUTSIDE = 0.10
 """How far the stretched arm's target goes out of reach [m]."""
-JUMP_TICKS = 50
-"""Ticks from jump to jump."""
 SEED = 7
 
 
-class Sizes(NamedTuple):
-    """Lengths that suit a robot [m]: the ball around the hand that targets jump in, the stroke of a squat."""
-
-    jump: float
-    squat: float = 0.0
-
-
-SIZES: Mapping[str, Sizes] = {"g1": Sizes(0.5, 0.10), "nao": Sizes(0.25, 0.05), "arm7": Sizes(0.5)}
+SQUAT: Mapping[str, float] = {"g1": 0.10, "nao": 0.05}
+"""Strokes that suit a robot [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,10 +70,8 @@ def _beyond(work: Workload) -> list[Case]:
 def _jumps(work: Workload) -> Case:
     """Uniform in a ball around the hand's place at the start."""
     rng, ticks = np.random.default_rng(SEED), 2 * CHUNK
-    count = ticks // JUMP_TICKS
-    away = rng.normal(size=(count, 3))
-    away *= SIZES[work.robot].jump * rng.uniform(size=(count, 1)) ** (1 / 3) / np.linalg.norm(away, axis=1)[:, None]
-    path = np.repeat(work.hand_position + away, JUMP_TICKS, axis=0)
+    away = in_ball(rng, ticks // STEPS, RADIUS[work.robot])
+    path = np.repeat(work.hand_position + away, STEPS, axis=0)
     return Case("jumps", path, _held(work.com_start, ticks))
 
 
@@ -104,7 +94,7 @@ def _inside(work: Workload) -> Case:
 def _squat(work: Workload) -> Case:
     """The centre of mass goes down and up twice, higher than straight knees allow; judged in the second period."""
     t = DT * np.arange(2 * CHUNK)
-    lift = -SIZES[work.robot].squat * np.sin(np.pi * t)
+    lift = -SQUAT[work.robot] * np.sin(np.pi * t)
     com = _held(work.com_start, len(t)) + lift[:, None] * np.array([0.0, 0.0, 1.0])
     hand = _held(work.hand_position, len(t)) + lift[:, None] * np.array([0.0, 0.0, 1.0])
     return Case("squat", hand, com, CHUNK)

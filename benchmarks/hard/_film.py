@@ -20,7 +20,7 @@ from osik_jax.viewer._parts import RobotParts, robot_parts
 from osik_jax.viewer._scene import INK, ORANGE
 from osik_jax.viewer._stage import Camera, Stage, frame_camera
 
-from ..peers.ours import standing
+from ..peers.ours import places, standing
 from ..robots import workload
 from ..robots_table import file_of
 from ..workload import DT, Workload
@@ -60,8 +60,8 @@ def _pictures(found: dict[str, Motion], work: Workload, case: Case) -> Iterator[
     """Each with both robots, their target, who they are and how fast their fastest joints turn."""
     robot = standing(work)
     shape = robot_parts(robot, look=viewer.read_look(file_of("g1")))
-    places = np.array([robot.joint_qpos_index(name) for name in work.joints])
-    paths = [_own(motion.path, places)[: TICKS + 1] for motion in found.values()]
+    order = places(robot, work)
+    paths = [_own(motion.path, order)[: TICKS + 1] for motion in found.values()]
     across = Camera((0.0, 0.0, 0.0), 1.0, AZIMUTH, 0.0, 1.0).axes[0]
     shifts = np.array([-APART * across, APART * across])
     goals = case.hand[0] + shifts
@@ -90,11 +90,10 @@ def _corners(robot: osik.Robot, shape: RobotParts, path: np.ndarray, shift: np.n
     return np.concatenate([shape.corners(source) for source in mujoco_poses(robot, path[::10])]) + shift
 
 
-def _own(path: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _own(path: np.ndarray, order: list[int]) -> np.ndarray:
     """Our configurations of canonical ones."""
     found = np.zeros_like(path)
-    found[:, :7] = path[:, [0, 1, 2, 6, 3, 4, 5]]
-    found[:, places] = path[:, 7:]
+    found[:, order] = path
     return found
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 import osik_jax as osik
 
-from ..peers.ours import standing, tasks_of
+from ..peers.ours import places, standing, tasks_of
 from ..processes import Worker, started
 from ..workload import DT, Workload
 from ._cases import CHUNK, Case
@@ -148,8 +148,7 @@ class OurLoop:
 
     def __init__(self, work: Workload, ours: Ours, *, posture: bool) -> None:
         self.work, self.robot, self.scheme, self.change = work, standing(work), ours.scheme(), ours.change
-        places = [self.robot.joint_qpos_index(name) for name in work.joints]
-        self.order = [0, 1, 2, 4, 5, 6, 3, *places] if work.floating else places
+        self.order = places(self.robot, work)
         self.tasks = tasks_of(self.robot, work, self.robot.q0)
         self.tasks["hand"] = osik.FrameTask(
             self.robot, work.hand, rows="position", weight=work.costs.hand_position**2, priority=3

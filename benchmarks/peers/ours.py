@@ -54,9 +54,9 @@ class Runner:
         if devices > 1:
             jax.config.update("jax_num_cpu_devices", devices)
         jax.config.update("jax_enable_x64", precision == "float64")
-        self.work, self.floating, self.batch, self.resident = work, work.floating, batch, resident
+        self.work, self.batch, self.resident = work, batch, resident
         self.robot = standing(work)
-        self.places = np.array([self.robot.joint_qpos_index(name) for name in work.joints])
+        self.places = np.array(places(self.robot, work))
         start = self.robot.q0
         tick = tick_of(self.robot, work, SCHEMES[scheme](), start)
         none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), _warm_start(tick, start))
@@ -78,8 +78,7 @@ class Runner:
 
     def canonical(self, q: np.ndarray) -> np.ndarray:
         """Our quaternions are w x y z."""
-        base = (q[..., :3], q[..., 4:7], q[..., 3:4]) if self.floating else ()
-        return np.concatenate([*base, q[..., self.places]], axis=-1)
+        return q[..., self.places]
 
     def solved(self) -> float:
         """Share of the lanes and ticks so far whose status is SOLVED."""
@@ -93,12 +92,15 @@ class Runner:
 def standing(work: Workload) -> osik.Robot:
     """The workload's robot; its home is the workload's start."""
     robot = osik.Robot.from_urdf(work.urdf, floating_base=work.floating)
-    q, start = np.array(robot.q0), work.start
-    if work.floating:
-        q[:7] = start[[0, 1, 2, 6, 3, 4, 5]]
-        start = start[7:]
-    q[[robot.joint_qpos_index(name) for name in work.joints]] = start
+    q = np.array(robot.q0)
+    q[places(robot, work)] = work.start
     return replace(robot, q0=jnp.asarray(q))
+
+
+def places(robot: osik.Robot, work: Workload) -> list[int]:
+    """Where in our configuration each number of a canonical one stands."""
+    joints = [robot.joint_qpos_index(name) for name in work.joints]
+    return [0, 1, 2, 4, 5, 6, 3, *joints] if work.floating else joints
 
 
 def tasks_of(robot: osik.Robot, work: Workload, start: jax.Array) -> dict[str, osik.Task]:

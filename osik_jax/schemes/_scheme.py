@@ -16,6 +16,7 @@ from .._replace import Replaceable
 from ..limits import LimitRows
 from ..solvers import Damping, Level, Status
 from ..solvers._dense import apply
+from ..solvers._level import positive_root
 from ..tasks import TaskRows
 from ..tasks._curvature import length
 
@@ -72,7 +73,7 @@ class VelocityProblem(eqx.Module):
 
     def damping(self, names: Sequence[str], constant: Float[Array, ""], curvature: Float[Array, ""] | float) -> Damping:
         """Of a priority, from the damping that a scheme has anyway and the share of the curvature that it takes."""
-        pulls = [_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
+        pulls = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
         return Damping(constant, curvature * self.curvature(names), length(jnp.concatenate(pulls)))
 
     def level(self, names: Sequence[str]) -> Level:
@@ -105,12 +106,6 @@ class VelocityProblem(eqx.Module):
             ends = np.cumsum([len(rows.error) for rows in dense.values()])[:-1]
             values |= dict(zip(dense, jnp.split(together, ends), strict=True))
         return {name: values[name] - jnp.clip(values[name], r.lower, r.upper) for name, r in self.rows.items()}
-
-
-def _root(weight: Float[Array, " m"]) -> Float[Array, " m"]:
-    """The square root; 0 of 0 and of what is no number, with a derivative of 0."""
-    positive = weight > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, weight, 1.0)), 0.0)
 
 
 def _joined(first: Level, second: Level) -> Level:

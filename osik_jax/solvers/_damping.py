@@ -17,14 +17,12 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
 from ._dense import apply, product
-from ._level import Level
+from ._level import Level, positive_root
 
 PASSES = 3
 """Steps towards the fixed point; each makes what is damped too much smaller by the factor unmet / s^2."""
 _RIDGE = 1e-13
 """Of the rows' squares, or ten roundings of them: keeps dependent rows from breaking the factorisation."""
-
-
 _LEAST = 1e-13
 """Of the square of the level's longest row: a damping under this has slopes under those that rounding has."""
 
@@ -86,10 +84,8 @@ def effective(
         strength = damping.constant + damping.unmet * share + ridge
         factor = jnp.linalg.cholesky(gram + jnp.where(strength > 0.0, strength, 1.0) * eye)
         end = jnp.clip(base + apply(rows.T, cho_solve((factor, True), goal)), lower, upper)
-        missed = jnp.sum(level.distance(end) ** 2)
-        some = missed > 0.0
-        root = jnp.where(some, jnp.sqrt(jnp.where(some, missed, 1.0)), 0.0)
-        share = jnp.minimum(root / demand, 1.0)
+        missed = positive_root(jnp.sum(level.distance(end) ** 2))
+        share = jnp.minimum(missed / demand, 1.0)
     whole = damping.constant + damping.unmet * share
     longest = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
     return jnp.where(whole > _LEAST * longest, whole, 0.0)

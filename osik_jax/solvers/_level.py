@@ -81,8 +81,7 @@ class Level(eqx.Module):
         """The same level with the square roots of the weights multiplied in; a weight of 0 removes its row."""
         if self.weight is None:
             return self
-        positive = self.weight > 0.0
-        root = jnp.where(positive, jnp.sqrt(jnp.where(positive, self.weight, 1.0)), 0.0)
+        positive, root = self.weight > 0.0, positive_root(self.weight)
         matrix = root[:, None] * self.matrix
         known = np.array(self.equalities, bool)
         goal = jnp.where(positive, jnp.where(known, self.lower, 0.0) * root, 0.0)
@@ -102,6 +101,12 @@ class Level(eqx.Module):
         """A x minus the nearest point of its interval: the slack, 0 where the row holds."""
         value = apply(self.matrix, x)
         return value - jnp.clip(value, self.lower, self.upper)
+
+
+def positive_root(a: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The square root of what is positive; 0, with a derivative of 0, of what is 0, negative or no number."""
+    positive = a > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, a, 1.0)), 0.0)
 
 
 def _scaled_bound(bound: Float[Array, " m"], root: Float[Array, " m"], none: float) -> Float[Array, " m"]:
