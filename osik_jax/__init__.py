@@ -11,6 +11,8 @@ from .control import Solution as Solution
 from .control import Trajectory as Trajectory
 from .control import rollout as rollout
 from .control import solve as solve
+from .inverse import InverseKinematicsSolution as InverseKinematicsSolution
+from .inverse import inverse_kinematics as inverse_kinematics
 from .kinematics import Kinematics as Kinematics
 from .kinematics import center_of_mass as center_of_mass
 from .kinematics import centroidal_momentum_matrix as centroidal_momentum_matrix

@@ -87,3 +87,9 @@ def entries(values: np.ndarray, which: np.ndarray, names: Sequence[str] | None =
     """For messages: some entries of an array, by name where there are names."""
     found = np.flatnonzero(which).tolist()
     return ", ".join(f"{names[i] if names else f'entry {i}'} ({values[i]})" for i in found)
+
+
+def check_count(what: str, value: Any, *, least: int = 1) -> None:
+    """Raises ValueError for what is no integer, or less than ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{what} is {value!r}; it is an integer, at least {least}")

@@ -1,4 +1,4 @@
-"""The command line: ``osik demo`` and ``osik info``."""
+"""The command line: ``osik demo``, ``ik``, ``reach``, ``retarget``, ``view`` and ``info``."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import importlib.metadata
 import os
 import sys
 import warnings
+import webbrowser
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -69,6 +70,101 @@ class Demo:
 
 
 @dataclasses.dataclass(frozen=True)
+class View:
+    """Shows a robot in the browser: drag its hands, feet and waist, and it follows. Needs the extra viewer.
+
+    With a file: plays the motion.npz that osik demo wrote, or opens a session that a view has saved.
+    """
+
+    file: Annotated[Path | None, tyro.conf.Positional] = None
+    """A motion.npz to play, or a session.json to open. Default: drag the robot."""
+    robot: str = "nao"
+    """A URDF or MJCF file, or nao, arm7, g1 (from the package example-robot-data), or a name of robot_descriptions."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+    support: tuple[str, ...] = ()
+    """Frames that stand on the ground. Default: those that look like feet."""
+    host: str = "127.0.0.1"
+    """Address to listen at; the default is this machine alone."""
+    port: int = 8080
+    """Port to listen at; 0 for any that is free."""
+    browser: bool = True
+    """Open the page in a browser."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Ik:
+    """Finds a configuration that brings a frame to a pose, and prints it; or says what stops the robot.
+
+    The exit code is 1 where none is found.
+    """
+
+    robot: Annotated[str, tyro.conf.Positional]
+    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    frame: str
+    """The frame: a link, body, site or geom."""
+    position: tuple[float, float, float]
+    """Where its origin should be, in world axes [m]."""
+    quaternion: tuple[float, float, float, float] | None = None
+    """How it should be turned: w x y z. Default: anyhow."""
+    hold: tuple[str, ...] = ()
+    """Frames that stay where they are at the robot's home configuration, such as feet."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+    nearest: bool = False
+    """Of the solutions that are found, the one nearest to the home configuration."""
+    all: bool = False
+    """Print all solutions that differ."""
+    seeds: int = 64
+    """Number of searches."""
+    key: int = 0
+    """Number of the sequence of their starts."""
+    position_tolerance: float = 1e-3
+    """Largest distance from the position [m]."""
+    orientation_tolerance: float = 1e-2
+    """Largest angle to the orientation [rad]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reach:
+    """Maps what a frame gets to: for each position of a grid, the share of orientations that it reaches.
+
+    Writes the map and, beside it, a picture. What is finished is kept in a folder until then: the name of the map with
+    .chunks after it.
+    """
+
+    robot: str
+    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    frame: str
+    """The frame: a link, body, site or geom, carried by hinges and slides."""
+    out: Path = Path("map.npz")
+    """File to write. The picture has the same name, and ends in .png."""
+    resume: bool = False
+    """Go on with a map that was interrupted, with the same options."""
+    positions: int = 20_000
+    """About how many positions."""
+    orientations: int = 64
+    """How many orientations at each."""
+    seeds: int = 64
+    """Number of searches for a pose, at most."""
+    key: int = 0
+    """Number of the sequence of their starts."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+    position_tolerance: float = 1e-3
+    """Largest distance from a position [m]."""
+    orientation_tolerance: float = 1e-2
+    """Largest angle to an orientation [rad]."""
+    picture: bool = True
+    """Draw the picture."""
+
+    @property
+    def unfinished(self) -> Path:
+        """Folder of what is finished."""
+        return self.out.with_name(f"{self.out.name}.chunks")
+
+
+@dataclasses.dataclass(frozen=True)
 class Info:
     """Prints a robot's joints with their limits, its frames and its mass."""
 
@@ -78,44 +174,91 @@ class Info:
     """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Retarget:
+    """Makes a robot do what a person did: from a motion file to a folder.
+
+    Writes motion.npz (MuJoCo's order, with the person's joints), motion.csv (position, quaternion x y z w, joints; no
+    headings), report.json (figures recomputed by MuJoCo), profile.toml (how the robot was seen) and motion.gif.
+    """
+
+    clip: Annotated[str, tyro.conf.Positional]
+    """A BVH file, or keypoints as .npz or .csv."""
+    robot: str = "nao"
+    """nao, g1 (of example-robot-data, where that is installed), or a URDF or MJCF file."""
+    out: Path = Path("osik-retarget")
+    """Folder to write to."""
+    profile: str | None = None
+    """A TOML file that says how the robot is seen. Default: the package's own for NAO and G1, else a guess."""
+    mapping: tuple[str, ...] = ()
+    """Which of the clip's joints is which, as ROLE=NAME, where names are not to be guessed; all of them then."""
+    fps: float | None = None
+    """Frames a second of the result. Default: the clip's."""
+    acceleration: float = 240.0
+    """Greatest acceleration of the joints [rad/s^2]."""
+    unit: str | None = None
+    """Of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
+    up: Literal["x", "y", "z"] | None = None
+    """Of a BVH: the axis that points up. Default: found from the skeleton."""
+    animation: bool = True
+    """Write the film (motion.gif)."""
+
+
+_Command = Demo | Ik | Reach | Retarget | View | Info
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code.
 
-    0, or 2 after what the user can set right (told on stderr in one line), or 130 where it was interrupted.
+    0, or 1 where ``osik ik`` finds nothing, or 2 after what the user can set right (told on stderr in one line), or 130
+    where it was interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments == ["--version"]:
         print(f"osik-jax {importlib.metadata.version('osik-jax')}")
         return 0
     command = tyro.extras.subcommand_cli_from_dict(
-        {"demo": Demo, "info": Info}, prog="osik", description=_DESCRIPTION, args=arguments or ["--help"]
+        {"demo": Demo, "ik": Ik, "reach": Reach, "retarget": Retarget, "view": View, "info": Info},
+        prog="osik",
+        description=_DESCRIPTION,
+        args=arguments or ["--help"],
     )
     try:
         with _notes():
-            _run(command)
+            return _run(command)
     except CommandError as error:
         print(f"osik: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"osik: interrupted{_left_behind(command)}", file=sys.stderr)
         return 130
-    return 0
 
 
-def _run(command: Demo | Info) -> None:
-    """Runs a command in double precision."""
+def _run(command: _Command) -> int:
+    """Runs a command in double precision; returns the exit code."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     if isinstance(command, Info):
         _info(command)
+    elif isinstance(command, Ik):
+        return _ik(command)
+    elif isinstance(command, Reach):
+        _reach(command)
+    elif isinstance(command, View):
+        _view(command)
+    elif isinstance(command, Retarget):
+        _retarget(command)
     else:
         _demo(command)
+    return 0
 
 
-def _left_behind(command: Demo | Info) -> str:
+def _left_behind(command: _Command) -> str:
     """A remark where an interrupted command has written something."""
-    if not isinstance(command, Demo) or not command.out.is_dir() or not os.listdir(command.out):
+    if isinstance(command, Reach) and command.unfinished.is_dir():
+        return f"; with --resume it goes on where it was ({command.unfinished})"
+    if not isinstance(command, Demo | Retarget) or not command.out.is_dir() or not os.listdir(command.out):
         return ""
     return f"; what is in {command.out} may be incomplete"
 
@@ -160,6 +303,7 @@ def read_robot(source: str, base: str = "auto") -> Robot:
     Raises:
         CommandError: no such file, or what is in it is broken.
     """
+    from ._loading import is_mjcf
     from .robot import Robot, load_robot
 
     with _told():
@@ -175,7 +319,7 @@ def read_robot(source: str, base: str = "auto") -> Robot:
                 f"no such file: {source} (embedded robots: {', '.join(_EMBEDDED)}; names of robot_descriptions end in "
                 "_description)"
             )
-        if _is_mjcf(path):
+        if is_mjcf(path):
             return Robot.from_mjcf(path, floating_base=floating)
         return Robot.from_urdf(path, floating_base=floating)
 
@@ -195,24 +339,21 @@ def _described(name: str, floating: bool | None) -> Robot:
 
 def _read_demo_robot(command: Demo, source: str) -> Robot:
     """The robot to move; a URDF that does not say whether its base moves floats if --support names what stands."""
-    stands = command.base == "auto" and command.support and Path(source).is_file() and not _is_mjcf(Path(source))
+    from ._loading import is_mjcf
+
+    stands = command.base == "auto" and command.support and Path(source).is_file() and not is_mjcf(source)
     return read_robot(source, "floating" if stands else command.base)
 
 
 def _look(source: str) -> Look | None:
     """What a URDF shows; an MJCF's own shapes are in its model already."""
-    from ._loading import urdf_of_description
+    from ._loading import is_mjcf, urdf_of_description
     from .viewer import read_look
 
     if os.path.isfile(source):
-        return None if _is_mjcf(Path(source)) else read_look(source)
+        return None if is_mjcf(source) else read_look(source)
     urdf = None if source in _EMBEDDED else urdf_of_description(source)
     return None if urdf is None else read_look(urdf[0], package_dirs=urdf[1])
-
-
-def _is_mjcf(path: Path) -> bool:
-    text = path.read_text(encoding="utf-8", errors="replace")
-    return "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]
 
 
 def _info(command: Info) -> None:
@@ -228,6 +369,77 @@ def _info(command: Info) -> None:
     for follower, (leader, multiplier) in robot.mimic_joints.items():
         console.print(f"{follower} follows {leader}, times {multiplier:g}")
     console.print(f"[bold]{len(robot.frame_names)} frames[/bold]: {', '.join(robot.frame_names)}")
+
+
+def _ik(command: Ik) -> int:
+    from rich.console import Console
+
+    from .inverse import inverse_kinematics
+    from .inverse._report import print_found
+
+    robot = read_robot(command.robot, command.base)
+    with _told():
+        held = _home_poses(robot, command.hold)
+        turned = command.quaternion is not None
+        wanted = {command.frame: (command.position, command.quaternion) if turned else command.position}
+        found = inverse_kinematics(
+            robot,
+            held | wanted,
+            seeds=command.seeds,
+            key=command.key,
+            nearest=command.nearest,
+            all=command.all,
+            position_tolerance=command.position_tolerance,
+            orientation_tolerance=command.orientation_tolerance,
+        )
+    print_found(Console(), robot, found)
+    return 0 if found.converged else 1
+
+
+def _home_poses(robot: Robot, frames: Sequence[str]) -> dict[str, Any]:
+    """Where frames are at the home configuration."""
+    from .kinematics import forward_kinematics
+
+    if not frames:
+        return {}
+    home = forward_kinematics(robot, robot.q0)
+    return {name: home.frame_pose(robot, name) for name in frames}
+
+
+def _reach(command: Reach) -> None:
+    import shutil
+
+    from rich.console import Console
+
+    from . import reachability
+    from .reachability._report import summary_table
+
+    chunks = command.unfinished
+    if chunks.exists() and not command.resume:
+        raise CommandError(f"{chunks} has an unfinished map: --resume goes on with it; else remove it, or change --out")
+    robot = read_robot(command.robot, command.base)
+    with _told():
+        found = reachability.reachability_map(
+            robot,
+            command.frame,
+            grid=command.positions,
+            orientations=command.orientations,
+            seeds=command.seeds,
+            key=command.key,
+            position_tolerance=command.position_tolerance,
+            orientation_tolerance=command.orientation_tolerance,
+            out=chunks,
+        )
+        found.save(command.out)
+    written, picture = [str(command.out)], command.out.with_suffix(".png")
+    if command.picture:
+        with _writing(picture):
+            found.figure().savefig(picture)
+        written.append(str(picture))
+    shutil.rmtree(chunks, ignore_errors=True)
+    console = Console()
+    console.print(summary_table(found))
+    console.print(f"written: {', '.join(written)}", markup=False, highlight=False)
 
 
 def _joint_table(robot: Robot) -> Table:
@@ -278,6 +490,58 @@ def _demo(command: Demo) -> None:
     console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
 
 
+def _retarget(command: Retarget) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+
+    from . import retargeting
+    from .retargeting._command import retarget_to_folder
+
+    console = Console()
+    with _told():
+        unit = None if command.unit is None else _number_or_name(command.unit)
+        motion = retargeting.load_motion(command.clip, unit=unit, up=command.up)
+        profile = None if command.profile is None else retargeting.load_profile(command.profile)
+        robot = _robot_to_retarget(command.robot)
+        retargeter = retargeting.Retargeter(robot, profile=profile, acceleration=command.acceleration)
+        mapping = _mapping(command.mapping)
+        console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
+        _, figures = retarget_to_folder(
+            retargeter, motion, command.out, mapping=mapping, fps=command.fps, animation=command.animation
+        )
+    joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
+    console.print(
+        f"segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {feet['slip_mm_max']:.2f} mm, soles "
+        f"{feet['float_mm_max']:.2f} mm above and {feet['below_floor_mm_max']:.2f} mm below the floor at most, "
+        f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
+    )
+    console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
+
+
+def _robot_to_retarget(source: str) -> Robot:
+    """A robot by name or file, its base floating; ``g1`` is that of example-robot-data."""
+    if source == "g1" and not os.path.exists(source):
+        from .retargeting._g1 import g1_urdf
+
+        source = str(g1_urdf())
+    return read_robot(source, "auto" if source in _EMBEDDED else "floating")
+
+
+def _number_or_name(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:
+    """ROLE=NAME as a mapping; None where there are none."""
+    wrong = [pair for pair in pairs if "=" not in pair]
+    if wrong:
+        raise ValueError(f"--mapping takes ROLE=NAME; got {', '.join(wrong)}")
+    return {role: name for role, _, name in (pair.partition("=") for pair in pairs)} or None
+
+
 def _motion(command: Demo) -> Motion:
     """The motion that the options ask for."""
     from . import demo
@@ -322,6 +586,38 @@ def _check(command: Demo) -> None:
             check_opengl()
         except RuntimeError as error:
             raise CommandError(f"--renderer mujoco: {' '.join(str(error).split())}; use auto or raycast") from error
+
+
+def _view(command: View) -> None:
+    """Serves a page until Ctrl-C, which is how a view ends."""
+    from .viewer.live import _open
+
+    with _told():
+        _open.check(command.host, command.port)
+        source = _open.source_of(command.robot, {"auto": None, "floating": True, "fixed": False}[command.base])
+        if command.file is not None and command.file.suffix == ".json":
+            view = _open.open_session(command.file, host=command.host, port=command.port)
+        else:
+            robot = read_robot(source.robot, command.base)
+            options: Any = dict(host=command.host, port=command.port)
+            if command.file is not None:
+                view = _open.open_motion(command.file, robot, source, **options)
+            else:
+                feet = command.support or _feet(robot)
+                view = _open.open_robot(robot, source, feet, **options)
+    print(f"osik view: {view.url} (Ctrl-C ends it)", flush=True)
+    if command.browser:
+        webbrowser.open(view.url)
+    with suppress(KeyboardInterrupt):
+        view.wait()
+    view.stop()
+
+
+def _feet(robot: Robot) -> tuple[str, ...]:
+    """Frames on the ground, of a robot that moves freely."""
+    from .demo import guess_feet
+
+    return guess_feet(robot) if robot.floating_base else ()
 
 
 @contextmanager

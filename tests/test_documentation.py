@@ -27,6 +27,8 @@ PACKAGES = (
     "osik_jax.viewer",
     "osik_jax.tuning",
     "osik_jax.scaling",
+    "osik_jax.retargeting",
+    "osik_jax.reachability",
 )
 OPTIONAL = (
     "matplotlib",
@@ -40,6 +42,8 @@ OPTIONAL = (
     "osik_jax.demo",
     "osik_jax.tuning",
     "osik_jax.scaling",
+    "osik_jax.retargeting",
+    "osik_jax.reachability",
     "optax",
 )
 

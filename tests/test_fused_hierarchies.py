@@ -31,7 +31,7 @@ def batch() -> Batch:
 
     def stack_of(levels, lower, upper):
         given = [Level(*level) for level in levels]
-        none = one_each(0.0, len(given), lower.dtype)
+        none = one_each(0.0, len(given), len(lower), lower.dtype)
         layout, stack = stacked(given, [level.equal for level in given], lower, upper, lower >= upper, none)
         layouts.append(layout)
         return stack

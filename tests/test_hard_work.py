@@ -9,7 +9,7 @@ import osik_jax as osik
 from benchmarks.hard._reach import farthest
 from benchmarks.robots import workload
 from osik_jax.solvers import Damping, Level, Status, solve_hqp
-from osik_jax.solvers._damping import effective
+from osik_jax.solvers._damping import ROOM, SPENT, effective, room_below
 from osik_jax.viewer import mujoco_frame_pose, mujoco_poses
 
 DT, STEPS = 0.005, 800
@@ -62,11 +62,11 @@ def held(robot, tasks, scheme, places, gains):
     return [np.asarray(part) for part in motion(jnp.asarray(places), jnp.asarray(gains))]
 
 
-def assert_calm(robot, velocity, status, rest):
-    """At rest from that tick on, far from top speed after two seconds, and before never above it."""
+def assert_calm(robot, velocity, status, rest, *, limits=True):
+    """At rest from that tick on, far from top speed after two seconds, and before never above it but without limits."""
     base = 6 if robot.floating_base else 0
     joints, top = velocity[..., base:], np.asarray(robot.velocity_limit)[base:]
-    assert np.isfinite(velocity).all() and (np.abs(joints) <= top * (1.0 + 1e-9)).all()
+    assert np.isfinite(velocity).all() and (not limits or (np.abs(joints) <= top * (1.0 + 1e-9)).all())
     assert np.sqrt((joints[:, rest:] ** 2).mean((1, 2))).max() < CALM
     assert (np.abs(joints[:, LATE:]) < 0.2 * top).all()
     assert (status == Status.SOLVED).all()
@@ -82,15 +82,29 @@ class TestOutOfReach:
         places = middle + away * units
         return np.repeat(places, len(self.GAINS), 0), np.tile(self.GAINS, len(places))
 
-    @pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
-    def test_an_arm_comes_to_rest(self, arm, scheme):
-        """The target is 1.4 m from its shoulder; the hand gets as near as Pinocchio's farthest place is."""
+    @pytest.mark.parametrize(
+        ("scheme", "posture"),
+        [
+            ("weighted", False),
+            ("hierarchy", True),
+            pytest.param("hierarchy", False, marks=pytest.mark.slow),
+            pytest.param("null space", True, marks=pytest.mark.slow),
+            pytest.param("saturated null space", True, marks=pytest.mark.slow),
+        ],
+    )
+    def test_an_arm_comes_to_rest(self, arm, scheme, posture):
+        """The target is 1.4 m from its shoulder; the hand gets as near as Pinocchio's farthest place is.
+
+        A posture of a lower priority pulls at the stretched arm all the time.
+        """
         shoulder = places_of(arm, [arm.q0], "link2")[0]
         places, gains = self.lanes(shoulder, 1.4)
         work = workload("arm7")
-        tasks = {"hand": osik.FrameTask(arm, "hand", rows="position")}
+        tasks: dict[str, osik.Task] = {"hand": osik.FrameTask(arm, "hand", rows="position")}
+        if posture:
+            tasks["posture"] = osik.PostureTask(arm, target=jnp.full(7, 0.4), gain=10.0, priority=2)
         velocity, status, path = held(arm, tasks, SCHEMES[scheme](), places, gains)
-        assert_calm(arm, velocity, status, LATE)
+        assert_calm(arm, velocity, status, LATE, limits=scheme != "null space")
         for lane, place in enumerate(places):
             nearest = farthest(work, (place - shoulder) / 1.4)
             left = np.linalg.norm(places_of(arm, path[lane, -1:], "hand")[0] - place)
@@ -204,3 +218,43 @@ class TestDampingInSinglePrecision:
         (single, status), (double, _) = answers(jnp.float32), answers(jnp.float64)
         assert (status == Status.SOLVED).all()
         np.testing.assert_allclose(single, double, rtol=0, atol=1e-3)
+
+
+class TestRoomBelow:
+    """Levels below one that is out of reach may spend a part of its progress."""
+
+    LEVEL = Level(jnp.array([[1.0, 0.5, 0.0], [0.0, 0.0, 2.0]]), jnp.array([3.0, 4.0]))
+    BENDS = jnp.array([0.2, 0.4, 0.0])
+    FREE = jnp.full(3, jnp.inf)
+
+    def room(self, x, *, unmet=0.3, bends=BENDS):
+        damping = Damping(0.0, unmet, 5.0, bends)
+        low, high, bent = room_below(damping, self.LEVEL, jnp.zeros(3), jnp.asarray(x), -self.FREE, self.FREE)
+        np.testing.assert_allclose(bent, bends / np.linalg.norm(self.LEVEL.matrix))
+        np.testing.assert_allclose(high - x, x - low, atol=1e-12)
+        return np.asarray(high - x)
+
+    def test_the_cost_at_the_end_of_the_room_is_that_part_of_the_progress(self):
+        """|residual| (grad^2 e)[d, d] at the corner of the box, against half the squares that the level has gained."""
+        x = jnp.array([1.0, 0.4, 0.5])
+        left = np.linalg.norm(self.LEVEL.distance(x))
+        room = self.room(x)
+        cost = 0.5 * left * np.sum(np.asarray(self.BENDS)[:2] * (room[:2] - ROOM) ** 2)
+        assert cost == pytest.approx(SPENT * 0.5 * (5.0**2 - left**2), rel=1e-12)
+        assert room[2] == np.inf
+
+    def test_without_progress_next_to_nothing_is_left(self):
+        np.testing.assert_allclose(self.room(jnp.zeros(3)), [ROOM, ROOM, np.inf])
+
+    def test_a_level_that_is_met_narrows_nothing(self):
+        assert np.isinf(self.room(jnp.array([3.0, 0.0, 2.0]))).all()
+        assert np.isinf(self.room(jnp.zeros(3), unmet=0.0)).all()
+
+    def test_a_level_below_ends_at_its_room_and_names_no_bound(self):
+        """The level asks for a motion of x, which it gets, and for 2 of what nothing moves; y is free of its rows."""
+        first = Level(jnp.array([[1.0, 0.0], [0.0, 0.0]]), jnp.array([1.5, 2.0]))
+        wanted = Level(jnp.eye(2), jnp.array([1.0, 1.0]))
+        damping = Damping(0.0, 1e-6, 2.5, jnp.array([0.0, 0.5])), 0.0
+        found = solve_hqp([first, wanted], -self.FREE[:2], self.FREE[:2], damping=damping)
+        np.testing.assert_allclose(found.x, [1.5, np.sqrt(SPENT * (2.5**2 - 2.0**2) / (2.0 * 0.5)) + ROOM], rtol=1e-5)
+        assert found.status == Status.SOLVED and (np.asarray(found.active) == 0).all()

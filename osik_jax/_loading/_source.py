@@ -12,6 +12,12 @@ from typing import NamedTuple
 _ROOTS = {"robot": "a URDF: use Robot.from_urdf", "mujoco": "an MJCF: use Robot.from_mjcf", "sdf": "an SDF"}
 
 
+def is_mjcf(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is in MuJoCo's format, told by what is in it."""
+    text = Path(path).read_text(encoding="utf-8", errors="replace")
+    return "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]
+
+
 class Source(NamedTuple):
     """XML before it is parsed.
 

@@ -155,7 +155,7 @@ def _cores(scene: Scene, ids: tuple[int, ...], placed: Placed, hulls: UnitCore |
 
 
 def separation_jacobian(
-    tree: KinematicTree, kinematics: Kinematics, near: Nearest, bodies: Int[np.ndarray, "k 2"]
+    tree: KinematicTree, kinematics: Kinematics, near: Nearest, bodies: Int[np.ndarray, "k 2"] | Int[Array, "k 2"]
 ) -> Float[Array, "k nv"]:
     """``d distance / dt = J v`` of pairs whose shapes are fixed to these bodies: ``normal' (J_b - J_a)``.
 
@@ -165,9 +165,10 @@ def separation_jacobian(
     at_root = kinematics.dof_linear + cross(kinematics.dof_anchor - root, kinematics.dof_angular)
     straight = jnp.matmul(near.normal, at_root.T, precision="highest")
 
-    def along(points: Float[Array, "k 3"], moves: Bool[np.ndarray, "k nvfull"]) -> Float[Array, "k nvfull"]:
+    def along(points: Float[Array, "k 3"], moves: Bool[np.ndarray, "k n"] | Bool[Array, "k n"]) -> Float[Array, "k n"]:
         turned = jnp.matmul(cross(points - root, near.normal), kinematics.dof_angular.T, precision="highest")
         return jnp.where(moves, straight + turned, 0.0)
 
-    rate = along(near.point_b, tree.moves[bodies[:, 1]]) - along(near.point_a, tree.moves[bodies[:, 0]])
+    moves = tree.moves if isinstance(bodies, np.ndarray) else jnp.asarray(tree.moves)
+    rate = along(near.point_b, moves[bodies[:, 1]]) - along(near.point_a, moves[bodies[:, 0]])
     return independent_columns(tree, rate)

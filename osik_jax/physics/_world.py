@@ -124,7 +124,7 @@ def _contact_points(robot: Robot, feet: Feet | None) -> dict[str, Float[np.ndarr
         feet = [name for name in feet if name in names]
     if isinstance(feet, str):
         raise TypeError(f"feet is a sequence of names or a mapping, not one string: use ({feet!r},)")
-    given = dict(feet) if isinstance(feet, Mapping) else {name: _sole_points(robot, name) for name in feet}
+    given = dict(feet) if isinstance(feet, Mapping) else {name: sole_points(robot, name) for name in feet}
     out = {name: np.atleast_2d(np.asarray(points, float)) for name, points in given.items()}
     for name, points in out.items():
         robot.tree.frame(name)
@@ -152,7 +152,7 @@ def _in_frame(robot: Robot, frame: str, points: Float[np.ndarray, "k 3"]) -> Flo
     return (points - np.asarray(robot.frame_position[index])) @ np.asarray(robot.frame_rotation[index])
 
 
-def _sole_points(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
+def sole_points(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
     """The lower corners, at home, of the boxes that collide on the frame's body; without boxes, its corner sites."""
     model, data = robot.mj_model, _home(robot)
     body = _model_body(robot, robot.tree.frame_bodies[robot.tree.frame(frame)])

@@ -58,4 +58,4 @@ class HierarchicalQP(Scheme):
     def _damping(self, problem: VelocityProblem, *, hard: bool) -> list[Damping]:
         """Of each level: none of the constraints, which damping would let off a part of what they ask."""
         own = [problem.damping(names, self.damping, self.curvature_damping) for names in problem.by_priority()]
-        return [Damping(), *own] if hard else own
+        return [problem.constraint_damping(self.curvature_damping), *own] if hard else own

@@ -88,7 +88,7 @@ class NullSpace(Scheme):
     def _damping(self, problem: VelocityProblem, constraints: Level | None) -> list[Damping]:
         """Of each level: none of the constraints, which damping would let off a part of what they ask."""
         own = [problem.damping(names, self.damping, self.curvature_damping) for names in problem.by_priority()]
-        return own if constraints is None else [Damping(), *own]
+        return own if constraints is None else [problem.constraint_damping(self.curvature_damping), *own]
 
     def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
         """Where the first level begins: an inequality row that holds there takes no part in it."""

@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._numbers import as_scalar
 from .._replace import Replaceable
@@ -18,7 +18,7 @@ from ..solvers import Damping, Level, Status
 from ..solvers._dense import apply
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
-from ..tasks._curvature import length
+from ..tasks._curvature import length, row_sums
 
 _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 """A hard row that is missed by less, of what its numbers amount to, holds."""
@@ -40,6 +40,8 @@ class VelocityProblem(eqx.Module):
         hard: names of the tasks that are constraints (static).
         limit_rows: of the limits that are no box, all together; None where there are none.
         dt: time of the tick [s].
+        turning: dofs that turn something, which bends paths. (nv,)
+        scalar: dofs that are a joint of their own: not those of a ball or a free joint. (nv,)
     """
 
     rows: dict[str, TaskRows]
@@ -52,6 +54,8 @@ class VelocityProblem(eqx.Module):
     hard: tuple[str, ...] = eqx.field(default=(), static=True)
     limit_rows: LimitRows | None = None
     dt: Float[Array, ""] = eqx.field(default=0.0, converter=jnp.asarray)
+    turning: Bool[Array, " nv"] = eqx.field(default=True, converter=jnp.asarray)
+    scalar: Bool[Array, " nv"] = eqx.field(default=True, converter=jnp.asarray)
 
     def soft(self) -> dict[str, TaskRows]:
         """Rows of the tasks that are no constraints."""
@@ -74,7 +78,23 @@ class VelocityProblem(eqx.Module):
     def damping(self, names: Sequence[str], constant: Float[Array, ""], curvature: Float[Array, ""] | float) -> Damping:
         """Of a priority, from the damping that a scheme has anyway and the share of the curvature that it takes."""
         pulls = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
-        return Damping(constant, curvature * self.curvature(names), length(jnp.concatenate(pulls)))
+        return Damping(
+            constant, curvature * self.curvature(names), length(jnp.concatenate(pulls)), curvature * self.bends(names)
+        )
+
+    def constraint_damping(self, curvature: Float[Array, ""] | float) -> Damping:
+        """Of the constraints: none, which would let them off a part of what they ask; but they bend."""
+        return Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping()
+
+    def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
+        """What a motion of each dof costs these tasks at second order, along a unit pull (``row_sums``).
+
+        0 for those of ball and free joints: a box for the components of a turn would depend on where the world's axes
+        point. What stands is held by its legs.
+        """
+        arms = [jnp.broadcast_to(self.rows[name].levers, self.lower.shape) for name in names]
+        farthest = jnp.max(jnp.stack(arms), axis=0)
+        return jnp.where(self.scalar, self.dt * row_sums(jnp.where(self.turning, farthest, 0.0)), 0.0)
 
     def level(self, names: Sequence[str]) -> Level:
         """The rows of some tasks as one level."""

@@ -10,7 +10,7 @@ the residual is that of the damped step itself: a fixed point, found from share 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
@@ -23,8 +23,27 @@ PASSES = 3
 """Steps towards the fixed point; each makes what is damped too much smaller by the factor unmet / s^2."""
 _RIDGE = 1e-13
 """Of the rows' squares, or ten roundings of them: keeps dependent rows from breaking the factorisation."""
-_LEAST = 1e-13
+LEAST = 1e-13
 """Of the square of the level's longest row: a damping under this has slopes under those that rounding has."""
+SPENT = 0.1
+"""Of what a level gains, the part that the levels below may cost it at second order."""
+ROOM = 1e-6
+"""What they may move at least: a box with a width is no equality."""
+BENDS = 1e-6
+"""Of the largest cost of a variable, what another has to cost to count: less may be rounding."""
+
+
+class Rows(Protocol):
+    """Rows of a level, weights multiplied in."""
+
+    @property
+    def matrix(self) -> Float[Array, "m n"]:
+        """A."""
+        ...
+
+    def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """A x minus the nearest point of its interval."""
+        ...
 
 
 class Damping(NamedTuple):
@@ -32,25 +51,34 @@ class Damping(NamedTuple):
 
     ``share`` is the size of the residual w that the level's step leaves, as a part of ``demand``, and 1 at most. The
     step is judged by itself, clipped into the box.
+
+    ``bends`` is how much a motion of each variable alone bends the level's rows, along a unit residual: bounds on row
+    sums of their second derivative, times dt. Where the level is out of reach, those below it get a narrower box
+    (``room_below``).
     """
 
     constant: Any = 0.0  # Float[Array, ""], and so the following
     unmet: Any = 0.0
     demand: Any = 0.0
+    bends: Any = 0.0  # Float[Array, " n"]
 
 
-def one_each(damping: Any, count: int, dtype: jnp.dtype) -> Damping:
-    """Of each of ``count`` levels, from one for all or from one for each: every field has an axis of levels."""
+def one_each(damping: Any, count: int, n: int, dtype: jnp.dtype) -> Damping:
+    """Of each of ``count`` levels of n variables, from one for all or one for each; fields have an axis of levels."""
     single = isinstance(damping, Damping) or not isinstance(damping, Sequence)
     given = [damping] * count if single else list(damping)
     if len(given) != count:
         raise ValueError(f"there are {len(given)} dampings and {count} levels")
     whole = [one if isinstance(one, Damping) else Damping(one) for one in given]
-    return Damping(*(jnp.array([jnp.asarray(part, dtype) for part in parts], dtype) for parts in _fields(whole)))
+    constant, unmet, demand, bends = (
+        jnp.array([jnp.asarray(part, dtype) for part in parts], dtype) for parts in _fields(whole)
+    )
+    return Damping(constant, unmet, demand, jnp.broadcast_to(bends if bends.ndim == 2 else bends[:, None], (count, n)))
 
 
 def _fields(whole: Sequence[Damping]) -> list[list]:
-    return [[getattr(one, name) for one in whole] for name in Damping._fields]
+    fields = [[getattr(one, name) for one in whole] for name in Damping._fields]
+    return [*fields[:-1], jnp.broadcast_arrays(*fields[-1])]
 
 
 def effective(
@@ -88,4 +116,43 @@ def effective(
         share = jnp.minimum(missed / demand, 1.0)
     whole = damping.constant + damping.unmet * share
     longest = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
-    return jnp.where(whole > _LEAST * longest, whole, 0.0)
+    return jnp.where(whole > LEAST * longest, whole, 0.0)
+
+
+def room_below(
+    damping: Damping,
+    level: Rows,
+    bent: Float[Array, " n"],
+    x: Float[Array, " n"],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+    """The box of the levels below one that ended at x: what they may spend of its progress.
+
+    What a level cannot meet pulls, through the rows of the levels above, at everything that holds it. A motion d of the
+    levels below, which none of those rows sees, costs it at second order up to ``1/2 missed size sum_j bent_j d_j^2``,
+    and its gain is ``1/2 (demand^2 - missed^2)``. The cost stays under the gain where each variable has an equal part
+    of it. What a level can meet narrows nothing.
+
+    Args:
+        damping: of the level.
+        level: the level.
+        bent: how much each variable bends the levels above, in units of the size of their rows (Frobenius norm).
+        x: where the level has ended.
+        lower: of the box, -inf where unbounded.
+        upper: of the box, inf where unbounded.
+
+    Returns:
+        Lower and upper of the new box, and ``bent`` with the level in it.
+    """
+    longest = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
+    size = positive_root(jnp.sum(level.matrix**2))
+    bent = jnp.maximum(bent, damping.bends / jnp.where(size > 0.0, size, 1.0))
+    missed = jnp.minimum(positive_root(jnp.sum(level.distance(x) ** 2)), damping.demand)
+    share = missed / jnp.where(damping.demand > 0.0, damping.demand, 1.0)
+    cost = missed * size * bent
+    counts = (cost > BENDS * jnp.max(cost)) & (damping.unmet * share > LEAST * longest)
+    many = jnp.maximum(jnp.sum(counts), 1)
+    gain = SPENT * (damping.demand - missed) * (damping.demand + missed)
+    room = jnp.where(counts, positive_root(gain / (many * jnp.where(counts, cost, 1.0))) + ROOM, jnp.inf)
+    return jnp.maximum(lower, x - room), jnp.minimum(upper, x + room), bent

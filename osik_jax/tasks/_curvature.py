@@ -30,6 +30,9 @@ from ..kinematics._rigid import cross
 from ._gain import safe_norm
 from ._rotation import dot
 
+_MOVES = 1e-6
+"""Of the longest lever, one that is shorter may be rounding of none."""
+
 
 def pose_curvature(
     pull: Float[Array, "3"], torque: Float[Array, "3"], jacobian: Float[Array, "6 nv"]
@@ -75,3 +78,22 @@ def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "m nv"])
 def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:
     """Of rows that are linear in the joints."""
     return jnp.zeros((), pull.dtype)
+
+
+def levers(weight: Float[Array, " m"], jacobian: Float[Array, "m nv"]) -> Float[Array, " nv"]:
+    """How far each dof moves the rows: the length of its weighted column; the gradient at 0 is 0."""
+    squared = jnp.sum(weight[:, None] * jacobian**2, axis=0)
+    positive = squared > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+
+def row_sums(levers: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """Of each dof, a bound on the sum of the absolute entries of its row in the second derivative along a unit pull.
+
+    The entry of dofs i and j is at most the lever of the one that is farther from the root, and dofs stand in the order
+    of the tree. So a motion d costs at most ``1/2 sum_j row_sums_j d_j^2`` at second order.
+    """
+    moves = levers > _MOVES * jnp.max(levers, initial=0.0)
+    counted = jnp.where(moves, levers, 0.0)
+    before = jnp.cumsum(moves) - moves
+    return jnp.where(moves, jnp.cumsum(counted[::-1])[::-1], 0.0) + counted * before

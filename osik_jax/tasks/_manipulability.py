@@ -144,7 +144,7 @@ class ManipulabilityTask(Task):
             turn = kinematics.frame_pose(robot, self.frame)[1].T
             parts = (jnp.matmul(turn, part, precision="highest") for part in (jacobian[:3], jacobian[3:]))
             jacobian = jnp.concatenate(list(parts))
-        return _volume(jacobian[np.flatnonzero(self.kept)], log=self.log)
+        return volume(jacobian[np.flatnonzero(self.kept)], log=self.log)
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         return super()._held(robot, kinematics, q) if self.target is None else dict(target=self.value(robot, q))
@@ -169,21 +169,21 @@ def _moving_dofs(tree: KinematicTree, body: int, joints: Sequence[int]) -> tuple
     return tuple(dof for dof in chosen if moves[dof])
 
 
-def _volume(rows: Float[Array, "m n"], *, log: bool) -> Float[Array, ""]:
+def volume(rows: Float[Array, "m n"], *, log: bool) -> Float[Array, ""]:
     """sqrt(det(rows rows')) or its logarithm, m <= n: the product of what each row adds to those before it.
 
     By Gram and Schmidt's method, so that small values keep their digits, which determinants of products lose.
     """
     m, n = rows.shape
     noise = (_NOISE * n * jnp.finfo(rows.dtype).eps) ** 2
-    squares, singular, volume = jnp.sum(rows**2, 1), jnp.asarray(False), jnp.ones((), rows.dtype)
+    squares, singular, product = jnp.sum(rows**2, 1), jnp.asarray(False), jnp.ones((), rows.dtype)
     for k in range(m):
         square = jnp.sum(rows[k] ** 2)
         depends = square <= noise * squares[k]
         length = jnp.sqrt(jnp.where(depends, 1.0, square))
         direction = rows[k] / length
         rows = rows - jnp.matmul(rows, direction, precision="highest")[:, None] * direction
-        singular, volume = singular | depends, volume * length
+        singular, product = singular | depends, product * length
     if log:
-        return jnp.where(singular, jnp.log(float(jnp.finfo(rows.dtype).tiny)), jnp.log(volume))
-    return jnp.where(singular, 0.0, volume)
+        return jnp.where(singular, jnp.log(float(jnp.finfo(rows.dtype).tiny)), jnp.log(product))
+    return jnp.where(singular, 0.0, product)

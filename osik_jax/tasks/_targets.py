@@ -35,7 +35,7 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> 
     """
     parts = _parts(value, dtype)
     if parts is None:
-        array = _array(value, dtype)
+        array = pose_array(value, dtype)
         if array.shape == (4, 4):
             parts = array[:3, 3], array[:3, :3]
             _check_matrix(parts[1])
@@ -58,12 +58,16 @@ def _parts(value: Any, dtype: Any) -> tuple[Array, Array] | None:
     if isinstance(value, jaxlie.SE3):  # its quaternion, so that no other normalisation comes in between
         return jnp.asarray(value.translation(), dtype), jnp.asarray(value.rotation().wxyz, dtype)
     if isinstance(value, (tuple, list)) and len(value) == 2:
-        return _array(value[0], dtype), _array(value[1], dtype)
+        return pose_array(value[0], dtype), pose_array(value[1], dtype)
     return None
 
 
-def _array(value: Any, dtype: Any) -> Array:
-    """The numbers of an array, or of an object that has a matrix."""
+def pose_array(value: Any, dtype: Any, accepted: str | None = None) -> Array:
+    """The numbers of an array, or of an object that has a matrix.
+
+    Raises:
+        TypeError: they are none; the message tells what is accepted, by default of one pose.
+    """
     if callable(getattr(value, "as_matrix", None)):
         value = value.as_matrix()
     elif hasattr(value, "homogeneous"):
@@ -71,7 +75,7 @@ def _array(value: Any, dtype: Any) -> Array:
     try:
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError):
-        raise TypeError(f"got {type(value).__name__}, which is no pose; {_ACCEPTED}") from None
+        raise TypeError(f"got {type(value).__name__}, which is no pose; {accepted or _ACCEPTED}") from None
 
 
 _ACCEPTED = (

@@ -17,7 +17,7 @@ from .._made_for import MadeForRobot
 from .._replace import Replaceable
 from ..kinematics import Kinematics
 from ..robot import Robot
-from ._curvature import jacobian_curvature, no_curvature
+from ._curvature import jacobian_curvature, levers, no_curvature
 from ._gain import Gain, as_gain, evaluate_gain
 from ._leaves import as_own_weight, as_weight
 from ._repr import short_repr
@@ -39,6 +39,8 @@ class TaskRows(eqx.Module):
             grad^2 e_i|``: times dt, the damping that the schemes add for it (``_curvature.py``). 0 where the task is
             met, or linear in the joints. ()
         pull: ``gain e`` of each row, without the target's own velocity; of an inequality, what it is outside by. (m,)
+        levers: how far each dof moves the rows, their weights' roots multiplied in; 0 for a dof that they are linear
+            in. (nv,)
         dofs: where each row asks for one dof's velocity as it is, those dofs (static): ``jacobian`` is then those rows
             of the identity, which a scheme may use to save work. None elsewhere.
     """
@@ -50,6 +52,7 @@ class TaskRows(eqx.Module):
     weight: Float[Array, " m"]
     curvature: Float[Array, ""] = eqx.field(default=0.0, converter=jnp.asarray)
     pull: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
+    levers: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
 
     @property
@@ -163,16 +166,18 @@ def task_rows(
     the pull's length times the size of the Jacobian, which is above what a chain of hinges can bend.
     """
     shift = jnp.zeros_like(error) if feedforward is None else feedforward
+    linear = dofs is not None or curvature is no_curvature
+    arms = jnp.zeros_like(jacobian[0]) if linear else levers(weight, jacobian)
     bend = curvature or (no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian))
     if lower is None or upper is None:
         pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
         wanted = shift - pull
-        return TaskRows(error, jacobian, wanted, wanted, weight, bend(weight * pull), pull, dofs)
+        return TaskRows(error, jacobian, wanted, wanted, weight, bend(weight * pull), pull, arms, dofs)
     outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
     rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
     low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
     pull = rate * outside
-    return TaskRows(error, jacobian, low, high, weight, bend(weight * pull), pull, dofs)
+    return TaskRows(error, jacobian, low, high, weight, bend(weight * pull), pull, arms, dofs)
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:

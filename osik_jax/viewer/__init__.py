@@ -1,4 +1,4 @@
-"""Pictures of robots and motions. Needs no display and no GL library; loads matplotlib, so import it by name."""
+"""Pictures, films and live views of robots. Needs no display and no GL library; loads matplotlib: import it by name."""
 
 from ._animate import Curves as Curves
 from ._animate import animate as animate
@@ -23,3 +23,9 @@ from ._scene import draw_robot_with_com as draw_robot_with_com
 from ._scene import draw_target as draw_target
 from ._scene import draw_trail as draw_trail
 from ._scene import scene_axes as scene_axes
+from .live import LiveView as LiveView
+from .live import Session as Session
+from .live import export_html as export_html
+from .live import load_session as load_session
+from .live import serve as serve
+from .live import serve_session as serve_session

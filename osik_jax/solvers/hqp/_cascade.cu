@@ -14,7 +14,8 @@
 // damping 1: the smallest norm.
 //
 // Variable i belongs to lane i % 32, and so do row i of the level and column i of Z. Constants from _kernel.py: N
-// variables, LEVELS, M rows of the longest level, ROWS of all levels, PASSES to the fixed point of a damping, P hard
+// variables, LEVELS, M rows of the longest level, ROWS of all levels, PASSES to the fixed point of a damping and LEAST,
+// SPENT, ROOM, BENDS of _damping.py, P hard
 // rows beside the box (at most 32), WARPS a block; COUNT, OFFSET, MIXED of each level; PLACE of each hard row among all
 // rows, and its LEVEL.
 
@@ -23,8 +24,7 @@ constexpr int ZD = N | 1, VD = M | 1;                 // lengths of rows in shar
 constexpr int MOST_RANK = N < M ? N : M;
 constexpr int LONGEST = (N > M ? N : M) > P ? (N > M ? N : M) : P;
 constexpr int HARD = N + P;
-constexpr int AT_LEAST = N * VD > M * ZD ? N * VD : M * ZD;
-constexpr int FACTORS = MOST_RANK * (ZD + VD) > AT_LEAST ? MOST_RANK * (ZD + VD) : AT_LEAST;
+constexpr int FACTORS = N * VD + M * ZD;               // reflections, before them the level's rows; then what they make
 constexpr int ATTEMPTS = 4;                           // at a working set, before it is changed by hand
 constexpr int PATIENCE = 20;                          // steps of no length, before the least index decides
 constexpr double DAMPING = 1e-9;                      // of the longest row, squared, as in _proposal.py
@@ -39,7 +39,7 @@ bool exists[H];
 for (int h = 0; h < H; ++h) exists[h] = lane + 32 * h < N;
 double* const Z = shared_doubles[warp];               // row i: variable i
 double* const V = Z + N * ZD;                         // row k: reflection k of the level's factor, over its rows
-double* const R = V + MOST_RANK * VD;                 // row k of the triangle, over the columns of Z
+double* const R = V + N * VD;                         // row k of the triangle, over the columns of Z
 double* const E = Z + N * ZD + FACTORS;               // hard rows beside the box, in the basis
 double* const point = E + (P ? P : 1) * ZD;
 double* const turn = point + LONGEST;                 // a reflection, or what is worked out with it
@@ -48,7 +48,7 @@ double* const second_of = first_of + LONGEST;
 double* const strength = second_of + LONGEST;         // of the reflections
 double* const square_of = strength + MOST_RANK;       // Cholesky factor below, what is factored above; rows of VD
 double* const inverse_of = square_of + M * VD;        // of the diagonal of that factor
-double* const rows_of = V;                            // before V and R are: the level's rows in the basis; rows of ZD
+double* const rows_of = R;                            // before the triangle is: the level's rows in the basis
 int* const held = shared_ints[warp];                  // the row that column k of the basis is for
 int* const pivot = held + N;
 int* const flags = pivot + MOST_RANK;
@@ -80,6 +80,7 @@ const double multiplier_share = tolerances.data[problem * 4 + 2], feasible_share
 
 // ---- the variables
 double x[H], low[H], high[H];
+double bent[H];                                       // how much a variable bends the rows of the levels so far
 int side[H], box_label[H];                            // side: held at the lower (-1) or upper (1) bound
 bool frozen[H];
 int width = 0;                                        // columns of Z
@@ -90,7 +91,7 @@ for (int h = 0; h < H; ++h) {
   high[h] = exists[h] ? hard_upper.data[problem * HARD + i] : 0.0;
   frozen[h] = !exists[h] || hard_equal.data[problem * HARD + i] != 0;
   box_label[h] = exists[h] && frozen[h] ? 2 : 0;
-  side[h] = 0;
+  side[h] = 0, bent[h] = 0.0;
   x[h] = clip(0.0, low[h], high[h]);
   const unsigned loose = __ballot_sync(ALL, !frozen[h]);
   if (exists[h]) {
@@ -112,6 +113,7 @@ if (has_row) {
   row_level = LEVEL[lane];
   row_frozen = false;
   double square = 0.0;
+#pragma unroll 8
   for (int i = 0; i < N; ++i) square += row_of_lane[i * ROWS] * row_of_lane[i * ROWS];
   row_length = sqrt(square);
 }
@@ -130,11 +132,13 @@ bool equal[G], counts[G], in_level[G];
 auto entry = [&](int a, int i) { return B[i * ROWS + a]; };
 auto row_times = [&](int a, const double* d) {        // row a of the level times d, in shared memory
   double total = 0.0;
+#pragma unroll 8
   for (int i = 0; i < N; ++i) total += B[i * ROWS + a] * d[i];
   return total;
 };
 auto hard_row_times = [&](const double* d) {          // the lane's hard row beside the box
   double total = 0.0;
+#pragma unroll 8
   for (int i = 0; i < N; ++i) total += row_of_lane[i * ROWS] * d[i];
   return total;
 };
@@ -156,36 +160,59 @@ auto along = [&](int from, int to, double* d) {       // sum of columns of Z, ti
       for (int j = from; j < to; ++j) d[h] += Z[(lane + 32 * h) * ZD + j] * turn[j];
   }
 };
-// `turn` becomes the reflection that takes the row in it, from column `at` on, to that column; its strength
-auto reflection = [&](int at, double norm) {
+// the sum of the squares of a row's columns
+auto square_from = [&](const double* row, int from, int to) {
+  double even = 0.0, odd = 0.0;
+  int j = from;
+  for (; j + 1 < to; j += 2) even += row[j] * row[j], odd += row[j + 1] * row[j + 1];
+  return j < to ? even + odd + row[j] * row[j] : even + odd;
+};
+// `turn` becomes the reflection that takes a row's columns from `at` on to that column; its strength
+auto reflection_of = [&](const double* row, int at) {
+  double square = 0.0;
+  __syncwarp();
+  for (int j = lane; j < N; j += 32) {
+    turn[j] = j >= at && j < width ? row[j] : 0.0;
+    square += turn[j] * turn[j];
+  }
+  const double norm = sqrt(sum(square));
+  __syncwarp();
   const double head = turn[at];
   __syncwarp();
   if (lane == 0) turn[at] = head + (head < 0.0 ? -norm : norm);
   __syncwarp();
   return 1.0 / (norm * (norm + fabs(head)));
 };
+auto reflect = [&](double* row, int at, double weight) {  // a row of this lane
+  double even = 0.0, odd = 0.0;
+  int j = at;
+  for (; j + 1 < width; j += 2) even += row[j] * turn[j], odd += row[j + 1] * turn[j + 1];
+  if (j < width) even += row[j] * turn[j];
+  const double by = weight * (even + odd);
+  for (int i = at; i < width; ++i) row[i] -= by * turn[i];
+};
 
 // Cholesky factor of the first `count` rows of `square_of`, whose upper triangle with the diagonal is the matrix, plus
 // `ridge` on the diagonal; the factor goes below, its diagonal's inverse to `inverse_of`
 auto cholesky = [&](int count, double ridge) {
-  for (int e = lane; e < count * count; e += 32) {
-    const int a = e / count, b = e % count;
-    if (b < a) square_of[a * VD + b] = square_of[b * VD + a];
-    if (b == a) inverse_of[a] = square_of[a * VD + a] + ridge;
-  }
-  __syncwarp();
   for (int k = 0; k < count; ++k) {
-    const double inverse = 1.0 / sqrt(fmax(inverse_of[k], 1e-300));
-    const int left = count - k - 1;
-    __syncwarp();
-    for (int a = k + 1 + lane; a < count; a += 32) square_of[a * VD + k] *= inverse;
-    if (lane == 0) inverse_of[k] = inverse;
-    __syncwarp();
-    for (int e = lane; e < left * left; e += 32) {
-      const int a = k + 1 + e / left, b = k + 1 + e % left;
-      if (b < a) square_of[a * VD + b] -= square_of[a * VD + k] * square_of[b * VD + k];
-      if (b == a) inverse_of[a] -= square_of[a * VD + k] * square_of[a * VD + k];
+    double value[G];
+#pragma unroll
+    for (int g = 0; g < G; ++g) {
+      const int a = lane + 32 * g;
+      value[g] = a >= k && a < count ? square_of[k * VD + a] + (a == k ? ridge : 0.0) : 0.0;
+      if (a >= k && a < count)
+        for (int j = 0; j < k; ++j) value[g] -= square_of[a * VD + j] * square_of[k * VD + j];
     }
+    double mine = value[0];
+#pragma unroll
+    for (int g = 1; g < G; ++g) mine = k >> 5 == g ? value[g] : mine;
+    const double inverse = 1.0 / sqrt(fmax(__shfl_sync(ALL, mine, k & 31), 1e-300));
+    __syncwarp();
+#pragma unroll
+    for (int g = 0; g < G; ++g)
+      if (lane + 32 * g > k && lane + 32 * g < count) square_of[(lane + 32 * g) * VD + k] = value[g] * inverse;
+    if (lane == 0) inverse_of[k] = inverse;
     __syncwarp();
   }
 };
@@ -225,61 +252,37 @@ auto hold = [&]() {                                   // rotates the held rows t
     for (int j = lane; j < width; j += 32)
       for (int q = 0; q < P; ++q) {
         double total = 0.0;
+#pragma unroll 8
         for (int i = 0; i < N; ++i) total += A[i * ROWS + PLACE[q]] * Z[i * ZD + j];
         E[q * ZD + j] = total;
       }
     __syncwarp();
   }
   if (!any(some)) return;
-  double own[H][N];
-#pragma unroll
-  for (int h = 0; h < H; ++h)
-#pragma unroll
-    for (int j = 0; j < N; ++j) own[h][j] = exists[h] ? Z[(lane + 32 * h) * ZD + j] : 0.0;
   while (held_count < width) {
     double best = -1.0;
     int which = HARD;
 #pragma unroll
-    for (int h = 0; h < H; ++h) {
-      double square = 0.0;
-#pragma unroll
-      for (int j = 0; j < N; ++j) square += j >= held_count ? own[h][j] * own[h][j] : 0.0;
-      if (waits[h] && square > best) best = square, which = lane + 32 * h;
-    }
+    for (int h = 0; h < H; ++h)
+      if (waits[h]) {
+        const double square = square_from(Z + (lane + 32 * h) * ZD, held_count, width);
+        if (square > best) best = square, which = lane + 32 * h;
+      }
     if (P && row_waits) {
-      double square = 0.0;
-      for (int j = held_count; j < width; ++j) square += E[lane * ZD + j] * E[lane * ZD + j];
+      double square = square_from(E + lane * ZD, held_count, width);
       square /= row_length > 0.0 ? row_length * row_length : 1.0;
       if (square > best) best = square, which = N + lane;
     }
     first_largest(best, which);
     if (!(best > rank_share * rank_share)) break;
-    double square = 0.0;
-#pragma unroll
-    for (int h = 0; h < H; ++h)
-      if (is(h, which))
-#pragma unroll
-        for (int j = 0; j < N; ++j) turn[j] = j >= held_count ? own[h][j] : 0.0;
-    if (P && which >= N)
-      for (int j = lane; j < N; j += 32) turn[j] = j >= held_count && j < width ? E[(which - N) * ZD + j] : 0.0;
-    __syncwarp();
-    for (int j = lane; j < N; j += 32) square += turn[j] * turn[j];
-    const double weight = reflection(held_count, sqrt(sum(square)));
+    const double weight = reflection_of(which < N ? Z + which * ZD : E + (which - N) * ZD, held_count);
 #pragma unroll
     for (int h = 0; h < H; ++h) {
-      double total = 0.0;
-#pragma unroll
-      for (int j = 0; j < N; ++j) total += own[h][j] * turn[j];
-      total *= weight;
-#pragma unroll
-      for (int j = 0; j < N; ++j) own[h][j] -= total * turn[j];
+      if (exists[h]) reflect(Z + (lane + 32 * h) * ZD, held_count, weight);
       if (is(h, which)) waits[h] = false;
     }
     if (has_row) {
-      double total = 0.0;
-      for (int j = held_count; j < width; ++j) total += E[lane * ZD + j] * turn[j];
-      total *= weight;
-      for (int j = held_count; j < width; ++j) E[lane * ZD + j] -= total * turn[j];
+      reflect(E + lane * ZD, held_count, weight);
       if (N + lane == which) row_waits = false;
     }
     if (lane == 0) held[held_count] = which;
@@ -289,9 +292,6 @@ auto hold = [&]() {                                   // rotates the held rows t
 #pragma unroll
   for (int h = 0; h < H; ++h) {
     if (waits[h]) side[h] = 0;
-    if (exists[h])
-#pragma unroll
-      for (int j = 0; j < N; ++j) Z[(lane + 32 * h) * ZD + j] = own[h][j];
   }
   if (row_waits) row_side = 0;
   __syncwarp();
@@ -309,83 +309,84 @@ auto soften = [&]() {                                 // the squares of the fact
   cholesky(rank, damping + 1e-14 * size * size);
 };
 
-auto fit = [&]() {                                    // factors the rows that count, within what the held rows leave
-  ++factorizations;
-  double column[H][M];
+// the rows of the level that are wanted, to V: entry i of row a at V[i * VD + a]
+auto stage = [&](const bool* wanted) {
 #pragma unroll
   for (int g = 0; g < G; ++g)
     if (in_level[g])
-      for (int i = 0; i < N; ++i) V[i * VD + lane + 32 * g] = counts[g] ? entry(lane + 32 * g, i) : 0.0;
+#pragma unroll 8
+      for (int i = 0; i < N; ++i) V[i * VD + lane + 32 * g] = wanted[g] ? entry(lane + 32 * g, i) : 0.0;
   __syncwarp();
+};
+// these rows in columns of the basis, from one on, to R; squares of the columns
+auto project = [&](int from, double* square) {
 #pragma unroll
-  for (int h = 0; h < H; ++h)
+  for (int h = 0; h < H; ++h) {
+    const int j = lane + 32 * h;
+    square[h] = 0.0;
+    for (int first = 0; first < m; first += 4) {      // four rows at a time, so that sums do not wait for each other
+      double total[4] = {0.0, 0.0, 0.0, 0.0};
+      if (j >= from && j < width)
+#pragma unroll 2
+        for (int i = 0; i < N; ++i) {
+          const double z = Z[i * ZD + j];
 #pragma unroll
-    for (int a = 0; a < M; ++a) column[h][a] = 0.0;
-  for (int i = 0; i < N; ++i) {
-    double z[H];
+          for (int b = 0; b < 4; ++b)
+            if (first + b < m) total[b] += V[i * VD + first + b] * z;
+        }
 #pragma unroll
-    for (int h = 0; h < H; ++h) z[h] = exists[h] ? Z[i * ZD + lane + 32 * h] : 0.0;
-#pragma unroll
-    for (int a = 0; a < M; ++a)
-      if (a < m)
-#pragma unroll
-        for (int h = 0; h < H; ++h) column[h][a] += V[i * VD + a] * z[h];
+      for (int b = 0; b < 4; ++b)
+        if (first + b < m && exists[h]) R[(first + b) * ZD + j] = total[b], square[h] += total[b] * total[b];
+    }
   }
   __syncwarp();
+};
+
+auto fit = [&]() {                                    // factors the rows that count, within what the held rows leave
+  ++factorizations;
+  double square[H];                                   // of a column, from row `rank` down
   bool waits[H];
 #pragma unroll
   for (int h = 0; h < H; ++h) waits[h] = lane + 32 * h >= held_count && lane + 32 * h < width;
+  stage(counts);
+  project(held_count, square);
   const int most = width - held_count < m ? width - held_count : m;
   for (rank = 0; rank < most; ++rank) {
     double best = -1.0;
     int which = N;
 #pragma unroll
-    for (int h = 0; h < H; ++h) {
-      double square = 0.0;
-#pragma unroll
-      for (int a = 0; a < M; ++a)
-        if (a < m) square += a >= rank ? column[h][a] * column[h][a] : 0.0;
-      if (waits[h] && square > best) best = square, which = lane + 32 * h;
-    }
+    for (int h = 0; h < H; ++h)
+      if (waits[h] && square[h] > best) best = square[h], which = lane + 32 * h;
     first_largest(best, which);
     const double norm = sqrt(best);
     if (!(norm > rank_share * size)) break;
     double* const v = V + rank * VD;
-#pragma unroll
-    for (int h = 0; h < H; ++h)
-      if (is(h, which))
-#pragma unroll
-        for (int a = 0; a < M; ++a)
-          if (a < m) v[a] = a >= rank ? column[h][a] : 0.0;
-    __syncwarp();
-    const double head = v[rank], weight = 1.0 / (norm * (norm + fabs(head)));
-    __syncwarp();
-    if (lane == 0) {
-      v[rank] = head + (head < 0.0 ? -norm : norm);
-      strength[rank] = weight;
-      pivot[rank] = which;
+    const double head = R[rank * ZD + which], weight = 1.0 / (norm * (norm + fabs(head)));
+    for (int a = lane; a < m; a += 32) {
+      const double own = a >= rank ? R[a * ZD + which] : 0.0;
+      v[a] = a == rank ? head + (head < 0.0 ? -norm : norm) : own;
     }
+    if (lane == 0) strength[rank] = weight, pivot[rank] = which;
     __syncwarp();
 #pragma unroll
     for (int h = 0; h < H; ++h) {
-      double total = 0.0;
-#pragma unroll
-      for (int a = 0; a < M; ++a)
-        if (a < m) total += column[h][a] * v[a];
-      total *= weight;
-#pragma unroll
-      for (int a = 0; a < M; ++a)
-        if (a < m) column[h][a] -= total * v[a];
-      if (is(h, which)) waits[h] = false;
+      const int j = lane + 32 * h;
+      if (j < held_count || j >= width) continue;
+      double even = 0.0, odd = 0.0, left = 0.0;
+      int a = rank;
+      for (; a + 1 < m; a += 2) even += R[a * ZD + j] * v[a], odd += R[(a + 1) * ZD + j] * v[a + 1];
+      if (a < m) even += R[a * ZD + j] * v[a];
+      const double by = weight * (even + odd);
+      R[rank * ZD + j] -= by * v[rank];
+      for (a = rank + 1; a < m; ++a) {
+        const double now = R[a * ZD + j] - by * v[a];
+        R[a * ZD + j] = now, left += now * now;
+      }
+      square[h] = left;
+      if (j == which) waits[h] = false;
     }
+    __syncwarp();
   }
-#pragma unroll
-  for (int h = 0; h < H; ++h)
-#pragma unroll
-    for (int k = 0; k < MOST_RANK; ++k)
-      if (k < rank && exists[h])
-        R[k * ZD + lane + 32 * h] = lane + 32 * h >= held_count && lane + 32 * h < width ? column[h][k] : 0.0;
-  __syncwarp();
   if (damping > 0.0) soften();
 };
 
@@ -495,6 +496,7 @@ auto judge = [&](const double* slack) {               // multipliers of the held
     gradient[h] = 0.0;
     if (exists[h]) {
       gradient[h] = damping * x[h];
+#pragma unroll 8
       for (int a = 0; a < m; ++a) gradient[h] += B[(lane + 32 * h) * ROWS + a] * first_of[a];
     }
     square += gradient[h] * gradient[h];
@@ -568,6 +570,7 @@ for (level = 0; level < LEVELS; ++level) {
       above[g] = rows_upper.data[at];
       equal[g] = rows_equal.data[at] != 0;
       double square = 0.0;
+#pragma unroll 8
       for (int i = 0; i < N; ++i) square += B[i * ROWS + a] * B[i * ROWS + a];
       length[g] = sqrt(square);
     }
@@ -576,15 +579,26 @@ for (level = 0; level < LEVELS; ++level) {
 #pragma unroll
   for (int g = 1; g < G; ++g) size = fmax(size, length[g]);
   size = largest(size);
+  const double longest = size * size;
+  double rows_size = 0.0;                             // Frobenius norm
+#pragma unroll
+  for (int g = 0; g < G; ++g) rows_size += length[g] * length[g];
+  rows_size = sqrt(sum(rows_size));
 
   // ---- its damping: the constant part, and the other by what a step by itself, clipped into the box, would miss
   const double* const given_damping = dampings.data + problem * (LEVELS * 3) + level;
   const double constant = given_damping[0], unmet = given_damping[LEVELS], demand = given_damping[2 * LEVELS];
   damping = constant;
-  if (unmet > 0.0) {
-    double base[H], goal[G], d[H], trace = 0.0, share = 1.0;
+  if (unmet > LEAST * longest) {
+    double base[H], goal[G], d[H], squares[H], trace = 0.0, share = 1.0;
+    bool all[G];
+#pragma unroll
+    for (int g = 0; g < G; ++g) all[g] = true;
+    stage(all);
     auto distance = [&](int g) {                      // of row lane + 32 g from its interval, at `point`
-      const double at = row_times(lane + 32 * g, point);
+      double at = 0.0;
+#pragma unroll 4
+      for (int i = 0; i < N; ++i) at += V[i * VD + lane + 32 * g] * point[i];
       return equal[g] ? at - below[g] : at - clip(at, below[g], above[g]);
     };
     share_out(x);
@@ -605,12 +619,9 @@ for (level = 0; level < LEVELS; ++level) {
       if (in_level[g]) second_of[lane + 32 * g] = equal[g] || goal[g] != 0.0 ? 1.0 : 0.0;
     }
     __syncwarp();
+    project(0, squares);
     for (int j = lane; j < width; j += 32)
-      for (int a = 0; a < m; ++a) {
-        double total = 0.0;
-        for (int i = 0; i < N; ++i) total += entry(a, i) * Z[i * ZD + j];
-        rows_of[a * ZD + j] = second_of[a] * total;
-      }
+      for (int a = 0; a < m; ++a) rows_of[a * ZD + j] *= second_of[a];
     __syncwarp();
     for (int e = lane; e < m * m; e += 32) {
       const int a = e / m, b = e % m;
@@ -622,8 +633,8 @@ for (level = 0; level < LEVELS; ++level) {
     }
     trace = sum(trace);
     __syncwarp();
-    double before = 0.0;                              // a share that a pass has not changed stays
-    for (int pass = 0; pass < PASSES && share != before; ++pass) {
+    double before = 0.0;                              // a share that a pass has not changed stays, and one that makes no damping
+    for (int pass = 0; pass < PASSES && share != before && unmet * share > LEAST * longest; ++pass) {
       before = share;
       double y[G], missed = 0.0;
       const double ridge = constant + unmet * share + 1e-13 * trace;
@@ -656,7 +667,7 @@ for (level = 0; level < LEVELS; ++level) {
     }
     damping = constant + unmet * share;
   }
-  if (!(damping > 1e-13 * size * size)) damping = 0.0;  // its slopes would be rounding
+  if (!(damping > LEAST * longest)) damping = 0.0;      // its slopes would be rounding
   size = fmax(size, sqrt(damping));
 
   double value[G], slack[G], reach = 0.0, missing = 0.0, missing_rows = 0.0;
@@ -1030,36 +1041,41 @@ for (level = 0; level < LEVELS; ++level) {
   }
   if (lane == 0) ranks.data[here] = tie ? rank_there : rank, reached.data[here] = missing_rows, strengths.data[here] = damping;
 
-  // ---- and are cut off: the row space of the factor goes to the front, after what is tight
+  // ---- what the levels below may spend of its progress (room_below of _damping.py)
   {
-    double own[H][N], triangle[H][N];
+    const double missed = fmin(missing_rows, demand);
+    const bool narrows = unmet * (missed / (demand > 0.0 ? demand : 1.0)) > LEAST * longest;
+    double cost[H], most = 0.0;
+    int many = 0;
+#pragma unroll
+    for (int h = 0; h < H; ++h) {
+      const double bends_here = exists[h] ? bends.data[here * N + lane + 32 * h] : 0.0;
+      bent[h] = fmax(bent[h], bends_here / (rows_size > 0.0 ? rows_size : 1.0));
+      cost[h] = missed * rows_size * bent[h];
+      most = fmax(most, cost[h]);
+    }
+    most = BENDS * largest(most);
+#pragma unroll
+    for (int h = 0; h < H; ++h) many += __popc(__ballot_sync(ALL, cost[h] > most));
+    const double gain = SPENT * (demand - missed) * (demand + missed);
 #pragma unroll
     for (int h = 0; h < H; ++h)
-#pragma unroll
-      for (int j = 0; j < N; ++j) {
-        own[h][j] = exists[h] ? Z[(lane + 32 * h) * ZD + j] : 0.0;
-        triangle[h][j] = lane + 32 * h < rank ? R[(lane + 32 * h) * ZD + j] : 0.0;
+      if (narrows && cost[h] > most) {
+        const double room = sqrt(gain / (many * cost[h])) + ROOM;
+        low[h] = fmax(low[h], x[h] - room), high[h] = fmin(high[h], x[h] + room);
       }
+  }
+
+  // ---- and are cut off: the row space of the factor goes to the front, after what is tight
+  {
     for (int k = 0; k < rank; ++k) {
       const int at = held_count + k;
+      const double weight = reflection_of(R + k * ZD, at);
 #pragma unroll
       for (int h = 0; h < H; ++h)
-        if (lane + 32 * h == k)
-#pragma unroll
-          for (int j = 0; j < N; ++j) turn[j] = j >= at ? triangle[h][j] : 0.0;
-      __syncwarp();
-      double square = 0.0;
-      for (int j = lane; j < N; j += 32) square += turn[j] * turn[j];
-      const double weight = reflection(at, sqrt(sum(square)));
-#pragma unroll
-      for (int h = 0; h < H; ++h) {
-        double first = 0.0, second = 0.0;
-#pragma unroll
-        for (int j = 0; j < N; ++j) first += own[h][j] * turn[j], second += triangle[h][j] * turn[j];
-        first *= weight, second *= weight;
-#pragma unroll
-        for (int j = 0; j < N; ++j) own[h][j] -= first * turn[j], triangle[h][j] -= second * turn[j];
-      }
+        if (exists[h]) reflect(Z + (lane + 32 * h) * ZD, at, weight);
+      for (int row = lane; row < rank; row += 32)
+        if (row > k) reflect(R + row * ZD, at, weight);
       __syncwarp();
     }
     const int gone = held_count + rank;
@@ -1068,10 +1084,8 @@ for (level = 0; level < LEVELS; ++level) {
     for (int h = 0; h < H; ++h)
       if (exists[h]) {
         double* const row = Z + (lane + 32 * h) * ZD;
-#pragma unroll
-        for (int j = 0; j < N; ++j)
-          if (j >= gone) row[j - gone] = j - gone < width ? own[h][j] : 0.0;
-        for (int j = N - gone; j < N; ++j) row[j] = 0.0;
+        for (int j = 0; j < width; ++j) row[j] = row[j + gone];
+        for (int j = width; j < width + gone; ++j) row[j] = 0.0;
       }
     __syncwarp();
   }
@@ -1080,8 +1094,10 @@ for (level = 0; level < LEVELS; ++level) {
 #pragma unroll
 for (int h = 0; h < H; ++h)
   if (exists[h]) {
+    const size_t at = problem * HARD + lane + 32 * h;
+    const bool narrowed = box_label[h] < 0 ? low[h] > hard_lower.data[at] : high[h] < hard_upper.data[at];
     solution.data[problem * N + lane + 32 * h] = x[h];
-    box.data[problem * N + lane + 32 * h] = box_label[h];
+    box.data[problem * N + lane + 32 * h] = narrowed ? 0 : box_label[h];
   }
 if (lane == 0) {
   residuals.data[problem] = worst_residual;

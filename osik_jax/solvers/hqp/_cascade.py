@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._damping import effective
+from .._damping import effective, room_below
 from .._dense import apply, product
 from .._lanes import choose
 from .._level import Level
@@ -37,6 +37,7 @@ class _Cascade(NamedTuple):
     frozen: Bool[Array, " h"]
     side: Int[Array, " h"]  # held and not frozen
     projector: Float[Array, "n n"]  # onto the null space of the frozen rows
+    bent: Float[Array, " n"]  # how much each variable bends the rows of the levels so far
     box: Int[Array, " n"]  # active bounds, frozen or held
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -88,9 +89,13 @@ def descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, 
     numbers = jnp.arange(layout.levels)
     cascade, outcomes = jax.lax.scan(descend, first, (numbers, levels, guesses))
     decisions, working, multipliers, reached = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes)
+    n = layout.variables
+    narrowed = jnp.where(
+        cascade.box < 0, cascade.lower[:, :n] > stack.hard_lower[:, :n], cascade.upper[:, :n] < stack.hard_upper[:, :n]
+    )
     end = Descent(
         x=cascade.x,
-        box=cascade.box,
+        box=jnp.where(narrowed, 0, cascade.box),
         decisions=decisions,
         working=working,
         multipliers=multipliers,
@@ -116,6 +121,7 @@ def _start(stack: Stack) -> _Cascade:
         frozen=jnp.pad(pinned, (0, h - n)),
         side=jnp.zeros(h, jnp.int32),
         projector=jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(dtype)),
+        bent=jnp.zeros(n, dtype),
         box=jnp.where(pinned, 2, 0).astype(jnp.int32),
         residual=jnp.zeros((), dtype),
         iterations=nothing,
@@ -135,7 +141,8 @@ def _task(layout: Layout, k: Int[Array, ""], stack: Stack, level: Level, cascade
     own = jax.tree.map(lambda a: a[k], stack.damping)
     return Task(
         level=level,
-        damping=effective(own, level, cascade.x, cascade.projector, stack.hard_lower[:n], stack.hard_upper[:n]),
+        damping=effective(own, level, cascade.x, cascade.projector, cascade.lower[:n], cascade.upper[:n]),
+        given=own,
         equal=stack.equal[k],
         matrix=stack.hard,
         lower=cascade.lower,
@@ -266,13 +273,15 @@ def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Toleranc
     basis, rank = _row_space(to_freeze, task.projector, decided, tolerances.rank)
     missed = jnp.where(counts, jnp.where(slack > 0.0, 1, -1), 0).astype(jnp.int32)
     reached = apply(task.matrix, end.x)
+    low, high, bent = room_below(task.given, level, cascade.bent, end.x, task.lower[:n], task.upper[:n])
     after = cascade._replace(
         x=end.x,
-        lower=jnp.where(task.own, jnp.minimum(task.lower, reached), task.lower),
-        upper=jnp.where(task.own, jnp.maximum(task.upper, reached), task.upper),
+        lower=jnp.where(task.own, jnp.minimum(task.lower, reached), task.lower).at[:n].set(low),
+        upper=jnp.where(task.own, jnp.maximum(task.upper, reached), task.upper).at[:n].set(high),
         frozen=cascade.frozen | tight | task.spread(counts),
         side=jnp.where(tight, 0, end.side),
         projector=task.projector - product(basis, basis.T),
+        bent=bent,
         box=jnp.where(end.side[:n] != 0, end.side[:n], jnp.where(cascade.frozen[:n], cascade.box, 0)),
         residual=jnp.maximum(cascade.residual, end.residual),
         done=cascade.done & end.done,
@@ -301,7 +310,7 @@ def certified(end: Descent, stack: Stack, tolerances: Tolerances) -> Descent:
     """
     length = jnp.sqrt(jnp.sum(stack.hard**2, -1))
     bound = jnp.where(end.working.hard < 0, stack.hard_lower, stack.hard_upper)
-    held = (end.working.hard != 0) & (length > 0.0)
+    held = (end.working.hard != 0) & (length > 0.0) & jnp.isfinite(bound)  # a narrowed bound is nearer than x
     been = jnp.max(jnp.where(held, jnp.abs(bound) / jnp.where(length > 0.0, length, 1.0), 0.0))
     reach = jnp.maximum(jnp.max(jnp.abs(end.x)), been)
 

@@ -6,6 +6,7 @@ layout of the hierarchy, once a process (and once for all in Warp's cache on dis
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._damping import PASSES
+from .._damping import BENDS, LEAST, PASSES, ROOM, SPENT
 from ._cascade import Descent
 from ._problem import Tolerances, WorkingSet
 from ._replay import Decision
@@ -28,7 +29,7 @@ _MOST_WARPS = 2
 _INPUTS = (
     dict(matrix="double", rows_lower="double", rows_upper="double", rows_equal="int")
     | dict(hard_lower="double", hard_upper="double", hard_equal="int")
-    | dict(guess_hard="int", guess_own="int", dampings="double", tolerances="double")
+    | dict(guess_hard="int", guess_own="int", dampings="double", bends="double", tolerances="double")
 )
 _OUTPUTS = dict(
     solution="double", box="int", sides="int", tight_rows="int", missed_rows="int", own_rows="int", ranks="int"
@@ -68,7 +69,7 @@ class Shape(NamedTuple):
             return 0
         row, column = n | 1, m | 1
         rank = min(n, m)
-        factors = max(rank * (row + column), n * column, m * row)
+        factors = n * column + m * row
         doubles = n * row + factors + max(p, 1) * row + 4 * max(n, m, p) + rank + m * (column + 1)
         return min(_MOST_WARPS, _SHARED_BYTES // (8 * doubles + 4 * (2 * n + m)))
 
@@ -90,7 +91,8 @@ def solve(
         *(rows(a) for a in (stack.levels.lower, stack.levels.upper, stack.equal.astype(jnp.int32))),
         *(stack.hard_lower, stack.hard_upper, stack.hard_equal.astype(jnp.int32)),
         *(a.astype(jnp.int32) for a in guess),
-        jnp.stack(stack.damping, 1),
+        jnp.stack(stack.damping[:3], 1),
+        stack.damping.bends,
         jnp.stack(tolerances, -1),
     )
     sizes = dict(solution=n, box=n, sides=count * h, tight_rows=count * h, missed_rows=count * m, own_rows=count * m)
@@ -127,8 +129,8 @@ def _kernel(shape: Shape) -> Callable[..., Any]:
 
     def solve_by_warp(
         matrix, rows_lower, rows_upper, rows_equal, hard_lower, hard_upper, hard_equal, guess_hard, guess_own,
-        dampings, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks, multipliers,
-        reached, strengths, residuals, report, pid,
+        dampings, bends, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks,
+        multipliers, reached, strengths, residuals, report, pid,
     ): ...  # fmt: skip
 
     solve_by_warp.__annotations__ = inputs | outputs | dict(pid=warp.int32)
@@ -136,12 +138,12 @@ def _kernel(shape: Shape) -> Callable[..., Any]:
 
     def solve_all(
         matrix, rows_lower, rows_upper, rows_equal, hard_lower, hard_upper, hard_equal, guess_hard, guess_own,
-        dampings, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks, multipliers,
-        reached, strengths, residuals, report,
+        dampings, bends, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks,
+        multipliers, reached, strengths, residuals, report,
     ):  # fmt: skip
         native(
             matrix, rows_lower, rows_upper, rows_equal, hard_lower, hard_upper, hard_equal, guess_hard, guess_own,
-            dampings, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks,
+            dampings, bends, tolerances, most_changes, solution, box, sides, tight_rows, missed_rows, own_rows, ranks,
             multipliers, reached, strengths, residuals, report, warp.tid() // 32,
         )  # fmt: skip
 
@@ -162,5 +164,23 @@ def source(shape: Shape) -> str:
     lists = dict(COUNT=shape.counts, OFFSET=offsets, MIXED=[int(a) for a in shape.mixed])
     lists |= dict(PLACE=shape.place or (0,), LEVEL=shape.level or (0,))
     head = [f"constexpr int {name} = {value};" for name, value in numbers.items()]
+    head += [
+        f"constexpr double {name} = {value!r};"
+        for name, value in dict(LEAST=LEAST, SPENT=SPENT, ROOM=ROOM, BENDS=BENDS).items()
+    ]
     head += [f"const int {name}[] = {{{', '.join(map(str, values))}}};" for name, values in lists.items()]
-    return "\n".join(head) + "\n" + files("osik_jax.solvers.hqp").joinpath("_cascade.cu").read_text()
+    body = files("osik_jax.solvers.hqp").joinpath("_cascade.cu").read_text()
+    return "\n".join(head) + "\n" + rolled(body)
+
+
+def rolled(text: str) -> str:
+    """CUDA text whose loops stay loops, but for those that ask to be unrolled.
+
+    Written out, this kernel is several times as long as the instruction caches, which then decide how fast it is.
+    """
+    lines = text.splitlines(keepends=True)
+    loose = [
+        re.match(r"\s*(for|while) \(", line) and not before.startswith("#pragma")
+        for before, line in zip(["", *lines], lines, strict=False)
+    ]
+    return "".join("#pragma unroll 1\n" + line if alone else line for line, alone in zip(lines, loose, strict=True))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..._rules import custom_jvp
-from .._damping import Damping, effective
+from .._damping import Damping, effective, room_below
 from .._dense import apply, product
 from .._inverses import row_space_and_motion, row_space_and_motion_of_rank
 from .._level import Level
@@ -54,21 +54,27 @@ def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 def _replay(decisions: Decision, nothing: Array, stack: Stack) -> Float[Array, " n"]:
     n = stack.hard.shape[1]
-    hard = (stack.hard, stack.hard_lower, stack.hard_upper)
     pinned = stack.hard_equal[:n]
 
-    def descend(state: tuple[Array, Array], now: tuple[Decision, Level, Damping]) -> tuple[tuple[Array, Array], None]:
-        decision, level, damping = now
-        x, projector = state
-        damping = effective(damping, level, x, projector, stack.hard_lower[:n], stack.hard_upper[:n])
+    def descend(state: tuple[Array, ...], now: tuple[Decision, Level, Damping]) -> tuple[tuple[Array, ...], None]:
+        decision, level, given = now
+        x, projector, low, high, bent = state
+        hard = stack.hard, stack.hard_lower.at[:n].set(low), stack.hard_upper.at[:n].set(high)
+        damping = effective(given, level, x, projector, low, high)
         x, held = _block(*_independent(*hard, decision.held), n, x, projector, nothing)
         _, left = _block(*_independent(*hard, decision.tight), n, x, projector, nothing)
         own = level.matrix, level.lower, level.upper, decision.counts, decision.rank
         x, _ = _block(*own, x, held, nothing, damping)
         _, left = _block(*own, x, left, nothing)
-        return (x, left), None
+        return (x, left, *room_below(given, level, bent, x, low, high)), None
 
-    start = jnp.where(pinned, stack.hard_lower[:n], 0.0), jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(stack.hard.dtype))
+    box = stack.hard_lower[:n], stack.hard_upper[:n]
+    start = (
+        jnp.where(pinned, box[0], 0.0),
+        jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(stack.hard.dtype)),
+        *box,
+        jnp.zeros_like(box[0]),
+    )
     return jax.lax.scan(descend, start, (decisions, stack.levels, stack.damping))[0][0]
 
 

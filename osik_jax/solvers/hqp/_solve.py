@@ -66,7 +66,7 @@ def solve_hqp(
     lower, upper = jnp.asarray(lower), jnp.asarray(upper)
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
     tolerances = Tolerances(rank=_RANK[dtype]) if tolerances is None else tolerances
-    damped = one_each(damping, len(levels), dtype)
+    damped = one_each(damping, len(levels), len(lower), dtype)
     sane = _finite(levels, lower, upper) & jnp.stack([(jnp.isfinite(a) & (a >= 0.0)).all() for a in damped]).all()
     equal = [level.equal | ~sane for level in levels]
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True) if levels else ((), ())
@@ -77,7 +77,7 @@ def solve_hqp(
     scaled, equal = [*scaled, _no_rows(len(low), dtype)], [*equal, jnp.ones(0, bool)]
     # the last level has nothing but damping: the smallest norm
     damped = Damping(
-        *(jnp.append(jnp.where(sane, a, 0.0), last) for a, last in zip(damped, (1.0, 0.0, 0.0), strict=True))
+        *(_with_last(jnp.where(sane, a, 0.0), last) for a, last in zip(damped, (1.0, 0.0, 0.0, 0.0), strict=True))
     )
     layout, stack = stacked(scaled, equal, low, high, (lower >= upper) & sane, damped)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
@@ -85,6 +85,10 @@ def solve_hqp(
     nothing = jnp.maximum(NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
     x = with_derivative(end.x, end.decisions, stack, nothing)
     return _answer(levels, end, x, sane, possible, lower, upper)
+
+
+def _with_last(a: Array, last: float) -> Array:
+    return jnp.concatenate([a, jnp.full_like(a[:1], last)])
 
 
 def _no_rows(n: int, dtype: jnp.dtype) -> Level:

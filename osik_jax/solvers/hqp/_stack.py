@@ -50,6 +50,7 @@ class Task(NamedTuple):
 
     level: Level
     damping: Float[Array, ""]  # of x, part of the level's cost
+    given: Damping  # what that came from
     equal: Bool[Array, " m"]  # the level's equalities; their bounds are one number, but for rounding
     matrix: Float[Array, "h n"]  # the hard rows
     lower: Float[Array, " h"]

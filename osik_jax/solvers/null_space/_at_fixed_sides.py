@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._rules import custom_jvp
-from .._damping import Damping
+from .._damping import room_below
 from .._dense import apply, product
-from ._padded import Problem, Rows, first_room
-from ._projection import level_motion
+from ._padded import Problem, first_room
+from ._projection import damped_part, level_motion
 from ._search import Room, blocked_scale
 
 
@@ -55,32 +55,27 @@ def _attach_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[An
 
 
 def _descend(decisions: Decision, problem: Problem) -> Answer:
-    def level(state: tuple[Array, Array], each: tuple[Any, ...]) -> tuple[tuple[Array, Array], Array]:
-        decision, *rest = each
-        x, projector, scale = _level(decision, problem, *state, *rest)
-        return (x, projector), scale
+    def level(state: tuple[Array, ...], each: tuple[Any, ...]) -> tuple[tuple[Array, ...], Array]:
+        decision, rows, damping, target = each
+        start, projector, lower, upper, bent = state
+        motion, projector, strength = level_motion(rows, start, projector, damping, problem.rank)
+        x, projector, scale = _level(decision, Room(start, motion, target, projector, lower, upper))
+        part = damped_part(rows, start, x, strength, problem.rank)
+        x, scale = start + part * (x - start), part * scale
+        return (x, projector, *room_below(damping, rows, bent, x, lower, upper)), scale
 
     across = decisions, problem.rows, problem.damping, problem.targets
-    (x, projector), scales = jax.lax.scan(level, first_room(problem), across)
+    start = *first_room(problem), problem.lower, problem.upper, jnp.zeros_like(problem.lower)
+    (x, projector, *_), scales = jax.lax.scan(level, start, across)
     return x, projector, scales
 
 
-def _level(
-    decision: Decision,
-    problem: Problem,
-    start: Float[Array, " n"],
-    projector: Float[Array, "n n"],
-    rows: Rows,
-    damping: Damping,
-    target: Float[Array, " n"],
-) -> Answer:
-    motion, projector = level_motion(rows, start, projector, damping, problem.rank)
-    room = Room(start, motion, target, projector, problem.lower, problem.upper)
+def _level(decision: Decision, room: Room) -> Answer:
     scale, projector = _stop(room, decision)
     # one factorisation after another: see osik_jax/_runtime.py
     scale, side = jax.lax.optimization_barrier((scale, decision.side))
     x = jnp.where(side != 0, room.bound(side), _settle(room, scale, side, _dual_basis(room.projector, side)))
-    return jnp.where(decision.done, x, start), projector, jnp.where(decision.done, scale, 0.0)
+    return jnp.where(decision.done, x, room.start), projector, jnp.where(decision.done, scale, 0.0)
 
 
 def _stop(room: Room, decision: Decision) -> tuple[Float[Array, ""], Float[Array, "n n"]]:

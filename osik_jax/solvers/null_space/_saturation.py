@@ -29,18 +29,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._rules import found as kept
-from .._damping import Damping
+from .._damping import Damping, room_below
 from .._double import in_double
 from .._inverses import row_space_and_motion
 from .._lanes import in_lanes
 from ..hqp import Level
 from ._at_fixed_sides import Decision, with_derivative
 from ._padded import Problem, Rows, first_room, padded
-from ._projection import level_motion
+from ._projection import damped_part, level_motion
 from ._search import Found, Room, search
 
 _INDEPENDENT = 1e-6
 """Part of a joint's unit vector in the null space and outside the span of others that stop the level; one has less."""
+_AT_BOUND = 1e-9
+"""A joint that is off its bound by more is not on it."""
 
 
 class Saturated(NamedTuple):
@@ -91,6 +93,9 @@ class _State(NamedTuple):
     """Where the levels so far ended."""
 
     x: Float[Array, " n"]
+    lower: Float[Array, " n"]  # of the levels to come
+    upper: Float[Array, " n"]
+    bent: Float[Array, " n"]  # how much each variable bends the rows of these levels
     projector: Float[Array, "n n"]  # without the joints that can move no more
     fixed: Int[Array, " n"]  # those, at their side; 2 for the pinned ones
     active: Int[Array, " n"]
@@ -105,25 +110,31 @@ def _descend(max_iterations: int, problem: Problem) -> _End:
     none = jnp.zeros(len(x), jnp.int32)
 
     def level(state: _State, each: tuple[Rows, Damping, Array]) -> tuple[_State, tuple[Array, Decision]]:
-        room = jax.vmap(_room)(problem, state, *each)
+        room, strength = jax.vmap(_room)(problem, state, *each)
         found = search(room, max_iterations)
-        after, decision = jax.vmap(_after)(state, room, found)
-        return after, (jnp.where(found.done, found.scale, 0.0), decision)
+        part = jax.vmap(damped_part)(each[0], state.x, found.x, strength, problem.rank)
+        after, decision = jax.vmap(_after)(state, room, found, part, *each[:2])
+        return after, (jnp.where(found.done, part * found.scale, 0.0), decision)
 
-    start = _State(x, projector, fixed, fixed, none, none == 0)
+    start = _State(x, problem.lower, problem.upper, jnp.zeros_like(x), projector, fixed, fixed, none, none == 0)
     across = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), (problem.rows, problem.damping, problem.targets))
     end, (scales, decisions) = jax.lax.scan(level, start, across)
     scales, decisions = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), (scales, decisions))
-    return _End(end.x, end.projector, scales, decisions, end.active, end.iterations, end.done)
+    bound = jnp.where(end.active < 0, problem.lower, problem.upper)
+    away = (jnp.abs(end.active) == 1) & (jnp.abs(end.x - bound) > _AT_BOUND * (1.0 + jnp.abs(bound)))
+    active = jnp.where(away, 0, end.active)  # at the end of its room, or damped on its way to the bound
+    return _End(end.x, end.projector, scales, decisions, active, end.iterations, end.done)
 
 
-def _room(problem: Problem, state: _State, rows: Rows, damping: Damping, target: Array) -> Room:
-    """Where the next x may be."""
-    motion, projector = level_motion(rows, state.x, state.projector, damping, problem.rank)
-    return Room(state.x, motion, target, projector, problem.lower, problem.upper)
+def _room(problem: Problem, state: _State, rows: Rows, damping: Damping, target: Array) -> tuple[Room, Array]:
+    """Where the next x may be, and the damping of the level."""
+    motion, projector, strength = level_motion(rows, state.x, state.projector, damping, problem.rank)
+    return Room(state.x, motion, target, projector, state.lower, state.upper), strength
 
 
-def _after(state: _State, room: Room, found: Found) -> tuple[_State, Decision]:
+def _after(
+    state: _State, room: Room, found: Found, part: Array, rows: Rows, damping: Damping
+) -> tuple[_State, Decision]:
     """The start again where the search failed."""
     side, stops = (jnp.where(found.done, sides, 0) for sides in (found.side, found.blocking))
     stopped = jnp.where((stops != 0)[:, None], room.projector, 0.0)
@@ -131,8 +142,15 @@ def _after(state: _State, room: Room, found: Found) -> tuple[_State, Decision]:
     space, _ = row_space_and_motion(stopped, stopped[:, 0], none + _INDEPENDENT, none)
     keep = (stops == 0)[:, None] & (stops == 0)[None, :]
     fixed = jnp.where(state.fixed == 0, stops, state.fixed)
+    x = jnp.where(
+        found.done & (part < 1.0), state.x + part * (found.x - state.x), jnp.where(found.done, found.x, state.x)
+    )
+    lower, upper, bent = room_below(damping, rows, state.bent, x, state.lower, state.upper)
     after = _State(
-        x=jnp.where(found.done, found.x, state.x),
+        x=x,
+        lower=lower,
+        upper=upper,
+        bent=bent,
         projector=jnp.where(keep, room.projector - space, 0.0),
         fixed=fixed,
         active=jnp.where(fixed != 0, fixed, side),

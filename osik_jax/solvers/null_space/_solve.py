@@ -77,7 +77,7 @@ def solve_nullspace(
     pull = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True)
     possible = ~jnp.stack(crossed).any()
-    given = one_each(damping, len(levels), dtype)
+    given = one_each(damping, len(levels), n, dtype)
     good = sane(levels, pull, *given) & (True if box is None else _exists(*box))
     clean, pull, damped = _where(good, (list(levels), pull, given))
     damped = [Damping(*parts) for parts in zip(*damped, strict=True)]

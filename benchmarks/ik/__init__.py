@@ -1,0 +1,1 @@
+"""From poses to configurations: who finds them, how exactly, how fast."""

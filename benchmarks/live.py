@@ -1,0 +1,125 @@
+"""How regular the control loop of a live view is, with a visitor connected: python -m benchmarks.live [--robot g1].
+
+Leads both hands along circles that leave the reach, for a minute; prints periods, step times, what broke a limit and
+how the memory grew. A visitor is a websocket that reads all that the page sends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import resource
+import sys
+import threading
+import time
+from typing import Any
+
+import jax
+import numpy as np
+from websockets.asyncio.client import connect
+from websockets.typing import Subprotocol
+
+import osik_jax as osik
+from osik_jax.cli import read_robot
+from osik_jax.demo import guess_feet
+from osik_jax.viewer import LiveView
+from osik_jax.viewer.live import _open
+from osik_jax.viewer.live._default import find_hands
+from osik_jax.viewer.live._timing import Stopwatch
+
+
+def visit(url: str, end: threading.Event) -> int:
+    """Reads what the page sends until the end; how many bytes that were."""
+    import viser
+
+    async def read() -> int:
+        size, protocol = 0, Subprotocol(f"viser-v{viser.__version__}")
+        async with connect(url.replace("http", "ws"), subprotocols=[protocol], max_size=None) as socket:
+            while not end.is_set():
+                try:
+                    size += len(await asyncio.wait_for(socket.recv(), 0.5))
+                except TimeoutError:
+                    continue
+        return size
+
+    return asyncio.run(read())
+
+
+def lead(view: LiveView, robot: osik.Robot, seconds: float, radius: float) -> None:
+    """Leads the hands in circles at 30 targets a second."""
+    tasks: Any = view.session.tasks
+    hands = {hand: tasks[hand].target for hand in find_hands(robot)}
+    start = time.monotonic()
+    while (now := time.monotonic() - start) < seconds:
+        for side, (hand, (position, rotation)) in zip((1.0, -1.0), hands.items(), strict=False):
+            angle = 1.5 * now * side
+            view.aim(hand, (position + radius * np.array([np.sin(angle), 0.0, 1.0 - np.cos(angle)]), rotation))
+        time.sleep(1.0 / 30.0)
+
+
+def broken(robot: osik.Robot, q: np.ndarray, dt: float) -> dict[str, int]:
+    """Steps in which a joint moves further than its speed allows, and configurations outside the ranges."""
+    limited = [robot.joint_dof_index(name) for name in robot.joint_names]
+    place = [robot.joint_qpos_index(name) for name in robot.joint_names]
+    top, lower, upper = (
+        np.asarray(part)[limited] for part in (robot.velocity_limit, robot.position_lower, robot.position_upper)
+    )
+    fast = np.abs(np.diff(q[:, place], axis=0)) > top * dt * (1.0 + 1e-9)
+    outside = (q[:, place] < lower) | (q[:, place] > upper)
+    return dict(too_fast=int(fast.any(1).sum()), outside=int(outside.any(1).sum()))
+
+
+def measure(name: str, seconds: float) -> dict[str, object]:
+    """One session."""
+    source = _open.source_of(name, None)
+    robot = read_robot(source.robot)
+    feet = guess_feet(robot) if robot.floating_base else ()
+    load, end = os.getloadavg()[0], threading.Event()
+    with _open.open_robot(robot, source, feet, host="127.0.0.1", port=0) as view:
+        view.loop.wait_until_ready(300.0)
+        sizes: list[int] = []
+        visitor = threading.Thread(target=lambda: sizes.append(visit(view.url, end)), daemon=True)
+        visitor.start()
+        time.sleep(5.0)
+        view.loop.pause()
+        view.loop.record()
+        view.loop._stopwatch = Stopwatch(round(seconds / view.loop.dt))
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        view.loop.resume()
+        lead(view, robot, seconds, radius=0.35 if robot.floating_base else 0.2)
+        timing, failures = view.loop.timing, view.loop.snapshot.failures
+        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        q, dt = view.loop.recorded().q, view.loop.dt
+        end.set()
+        visitor.join(timeout=5.0)
+    return {
+        "robot": name,
+        "seconds": seconds,
+        "steps": timing.steps,
+        "period p50, p99, max of the whole session [ms]": [round(1e3 * x, 2) for x in timing.period],
+        "step p50, p99, max of the whole session [ms]": [round(1e3 * x, 2) for x in timing.step],
+        "failures": failures,
+        **broken(robot, q, dt),
+        "memory grew by [MB]": round((after - before) / 1024.0, 1),
+        "visitor read [MB]": round(sum(sizes) / 2**20, 1),
+        "load average before": round(load, 2),
+        "cores": os.cpu_count(),
+        "jax": jax.__version__,
+    }
+
+
+def main() -> None:
+    """Prints one line of JSON."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.live", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--robot", default="nao")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    json.dump(measure(given.robot, given.seconds), sys.stdout, indent=1)
+    print()
+
+
+if __name__ == "__main__":
+    main()

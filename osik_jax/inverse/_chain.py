@@ -1,0 +1,268 @@
+"""The kinematics of a few frames, for many configurations at once: lanes are the last axis of every array.
+
+A search evaluates hundreds of configurations a target. With the lanes last, every operation is one pass over contiguous
+numbers, on a CPU and on a GPU. Of the robot, only the joints that carry one of the frames take part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._tree import HINGE, SLIDE, KinematicTree
+from ..kinematics._rigid import compose, cross, rotate, rotation_matrix
+from ..robot import Robot
+
+
+class Layout(NamedTuple):
+    """Which joints take part, and how they hang together; hashable.
+
+    Attributes:
+        joints: the robot's joints, parents first.
+        parents: place in ``joints`` of the joint before each, one past the last for the world.
+        hinges: whether each joint turns; the others slide.
+        entries: entry of q that moves each joint, -1 for a locked one.
+        factors: of that entry.
+        dofs: entries of q that move any of the frames, in order: the coordinates of the search.
+        ends: place in ``joints`` of the joint that carries each frame, one past the last for the world.
+        carries: whether each joint carries each frame.
+    """
+
+    joints: tuple[int, ...]
+    parents: tuple[int, ...]
+    hinges: tuple[bool, ...]
+    entries: tuple[int, ...]
+    factors: tuple[float, ...]
+    dofs: tuple[int, ...]
+    ends: tuple[int, ...]
+    carries: tuple[tuple[bool, ...], ...]
+
+
+class Chain(eqx.Module):
+    """A robot's geometry, as far as the frames depend on it.
+
+    The pose of a joint's far side in its near side is ``constant + f(angle) first + g(angle) second``, with sine and
+    versine of a hinge's angle, or the travel of a slide and 0.
+
+    Attributes:
+        layout: the structure (static).
+        constant, first, second: [rotation, position] of each joint, from the frame before. (k, 3, 4)
+        offset: added to each joint's coordinate. (k,)
+        axis: of each joint, in its own frame. (k, 3)
+        anchor: of each joint, in its own frame [m]. (k, 3)
+        tip: pose of each frame in that of the joint that carries it. (frames, 3, 4)
+    """
+
+    layout: Layout = eqx.field(static=True)
+    constant: Float[Array, "k 3 4"]
+    first: Float[Array, "k 3 4"]
+    second: Float[Array, "k 3 4"]
+    offset: Float[Array, " k"]
+    axis: Float[Array, "k 3"]
+    anchor: Float[Array, "k 3"]
+    tip: Float[Array, "frames 3 4"]
+
+
+def is_plain(tree: KinematicTree, frames: Sequence[str]) -> bool:
+    """Whether only hinges and slides carry the frames, so that a ``Chain`` can be made."""
+    joints = {joint for name in frames for joint in _carrying(tree, name)}
+    return bool(joints) and all(tree.joint_types[j] in (HINGE, SLIDE) for j in joints)
+
+
+def _carrying(tree: KinematicTree, frame: str) -> list[int]:
+    """The joints between the world and a frame, from the world on."""
+    body, path = tree.frame_bodies[tree.frame(frame)], []
+    while body:
+        path.append(body)
+        body = tree.body_parents[body]
+    return [j for body in reversed(path) for j, owner in enumerate(tree.joint_bodies) if owner == body]
+
+
+def chain_layout(tree: KinematicTree, frames: Sequence[str]) -> Layout:
+    """The structure of the chain to some frames, of which ``is_plain`` holds."""
+    paths = [_carrying(tree, name) for name in frames]
+    joints = sorted({joint for path in paths for joint in path})
+    place = {joint: at for at, joint in enumerate(joints)}
+    before = {joint: path[at - 1] if at else -1 for path in paths for at, joint in enumerate(path)}
+    index, factor = tree.qpos_source
+    starts = tree.full_qpos_address
+    entries = [int(index[starts[j]]) if factor[starts[j]] else -1 for j in joints]
+    return Layout(
+        joints=tuple(joints),
+        parents=tuple(place.get(before[j], len(joints)) for j in joints),
+        hinges=tuple(tree.joint_types[j] == HINGE for j in joints),
+        entries=tuple(entries),
+        factors=tuple(float(factor[starts[j]]) for j in joints),
+        dofs=tuple(sorted({entry for entry in entries if entry >= 0})),
+        ends=tuple(place[path[-1]] if path else len(joints) for path in paths),
+        carries=tuple(tuple(j in path for j in joints) for path in paths),
+    )
+
+
+def make_chain(robot: Robot, frames: Sequence[str], layout: Layout) -> Chain:
+    """The geometry of the chain to some frames; differentiable in the robot's numbers."""
+    tree, joints = robot.tree, np.array(layout.joints, int)
+    bodies = np.asarray(tree.joint_bodies, int)[joints]
+    first_of_body = np.array([tree.joint_bodies.index(int(body)) == j for j, body in zip(joints, bodies, strict=True)])
+    position, turn = _before_joints(robot, bodies, first_of_body)
+    axis = robot.joint_axis[joints]
+    axis = axis / jnp.sqrt(jnp.sum(axis**2, -1, keepdims=True))
+    anchor = robot.joint_position[joints]
+    constant, first, second = _motions(position, turn, axis, anchor, np.array(layout.hinges))
+    address = tree.full_qpos_address[:-1][joints]
+    ids = np.array([tree.frame(name) for name in frames], int)
+    return Chain(
+        layout=layout,
+        constant=constant,
+        first=first,
+        second=second,
+        offset=robot.qpos_offset[address] - robot.joint_reference[address],
+        axis=axis,
+        anchor=anchor,
+        tip=jnp.concatenate([robot.frame_rotation[ids], robot.frame_position[ids][..., None]], -1),
+    )
+
+
+def _before_joints(
+    robot: Robot, bodies: np.ndarray, first_of_body: np.ndarray
+) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
+    """Pose, in the frame before, in which each joint finds its body: that of the body before the first of its joints.
+
+    Bodies that are fixed to others are one body with them, so that there is a joint on each body of a path.
+    """
+    turn = rotation_matrix(robot.body_quaternion[bodies])
+    return (
+        jnp.where(first_of_body[:, None], robot.body_position[bodies], 0.0),
+        jnp.where(first_of_body[:, None, None], turn, np.eye(3, dtype=turn.dtype)),
+    )
+
+
+def _motions(
+    position: Float[Array, "k 3"],
+    turn: Float[Array, "k 3 3"],
+    axis: Float[Array, "k 3"],
+    anchor: Float[Array, "k 3"],
+    hinges: np.ndarray,
+) -> tuple[Array, Array, Array]:
+    """Rodrigues' formula as three matrices a joint: ``R = I + sin K + (1 - cos) K^2``, about the anchor."""
+    zero = jnp.zeros_like(axis[:, 0])
+    x, y, z = axis.T
+    skew = jnp.stack([jnp.stack([zero, -z, y], -1), jnp.stack([z, zero, -x], -1), jnp.stack([-y, x, zero], -1)], -2)
+    sine, versine = compose(turn, skew), compose(turn, compose(skew, skew))
+    slide = rotate(turn, axis)
+    hinge, none = hinges[:, None], jnp.zeros_like(slide)
+    constant = jnp.concatenate([turn, position[..., None]], -1)
+    moved = jnp.where(hinge, -rotate(sine, anchor), slide)
+    first = jnp.concatenate([jnp.where(hinge[..., None], sine, 0.0), moved[..., None]], -1)
+    again = jnp.where(hinge, -rotate(versine, anchor), none)
+    second = jnp.concatenate([jnp.where(hinge[..., None], versine, 0.0), again[..., None]], -1)
+    return constant, first, second
+
+
+class Placed(NamedTuple):
+    """Where joints and frames are, in world axes.
+
+    Attributes:
+        axis: of each joint. (k, 3, lanes)
+        anchor: a point on it [m]. (k, 3, lanes)
+        position: of each frame [m]. (frames, 3, lanes)
+        rotation: of each frame. (frames, 3, 3, lanes)
+    """
+
+    axis: Float[Array, "k 3 lanes"]
+    anchor: Float[Array, "k 3 lanes"]
+    position: Float[Array, "frames 3 lanes"]
+    rotation: Float[Array, "frames 3 3 lanes"]
+
+
+def place(chain: Chain, x: Float[Array, "n lanes"]) -> Placed:
+    """Where everything is with these values of the chain's coordinates.
+
+    Args:
+        chain: the chain.
+        x: entries ``layout.dofs`` of configurations.
+    """
+    layout = chain.layout
+    local = _local_poses(chain, x)
+    poses = _world_poses(layout, local)
+    turned = _times(poses[:-1, :, :3], chain.axis[:, :, None, None])[:, :, 0]
+    anchor = _times(poses[:-1, :, :3], chain.anchor[:, :, None, None])[:, :, 0] + poses[:-1, :, 3]
+    ends = poses[np.array(layout.ends)]
+    tips = _times(ends[:, :, :3], chain.tip[..., None])
+    return Placed(turned, anchor, tips[:, :, 3] + ends[:, :, 3], tips[:, :, :3])
+
+
+def _local_poses(chain: Chain, x: Float[Array, "n lanes"]) -> Float[Array, "k 3 4 lanes"]:
+    layout = chain.layout
+    spot = np.array([layout.dofs.index(entry) if entry >= 0 else 0 for entry in layout.entries])
+    factor = np.array(layout.factors)
+    angle = x[spot] * jnp.asarray(factor, x.dtype)[:, None] + chain.offset[:, None]
+    hinge = np.array(layout.hinges)[:, None]
+    half = jnp.sin(0.5 * angle)
+    first, second = jnp.where(hinge, jnp.sin(angle), angle), jnp.where(hinge, 2.0 * half**2, 0.0)
+    # A library call, or XLA's CPU backend computes each sine again for every entry of the matrices that it is in.
+    parts = jnp.stack([chain.constant, chain.first, chain.second], -1).reshape(-1, 12, 3)
+    shares = jnp.stack([jnp.ones_like(first), first, second], 1)
+    return jnp.matmul(parts, shares, precision="highest").reshape(-1, 3, 4, x.shape[-1])
+
+
+def _world_poses(layout: Layout, local: Float[Array, "k 3 4 lanes"]) -> Float[Array, "k_1 3 4 lanes"]:
+    """Of each joint's far side, one after the other; the world is last. A loop, or XLA computes parents again."""
+    world = jnp.concatenate([jnp.eye(3, dtype=local.dtype), jnp.zeros((3, 1), local.dtype)], -1)
+    world = jnp.broadcast_to(world[..., None], local.shape[1:])
+    serial = layout.parents == (len(layout.joints), *range(len(layout.joints) - 1))
+    if serial:
+
+        def along(pose: Array, own: Array) -> tuple[Array, Array]:
+            pose = _joined(pose, own)
+            return pose, pose
+
+        _, poses = jax.lax.scan(along, world, local)
+        return jnp.concatenate([poses, world[None]])
+
+    def after(poses: Array, step: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        at, parent, own = step
+        before = jax.lax.dynamic_index_in_dim(poses, parent, 0, keepdims=False)
+        return jax.lax.dynamic_update_index_in_dim(poses, _joined(before, own), at, 0), None
+
+    poses = jnp.concatenate([jnp.zeros_like(local), world[None]])
+    order = jnp.arange(len(layout.joints)), jnp.asarray(layout.parents)
+    return jax.lax.scan(after, poses, (*order, local))[0]
+
+
+def _joined(pose: Float[Array, "3 4 lanes"], own: Float[Array, "3 4 lanes"]) -> Float[Array, "3 4 lanes"]:
+    moved = _times(pose[:, :3], own)
+    return jnp.concatenate([moved[:, :3], (moved[:, 3] + pose[:, 3])[:, None]], 1)
+
+
+def _times(a: Float[Array, "*k m 3 lanes"], b: Float[Array, "*k 3 n lanes"]) -> Float[Array, "*k m n lanes"]:
+    """The matrix product of each lane, written out: three products of arrays."""
+    first, second, third = (a[..., :, i, None, :] * b[..., i, None, :, :] for i in range(3))
+    return first + second + third
+
+
+def jacobian(chain: Chain, placed: Placed) -> Float[Array, "frames 6 n lanes"]:
+    """Of each frame over the chain's coordinates: rows [linear; angular] in world axes, linear at its origin."""
+    layout = chain.layout
+    hinge = np.array(layout.hinges)[:, None, None]
+    columns = []
+    for at, carried in enumerate(layout.carries):
+        arm = placed.position[at] - placed.anchor
+        linear = jnp.where(hinge, cross(placed.axis, arm, along=-2), placed.axis)
+        both = jnp.concatenate([linear, jnp.where(hinge, placed.axis, 0.0)], 1)
+        columns.append(jnp.where(np.array(carried)[:, None, None], both, 0.0))
+    own = jnp.stack(columns)  # (frames, k, 6, lanes)
+    return jnp.stack([_column(layout, own, dof) for dof in layout.dofs], 2)
+
+
+def _column(layout: Layout, own: Float[Array, "frames k 6 lanes"], dof: int) -> Float[Array, "frames 6 lanes"]:
+    """Of one coordinate: its joint's, and those of the joints that follow it."""
+    moved = [at for at, entry in enumerate(layout.entries) if entry == dof]
+    parts = [own[:, at] if layout.factors[at] == 1.0 else own[:, at] * layout.factors[at] for at in moved]
+    return sum(parts[1:], parts[0])

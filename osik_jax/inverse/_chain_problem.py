@@ -1,0 +1,204 @@
+"""Frames, limits and tolerances as a search, and what a search found as an answer."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._joint_selection import dof_names, scalar_layout
+from .._tree import HINGE
+from ..robot import Robot
+from ._chain import Chain, chain_layout, make_chain, place
+from ._chain_search import ChainSearch, Goal
+from ._fixed import at_solution
+from ._pool import Errors
+from ._seeds import shift_of
+from ._solution import InverseKinematicsSolution
+
+_ROUNDINGS = 64.0
+"""Machine epsilons, of the robot's size, by which computed errors may be off."""
+_ENOUGH = 0.01
+"""Share of the tolerance at which a search is done; the next step would be a rounding."""
+_RADIAN = 0.1
+"""What a radian counts as, as a share of the length of the chain."""
+_PULLS = 1e-3
+"""A joint is stopped by its limit where the error pulls it with at least this share of what it could."""
+
+
+class Settings(NamedTuple):
+    """Numbers of a search, all traced.
+
+    Attributes:
+        home: what entries of q have that move no frame, and where search 0 of a warm start begins. (nq,)
+        lower: limits of each entry of v. (nv,)
+        upper: (nv,)
+        key: of the starts.
+        tolerance: of position [m] and orientation [rad]. (2,)
+        seeds: number of searches that ``nearest`` spreads out. ()
+        parts: what else a way to search is made of.
+    """
+
+    home: Float[Array, " nq"]
+    lower: Float[Array, " nv"]
+    upper: Float[Array, " nv"]
+    key: Any
+    tolerance: Float[Array, "2"]
+    seeds: Int[Array, ""] | int
+    parts: Any = None
+
+
+class ChainRoute(NamedTuple):
+    """Poses of frames that hinges and slides carry; hashable.
+
+    Attributes:
+        frames: names.
+        rows: of each frame, those that count: x, y, z, rotation about x, y, z.
+    """
+
+    frames: tuple[str, ...]
+    rows: tuple[tuple[bool, ...], ...]
+
+    def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
+        """The way to search."""
+        return chain_search(robot, self, settings, warm=warm, near=near)
+
+    def beyond(self, search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
+        """How far each target is at least from all that can be reached [m]; 0 where it may be within."""
+        return _beyond(search, goal)
+
+    def entries(self, robot: Robot) -> np.ndarray:
+        """Entries of q that a search moves."""
+        return np.array(chain_layout(robot.tree, self.frames).dofs, int)
+
+    def answer(self, robot: Robot, search: ChainSearch, goal: Goal, x: Array, seed: Array, steps: Array) -> Any:
+        """What was found for many targets, its errors computed anew, with the derivative of a solution."""
+        return answer(robot, self, search, goal, x, seed, steps)
+
+
+def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
+    """The search for configurations of a robot whose frames hinges and slides carry."""
+    frames, rows = route
+    layout = chain_layout(robot.tree, frames)
+    chain = make_chain(robot, frames, layout)
+    coordinates = np.array(layout.dofs, int)
+    dofs = dof_of_entries(robot)[coordinates]
+    lower, upper = settings.lower[dofs], settings.upper[dofs]
+    first = jnp.clip(settings.home[coordinates], lower, upper)
+    low, high = _starts(robot, coordinates, lower, upper, first)
+    length = jnp.max(jax.lax.stop_gradient(reaches(chain, first, lower, upper)[0]))
+    return ChainSearch(
+        rows=rows,
+        chain=chain,
+        lower=lower,
+        upper=upper,
+        low=low,
+        high=high,
+        first=first,
+        home=settings.home,
+        warm=warm,
+        near=near,
+        seeds=jnp.asarray(settings.seeds, first.dtype),
+        shift=shift_of(settings.key, len(coordinates)),
+        length=_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0),
+        tolerance=allowed(settings.tolerance, length),
+        enough=jnp.asarray(_ENOUGH, first.dtype),
+    )
+
+
+def allowed(tolerance: Float[Array, "2"], length: Float[Array, ""]) -> Float[Array, "2"]:
+    """Tolerances less what rounding may hide, so that what is called converged is so in exact numbers too."""
+    size = jnp.stack([jnp.where(jnp.isfinite(length), length, 1.0), jnp.ones_like(length)])
+    hidden = _ROUNDINGS * float(jnp.finfo(tolerance.dtype).eps) * size
+    return jnp.maximum(tolerance - hidden, 0.25 * tolerance)
+
+
+def dof_of_entries(robot: Robot) -> np.ndarray:
+    """The entry of v of each entry of q, of hinges and slides. (nq,)."""
+    scalar, index = scalar_layout(robot)
+    out = np.zeros(robot.nq, int)
+    out[index[scalar]] = np.flatnonzero(scalar)
+    return out
+
+
+def _starts(robot: Robot, coordinates: np.ndarray, lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
+    """Finite ends of where searches start: the limits, or half a turn or a metre around the first configuration."""
+    kinds = {at: robot.tree.joint_types[joint] for joint, at in robot.tree.qpos_address.items()}
+    width = np.array([np.pi if kinds[at] == HINGE else 1.0 for at in coordinates.tolist()])
+    free = jnp.isinf(lower) | jnp.isinf(upper)
+    low = jnp.where(free, jnp.maximum(first - width, lower), lower)
+    return low.astype(first.dtype), jnp.where(free, jnp.minimum(first + width, upper), upper).astype(first.dtype)
+
+
+def reaches(chain: Chain, x: Array, lower: Array, upper: Array) -> tuple[Float[Array, " frames"], Array]:
+    """Length of the links to each frame [m], slides drawn out; and where the first joint of each is. (frames, 3)."""
+    placed, layout = place(chain, x[:, None]), chain.layout
+    travel = jnp.maximum(jnp.abs(upper - x), jnp.abs(lower - x))
+    lengths, roots = [], []
+    for at, carried in enumerate(layout.carries):
+        path = np.flatnonzero(carried)
+        points = jnp.concatenate([placed.anchor[path, :, 0], placed.position[at, :, 0][None]])
+        whole = jnp.sum(jnp.sqrt(jnp.sum((points[1:] - points[:-1]) ** 2, -1)))
+        slides = [(j, layout.entries[j]) for j in path.tolist() if not layout.hinges[j] and layout.entries[j] >= 0]
+        drawn = [abs(layout.factors[j]) * travel[layout.dofs.index(entry)] for j, entry in slides]
+        lengths.append(sum(drawn, whole))
+        roots.append(points[0])
+    return jnp.stack(lengths), jnp.stack(roots)
+
+
+def answer(
+    robot: Robot,
+    route: ChainRoute,
+    search: ChainSearch,
+    goal: Goal,
+    x: Float[Array, "targets n"],
+    seed: Int[Array, " targets"],
+    steps: Int[Array, " targets"],
+) -> InverseKinematicsSolution:
+    """What was found for many targets, its errors computed anew, with the derivative of a solution."""
+    x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
+    fixed_search, fixed_x = jax.lax.stop_gradient((search, x))
+    turned = Goal(jnp.moveaxis(goal.position, 0, -1), jnp.moveaxis(goal.rotation, 0, -1))
+    residual, pull, errors = _evaluated(fixed_search, fixed_x.T, jax.lax.stop_gradient(turned))
+    converged = errors.score <= 1.0
+    coordinates = np.array(search.chain.layout.dofs, int)
+    whole = jnp.broadcast_to(search.home, (len(x), robot.nq)).at[:, coordinates].set(x)
+    at_limit = jnp.zeros((len(x), robot.nv), jnp.int32)
+    return InverseKinematicsSolution(
+        q=whole,
+        converged=converged,
+        position_error=errors.position,
+        orientation_error=errors.orientation,
+        seed=seed,
+        steps=steps,
+        residual={name: jnp.moveaxis(residual[at], -1, 0) for at, name in enumerate(route.frames)},
+        at_limit=at_limit.at[:, dof_of_entries(robot)[coordinates]].set(pull.T),
+        beyond_reach=_beyond(fixed_search, jax.lax.stop_gradient(goal)),
+        joints=tuple(dof_names(robot)),
+    )
+
+
+def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
+    """Residual of each frame (frames, 6, lanes), which limits stop it (n, lanes), and the errors."""
+    error, matrix, errors = search.linearised(x, goal)
+    rows = np.array(search.rows)
+    scale = jnp.where(np.arange(6) < 3, 1.0, search.length)[None].repeat(len(rows), 0)[rows]
+    residual = jnp.zeros((*rows.shape, x.shape[-1]), x.dtype).at[np.nonzero(rows)].set(error / scale[:, None])
+    pull = jnp.sum(matrix * error[:, None], 0)
+    most = jnp.sqrt(jnp.sum(matrix**2, 0)) * jnp.sqrt(errors.cost)
+    stopped = jnp.abs(pull) > _PULLS * most
+    low, high = (x <= search.lower[:, None]) & (pull > 0.0), (x >= search.upper[:, None]) & (pull < 0.0)
+    return residual, jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0), errors
+
+
+def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
+    """How far targets are at least from what the links can reach, 0 where they may be within."""
+    length, root = reaches(search.chain, search.first, search.lower, search.upper)
+    asked = np.array(search.rows)[:, :3].all(-1)
+    longest = length * (1.0 + _ROUNDINGS * float(jnp.finfo(length.dtype).eps))
+    away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - longest
+    away = jnp.where(jnp.isfinite(away) & asked, away, 0.0)
+    return jnp.maximum(jnp.max(away, -1), 0.0)

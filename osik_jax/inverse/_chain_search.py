@@ -1,0 +1,175 @@
+"""Searches for poses of frames that hinges and slides carry, with nothing but a box around the joints."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt
+
+from ._chain import Chain, jacobian, place
+from ._error import rotation_error
+from ._linear import solve_positive
+from ._pool import Errors
+from ._seeds import unit_points
+
+_DAMPING = 0.03
+"""Of the squared error: with less, steps from afar go too far; with more, they are short (measured on two arms)."""
+_LEAST_DAMPING = 1e-5
+"""Of the squared length that a radian counts as: keeps singular arms from long steps where the error is small."""
+
+
+class Goal(NamedTuple):
+    """Where the frames have to be.
+
+    Attributes:
+        position: [m]. (..., frames, 3)
+        rotation: (..., frames, 3, 3)
+    """
+
+    position: Float[Array, "*lanes frames 3"]
+    rotation: Float[Array, "*lanes frames 3 3"]
+
+
+class ChainSearch(eqx.Module):
+    """Levenberg-Marquardt steps with a damping proportional to the squared error, projected into the box.
+
+    Such a damping needs no line search, and vanishes fast enough for quadratic convergence (T. Sugihara, "Solvability-
+    unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on Robotics 27(5), 2011). A
+    joint at a limit that the error pulls further is left out of the step.
+
+    Attributes:
+        rows: of each frame, the rows that count: x, y, z, rotation about x, y, z (static).
+        chain: geometry.
+        lower: of the chain's coordinates, -inf where free. (n,)
+        upper: (n,)
+        low: of where searches start, finite. (n,)
+        high: (n,)
+        first: where search 0 starts, used where ``warm``. (n,)
+        home: the whole configuration that the coordinates are part of. (nq,)
+        warm: whether search 0 starts at ``first`` (static).
+        near: whether the nearest solution to ``first`` is wanted: searches start around it, and what the frames leave
+            free goes towards it (static).
+        seeds: number of searches that ``near`` spreads out. ()
+        shift: of the sequence of starts. (n,)
+        length: what a radian counts as [m]. ()
+        tolerance: of position [m] and orientation [rad], less what rounding may hide. (2,)
+        enough: score at which a search stays where it is. ()
+    """
+
+    rows: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
+    chain: Chain
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    low: Float[Array, " n"]
+    high: Float[Array, " n"]
+    first: Float[Array, " n"]
+    home: Float[Array, " nq"]
+    warm: bool = eqx.field(static=True)
+    near: bool = eqx.field(static=True)
+    seeds: Float[Array, ""]
+    shift: UInt[Array, " n"]
+    length: Float[Array, ""]
+    tolerance: Float[Array, "2"]
+    enough: Float[Array, ""]
+
+    def begin(self, seed: Int[Array, " lanes"], goal: Goal) -> Float[Array, "lanes n"]:
+        """Where a search with this number starts."""
+        del goal
+        points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
+        if self.near:
+            share = jnp.minimum(seed.astype(points.dtype) / self.seeds, 1.0)[:, None]
+            points = self.first + share * (points - self.first)
+        elif self.warm:
+            points = jnp.where((seed == 0)[:, None], self.first, points)
+        return jnp.clip(points, self.lower, self.upper)
+
+    def advance(self, x: Float[Array, "lanes n"], goal: Goal, steps: int) -> tuple[Array, Array, Errors]:
+        """Some steps: where the last one set out, where it led, and the errors of where it set out."""
+        turned = Goal(jnp.moveaxis(goal.position, 0, -1), jnp.moveaxis(goal.rotation, 0, -1))
+
+        def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
+            at = carry[1]
+            after, errors = self.step(at, turned)
+            return at, after, errors
+
+        nothing = jnp.zeros(len(x), x.dtype)
+        start = x.T, x.T, Errors(nothing, nothing, nothing, nothing)
+        here, there, errors = jax.lax.fori_loop(0, steps, step, start)
+        return here.T, there.T, errors
+
+    def step(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Float[Array, "n lanes"], Errors]:
+        """Where a step leads, and the errors of where it sets out; lanes last. A search that is done stays."""
+        error, matrix, errors = self.linearised(x, goal)
+        pull = _transposed_times(matrix, error)
+        lower, upper = self.lower[:, None], self.upper[:, None]
+        free = ~(((x <= lower) & (pull > 0.0)) | ((x >= upper) & (pull < 0.0)))
+        matrix = jnp.where(free, matrix, 0.0)
+        damping = _DAMPING * errors.cost + _LEAST_DAMPING * self.length**2
+        done, home = errors.score <= self.enough, jnp.zeros_like(x)
+        if self.near:
+            done, home = jnp.zeros_like(done), jnp.where(free, self.first[:, None] - x, 0.0)
+            error = error + _times(matrix, home)
+        move = home - _transposed_times(matrix, solve_positive(_gram(matrix, damping), error))
+        return jnp.where(done, x, jnp.clip(x + move, lower, upper)), errors
+
+    def newton_step(self, x: Float[Array, " n"], goal: Goal) -> Float[Array, " n"]:
+        """The shortest step to the goal by the linear model at x; what stands at a limit goes with the limit."""
+        aim = Goal(goal.position[..., None], goal.rotation[..., None])
+        error, matrix, _ = self.linearised(x[:, None], aim)
+        low, high = x <= self.lower, x >= self.upper
+        forced = jnp.where(low, self.lower, jnp.where(high, self.upper, x)) - x
+        error = error + _times(matrix, forced[:, None])
+        matrix = jnp.where((low | high)[:, None], 0.0, matrix)
+        ridge = 100.0 * jnp.finfo(x.dtype).eps * jnp.maximum(jnp.sum(matrix**2, (0, 1)), self.length**2)
+        step = _transposed_times(matrix, solve_positive(_gram(matrix, ridge), error))
+        return forced - step[:, 0]
+
+    def distance(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        """From where search 0 starts."""
+        return jnp.sqrt(jnp.sum((x - self.first) ** 2))
+
+    def finishing(self) -> ChainSearch:
+        """The same search without its pull to the first configuration, for the last steps."""
+        return dataclasses.replace(self, near=False)
+
+    def linearised(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
+        """Error of each row that counts [m], its derivative (rows, n, lanes), and the errors of the frames."""
+        placed = place(self.chain, x)
+        linear = placed.position - goal.position
+        angular = rotation_error(placed.rotation, goal.rotation)
+        scale = jnp.where(np.arange(6) < 3, 1.0, self.length).astype(x.dtype)
+        kept = np.flatnonzero(np.array(self.rows).ravel())
+        rows = jnp.concatenate([linear, angular], 1) * scale[:, None]
+        matrix = jacobian(self.chain, placed) * scale[:, None, None]
+        lanes = x.shape[-1]
+        error = rows.reshape(-1, lanes)[kept]
+        matrix = matrix.reshape(-1, len(x), lanes)[kept]
+        return error, matrix, self._errors(linear, angular, jnp.sum(error**2, 0))
+
+    def _errors(self, linear: Array, angular: Array, cost: Array) -> Errors:
+        kept = np.array(self.rows)
+        sizes = [
+            jnp.max(jnp.sqrt(jnp.sum(jnp.where(mask[:, :, None], part, 0.0) ** 2, 1)), 0)
+            for part, mask in ((linear, kept[:, :3]), (angular, kept[:, 3:]))
+        ]
+        score = jnp.maximum(sizes[0] / self.tolerance[0], sizes[1] / self.tolerance[1])
+        return Errors(sizes[0], sizes[1], score, cost)
+
+
+def _times(matrix: Float[Array, "m n lanes"], vector: Float[Array, "n lanes"]) -> Float[Array, "m lanes"]:
+    return jnp.sum(matrix * vector, 1)
+
+
+def _transposed_times(matrix: Float[Array, "m n lanes"], vector: Float[Array, "m lanes"]) -> Float[Array, "n lanes"]:
+    return sum((matrix[i] * vector[i] for i in range(1, len(matrix))), matrix[0] * vector[0])
+
+
+def _gram(matrix: Float[Array, "m n lanes"], damping: Float[Array, " lanes"]) -> Float[Array, "m m lanes"]:
+    """matrix matrix' + damping I."""
+    parts = [matrix[:, None, k] * matrix[None, :, k] for k in range(matrix.shape[1])]
+    return sum(parts[1:], parts[0]) + jnp.eye(len(matrix), dtype=matrix.dtype)[..., None] * damping

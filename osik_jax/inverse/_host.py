@@ -1,0 +1,62 @@
+"""How a batch of targets runs: in chunks of one shape, several at a time on a CPU."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_CHUNK = {"cpu": 1024}
+_OTHER_CHUNK = 65536
+"""Targets that run together. Shapes are powers of two up to here, so that few programs are compiled."""
+_MOST_LANES = {"cpu": 128}
+_OTHER_LANES = 131072
+"""Searches that go on together: as many as a core's cache holds, or as keep a GPU busy."""
+_FEWEST_LANES = 16
+_LANES_EACH = 8
+"""Searches for a target that a GPU goes on with together, where there are few targets."""
+
+
+def lanes_for(targets: int) -> int:
+    """Number of searches that go on together for so many targets."""
+    backend = jax.default_backend()
+    wanted = targets if backend == "cpu" else _LANES_EACH * targets
+    return min(max(_power_of_two(wanted), _FEWEST_LANES), _MOST_LANES.get(backend, _OTHER_LANES))
+
+
+def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
+    """``function(goals, open)`` of chunks of the targets, put together; a chunk is filled up with targets not open.
+
+    On a CPU, chunks run in threads side by side: XLA runs a program in the thread that calls it. What comes out does
+    not depend on how many there are.
+
+    Args:
+        function: of a chunk's goals, and which of them are looked for.
+        goals: pytree with the targets in front.
+    """
+    count = len(jax.tree.leaves(goals)[0])
+    size = min(_power_of_two(count), _CHUNK.get(jax.default_backend(), _OTHER_CHUNK))
+    starts, goals = range(0, count, size), jax.device_get(goals)
+
+    def run(start: int) -> Any:
+        here = min(size, count - start)
+        number = np.minimum(np.arange(start, start + size), count - 1)
+        out = function(jax.tree.map(lambda a: a[number], goals), np.arange(size) < here)
+        return jax.tree.map(lambda a: a[:here], jax.device_get(out))
+
+    if len(starts) == 1 or jax.default_backend() != "cpu":
+        parts = [run(start) for start in starts]
+    else:
+        first = run(0)  # compiles
+        with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
+            parts = [first, *threads.map(run, starts[1:])]
+    return jax.tree.map(lambda *own: jnp.asarray(np.concatenate(own)), *parts)
+
+
+def _power_of_two(count: int) -> int:
+    return 1 << (count - 1).bit_length()

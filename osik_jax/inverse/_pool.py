@@ -1,0 +1,197 @@
+"""Many searches on a fixed number of lanes: a lane that ends takes up the next search, until none is left."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+CHECK = 4
+"""Steps between two looks at how the lanes are doing."""
+_TRIAL = 8
+"""Steps that every search may take before it has to make progress."""
+_PROGRESS = 0.7
+"""A search goes on where a few steps have brought the cost below this share of what it was."""
+
+
+class Errors(NamedTuple):
+    """How far configurations are from what is asked.
+
+    Attributes:
+        position: largest of the distances [m].
+        orientation: largest of the angles [rad].
+        score: largest error as a share of its tolerance: 1 and less is converged.
+        cost: what the steps reduce.
+    """
+
+    position: Float[Array, "..."]
+    orientation: Float[Array, "..."]
+    score: Float[Array, "..."]
+    cost: Float[Array, "..."]
+
+
+class Search(Protocol):
+    """One way to search: a pytree, whose methods take arrays with the lanes in front."""
+
+    def begin(self, seed: Int[Array, " lanes"], goal: Any) -> Float[Array, "lanes n"]:
+        """Where a search with this number starts."""
+        ...
+
+    def advance(self, x: Float[Array, "lanes n"], goal: Any, steps: int) -> tuple[Array, Array, Errors]:
+        """Some steps: where the last one set out, where it led, and the errors of where it set out."""
+        ...
+
+
+class Found(NamedTuple):
+    """The best of each target's searches.
+
+    Attributes:
+        x: coordinates.
+        errors: there.
+        seed: number of the search.
+        steps: that the target's searches took, all together.
+    """
+
+    x: Float[Array, "targets n"]
+    errors: Errors
+    seed: Int[Array, " targets"]
+    steps: Int[Array, " targets"]
+
+
+class _Lanes(NamedTuple):
+    x: Float[Array, "lanes n"]
+    target: Int[Array, " lanes"]  # one past the last: idle
+    seed: Int[Array, " lanes"]
+    age: Int[Array, " lanes"]
+    cost: Float[Array, " lanes"]  # at the last look
+
+
+class _State(NamedTuple):
+    lanes: _Lanes
+    found: Found
+    started: Int[Array, " targets"]
+    cursor: Int[Array, ""]
+
+
+def run_pool(
+    search: Search,
+    goals: Any,
+    open_: Bool[Array, " targets"],
+    *,
+    lanes: int,
+    seeds: Int[Array, " targets"],
+    longest: Int[Array, ""],
+    enough: Float[Array, ""],
+) -> Found:
+    """Searches for all targets until each is found or has had all its seeds.
+
+    Deterministic: which search a lane takes up depends on nothing but the arguments.
+
+    Args:
+        search: the way to search.
+        goals: pytree of the targets, with the targets in front.
+        open_: targets that are looked for; the others, which fill up a batch, are left alone.
+        lanes: searches that go on at the same time.
+        seeds: searches for each target at most, one number each.
+        longest: steps of one search at most.
+        enough: score at which a target is found and its searches end.
+    """
+    targets = len(open_)
+    size = jax.eval_shape(search.begin, jnp.zeros(lanes, jnp.int32), _of(goals, jnp.zeros(lanes, jnp.int32)))
+    state = _first_state(size, targets, lanes)
+
+    def body(state: _State) -> _State:
+        state = _refill(search, goals, open_, seeds, enough, state)
+        here, there, errors = search.advance(state.lanes.x, _of(goals, state.lanes.target), CHECK)
+        found = _best(state.found, state.lanes, here, errors)
+        return state._replace(lanes=_culled(state.lanes, there, errors, found, longest, enough), found=found)
+
+    def goes_on(state: _State) -> Array:
+        return (state.lanes.target < targets).any() | _wanting(state, open_, seeds, enough).any()
+
+    found = jax.lax.while_loop(goes_on, body, state).found
+    return jax.tree.map(lambda a: a[:-1], found)
+
+
+def _of(goals: Any, target: Int[Array, " lanes"]) -> Any:
+    """Each lane's goal; idle lanes have the last one's."""
+    return jax.tree.map(lambda a: jnp.take(a, target, axis=0, mode="clip"), goals)
+
+
+def _first_state(size: Any, targets: int, lanes: int) -> _State:
+    """All lanes idle. What belongs to targets has one more place, for what idle lanes write."""
+    worst = jnp.full(targets + 1, jnp.inf, size.dtype)
+    none = jnp.zeros(targets + 1, jnp.int32)
+    idle = jnp.zeros(lanes, jnp.int32)
+    return _State(
+        _Lanes(jnp.zeros(size.shape, size.dtype), idle + targets, idle, idle, jnp.zeros(lanes, size.dtype)),
+        Found(jnp.zeros((targets + 1, size.shape[1]), size.dtype), Errors(worst, worst, worst, worst), none, none),
+        none,
+        jnp.zeros((), jnp.int32),
+    )
+
+
+def _wanting(state: _State, open_: Array, seeds: Array, enough: Array) -> Bool[Array, " targets"]:
+    """Targets that another search could help."""
+    return open_ & (state.started[:-1] < seeds) & (state.found.errors.score[:-1] > enough)
+
+
+def _refill(search: Search, goals: Any, open_: Array, seeds: Array, enough: Array, state: _State) -> _State:
+    """Idle lanes take up searches for the targets that want one, in turn."""
+    targets = len(open_)
+    wanting = _wanting(state, open_, seeds, enough)
+    rank = jnp.cumsum(wanting, dtype=jnp.int32)
+    count = rank[-1]
+    free = state.lanes.target >= targets
+    turn = jnp.cumsum(free, dtype=jnp.int32) - 1  # of each free lane among them
+    before = jnp.where(state.cursor > 0, rank[jnp.maximum(state.cursor - 1, 0)], 0)
+    some = jnp.maximum(count, 1)
+    chosen = jnp.searchsorted(rank, (before + turn) % some + 1).astype(jnp.int32)
+    seed = state.started[jnp.minimum(chosen, targets)] + turn // some
+    takes = free & (count > 0) & (seed < jnp.take(seeds, chosen, mode="clip"))
+    target = jnp.where(takes, chosen, state.lanes.target)
+    last = jnp.max(jnp.where(takes & (turn == jnp.sum(takes, dtype=jnp.int32) - 1), chosen, -1))
+    start = search.begin(seed, _of(goals, target))
+    return state._replace(
+        lanes=_Lanes(
+            x=jnp.where(takes[:, None], start, state.lanes.x),
+            target=target,
+            seed=jnp.where(takes, seed, state.lanes.seed),
+            age=jnp.where(takes, 0, state.lanes.age),
+            cost=jnp.where(takes, jnp.inf, state.lanes.cost),
+        ),
+        started=state.started.at[jnp.where(takes, chosen, targets)].add(1),
+        cursor=jnp.where(last >= 0, (last + 1) % targets, state.cursor).astype(jnp.int32),
+    )
+
+
+def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
+    """What is best of each target so far; of equals, what was there, then the lowest lane."""
+    least = found.errors.score.at[lanes.target].min(errors.score)
+    number = jnp.arange(len(lanes.target), dtype=jnp.int32)
+    wins = (errors.score == least[lanes.target]) & (errors.score < found.errors.score[lanes.target])
+    none = jnp.full(found.seed.shape, len(number), jnp.int32)
+    winner = none.at[lanes.target].min(jnp.where(wins, number, len(number)))
+    wins &= winner[lanes.target] == number
+    place = jnp.where(wins, lanes.target, len(found.seed))  # out of range: dropped
+
+    def put(old: Array, new: Array) -> Array:
+        return old.at[place].set(new, mode="drop")
+
+    return Found(
+        put(found.x, x),
+        Errors(*(put(old, new) for old, new in zip(found.errors, errors, strict=True))),
+        put(found.seed, lanes.seed),
+        found.steps.at[lanes.target].add(CHECK),
+    )
+
+
+def _culled(lanes: _Lanes, x: Array, errors: Errors, found: Found, longest: Array, enough: Array) -> _Lanes:
+    """Searches end when their target is found, when they are too long, and when they no longer make progress."""
+    age = lanes.age + CHECK
+    stuck = (age > _TRIAL) & ~(errors.cost < _PROGRESS * lanes.cost)
+    ends = stuck | (age >= longest) | (found.errors.score[lanes.target] <= enough)
+    idle = len(found.seed) - 1
+    return _Lanes(x, jnp.where(ends, idle, lanes.target), lanes.seed, age, errors.cost)

@@ -1,0 +1,111 @@
+"""From the poses that a user gives, one or many, to arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+from .._joint_selection import concrete
+from ..robot import Robot
+from ..tasks._targets import as_pose, pose_array
+from ._chain_search import Goal
+
+_POSITION = (True,) * 3 + (False,) * 3
+_POSE = (True,) * 6
+_TOLERANCE = 1e-4
+_ACCEPTED = (
+    "a pose is (position (3,), rotation matrix (3, 3)), (position (3,), quaternion w x y z (4,)), a (4, 4) matrix, a "
+    "jaxlie.SE3, or a position (3,) alone; many have one more axis in front"
+)
+
+
+def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tuple[bool, ...], ...], int | None]:
+    """Goals (targets, frames, ...), the rows of each frame that count, and the number of targets; None: one, no batch.
+
+    Raises:
+        TypeError, ValueError: something that is no pose, or batches of different lengths.
+        KeyError: no such frame.
+    """
+    dtype = robot.q0.dtype
+    parts = {}
+    for name, value in targets.items():
+        try:
+            parts[name] = _one(value, dtype)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"targets[{name!r}]: {error}") from None
+    counts = {name: position.shape[0] for name, (position, _, _) in parts.items() if position.ndim == 2}
+    if len(set(counts.values())) > 1:
+        raise ValueError(
+            f"the numbers of targets differ: {', '.join(f'{name}: {count}' for name, count in counts.items())}"
+        )
+    count = next(iter(counts.values()), None)
+    if count == 0:
+        raise ValueError("there are no targets: the poses have a leading axis of length 0")
+    shape = (count or 1,)
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(parts))
+    numbers = jnp if traced else np  # an operation of JAX's costs as much as a short search
+    position = numbers.stack([numbers.broadcast_to(p, (*shape, 3)) for p, _, _ in parts.values()], 1)
+    rotation = numbers.stack([numbers.broadcast_to(r, (*shape, 3, 3)) for _, r, _ in parts.values()], 1)
+    return Goal(cast(Array, position), cast(Array, rotation)), tuple(rows for _, _, rows in parts.values()), count
+
+
+def _one(value: Any, dtype: Any) -> tuple[Array, Array, tuple[bool, ...]]:
+    """Position (3,) or (n, 3), rotation likewise, and rows."""
+    identity = jnp.eye(3, dtype=dtype)
+    array = None if _has_parts(value) else pose_array(value, dtype, _ACCEPTED)
+    if array is not None and array.shape[-1:] == (3,) and array.ndim <= 2:
+        _check_finite(array)
+        return array, jnp.broadcast_to(identity, (*array.shape[:-1], 3, 3)), _POSITION
+    pose = _split(value if array is None else array, dtype)
+    if pose[0].ndim == 1:
+        return *as_pose(pose, dtype), _POSE
+    if pose[0].ndim != 2 or pose[1].ndim not in (2, 3) or len(pose[0]) != len(pose[1]):
+        raise ValueError(
+            f"got positions of shape {pose[0].shape} and rotations of shape {pose[1].shape}; many poses are positions "
+            "(n, 3) with rotation matrices (n, 3, 3) or quaternions w x y z (n, 4), or matrices (n, 4, 4)"
+        )
+    _check_many(*pose)
+    return *jax.vmap(lambda p, r: as_pose((p, r), dtype))(*pose), _POSE
+
+
+def _has_parts(value: Any) -> bool:
+    return isinstance(value, jaxlie.SE3) or (isinstance(value, tuple | list) and len(value) == 2)
+
+
+def _split(value: Any, dtype: Any) -> tuple[Array, Array]:
+    if isinstance(value, jaxlie.SE3):
+        return jnp.asarray(value.translation(), dtype), jnp.asarray(value.rotation().wxyz, dtype)
+    if isinstance(value, tuple | list):
+        return pose_array(value[0], dtype, _ACCEPTED), pose_array(value[1], dtype, _ACCEPTED)
+    if value.shape[-2:] != (4, 4) or value.ndim > 3:
+        raise ValueError(f"got an array of shape {value.shape}; a pose is a (4, 4) matrix, a position is (3,)")
+    return value[..., :3, 3], value[..., :3, :3]
+
+
+def _check_finite(array: Array) -> None:
+    seen = concrete(array)
+    if seen is not None and not np.isfinite(seen).all():
+        raise ValueError("the targets' positions have to be finite")
+
+
+def _check_many(position: Array, rotation: Array) -> None:
+    """As ``as_pose`` checks one, where the numbers can be seen."""
+    _check_finite(position)
+    seen = concrete(rotation)
+    if seen is None:
+        return
+    if seen.ndim == 2:
+        wrong = ~(np.abs(np.linalg.norm(seen, axis=-1) - 1.0) < _TOLERANCE)
+    else:
+        residual = np.abs(seen @ np.swapaxes(seen, -1, -2) - np.eye(3)).max((-1, -2))
+        wrong = ~((residual < _TOLERANCE) & (np.linalg.det(seen) > 0.0))
+    if wrong.any():
+        numbers = np.flatnonzero(wrong)[:10].tolist()
+        raise ValueError(f"rotations that are none (R R' = I and det R = 1, or quaternions of length 1): {numbers}")

@@ -1,0 +1,106 @@
+"""From poses and tasks by name to what is searched for, and in which way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._tree import unknown_name
+from ..limits import CollisionAvoidanceLimit, Limit, PositionBarrier
+from ..robot import Robot
+from ..schemes import Scheme, WeightedQP
+from ..tasks import FrameTask, Task
+from ._chain import is_plain
+from ._chain_problem import ChainRoute
+from ._poses import read_poses
+from ._task_problem import TaskParts, TaskRoute, read_limits, read_scheme, read_tasks
+from ._task_search import Aims
+
+
+class Problem(NamedTuple):
+    """What is searched for.
+
+    Attributes:
+        route: the way to search (static).
+        goals: pytree with the targets in front.
+        parts: what else the search is made of; None for a ``ChainRoute``.
+        many: whether the user gave a batch.
+    """
+
+    route: ChainRoute | TaskRoute
+    goals: Any
+    parts: TaskParts | None
+    many: bool
+
+
+def read_problem(
+    robot: Robot, tasks: Any, targets: Any, scheme: Scheme | None, limits: tuple[Limit, ...] | None
+) -> Problem:
+    """From what a user gives.
+
+    Raises:
+        TypeError, KeyError, ValueError: as ``inverse_kinematics``.
+    """
+    if not isinstance(tasks, Mapping):
+        raise TypeError(f"tasks is a {type(tasks).__name__}; it is a dict from names of frames to poses, or to tasks")
+    if not tasks:
+        raise ValueError("there is nothing to reach: give a frame a pose, or at least one task")
+    poses = {name: value for name, value in tasks.items() if not isinstance(value, Task)}
+    for name in poses:
+        robot.tree.frame(name)
+    goal, rows, count = read_poses(robot, poses) if poses else (None, (), None)
+    boxed = not any(isinstance(limit, CollisionAvoidanceLimit | PositionBarrier) for limit in limits or ())
+    plain = len(poses) == len(tasks) and is_plain(robot.tree, tuple(poses))
+    if goal is not None and plain and boxed and scheme is None:
+        if targets is not None:
+            raise ValueError("targets go with tasks; many poses are arrays with one more axis in front")
+        return Problem(ChainRoute(tuple(poses), rows), goal, None, count is not None)
+    return _of_tasks(robot, tasks, poses, (goal, rows, count), targets, scheme, limits)
+
+
+def _of_tasks(
+    robot: Robot,
+    tasks: Mapping[str, Any],
+    poses: Mapping[str, Any],
+    read: tuple[Any, tuple[tuple[bool, ...], ...], int | None],
+    targets: Any,
+    scheme: Scheme | None,
+    limits: tuple[Limit, ...] | None,
+) -> Problem:
+    goal, rows, count = read
+    framed = {name: FrameTask(robot, name, rows=own) for name, own in zip(poses, rows, strict=True)}
+    known = read_tasks(robot, {name: framed.get(name, task) for name, task in tasks.items()})
+    aims, number = _aims(targets, known, count)
+    many = number is not None
+    number = number or 1
+    for at, name in enumerate(poses):
+        own = goal.position[:, at], goal.rotation[:, at]
+        aims[name] = jax.tree.map(lambda a: jnp.broadcast_to(a, (number, *a.shape[1:])), own)
+    chosen = jax.tree.map(lambda a: a.astype(robot.q0.dtype), WeightedQP()) if scheme is None else scheme
+    goals = Aims(jnp.arange(number, dtype=jnp.int32), aims)
+    return Problem(TaskRoute(), goals, TaskParts(known, read_scheme(chosen), read_limits(robot, limits)), many)
+
+
+def _aims(targets: Any, tasks: Mapping[str, Task], count: int | None) -> tuple[dict[str, Any], int | None]:
+    """Targets of tasks as arrays with the targets in front, and how many they are."""
+    if targets is None:
+        return {}, count
+    if not isinstance(targets, Mapping):
+        raise TypeError(f"targets is a {type(targets).__name__}; it is a dict from names of tasks to many targets")
+    aims: dict[str, Any] = {}
+    for name, value in targets.items():
+        if name not in tasks:
+            raise unknown_name("task", name, tuple(tasks))
+        aims[name] = jax.tree.map(jnp.asarray, value)
+        lengths = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(aims[name])}
+        if len(lengths) != 1 or lengths == {()} or (count is not None and lengths != {(count,)}):
+            expected = "one length" if count is None else f"length {count}, as those of the others"
+            raise ValueError(
+                f"targets[{name!r}] has leading axes {sorted(lengths)}; they are the targets, of {expected}"
+            )
+        (count,) = lengths.pop()
+    return aims, count

@@ -1,0 +1,35 @@
+"""Configurations as tables, for the command line."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Column, Table
+
+from ..robot import Robot
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ._solution import InverseKinematicsSolution
+
+
+def print_found(console: Console, robot: Robot, found: InverseKinematicsSolution) -> None:
+    """What was found for one target, or what stops the robot, and the configurations joint by joint."""
+    console.print(found.explain(), markup=False, highlight=False)
+    several = found.solutions is not None and found.converged
+    solutions = list(found.solutions[: int(found.count)]) if several else [found.q]  # pyright: ignore
+    for q in solutions:
+        console.print(configuration_table(robot, q))
+
+
+def configuration_table(robot: Robot, q: Any) -> Table:
+    """A configuration, joint by joint."""
+    table = Table("joint", *(Column(name, justify="right") for name in ("in q", "value", "lower", "upper")))
+    if robot.floating_base:
+        table.add_row("base", "0-6", " ".join(f"{float(value):.5f}" for value in q[:7]), "", "")
+    for name in robot.joint_names:
+        dof, index = robot.joint_dof_index(name), robot.joint_qpos_index(name)
+        numbers = (q[index], robot.position_lower[dof], robot.position_upper[dof])
+        table.add_row(name, str(index), *(f"{float(value):.5f}" for value in numbers))
+    return table

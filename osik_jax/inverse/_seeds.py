@@ -1,0 +1,40 @@
+"""Where searches start: points that fill a box evenly, however many of them are taken."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt
+
+_BITS = 32
+
+
+def shift_of(key: int | Array, dimensions: int) -> UInt[Array, " n"]:
+    """Where the sequence begins in each dimension, from an integer or a key of ``jax.random``."""
+    made = jax.random.key(key) if jnp.issubdtype(jnp.result_type(key), jnp.integer) and jnp.ndim(key) == 0 else key
+    return jax.random.bits(made, (dimensions,), jnp.uint32)
+
+
+def unit_points(shift: UInt[Array, " n"], number: Int[Array, "..."], dtype: jnp.dtype) -> Float[Array, "... n"]:
+    """Points of an additive recurrence in the unit cube (Kronecker's sequence).
+
+    Its increments are the powers of 1/phi, phi being the positive root of ``phi**(n + 1) = phi + 1``: the golden ratio
+    for n = 1. In integers that wrap around, so that a late point is as exact as the first.
+
+    Args:
+        shift: start, as a share of the cube in units of 2**-32.
+        number: of the points.
+        dtype: of the result.
+    """
+    increments = jnp.asarray(_increments(len(shift)))
+    bits = shift + number.astype(jnp.uint32)[..., None] * increments
+    return (bits >> 8).astype(dtype) * 2.0 ** (8 - _BITS)  # 24 bits: what single precision holds
+
+
+def _increments(dimensions: int) -> np.ndarray:
+    phi = 1.5
+    for _ in range(64):  # a contraction: phi = (1 + phi)^(1 / (n + 1))
+        phi = (1.0 + phi) ** (1.0 / (dimensions + 1))
+    shares = phi ** -np.arange(1.0, dimensions + 1.0) % 1.0
+    return np.floor(shares * 2.0**_BITS).astype(np.uint64).astype(np.uint32)

@@ -1,0 +1,96 @@
+"""What inverse kinematics answers, and why it says no."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+_NEAR = 5e-3
+"""Pairs that are nearer than this to what they may be are told of [m]."""
+
+
+class InverseKinematicsSolution(eqx.Module):
+    """Configurations that put frames where they have to be, or come as near as was found; one, or with a leading axis.
+
+    Attributes:
+        q: the best configuration, its joints within their limits exactly. (..., nq)
+        converged: whether every error at q is within its tolerance. (...)
+        position_error: the largest distance of a frame from its target [m]. (...)
+        orientation_error: the largest angle of a frame to its target [rad]. (...)
+        seed: number of the search that found q. (...)
+        steps: that were taken for the target, all searches together. (...)
+        residual: of each frame, ``[p - p*, log(R R*')]``, world axes [m, rad], 0 in the rows not asked for; of each
+            task, the error of its rows, or of an inequality how far it is outside. {name: (..., m)}
+        at_limit: of each entry of v, -1 or 1 where its joint stands at its lower or upper limit and a step past it
+            would reduce the error; else 0. (..., nv)
+        beyond_reach: how far the target is at least from all that the frame could ever reach, from the lengths of the
+            links alone [m]: more than 0 proves that there is no solution. (...)
+        solutions: with ``all=True``, the distinct solutions, ``q`` first; rows from ``count`` on are NaN.
+            (..., seeds, nq)
+        count: with ``all=True``, how many there are. (...)
+        clearance: with a ``CollisionAvoidanceLimit``, the distance of the nearest pair less ``minimum_distance`` [m].
+            (...)
+        nearest_pair: number of that pair in ``pairs``. (...)
+        joints: names of the joints, for each entry of v (static).
+        pairs: names of the shapes that are kept apart (static).
+    """
+
+    q: Float[Array, "*n nq"]
+    converged: Bool[Array, "*n"]
+    position_error: Float[Array, "*n"]
+    orientation_error: Float[Array, "*n"]
+    seed: Int[Array, "*n"]
+    steps: Int[Array, "*n"]
+    residual: dict[str, Float[Array, "*n m"]]
+    at_limit: Int[Array, "*n nv"]
+    beyond_reach: Float[Array, "*n"]
+    solutions: Float[Array, "*n seeds nq"] | None = None
+    count: Int[Array, "*n"] | None = None
+    clearance: Float[Array, "*n"] | None = None
+    nearest_pair: Int[Array, "*n"] | None = None
+    joints: tuple[str, ...] = eqx.field(default=(), static=True)
+    pairs: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
+
+    def explain(self, index: int | None = None) -> str:
+        """What was found for a target, in words: the errors, and what stops the robot where it does not get there.
+
+        Args:
+            index: of the target, where there are many.
+
+        Raises:
+            ValueError: there are many targets and no index, or one alone and an index.
+            IndexError: there is no such target.
+        """
+        many = np.ndim(self.converged) > 0
+        if many != (index is not None):
+            count = len(np.asarray(self.converged)) if many else 1
+            raise ValueError(f"explain({'' if index is None else index}): there are {count} targets; give one's number")
+        pick = (lambda a: np.asarray(a)) if index is None else (lambda a: np.asarray(a)[index])
+        errors = f"{pick(self.position_error):.3g} m and {pick(self.orientation_error):.3g} rad off"
+        if pick(self.converged):
+            return f"found by search {pick(self.seed)}: {errors}"
+        lines = [f"not found in {pick(self.steps)} steps; the best configuration is {errors}"]
+        lines += [f"  {name}: {_miss(pick(residual))}" for name, residual in self.residual.items()]
+        return "\n".join([*lines, *(f"  {reason}" for reason in self._reasons(pick))])
+
+    def _reasons(self, pick: Callable[[Any], np.ndarray]) -> list[str]:
+        """What stops the robot, line by line."""
+        beyond, at_limit = float(pick(self.beyond_reach)), pick(self.at_limit)
+        if beyond > 0.0:
+            return [f"out of reach: {beyond:.3g} m further away than all links in one line"]
+        sides = {-1: "lower", 1: "upper"}
+        reasons = [f"{self.joints[i]} is at its {sides[int(at_limit[i])]} limit" for i in np.flatnonzero(at_limit)]
+        if self.clearance is not None and self.nearest_pair is not None and pick(self.clearance) < _NEAR:
+            one, other = self.pairs[int(pick(self.nearest_pair))]
+            reasons.append(f"{one} and {other} are {float(pick(self.clearance)):+.3g} m from as near as they may be")
+        return reasons or ["no limit stops a joint: the links are stretched, folded or turned as far as they go"]
+
+
+def _miss(residual: np.ndarray) -> str:
+    """A residual in words."""
+    numbers = " ".join(f"{value:+.3g}" for value in residual)
+    return f"off by {numbers}" + (" (x y z [m], rotation about x y z [rad])" if len(residual) == 6 else "")

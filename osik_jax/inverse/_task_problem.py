@@ -1,0 +1,166 @@
+"""Tasks, limits and tolerances as a search, and what a search found as an answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._checks import check_tasks
+from .._joint_selection import dof_names
+from .._tree import HINGE, SLIDE
+from ..kinematics import forward_kinematics
+from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, PositionBarrier
+from ..robot import Robot
+from ..schemes import Scheme
+from ..tasks import Task
+from ._chain_problem import Settings, allowed
+from ._fixed import at_solution
+from ._pool import Errors
+from ._seeds import shift_of
+from ._solution import InverseKinematicsSolution
+from ._task_search import CURVATURE, Aims, TaskSearch, entry_limits, is_goal
+
+_KEPT = (ConfigurationLimit, CollisionAvoidanceLimit, PositionBarrier)
+_ENOUGH = 0.01
+_RADIUS = 1.0
+"""What the positions' rounding is counted by [m]."""
+_PULLS = 1e-3
+_AT = 1e-6
+"""A joint that is nearer to its limit is at it [rad or m]."""
+
+
+class TaskParts(NamedTuple):
+    """What a ``TaskSearch`` is made of."""
+
+    tasks: dict[str, Task]
+    scheme: Scheme
+    limits: tuple[Limit, ...]
+
+
+class TaskRoute(NamedTuple):
+    """Tasks and limits of any kind; hashable."""
+
+    def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> TaskSearch:
+        """The way to search."""
+        del warm, near
+        parts: TaskParts = settings.parts
+        lower, upper = entry_limits(robot, settings.lower, settings.upper)
+        first = jnp.clip(settings.home, lower, upper)
+        low, high = _starts(robot, lower, upper, first)
+        return TaskSearch(
+            robot=robot,
+            tasks=parts.tasks,
+            scheme=parts.scheme,
+            limits=parts.limits,
+            first=first,
+            low=low,
+            high=high,
+            lower=lower,
+            upper=upper,
+            shift=shift_of(settings.key, robot.nq),
+            tolerance=allowed(settings.tolerance, jnp.asarray(_RADIUS, first.dtype)),
+            enough=jnp.asarray(_ENOUGH, first.dtype),
+        )
+
+    def beyond(self, search: TaskSearch, goal: Aims) -> Float[Array, " targets"]:
+        """Nothing is known of what tasks cannot reach: 0."""
+        return jnp.zeros(goal.number.shape, search.first.dtype)
+
+    def entries(self, robot: Robot) -> np.ndarray:
+        """Entries of q that a search moves."""
+        return np.arange(robot.nq)
+
+    def answer(self, robot: Robot, search: TaskSearch, goal: Any, x: Array, seed: Array, steps: Array) -> Any:
+        """What was found for many targets, its errors computed anew, with the derivative of a solution."""
+        q = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
+        fixed, here, aim = jax.lax.stop_gradient((search, q, goal))
+        residual, at_limit, errors = jax.vmap(lambda q, goal: _evaluated(fixed, q, goal))(here, aim)
+        limit = next((limit for limit in search.limits if isinstance(limit, CollisionAvoidanceLimit)), None)
+        clearance, pair = (None, None) if limit is None else jax.vmap(lambda q: _clearance(robot, limit, q))(here)
+        return InverseKinematicsSolution(
+            q=q,
+            converged=errors.score <= 1.0,
+            position_error=errors.position,
+            orientation_error=errors.orientation,
+            seed=seed,
+            steps=steps,
+            residual=residual,
+            at_limit=at_limit,
+            beyond_reach=jnp.zeros(len(q), q.dtype),
+            clearance=clearance,
+            nearest_pair=pair,
+            joints=tuple(dof_names(robot)),
+            pairs=() if limit is None else limit.pairs,
+        )
+
+
+def read_tasks(robot: Robot, given: Mapping[str, Any]) -> dict[str, Task]:
+    """Tasks as they are searched with: gains 1, targets at rest.
+
+    Raises:
+        TypeError: something that is no task.
+        ValueError: a task for another robot, or none that has to be met.
+    """
+    check_tasks(given, robot)
+    if not any(is_goal(task) for task in given.values()):
+        raise ValueError("no task says where anything has to be: give a FrameTask, a ComTask or another on a place")
+    tasks = {}
+    for name, task in given.items():
+        still = {field: 0.0 for field in ("target_velocity",) if field in task.replaceable}
+        tasks[name] = task.replace(gain=1.0, **still) if "gain" in task.replaceable else task.replace(**still)
+    return tasks
+
+
+def read_scheme(scheme: Scheme) -> Scheme:
+    """The scheme with its curvature damping as a search takes it."""
+    if "curvature_damping" not in scheme.replaceable:
+        return scheme
+    return scheme.replace(curvature_damping=CURVATURE * scheme.curvature_damping)  # pyright: ignore
+
+
+def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ...]:
+    """The limits that speak of configurations; those on speeds do not bind a search.
+
+    Rows ask for the whole way to their bounds in a step.
+    """
+    given = (ConfigurationLimit(robot),) if limits is None else limits
+    kept = [limit for limit in given if isinstance(limit, _KEPT)]
+    return tuple(limit if "gain" not in limit.replaceable else limit.replace(gain=1.0) for limit in kept)
+
+
+def _starts(robot: Robot, lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
+    """Where searches start, of each entry of q: within the limits, or half a turn; free and ball joints stay."""
+    width = np.zeros(robot.nq)
+    for joint, at in robot.tree.qpos_address.items():
+        width[at] = {HINGE: np.pi, SLIDE: 1.0}.get(robot.tree.joint_types[joint], 0.0)
+    free = jnp.isinf(lower) | jnp.isinf(upper)
+    low = jnp.where(free, jnp.maximum(first - width, lower), lower)
+    return low.astype(first.dtype), jnp.where(free, jnp.minimum(first + width, upper), upper).astype(first.dtype)
+
+
+def _evaluated(
+    search: TaskSearch, q: Float[Array, " nq"], goal: Aims
+) -> tuple[dict[str, Array], Int[Array, " nv"], Errors]:
+    """Residual of each goal, which limits stop the robot, and the errors."""
+    rows, errors = search.errors(q, goal)
+    pulls = [jnp.matmul(own.jacobian.T, own.weight * own.pull, precision="highest") for own in rows.values()]
+    sizes = [jnp.sqrt(jnp.sum(own.weight * own.pull**2)) for own in rows.values()]
+    levers = [jnp.sqrt(jnp.matmul(own.weight, own.jacobian**2, precision="highest")) for own in rows.values()]
+    pull, most = sum(pulls), sum(size * lever for size, lever in zip(sizes, levers, strict=True))
+    box = [limit.box(search.robot, q, 1.0) for limit in search.limits if isinstance(limit, ConfigurationLimit)]
+    low = sum((lower >= -_AT).astype(jnp.int32) for lower, _ in box) > 0 if box else jnp.zeros(search.robot.nv, bool)
+    high = sum((upper <= _AT).astype(jnp.int32) for _, upper in box) > 0 if box else jnp.zeros(search.robot.nv, bool)
+    stopped = jnp.abs(pull) > _PULLS * most
+    side = (stopped & high & (pull < 0.0)).astype(jnp.int32) - (stopped & low & (pull > 0.0)).astype(jnp.int32)
+    return {name: jnp.where(own.weight > 0.0, own.pull, 0.0) for name, own in rows.items()}, side, errors
+
+
+def _clearance(robot: Robot, limit: CollisionAvoidanceLimit, q: Float[Array, " nq"]) -> tuple[Array, Array]:
+    distances = limit.distances(robot, forward_kinematics(robot, q))
+    nearest = jnp.argmin(distances)
+    return distances[nearest] - limit.minimum_distance, nearest.astype(jnp.int32)

@@ -1,0 +1,7 @@
+"""Where a frame gets to, and how it can be turned there; import it by name."""
+
+from ._grid import grid_around as grid_around
+from ._map import ReachabilityMap as ReachabilityMap
+from ._map import load_map as load_map
+from ._reachability_map import reachability_map as reachability_map
+from ._rotations import spread_rotations as spread_rotations

@@ -1,0 +1,104 @@
+"""What a frame can do, apart from any search: where random joints take it, and how far it could be drawn out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..inverse._chain import is_plain, jacobian, place
+from ..inverse._chain_problem import ChainRoute, Settings
+from ..inverse._chain_search import ChainSearch, Goal
+from ..inverse._inverse_kinematics import joint_box
+from ..limits import Limit
+from ..robot import Robot
+from ..tasks._manipulability import volume
+
+
+class Frame(NamedTuple):
+    """A frame that hinges and slides carry.
+
+    Attributes:
+        robot: the robot.
+        name: of the frame.
+        settings: limits of the joints, and where those stay that do not carry it.
+    """
+
+    robot: Robot
+    name: str
+    settings: Settings
+
+    def sampled_positions(self, count: int) -> Float[np.ndarray, "count 3"]:
+        """Where configurations that fill the joints' ranges evenly put it [m]."""
+        return np.asarray(_sampled(self.robot, self.settings, jnp.arange(count, dtype=jnp.int32), route=self._route))
+
+    def beyond_reach(self, positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """How far positions are at least from all that it could ever reach [m]; 0 where they may be within."""
+        given = jnp.asarray(positions, self.robot.q0.dtype)
+        return np.asarray(_beyond(self.robot, self.settings, given, route=self._route))
+
+    def manipulability(self, q: Float[Array, "n nq"]) -> Float[np.ndarray, " n"]:
+        """Yoshikawa's index of configurations, of the motions that as many joints can make."""
+        return np.asarray(_manipulability(self.robot, self.settings, q, route=self._route))
+
+    def links(self) -> Float[np.ndarray, "k 3"]:
+        """Points on the joints that carry it, at home, and the frame's own [m]."""
+        return np.asarray(_links(self.robot, self.settings, route=self._route))
+
+    @property
+    def _route(self) -> ChainRoute:
+        return ChainRoute((self.name,), ((True,) * 6,))
+
+
+def read_frame(robot: Robot, name: str, limits: Sequence[Limit] | None, key: int) -> Frame:
+    """A robot's frame, checked.
+
+    Raises:
+        KeyError: no such frame; the message lists those that exist.
+        ValueError: no joint carries it, or one that moves freely.
+    """
+    robot.tree.frame(name)
+    if not is_plain(robot.tree, (name,)):
+        raise ValueError(
+            f"{name!r} is not carried by hinges and slides alone: what moves freely gets everywhere, and what no joint "
+            "moves gets nowhere. Of a robot with a free base, load it bolted down (floating_base=False, --base fixed)"
+        )
+    lower, upper = joint_box(robot, None if limits is None else tuple(limits))
+    return Frame(robot, name, Settings(robot.q0, lower, upper, key, jnp.ones(2, robot.q0.dtype), 1))
+
+
+def _search(robot: Robot, settings: Settings, route: ChainRoute) -> ChainSearch:
+    return route.search(robot, settings, warm=False, near=False)
+
+
+@partial(jax.jit, static_argnames="route")
+def _sampled(robot: Robot, settings: Settings, number: Array, *, route: ChainRoute) -> Array:
+    search = _search(robot, settings, route)
+    return place(search.chain, search.begin(number, None).T).position[0].T  # pyright: ignore[reportArgumentType]
+
+
+@partial(jax.jit, static_argnames="route")
+def _beyond(robot: Robot, settings: Settings, positions: Array, *, route: ChainRoute) -> Array:
+    turns: Any = jnp.broadcast_to(jnp.eye(3, dtype=positions.dtype), (len(positions), 1, 3, 3))
+    return route.beyond(_search(robot, settings, route), Goal(positions[:, None], turns))
+
+
+@partial(jax.jit, static_argnames="route")
+def _manipulability(robot: Robot, settings: Settings, q: Array, *, route: ChainRoute) -> Array:
+    """Of sqrt(det(J J')) and sqrt(det(J' J)), the one that is not 0 for the number of joints alone."""
+    chain = _search(robot, settings, route).chain
+    matrix = jnp.moveaxis(jacobian(chain, place(chain, q.T[np.array(chain.layout.dofs, int)]))[0], -1, 0)
+    rows = matrix if matrix.shape[1] <= matrix.shape[2] else jnp.swapaxes(matrix, 1, 2)
+    return jax.vmap(partial(volume, log=False))(rows)
+
+
+@partial(jax.jit, static_argnames="route")
+def _links(robot: Robot, settings: Settings, *, route: ChainRoute) -> Array:
+    search = _search(robot, settings, route)
+    placed = place(search.chain, search.first[:, None])
+    return jnp.concatenate([placed.anchor[..., 0], placed.position[..., 0]])

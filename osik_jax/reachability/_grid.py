@@ -1,0 +1,93 @@
+"""Positions to ask for: a grid over all that a frame gets to."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from .._numbers import check_count
+from ..robot import Robot
+from ._frame import Frame, read_frame
+
+Grid = tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " ny"], Float[np.ndarray, " nz"]]
+"""Coordinates of the positions along x, y and z, world axes, increasing [m]."""
+
+_SAMPLES = 4096
+_MARGIN = 0.05
+"""Of the longest side: how far the grid goes past the samples, of which none is quite at the edge."""
+_FLAT = 1e-6
+"""Share of the longest side below which a side is a rounding."""
+
+
+def grid_around(robot: Robot, frame: str, positions: int = 20_000) -> Grid:
+    """A grid with the same spacing along x, y and z, over the box of all that a frame gets to.
+
+    The box is that of 4,096 configurations which fill the joints' ranges evenly, and a margin. A side along which the
+    frame never moves, as a planar arm's, is a single coordinate.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom.
+        positions: their number at most; it is nearly reached.
+
+    Returns:
+        Coordinates along x, y and z, world axes [m].
+
+    Raises:
+        KeyError: no such frame.
+        ValueError: no positive number, or a frame that is not carried by hinges and slides alone.
+    """
+    return around(read_frame(robot, frame, None, 0), positions)
+
+
+def around(frame: Frame, positions: int) -> Grid:
+    """As ``grid_around``."""
+    check_count("positions", positions)
+    places = frame.sampled_positions(_SAMPLES)
+    low, high = places.min(0), places.max(0)
+    longest = float((high - low).max())
+    margin = np.where(high - low > _FLAT * longest, _MARGIN * longest, 0.0)
+    middle, sides = 0.5 * (low + high), np.where(margin > 0.0, high - low + 2.0 * margin, 0.0)
+    spacing = _spacing(sides, positions)
+    return tuple(_along(at, side, spacing) for at, side in zip(middle, sides, strict=True))  # pyright: ignore
+
+
+def _spacing(sides: Float[np.ndarray, "3"], positions: int) -> float:
+    """The smallest that makes no more than so many positions, by bisection."""
+    enough, few = 2.0 * float(sides.max()) + 1e-9, 0.0
+    for _ in range(60):
+        spacing = 0.5 * (enough + few)
+        if np.prod([_number(side, spacing) for side in sides]) <= positions:
+            enough = spacing
+        else:
+            few = spacing
+    return enough
+
+
+def _number(side: float, spacing: float) -> float:
+    return np.floor(side / spacing) + 1.0
+
+
+def _along(middle: float, side: float, spacing: float) -> Float[np.ndarray, " n"]:
+    number = int(_number(side, spacing))
+    return middle + spacing * (np.arange(number) - 0.5 * (number - 1))
+
+
+def checked_grid(grid: object) -> Grid:
+    """A grid that a user gives.
+
+    Raises:
+        TypeError: no three sequences of numbers.
+        ValueError: coordinates that are not finite, not increasing, or none.
+    """
+    expected = "it is (x, y, z): the coordinates along each axis, increasing [m]"
+    if not isinstance(grid, tuple | list) or len(grid) != 3:
+        raise TypeError(f"grid is {grid!r}; {expected}")
+    try:
+        axes = tuple(np.asarray(axis, float) for axis in grid)
+    except (TypeError, ValueError):
+        raise TypeError(f"grid is {grid!r}; {expected}") from None
+    for name, axis in zip("xyz", axes, strict=True):
+        if axis.ndim != 1 or not axis.size or not np.isfinite(axis).all() or not (np.diff(axis) > 0.0).all():
+            raise ValueError(f"{name} of the grid is {axis}; {expected}")
+    return axes  # pyright: ignore[reportReturnType]

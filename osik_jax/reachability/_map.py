@@ -1,0 +1,106 @@
+"""What a frame gets to, position by position."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..scaling._chunk_file import whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ReachabilityMap:
+    """Which orientations a frame can take at each position of a grid; NumPy arrays.
+
+    Attributes:
+        frame: its name.
+        x: coordinates of the positions along x, world axes [m]. (nx,)
+        y: along y [m]. (ny,)
+        z: along z [m]. (nz,)
+        rotations: orientations that were asked for, frame axes to world axes. (m, 3, 3)
+        reached: whether a configuration was found for each pose. (nx, ny, nz, m)
+        beyond_reach: how far the position is at least from all that the frame could ever reach, from the lengths of
+            the links alone [m]: more than 0 proves that nothing is reached there. (nx, ny, nz)
+        manipulability: the largest index of Yoshikawa's among the configurations found at the position, of the six rows
+            of the frame's Jacobian, or of its columns where there are fewer than six; NaN where none is found.
+            (nx, ny, nz)
+        q: the configuration that has it; NaN where there is none. (nx, ny, nz, nq)
+        links: points on the joints that carry the frame, and the frame's own, at the home configuration [m]. (k, 3)
+    """
+
+    frame: str
+    x: Float[np.ndarray, " nx"]
+    y: Float[np.ndarray, " ny"]
+    z: Float[np.ndarray, " nz"]
+    rotations: Float[np.ndarray, "m 3 3"]
+    reached: Bool[np.ndarray, "nx ny nz m"]
+    beyond_reach: Float[np.ndarray, "nx ny nz"]
+    manipulability: Float[np.ndarray, "nx ny nz"]
+    q: Float[np.ndarray, "nx ny nz nq"]
+    links: Float[np.ndarray, "k 3"]
+
+    @property
+    def share(self) -> Float[np.ndarray, "nx ny nz"]:
+        """Share of the orientations that are reached at each position."""
+        return self.reached.mean(-1)
+
+    @property
+    def positions(self) -> Float[np.ndarray, "nx ny nz 3"]:
+        """The positions [m]."""
+        return np.stack(np.meshgrid(self.x, self.y, self.z, indexing="ij"), -1)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes a ``.npz`` with an array for each attribute, under its name only when complete.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        arrays = {field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        with whole_file(Path(path)) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, format=np.array(_FORMAT), **arrays)
+
+    def figure(self, at: tuple[float, float, float] | None = None) -> Figure:
+        """Slices across x, y and z, coloured by the share of orientations, with the robot at home; for matplotlib.
+
+        Args:
+            at: a point that the slices go through; each is the grid's nearest [m]. Default: of each axis, where most
+                is reached.
+
+        Returns:
+            A figure, which ``savefig`` writes to a file.
+
+        Raises:
+            ValueError: ``at`` is no point.
+        """
+        from ._picture import draw_slices
+
+        return draw_slices(self, at)
+
+
+def load_map(path: str | os.PathLike[str]) -> ReachabilityMap:
+    """The map that ``save``, or ``osik reach``, has written.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no map, or one of another version.
+    """
+    names = [field.name for field in dataclasses.fields(ReachabilityMap)]
+    with np.load(path, allow_pickle=False) as file:
+        missing = [name for name in ("format", *names) if name not in getattr(file, "files", ())]
+        if missing:
+            raise ValueError(f"{os.fspath(path)} is no reachability map: it has no {missing[0]}")
+        if int(file["format"]) != _FORMAT:
+            raise ValueError(f"{os.fspath(path)} has format {file['format']}; this version reads {_FORMAT}")
+        arrays: dict[str, Any] = {name: file[name] for name in names}
+    arrays["frame"] = str(arrays["frame"])
+    return ReachabilityMap(**arrays)

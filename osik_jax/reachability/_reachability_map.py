@@ -1,0 +1,166 @@
+"""From a robot and a frame to a map of what the frame gets to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._checks import check_setting, checked_limits
+from .._numbers import check_count
+from ..inverse import inverse_kinematics
+from ..inverse._inverse_kinematics import checked_tolerance
+from ..inverse._poses import read_poses
+from ..limits import Limit
+from ..robot import Robot
+from ..scaling import run_in_chunks
+from ..scaling._progress import Progress
+from ._frame import Frame, read_frame
+from ._grid import Grid, around, checked_grid
+from ._map import ReachabilityMap
+from ._rotations import spread_rotations
+
+_POSES = 16_384
+"""Poses in a chunk: some seconds of work, and enough to fill the cores."""
+
+
+def reachability_map(
+    robot: Robot,
+    frame: str,
+    *,
+    grid: Grid | int = 20_000,
+    orientations: int | ArrayLike | Array = 64,
+    limits: Sequence[Limit] | None = None,
+    seeds: int = 64,
+    key: int = 0,
+    position_tolerance: float = 1e-3,
+    orientation_tolerance: float = 1e-2,
+    out: str | os.PathLike[str] | None = None,
+    progress: Progress = True,
+) -> ReachabilityMap:
+    """At each position of a grid, the share of orientations that a frame reaches, and its best manipulability.
+
+    Each pose is searched for as in ``inverse_kinematics``, joints within their limits; positions that are proven to be
+    beyond the links' lengths are not. So what is reached is certain, and what is not was not found by ``seeds``
+    searches. The answer is the same each time, for the same arguments.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom that hinges and slides carry.
+        grid: coordinates of the positions along x, y and z, world axes, increasing [m]; or about how many positions to
+            put around all that the frame gets to (``grid_around``).
+        orientations: how many, spread evenly (``spread_rotations``); or which: matrices (m, 3, 3), frame axes to world
+            axes, or quaternions w x y z (m, 4).
+        limits: as in ``inverse_kinematics``; with a ``CollisionAvoidanceLimit`` a pose is reached where the robot keeps
+            clear, and takes much longer.
+        seeds: searches for a pose, at most.
+        key: an integer: other starts of the searches.
+        position_tolerance: largest distance from a position [m].
+        orientation_tolerance: largest angle to an orientation [rad].
+        out: folder for what is finished, as in ``run_in_chunks``: called again with the same arguments, a job that was
+            killed goes on where it was. Default: none.
+        progress: whether to show a bar; or a function of the number of positions that are done and of all.
+
+    Raises:
+        KeyError: no such frame; the message lists those that exist.
+        TypeError: no robot, grid, orientations or limits.
+        ValueError: a frame that is not carried by hinges and slides alone, a grid that does not increase, rotations
+            that are none, or numbers out of range; a folder with another map in it.
+        OSError: the folder cannot be written to.
+    """
+    check_setting("reachability_map(robot, frame)", robot, None, 1.0)
+    check_count("seeds", seeds)
+    check_count("key", key, least=0)
+    for tolerance in (position_tolerance, orientation_tolerance):
+        checked_tolerance(tolerance, robot.q0.dtype)
+    limits = checked_limits(robot, limits)
+    own = read_frame(robot, frame, limits, key)
+    axes = around(own, grid) if isinstance(grid, int | np.integer) else checked_grid(grid)
+    rotations = _rotations(robot, frame, orientations)
+    positions = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    beyond = own.beyond_reach(positions)
+    near = np.flatnonzero(beyond <= 0.0)
+    tolerances = dict(position_tolerance=position_tolerance, orientation_tolerance=orientation_tolerance)
+    settings = dict(limits=limits, seeds=seeds, key=key, **tolerances)
+    found = _run(own, positions[near], rotations, settings, out, progress)
+    shape = tuple(len(axis) for axis in axes)
+
+    def spread(values: np.ndarray, elsewhere: Any) -> np.ndarray:
+        whole = np.full((len(positions), *values.shape[1:]), elsewhere, values.dtype)
+        whole[near] = values
+        return whole.reshape(*shape, *values.shape[1:])
+
+    return ReachabilityMap(
+        frame=frame,
+        **dict(zip("xyz", axes, strict=True)),
+        rotations=rotations,
+        reached=spread(found["reached"], False),
+        beyond_reach=beyond.reshape(shape),
+        manipulability=spread(found["manipulability"], np.nan),
+        q=spread(found["q"], np.nan),
+        links=own.links(),
+    )
+
+
+def _rotations(robot: Robot, frame: str, given: int | ArrayLike | Array) -> Float[np.ndarray, "m 3 3"]:
+    if isinstance(given, int | np.integer):
+        check_count("orientations", given)
+        return spread_rotations(int(given)).astype(robot.q0.dtype)
+    shape = np.shape(given)
+    if shape[1:] not in ((3, 3), (4,)) or not shape[0]:
+        raise ValueError(f"orientations have shape {shape}; they are matrices (m, 3, 3), or quaternions w x y z (m, 4)")
+    goal, _, _ = read_poses(robot, {frame: (np.zeros((shape[0], 3)), given)})
+    return np.asarray(goal.rotation[:, 0])
+
+
+def _run(
+    frame: Frame,
+    positions: Float[np.ndarray, "n 3"],
+    rotations: Float[np.ndarray, "m 3 3"],
+    settings: dict[str, Any],
+    out: Any,
+    progress: Progress,
+) -> dict[str, np.ndarray]:
+    """What is reached at the positions, in chunks."""
+    count, dtype = len(rotations), frame.robot.q0.dtype
+    like = {"reached": (np.bool_, (count,)), "manipulability": (dtype, ()), "q": (dtype, (frame.robot.nq,))}
+    if not len(positions):
+        return {name: np.zeros((0, *shape), kind) for name, (kind, shape) in like.items()}
+
+    def run(positions: Any, robot: Robot, rotations: Any, settings: dict[str, Any]) -> dict[str, Any]:
+        if isinstance(positions, Tracer):  # only the shapes are asked for
+            return {name: jnp.zeros((len(positions), *shape), kind) for name, (kind, shape) in like.items()}
+        return _reached(frame, positions, rotations, settings)
+
+    found = run_in_chunks(
+        run,
+        positions,
+        chunk=max(min(_POSES // count, len(positions)), 1),
+        shared=(frame.robot, rotations, settings),
+        out=out,
+        label=f"reachability of {frame.name}",
+        progress=progress,
+    )
+    return found if out is None else found[:]
+
+
+def _reached(frame: Frame, positions: np.ndarray, rotations: np.ndarray, settings: dict[str, Any]) -> dict[str, Any]:
+    """Which orientations are reached at each position; of their configurations, the most manipulable one."""
+    count, number = len(positions), len(rotations)
+    poses = np.repeat(positions, number, 0), np.tile(rotations, (count, 1, 1))
+    found = inverse_kinematics(frame.robot, {frame.name: poses}, restarts=0, **settings)
+    reached = np.asarray(found.converged).reshape(count, number)
+    index = np.where(reached, frame.manipulability(found.q).reshape(count, number), -1.0)
+    best, some = index.argmax(1), np.any(reached, 1)
+    q = np.asarray(found.q).reshape(count, number, -1)[np.arange(count), best]
+    return {
+        "reached": reached,
+        "manipulability": np.where(some, index.max(1), np.nan).astype(frame.robot.q0.dtype),
+        "q": np.where(some[:, None], q, np.nan),
+    }

@@ -1,0 +1,22 @@
+"""From a person to a robot: motion retargeting."""
+
+from ._bvh import read_bvh as read_bvh
+from ._goals import Weights as Weights
+from ._guess import guess_profile as guess_profile
+from ._keypoints import read_keypoints as read_keypoints
+from ._load import load_motion as load_motion
+from ._motion import HumanMotion as HumanMotion
+from ._profile import Capsule as Capsule
+from ._profile import Foot as Foot
+from ._profile import Profile as Profile
+from ._profile_file import find_profile as find_profile
+from ._profile_file import load_profile as load_profile
+from ._profile_file import save_profile as save_profile
+from ._report import report as report
+from ._retarget import Retargeted as Retargeted
+from ._retarget import Retargeter as Retargeter
+from ._retarget import retarget as retarget
+from ._robot_motion import RobotMotion as RobotMotion
+from ._robot_motion import load_robot_motion as load_robot_motion
+from ._robot_motion import write_csv as write_csv
+from ._skeletons import find_roles as find_roles

@@ -1,0 +1,245 @@
+"""BVH files: a tree of joints with offsets and channels, then one row of numbers for each frame.
+
+The format is a description of its own, not a standard: no unit, no up axis. Both are told by the caller or found from
+the skeleton's rest pose.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from ._motion import HumanMotion
+from ._rotations import about, continuous, multiply, rotate
+
+Up = Literal["x", "y", "z"]
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "cmu": 0.0254 / 0.45}
+"""Metres a unit. ``cmu``: that of the CMU database's skeletons."""
+_HEIGHTS = (1.0, 2.3)
+_TO_Z_UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
+_CHANNELS = {f"{axis}{kind}": (kind, axis.lower()) for axis in "XYZ" for kind in ("position", "rotation")}
+
+
+@dataclasses.dataclass
+class _Joint:
+    """One joint of the tree, with the numbers of the file's axes and unit."""
+
+    name: str
+    parent: int
+    offset: np.ndarray
+    channels: tuple[tuple[str, str], ...] = ()
+
+
+class _Lines:
+    """The file's words line by line, and errors that say where they are."""
+
+    def __init__(self, path: str, text: str):
+        self.path = path
+        self._lines = [(number, words) for number, line in enumerate(text.splitlines(), 1) if (words := line.split())]
+        self._at = 0
+
+    def next(self, expected: str) -> list[str]:
+        if self._at == len(self._lines):
+            raise ValueError(f"{self.path} ends where {expected} should come")
+        self._at += 1
+        return self._lines[self._at - 1][1]
+
+    def error(self, what: str) -> ValueError:
+        """The error of the line that was read last."""
+        number, words = self._lines[max(self._at - 1, 0)] if self._lines else (1, [])
+        return ValueError(f"{self.path}, line {number}: {what}; the line is {' '.join(words)[:60]!r}")
+
+    def rest(self) -> Iterator[list[str]]:
+        while self._at < len(self._lines):
+            yield self.next("a frame")
+
+    def numbers(self, words: list[str], count: int, what: str) -> list[float]:
+        """Words of the last line as this many finite numbers."""
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            raise self.error(f"{what} is not numbers") from None
+        if len(values) != count:
+            raise self.error(f"{what} has {len(values)} numbers where there should be {count}")
+        if not np.isfinite(values).all():
+            raise self.error(f"{what} is not finite")
+        return values
+
+
+def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None) -> HumanMotion:
+    """Reads a BVH file.
+
+    A joint's rotation is the product of its channels in the order in which the file lists them. The ends of chains
+    (``End Site``) become joints called ``PARENT_end``. ``rest_positions`` is the pose with all rotations 0, its root at
+    the origin. Facing z with y up becomes facing x with z up.
+
+    Args:
+        path: the file.
+        unit: metres a unit, or ``"m"``, ``"cm"``, ``"mm"``, ``"inch"``, ``"cmu"``. None: the one of these in which
+            the rest pose is between 1 and 2.3 m large.
+        up: the file's axis that points up. None: the one along which the head is above the hips in the rest pose; y
+            where no joint is called head.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: the file is broken; the message says which line and what is wrong. Or the unit cannot be told.
+        KeyError: no such unit.
+    """
+    source = str(path)
+    lines = _Lines(source, Path(path).read_text(encoding="utf-8", errors="replace"))
+    joints = _hierarchy(lines)
+    fps, values = _frames(lines, sum(len(joint.channels) for joint in joints))
+    rest = _rest(joints)
+    scale = _scale(source, unit, float(np.ptp(rest, axis=0).max()))
+    order = list(_TO_Z_UP[_up(joints, rest) if up is None else up])
+    positions, rotations = _forward(joints, values)
+    rotations = np.concatenate([rotations[..., :1], rotations[..., 1:][..., order]], -1)
+    return HumanMotion(
+        name=Path(path).stem,
+        fps=fps,
+        joint_names=tuple(joint.name for joint in joints),
+        positions=scale * positions[..., order],
+        rotations=continuous(rotations),
+        rest_positions=scale * rest[:, order],
+    )
+
+
+def _hierarchy(lines: _Lines) -> list[_Joint]:
+    if lines.next("HIERARCHY")[0].upper() != "HIERARCHY":
+        raise lines.error("a BVH file starts with HIERARCHY")
+    joints: list[_Joint] = []
+    open_joints: list[int] = []
+    while True:
+        words = lines.next("JOINT, End Site, } or MOTION")
+        word = words[0].upper()
+        if word in ("ROOT", "JOINT") or (word, *map(str.upper, words[1:2])) == ("END", "SITE"):
+            _check_place(lines, word, bool(joints), bool(open_joints))
+            open_joints.append(_joint(lines, words, joints, open_joints[-1] if open_joints else -1))
+        elif word == "OFFSET" and open_joints:
+            joints[open_joints[-1]].offset = np.array(lines.numbers(words[1:], 3, "OFFSET"))
+        elif word == "CHANNELS" and open_joints:
+            joints[open_joints[-1]].channels = _channels(lines, words)
+        elif word == "}" and open_joints:
+            if np.isnan(joints[open_joints[-1]].offset).any():
+                raise lines.error(f"{joints[open_joints[-1]].name} has no OFFSET")
+            open_joints.pop()
+        elif word == "MOTION" and joints and not open_joints:
+            return joints
+        else:
+            raise lines.error(f"{words[0]} is not expected here")
+
+
+def _check_place(lines: _Lines, word: str, started: bool, inside: bool) -> None:
+    """Whether a joint may start here: one ROOT first, all others inside it."""
+    if (word == "ROOT") == started or (word == "ROOT") == inside:
+        raise lines.error("a skeleton is one ROOT, and every JOINT and End Site is inside it")
+
+
+def _joint(lines: _Lines, words: list[str], joints: list[_Joint], parent: int) -> int:
+    """Adds a joint whose first line was read, up to its opening brace; its place."""
+    if words[0].upper() == "END":
+        name = f"{joints[parent].name}_end"
+        name = name if all(joint.name != name for joint in joints) else f"{name}_{len(joints)}"
+    else:
+        name = " ".join(words[1:]).removesuffix("{").strip()
+    if not name:
+        raise lines.error(f"{words[0]} has no name")
+    if any(joint.name == name for joint in joints):
+        raise lines.error(f"a second joint is called {name}")
+    if words[-1] != "{" and lines.next("{") != ["{"]:
+        raise lines.error(f"{{ should follow {name}")
+    joints.append(_Joint(name, parent, np.full(3, np.nan)))
+    return len(joints) - 1
+
+
+def _channels(lines: _Lines, words: list[str]) -> tuple[tuple[str, str], ...]:
+    if len(words) < 2 or not words[1].isdigit() or int(words[1]) != len(words) - 2:
+        raise lines.error("CHANNELS is followed by how many there are, and by their names")
+    known = {name.lower(): value for name, value in _CHANNELS.items()}
+    for name in words[2:]:
+        if name.lower() not in known:
+            raise lines.error(f"no channel {name}; there are {', '.join(_CHANNELS)}")
+    if len({name.lower() for name in words[2:]}) != len(words) - 2:
+        raise lines.error("a channel is named twice")
+    return tuple(known[name.lower()] for name in words[2:])
+
+
+def _frames(lines: _Lines, channels: int) -> tuple[float, Float[np.ndarray, "F C"]]:
+    words = lines.next("Frames:")
+    if words[0].lower() not in ("frames:", "frames") or not words[-1].isdigit():
+        raise lines.error("Frames: and their number should follow MOTION")
+    count = int(words[-1])
+    words = lines.next("Frame Time:")
+    if [word.lower().rstrip(":") for word in words[:2]] != ["frame", "time"]:
+        raise lines.error("Frame Time: and seconds should follow Frames:")
+    step = lines.numbers(words[2:], 1, "Frame Time")[0]
+    if not step > 0.0:
+        raise lines.error("the frame time has to be more than 0 s")
+    rows = [lines.numbers(words, channels, "a frame") for words in lines.rest()]
+    if len(rows) != count or not rows:
+        raise lines.error(f"the file says Frames: {count}, and has {len(rows)}")
+    fps = 1.0 / step
+    return (float(round(fps)) if abs(fps - round(fps)) < 1e-2 else fps), np.array(rows)
+
+
+def _rest(joints: list[_Joint]) -> Float[np.ndarray, "J 3"]:
+    rest = np.zeros((len(joints), 3))
+    for i, joint in enumerate(joints):
+        if joint.parent >= 0:
+            rest[i] = rest[joint.parent] + joint.offset
+    return rest
+
+
+def _forward(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and rotations of all joints in the file's axes and unit."""
+    frames, column = len(values), 0
+    positions, rotations = np.zeros((frames, len(joints), 3)), np.zeros((frames, len(joints), 4))
+    for i, joint in enumerate(joints):
+        offset, turn = np.tile(joint.offset, (frames, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (frames, 1))
+        if any(kind == "position" for kind, _ in joint.channels):
+            offset = np.where([("position", axis) in joint.channels for axis in "xyz"], 0.0, offset)
+        for kind, axis in joint.channels:
+            if kind == "position":
+                offset[:, "xyz".index(axis)] += values[:, column]
+            else:
+                turn = multiply(turn, about(axis, np.radians(values[:, column])))
+            column += 1
+        if joint.parent < 0:
+            positions[:, i], rotations[:, i] = offset, turn
+            continue
+        parent = rotations[:, joint.parent]
+        positions[:, i] = positions[:, joint.parent] + rotate(parent, offset)
+        rotations[:, i] = multiply(parent, turn)
+    return positions, rotations
+
+
+def _up(joints: list[_Joint], rest: np.ndarray) -> Up:
+    """The axis along which the head is above the root in the rest pose."""
+    heads = [i for i, joint in enumerate(joints) if "head" in joint.name.lower()]
+    axes: tuple[Up, Up, Up] = ("x", "y", "z")
+    return axes[int(np.argmax(rest[heads[-1]]))] if heads else "y"
+
+
+def _scale(path: str, unit: str | float | None, size: float) -> float:
+    """Metres a unit."""
+    if isinstance(unit, str):
+        if unit not in UNITS:
+            raise KeyError(f"no unit {unit!r}; units: {', '.join(UNITS)}, or metres a unit as a number")
+        return UNITS[unit]
+    if unit is not None:
+        if not (np.isfinite(unit) and unit > 0.0):
+            raise ValueError(f"unit is {unit}; it is metres a unit, more than 0")
+        return float(unit)
+    for factor in UNITS.values():
+        if _HEIGHTS[0] <= factor * size <= _HEIGHTS[1]:
+            return factor
+    raise ValueError(
+        f"{path}: the rest pose is {size:.4g} units large, which is no person's size in any of {', '.join(UNITS)}: say "
+        "what a unit is with unit=METRES"
+    )

@@ -1,0 +1,68 @@
+"""The last pass: a plan followed from frame to frame inside limits that hold exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._joint_selection import scalar_layout
+from ..control import remembering
+from ..kinematics import difference, integrate
+from ..limits import AccelerationLimit, Limit, limit_box
+from ..limits._acceleration import stopping_speed
+from ..robot import Robot
+
+_SPARE = 0.1
+"""Share of the acceleration with which the motion comes back to the plan."""
+
+
+@jax.jit
+def follow(
+    robot: Robot, plan: Float[Array, "F nq"], limits: Sequence[Limit], dt: Float[Array, ""] | float
+) -> tuple[Float[Array, "F nq"], Float[Array, " F"]]:
+    """Goes with a plan as far as the limits allow, and comes back to it without overshooting where they held it.
+
+    A frame's velocity is the plan's, and the fastest towards the plan that a share of the acceleration can still stop
+    at it. The motion begins inside the joints' ranges, at the speed of the plan's first step.
+
+    Returns:
+        the configurations, and how far the farthest joint of each is from the plan's [rad or m]. (F, nq), (F,)
+    """
+    dt = jnp.asarray(dt, plan.dtype)
+    spare = _SPARE * _accelerations(robot, limits)
+
+    def step(state: tuple[Array, Array], goals: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        (q, velocity), (goal, following) = state, goals
+        lower, upper = limit_box(robot, q, remembering(tuple(limits), velocity, True), dt)
+        behind = difference(robot, q, goal)
+        back = jnp.sign(behind) * stopping_speed(jnp.abs(behind), spare, dt)
+        v = jnp.clip(difference(robot, goal, following) / dt + back, lower, upper)
+        q = integrate(robot, q, v, dt)
+        return (q, v), (q, jnp.abs(difference(robot, q, following)).max())
+
+    start = _inside(robot, plan[0])
+    others = [part for limit in limits for part in limit.parts() if part.kind != "acceleration"]
+    velocity = difference(robot, start, plan[jnp.minimum(1, len(plan) - 1)]) / dt
+    velocity = jnp.clip(velocity, *limit_box(robot, start, others, dt))
+    _, (q, off) = jax.lax.scan(step, (start, velocity), (plan[:-1], plan[1:]))
+    first = jnp.abs(difference(robot, start, plan[0])).max()
+    return jnp.concatenate([start[None], q]), jnp.concatenate([first[None], off])
+
+
+def _accelerations(robot: Robot, limits: Sequence[Limit]) -> Float[Array, " nv"]:
+    """The least of what the limits allow of each dof's acceleration; infinite where none does."""
+    most = jnp.full(robot.nv, jnp.inf, robot.q0.dtype)
+    for limit in limits:
+        if isinstance(limit, AccelerationLimit):
+            most = jnp.minimum(most, limit.acceleration)
+    return most
+
+
+def _inside(robot: Robot, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
+    """A configuration with its joints inside their ranges."""
+    scalar, index = scalar_layout(robot)
+    at = index[scalar]
+    return q.at[at].set(jnp.clip(q[at], robot.position_lower[scalar], robot.position_upper[scalar]))

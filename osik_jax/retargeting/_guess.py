@@ -1,0 +1,198 @@
+"""A robot's profile out of its tree: legs and arms, and where they bend."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from .._feet import find_feet
+from .._home import home_kinematics
+from ..kinematics import Kinematics
+from ..physics._world import contact_corners, sole_points
+from ..robot import Robot
+from ._person import SIDES
+from ._profile import Capsule, Foot, Place, Point, Profile
+
+_FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
+_LEG_RADIUS, _ARM_RADIUS, _TRUNK_RADIUS = 0.18, 0.18, 0.3
+_HAND = 0.6
+_SAME = 1e-6
+_ORIGIN: Point = (0.0, 0.0, 0.0)
+
+
+class _Chain(NamedTuple):
+    """Bodies from the trunk to the end of a limb, and where the joint of each is at home [m]."""
+
+    bodies: tuple[int, ...]
+    anchors: np.ndarray
+
+
+def guess_profile(robot: Robot) -> Profile:
+    """The profile of a robot with two legs and two arms, as its tree and its home configuration show it.
+
+    Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as what reaches furthest to the sides. A knee
+    or an elbow is the joint that is far from both ends of its limb. Soles are the feet's corner frames
+    (``NAME_corner_0`` and so on), or their boxes or balls; a foot without is given a length that goes with its leg.
+    Look at it, and save it with ``save_profile`` to change it.
+
+    Raises:
+        ValueError: the base does not float, or two legs and two arms are not found.
+    """
+    if not robot.floating_base:
+        raise ValueError("a robot that is bolted down cannot walk as a person does: load it with floating_base=True")
+    kinematics, tree = home_kinematics(robot), robot.tree
+    feet = find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
+    if len(feet) != 2:
+        raise ValueError(f"two feet are needed, and {len(feet)} frames look like some: {', '.join(feet) or 'none'}")
+    feet = sorted(feet, key=lambda name: -_y(kinematics.frame_pose(robot, name)[0]))
+    legs = _chains(robot, kinematics, [tree.frame_bodies[tree.frame(name)] for name in feet])
+    used = {body for leg in legs for body in leg.bodies}
+    arms = _chains(robot, kinematics, _hands(robot, kinematics, used))
+    keypoints: dict[str, Place] = {}
+    for side, leg, arm in zip(SIDES, legs, arms, strict=True):
+        knee, elbow = _bend(leg.anchors, 0), _bend(arm.anchors, 1)
+        hip, shoulder = max(knee - 2, 0), min(1, elbow - 1)
+        wrist = _last_apart(arm.anchors, elbow)
+        places = dict(hip=leg.bodies[hip], knee=leg.bodies[knee], ankle=leg.bodies[_after(leg.anchors, knee)])
+        places |= dict(shoulder=arm.bodies[shoulder], elbow=arm.bodies[elbow], wrist=arm.bodies[wrist])
+        keypoints |= {f"{side}_{role}": (tree.body_names[body], _ORIGIN) for role, body in places.items()}
+    trunk = tree.body_parents[arms[0].bodies[0]]
+    root = tree.root
+    found = Profile(
+        keypoints=dict(sorted(keypoints.items())),
+        pelvis=tree.body_names[root],
+        torso=None if trunk == root else tree.body_names[trunk],
+        feet={side: _foot(robot, kinematics, name, leg) for side, name, leg in zip(SIDES, feet, legs, strict=True)},
+    )
+    return Profile(found.keypoints, found.pelvis, found.torso, found.feet, _capsules(robot, kinematics, found))
+
+
+def _y(position) -> float:
+    return float(position[1])
+
+
+def _chains(robot: Robot, kinematics: Kinematics, ends: list[int]) -> list[_Chain]:
+    left, right = ends
+    return [_chain(robot, kinematics, left, right), _chain(robot, kinematics, right, left)]
+
+
+def _chain(robot: Robot, kinematics: Kinematics, end: int, other: int) -> _Chain:
+    """From the first body that the other side's limb does not hang from to the end."""
+    above = robot.tree.descendants[:, end] & ~robot.tree.descendants[:, other]
+    bodies = tuple(int(b) for b in np.flatnonzero(above) if b != robot.tree.root)
+    if len(bodies) < 3:
+        raise ValueError(f"the limb that ends in {robot.tree.body_names[end]} has {len(bodies)} joints; it needs three")
+    return _Chain(bodies, np.asarray(kinematics.body_position)[list(bodies)])
+
+
+def _hands(robot: Robot, kinematics: Kinematics, used: set[int]) -> list[int]:
+    """The outermost bodies that reach furthest to the left and to the right, legs left out; fingers shortened."""
+    tree, position = robot.tree, np.asarray(kinematics.body_position)
+    outermost = sorted(set(range(2, len(tree.body_parents))) - set(tree.body_parents) - used)
+    named = [b for b in outermost if re.search(r"head|neck|camera", tree.body_names[b], re.IGNORECASE) is None]
+    if len(named) < 2:
+        raise ValueError(f"two arms are needed; bodies at ends of limbs: {[tree.body_names[b] for b in named]}")
+    left, right = max(named, key=lambda b: position[b, 1]), min(named, key=lambda b: position[b, 1])
+    if not position[left, 1] > 0.0 > position[right, 1]:
+        raise ValueError("no arm is on the left or on the right of the base; x has to be forward and y left at home")
+    return [left, right]
+
+
+def _bend(anchors: np.ndarray, first: int) -> int:
+    """The joint of a limb that is far from both its ends: the knee or the elbow."""
+    first = min(first, len(anchors) - 1)
+    near = [min(np.linalg.norm(a - anchors[first]), np.linalg.norm(a - anchors[-1])) for a in anchors]
+    best = max(near[1:-1], default=0.0)
+    if best < _SAME:
+        raise ValueError("a limb has no joint between its ends; it cannot bend as a person's does")
+    return next(i for i, value in enumerate(near) if value > 0.999 * best and 0 < i < len(near) - 1)
+
+
+def _after(anchors: np.ndarray, bend: int) -> int:
+    """The first joint behind a bend that is elsewhere."""
+    apart = np.linalg.norm(anchors - anchors[bend], axis=-1) > _SAME
+    return next(i for i in range(bend + 1, len(anchors)) if apart[i])
+
+
+def _last_apart(anchors: np.ndarray, bend: int) -> int:
+    """The joint of a wrist: the last of its limb."""
+    return max(_after(anchors, bend), len(anchors) - 1)
+
+
+def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: _Chain) -> Foot:
+    """The sole's corners, or those of a foot that goes with the leg."""
+    corners = _corners(robot, kinematics, frame)
+    if len(corners) >= 4:
+        ordered = corners[np.argsort(corners[:, 0])]
+        return Foot(frame, *(_pair(part[np.argsort(-part[:, 1])]) for part in (ordered[:2], ordered[-2:])))
+    length = float(np.linalg.norm(np.diff(leg.anchors, axis=0), axis=-1).sum())
+    foot, width, height = _FOOT_LENGTH * length / 2, _FOOT_WIDTH * length / 2, _FOOT_HEIGHT * length
+    rear, front = -_HEEL * foot, (1.0 - _HEEL) * foot
+    return Foot(frame, *(_pair(np.array([[x, width, -height], [x, -width, -height]])) for x in (rear, front)))
+
+
+def _corners(robot: Robot, kinematics: Kinematics, frame: str) -> np.ndarray:
+    """Corner frames, else the lower corners of boxes, else the lowest points of balls. (k, 3)."""
+    for corners in (contact_corners(robot, frame), sole_points(robot, frame)):
+        if len(corners):
+            return corners
+    tree, model = robot.tree, robot.mj_model
+    body = tree.frame_bodies[tree.frame(frame)]
+    balls = [
+        geom
+        for geom in range(model.ngeom)
+        if tree.geom_bodies[geom] == body and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
+    ]
+    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
+    turn, origin = np.asarray(kinematics.body_rotation[body]), np.asarray(kinematics.body_position[body])
+    points = np.array([origin + turn @ np.asarray(robot.geom_position[g]) for g in balls]).reshape(-1, 3)
+    points[:, 2] -= np.array([float(robot.geom_size[g, 0]) for g in balls])
+    return (points - position) @ rotation
+
+
+def _pair(points: np.ndarray) -> tuple[Point, Point]:
+    (a, b, c), (d, e, f) = np.round(points, 6).tolist()
+    return (a, b, c), (d, e, f)
+
+
+def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[Capsule, ...]:
+    """Limbs as capsules from joint to joint, hands that go on, and the trunk as one that ends below its shoulders."""
+
+    def place(role: str) -> np.ndarray:
+        frame, point = profile.keypoints[role]
+        position, rotation = kinematics.frame_pose(robot, frame)
+        return np.asarray(position) + np.asarray(rotation) @ np.array(point)
+
+    def inside(frame: str, start: np.ndarray, end: np.ndarray) -> tuple[Point, Point]:
+        position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
+        return _pair((np.stack([start, end]) - position) @ rotation)
+
+    out = []
+    for side in SIDES:
+        for a, b, ratio in (
+            ("hip", "knee", _LEG_RADIUS),
+            ("knee", "ankle", _LEG_RADIUS),
+            ("shoulder", "elbow", _ARM_RADIUS),
+            ("elbow", "wrist", _ARM_RADIUS),
+        ):
+            start, end = place(f"{side}_{a}"), place(f"{side}_{b}")
+            length = float(np.linalg.norm(end - start))
+            radius = ratio * length
+            along = (end - start) / length
+            frame = profile.keypoints[f"{side}_{a}"][0]
+            ends = inside(frame, start + radius * along, end - 0.5 * radius * along)
+            out.append(Capsule(frame, *ends, round(radius, 6)))
+        elbow, wrist = place(f"{side}_elbow"), place(f"{side}_wrist")
+        radius = 1.2 * _ARM_RADIUS * float(np.linalg.norm(wrist - elbow))
+        frame = profile.keypoints[f"{side}_wrist"][0]
+        out.append(Capsule(frame, *inside(frame, wrist, wrist + _HAND * (wrist - elbow)), round(radius, 6)))
+    shoulders, hips = ([place(f"{side}_{role}") for side in SIDES] for role in ("shoulder", "hip"))
+    top, bottom = 0.5 * (shoulders[0] + shoulders[1]), 0.5 * (hips[0] + hips[1])
+    radius = _TRUNK_RADIUS * float(np.linalg.norm(shoulders[0] - shoulders[1]))
+    trunk = profile.torso or profile.pelvis
+    up = (top - bottom) / np.linalg.norm(top - bottom)
+    ends = inside(trunk, bottom + 1.5 * radius * up, top - 0.5 * radius * up)
+    return (*out, Capsule(trunk, *ends, round(radius, 6)))

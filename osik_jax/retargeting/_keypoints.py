@@ -1,0 +1,160 @@
+"""Keypoint files: joint positions as arrays (.npz) or as a table (.csv)."""
+
+from __future__ import annotations
+
+import csv
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ._motion import CONTACT_POINTS, HumanMotion
+from ._rotations import continuous
+
+_AXES = ("x", "y", "z")
+
+
+def read_keypoints(path: str | os.PathLike[str]) -> HumanMotion:
+    """Reads ``.npz`` or ``.csv`` keypoints, in metres, z up.
+
+    ``.npz``: ``fps``, ``positions`` (F, J, 3), ``joint_names`` (J,); optional ``rotations`` (F, J, 4; w x y z),
+    ``rest_positions`` (J, 3), ``contact`` (F, 4; left heel, left toe, right heel, right toe, or F, 2; left, right) and
+    ``ground``. Nothing is unpickled.
+
+    ``.csv``: a line of headings, ``time`` and ``NAME.x``, ``NAME.y``, ``NAME.z`` of each joint, optionally
+    ``contact.left_heel`` and so on (0 or 1); then a line for each frame, at a constant rate.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: the file is broken; the message says which array, or which line and column, and what is wrong.
+    """
+    return _from_csv(Path(path)) if str(path).lower().endswith(".csv") else _from_npz(Path(path))
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of a ``.npz`` file; nothing is unpickled.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it is none, or holds objects.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {path}")
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if not hasattr(data, "files"):
+                raise ValueError("it holds one array and not several by name")
+            return {name: data[name] for name in data.files}
+    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"{path} cannot be read as an .npz of plain arrays: {error}") from None
+
+
+def _from_npz(path: Path) -> HumanMotion:
+    arrays = load_arrays(path)
+    missing = [name for name in ("fps", "positions", "joint_names") if name not in arrays]
+    if missing:
+        raise ValueError(f"{path} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
+    contact = arrays.get("contact")
+    if contact is not None and contact.ndim == 2 and contact.shape[1] == 2:
+        contact = contact[:, [0, 0, 1, 1]]
+    rotations = _numbers(path, arrays, "rotations")
+    ground = _numbers(path, arrays, "ground")
+    try:
+        return HumanMotion(
+            name=path.stem,
+            fps=float(_number(path, arrays, "fps")),
+            joint_names=tuple(str(name) for name in arrays["joint_names"].ravel()),
+            positions=_numbers(path, arrays, "positions"),
+            rotations=None if rotations is None else continuous(rotations),
+            rest_positions=_numbers(path, arrays, "rest_positions"),
+            contact=None if contact is None else contact.astype(bool),
+            ground=None if ground is None else float(_number(path, arrays, "ground")),
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from None
+
+
+def _numbers(path: Path, arrays: dict[str, np.ndarray], name: str) -> Any:
+    """An array of floats, or None where the file has none of this name."""
+    if name not in arrays:
+        return None
+    if arrays[name].dtype.kind not in "fiub":
+        raise ValueError(f"{path}: {name} is of type {arrays[name].dtype}; it has to be numbers")
+    return arrays[name].astype(float)
+
+
+def _number(path: Path, arrays: dict[str, np.ndarray], name: str) -> float:
+    values = np.ravel(_numbers(path, arrays, name))
+    if values.size != 1:
+        raise ValueError(f"{path}: {name} is one number, not {values.size}")
+    return float(values[0])
+
+
+def _from_csv(path: Path) -> HumanMotion:
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {path}")
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if row]
+    if len(rows) < 3:
+        raise ValueError(f"{path} has {len(rows)} lines; it needs one of headings and two of numbers at least")
+    headings = [name.strip() for name in rows[0][1]]
+    names = _joints(path, headings)
+    values = np.array([_row(path, number, row, headings) for number, row in rows[1:]])
+    column = {name: i for i, name in enumerate(headings)}
+    positions = np.stack([values[:, [column[f"{name}.{axis}"] for axis in _AXES]] for name in names], 1)
+    flags = [f"contact.{point}" for point in CONTACT_POINTS]
+    known = all(flag in column for flag in flags)
+    return HumanMotion(
+        name=path.stem,
+        fps=_rate(path, values[:, column["time"]], [number for number, _ in rows[1:]]),
+        joint_names=names,
+        positions=positions,
+        contact=values[:, [column[flag] for flag in flags]] > 0.5 if known else None,
+    )
+
+
+def _joints(path: Path, headings: list[str]) -> tuple[str, ...]:
+    """Names of the joints that the headings have all three coordinates of."""
+    if "time" not in headings:
+        raise ValueError(f"{path}, line 1: no column is called time; columns: {', '.join(headings)}")
+    twice = sorted({name for name in headings if headings.count(name) > 1})
+    if twice:
+        raise ValueError(f"{path}, line 1: columns occur twice: {', '.join(twice)}")
+    others = [name for name in headings if name != "time" and not name.startswith("contact.")]
+    names = tuple(dict.fromkeys(name.rpartition(".")[0] for name in others))
+    expected = {f"{name}.{axis}" for name in names for axis in _AXES}
+    wrong = sorted(expected.symmetric_difference(others))
+    if wrong or not names:
+        raise ValueError(
+            f"{path}, line 1: a joint has the three columns NAME.x, NAME.y and NAME.z; missing or of no joint: "
+            f"{', '.join(wrong) or 'all'}"
+        )
+    return names
+
+
+def _row(path: Path, number: int, row: list[str], headings: list[str]) -> list[float]:
+    if len(row) != len(headings):
+        raise ValueError(f"{path}, line {number}: {len(row)} values, but there are {len(headings)} headings")
+    out = []
+    for heading, text in zip(headings, row, strict=True):
+        try:
+            value = float(text)
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise ValueError(f"{path}, line {number}, column {heading}: {text!r} is no finite number")
+        out.append(value)
+    return out
+
+
+def _rate(path: Path, time: np.ndarray, lines: list[int]) -> float:
+    """Frames a second; the times have to be evenly apart, to a tenth of a step."""
+    steps = np.diff(time)
+    step = np.median(steps)
+    uneven = np.flatnonzero((np.abs(steps - step) > 0.1 * abs(step)) | (steps <= 0.0))
+    if uneven.size:
+        where = lines[int(uneven[0]) + 1]
+        raise ValueError(f"{path}, line {where}: the time steps by {steps[uneven[0]]:.4g} s, elsewhere by {step:.4g} s")
+    return float(len(steps) / (time[-1] - time[0]))

@@ -1,0 +1,130 @@
+"""The record of a person's motion: what every reader returns and everything else takes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .._tree import unknown_name
+from ._rotations import continuous, slerp
+
+CONTACT_POINTS = ("left_heel", "left_toe", "right_heel", "right_toe")
+"""The columns of ``HumanMotion.contact``."""
+_UNIT = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanMotion:
+    """A person's motion: joint positions at a constant rate, in a world whose z axis points up.
+
+    Attributes:
+        name: of the clip, for people.
+        fps: frames a second.
+        joint_names: of the joints, each once.
+        positions: of the joints in the world [m]. (F, J, 3)
+        rotations: of the joints in the world, unit quaternions w x y z; None where they are not known. (F, J, 4)
+        rest_positions: of the joints in the pose in which all rotations are the identity [m]; None: not known. (J, 3)
+        contact: whether left heel, left toe, right heel and right toe stand on the ground; None: to be found. (F, 4)
+        ground: height of the floor [m]; None: to be found.
+
+    Raises:
+        ValueError: shapes that do not agree, numbers that are not finite, quaternions that are not of unit length,
+            a name that occurs twice, or a rate that is not positive.
+    """
+
+    name: str
+    fps: float
+    joint_names: tuple[str, ...]
+    positions: Float[np.ndarray, "F J 3"]
+    rotations: Float[np.ndarray, "F J 4"] | None = None
+    rest_positions: Float[np.ndarray, "J 3"] | None = None
+    contact: Bool[np.ndarray, "F 4"] | None = None
+    ground: float | None = None
+
+    def __post_init__(self) -> None:
+        frames, joints = len(self.positions), len(self.joint_names)
+        if not (np.isfinite(self.fps) and self.fps > 0.0):
+            raise ValueError(f"fps is {self.fps}; it is frames a second, more than 0")
+        repeated = sorted({name for name in self.joint_names if self.joint_names.count(name) > 1})
+        if repeated:
+            raise ValueError(f"joint names occur twice: {', '.join(repeated)}")
+        if frames < 1 or joints < 1:
+            raise ValueError(f"a motion has a frame and a joint at least; this one has {frames} and {joints}")
+        _check_array("positions", self.positions, (frames, joints, 3))
+        _check_array("rest_positions", self.rest_positions, (joints, 3))
+        _check_array("rotations", self.rotations, (frames, joints, 4))
+        if self.contact is not None and np.shape(self.contact) != (frames, 4):
+            raise ValueError(f"contact has shape {np.shape(self.contact)}, expected {(frames, 4)}: {CONTACT_POINTS}")
+        if self.ground is not None and not np.isfinite(self.ground):
+            raise ValueError(f"ground is {self.ground}; it is a height in metres")
+        if self.rotations is not None:
+            length = np.linalg.norm(self.rotations, axis=-1)
+            if np.abs(length - 1.0).max() > _UNIT:
+                frame, joint = np.unravel_index(np.argmax(np.abs(length - 1.0)), length.shape)
+                raise ValueError(
+                    f"rotations are unit quaternions w x y z; that of {self.joint_names[joint]} in frame {frame} has "
+                    f"length {length[frame, joint]:.4g}"
+                )
+
+    @property
+    def frames(self) -> int:
+        """How many frames there are."""
+        return len(self.positions)
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first frame to the last."""
+        return (self.frames - 1) / self.fps
+
+    def track(self, name: str) -> Float[np.ndarray, "F 3"]:
+        """Positions of one joint [m].
+
+        Raises:
+            KeyError: no such joint; the message lists those that exist.
+        """
+        if name not in self.joint_names:
+            raise unknown_name("joint", name, self.joint_names)
+        return self.positions[:, self.joint_names.index(name)]
+
+    def resampled(self, fps: float) -> HumanMotion:
+        """The same motion at another rate: positions by straight lines, rotations by spherical interpolation.
+
+        A point is in contact where it is in the nearer frame. Slower rates are not filtered first.
+
+        Raises:
+            ValueError: a rate that is not positive.
+        """
+        if not (np.isfinite(fps) and fps > 0.0):
+            raise ValueError(f"fps is {fps}; it is frames a second, more than 0")
+        if fps == self.fps or self.frames == 1:
+            return dataclasses.replace(self, fps=float(fps))
+        at = np.arange(int(np.floor(self.seconds * fps + 1e-9)) + 1) / fps * self.fps
+        before = np.minimum(at.astype(int), self.frames - 2)
+        part = np.clip(at - before, 0.0, 1.0)
+        rotations, contact = self.rotations, self.contact
+        if rotations is not None:
+            share = np.broadcast_to(part[:, None], (len(at), rotations.shape[1]))
+            rotations = continuous(slerp(rotations[before], rotations[before + 1], share))
+        if contact is not None:
+            contact = np.where((part < 0.5)[:, None], contact[before], contact[before + 1])
+        low, high = self.positions[before], self.positions[before + 1]
+        return dataclasses.replace(
+            self,
+            fps=float(fps),
+            positions=low + part[:, None, None] * (high - low),
+            rotations=rotations,
+            contact=contact,
+        )
+
+
+def _check_array(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> None:
+    """Raises ValueError where an array that is there has another shape, or numbers that are not finite."""
+    if value is None:
+        return
+    if np.shape(value) != shape:
+        raise ValueError(f"{name} has shape {np.shape(value)}, expected {shape}")
+    wrong = ~np.isfinite(value)
+    if wrong.any():
+        raise ValueError(f"{name} is not finite at {tuple(np.argwhere(wrong)[0].tolist())}")

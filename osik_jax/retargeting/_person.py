@@ -1,0 +1,186 @@
+"""The person: directions of limbs, turns of the trunk, feet, out of a clip's joints."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ._contact import find_contact, find_ground
+from ._motion import CONTACT_POINTS, HumanMotion
+
+LIMBS = (
+    ("left_hip", "left_knee"),
+    ("left_knee", "left_ankle"),
+    ("right_hip", "right_knee"),
+    ("right_knee", "right_ankle"),
+    ("left_shoulder", "left_elbow"),
+    ("left_elbow", "left_wrist"),
+    ("right_shoulder", "right_elbow"),
+    ("right_elbow", "right_wrist"),
+)
+"""The segments whose directions are followed: from the first role to the second."""
+SIDES = ("left", "right")
+NEEDED = tuple(dict.fromkeys(role for limb in LIMBS for role in limb))
+"""Roles that every person has."""
+OPTIONAL = ("pelvis", "chest", "neck", "head", "left_heel", "left_toe", "right_heel", "right_toe")
+_SHORTEST = 1e-9
+_SPINE = 1e-3
+_TOE, _SOLE, _HEEL = 0.35, 0.12, 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Person:
+    """A person's motion as retargeting sees it. World axes, z up, the floor at height 0.
+
+    Attributes:
+        fps: frames a second.
+        points: by role, heels and toes among them [m]. (F, 3) each
+        directions: of each of ``LIMBS``, unit vectors. (F, 8, 3)
+        pelvis: forward, left and up axes of the pelvis as columns. (F, 3, 3)
+        torso: the same of the chest. (F, 3, 3)
+        root: midpoint of the hips [m]. (F, 3)
+        feet: forward, left and up axes of the left and right foot as columns. (F, 2, 3, 3)
+        contact: whether left heel, left toe, right heel and right toe stand. (F, 4)
+        leg: length of a leg, thigh and shank [m].
+        ankle: height of the ankles above the floor when standing [m].
+    """
+
+    fps: float
+    points: Mapping[str, Float[np.ndarray, "F 3"]]
+    directions: Float[np.ndarray, "F 8 3"]
+    pelvis: Float[np.ndarray, "F 3 3"]
+    torso: Float[np.ndarray, "F 3 3"]
+    root: Float[np.ndarray, "F 3"]
+    feet: Float[np.ndarray, "F 2 3 3"]
+    contact: Bool[np.ndarray, "F 4"]
+    leg: float
+    ankle: float
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    """Vectors of length 1; the x axis where there is no direction. (..., 3)."""
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.where(length > _SHORTEST, vector / np.maximum(length, _SHORTEST), np.eye(3)[0])
+
+
+def axes_from(left: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Right-handed axes as columns, with the y axis along ``left`` and z as near ``up`` as it can be. (..., 3, 3)."""
+    y = unit(left)
+    x = unit(np.cross(y, up))
+    return np.stack([x, y, np.cross(x, y)], -1)
+
+
+def foot_axes(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Axes as columns, with x along ``forward`` and z as near ``up`` as it can be. (..., 3, 3)."""
+    x = unit(forward)
+    y = unit(np.cross(up, x))
+    return np.stack([x, y, np.cross(x, y)], -1)
+
+
+def read_person(motion: HumanMotion, roles: Mapping[str, str]) -> Person:
+    """The person in a clip.
+
+    Args:
+        motion: the clip.
+        roles: of each of a person's joints, what the clip calls it (``find_roles``).
+    """
+    points = {role: motion.track(name) for role, name in roles.items()}
+    rest = None
+    if motion.rest_positions is not None:
+        at = {role: motion.joint_names.index(name) for role, name in roles.items()}
+        rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
+    points = _with_soles(points, rest)
+    soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
+    ground = find_ground(soles) if motion.ground is None else motion.ground
+    contact = find_contact(soles, motion.fps, ground) if motion.contact is None else motion.contact
+    points = {role: track - [0.0, 0.0, ground] for role, track in points.items()}
+    straight = None if rest is None else _turns(_with_soles(rest, rest))
+    turns = _turns(points)
+    pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
+    legs = [np.linalg.norm(points[b] - points[a], axis=-1).mean() for a, b in LIMBS[:4]]
+    ankles = np.minimum(points["left_ankle"][:, 2], points["right_ankle"][:, 2])
+    return Person(
+        fps=motion.fps,
+        points=points,
+        directions=unit(np.stack([points[b] - points[a] for a, b in LIMBS], 1)),
+        pelvis=pelvis,
+        torso=torso,
+        root=0.5 * (points["left_hip"] + points["right_hip"]),
+        feet=np.stack([_foot(points, side) for side in SIDES], 1),
+        contact=np.asarray(contact, bool),
+        leg=0.5 * float(sum(legs)),
+        ankle=float(np.percentile(ankles, 5)),
+    )
+
+
+def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Axes of the pelvis and of the chest."""
+    hips = 0.5 * (points["left_hip"] + points["right_hip"])
+    shoulders = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
+    neck = points.get("neck", shoulders)
+    chest = points.get("chest", hips)
+    spine = chest - hips
+    up = np.where(np.linalg.norm(spine, axis=-1, keepdims=True) > _SPINE, spine, neck - hips)
+    pelvis = axes_from(points["left_hip"] - points["right_hip"], up)
+    return pelvis, axes_from(points["left_shoulder"] - points["right_shoulder"], neck - chest)
+
+
+def _from_rest(axes: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Axes that are upright in the rest pose, whichever way the person faces in it."""
+    heading = axes_from(rest[:, 1] * [1.0, 1.0, 0.0], np.array([0.0, 0.0, 1.0]))
+    return axes @ rest.T @ heading
+
+
+def _foot(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
+    """Axes of a foot: along the sole, and up as the shank is."""
+    shank = points[f"{side}_knee"] - points[f"{side}_ankle"]
+    return foot_axes(points[f"{side}_toe"] - points[f"{side}_heel"], shank)
+
+
+def _with_soles(points: Mapping[str, np.ndarray], rest: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarray]:
+    """The points with heels and toes, where the clip has none: fixed to the foot as they are in a flat one."""
+    out = dict(points)
+    for side in SIDES:
+        if f"{side}_toe" not in out:
+            out[f"{side}_toe"] = _toe(out, side)
+        if f"{side}_heel" not in out:
+            flat = _flat(out, side) if rest is None else {**rest, **{k: v for k, v in _toes(rest, side).items()}}
+            out[f"{side}_heel"] = _heel(out, flat, side)
+    return out
+
+
+def _toes(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
+    return {} if f"{side}_toe" in points else {f"{side}_toe": _toe(points, side)}
+
+
+def _toe(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
+    """Before and below the ankle, at right angles to the shank, as far as feet are long for a shank."""
+    shank = points[f"{side}_ankle"] - points[f"{side}_knee"]
+    forward = np.cross(points["left_hip"] - points["right_hip"], -shank)
+    length = np.linalg.norm(shank, axis=-1, keepdims=True)
+    return points[f"{side}_ankle"] + length * (_TOE * unit(forward) + _SOLE * unit(shank))
+
+
+def _flat(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
+    """The one frame in which ankle and toe are lowest: the foot is taken to be flat in it."""
+    frame = int(np.argmin(points[f"{side}_ankle"][:, 2] + points[f"{side}_toe"][:, 2]))
+    return {
+        name: points[f"{side}_{name.split('_', 1)[1]}"][frame, None]
+        for name in (f"{side}_knee", f"{side}_ankle", f"{side}_toe")
+    }
+
+
+def _heel(points: Mapping[str, np.ndarray], flat: Mapping[str, np.ndarray], side: str) -> np.ndarray:
+    """The point that is a little behind the ankle and as low as the toe where the foot is flat."""
+
+    def axes(at: Mapping[str, np.ndarray]) -> np.ndarray:
+        ankle = at[f"{side}_ankle"]
+        return foot_axes(at[f"{side}_toe"] - ankle, at[f"{side}_knee"] - ankle)
+
+    ankle, toe = flat[f"{side}_ankle"][0], flat[f"{side}_toe"][0]
+    heel = ankle - _HEEL * (toe - ankle)
+    heel[2] = toe[2]
+    return points[f"{side}_ankle"] + axes(points) @ (axes(flat)[0].T @ (heel - ankle))

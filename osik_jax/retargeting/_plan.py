@@ -1,0 +1,219 @@
+"""The plan: configurations of a whole clip at once, by Gauss-Newton.
+
+What each frame asks for and what ties frames together (standing points that do not move, smooth joints, limits of speed
+and acceleration) is one sum of squares over all frames. Limits are met by leading, for every frame knows what comes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._joint_selection import scalar_layout
+from ..kinematics import difference, integrate
+from ._banded import BandedSystem, solve_banded
+from ._goals import Goals, Weights
+from ._terms import Body, Bounds, Stance, frame_rows
+
+_LARGEST_STEP = 0.5
+"""Of any dof in an iteration [rad or m]: what the linear model is good for."""
+
+_SOFTEST, _STIFFENING, _SLOWING = 1e-4, 10.0, 0.5
+"""Stiffness of the bounds at first, its growth, and the share of the cost below which a step's gain lets it grow."""
+
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-3, 1e8
+_CALMER, _CAREFUL = 0.3, 4.0
+"""Factors of the damping after a step that was good, and after one that was not; the latter doubles each time."""
+
+_LITTLE, _SETTLED = 3e-3, 2
+"""A gain that is little, as a share of what the wishes cost, and how many of them in a row are the end."""
+
+
+class Plan(NamedTuple):
+    """A plan.
+
+    Attributes:
+        q: configurations. (F, nq)
+        cost: what is left of the wishes, and of the bounds that have to hold. (2,)
+        iterations: systems solved.
+    """
+
+    q: Float[Array, "F nq"]
+    cost: Float[Array, "2"]
+    iterations: Int[Array, ""]
+
+
+class _Linearised(NamedTuple):
+    """Gauss-Newton's system at some configurations, with its gradient and its cost."""
+
+    system: BandedSystem
+    gradient: Float[Array, "F nv"]
+    soft: Float[Array, ""]
+    stiff: Float[Array, ""]
+
+
+class _State(NamedTuple):
+    """What an iteration leaves to the next."""
+
+    q: Float[Array, "F nq"]
+    here: _Linearised
+    stiffness: Float[Array, ""]
+    ready: Bool[Array, ""]
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]
+    settled: Int[Array, ""]
+    iterations: Int[Array, ""]
+
+
+@jax.jit
+def make_plan(
+    body: Body,
+    goals: Goals,
+    weights: Weights,
+    bounds: Bounds,
+    start: Float[Array, "F nq"],
+    max_iterations: Int[Array, ""] | int,
+) -> Plan:
+    """The configurations that serve a clip's goals best, from a first guess.
+
+    Levenberg and Marquardt's method. Bounds that have to hold begin soft and get stiffer with each step that is
+    taken, so that limbs find their way before feet and limits pin them down. It ends when two steps in a row gained
+    less than a small part of what the wishes cost, with all bounds at their full stiffness.
+    """
+    identity = jnp.eye(body.robot.nv, dtype=start.dtype)
+
+    def improve(state: _State) -> _State:
+        here = state.here
+        damped = here.system._replace(diagonal=here.system.diagonal + state.damping * identity)
+        move = -solve_banded(damped, here.gradient)
+        longest = jnp.abs(move).max(-1, keepdims=True)
+        move = move * jnp.minimum(1.0, _LARGEST_STEP / jnp.maximum(longest, _LARGEST_STEP))
+        candidate = jax.vmap(lambda a, b: integrate(body.robot, a, b))(state.q, move)
+        stiffer = jnp.where(state.ready, jnp.minimum(state.stiffness * _STIFFENING, 1.0), state.stiffness)
+        there = _linearised(body, candidate, goals, weights, bounds, stiffer)
+        before, after = (x.soft + state.stiffness * x.stiff for x in (here, there))
+        better = after < before
+        factor = jnp.where(better, _CALMER, state.growth)
+        damping = jnp.clip(state.damping * factor, _LEAST_DAMPING, _MOST_DAMPING)
+        growth = jnp.where(better, _CAREFUL, 2.0 * state.growth)
+        little = better & (state.stiffness >= 1.0) & (before - after < _LITTLE * there.soft)
+        settled = jnp.where(little, state.settled + 1, jnp.where(better, 0, state.settled))
+        ready = jnp.where(better, before - after < _SLOWING * before, state.ready)
+        stuck = ~better & (state.damping >= _MOST_DAMPING)
+        old, new = (state.q, here, state.stiffness), (candidate, there, stiffer)
+        q, here, stiffness = jax.tree.map(lambda a, b: jnp.where(better, b, a), old, new)
+        return _State(
+            q, here, stiffness, ready, damping, growth, jnp.where(stuck, _SETTLED, settled), state.iterations + 1
+        )
+
+    softest = jnp.asarray(_SOFTEST, start.dtype)
+    here = _linearised(body, start, goals, weights, bounds, softest)
+    damping, growth = jnp.asarray(_FIRST_DAMPING, start.dtype), jnp.asarray(_CAREFUL, start.dtype)
+    first = _State(start, here, softest, jnp.array(False), damping, growth, jnp.array(0), jnp.array(0))
+    last = jax.lax.while_loop(
+        lambda state: (state.settled < _SETTLED) & (state.iterations < max_iterations), improve, first
+    )
+    return Plan(last.q, jnp.stack([last.here.soft, last.here.stiff]), last.iterations)
+
+
+def _weights_between(goals: Goals, weights: Weights) -> Float[Array, "F 4"]:
+    """Of each frame's standing points, what their motion since the frame before weighs; 0 in the first."""
+    both = goals.contact[1:] * goals.contact[:-1]
+    return weights.stance * jnp.concatenate([jnp.zeros_like(both[:1]), both])
+
+
+class _Hinge(NamedTuple):
+    """Weight and gradient of what a quantity costs: smooth, and stiff beyond a bound."""
+
+    weight: Float[Array, "F nv"]
+    gradient: Float[Array, "F nv"]
+    soft: Float[Array, ""]
+    stiff: Float[Array, ""]
+
+
+def _hinge(
+    value: Float[Array, "F nv"],
+    bound: Float[Array, " nv"],
+    smooth: Float[Array, "F nv"] | Float[Array, " nv"],
+    limit: Float[Array, ""],
+    stiffness: Float[Array, ""],
+) -> _Hinge:
+    """What is beyond a bound counts as a share of it: limits are kept as well at any rate of frames."""
+    over = value - jnp.clip(value, -bound, bound)
+    beyond = jnp.where(over != 0.0, limit / bound**2, 0.0)
+    soft, stiff = (0.5 * jnp.sum(w * x**2) for w, x in ((smooth, value), (beyond, over)))
+    return _Hinge(smooth + stiffness * beyond, smooth * value + stiffness * beyond * over, soft, stiff)
+
+
+def _between(body: Body, q, goals: Goals, weights: Weights, bounds: Bounds, stiffness):
+    """Steps from frame to frame, and their changes."""
+    robot = body.robot
+    joints = scalar_layout(robot)[0]
+    smooth = jnp.where(joints, weights.smooth, weights.smooth_base)
+    step = jax.vmap(lambda a, b: difference(robot, a, b))(q[:-1], q[1:])
+    there = goals.present[1:, None]
+    steps = _hinge(step * there, bounds.step, 0.0 * smooth, weights.speed, stiffness)
+    there = goals.present[2:, None]
+    changes = _hinge((step[1:] - step[:-1]) * there, bounds.change, smooth * there, weights.speed, stiffness)
+    return steps, changes
+
+
+def _linearised(
+    body: Body, q: Float[Array, "F nq"], goals: Goals, weights: Weights, bounds: Bounds, stiffness: Float[Array, ""]
+) -> _Linearised:
+    rows = jax.vmap(lambda x, g: frame_rows(body, x, g, weights, bounds))(q, goals)
+    soft_weight = rows.soft.weight * goals.present[:, None]
+    stiff_weight = rows.stiff.weight * goals.present[:, None]
+    jacobian = jnp.concatenate([rows.soft.jacobian, rows.stiff.jacobian], 1)
+    residual = jnp.concatenate([rows.soft.residual, rows.stiff.residual], 1)
+    weighted = jacobian * jnp.concatenate([soft_weight, stiffness * stiff_weight], 1)[..., None]
+    diagonal = jnp.matmul(jnp.swapaxes(weighted, 1, 2), jacobian)
+    gradient = jnp.einsum("fmi,fm->fi", weighted, residual)
+    soft = 0.5 * jnp.sum(soft_weight * rows.soft.residual**2)
+    stiff = 0.5 * jnp.sum(stiff_weight * rows.stiff.residual**2)
+    system = BandedSystem(diagonal, jnp.zeros_like(diagonal), jnp.zeros_like(gradient))
+    here = _Linearised(system, gradient, soft, stiff)
+    here = _with_standing_points(here, rows.stance, _weights_between(goals, weights), stiffness)
+    return _with_steps(here, *_between(body, q, goals, weights, bounds, stiffness))
+
+
+def _with_standing_points(here: _Linearised, stance: Stance, weight: Float[Array, "F 4"], stiffness) -> _Linearised:
+    """Standing points do not move from one frame to the next: ``p_t - p_t-1``, with derivatives in both frames."""
+    frames, n = here.gradient.shape
+    own, point = stance.jacobian.reshape(frames, 8, n), stance.point.reshape(frames, 8)
+    before = jnp.roll(own, 1, 0)
+    move, weight = point - jnp.roll(point, 1, 0), jnp.repeat(weight, 2, axis=-1)
+    stiff = here.stiff + 0.5 * jnp.sum(weight * move**2)
+    weight = stiffness * weight
+    weighted, weighted_before = (jnp.swapaxes(x * weight[..., None], 1, 2) for x in (own, before))
+    back = jnp.roll(jnp.matmul(weighted_before, before), -1, 0)
+    diagonal = here.system.diagonal + jnp.matmul(weighted, own) + back
+    first = here.system.first - jnp.matmul(weighted, before)
+    pulled_back = jnp.roll(jnp.einsum("fim,fm->fi", weighted_before, move), -1, 0)
+    gradient = here.gradient + jnp.einsum("fim,fm->fi", weighted, move) - pulled_back
+    return _Linearised(here.system._replace(diagonal=diagonal, first=first), gradient, here.soft, stiff)
+
+
+def _with_steps(here: _Linearised, steps: _Hinge, changes: _Hinge) -> _Linearised:
+    """Speeds and accelerations, in all dofs apart.
+
+    ``step_t = q_t+1 - q_t`` has derivatives (-1, 1), ``change_t = q_t+2 - 2 q_t+1 + q_t`` has (1, -2, 1).
+    """
+    n = here.gradient.shape[-1]
+    w, c = steps.weight, changes.weight
+    main = jnp.zeros_like(here.gradient).at[:-1].add(w).at[1:].add(w)
+    main = main.at[:-2].add(c).at[1:-1].add(4.0 * c).at[2:].add(c)
+    near = jnp.zeros_like(main).at[1:].add(-w).at[1:-1].add(-2.0 * c).at[2:].add(-2.0 * c)
+    far = here.system.second.at[2:].add(c)
+    g, a = steps.gradient, changes.gradient
+    gradient = here.gradient.at[:-1].add(-g).at[1:].add(g)
+    gradient = gradient.at[:-2].add(a).at[1:-1].add(-2.0 * a).at[2:].add(a)
+    spread = jnp.eye(n, dtype=main.dtype)
+    system = BandedSystem(
+        here.system.diagonal + main[:, :, None] * spread, here.system.first + near[:, :, None] * spread, far
+    )
+    soft, stiff = here.soft + steps.soft + changes.soft, here.stiff + steps.stiff + changes.stiff
+    return _Linearised(system, gradient, soft, stiff)

@@ -1,0 +1,176 @@
+"""How good a retargeted motion is, recomputed from its file's numbers by MuJoCo's own C code."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..physics._world import frame_pose
+from ._body import JOINTS_APART, joints_between
+from ._person import LIMBS, SIDES
+from ._profile import Profile
+from ._retarget import Retargeted
+
+JUMP = 15.0
+"""A change of joint speed from one frame to the next that counts as a jump [rad/s]."""
+_CHAINS = {
+    f"{side}_{limb}": tuple(f"{side}_{role}" for role in roles)
+    for side in SIDES
+    for limb, roles in (("leg", ("hip", "knee", "ankle")), ("arm", ("shoulder", "elbow", "wrist")))
+}
+
+
+def report(result: Retargeted) -> dict[str, Any]:
+    """Figures of a retargeted motion: lengths in mm, angles in rad but for ``segment_angle_deg``.
+
+    ``joints``: how far joints are beyond their ranges, speed over its limit, accelerations, and frames with a jump of
+    more than 15 rad/s. ``feet``: how far points that stand move from where they landed (``slip``), how high they are
+    (``float``), and how deep soles are below the floor. ``shapes``: how deep the profile's capsules are in each other.
+    ``tracking``: keypoints against the person's, limb by limb, with the scale that fits each limb best; and the angle
+    between the person's segments and the robot's.
+    """
+    places = _places(result)
+    return {
+        "frames": len(result.q),
+        "fps": result.motion.fps,
+        "iterations": result.iterations,
+        "off_plan_rad": float(result.off_plan.max()),
+        "joints": _joints(result),
+        "feet": _feet(places["soles"], result.contact, result.motion.fps),
+        "shapes": {"penetration_mm_max": _penetration(result, places["capsules"])},
+        "tracking": _tracking(result, places["keypoints"]),
+    }
+
+
+def _places(result: Retargeted) -> dict[str, Any]:
+    """Keypoints by role, soles' corners (F, 8, 3) and capsules' ends (F, k, 2, 3), as MuJoCo has them."""
+    robot, profile = result.robot, result.profile
+    data = mujoco.MjData(robot.mj_model)
+    index, coefficient = robot.tree.qpos_source
+    wanted = [*profile.keypoints.values(), *profile.corners]
+    wanted += [(c.frame, point) for c in profile.capsules for point in (c.start, c.end)]
+    points = np.zeros((len(result.q), len(wanted), 3))
+    frames = tuple(dict.fromkeys(frame for frame, _ in wanted))
+    for f, q in enumerate(result.q):
+        data.qpos[:] = q[index] * coefficient + np.asarray(robot.qpos_offset)
+        mujoco.mj_kinematics(robot.mj_model, data)
+        poses = {frame: frame_pose(robot, data, frame) for frame in frames}
+        points[f] = [poses[frame][0] + poses[frame][1] @ np.array(point) for frame, point in wanted]
+    keys = len(profile.keypoints)
+    return {
+        "keypoints": dict(zip(profile.keypoints, np.moveaxis(points[:, :keys], 1, 0), strict=True)),
+        "soles": points[:, keys : keys + 8],
+        "capsules": points[:, keys + 8 :].reshape(len(points), -1, 2, 3),
+    }
+
+
+def _joints(result: Retargeted) -> dict[str, Any]:
+    robot, fps = result.robot, result.motion.fps
+    names = robot.joint_names
+    dofs = [robot.joint_dof_index(name) for name in names]
+    q = result.q[:, [robot.joint_qpos_index(name) for name in names]]
+    low, high, fast = (np.asarray(x)[dofs] for x in (robot.position_lower, robot.position_upper, robot.velocity_limit))
+    speed = np.diff(q, axis=0) * fps
+    change = np.abs(np.diff(speed, axis=0))
+    worst = int(np.argmax(change.max(0)))
+    return {
+        "beyond_range_max": float(max(0.0, (low - q).max(), (q - high).max())),
+        "speed_over_limit_max": float((np.abs(speed) / fast).max()),
+        "acceleration_max": float(change.max() * fps),
+        "acceleration_max_joint": names[worst],
+        "jump_frames": int((change > JUMP).any(1).sum()),
+    }
+
+
+def _feet(corners: Float[np.ndarray, "F 8 3"], contact: Bool[np.ndarray, "F 4"], fps: float) -> dict[str, Any]:
+    points = corners.reshape(len(corners), 4, 2, 3).mean(2)
+    slip = [0.0]
+    for k in range(4):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], contact[:, k], [False]]).astype(int)))
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            track = points[start:end, k, :2]
+            slip.append(float(np.linalg.norm(track - track[0], axis=-1).max()))
+    heights = points[..., 2][contact]
+    return {
+        "contact_share": float(contact.any(1).mean()),
+        "slip_mm_max": 1e3 * max(slip),
+        "float_mm_max": 1e3 * float(max(0.0, heights.max(initial=0.0))),
+        "below_floor_mm_max": 1e3 * float(max(0.0, -corners[..., 2].min())),
+    }
+
+
+def _penetration(result: Retargeted, ends: Float[np.ndarray, "F k 2 3"]) -> float | None:
+    """The deepest overlap of two capsules that three joints or more are between and that are apart at home [mm]."""
+    profile = result.profile
+    if not profile.capsules:
+        return None
+    model = _capsule_model(profile)
+    data = mujoco.MjData(model)
+    pairs = _pairs(result, model, data)
+    deepest = 0.0
+    for placed in ends:
+        _place(model, data, placed)
+        for pair in pairs:
+            deepest = max(deepest, -mujoco.mj_geomDistance(model, data, *pair, 0.1, None))
+    return 1e3 * deepest
+
+
+def _pairs(result: Retargeted, model: mujoco.MjModel, data: mujoco.MjData) -> list[tuple[int, int]]:
+    tree, capsules = result.robot.tree, result.profile.capsules
+    bodies = [tree.frame_bodies[tree.frame(c.frame)] for c in capsules]
+    home = mujoco.MjData(result.robot.mj_model)
+    home.qpos[:] = np.asarray(result.robot.mujoco_qpos(result.robot.q0))
+    mujoco.mj_kinematics(result.robot.mj_model, home)
+    poses = [frame_pose(result.robot, home, c.frame) for c in capsules]
+    placed = [[p + R @ np.array(x) for x in (c.start, c.end)] for c, (p, R) in zip(capsules, poses, strict=True)]
+    _place(model, data, np.array(placed))
+    return [
+        (i, j)
+        for i, j in itertools.combinations(range(len(bodies)), 2)
+        if joints_between(result.robot, bodies[i], bodies[j]) >= JOINTS_APART
+        and mujoco.mj_geomDistance(model, data, i, j, 0.1, None) >= 0.0
+    ]
+
+
+def _capsule_model(profile: Profile) -> mujoco.MjModel:
+    """Free-standing capsules, in the profile's order."""
+    spec = mujoco.MjSpec()
+    for c in profile.capsules:
+        half = 0.5 * float(np.linalg.norm(np.subtract(c.end, c.start)))
+        body = spec.worldbody.add_body(mocap=True)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[c.radius, half, 0.0])
+    return spec.compile()
+
+
+def _place(model: mujoco.MjModel, data: mujoco.MjData, ends: Float[np.ndarray, "k 2 3"]) -> None:
+    """Puts each capsule between its two ends."""
+    data.mocap_pos[:] = ends.mean(1)
+    for k, along in enumerate(ends[:, 1] - ends[:, 0]):
+        mujoco.mju_quatZ2Vec(data.mocap_quat[k], along)
+    mujoco.mj_kinematics(model, data)
+
+
+def _tracking(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) -> dict[str, Any]:
+    person = {name: result.human[:, k] for k, name in enumerate(result.human_names)}
+    errors = {}
+    for name, (first, *others) in _CHAINS.items():
+        h, r = (np.concatenate([points[o] - points[first] for o in others]) for points in (person, robot))
+        scale = np.sum(h * r) / np.sum(h * h)
+        errors[name] = 1e3 * float(np.linalg.norm(scale * h - r, axis=-1).mean())
+    angles = {f"{a}-{b}": _angle(person[b] - person[a], robot[b] - robot[a]) for a, b in LIMBS}
+    return {
+        "limb_error_mm": errors,
+        "limb_error_mm_mean": float(np.mean(list(errors.values()))),
+        "segment_angle_deg": angles,
+        "segment_angle_deg_mean": float(np.mean(list(angles.values()))),
+    }
+
+
+def _angle(a: Float[np.ndarray, "F 3"], b: Float[np.ndarray, "F 3"]) -> float:
+    """The mean angle between vectors [deg]."""
+    across, along = np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, -1)
+    return float(np.degrees(np.arctan2(across, along)).mean())

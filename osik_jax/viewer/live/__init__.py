@@ -1,0 +1,8 @@
+"""A robot in the browser: a control loop of its own, and pages that show it. The pages need the extra ``viewer``."""
+
+from ._export import export_html as export_html
+from ._page import LiveView as LiveView
+from ._page import serve as serve
+from ._page import serve_session as serve_session
+from ._session import Session as Session
+from ._session import load_session as load_session

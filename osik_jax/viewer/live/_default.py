@@ -1,0 +1,106 @@
+"""What a live view starts with: a robot's hands, feet, waist and centre of mass as tasks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._home import compiled_kinematics
+from ...limits import ConfigurationLimit, VelocityLimit
+from ...robot import Robot
+from ...schemes import WeightedQP
+from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task
+from ._session import Session
+from ._source import RobotSource
+
+_HANDS = (r"gripper|tcp|tool|end_?effector|\bee\b", r"rubber_hand|palm|hand(?!.*(index|middle|thumb|finger))", r"wrist")
+_SIDES = {"left": r"(^|_)(l|left)(_|$)|left|^L(?=[A-Z])", "right": r"(^|_)(r|right)(_|$)|right|^R(?=[A-Z])"}
+_GAIN = 15.0
+WEIGHTS = {"foot": 1e4, "balance": 1e3, "waist": 1e2, "com": 1e2, "hand": 1e2, "posture": 1e-2}
+"""For the weighted scheme; the others rank by priority."""
+
+
+def default_session(
+    robot: Robot,
+    *,
+    q: Float[Array, " nq"] | None = None,
+    feet: Sequence[str] = (),
+    polygon: SupportPolygon | None = None,
+    source: RobotSource | None = None,
+    dt: float = 0.005,
+) -> Session:
+    """A session for a robot, whose waist and centre of mass are switched off until somebody wants to lead them.
+
+    Args:
+        robot: the robot.
+        q: where it starts; default: ``robot.q0``. (nq,)
+        feet: frames that stand on the ground.
+        polygon: over which the centre of mass stays.
+        source: where the robot comes from.
+        dt: time of a step [s].
+    """
+    start = robot.q0 if q is None else q
+    poses = compiled_kinematics(robot, start)
+    flat = "pose" if len(feet) <= 2 else "position"
+    tasks: dict[str, Task] = {
+        foot: FrameTask(robot, foot, target=poses.frame_pose(robot, foot), rows=flat, weight=WEIGHTS["foot"])
+        for foot in feet
+    }
+    if polygon is not None:
+        tasks["balance"] = ComTask(robot, polygon=polygon, weight=WEIGHTS["balance"], gain=_GAIN, priority=2)
+    for name in find_hands(robot):
+        pose = poses.frame_pose(robot, name)
+        rows = "position" if feet else "pose"
+        tasks[name] = FrameTask(robot, name, target=pose, rows=rows, weight=WEIGHTS["hand"], gain=_GAIN, priority=3)
+    led: Mapping[str, Task] = _led_later(robot, start) if robot.floating_base else {}
+    tasks |= led
+    tasks["posture"] = PostureTask(robot, target=start, weight=WEIGHTS["posture"], gain=1.0, priority=4)
+    return Session(
+        robot=robot,
+        tasks=tasks,
+        scheme=WeightedQP(),
+        limits=(ConfigurationLimit(robot), VelocityLimit(robot)),
+        dt=dt,
+        q=np.asarray(start),
+        off=frozenset(led),
+        source=source,
+    )
+
+
+def _led_later(robot: Robot, q: Float[Array, " nq"]) -> dict[str, Task]:
+    """Of a robot that moves freely: its waist and its centre of mass."""
+    waist = robot.tree.body_names[robot.tree.root]
+    task = FrameTask(robot, waist, weight=WEIGHTS["waist"], gain=_GAIN, priority=3).at(robot, q)
+    com = ComTask(robot, weight=WEIGHTS["com"], gain=_GAIN, priority=3).at(robot, q)
+    return {waist: task, "centre of mass": com}
+
+
+def find_hands(robot: Robot) -> tuple[str, ...]:
+    """A frame for the left hand and one for the right; of a robot without sides, what is called a hand, or the tip.
+
+    Of several frames of one kind, the one that most joints move.
+    """
+    tree = robot.tree
+    depth = [0] * len(tree.body_parents)
+    for body, parent in enumerate(tree.body_parents[1:], 1):
+        depth[body] = depth[parent] + 1
+    moving = [(name, depth[body]) for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body]
+    sided = [hand for side in _SIDES.values() if (hand := _named([f for f in moving if re.search(side, f[0])]))]
+    if len(set(sided)) == len(_SIDES):
+        return tuple(sided)
+    hand = _named(moving)
+    if hand is None and not robot.floating_base:
+        hand = max(moving, key=lambda frame: frame[1])[0]
+    return () if hand is None else (hand,)
+
+
+def _named(frames: Sequence[tuple[str, int]]) -> str | None:
+    """The deepest of the frames that are called like a hand."""
+    for pattern in _HANDS:
+        found = [frame for frame in frames if re.search(pattern, frame[0], re.IGNORECASE)]
+        if found:
+            return max(found, key=lambda frame: frame[1])[0]
+    return None

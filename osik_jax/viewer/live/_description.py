@@ -1,0 +1,124 @@
+"""Tasks, limits and schemes as plain data, which JSON can hold, and as the line of Python that makes them."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from ...robot import Robot
+from ...tasks import AdaptiveGain, PostureTask, SupportPolygon
+from ...tasks._pose import PoseTask
+
+Description = dict[str, Any]
+"""``{"kind": name of the class, argument: plain value, ...}``; arguments that change nothing are left out."""
+
+_PARTS = {"AdaptiveGain": AdaptiveGain, "SupportPolygon": SupportPolygon}
+_ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
+
+
+def describe(part: Any, robot: Robot) -> Description:
+    """A task, limit or scheme of this package as plain data.
+
+    Raises:
+        ValueError: a class of somebody's own, or an object that its constructor's arguments do not tell all of.
+    """
+    kind = type(part).__name__
+    if getattr(importlib.import_module("osik_jax"), kind, None) is not type(part):
+        raise ValueError(f"{kind} is no class of osik_jax, so a session file cannot hold it")
+    names = [name for name in inspect.signature(type(part)).parameters if name != "robot"]
+    described = {"kind": kind} | {name: _argument(part, robot, name) for name in names}
+    if not _makes(described, robot, part):
+        raise ValueError(f"this {kind} has settings that a session file cannot hold")
+    for name in names:
+        without = {key: value for key, value in described.items() if key != name}
+        described = without if _makes(without, robot, part) else described
+    return described
+
+
+def _makes(described: Description, robot: Robot, part: Any) -> bool:
+    """Whether that is a description of the object: the same structure and the same numbers."""
+    try:
+        first, second = jax.tree.flatten(rebuild(described, robot)), jax.tree.flatten(part)
+    except ValueError:
+        return False
+    return first[1] == second[1] and all(np.array_equal(x, y) for x, y in zip(first[0], second[0], strict=True))
+
+
+def rebuild(described: Mapping[str, Any], robot: Robot) -> Any:
+    """The object of a description.
+
+    Raises:
+        ValueError: a description of nothing that is known, or arguments that do not fit.
+    """
+    found = getattr(importlib.import_module("osik_jax"), str(described.get("kind")), None)
+    if not inspect.isclass(found):
+        raise ValueError(f"{described.get('kind')!r} is no class of osik_jax")
+    cls: Any = found
+    arguments = {name: _live(value) for name, value in described.items() if name != "kind"}
+    try:
+        return cls(robot, **arguments) if _takes_robot(cls) else cls(**arguments)
+    except TypeError as error:
+        raise ValueError(f"{cls.__name__}: {error}") from error
+
+
+def python(described: Mapping[str, Any]) -> str:
+    """The expression that makes it, in a program that has ``import osik_jax as osik`` and a ``robot``."""
+    kind = described["kind"]
+    first = ["robot"] if _takes_robot(getattr(importlib.import_module("osik_jax"), kind)) else []
+    given = [f"{name}={_text(value)}" for name, value in described.items() if name != "kind"]
+    return f"osik.{kind}({', '.join(first + given)})"
+
+
+def _takes_robot(cls: type) -> bool:
+    return next(iter(inspect.signature(cls).parameters), None) == "robot"
+
+
+def _argument(part: Any, robot: Robot, name: str) -> Any:
+    """What a constructor's argument has to be for this object, as plain data."""
+    if name == "rows" and isinstance(part, PoseTask):
+        return _ROWS.get(part.kept, list(part.kept))
+    if name == "joints" and isinstance(part, PostureTask):
+        return [robot.tree.joint_names[joint] for joint in part.joints]
+    if not hasattr(part, name):
+        raise ValueError(f"a session file cannot hold a {type(part).__name__}: its {name} is not kept")
+    return _plain(getattr(part, name))
+
+
+def _plain(value: Any) -> Any:
+    """Numbers as floats and lists of floats."""
+    for kind, cls in _PARTS.items():
+        if isinstance(value, cls):
+            names = ("maximum", "minimum", "decay") if cls is AdaptiveGain else ("normals", "offsets", "vertices")
+            return {"kind": kind} | {name: _plain(getattr(value, name)) for name in names}
+    if isinstance(value, tuple | list):
+        return [_plain(one) for one in value]
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return np.asarray(value).tolist()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise ValueError(f"a session file cannot hold a {type(value).__name__}")
+
+
+def _live(value: Any) -> Any:
+    """Of plain data, what constructors take."""
+    if isinstance(value, Mapping):
+        cls = _PARTS[value["kind"]]
+        return cls(**{name: np.asarray(one, float) for name, one in value.items() if name != "kind"})
+    return value
+
+
+def _text(value: Any) -> str:
+    """Plain data as Python."""
+    if isinstance(value, Mapping):
+        given = ", ".join(f"{name}=np.array({_text(one)})" for name, one in value.items() if name != "kind")
+        return f"osik.{value['kind']}({given})"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_text, value))}]"
+    if isinstance(value, float) and not np.isfinite(value):
+        return "np.nan" if np.isnan(value) else f"{'-' if value < 0.0 else ''}np.inf"
+    return repr(value)

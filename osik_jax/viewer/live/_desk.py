@@ -1,0 +1,152 @@
+"""A session that is being edited, and the loop that runs it."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..._tree import unknown_name
+from ...limits import VelocityLimit
+from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
+from ...tasks import FrameTask, Task
+from ._description import describe, rebuild
+from ._hold import targets_here
+from ._loop import ControlLoop
+from ._session import Session
+from ._step import Controller, with_targets
+
+SCHEMES: dict[str, Callable[[], Scheme]] = {
+    "Weighted QP": WeightedQP,
+    "Hierarchical QP": HierarchicalQP,
+    "Null space": lambda: NullSpace(saturate=True),
+}
+"""The schemes to choose from, all of which keep the limits."""
+
+
+class Desk:
+    """Edits of a session, each of which the loop takes up.
+
+    Attributes:
+        loop: runs the session's controller.
+    """
+
+    def __init__(self, session: Session) -> None:
+        """Takes the session to start with; the loop does not run yet."""
+        self._session, self._lock = session, threading.RLock()
+        controller = session.controller()
+        self._told = (controller, session, session)
+        self.loop = ControlLoop(session.robot, controller, dt=session.dt, q0=jnp.asarray(session.q))
+
+    @property
+    def session(self) -> Session:
+        """The session with the targets of now; the same object until something changes."""
+        with self._lock:
+            now = self.loop.controller
+            if self._told[0] is now and self._told[1] is self._session:
+                return self._told[2]
+            targets = {k: t for k, task in now.tasks.items() if (t := getattr(task, "target", None)) is not None}
+            kept = with_targets(Controller(self._session.tasks, now.scheme, ()), targets)
+            self._told = now, self._session, dataclasses.replace(self._session, tasks=kept.tasks)
+            return self._told[2]
+
+    def edit(self, **changes: Any) -> None:
+        """Replaces fields of the session."""
+        with self._lock:
+            new = dataclasses.replace(self.session, **changes)
+            self.loop.change(lambda _: new.controller())
+            self._session = new
+
+    def switch(self, name: str, on: bool) -> None:
+        """Switches a task on or off; one that comes on starts where the robot is."""
+        with self._lock:
+            session = self.session
+            if on == (name not in session.off):
+                return
+            if on:
+                here = targets_here(session.robot, self.loop.snapshot.q, session.tasks, [name])
+                moved = with_targets(Controller({name: session.tasks[name]}, session.scheme, ()), here)
+                self._put(name, moved.tasks[name], off=session.off - {name})
+            else:
+                self.edit(off=session.off | {name})
+
+    def renumber(self, name: str, **numbers: Any) -> None:
+        """Another weight or gain of a task."""
+        with self._lock:
+            self._put(name, self.task(name).replace(**numbers))
+
+    def rank(self, name: str, priority: int) -> None:
+        """Another priority of a task.
+
+        Raises:
+            ValueError: a task of a class of somebody's own.
+        """
+        with self._lock:
+            task, robot = self.task(name), self._session.robot
+            if task.priority != priority:
+                self._put(name, rebuild({**describe(task, robot), "priority": priority}, robot))
+
+    def add_frame(self, frame: str) -> str:
+        """A new task for a frame, which starts where the robot is; returns its name."""
+        with self._lock:
+            session, name = self.session, frame
+            while name in session.tasks:
+                name += "'"
+            task = FrameTask(session.robot, frame, rows="position", weight=1e2, priority=3)
+            self._put(name, task.at(session.robot, jnp.asarray(self.loop.snapshot.q)), off=session.off)
+            return name
+
+    def remove(self, name: str) -> None:
+        """Takes a task away; the last one stays."""
+        with self._lock:
+            left = {key: task for key, task in self.session.tasks.items() if key != name}
+            if left:
+                self.edit(tasks=left, off=self._session.off - {name})
+
+    def take_scheme(self, title: str) -> None:
+        """Another scheme, by its title."""
+        self.edit(scheme=SCHEMES[title]())
+
+    def switch_limit(self, number: int, on: bool) -> None:
+        """Switches one of the session's limits on or off."""
+        with self._lock:
+            off = self._session.limits_off
+            self.edit(limits_off=off - {number} if on else off | {number})
+
+    def slow_down(self, share: float) -> None:
+        """Speed limits at a share of the robot's own."""
+        with self._lock:
+            own = np.asarray(self._session.robot.velocity_limit)
+            limits = [
+                limit.replace(velocity=own * share) if type(limit) is VelocityLimit else limit
+                for limit in self._session.limits
+            ]
+            self.edit(limits=tuple(limits))
+
+    def load(self, session: Session) -> None:
+        """Takes over another session of the same robot, at the configuration reached.
+
+        Raises:
+            ValueError: a session of another robot.
+        """
+        if session.robot.tree != self._session.robot.tree:
+            raise ValueError("the session is of another robot: start osik view with it")
+        self.edit(**{f.name: getattr(session, f.name) for f in dataclasses.fields(session) if f.name != "robot"})
+
+    def task(self, name: str) -> Task:
+        """A task by name.
+
+        Raises:
+            KeyError: no such task.
+        """
+        tasks = self.session.tasks
+        if name not in tasks:
+            raise unknown_name("task", name, tuple(tasks))
+        return tasks[name]
+
+    def _put(self, name: str, task: Task, **changes: Any) -> None:
+        self.edit(tasks={**self.session.tasks, name: task}, **changes)

@@ -1,0 +1,86 @@
+"""A motion as one page that plays without a server and without a network."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...control import Trajectory
+from ...robot import Robot
+from .._look import Look
+from ._playback import Cast, Motion
+from ._server import close_server, open_server
+
+_PICTURES = 30.0
+"""A second, of those that are kept."""
+
+
+def export_html(
+    robot: Robot,
+    trajectory: Trajectory | ArrayLike | Mapping[str, ArrayLike],
+    path: str | os.PathLike[str],
+    *,
+    dt: float | None = None,
+    look: Look | None = None,
+    title: str = "osik-jax",
+) -> Path:
+    """Writes a motion as one self-contained page: time slider, speeds, and a camera to turn with the mouse.
+
+    Everything is in the file, which any browser with WebGL plays offline; it is about 1 MB and what the robot's meshes
+    take.
+
+    Args:
+        robot: the robot.
+        trajectory: of ``rollout``, or configurations (T, nq), or several of them by name, side by side.
+        path: of the page.
+        dt: time between configurations [s]; default: that of the trajectory, or 0.005.
+        look: what the robot's URDF shows, from ``read_look``; default: the model's own shapes.
+        title: of the page.
+
+    Returns:
+        The path.
+
+    Raises:
+        ImportError: viser is not installed (the extra ``viewer``).
+        ValueError: configurations of another robot, or none.
+    """
+    motion = _motion(robot, trajectory, dt)
+    server = open_server("127.0.0.1", 0, title)
+    try:
+        cast = Cast(server, robot, motion, look, panel=False)
+        serializer = server.get_scene_serializer()
+        count = max(int(np.ceil(motion.duration * _PICTURES)), 1)
+        for now in np.linspace(0.0, motion.duration, count + 1):
+            cast.show(float(now))
+            serializer.insert_sleep(motion.duration / count)
+        page = serializer.as_html()
+    finally:
+        close_server(server)
+    out = Path(path)
+    out.write_text(page.replace("<title>Viser</title>", f"<title>{_escaped(title)}</title>", 1), encoding="utf-8")
+    return out
+
+
+def _motion(robot: Robot, trajectory: Any, dt: float | None) -> Motion:
+    """The runs with their times, checked."""
+    if isinstance(trajectory, Trajectory):
+        period = float(trajectory.time[1] - trajectory.time[0]) if len(trajectory.time) > 1 else 0.005
+        trajectory, dt = trajectory.q, period if dt is None else dt
+    given = trajectory if isinstance(trajectory, Mapping) else {"motion": trajectory}
+    runs = {str(name): np.asarray(q, float) for name, q in given.items()}
+    for name, q in runs.items():
+        if q.ndim != 2 or len(q) == 0 or q.shape[1] != robot.nq or not np.isfinite(q).all():
+            raise ValueError(f"run {name!r} has shape {q.shape}; it is configurations (T, {robot.nq}), all finite")
+    period = 0.005 if dt is None else float(dt)
+    if not (runs and np.isfinite(period) and period > 0.0):
+        raise ValueError(f"there are {len(runs)} runs and dt is {period}; it takes one at least, and a positive time")
+    return Motion(runs, {name: np.arange(len(q)) * period for name, q in runs.items()})
+
+
+def _escaped(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;")

@@ -1,0 +1,325 @@
+"""The control loop in a thread of its own: what others ask for is taken up between steps and never waited for."""
+
+from __future__ import annotations
+
+import atexit
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Hashable
+from dataclasses import replace
+from typing import Any, NamedTuple, Self
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._tree import unknown_name
+from ...robot import Robot
+from ...solvers import Status
+from ._compiler import Compiler
+from ._hold import targets_here
+from ._push import Push
+from ._recorder import Recorder
+from ._snapshot import Recording, Snapshot
+from ._step import Controller, Program, State, with_targets
+from ._timing import Stopwatch, Timing
+
+_LATE = 5
+"""A loop that is so many periods late starts counting anew instead of catching up."""
+_SWITCH_INTERVAL = 5e-4
+"""[s]"""
+
+
+class _Job(NamedTuple):
+    """What the control thread runs: a program and the numbers that it takes."""
+
+    program: Program
+    numbers: list[Array]
+
+
+class _Lease(NamedTuple):
+    """Who leads the target of a task, and until when that counts as fresh [s]."""
+
+    owner: Hashable
+    until: float
+
+
+class ControlLoop:
+    """Runs a controller at a fixed rate, in a thread of its own.
+
+    All methods may be called from any thread. Numbers (targets, weights, gains, limits) count from the next step on.
+    Another structure (another task, scheme, priority or limit) is compiled in the background while the step before
+    goes on and follows new targets; then it takes over at the configuration that was reached.
+
+    The robot stands still while nothing is compiled yet, while paused, and wherever an answer is not finite. A target
+    that somebody leads (``aim`` with an owner or a timeout) and then abandons becomes where the robot is.
+
+    Attributes:
+        robot: the robot.
+        dt: the period [s].
+    """
+
+    def __init__(
+        self, robot: Robot, controller: Controller, *, dt: float = 0.005, q0: Float[Array, " nq"] | None = None
+    ) -> None:
+        """Takes the robot, the controller to start with, the period [s] and where to start, ``robot.q0`` by default.
+
+        Raises:
+            ValueError: q0 does not fit, or dt is not positive.
+        """
+        if not (np.isfinite(dt) and dt > 0.0):
+            raise ValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
+        start = robot.q0 if q0 is None else q0
+        robot.check_configuration(start, "q0")
+        self.robot, self.dt = robot, float(dt)
+        self._start = np.asarray(start, robot.q0.dtype)
+        self._editing, self._lock = threading.Lock(), threading.Lock()
+        self._wanted = self._running = controller
+        self._targets: dict[str, Any] = {}
+        self._told = (self._wanted, self._targets, controller)
+        self._leases: dict[str, _Lease] = {}
+        self._job: _Job | None = None
+        self._is_behind, self._problem = False, ""
+        self._orders: deque[Callable[[], None]] = deque()
+        self._stopwatch, self._recorder, self._push = Stopwatch(), Recorder(self.dt), Push(robot.nv, self.dt)
+        self._snapshot = Snapshot(0.0, self._start, np.zeros(robot.nv), preparing=True)
+        self._state: State = (jnp.asarray(self._start), jnp.zeros(robot.nv, self._start.dtype), None)
+        self._program: Program | None = None
+        self._stop = threading.Event()
+        self._compiler = Compiler(robot, self.dt, self._compiled, self._not_compiled)
+        self._thread = threading.Thread(target=self._run, name="osik-control", daemon=True)
+
+    def start(self) -> Self:
+        """Starts the threads; the first step is compiled in the background.
+
+        While it runs, Python's threads change places every half millisecond, not every five: the control thread would
+        wait that long for each of the others that computes.
+        """
+        self._switch_interval = sys.getswitchinterval()
+        sys.setswitchinterval(min(_SWITCH_INTERVAL, self._switch_interval))
+        atexit.register(self.stop)
+        self._compiler.thread.start()
+        self._compiler.ask(self._wanted)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Ends the threads; what is being compiled is waited for, as no thread may be left in XLA when Python ends."""
+        atexit.unregister(self.stop)
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+            sys.setswitchinterval(self._switch_interval)
+        self._compiler.stop()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """What the last step left; a new object for each step."""
+        return self._snapshot
+
+    @property
+    def controller(self) -> Controller:
+        """The controller that is asked for; it runs as soon as it is compiled. The same object until it changes."""
+        with self._lock:
+            if self._told[0] is not self._wanted or self._told[1] is not self._targets:
+                self._told = self._wanted, self._targets, with_targets(self._wanted, self._targets)
+            return self._told[2]
+
+    @property
+    def timing(self) -> Timing:
+        """Periods and step times of the last steps since the start or the last pause."""
+        return self._stopwatch.timing()
+
+    def wait_until_ready(self, timeout: float = 60.0) -> bool:
+        """Waits until the controller asked for is the one that runs; False: it does not after the timeout [s]."""
+        end = time.monotonic() + timeout
+        while time.monotonic() < end:
+            if self._job is not None and not self._is_behind:
+                return True
+            time.sleep(0.005)
+        return False
+
+    def change(self, edit: Callable[[Controller], Controller]) -> None:
+        """Replaces the controller by what ``edit`` makes of the one asked for; changes wait for each other.
+
+        Raises:
+            Whatever ``edit`` raises; the controller then stays.
+        """
+        with self._editing:
+            with self._lock:
+                known = dict(self._targets)
+            wanted = edit(with_targets(self._wanted, known))
+            with self._lock:
+                self._targets = {k: new for k, new in self._targets.items() if new is not known.get(k)}
+                self._wanted, self._problem = wanted, ""
+                self._is_behind = wanted.structure() != self._running.structure()
+                if not self._is_behind:
+                    self._running = wanted
+                    self._refresh()
+                behind = self._is_behind or self._job is None
+            if behind:
+                self._compiler.ask(wanted)
+
+    def aim(self, name: str, target: Any, *, owner: Hashable = None, timeout: float | None = None) -> None:
+        """Gives a task another target, also while another structure is being compiled.
+
+        Args:
+            name: of the task.
+            target: what ``task.replace(target=...)`` takes.
+            owner: who leads it; ``release(owner)`` holds the robot where it is.
+            timeout: if no other target comes within this time, the robot is held where it is [s].
+
+        Raises:
+            KeyError: no such task.
+            TypeError, ValueError: no such target.
+        """
+        if name not in self._wanted.tasks:
+            raise unknown_name("task", name, tuple(self._wanted.tasks))
+        aimed: Any = self._wanted.tasks[name].replace(target=target)
+        until = np.inf if timeout is None else time.monotonic() + timeout
+        with self._lock:
+            self._leases.pop(name, None)
+            if owner is not None or timeout is not None:
+                self._leases[name] = _Lease(owner, until)
+            self._retarget({name: aimed.target})
+
+    def let_go(self, owner: Hashable) -> None:
+        """The owner has put its targets where it wants them: they stay."""
+        with self._lock:
+            self._leases = {name: lease for name, lease in self._leases.items() if lease.owner != owner}
+
+    def release(self, owner: Hashable) -> None:
+        """The owner has gone while it led targets: they become where the robot is."""
+        with self._lock:
+            left = [name for name, lease in self._leases.items() if lease.owner == owner]
+        if left:
+            self._orders.append(lambda: self._hold(left))
+
+    def push(self, velocity: Float[np.ndarray, " nv"]) -> None:
+        """Adds a velocity [m/s, rad/s] that fades within a second: a shove, which the controller has to make up for."""
+        self._orders.append(lambda: self._push.start(velocity))
+
+    def pause(self) -> None:
+        """Stands still from the next step on."""
+        self._orders.append(lambda: self._show(paused=True))
+
+    def resume(self) -> None:
+        """Goes on."""
+        self._orders.append(lambda: self._show(paused=False))
+
+    def reset(self) -> None:
+        """Puts the robot back to where it started, at once; targets stay where they are."""
+        self._orders.append(self._reset)
+
+    def record(self) -> None:
+        """Starts a recording, of ten minutes at most; one that runs is thrown away."""
+        self._orders.append(lambda: self._recorder.start(self._snapshot.q))
+
+    def recorded(self) -> Recording:
+        """Ends the recording and returns it; empty where there was none."""
+        return self._recorder.stop()
+
+    def _refresh(self) -> None:
+        """Takes the numbers over that are asked for; the lock is held."""
+        if self._job is not None:
+            self._job = self._job._replace(numbers=with_targets(self._running, self._targets).numbers())
+
+    def _retarget(self, targets: dict[str, Any]) -> None:
+        """New targets for what runs and for what is being compiled; the lock is held."""
+        self._targets = self._targets | targets
+        self._refresh()
+
+    def _compiled(self, controller: Controller, program: Program) -> None:
+        """The compiler has the program of a controller; it may no longer be the one that is asked for."""
+        with self._lock:
+            if controller.structure() == self._wanted.structure():
+                self._running, self._is_behind = self._wanted, False
+                self._job = _Job(program, with_targets(self._running, self._targets).numbers())
+
+    def _not_compiled(self, controller: Controller, error: Exception) -> None:
+        """Goes back to what runs, and says why."""
+        with self._lock:
+            if controller.structure() == self._wanted.structure():
+                self._wanted, self._is_behind = self._running, False
+                self._problem = " ".join(str(error).split())
+
+    def _run(self) -> None:
+        """The control thread."""
+        deadline = time.perf_counter()
+        while not self._stop.is_set():
+            self._tick()
+            deadline += self.dt
+            wait = deadline - time.perf_counter()
+            if wait > 0.0:
+                time.sleep(wait)
+            elif wait < -_LATE * self.dt:
+                deadline = time.perf_counter()
+
+    def _tick(self) -> None:
+        begin = time.perf_counter()
+        while self._orders:
+            self._orders.popleft()()
+        self._hold(self._abandoned())
+        job = self._job
+        self._show(ready=job is not None, preparing=job is None or self._is_behind, problem=self._problem)
+        if job is None or self._snapshot.paused:
+            self._stopwatch.clear()
+            return
+        self._step(job)
+        self._stopwatch.add(begin, time.perf_counter() - begin)
+
+    def _step(self, job: _Job) -> None:
+        """One step; where its answer cannot be used, the robot stands still and the solver starts anew."""
+        if job.program is not self._program:
+            self._program, self._state = job.program, (*self._state[:2], job.program.cold)
+        state, status, errors = job.program.run(job.numbers, self._state, self._push.now())
+        before, code = self._snapshot, int(status)
+        q, velocity = np.asarray(state[0]), np.asarray(state[1])
+        usable = bool(np.isfinite(q).all()) and code != Status.NUMERICAL_ERROR
+        if usable:
+            self._state = state
+        else:
+            q, velocity = before.q, np.zeros_like(velocity)
+            self._state = (self._state[0], jnp.asarray(velocity), job.program.cold)
+        self._show(
+            time=before.time + self.dt,
+            q=q,
+            velocity=velocity,
+            status=code,
+            errors={name: np.asarray(error) for name, error in errors.items()},
+            failures=before.failures + (not usable),
+            recording=self._recorder.add(q),
+        )
+
+    def _show(self, **changes: Any) -> None:
+        self._snapshot = replace(self._snapshot, **changes)
+
+    def _reset(self) -> None:
+        """Back to the start, at rest."""
+        still = np.zeros_like(self._snapshot.velocity)
+        cold = None if self._program is None else self._program.cold
+        self._state = (jnp.asarray(self._start), jnp.asarray(still), cold)
+        self._push.stop()
+        self._show(time=0.0, q=self._start, velocity=still, failures=0)
+
+    def _abandoned(self) -> list[str]:
+        """Tasks whose target is older than it may be."""
+        now = time.monotonic()
+        return [name for name, lease in list(self._leases.items()) if lease.until < now]
+
+    def _hold(self, names: list[str]) -> None:
+        """Targets of these tasks become where the robot is."""
+        if not names:
+            return
+        here = targets_here(self.robot, self._snapshot.q, self._running.tasks, names)
+        with self._lock:
+            self._leases = {name: lease for name, lease in self._leases.items() if name not in names}
+            self._retarget(here)

@@ -1,0 +1,97 @@
+"""What ``osik view`` opens."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..._errors import warn
+from ...robot import Robot
+from .._parts import robot_parts
+from ._default import default_session
+from ._needs import import_viser
+from ._page import LiveView, serve_session
+from ._playback import Player, read_motion
+from ._server import check_port
+from ._session import load_session
+from ._source import RobotSource, source_look
+from ._stance import sole_polygon, standing
+
+_G1 = "g1_description/urdf/g1_29dof_rev_1_0.urdf"
+_G1_DESCRIPTION = "g1_mj_description"
+
+
+def check(host: str, port: int) -> None:
+    """Finds out before the work what would fail after it.
+
+    Raises:
+        ImportError: viser is not installed.
+        OSError: the port is in use, or the address is none of this machine's.
+    """
+    import_viser()
+    check_port(host, port)
+
+
+def source_of(name: str, floating_base: bool | None) -> RobotSource:
+    """Where a robot comes from; ``g1`` is that of example-robot-data, or of robot_descriptions."""
+    if name != "g1" or Path(name).exists():
+        return RobotSource(name, floating_base)
+    try:
+        files = importlib.metadata.files("example-robot-data") or []
+    except importlib.metadata.PackageNotFoundError:
+        files = []
+    found = [str(file.locate()) for file in files if str(file).endswith(_G1)]
+    return RobotSource(found[0] if found else _G1_DESCRIPTION, floating_base)
+
+
+def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: str, port: int) -> LiveView:
+    """A robot to drag.
+
+    Args:
+        robot: the robot.
+        source: where it comes from.
+        feet: frames that stand on the ground.
+        host: address to listen at.
+        port: to listen at.
+
+    Raises:
+        KeyError: no such frame.
+        OSError: the port is in use.
+    """
+    for foot in feet:
+        robot.tree.frame(foot)
+    look = source_look(source)
+    if look is not None and look.missing:
+        warn(f"the page does without mesh files that cannot be read: {', '.join(look.missing[:3])}")
+    shapes = robot_parts(robot, look=look)
+    q = standing(robot, shapes, feet) if robot.floating_base else np.asarray(robot.q0)
+    polygon = sole_polygon(robot, shapes, q, feet) if feet else None
+    session = default_session(robot, q=jnp.asarray(q), feet=feet, polygon=polygon, source=source)
+    return serve_session(session, look=look, host=host, port=port)
+
+
+def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> Player:
+    """A motion to play.
+
+    Raises:
+        FileNotFoundError, ValueError: as in ``read_motion``.
+        OSError: the port is in use.
+    """
+    motion = read_motion(path, robot)
+    return Player(robot, motion, look=source_look(source), host=host, port=port, title=path.name)
+
+
+def open_session(path: Path, *, host: str, port: int) -> LiveView:
+    """A session to go on with.
+
+    Raises:
+        FileNotFoundError, ValueError: as in ``load_session``.
+        OSError: the port is in use.
+    """
+    session = load_session(path)
+    look = None if session.source is None else source_look(session.source)
+    return serve_session(session, look=look, host=host, port=port)

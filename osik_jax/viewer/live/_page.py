@@ -1,0 +1,238 @@
+"""A page: the scene and the panel of a session, kept up to date by a thread that only reads."""
+
+from __future__ import annotations
+
+import threading
+import time
+import webbrowser
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Self
+
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._checks import check_setting, check_tasks, checked_limits
+from ...limits import ConfigurationLimit, Limit, VelocityLimit
+from ...robot import Robot
+from ...schemes import Scheme, WeightedQP
+from ...tasks import ComTask, SupportPolygon, Task
+from .._look import Look
+from .._mujoco import robot_com
+from .._outline import floor_height
+from .._parts import robot_parts
+from ._desk import Desk
+from ._gizmos import Gizmos, Pose, gizmo_target
+from ._loop import ControlLoop
+from ._marks import BalanceMarks
+from ._panel import Panel
+from ._robot_nodes import RobotNodes
+from ._server import close_server, open_server
+from ._session import Session
+from ._source import RobotSource
+from ._surroundings import add_surroundings
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
+
+_FRAME = 1.0 / 30.0
+"""Time between pictures [s]."""
+_WORDS = 6
+"""The panel's figures change with every so many pictures."""
+
+
+class LiveView:
+    """A page that runs a session; ``serve`` makes one.
+
+    Attributes:
+        url: address of the page.
+    """
+
+    def __init__(self, session: Session, *, look: Look | None, host: str, port: int, title: str) -> None:
+        """Starts the server and the loop."""
+        self._server = open_server(host, port, title)
+        self.url = f"http://{host}:{self._server.get_port()}"
+        self._desk = Desk(session)
+        robot = session.robot
+        shapes, self._data = robot_parts(robot, look=look), mujoco.MjData(robot.mj_model)
+        self._kinematics(session.q)
+        seen, floor = shapes.corners(self._data), floor_height(robot, shapes, [self._data])
+        size = float(np.linalg.norm(np.ptp(seen, axis=0)))
+        add_surroundings(self._server, seen, floor)
+        self._robot = RobotNodes(self._server.scene, robot, look=look)
+        self._marks = BalanceMarks(self._server.scene, floor, size) if robot.floating_base else None
+        self._gizmos = Gizmos(self._server.scene, size, self._drag)
+        self._panel = Panel(self._server, self._desk, size)
+        self._polygon: SupportPolygon | None = None
+        self._server.on_client_disconnect(self._gone)
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="osik-page", daemon=True)
+        self._desk.loop.start()
+        self._thread.start()
+
+    @property
+    def loop(self) -> ControlLoop:
+        """What runs the controller."""
+        return self._desk.loop
+
+    @property
+    def session(self) -> Session:
+        """The session as it is now; ``session.save(path)`` writes it."""
+        return self._desk.session
+
+    def aim(self, task: str, target: Any, *, timeout: float | None = None) -> None:
+        """Gives a task another target; the robot is held where it is if none follows within the timeout [s].
+
+        Raises:
+            KeyError: no such task.
+            TypeError, ValueError: no such target.
+        """
+        self.loop.aim(task, target, timeout=timeout)
+
+    def wait(self) -> None:
+        """Blocks until ``stop`` is called from elsewhere, or Ctrl-C."""
+        while not self._end.wait(0.5):
+            pass
+
+    def stop(self) -> None:
+        """Ends the loop and the server."""
+        self._end.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout=2.0)
+        self.loop.stop()
+        close_server(self._server)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        """The thread that draws."""
+        count = 0
+        while not self._end.is_set():
+            begin = time.perf_counter()
+            self._draw()
+            if count % _WORDS == 0:
+                self._panel.tell()
+            count += 1
+            self._end.wait(max(_FRAME - (time.perf_counter() - begin), 0.2 * _FRAME))
+
+    def _draw(self) -> None:
+        """The robot as it is now."""
+        session = self._desk.session
+        on = session.active_tasks
+        self._kinematics(self.loop.snapshot.q)
+        with self._server.atomic():
+            self._robot.place(self._data)
+            self._gizmos.show(on)
+            if self._marks is not None:
+                polygon = _polygon(on)
+                if polygon is not self._polygon:
+                    self._marks.show_polygon(polygon)
+                    self._polygon = polygon
+                self._marks.place(robot_com(session.robot, self._data))
+
+    def _kinematics(self, q: Float[np.ndarray, " nq"]) -> None:
+        robot = self._desk.session.robot
+        index, coefficient = robot.tree.qpos_source
+        self._data.qpos[:] = np.asarray(q)[index] * coefficient + np.asarray(robot.qpos_offset)
+        mujoco.mj_kinematics(robot.mj_model, self._data)
+        mujoco.mj_comPos(robot.mj_model, self._data)
+
+    def _drag(self, name: str, pose: Pose, visitor: int, phase: str) -> None:
+        """A visitor drags a handle; one who has gone lets the robot stop where it is."""
+        if phase != "end":
+            self.loop.aim(name, gizmo_target(self._desk.session.tasks[name], pose), owner=visitor)
+        elif visitor in self._server.get_clients():
+            self.loop.let_go(visitor)
+        else:
+            self.loop.release(visitor)
+
+    def _gone(self, client: ClientHandle) -> None:
+        """A visitor has closed the page."""
+        self._gizmos.drop(client.client_id)
+        self.loop.release(client.client_id)
+
+
+def serve(
+    robot: Robot,
+    tasks: Mapping[str, Task],
+    *,
+    scheme: Scheme | None = None,
+    limits: Sequence[Limit] | None = None,
+    dt: float = 0.005,
+    q0: Float[Array, " nq"] | None = None,
+    look: Look | None = None,
+    source: RobotSource | str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open_browser: bool = False,
+) -> LiveView:
+    """Shows a controller at work in a page, where targets can be dragged, and runs it at a fixed rate.
+
+    ``view = serve(robot, tasks)`` returns at once; the first step is compiled while the page is up already.
+    ``view.stop()`` ends it, ``view.wait()`` keeps a program going until Ctrl-C.
+
+    Args:
+        robot: the robot.
+        tasks: by name. Frame tasks and centres of mass that have a target get a handle to drag.
+        scheme: as in ``osik_jax.solve``.
+        limits: as in ``osik_jax.solve``.
+        dt: time of a step, and period of the loop [s].
+        q0: where the robot starts; default: ``robot.q0``. (nq,)
+        look: what the robot's URDF shows, from ``read_look``; default: the model's own shapes.
+        source: name or file of the robot, which sessions then keep.
+        host: address to listen at; 127.0.0.1 is this machine alone.
+        port: 0 for any that is free.
+        open_browser: opens the page in a browser.
+
+    Returns:
+        The view.
+
+    Raises:
+        ImportError: viser is not installed (the extra ``viewer``).
+        OSError: the port is in use.
+        TypeError, ValueError: as in ``osik_jax.solve``.
+    """
+    start = robot.q0 if q0 is None else q0
+    robot.check_configuration(start, "q0")
+    session = Session(
+        robot=robot,
+        tasks=dict(tasks),
+        scheme=WeightedQP() if scheme is None else scheme,
+        limits=(ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else tuple(limits),
+        dt=dt,
+        q=np.asarray(start),
+        source=RobotSource(source) if isinstance(source, str) else source,
+    )
+    return serve_session(session, look=look, host=host, port=port, open_browser=open_browser)
+
+
+def serve_session(
+    session: Session,
+    *,
+    look: Look | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open_browser: bool = False,
+) -> LiveView:
+    """Shows a session, such as one from ``load_session``; the arguments are those of ``serve``.
+
+    Raises:
+        ImportError, OSError: as in ``serve``.
+    """
+    check_setting("serve(robot, tasks)", session.robot, session.scheme, session.dt)
+    check_tasks(session.tasks, session.robot)
+    checked_limits(session.robot, session.limits)
+    view = LiveView(session, look=look, host=host, port=port, title="osik-jax")
+    if open_browser:
+        webbrowser.open(view.url)
+    return view
+
+
+def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:
+    """Of the first task that keeps the centre of mass over one."""
+    found = (task.polygon for task in tasks.values() if isinstance(task, ComTask) and task.polygon is not None)
+    return next(found, None)

@@ -1,0 +1,213 @@
+"""The panel of a page: what can be switched, slid and read."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...tasks import AdaptiveGain
+from ._desk import SCHEMES, Desk
+from ._readout import error_table, joint_table, state_text, timing_text
+from ._session import session_from_json
+
+if TYPE_CHECKING:
+    from viser import GuiEvent, ViserServer
+
+_LIMIT_WORDS = {
+    "ConfigurationLimit": "joint ranges",
+    "VelocityLimit": "joint speeds",
+    "AccelerationLimit": "joint accelerations",
+    "CollisionAvoidanceLimit": "collisions",
+}
+_WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
+_PUSH = 0.6
+"""Speed of a push, in sizes of the robot a second."""
+
+
+class Panel:
+    """Everything that is no scene."""
+
+    def __init__(self, server: ViserServer, desk: Desk, size: float) -> None:
+        """Adds the panel to the page of a robot of this size [m]."""
+        self._server, self._desk, self._size = server, desk, size
+        gui = server.gui
+        self._state = gui.add_markdown("")
+        self._timing = gui.add_markdown("")
+        self._add_buttons()
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Tasks"):
+            self._add_tasks()
+        with tabs.add_tab("Limits"):
+            self._add_limits()
+        with tabs.add_tab("Session"):
+            self._add_session()
+        self.refill()
+
+    def tell(self) -> None:
+        """Shows what the loop says now."""
+        snapshot, session = self._desk.loop.snapshot, self._desk.session
+        texts = (
+            (self._state, state_text(snapshot)),
+            (self._timing, timing_text(snapshot, self._desk.loop.timing)),
+            (self._errors, error_table(session.tasks, session.off, snapshot.errors)),
+            (self._joints, joint_table(session.robot, snapshot.q, snapshot.velocity)),
+        )
+        for handle, text in texts:
+            if handle.content != text:
+                handle.content = text
+
+    def refill(self) -> None:
+        """Shows the session: after tasks were added or taken away, or another session was loaded."""
+        session = self._desk.session
+        for box in self._boxes.values():
+            box.remove()
+        self._boxes = {}
+        with self._switches:
+            for name in session.tasks:
+                self._add_switch(name, name not in session.off)
+        self._chosen.options = tuple(session.tasks)
+        title = next((t for t, make in SCHEMES.items() if type(make()) is type(session.scheme)), None)
+        if title is not None:
+            self._scheme.value = title
+        for number, box in self._limit_boxes.items():
+            box.value = number not in session.limits_off
+        self._show_chosen()
+
+    def _add_buttons(self) -> None:
+        gui, loop = self._server.gui, self._desk.loop
+        moves = ("Pause", "Reset", "Push") if self._desk.session.robot.floating_base else ("Pause", "Reset")
+        buttons = gui.add_button_group("", moves)
+
+        @buttons.on_click
+        def _(event: GuiEvent[Any]) -> None:
+            match event.target.value:
+                case "Pause":
+                    loop.resume() if loop.snapshot.paused else loop.pause()
+                case "Reset":
+                    loop.reset()
+                case "Push":
+                    loop.push(self._shove())
+
+    def _shove(self) -> np.ndarray:
+        """Of the base, in a random direction along the floor."""
+        angle = np.random.default_rng().uniform(0.0, 2.0 * np.pi)
+        velocity = np.zeros(self._desk.session.robot.nv)
+        velocity[:2] = _PUSH * self._size * np.array([np.cos(angle), np.sin(angle)])
+        return velocity
+
+    def _add_tasks(self) -> None:
+        gui = self._server.gui
+        self._scheme = gui.add_dropdown("Scheme", tuple(SCHEMES), initial_value=next(iter(SCHEMES)))
+        self._scheme.on_update(self._guarded(lambda event: self._desk.take_scheme(event.target.value)))
+        self._switches = gui.add_folder("On and off")
+        self._boxes: dict[str, Any] = {}
+        with gui.add_folder("Settings"):
+            names = tuple(self._desk.session.tasks)
+            self._chosen = gui.add_dropdown("Task", names, initial_value=names[0])
+            self._weight = gui.add_slider("Weight, 10^", *_WEIGHTS, step=0.1, initial_value=0.0)
+            self._gain = gui.add_slider("Gain [1/s]", *_GAINS, step=0.5, initial_value=10.0)
+            self._priority = gui.add_slider("Priority", *_PRIORITIES, step=1, initial_value=1)
+        self._chosen.on_update(lambda _: self._show_chosen())
+        self._weight.on_update(self._guarded(lambda event: self._weigh(event.target.value)))
+        self._gain.on_update(self._guarded(lambda event: self._desk.renumber(self._name, gain=event.target.value)))
+        self._priority.on_update(self._guarded(lambda event: self._desk.rank(self._name, int(event.target.value))))
+        with gui.add_folder("Frames", expand_by_default=False):
+            frames = self._desk.session.robot.frame_names
+            frame = gui.add_dropdown("Frame", frames, initial_value=frames[0])
+            add, remove = gui.add_button("Add a task for it"), gui.add_button("Remove the task chosen above")
+        add.on_click(self._guarded(lambda _: (self._desk.add_frame(frame.value), self.refill())))
+        remove.on_click(self._guarded(lambda _: (self._desk.remove(self._name), self.refill())))
+        self._errors = gui.add_markdown("")
+
+    def _add_limits(self) -> None:
+        gui, session = self._server.gui, self._desk.session
+        self._limit_boxes: dict[int, Any] = {}
+        for number, limit in enumerate(session.limits):
+            kind = type(limit).__name__
+            box = gui.add_checkbox(_LIMIT_WORDS.get(kind, kind), initial_value=True)
+            box.on_update(self._guarded(lambda event, n=number: self._desk.switch_limit(n, event.target.value)))
+            self._limit_boxes[number] = box
+        speed = gui.add_slider("Speeds, share", 0.05, 1.0, step=0.05, initial_value=1.0)
+        speed.on_update(self._guarded(lambda event: self._desk.slow_down(event.target.value)))
+        gui.add_markdown("**Nearest to a limit**")
+        self._joints = gui.add_markdown("")
+
+    def _add_session(self) -> None:
+        gui = self._server.gui
+        record, motion = gui.add_button("Start recording"), gui.add_button("Stop, and download motion.npz")
+        gui.add_divider()
+        save = gui.add_button("Download session.json")
+        load = gui.add_upload_button("Load a session", mime_type="application/json")
+        python = gui.add_button("Show the Python lines")
+        record.on_click(lambda _: self._desk.loop.record())
+        motion.on_click(self._guarded(self._send_motion))
+        save.on_click(
+            self._guarded(lambda event: self._send(event, "session.json", self._desk.session.to_json().encode()))
+        )
+        load.on_upload(self._guarded(lambda event: self._load(event.target.value.content)))
+        python.on_click(self._guarded(lambda event: self._show_python(event)))
+
+    def _load(self, content: bytes) -> None:
+        self._desk.load(session_from_json(content.decode("utf-8", errors="replace"), "the file"))
+        self.refill()
+
+    def _send_motion(self, event: Any) -> None:
+        """What was recorded, in the layout of ``osik demo``."""
+        recording = self._desk.loop.recorded()
+        if not len(recording.time):
+            raise ValueError("nothing was recorded")
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, time=recording.time, q_live=recording.q)
+        self._send(event, "motion.npz", buffer.getvalue())
+
+    def _send(self, event: Any, name: str, content: bytes) -> None:
+        """To the visitor who asked for it."""
+        (event.client or self._server).send_file_download(name, content, save_immediately=True)
+
+    def _show_python(self, event: Any) -> None:
+        with event.client.gui.add_modal("The same controller in Python") as modal:
+            event.client.gui.add_markdown(f"```python\n{self._desk.session.to_python()}```")
+            event.client.gui.add_button("Close").on_click(lambda _: modal.close())
+
+    @property
+    def _name(self) -> str:
+        """Of the task chosen."""
+        return self._chosen.value
+
+    def _add_switch(self, name: str, on: bool) -> None:
+        box = self._server.gui.add_checkbox(name, initial_value=on)
+        box.on_update(self._guarded(lambda event: self._desk.switch(name, event.target.value)))
+        self._boxes[name] = box
+
+    def _weigh(self, exponent: float) -> None:
+        """Scales a task's weights so that the largest is that power of ten."""
+        old = np.asarray(self._desk.task(self._name).weight)
+        top = float(old.max())
+        new = old * (10.0**exponent / top) if top > 0.0 else np.full(old.shape, 10.0**exponent)
+        self._desk.renumber(self._name, weight=new)
+
+    def _show_chosen(self) -> None:
+        """The sliders stand where the chosen task has its numbers."""
+        task = self._desk.task(self._name)
+        top, gain = float(np.max(np.asarray(task.weight))), task.gain
+        rate = float(np.max(np.asarray(gain.maximum if isinstance(gain, AdaptiveGain) else gain)))
+        self._weight.value = float(np.clip(np.log10(max(top, 1e-12)), *_WEIGHTS))
+        self._gain.value = float(np.clip(rate, *_GAINS))
+        self._priority.value = int(np.clip(task.priority, *_PRIORITIES))
+
+    def _guarded(self, act: Callable[[Any], Any]) -> Callable[[Any], None]:
+        """An answer to what a visitor does: mistakes are told to him. What the panel sets itself has no client."""
+
+        def answer(event: Any) -> None:
+            if event.client is None:
+                return
+            try:
+                act(event)
+            except (KeyError, ValueError, TypeError, OSError, ImportError) as error:
+                text = str(error.args[0]) if error.args else str(error)
+                event.client.add_notification("That does not work", " ".join(text.split()), color="red")
+
+        return answer

@@ -1,0 +1,88 @@
+"""What a page tells of a loop, in short lines of Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from ..._joint_selection import scalar_layout
+from ...robot import Robot
+from ...solvers import Status
+from ...tasks import ComTask, FrameTask, Task
+from ._snapshot import Snapshot
+from ._timing import Timing
+
+_WORDS = {
+    Status.SOLVED: "solved",
+    Status.MAX_ITERATIONS: "out of iterations",
+    Status.INFEASIBLE: "infeasible",
+    Status.NUMERICAL_ERROR: "numerical error",
+}
+_NEAREST = 5
+
+
+def state_text(snapshot: Snapshot) -> str:
+    """Whether it runs, and how well, in one line."""
+    if snapshot.problem:
+        return f"**refused:** {snapshot.problem}"
+    if not snapshot.ready:
+        return "**compiling the first step …**"
+    doing = "**paused**" if snapshot.paused else "**running**"
+    if snapshot.preparing:
+        doing += " · compiling the change …"
+    if snapshot.recording is not None:
+        doing += f" · recording {snapshot.recording:.1f} s"
+    return doing
+
+
+def timing_text(snapshot: Snapshot, timing: Timing) -> str:
+    """Status of the last step, its time, and the rate of the loop."""
+    status = _WORDS.get(Status(snapshot.status), str(snapshot.status))
+    if not timing.steps:
+        return f"{status}"
+    rate = 1.0 / timing.period[0] if timing.period[0] > 0.0 else 0.0
+    return f"{status} · step {1e3 * timing.step[0]:.2f} ms · {rate:.0f} Hz, period p99 {1e3 * timing.period[1]:.1f} ms"
+
+
+def error_table(tasks: Mapping[str, Task], off: frozenset[str], errors: Mapping[str, np.ndarray]) -> str:
+    """The errors of the tasks that are switched on."""
+    rows = [f"| {name} | {error_text(task, errors.get(name))} |" for name, task in tasks.items() if name not in off]
+    return "\n".join(["| task | error |", "|:--|--:|", *rows])
+
+
+def error_text(task: Task, error: Float[np.ndarray, " m"] | None) -> str:
+    """An error with its unit; of an inequality, by how much it is violated."""
+    if error is None:
+        return "…"
+    if isinstance(task, FrameTask) and not task.bounded:
+        count = sum(task.kept[:3])
+        parts = [f"{1e3 * np.linalg.norm(error[:count]):.1f} mm"] if count else []
+        turned = error[count:]
+        return ", ".join(parts + ([f"{np.rad2deg(np.linalg.norm(turned)):.1f}°"] if len(turned) else []))
+    if isinstance(task, ComTask) and task.polygon is not None:
+        outside = float(np.max(error - np.asarray(task.polygon.offsets)))
+        return f"{1e3 * outside:.1f} mm outside" if outside > 5e-4 else f"{-1e3 * outside:.0f} mm inside"
+    if isinstance(task, ComTask) and task.target is not None:
+        return f"{1e3 * np.linalg.norm(error):.1f} mm"
+    return f"{np.linalg.norm(error):.3g}"
+
+
+def joint_table(robot: Robot, q: Float[np.ndarray, " nq"], velocity: Float[np.ndarray, " nv"]) -> str:
+    """The joints nearest to an end of their range, with the share of the range that is left and their speed."""
+    scalar, index = (np.asarray(part) for part in scalar_layout(robot))
+    lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
+    limited = scalar & np.isfinite(upper - lower) & (upper > lower)
+    if not limited.any():
+        return "No joint has a range."
+    left = np.full(robot.nv, np.inf)
+    value, span = q[index[limited]], (upper - lower)[limited]
+    left[limited] = np.minimum(value - lower[limited], upper[limited] - value) / span
+    top = np.asarray(robot.velocity_limit)
+    names = {robot.joint_dof_index(name): name for name in robot.joint_names}
+    rows = []
+    for dof in np.argsort(left)[: min(_NEAREST, int(limited.sum()))]:
+        speed = f"{100.0 * abs(velocity[dof]) / top[dof]:.0f} %" if np.isfinite(top[dof]) and top[dof] > 0.0 else "free"
+        rows.append(f"| {names.get(int(dof), dof)} | {100.0 * max(left[dof], 0.0):.1f} % | {speed} |")
+    return "\n".join(["| joint | range left | of top speed |", "|:--|--:|--:|", *rows])

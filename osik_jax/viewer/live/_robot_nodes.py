@@ -1,0 +1,97 @@
+"""A robot in a page: a node for each body, with what is fixed to it below."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ...robot import Robot
+from .._look import Look
+from .._mujoco import mujoco_poses
+from .._parts import RobotParts, robot_parts
+from ._surfaces import Surface, part_triangles
+
+if TYPE_CHECKING:
+    from viser import FrameHandle, SceneApi
+
+_MOVED = 1e-7
+"""Nodes that move less are left alone [m, or of a quaternion]."""
+
+
+class RobotNodes:
+    """The nodes of one robot."""
+
+    def __init__(
+        self,
+        scene: SceneApi,
+        robot: Robot,
+        *,
+        look: Look | None = None,
+        name: str = "robot",
+        offset: Float[np.ndarray, "3"] | None = None,
+        opacity: float | None = None,
+    ) -> None:
+        """Adds the robot, at ``robot.q0``.
+
+        Args:
+            scene: of viser.
+            robot: the robot.
+            look: what its URDF shows.
+            name: of its node.
+            offset: by which it is moved [m].
+            opacity: of a robot that can be seen through; None: solid.
+        """
+        shapes = robot_parts(robot, look=look)
+        data = next(mujoco_poses(robot, np.asarray(robot.q0)))
+        scene.add_frame(f"/{name}", show_axes=False, position=np.zeros(3) if offset is None else offset)
+        self._frames: dict[int, FrameHandle] = {}
+        for body, pieces in _by_body(shapes, data).items():
+            position, quaternion = data.xpos[body], data.xquat[body]
+            self._frames[body] = scene.add_frame(
+                f"/{name}/{body}", show_axes=False, position=position.copy(), wxyz=quaternion.copy()
+            )
+            for number, (color, surface) in enumerate(pieces.items()):
+                scene.add_mesh_simple(
+                    f"/{name}/{body}/{number}",
+                    surface.vertices,
+                    surface.faces,
+                    color=color[:3],
+                    opacity=opacity if color[3] >= 255 else color[3] / 255.0,
+                )
+        self._shown = {body: np.r_[data.xpos[body], data.xquat[body]] for body in self._frames}
+
+    def place(self, data: mujoco.MjData) -> None:
+        """Moves the bodies to where MuJoCo's kinematics has them."""
+        for body, frame in self._frames.items():
+            now = np.r_[data.xpos[body], data.xquat[body]]
+            moved = np.abs(now - self._shown[body]) > _MOVED
+            if moved[:3].any():
+                frame.position = now[:3]
+            if moved[3:].any():
+                frame.wxyz = now[3:]
+            if moved.any():
+                self._shown[body] = now
+
+
+def _by_body(shapes: RobotParts, data: mujoco.MjData) -> dict[int, dict[tuple[int, int, int, int], Surface]]:
+    """Of each body, its surfaces by colour (0 to 255), in the body's frame."""
+    out: dict[int, dict[tuple[int, int, int, int], Surface]] = {}
+    positions, rotations = shapes.poses(data)
+    for part, body, position, rotation in zip(shapes.parts, shapes.bodies, positions, rotations, strict=True):
+        turn = data.xmat[body].reshape(3, 3)
+        own = part_triangles(part)
+        vertices = (own.vertices @ rotation.T + position - data.xpos[body]) @ turn
+        red, green, blue, alpha = (round(255 * float(x)) for x in np.clip(part.color, 0.0, 1.0))
+        pieces = out.setdefault(int(body), {})
+        pieces[red, green, blue, alpha] = _joined(pieces.get((red, green, blue, alpha)), Surface(vertices, own.faces))
+    return out
+
+
+def _joined(first: Surface | None, second: Surface) -> Surface:
+    if first is None:
+        return second
+    faces = np.concatenate([first.faces, second.faces + len(first.vertices)])
+    return Surface(np.concatenate([first.vertices, second.vertices]), faces)

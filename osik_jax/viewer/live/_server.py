@@ -1,0 +1,65 @@
+"""A page's server, on the port that was asked for and on no other."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+from typing import TYPE_CHECKING
+
+from ._needs import import_viser
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+_BLUE = (28, 111, 184)
+
+
+def open_server(host: str, port: int, title: str) -> ViserServer:
+    """Starts a server.
+
+    Args:
+        host: address to listen at.
+        port: 0 for any that is free.
+        title: of the panel.
+
+    Raises:
+        ImportError: viser is not installed.
+        OSError: the port is in use, or the address is none of this machine's.
+    """
+    viser = import_viser()
+    free = check_port(host, port)
+    with contextlib.redirect_stdout(io.StringIO()):  # its own greeting
+        server = viser.ViserServer(host=host, port=free, label=title, verbose=False)
+    if server.get_port() != free:
+        server.stop()
+        raise OSError(f"port {free} of {host} is in use: choose another")
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium", brand_color=_BLUE)
+    return server
+
+
+def close_server(server: ViserServer) -> None:
+    """Ends a server without a word."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def check_port(host: str, port: int) -> int:
+    """The port, or one that is free for 0.
+
+    Raises:
+        OSError: it is in use, or the address is none of this machine's.
+    """
+    if not 0 <= port < 2**16:
+        raise OSError(f"there is no port {port}: ports are 1 to 65535, 0 is any that is free")
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            return int(probe.getsockname()[1])
+    except socket.gaierror as error:
+        raise OSError(f"{host} is no address of this machine") from error
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise OSError(f"cannot listen at {host}, port {port}: {reason}") from error

@@ -1,0 +1,190 @@
+"""A session: a robot with its controller and what is switched off, as one file and as lines of Python."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ...limits import ConfigurationLimit, Limit, VelocityLimit
+from ...robot import Robot
+from ...schemes import Scheme
+from ...tasks import Task
+from ._description import describe, python, rebuild
+from ._source import RobotSource, load_source
+from ._step import Controller
+
+_FORMAT = "osik-jax session 1"
+
+
+@dataclasses.dataclass(frozen=True)
+class Session:
+    """A controller as it is in a live view.
+
+    ``osik_jax.solve(session.robot, q, session.active_tasks, scheme=session.scheme, limits=session.active_limits,
+    dt=session.dt)`` is a step of it.
+
+    Attributes:
+        robot: the robot.
+        tasks: all tasks by name, switched off or not.
+        scheme: how they share the robot.
+        limits: all limits, switched off or not.
+        dt: time of a step [s].
+        q: where the robot starts. (nq,)
+        off: names of the tasks that are switched off.
+        limits_off: numbers of the limits that are switched off, in the order of ``limits``.
+        source: where the robot comes from; None: not known, so that the session cannot be saved.
+    """
+
+    robot: Robot
+    tasks: Mapping[str, Task]
+    scheme: Scheme
+    limits: tuple[Limit, ...]
+    dt: float
+    q: Float[np.ndarray, " nq"]
+    off: frozenset[str] = frozenset()
+    limits_off: frozenset[int] = frozenset()
+    source: RobotSource | None = None
+
+    @property
+    def active_tasks(self) -> dict[str, Task]:
+        """The tasks that are switched on."""
+        return {name: task for name, task in self.tasks.items() if name not in self.off}
+
+    @property
+    def active_limits(self) -> tuple[Limit, ...]:
+        """The limits that are switched on."""
+        return tuple(limit for number, limit in enumerate(self.limits) if number not in self.limits_off)
+
+    def controller(self) -> Controller:
+        """The same controller with weights of 0 and infinite limits in the place of what is off.
+
+        So that switching compiles nothing; limits of other kinds are left out.
+        """
+        tasks = {name: task.replace(weight=0.0) if name in self.off else task for name, task in self.tasks.items()}
+        limits = [_loose(limit) if n in self.limits_off else limit for n, limit in enumerate(self.limits)]
+        return Controller(tasks, self.scheme, [limit for limit in limits if limit is not None])
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the session to a file, for ``load_session``.
+
+        Raises:
+            ValueError: it holds what a file cannot, such as a task of a class of one's own.
+        """
+        Path(path).write_text(self.to_json(), encoding="utf-8")
+
+    def to_json(self) -> str:
+        """What ``save`` writes.
+
+        Raises:
+            ValueError: as in ``save``.
+        """
+        if self.source is None:
+            raise ValueError("where the robot comes from is not known, so the session cannot be saved: give source=")
+        content = {
+            "format": _FORMAT,
+            "robot": dataclasses.asdict(self.source),
+            "dt": self.dt,
+            "q": np.asarray(self.q).tolist(),
+            "scheme": describe(self.scheme, self.robot),
+            "limits": [describe(limit, self.robot) for limit in self.limits],
+            "limits_off": sorted(self.limits_off),
+            "tasks": {name: describe(task, self.robot) for name, task in self.tasks.items()},
+            "off": sorted(self.off),
+        }
+        return json.dumps(content, indent=1) + "\n"
+
+    def to_python(self) -> str:
+        """A program that makes the same controller and takes one step; what is switched off is left out.
+
+        Raises:
+            ValueError: as in ``save``.
+        """
+        if self.source is None:
+            raise ValueError("where the robot comes from is not known, so no program can load it: give source=")
+        tasks = {name: python(describe(task, self.robot)) for name, task in self.active_tasks.items()}
+        limits = [python(describe(limit, self.robot)) for limit in self.active_limits]
+        lines = [
+            "import jax",
+            "import numpy as np",
+            "import osik_jax as osik",
+            "",
+            'jax.config.update("jax_enable_x64", True)',
+            "",
+            f"robot = {self.source.python()}",
+            f"q = np.array({np.asarray(self.q).tolist()})",
+            "tasks = {",
+            *(f"    {name!r}: {text}," for name, text in tasks.items()),
+            "}",
+            f"limits = ({''.join(f'{text}, ' for text in limits).rstrip(' ')})",
+            f"scheme = {python(describe(self.scheme, self.robot))}",
+            f"solution = osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt={self.dt!r})",
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def load_session(path: str | os.PathLike[str]) -> Session:
+    """Reads a session that a live view or ``Session.save`` wrote.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        FileNotFoundError: no such file, or the robot's file is no longer where it was.
+        ValueError: the file is no session, or one that this version cannot read.
+    """
+    return session_from_json(Path(path).read_text(encoding="utf-8"), str(path))
+
+
+def session_from_json(text: str, where: str = "this") -> Session:
+    """The session of what ``Session.to_json`` gave; ``where`` is what messages call it.
+
+    Raises:
+        ValueError: as in ``load_session``.
+    """
+    try:
+        content = json.loads(text)
+        known = isinstance(content, dict) and content.get("format") == _FORMAT
+    except ValueError:
+        known = False
+    if not known:
+        raise ValueError(f"{where} is no session of osik view ({_FORMAT})")
+    try:
+        return _session(content)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error.args[0] if error.args else error}") from error
+
+
+def _session(content: Mapping[str, Any]) -> Session:
+    source = RobotSource(**content["robot"])
+    robot = load_source(source)
+    q = np.asarray(content["q"], float)
+    robot.check_configuration(jnp.asarray(q))
+    return Session(
+        robot=robot,
+        tasks={name: rebuild(one, robot) for name, one in content["tasks"].items()},
+        scheme=rebuild(content["scheme"], robot),
+        limits=tuple(rebuild(one, robot) for one in content["limits"]),
+        dt=float(content["dt"]),
+        q=q,
+        off=frozenset(content["off"]),
+        limits_off=frozenset(content["limits_off"]),
+        source=source,
+    )
+
+
+def _loose(limit: Limit) -> Limit | None:
+    """The limit with numbers that bound nothing; None where it has no such."""
+    if type(limit) is ConfigurationLimit:
+        free = np.full(limit.lower.shape, np.inf)
+        return limit.replace(lower=-free, upper=free)
+    if type(limit) is VelocityLimit:
+        return limit.replace(velocity=np.full(limit.velocity.shape, np.inf))
+    return None

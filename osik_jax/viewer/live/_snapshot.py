@@ -1,0 +1,55 @@
+"""What a control loop tells of itself."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ...solvers import Status
+
+
+@dataclasses.dataclass(frozen=True)
+class Snapshot:
+    """What the last step left.
+
+    Attributes:
+        time: simulated since the start or the last reset [s].
+        q: configuration. (nq,)
+        velocity: what the controller asked for. (nv,)
+        status: a ``Status`` code.
+        errors: of each task. {name: (m,)}
+        failures: steps since the start or the last reset whose answer could not be used: the robot stood still.
+        ready: whether a compiled step runs; before that, the robot stands still.
+        preparing: whether what was asked for is still being compiled.
+        paused: whether the robot stands still because it was asked to.
+        recording: length of the recording [s]; None where nothing is recorded.
+        problem: why the last change could not be compiled; empty where it could.
+    """
+
+    time: float
+    q: Float[np.ndarray, " nq"]
+    velocity: Float[np.ndarray, " nv"]
+    status: int = int(Status.SOLVED)
+    errors: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    failures: int = 0
+    ready: bool = False
+    preparing: bool = False
+    paused: bool = False
+    recording: float | None = None
+    problem: str = ""
+
+
+class Recording(NamedTuple):
+    """A motion.
+
+    Attributes:
+        time: of each configuration [s]. (T,)
+        q: configurations. (T, nq)
+    """
+
+    time: Float[np.ndarray, " T"]
+    q: Float[np.ndarray, "T nq"]

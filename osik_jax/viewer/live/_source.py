@@ -1,0 +1,65 @@
+"""Where a robot comes from: what a session file keeps in the place of the robot itself."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from ..._loading import ROBOTS, is_mjcf, urdf_of_description
+from ...robot import Robot, load_robot
+from .._look import Look, read_look
+
+_SUFFIX = "_description"
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotSource:
+    """A robot by name or file.
+
+    Attributes:
+        robot: name of an embedded robot or one of robot_descriptions, or path of a URDF or MJCF file.
+        floating_base: as in ``Robot.from_urdf``; None: as the file says.
+    """
+
+    robot: str
+    floating_base: bool | None = None
+
+    @property
+    def is_file(self) -> bool:
+        """Whether it is a file, rather than a name."""
+        return self.robot not in ROBOTS and not self.robot.endswith(_SUFFIX)
+
+    @property
+    def is_mjcf(self) -> bool:
+        """Whether it is a file in MuJoCo's format."""
+        return self.is_file and is_mjcf(self.robot)
+
+    def python(self) -> str:
+        """The expression that loads it, in a program with ``import osik_jax as osik``."""
+        base = "" if self.floating_base is None else f", floating_base={self.floating_base}"
+        if not self.is_file:
+            return f"osik.load_robot({self.robot!r}{base})"
+        return f"osik.Robot.{'from_mjcf' if self.is_mjcf else 'from_urdf'}({self.robot!r}{base})"
+
+
+def load_source(source: RobotSource) -> Robot:
+    """The robot.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ImportError, KeyError, ValueError: as in ``load_robot``, ``Robot.from_urdf`` and ``Robot.from_mjcf``.
+    """
+    if not source.is_file:
+        return load_robot(source.robot, floating_base=source.floating_base)
+    if not Path(source.robot).is_file():
+        raise FileNotFoundError(f"no such file: {source.robot}")
+    load = Robot.from_mjcf if source.is_mjcf else Robot.from_urdf
+    return load(source.robot, floating_base=source.floating_base)
+
+
+def source_look(source: RobotSource) -> Look | None:
+    """What a URDF shows; None of robots whose shapes are in their model already."""
+    if source.is_file:
+        return None if source.is_mjcf else read_look(source.robot)
+    urdf = None if source.robot in ROBOTS else urdf_of_description(source.robot)
+    return None if urdf is None else read_look(urdf[0], package_dirs=urdf[1])

@@ -1,0 +1,102 @@
+"""One step of a controller as one compiled program, whose every number may change while it runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ...control import remembering, solve
+from ...kinematics import integrate
+from ...limits import Limit
+from ...robot import Robot
+from ...schemes import Scheme
+from ...tasks import Task
+
+State = tuple[Array, Array, Any]
+"""What a step leaves to the next: configuration (nq,), velocity (nv,) and warm start."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Controller:
+    """What a step is made of.
+
+    Attributes:
+        tasks: by name.
+        scheme: how they share the robot.
+        limits: hard bounds on the velocity.
+    """
+
+    tasks: Mapping[str, Task]
+    scheme: Scheme
+    limits: Sequence[Limit]
+
+    def parts(self) -> tuple[dict[str, Task], Scheme, tuple[Limit, ...]]:
+        """The same as a pytree."""
+        return dict(self.tasks), self.scheme, tuple(self.limits)
+
+    def numbers(self) -> list[Array]:
+        """All that may change without compiling, in a fixed order."""
+        leaves = jax.tree.leaves(self.parts())
+        return [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves]
+
+    def structure(self) -> tuple[Any, ...]:
+        """All that is compiled: two controllers of one structure share a program."""
+        leaves, tree = jax.tree.flatten(self.parts())
+        return (tree, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
+
+
+def with_targets(controller: Controller, targets: Mapping[str, Any]) -> Controller:
+    """The controller with other targets of some of its tasks; those that it has not, or not such, are passed over."""
+    aimed = {name: _aimed(task, targets[name]) for name, task in controller.tasks.items() if name in targets}
+    return dataclasses.replace(controller, tasks={**controller.tasks, **aimed}) if aimed else controller
+
+
+def _aimed(task: Any, target: Any) -> Task:
+    """The task with a target of the same shape, in its precision; no other checks."""
+    old = getattr(task, "target", None)
+    if old is None or jax.tree.map(np.shape, old) != jax.tree.map(np.shape, target):
+        return task
+    new = jax.tree.map(lambda own, given: jnp.asarray(given, own.dtype), old, target)
+    return eqx.tree_at(lambda own: own.target, task, new)
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """A compiled step.
+
+    Attributes:
+        run: from the controller's numbers, the state and a push (nv,) to the next state, status and task errors.
+        cold: the warm start of a first step.
+    """
+
+    run: Callable[[list[Array], State, Array], tuple[State, Array, dict[str, Array]]]
+    cold: Any
+
+
+def compile_step(robot: Robot, controller: Controller, dt: float) -> Program:
+    """Compiles one step of a controller; takes seconds, in whichever thread calls it.
+
+    The push is a velocity (nv,) that the robot has on top of what the controller asks for.
+    """
+    tree = jax.tree.structure(controller.parts())
+    numbers, push = controller.numbers(), jnp.zeros(robot.nv, robot.q0.dtype)
+
+    def step(numbers: list[Array], state: State, push: Array) -> tuple[State, Array, dict[str, Array]]:
+        tasks, scheme, limits = jax.tree.unflatten(tree, numbers)
+        q, velocity, warm_start = state
+        tasks, limits = remembering((tasks, limits), velocity, True)
+        answer = solve(robot, q, tasks, scheme=scheme, limits=limits, dt=dt, warm_start=warm_start)
+        moved = integrate(robot, q, answer.velocity + push, dt)
+        return (moved, answer.velocity, answer.warm_start), answer.status, answer.error
+
+    still = jnp.zeros_like(push)
+    traced = jax.eval_shape(step, numbers, (robot.q0, still, None), push)
+    cold = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), traced[0][2])
+    return Program(jax.jit(step).lower(numbers, (robot.q0, still, cold), push).compile(), cold)

@@ -1,0 +1,55 @@
+"""How regular a loop is: periods and times of its last steps."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """Percentiles over the last steps of a loop.
+
+    Attributes:
+        steps: how many steps there were in all.
+        period: of the starts of steps: median, 99th percentile and longest [s].
+        step: of the time that a step takes: median, 99th percentile and longest [s].
+    """
+
+    steps: int
+    period: tuple[float, float, float]
+    step: tuple[float, float, float]
+
+
+class Stopwatch:
+    """Keeps the starts and durations of the last steps, in memory that does not grow."""
+
+    def __init__(self, length: int = 2000) -> None:
+        """Keeps so many steps."""
+        self._starts, self._durations, self._count = np.zeros(length), np.zeros(length), 0
+
+    def add(self, start: float, duration: float) -> None:
+        """Notes a step [s]."""
+        place = self._count % len(self._starts)
+        self._starts[place], self._durations[place] = start, duration
+        self._count += 1
+
+    def clear(self) -> None:
+        """Forgets all steps, as after a pause."""
+        self._count = 0
+
+    def timing(self) -> Timing:
+        """Percentiles of what is kept."""
+        count = min(self._count, len(self._starts))
+        first = self._count % len(self._starts) if self._count > len(self._starts) else 0
+        starts = np.roll(self._starts, -first)[:count]
+        return Timing(self._count, _percentiles(np.diff(starts)), _percentiles(self._durations[:count]))
+
+
+def _percentiles(values: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
+    if not len(values):
+        return 0.0, 0.0, 0.0
+    median, late = np.percentile(values, (50.0, 99.0))
+    return float(median), float(late), float(values.max())

@@ -1,0 +1,112 @@
+"""Small motions of a stick figure, and writers of motion files, for tests."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+FIGURE = (
+    ("Hips", -1, (0.0, 0.0, 0.0)),
+    ("Spine", 0, (0.0, 0.25, 0.0)),
+    ("Neck", 1, (0.0, 0.22, 0.0)),
+    ("Head", 2, (0.0, 0.15, 0.0)),
+    ("LeftArm", 1, (0.18, 0.18, 0.0)),
+    ("LeftForeArm", 4, (0.27, 0.0, 0.0)),
+    ("LeftHand", 5, (0.25, 0.0, 0.0)),
+    ("RightArm", 1, (-0.18, 0.18, 0.0)),
+    ("RightForeArm", 7, (-0.27, 0.0, 0.0)),
+    ("RightHand", 8, (-0.25, 0.0, 0.0)),
+    ("LeftUpLeg", 0, (0.09, -0.02, 0.0)),
+    ("LeftLeg", 10, (0.0, -0.42, 0.0)),
+    ("LeftFoot", 11, (0.0, -0.41, 0.0)),
+    ("LeftToeBase", 12, (0.0, -0.06, 0.15)),
+    ("RightUpLeg", 0, (-0.09, -0.02, 0.0)),
+    ("RightLeg", 14, (0.0, -0.42, 0.0)),
+    ("RightFoot", 15, (0.0, -0.41, 0.0)),
+    ("RightToeBase", 16, (0.0, -0.06, 0.15)),
+)
+"""Name, parent and offset [m] of each joint: y up, facing z, arms to the sides."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A moving tree: local rotations of each joint, and where its root is.
+
+    Attributes:
+        joints: name, parent and offset of each.
+        root: position of the root in each frame. (F, 3)
+        angles: Euler angles of each joint in the order of ``orders`` [deg]. (F, J, 3)
+        orders: of each joint, such as ``"ZXY"``: the first turns first about the parent's axis.
+        fps: frames a second.
+    """
+
+    joints: tuple[tuple[str, int, tuple[float, float, float]], ...]
+    root: np.ndarray
+    angles: np.ndarray
+    orders: tuple[str, ...]
+    fps: float
+
+    def forward(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (F, J, 3) and rotation matrices (F, J, 3, 3) of all joints, by SciPy's rotations."""
+        frames, count = self.angles.shape[:2]
+        positions, turns = np.zeros((frames, count, 3)), np.zeros((frames, count, 3, 3))
+        for i, (_, parent, offset) in enumerate(self.joints):
+            local = Rotation.from_euler(self.orders[i], self.angles[:, i], degrees=True).as_matrix()
+            if parent < 0:
+                positions[:, i], turns[:, i] = self.root, local
+            else:
+                positions[:, i] = positions[:, parent] + turns[:, parent] @ np.array(offset)
+                turns[:, i] = turns[:, parent] @ local
+        return positions, turns
+
+
+def dancer(frames: int = 24, fps: float = 30.0) -> Figure:
+    """The figure lowers itself with both feet where they are, waves its arms and turns its head."""
+    phase = np.linspace(0.0, 2.0 * np.pi, frames)
+    names = [name for name, _, _ in FIGURE]
+    angles = np.zeros((frames, len(FIGURE), 3))  # z, x, y
+    bend = 12.0 * (1.0 - np.cos(phase))
+    shank, thigh = 0.41, 0.42
+    lean = np.degrees(np.arcsin(thigh * np.sin(np.radians(bend)) / shank))
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        angles[:, names.index(f"{side}UpLeg"), 1] = -bend
+        angles[:, names.index(f"{side}Leg"), 1] = bend + lean
+        angles[:, names.index(f"{side}Foot"), 1] = -lean
+        angles[:, names.index(f"{side}Arm"), 0] = -sign * (60.0 + 25.0 * np.sin(phase))
+        angles[:, names.index(f"{side}ForeArm"), 2] = -sign * (30.0 + 20.0 * np.cos(phase))
+    angles[:, names.index("Head"), 2] = 20.0 * np.sin(phase)
+    root = np.zeros((frames, 3))
+    root[:, 1] = 0.08 + 0.02 + thigh * np.cos(np.radians(bend)) + shank * np.cos(np.radians(lean))
+    return Figure(FIGURE, root, angles, ("ZXY",) * len(FIGURE), fps)
+
+
+def write_bvh(path: Path, figure: Figure, unit: float = 1.0) -> Path:
+    """A BVH file of a figure, lengths in ``unit`` metres; a joint without children gets an End Site."""
+    children = [[j for j, (_, parent, _) in enumerate(figure.joints) if parent == i] for i in range(len(figure.joints))]
+    lines, order = ["HIERARCHY"], []
+
+    def write(i: int, depth: int) -> None:
+        name, parent, offset = figure.joints[i]
+        indent, order_of = "\t" * depth, figure.orders[i]
+        order.append(i)
+        turns = " ".join(f"{axis}rotation" for axis in order_of)
+        moves = "Xposition Yposition Zposition " if parent < 0 else ""
+        lines.extend([f"{indent}{'ROOT' if parent < 0 else 'JOINT'} {name}", f"{indent}{{"])
+        lines.append(f"{indent}\tOFFSET {' '.join(repr(float(x) / unit) for x in offset)}")
+        lines.append(f"{indent}\tCHANNELS {6 if moves else 3} {moves}{turns}")
+        for child in children[i]:
+            write(child, depth + 1)
+        if not children[i]:
+            lines.extend([f"{indent}\tEnd Site", f"{indent}\t{{", f"{indent}\t\tOFFSET 0 0 0", f"{indent}\t}}"])
+        lines.append(f"{indent}}}")
+
+    write(0, 0)
+    lines += ["MOTION", f"Frames: {len(figure.root)}", f"Frame Time: {1.0 / figure.fps:.9f}"]
+    for root, angles in zip(figure.root, figure.angles, strict=True):
+        numbers = [*(root / unit), *(angle for i in order for angle in angles[i])]
+        lines.append(" ".join(repr(float(x)) for x in numbers))
+    path.write_text("\n".join(lines) + "\n")
+    return path

@@ -1,0 +1,348 @@
+"""Inverse kinematics: what is found is checked by MuJoCo, counted in closed form, differentiated by differences."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import osik_jax as osik
+
+POSITION, ORIENTATION = 1e-3, 1e-2
+PLANAR = """<mujoco><worldbody><body name="a"><joint name="j1" axis="0 0 1" range="-170 170"/>
+<geom type="capsule" fromto="0 0 0 .5 0 0" size=".02"/>
+<body name="b" pos=".5 0 0"><joint name="j2" axis="0 0 1" range="-170 170"/>
+<geom type="capsule" fromto="0 0 0 .4 0 0" size=".02"/>
+<site name="tip" pos=".4 0 0"/></body></body></worldbody></mujoco>"""
+MIXED = """<mujoco><worldbody><body name="cart" pos="0 .1 .2" euler="0 0 30"><joint name="rail" type="slide"
+axis="1 0 0" range="-.4 .6"/><joint name="turn" axis="0 .6 .8" pos=".03 0 .02" range="-150 150"/><geom size=".05"/>
+<body name="upper" pos=".1 0 .3" euler="10 20 0"><joint name="lift" axis="0 1 0" pos="0 .02 0" range="-120 120"/>
+<geom size=".05"/>
+<body name="fore" pos=".25 0 0"><joint name="bend" axis="0 1 0" range="-130 130" ref="10"/><geom size=".05"/>
+<body name="hand" pos=".25 0 0"><joint name="roll" axis="1 0 0" range="-160 160"/><joint name="tilt" axis="0 0 1"
+range="-90 90"/><geom size=".05"/><body name="thumb" pos=".1 0 0"><joint name="coupled" axis="0 1 0"/><geom size=".02"/>
+<site name="tool" pos=".05 .01 0" euler="0 40 0"/></body></body></body></body></body>
+<body name="other" pos="1 0 0"><joint name="aside" axis="0 0 1" range="-90 90"/><geom size=".05"/></body></worldbody>
+<equality><joint joint1="coupled" joint2="tilt" polycoef="0.1 0.5 0 0 0"/></equality></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+@pytest.fixture(scope="module")
+def planar():
+    return osik.Robot.from_mjcf(PLANAR)
+
+
+def mujoco_pose(robot, q, frame):
+    """The pose of a body or site, by MuJoCo's own kinematics in double precision."""
+    model = robot.mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.asarray(robot.mujoco_qpos(np.asarray(q, float)))
+    mujoco.mj_kinematics(model, data)
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, frame)
+    of = data.site(frame) if site >= 0 else data.body(frame)
+    return of.xpos.copy(), of.xmat.reshape(3, 3).copy()
+
+
+def mujoco_jacobian(robot, q, site):
+    """Rows [linear; angular] in world axes, by MuJoCo."""
+    model = robot.mj_model
+    data, jacobian = mujoco.MjData(model), np.zeros((6, model.nv))
+    data.qpos[:] = np.asarray(robot.mujoco_qpos(np.asarray(q, float)))
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], data.site(site).id)
+    return jacobian
+
+
+def angle(a, b):
+    return np.arccos(np.clip((np.trace(a @ b.T) - 1.0) / 2.0, -1.0, 1.0))
+
+
+def errors_by_mujoco(robot, q, frame, position, rotation):
+    poses = [mujoco_pose(robot, own, frame) for own in np.asarray(q)]
+    away = [np.linalg.norm(p - wanted) for (p, _), wanted in zip(poses, position, strict=True)]
+    turned = [angle(r, wanted) for (_, r), wanted in zip(poses, rotation, strict=True)]
+    return np.array(away), np.array(turned)
+
+
+def random_poses(robot, frame, count, rng):
+    """Poses of configurations within the limits, by MuJoCo."""
+    low, high = (np.where(np.isfinite(x), x, y) for x, y in ((robot.position_lower, -3.0), (robot.position_upper, 3.0)))
+    poses = [mujoco_pose(robot, low + (high - low) * rng.random(robot.nq), frame) for _ in range(count)]
+    return np.array([p for p, _ in poses]), np.array([r for _, r in poses])
+
+
+def assert_within_limits(robot, q):
+    q = np.asarray(q)
+    assert (q >= np.asarray(robot.position_lower)).all() and (q <= np.asarray(robot.position_upper)).all()
+
+
+@pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_finds_what_is_reachable(arm, rng, precision):
+    robot = arm.astype(precision)
+    position, rotation = random_poses(arm, "hand", 300, rng)
+    found = osik.inverse_kinematics(robot, {"hand": (position, rotation)})
+    away, turned = errors_by_mujoco(arm, found.q, "hand", position, rotation)
+    assert found.q.shape == (300, 7) and found.q.dtype == precision
+    assert np.asarray(found.converged).all()
+    assert away.max() <= POSITION and turned.max() <= ORIENTATION
+    np.testing.assert_allclose(found.position_error, away, atol=1e-9 if precision == "float64" else 2e-6)
+    assert_within_limits(robot, found.q)
+
+
+def test_slides_followers_and_two_joints_on_a_body(rng):
+    robot = osik.Robot.from_mjcf(MIXED)
+    position, rotation = random_poses(robot, "tool", 100, rng)
+    found = osik.inverse_kinematics(robot, {"tool": (position, rotation)})
+    away, turned = errors_by_mujoco(robot, found.q, "tool", position, rotation)
+    assert np.asarray(found.converged).all()
+    assert away.max() <= POSITION and turned.max() <= ORIENTATION
+    assert_within_limits(robot, found.q)
+    aside = robot.joint_qpos_index("aside")
+    assert (np.asarray(found.q)[:, aside] == np.asarray(robot.q0)[aside]).all()  # carries no frame, stays
+
+
+def test_what_cannot_be_reached_is_never_found(arm, rng):
+    position, rotation = random_poses(arm, "hand", 16, rng)
+    away = position / np.linalg.norm(position, axis=1, keepdims=True) * rng.uniform(1.3, 3.0, (16, 1))
+    found = osik.inverse_kinematics(arm, {"hand": (away, rotation)}, seeds=4, restarts=1)
+    assert not np.asarray(found.converged).any()
+    assert (np.asarray(found.beyond_reach) > 0.0).all()
+    missed, _ = errors_by_mujoco(arm, found.q, "hand", away, rotation)
+    np.testing.assert_allclose(found.position_error, missed, atol=1e-9)
+    assert (missed >= np.asarray(found.beyond_reach)).all()
+    assert_within_limits(arm, found.q)
+    assert "out of reach" in found.explain(3)
+    with pytest.raises(ValueError, match="there are 16 targets"):
+        found.explain()
+
+
+def test_says_which_limit_stops_it(planar):
+    """The target is at 0.9 m, behind: both joints turned as far as they go leave it."""
+    far = 0.9 * np.array([np.cos(3.1), np.sin(3.1), 0.0])
+    found = osik.inverse_kinematics(planar, {"tip": far})
+    assert not found.converged
+    assert np.asarray(found.at_limit).tolist()[0] == 1
+    assert "j1 is at its upper limit" in found.explain()
+    assert found.beyond_reach == 0.0
+
+
+def two_solutions(x, y):
+    """Of the planar arm, in closed form."""
+    bend = np.arccos((x * x + y * y - 0.5**2 - 0.4**2) / (2 * 0.5 * 0.4))
+    return [np.array([np.arctan2(y, x) - np.arctan2(0.4 * np.sin(b), 0.5 + 0.4 * np.cos(b)), b]) for b in (bend, -bend)]
+
+
+def test_all_solutions_are_those_of_the_closed_form(planar):
+    found = osik.inverse_kinematics(
+        planar, {"tip": (0.5, 0.3, 0.0)}, all=True, seeds=16, position_tolerance=1e-9, steps=60
+    )
+    assert found.count == 2
+    solutions = np.asarray(found.solutions)
+    for expected in two_solutions(0.5, 0.3):
+        assert np.abs(solutions[:2] - expected).max(1).min() < 1e-7
+    np.testing.assert_array_equal(solutions[0], found.q)
+    assert np.isnan(solutions[2:]).all()
+
+
+def test_nearest_is_the_nearest_of_the_closed_form(planar):
+    for expected in two_solutions(0.5, 0.3):
+        start = jnp.asarray(expected + 0.1)
+        found = osik.inverse_kinematics(planar, {"tip": (0.5, 0.3, 0.0)}, q0=start, nearest=True, seeds=16)
+        np.testing.assert_allclose(found.q, expected, atol=1e-4)
+
+
+def test_one_and_many_and_each_way_to_write_a_pose(arm):
+    position, rotation = mujoco_pose(arm, np.asarray(arm.q0) + 0.1, "hand")
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, position
+    first = osik.inverse_kinematics(arm, {"hand": (position, rotation)})
+    assert first.q.shape == (7,) and first.converged.shape == ()
+    for pose in ((position, quaternion), matrix):
+        np.testing.assert_allclose(osik.inverse_kinematics(arm, {"hand": pose}).q, first.q, atol=1e-6)
+    many = osik.inverse_kinematics(arm, {"hand": (position[None], quaternion[None])})
+    np.testing.assert_allclose(many.q, first.q[None], atol=1e-6)
+    assert "found by search" in first.explain()
+
+
+def test_same_key_same_answer(arm, rng):
+    poses = {"hand": random_poses(arm, "hand", 16, rng)}
+    a, b, other = (osik.inverse_kinematics(arm, poses, key=key) for key in (0, 0, 1))
+    np.testing.assert_array_equal(a.q, b.q)
+    assert (np.abs(np.asarray(a.q) - np.asarray(other.q)).max(1) > 1e-3).any()
+
+
+def test_a_start_that_is_right_is_kept(arm, rng):
+    starts = np.asarray(arm.q0) + 0.3 * rng.standard_normal(7)
+    pose = mujoco_pose(arm, starts, "hand")
+    found = osik.inverse_kinematics(arm, {"hand": pose}, q0=starts)
+    np.testing.assert_allclose(found.q, starts, atol=1e-6)
+    assert found.seed == 0
+
+
+def test_pure_form_is_differentiable_and_batched(arm, rng):
+    """Against central differences of the same search from its own solution, and MuJoCo's Jacobian."""
+    _, rotation = mujoco_pose(arm, np.asarray(arm.q0), "hand")
+
+    def find(position, start):
+        return osik.inverse_kinematics(
+            arm,
+            {"hand": (position, rotation)},
+            q0=start,
+            seeds=2,
+            steps=24,
+            position_tolerance=1e-8,
+            orientation_tolerance=1e-8,
+        ).q
+
+    both = jax.jit(jax.vmap(lambda p, q: (find(p, q), jax.jacfwd(find)(p, q), jax.jacrev(find)(p, q))))
+    positions = jnp.asarray(mujoco_pose(arm, np.asarray(arm.q0), "hand")[0] + rng.uniform(-0.1, 0.1, (2, 3)))
+    q, forward, reverse = both(positions, jnp.stack([arm.q0 + 0.1, arm.q0 - 0.1]))
+    np.testing.assert_allclose(forward, reverse, atol=1e-10)
+    step = 1e-4
+    for axis in np.eye(3):
+        ahead, behind = (both(positions + sign * step * axis, q)[0] for sign in (1.0, -1.0))
+        np.testing.assert_allclose(forward @ axis, (ahead - behind) / (2 * step), atol=1e-6)
+    shortest = np.linalg.pinv(mujoco_jacobian(arm, q[0], "hand"))
+    np.testing.assert_allclose(forward[0], shortest[:, :3], atol=1e-7)
+
+
+def test_derivative_is_finite_out_of_reach(planar):
+    find = jax.jit(lambda p: osik.inverse_kinematics(planar, {"tip": p}, seeds=2, steps=8).q)
+    slope = jax.jacrev(find)(jnp.array([3.0, 0.0, 0.0]))
+    assert np.isfinite(slope).all()
+
+
+def test_changing_numbers_compiles_nothing(arm, rng):
+    position, rotation = random_poses(arm, "hand", 16, rng)
+    osik.inverse_kinematics(arm, {"hand": (position, rotation)})
+    from osik_jax.inverse import _inverse_kinematics as module
+
+    program: Any = module._pooled
+    before = program._cache_size()
+    for key, tolerance, seeds in ((1, 1e-4, 8), (2, 1e-2, 32)):
+        poses = {"hand": (position[::-1], rotation[::-1])}
+        osik.inverse_kinematics(arm, poses, key=key, position_tolerance=tolerance, seeds=seeds, restarts=0, steps=30)
+    assert program._cache_size() == before
+
+
+def test_tasks_on_an_arm_with_a_wall_and_preferences(arm):
+    """Steps of the scheme: a barrier that a frame does not pass, a posture that fades out."""
+    start = np.asarray(arm.q0)
+    position, rotation = mujoco_pose(arm, start, "hand")
+    position += np.array([0.05, 0.1, -0.1])
+    tasks = {
+        "hand": osik.FrameTask(arm, "hand", target=(position, rotation), gain=3.0),
+        "posture": osik.PostureTask(arm, weight=1e-2, priority=2),
+    }
+    wall = osik.PositionBarrier(arm, "link4", upper=(np.inf, 0.02, np.inf))
+    limits = (osik.ConfigurationLimit(arm), osik.VelocityLimit(arm), wall)
+    found = osik.inverse_kinematics(arm, tasks, limits=limits, seeds=8, restarts=1)
+    away, turned = errors_by_mujoco(arm, found.q[None], "hand", [position], [rotation])
+    assert found.converged and away.max() <= POSITION and turned.max() <= ORIENTATION
+    assert mujoco_pose(arm, found.q, "link4")[0][1] <= 0.02 + 1e-4
+    assert_within_limits(arm, found.q)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hard", [False, True])
+def test_floating_base_with_feet_held_and_balance(rng, hard):
+    nao = osik.load_robot("nao")
+    standing = osik.support_polygon(nao, nao.q0, ("l_sole", "r_sole"), margin=0.01)
+    feet = {name: osik.FrameTask(nao, name, hard=hard, weight=10.0) for name in ("l_sole", "r_sole")}
+    tasks = {
+        **feet,
+        "balance": osik.ComTask(nao, polygon=standing, weight=10.0),
+        "hand": osik.FrameTask(nao, "l_gripper", rows="position"),
+        "posture": osik.PostureTask(nao, weight=1e-3),
+    }
+    home = np.array(mujoco_pose(nao, nao.q0, "l_gripper")[0])
+    goals = home + rng.uniform([0.0, -0.02, -0.05], [0.08, 0.05, 0.08], (8, 3))
+    rotations = np.broadcast_to(np.eye(3), (8, 3, 3))
+    found = osik.inverse_kinematics(nao, tasks, targets={"hand": (goals, rotations)}, seeds=8, restarts=1)
+    assert np.asarray(found.converged).all()
+    for q, goal in zip(np.asarray(found.q), goals, strict=True):
+        assert np.linalg.norm(mujoco_pose(nao, q, "l_gripper")[0] - goal) <= POSITION
+        for foot in feet:
+            (p, r), (wanted, turn) = mujoco_pose(nao, q, foot), mujoco_pose(nao, nao.q0, foot)
+            assert np.linalg.norm(p - wanted) <= POSITION and angle(r, turn) <= ORIENTATION
+        com = osik.center_of_mass(nao, osik.forward_kinematics(nao, q))
+        assert standing.distance(com[:2]) >= -POSITION
+    joints = np.asarray(found.q)[:, 7:]
+    assert (joints >= np.asarray(nao.position_lower)[6:]).all() and (joints <= np.asarray(nao.position_upper)[6:]).all()
+
+
+@pytest.mark.slow
+def test_configurations_keep_clear_of_an_obstacle(arm):
+    """A ball in the arm's way: the hand gets to its target around it, or the ball is named as what stops it."""
+    start = np.asarray(arm.q0)
+    position, rotation = mujoco_pose(arm, start, "hand")
+    elbow = mujoco_pose(arm, start, "link4")[0]
+    limits = (
+        osik.ConfigurationLimit(arm),
+        osik.CollisionAvoidanceLimit(
+            arm,
+            pairs=[("ball", "forearm"), ("ball", "tool")],
+            shapes={
+                "ball": osik.CollisionShape.sphere(0.05, elbow),
+                "forearm": osik.CollisionShape.sphere(0.06, frame="link4"),
+                "tool": osik.CollisionShape.sphere(0.04, frame="hand"),
+            },
+            q0_distance=-np.inf,
+        ),
+    )
+    targets = np.stack([position, elbow + np.array([0.0, 0.0, 0.05])])
+    rotations = np.stack([rotation, rotation])
+    found = osik.inverse_kinematics(arm, {"hand": (targets, rotations)}, limits=limits, seeds=16, restarts=1)
+    assert np.asarray(found.converged).tolist() == [True, False]
+    away, _ = errors_by_mujoco(arm, found.q, "hand", targets, rotations)
+    assert away[0] <= POSITION
+    apart = np.linalg.norm(mujoco_pose(arm, np.asarray(found.q)[0], "link4")[0] - elbow) - 0.11
+    assert apart >= 0.01 - 1e-4  # minimum_distance
+    assert found.clearance is not None and np.asarray(found.clearance)[0] >= -1e-4
+    assert "ball" in found.explain(1)
+
+
+class TestMistakes:
+    def test_names_and_kinds(self, arm):
+        pose = np.eye(4)
+        with pytest.raises(KeyError, match="no frame 'hnad'; did you mean 'hand'"):
+            osik.inverse_kinematics(arm, {"hnad": pose})
+        with pytest.raises(TypeError, match="dict from names of frames"):
+            osik.inverse_kinematics(arm, [pose])  # pyright: ignore
+        with pytest.raises(ValueError, match="nothing to reach"):
+            osik.inverse_kinematics(arm, {})
+        with pytest.raises(TypeError, match="which is no pose"):
+            osik.inverse_kinematics(arm, {"hand": "there"})
+        with pytest.raises(ValueError, match="no task says where"):
+            osik.inverse_kinematics(arm, {"posture": osik.PostureTask(arm)})
+        with pytest.raises(KeyError, match="no task 'foot'"):
+            osik.inverse_kinematics(arm, {"hand": osik.FrameTask(arm, "hand")}, targets={"foot": pose[None]})
+        with pytest.raises(ValueError, match="targets go with tasks"):
+            osik.inverse_kinematics(arm, {"hand": pose}, targets={"hand": pose[None]})
+
+    def test_numbers(self, arm):
+        position, rotation = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
+        rotation[1] *= 1.1
+        with pytest.raises(ValueError, match=r"targets\['hand'\]: rotations that are none.*\[1\]"):
+            osik.inverse_kinematics(arm, {"hand": (position, rotation)})
+        with pytest.raises(ValueError, match="numbers of targets differ: hand: 3, link4: 2"):
+            osik.inverse_kinematics(arm, {"hand": position, "link4": position[:2]})
+        for wrong in (0.0, -1.0, np.nan, 1e-15):
+            with pytest.raises(ValueError, match="a tolerance is"):
+                osik.inverse_kinematics(arm, {"hand": np.eye(4)}, position_tolerance=wrong)
+        with pytest.raises(ValueError, match="seeds is 0"):
+            osik.inverse_kinematics(arm, {"hand": np.eye(4)}, seeds=0)
+        with pytest.raises(ValueError, match="have to be finite"):
+            osik.inverse_kinematics(arm, {"hand": np.full((2, 3), np.nan)})
+        with pytest.raises(TypeError, match="all=True counts"):
+            jax.jit(lambda p: osik.inverse_kinematics(arm, {"hand": p}, all=True).q)(jnp.zeros(3))

@@ -1,0 +1,237 @@
+"""The control loop of a live view: what it does with targets, changes, failures and silence."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.viewer.live._loop import ControlLoop
+from osik_jax.viewer.live._step import Controller
+from osik_jax.viewer.live._timing import Stopwatch
+
+ROBOT = osik.load_robot("arm7")
+LIMITS = (osik.ConfigurationLimit(ROBOT), osik.VelocityLimit(ROBOT))
+HOME = osik.forward_kinematics(ROBOT, ROBOT.q0).frame_pose(ROBOT, "hand")
+DT = 0.005
+
+
+def tasks(**changes: Any) -> dict[str, osik.Task]:
+    """The hand's pose, and a weak posture."""
+    return {
+        "hand": osik.FrameTask(ROBOT, "hand", priority=1),
+        "posture": osik.PostureTask(ROBOT, weight=1e-6, priority=2),
+        **changes,
+    }
+
+
+def until(holds: Callable[[], bool], seconds: float = 20.0) -> bool:
+    """Waits until something holds; whether it did in time."""
+    end = time.monotonic() + seconds
+    while not holds():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def hand(q: np.ndarray) -> np.ndarray:
+    """Where MuJoCo has the hand [m]."""
+    data = mujoco.MjData(ROBOT.mj_model)
+    data.qpos[:] = np.asarray(ROBOT.mujoco_qpos(jnp.asarray(q)))
+    mujoco.mj_kinematics(ROBOT.mj_model, data)
+    return data.site("hand").xpos.copy()
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[ControlLoop]:
+    with ControlLoop(ROBOT, Controller(tasks(), osik.WeightedQP(), LIMITS), dt=DT) as loop:
+        assert loop.wait_until_ready()
+        yield loop
+
+
+@pytest.fixture
+def loop(running: ControlLoop) -> ControlLoop:
+    """At the start, at rest, with the controller of the start."""
+    running.resume()
+    running.change(lambda _: Controller(tasks(), osik.WeightedQP(), LIMITS))
+    running.let_go("somebody")
+    running.aim("hand", HOME)
+    running.reset()
+    assert running.wait_until_ready()
+    assert until(lambda: running.snapshot.time < 0.2 and running.snapshot.ready)
+    return running
+
+
+def target_of(loop: ControlLoop) -> np.ndarray:
+    """Where the hand is asked to be [m]."""
+    task: Any = loop.controller.tasks["hand"]
+    return np.asarray(task.target[0])
+
+
+def moved(x: float, y: float, z: float) -> tuple[Any, Any]:
+    return HOME[0] + jnp.array([x, y, z]), HOME[1]
+
+
+def test_the_robot_goes_where_its_target_is(loop: ControlLoop) -> None:
+    target = moved(-0.05, 0.08, -0.05)
+    loop.aim("hand", target)
+    assert until(lambda: bool(np.linalg.norm(hand(loop.snapshot.q) - target[0]) < 1e-4))
+    assert loop.snapshot.status == osik.Status.SOLVED
+    assert until(lambda: bool(np.linalg.norm(loop.snapshot.errors["hand"]) < 1e-3))
+
+
+def test_every_step_is_the_solution_of_its_tick(loop: ControlLoop) -> None:
+    target = moved(-0.1, 0.1, 0.0)
+    loop.record()
+    loop.aim("hand", target)
+    assert until(lambda: (loop.snapshot.recording or 0.0) > 0.3)
+    time, q = loop.recorded()
+    np.testing.assert_allclose(np.diff(time), DT, atol=1e-12)
+    wanted = tasks(hand=tasks()["hand"].replace(target=target))
+    for k in (20, 40, len(q) - 2):
+        v = osik.solve(ROBOT, q[k], wanted, scheme=osik.WeightedQP(), limits=LIMITS, dt=DT).velocity
+        np.testing.assert_allclose(q[k + 1], osik.integrate(ROBOT, q[k], v, DT), atol=1e-9)
+
+
+def test_limits_hold_on_the_way_to_what_is_out_of_reach(loop: ControlLoop) -> None:
+    loop.record()
+    loop.aim("hand", moved(2.0, 0.5, 1.0))
+    assert until(lambda: (loop.snapshot.recording or 0.0) > 1.5)
+    _, q = loop.recorded()
+    assert len(q) > 250
+    speed = np.abs(np.diff(q, axis=0)) / DT
+    assert np.all(speed <= np.asarray(ROBOT.velocity_limit) * (1.0 + 1e-9))
+    assert speed.max() > 0.5
+    assert np.all((q >= np.asarray(ROBOT.position_lower)) & (q <= np.asarray(ROBOT.position_upper)))
+    assert loop.snapshot.failures == 0
+
+
+@pytest.mark.parametrize("way", ["silence", "leaving"])
+def test_an_abandoned_target_leaves_the_robot_at_rest_where_it_is(loop: ControlLoop, way: str) -> None:
+    far = moved(-0.4, 0.4, -0.2)
+    if way == "silence":
+        loop.aim("hand", far, timeout=0.1)
+    else:
+        loop.aim("hand", far, owner="somebody")
+        assert until(lambda: bool(np.abs(loop.snapshot.velocity).max() > 0.2))
+        loop.release("somebody")
+    assert until(lambda: bool(np.linalg.norm(target_of(loop) - far[0]) > 0.05))
+    assert until(lambda: bool(np.abs(loop.snapshot.velocity).max() < 1e-3))
+    assert np.linalg.norm(hand(loop.snapshot.q) - target_of(loop)) < 1e-3
+    assert np.linalg.norm(hand(loop.snapshot.q) - far[0]) > 0.05
+
+
+def test_a_target_that_was_let_go_stays(loop: ControlLoop) -> None:
+    target = moved(-0.05, -0.05, 0.0)
+    loop.aim("hand", target, owner="somebody")
+    loop.let_go("somebody")
+    loop.release("somebody")
+    assert until(lambda: bool(np.linalg.norm(hand(loop.snapshot.q) - target[0]) < 1e-4))
+    np.testing.assert_array_equal(target_of(loop), target[0])
+
+
+def test_numbers_change_without_compiling(loop: ControlLoop) -> None:
+    program = loop._job.program if loop._job else None
+    loop.aim("hand", moved(-0.05, 0.0, 0.0))
+    softer = tasks(hand=tasks()["hand"].replace(gain=2.0, weight=0.5))
+    slow = (LIMITS[0], osik.VelocityLimit(ROBOT, velocity={"*": 0.01}))
+    loop.change(lambda now: Controller(softer, now.scheme.replace(damping=1e-4), slow))
+    assert not loop._is_behind and loop._job is not None and loop._job.program is program
+    assert until(lambda: bool(0.0 < np.abs(loop.snapshot.velocity).max() <= 0.01 * (1.0 + 1e-9)))
+
+
+def test_a_new_structure_takes_over_while_the_old_one_goes_on(loop: ControlLoop) -> None:
+    before = loop.snapshot.time
+    loop.change(lambda now: Controller(now.tasks, osik.HierarchicalQP(), now.limits))
+    assert loop._is_behind
+    target = moved(-0.05, 0.05, 0.0)
+    loop.aim("hand", target)
+    assert until(lambda: loop.snapshot.time > before + 0.05)
+    assert loop.wait_until_ready()
+    assert isinstance(loop._running.scheme, osik.HierarchicalQP)
+    assert until(lambda: bool(np.linalg.norm(hand(loop.snapshot.q) - target[0]) < 1e-4))
+
+
+def test_a_change_that_cannot_be_compiled_is_taken_back_and_told(loop: ControlLoop) -> None:
+    class Broken(osik.PostureTask):
+        def rows(self, robot: Any, kinematics: Any, q: Any) -> Any:
+            raise ValueError("this task has no rows")
+
+    made: Any = Broken
+    broken = made(ROBOT)
+    loop.change(lambda now: Controller({**now.tasks, "broken": broken}, now.scheme, now.limits))
+    assert until(lambda: "this task has no rows" in loop.snapshot.problem)
+    assert "broken" not in loop.controller.tasks
+    before = loop.snapshot.time
+    assert until(lambda: loop.snapshot.time > before + 0.05)
+
+
+def test_where_the_answer_is_not_finite_the_robot_stands_still(loop: ControlLoop) -> None:
+    before = loop.snapshot.q
+    spoiled = eqx.tree_at(lambda task: task.gain, tasks()["hand"], jnp.asarray(jnp.nan))
+    loop.change(lambda now: Controller({**now.tasks, "hand": spoiled}, now.scheme, now.limits))
+    assert until(lambda: loop.snapshot.failures > 5)
+    assert loop.snapshot.status == osik.Status.NUMERICAL_ERROR
+    np.testing.assert_allclose(loop.snapshot.q, before, atol=1e-3)
+    loop.change(lambda now: Controller(tasks(), now.scheme, now.limits))
+    assert until(lambda: loop.snapshot.status == osik.Status.SOLVED)
+
+
+def test_pause_push_and_reset(loop: ControlLoop) -> None:
+    loop.aim("hand", moved(-0.2, 0.2, 0.0))
+    assert until(lambda: bool(np.abs(loop.snapshot.velocity).max() > 0.1))
+    loop.pause()
+    assert until(lambda: loop.snapshot.paused)
+    still = loop.snapshot.q
+    time.sleep(0.1)
+    np.testing.assert_array_equal(loop.snapshot.q, still)
+    loop.aim("hand", HOME)
+    loop.reset()
+    loop.resume()
+    assert until(lambda: not loop.snapshot.paused and loop.snapshot.time > 0.1)
+    np.testing.assert_allclose(loop.snapshot.q, ROBOT.q0, atol=1e-6)
+    push = np.zeros(ROBOT.nv)
+    push[1] = 1.0
+    loop.push(push)
+    assert until(lambda: bool(np.linalg.norm(hand(loop.snapshot.q) - HOME[0]) > 0.01))
+    assert until(lambda: bool(np.linalg.norm(hand(loop.snapshot.q) - HOME[0]) < 1e-3))
+
+
+def test_wrong_targets_raise_where_they_are_given(loop: ControlLoop) -> None:
+    with pytest.raises(KeyError, match="hand"):
+        loop.aim("hnad", HOME)
+    with pytest.raises(ValueError, match="finite"):
+        loop.aim("hand", (np.full(3, np.nan), HOME[1]))
+    with pytest.raises(ValueError, match="dt is 0"):
+        ControlLoop(ROBOT, Controller(tasks(), osik.WeightedQP(), LIMITS), dt=0.0)
+    with pytest.raises(ValueError, match="q0 has shape"):
+        ControlLoop(ROBOT, Controller(tasks(), osik.WeightedQP(), LIMITS), q0=jnp.zeros(3))
+
+
+def test_pythons_own_settings_come_back_after_the_loop() -> None:
+    before = sys.getswitchinterval()
+    with ControlLoop(ROBOT, Controller(tasks(), osik.WeightedQP(), LIMITS)):
+        assert sys.getswitchinterval() <= 5e-4 + 1e-9
+    assert sys.getswitchinterval() == before
+
+
+def test_a_stopwatch_tells_percentiles_of_what_it_keeps() -> None:
+    watch, rng = Stopwatch(length=100), np.random.default_rng(0)
+    starts, durations = np.cumsum(rng.uniform(0.004, 0.006, 250)), rng.uniform(0.0, 0.002, 250)
+    for start, duration in zip(starts, durations, strict=True):
+        watch.add(start, duration)
+    timing = watch.timing()
+    assert timing.steps == 250
+    np.testing.assert_allclose(timing.period[:2], np.percentile(np.diff(starts[150:]), (50, 99)))
+    np.testing.assert_allclose(timing.step, (*np.percentile(durations[150:], (50, 99)), durations[150:].max()))
+    watch.clear()
+    assert watch.timing().period == (0.0, 0.0, 0.0)

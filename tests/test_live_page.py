@@ -1,0 +1,165 @@
+"""What a live view shows, as far as no browser is needed: surfaces, motions, exported pages, servers."""
+
+from __future__ import annotations
+
+import socket
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.cli import main
+from osik_jax.viewer import export_html, serve
+from osik_jax.viewer._parts import Part, robot_parts
+from osik_jax.viewer.live._playback import read_motion
+from osik_jax.viewer.live._readout import error_text, joint_table
+from osik_jax.viewer.live._stance import sole_polygon, standing
+from osik_jax.viewer.live._surfaces import part_triangles
+
+ARM, NAO = osik.load_robot("arm7"), osik.load_robot("nao")
+_GEOM = mujoco.mjtGeom
+
+
+def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Of a closed surface [m^3]."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return float(np.sum(a * np.cross(b, c)) / 6.0)
+
+
+def part(kind: mujoco.mjtGeom, *size: float) -> Part:
+    return Part(0, kind, np.array([*size, 0.0, 0.0][:3]), np.ones(4))
+
+
+@pytest.mark.parametrize(
+    ("shape", "exact", "corners"),
+    [
+        (part(_GEOM.mjGEOM_SPHERE, 0.3), 4.0 / 3.0 * np.pi * 0.027, None),
+        (part(_GEOM.mjGEOM_CYLINDER, 0.2, 0.5), np.pi * 0.04, None),
+        (part(_GEOM.mjGEOM_BOX, 0.1, 0.2, 0.3), 8 * 0.006, 3),
+    ],
+)
+def test_surfaces_are_closed_and_sharp_at_edges(shape: Part, exact: float, corners: int | None) -> None:
+    vertices, faces = part_triangles(shape)
+    assert volume(vertices, faces) == pytest.approx(exact, rel=0.03)
+    if corners is not None:  # each corner of a box is there once for each side
+        extreme = np.all(np.isclose(np.abs(vertices), shape.size), axis=1)
+        assert extreme.sum() == 8 * corners
+
+
+def test_large_meshes_become_smaller_and_stay_where_they_were() -> None:
+    fine = 120
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, fine, endpoint=False), np.linspace(0, np.pi, fine))
+    points = 0.5 * np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), -np.cos(v)], -1).reshape(-1, 3)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(fine - 1), np.arange(fine), indexing="ij"))
+    a, b = i * fine + j, i * fine + (j + 1) % fine
+    faces = np.concatenate([np.stack([a, b, b + fine], 1), np.stack([a, b + fine, a + fine], 1)])
+    big = Part(0, _GEOM.mjGEOM_MESH, np.zeros(3), np.ones(4), (points, faces))
+    vertices, fewer = part_triangles(big)
+    assert len(fewer) <= 4000 < len(faces)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.5, atol=0.02)
+    assert volume(vertices, fewer) == pytest.approx(volume(points, faces), rel=0.03)
+
+
+def test_motions_are_read_as_the_demo_and_rollouts_write_them(tmp_path: Path) -> None:
+    q = np.tile(np.asarray(ARM.q0), (5, 1)) + 0.1 * np.arange(5)[:, None]
+    np.savez(tmp_path / "demo.npz", time=0.01 * np.arange(4), q_weighted=q, v_weighted=q[1:], q_null_space=q[:3])
+    motion = read_motion(tmp_path / "demo.npz", ARM)
+    assert list(motion.runs) == ["weighted", "null_space"]
+    assert motion.duration == pytest.approx(0.04)
+    np.testing.assert_array_equal(motion.at("weighted", 0.0299), q[2])
+    np.testing.assert_array_equal(motion.at("weighted", 9.0), q[4])
+    np.savez(tmp_path / "rollout.npz", q=q)
+    assert read_motion(tmp_path / "rollout.npz", ARM).duration == pytest.approx(4 / 200)
+
+
+def test_an_exported_page_holds_everything(tmp_path: Path) -> None:
+    q = np.tile(np.asarray(ARM.q0), (50, 1)) + np.linspace(0.0, 0.5, 50)[:, None]
+    path = export_html(ARM, {"one": q, "other": q[::-1]}, tmp_path / "arm.html", dt=0.02, title="a <b> arm")
+    page = path.read_text(encoding="utf-8")
+    assert "<title>a &lt;b> arm</title>" in page and "__VISER_EMBED_DATA__" in page
+    assert ' src="http' not in page and ' href="http' not in page
+    still = export_html(ARM, q[:1], tmp_path / "still.html")
+    assert len(page) - len(still.read_text(encoding="utf-8")) > 1000  # what moves
+    with pytest.raises(ValueError, match="it is configurations"):
+        export_html(NAO, q, tmp_path / "wrong.html")
+    with pytest.raises(ValueError, match="dt is -1"):
+        export_html(ARM, q, tmp_path / "wrong.html", dt=-1.0)
+
+
+def test_a_page_is_served_and_a_visitor_who_goes_leaves_the_robot_at_rest() -> None:
+    tasks = {"hand": osik.FrameTask(ARM, "hand"), "posture": osik.PostureTask(ARM, weight=1e-6)}
+    with serve(ARM, tasks, port=0, source="arm7") as view:
+        with urllib.request.urlopen(view.url) as answer:
+            assert answer.status == 200 and b"<html" in answer.read(4000)
+        assert view.loop.wait_until_ready()
+        far, turn = tasks["hand"].target[0] + np.array([-0.3, 0.4, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])
+        view._drag("hand", (np.asarray(far), turn), 7, "start")
+        time.sleep(0.1)
+        view._drag("hand", (np.asarray(far), turn), 7, "end")  # of a visitor who is not connected
+        end = time.monotonic() + 20.0
+        while np.abs(view.loop.snapshot.velocity).max() > 1e-3 or view.loop.snapshot.time < 0.3:
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        task: Any = view.session.tasks["hand"]
+        assert np.linalg.norm(task.target[0] - far) > 0.05
+        taken = int(view.url.rsplit(":", 1)[1])
+        with pytest.raises(OSError, match=f"port {taken}"):
+            serve(ARM, tasks, port=taken)
+
+
+def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez(tmp_path / "motion.npz", q=np.zeros((3, 7)))
+    (tmp_path / "broken.urdf").write_text("<robot", encoding="utf-8")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = str(other.getsockname()[1])
+        for arguments, told in (
+            (["--port", taken], f"port {taken}"),
+            (["--port", "70000"], "no port 70000"),
+            (["--port", "0", "--robot", "nowhere.urdf"], "no such file: nowhere.urdf"),
+            (["--port", "0", "--robot", str(tmp_path / "broken.urdf")], "broken XML"),
+            (["--port", "0", "nowhere.npz"], "no such file: nowhere.npz"),
+            (["--port", "0", str(tmp_path / "motion.npz")], "another robot"),
+            (["--port", "0", "--support", "l_soul"], "l_sole"),
+        ):
+            assert main(["view", "--no-browser", *arguments]) == 2
+            error = capsys.readouterr().err
+            assert told in error and error.count("\n") == 1 and error.startswith("osik: ")
+
+
+def test_without_viser_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    with pytest.raises(ImportError, match=r"pip install 'osik-jax\[viewer\]'"):
+        serve(ARM, {"posture": osik.PostureTask(ARM)}, port=0)
+
+
+def test_soles_without_named_corners_span_what_they_stand_on() -> None:
+    shapes = robot_parts(NAO)
+    q = standing(NAO, shapes, ("l_sole", "r_sole"))
+    named = sole_polygon(NAO, shapes, q, ("l_sole", "r_sole"))
+    drawn = sole_polygon(NAO, shapes, q, ("l_ankle", "r_ankle"))
+    assert named is not None and drawn is not None
+    assert bool(np.all(named.distance(drawn.vertices) > -0.01))
+    assert _area(drawn.vertices) > 0.6 * _area(named.vertices)
+
+
+def _area(vertices: Any) -> float:
+    """Of a polygon [m^2]."""
+    x, y = np.asarray(vertices).T
+    return 0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
+
+
+def test_readings() -> None:
+    task = osik.FrameTask(ARM, "hand")
+    assert error_text(task, np.array([3e-3, 4e-3, 0.0, np.pi / 180.0, 0.0, 0.0])) == "5.0 mm, 1.0°"
+    lower, upper = np.asarray(ARM.position_lower), np.asarray(ARM.position_upper)
+    q = 0.5 * (lower + upper)
+    q[3] = lower[3] + 0.02 * (upper[3] - lower[3])
+    first = joint_table(ARM, q, np.zeros(7)).splitlines()[2]
+    assert ARM.joint_names[3] in first and "2.0 %" in first

@@ -1,0 +1,155 @@
+"""Sessions of a live view: files that hold all of a controller, and lines of Python that make the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.viewer import Session, load_session
+from osik_jax.viewer.live._default import default_session, find_hands
+from osik_jax.viewer.live._desk import Desk
+from osik_jax.viewer.live._source import RobotSource
+
+ROBOT = osik.load_robot("nao")
+
+
+def session(**changes: Any) -> Session:
+    """One with a task of each of several families, and numbers that are nobody's default."""
+    standing = osik.support_polygon(ROBOT, ROBOT.q0, ("l_sole", "r_sole"), margin=0.01)
+    home = osik.forward_kinematics(ROBOT, ROBOT.q0).frame_pose(ROBOT, "l_gripper")
+    tasks = {
+        "foot": osik.FrameTask(ROBOT, "l_sole", weight=1e4),
+        "balance": osik.ComTask(ROBOT, polygon=standing, weight=3.0, priority=2),
+        "hand": osik.FrameTask(
+            ROBOT,
+            "l_gripper",
+            target=(home[0] + 0.03, home[1]),
+            rows="position",
+            gain=osik.AdaptiveGain(20.0, 5.0, 1.0 / 3.0),
+            priority=3,
+        ),
+        "waist": osik.FrameTask(ROBOT, "torso", axes="frame", orientation_weight=(1.0, 2.0, 0.5), priority=3),
+        "arms": osik.PostureTask(ROBOT, joints=("LShoulder*", "LElbow*"), weight=0.1, priority=3),
+        "posture": osik.PostureTask(ROBOT, weight=1e-2, gain=1.0, priority=4),
+    }
+    given: dict[str, Any] = dict(
+        robot=ROBOT,
+        tasks=tasks,
+        scheme=osik.WeightedQP(damping=2e-6),
+        limits=(osik.ConfigurationLimit(ROBOT, gain=0.7), osik.VelocityLimit(ROBOT, velocity={"L*": 0.1})),
+        dt=0.004,
+        q=np.asarray(ROBOT.q0),
+        off=frozenset({"waist"}),
+        source=RobotSource("nao"),
+    )
+    return Session(**{**given, **changes})
+
+
+def answer(one: Session) -> osik.Solution:
+    return osik.solve(
+        ROBOT, jnp.asarray(one.q), one.active_tasks, scheme=one.scheme, limits=one.active_limits, dt=one.dt
+    )
+
+
+def test_a_session_comes_back_from_its_file_to_the_last_bit(tmp_path: Path) -> None:
+    saved = session(limits_off=frozenset({1}))
+    saved.save(tmp_path / "session.json")
+    loaded = load_session(tmp_path / "session.json")
+    assert loaded.off == {"waist"} and loaded.limits_off == {1} and loaded.dt == 0.004
+    for name in ("tasks", "scheme", "limits", "q"):
+        first, second = (jax.tree.flatten(getattr(one, name)) for one in (saved, loaded))
+        assert first[1] == second[1]
+        for x, y in zip(first[0], second[0], strict=True):
+            np.testing.assert_array_equal(x, y)
+    assert list(loaded.tasks) == list(saved.tasks)
+
+
+def test_its_lines_of_python_make_the_same_controller() -> None:
+    wanted = session()
+    names: dict[str, Any] = {}
+    exec(wanted.to_python(), names)
+    assert list(names["tasks"]) == [name for name in wanted.tasks if name != "waist"]
+    expected = answer(wanted)
+    assert expected.status == osik.Status.SOLVED and np.abs(expected.velocity).max() > 0.05
+    np.testing.assert_array_equal(names["solution"].velocity, expected.velocity)
+
+
+def test_what_is_switched_off_is_as_if_it_were_not_there() -> None:
+    wanted = session(limits_off=frozenset({1}))
+    parts = wanted.controller()
+    off = osik.solve(ROBOT, jnp.asarray(wanted.q), parts.tasks, scheme=parts.scheme, limits=parts.limits, dt=wanted.dt)
+    np.testing.assert_allclose(off.velocity, answer(wanted).velocity, atol=1e-8)
+    assert np.abs(off.velocity).max() > 0.1  # as far as the limit that is off would let no joint go
+    assert parts.structure() == session(off=frozenset()).controller().structure()
+
+
+def test_edits_at_the_desk() -> None:
+    desk = Desk(session())
+    desk.loop.aim("hand", (np.array([0.1, 0.1, 0.3]), np.eye(3)))
+    desk.rank("foot", 2)
+    desk.renumber("hand", weight=7.0)
+    name = desk.add_frame("r_gripper")
+    now: Any = desk.session
+    assert now.tasks["foot"].priority == 2 and float(now.tasks["hand"].weight) == 7.0
+    np.testing.assert_array_equal(now.tasks["hand"].target[0], [0.1, 0.1, 0.3])
+    home = osik.forward_kinematics(ROBOT, ROBOT.q0).frame_pose(ROBOT, "r_gripper")
+    np.testing.assert_allclose(now.tasks[name].target[0], home[0], atol=1e-12)
+    desk.remove(name)
+    desk.slow_down(0.5)
+    desk.take_scheme("Hierarchical QP")
+    desk.switch("waist", True)
+    now = desk.session
+    assert name not in now.tasks and not now.off and isinstance(now.scheme, osik.HierarchicalQP)
+    np.testing.assert_allclose(now.limits[1].velocity, 0.5 * ROBOT.velocity_limit)
+    desk.load(session())
+    assert isinstance(desk.session.scheme, osik.WeightedQP) and desk.session.off == {"waist"}
+    with pytest.raises(ValueError, match="another robot"):
+        desk.load(default_session(osik.load_robot("arm7")))
+
+
+def test_what_a_file_cannot_hold_is_refused_in_words(tmp_path: Path) -> None:
+    class Mine(osik.PostureTask):
+        """Of somebody's own."""
+
+    made: Any = Mine
+    with pytest.raises(ValueError, match="Mine is no class of osik_jax"):
+        session(tasks={"mine": made(ROBOT)}).to_json()
+    with pytest.raises(ValueError, match="where the robot comes from is not known"):
+        session(source=None).save(tmp_path / "session.json")
+    with pytest.raises(ValueError, match="CollisionAvoidanceLimit"):
+        session(limits=(osik.CollisionAvoidanceLimit(ROBOT),)).to_json()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(format="something else"), "no session of osik view"),
+        (dict(q=[0.0, 1.0]), "q has shape"),
+        (dict(robot=dict(robot="nowhere.urdf", floating_base=None)), "no such file: nowhere.urdf"),
+        (dict(scheme=dict(kind="NoScheme")), "'NoScheme' is no class of osik_jax"),
+        (dict(tasks=dict(hand=dict(kind="FrameTask", frame="l_griper"))), "l_gripper"),
+    ],
+)
+def test_broken_files_are_told_in_words(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    path = tmp_path / "session.json"
+    path.write_text(json.dumps({**json.loads(session().to_json()), **change}), encoding="utf-8")
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        load_session(path)
+
+
+def test_a_default_session_has_what_there_is_to_drag() -> None:
+    assert find_hands(ROBOT) == ("l_gripper", "r_gripper")
+    assert find_hands(osik.load_robot("arm7")) == ("hand",)
+    one = default_session(ROBOT, feet=("l_sole", "r_sole"))
+    assert list(one.tasks) == ["l_sole", "r_sole", "l_gripper", "r_gripper", "torso", "centre of mass", "posture"]
+    assert one.off == {"torso", "centre of mass"}
+    kinematics = osik.forward_kinematics(ROBOT, ROBOT.q0)
+    for name in one.active_tasks:
+        np.testing.assert_allclose(one.tasks[name].rows(ROBOT, kinematics, ROBOT.q0).error, 0.0, atol=1e-9)

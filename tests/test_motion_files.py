@@ -1,0 +1,229 @@
+"""Readers of motion files beside SciPy's rotations, and what they say of broken files."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_files import FIGURE, Figure, dancer, write_bvh
+from scipy.spatial.transform import Rotation
+
+from osik_jax.retargeting import (
+    HumanMotion,
+    RobotMotion,
+    load_motion,
+    load_robot_motion,
+    read_bvh,
+    write_csv,
+)
+
+_TO_Z_UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
+
+
+def known(array):
+    """What a motion may or may not have, and has here."""
+    assert array is not None
+    return array
+
+
+@st.composite
+def figures(draw):
+    """Trees of up to five joints, with any orders of rotation."""
+    count = draw(st.integers(1, 5))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    joints = tuple(
+        (f"joint {i}", -1 if i == 0 else draw(st.integers(0, i - 1)), tuple(rng.normal(size=3))) for i in range(count)
+    )
+    orders = tuple(draw(st.sampled_from(["ZXY", "XYZ", "ZYX", "YXZ", "YZX", "XZY"])) for _ in joints)
+    frames = draw(st.integers(1, 4))
+    return Figure(joints, rng.normal(size=(frames, 3)), rng.uniform(-180, 180, (frames, count, 3)), orders, 50.0)
+
+
+@given(figures(), st.sampled_from(["x", "y", "z"]), st.sampled_from([1.0, 0.01, 0.0254]))
+@settings(max_examples=40, deadline=None)
+def test_a_bvh_file_is_the_tree_that_was_written(tmp_path_factory, figure, up, unit):
+    path = write_bvh(tmp_path_factory.mktemp("bvh") / "clip.bvh", figure, unit)
+    motion = read_bvh(path, unit=unit, up=up)
+    positions, turns = figure.forward()
+    order = list(_TO_Z_UP[up])
+    change = np.eye(3)[order]
+    names = [name for name, _, _ in figure.joints]
+    found = [motion.joint_names.index(name) for name in names]
+    np.testing.assert_allclose(motion.positions[:, found], positions[..., order], atol=1e-12)
+    own = Rotation.from_quat(known(motion.rotations)[:, found].reshape(-1, 4), scalar_first=True).as_matrix()
+    np.testing.assert_allclose(own, (change @ turns @ change.T).reshape(-1, 3, 3), atol=1e-12)
+    assert np.linalg.det(change) == pytest.approx(1.0)
+    assert motion.fps == 50.0 and motion.frames == len(positions)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [(1.0, 1.0), (0.01, 1.0), (0.001, 1.0), (0.0254, 1.0), (0.0254 / 0.45, 1.0)]
+)
+def test_the_unit_is_found_from_the_size_of_the_skeleton(tmp_path, unit, factor):
+    motion = load_motion(write_bvh(tmp_path / "clip.bvh", dancer(), unit))
+    tall = known(motion.rest_positions)[:, 2].max() - known(motion.rest_positions)[:, 2].min()
+    assert tall == pytest.approx(factor * (0.25 + 0.22 + 0.15 + 0.02 + 0.42 + 0.41 + 0.06), rel=1e-9)
+
+
+def test_the_up_axis_is_found_from_the_head(tmp_path):
+    figure = dancer()
+    turned = tuple((name, parent, (z, x, y)) for name, parent, (x, y, z) in FIGURE)
+    lying = Figure(turned, figure.root[:, [2, 0, 1]], 0.0 * figure.angles, figure.orders, figure.fps)
+    motion = load_motion(write_bvh(tmp_path / "clip.bvh", lying))
+    assert motion.positions[:, motion.joint_names.index("Head"), 2].min() > 1.3
+    left, right = (motion.track(f"{side}UpLeg") for side in ("Left", "Right"))
+    np.testing.assert_allclose(left - right, np.tile([0.0, 0.18, 0.0], (motion.frames, 1)), atol=1e-12)
+
+
+def test_a_skeleton_of_no_persons_size_asks_for_the_unit(tmp_path):
+    path = write_bvh(tmp_path / "clip.bvh", dancer(), 5.0)
+    with pytest.raises(ValueError, match="units large.*unit=METRES"):
+        load_motion(path)
+    assert known(load_motion(path, unit=5.0).rest_positions)[:, 2].max() == pytest.approx(0.62)
+    with pytest.raises(KeyError, match="no unit 'yard'.*inch"):
+        load_motion(path, unit="yard")
+
+
+BROKEN = {
+    "no start": (lambda t: t.replace("HIERARCHY", "TREE"), r"line 1: a BVH file starts with HIERARCHY"),
+    "two offsets": (lambda t: t.replace("OFFSET 0.0 0.25 0.0", "OFFSET 0.0 0.25"), r"line 8: OFFSET has 2 numbers.*3"),
+    "no number": (lambda t: t.replace("OFFSET 0.0 0.25 0.0", "OFFSET 0.0 0.25 up"), r"line 8: OFFSET is not numbers"),
+    "no channel": (lambda t: t.replace("6 Xposition", "6 Wposition"), r"line 5: no channel Wposition; there are X"),
+    "count": (lambda t: t.replace("CHANNELS 6", "CHANNELS 5"), r"line 5: CHANNELS is followed by"),
+    "twice": (lambda t: t.replace("JOINT Neck", "JOINT Spine"), r"a second joint is called Spine"),
+    "open": (lambda t: t.replace("MOTION\n", "}\nMOTION\n"), r"} is not expected here"),
+    "frames": (lambda t: t.replace("Frames: 24", "Frames: 25"), r"says Frames: 25, and has 24"),
+    "time": (lambda t: t.replace("Frame Time: 0.03", "Frame Time: -0.03"), r"more than 0 s"),
+    "nan": (lambda t: t[: t.rindex(" ")] + " nan\n", r"a frame is not finite"),
+    "short": (lambda t: t[: t.rindex(" ")] + "\n", r"line \d+: a frame has 56 numbers where there should be 57"),
+    "cut": (lambda t: t[: t.index("MOTION")], r"ends where .*MOTION should come"),
+    "no offset": (lambda t: t.replace("\t\tOFFSET 0.0 0.25 0.0\n", ""), r"Spine has no OFFSET"),
+}
+
+
+@pytest.mark.parametrize("which", BROKEN)
+def test_a_broken_bvh_says_which_line_and_what_is_wrong(tmp_path, which):
+    spoil, message = BROKEN[which]
+    path = write_bvh(tmp_path / "clip.bvh", dancer())
+    broken = spoil(path.read_text())
+    assert broken != path.read_text()
+    path.write_text(broken)
+    with pytest.raises(ValueError, match=message):
+        read_bvh(path)
+
+
+def _written(path, **changes):
+    rng = np.random.default_rng(0)
+    arrays = dict(fps=30.0, positions=rng.normal(size=(4, 2, 3)), joint_names=["hip", "knee"])
+    np.savez(path, **{name: value for name, value in {**arrays, **changes}.items() if value is not None})
+    return path, arrays
+
+
+def test_keypoints_come_back(tmp_path):
+    quaternions = Rotation.random(8, random_state=0).as_quat(scalar_first=True).reshape(4, 2, 4)
+    flags = np.array([[1, 0], [0, 1], [1, 1], [0, 0]], bool)
+    path, arrays = _written(tmp_path / "clip.npz", rotations=quaternions, contact=flags, ground=0.1)
+    motion = load_motion(path)
+    np.testing.assert_array_equal(motion.positions, arrays["positions"])
+    same = np.abs(np.sum(motion.rotations * quaternions, -1))
+    np.testing.assert_allclose(same, 1.0, atol=1e-12)
+    assert (np.sum(known(motion.rotations)[1:] * known(motion.rotations)[:-1], -1) >= 0.0).all()
+    np.testing.assert_array_equal(motion.contact, flags[:, [0, 0, 1, 1]])
+    assert (motion.ground, motion.fps, motion.joint_names) == (0.1, 30.0, ("hip", "knee"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(fps=None), "has no fps; it has positions, joint_names"),
+        (dict(positions=np.zeros((4, 3, 3))), r"positions has shape \(4, 3, 3\), expected \(4, 2, 3\)"),
+        (dict(positions=np.full((4, 2, 3), np.nan)), r"positions is not finite at \(0, 0, 0\)"),
+        (dict(rotations=np.ones((4, 2, 4))), "of hip in frame 0 has length 2"),
+        (dict(joint_names=["hip", "hip"]), "joint names occur twice: hip"),
+        (dict(fps=0.0), "fps is 0.0"),
+        (dict(contact=np.zeros((4, 3))), r"contact has shape \(4, 3\)"),
+        (dict(positions=np.array([object()])), "cannot be read as an .npz of plain arrays"),
+    ],
+)
+def test_broken_keypoints_say_what_is_wrong(tmp_path, changes, message):
+    path, _ = _written(tmp_path / "clip.npz", **changes)
+    with pytest.raises(ValueError, match=message):
+        load_motion(path)
+
+
+def _table(path, edit=lambda lines: lines):
+    time, rng = np.arange(5) / 50.0, np.random.default_rng(1)
+    positions = rng.normal(size=(5, 2, 3))
+    flags = rng.integers(0, 2, (5, 4))
+    headings = ["time", *(f"{joint}.{axis}" for joint in ("hip", "left.knee") for axis in "xyz")]
+    headings += [f"contact.{point}" for point in ("left_heel", "left_toe", "right_heel", "right_toe")]
+    rows = np.column_stack([time, positions.reshape(5, -1), flags])
+    lines = [",".join(headings), *(",".join(repr(float(x)) for x in row) for row in rows)]
+    path.write_text("\n".join(edit(lines)) + "\n")
+    return path, positions, flags
+
+
+def test_a_table_comes_back(tmp_path):
+    path, positions, flags = _table(tmp_path / "clip.csv")
+    motion = load_motion(path)
+    np.testing.assert_array_equal(motion.positions, positions)
+    np.testing.assert_array_equal(motion.contact, flags.astype(bool))
+    assert motion.fps == pytest.approx(50.0) and motion.joint_names == ("hip", "left.knee")
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda t: [t[0].replace("hip.z", "hip.w"), *t[1:]], r"line 1: .*hip\.w, hip\.z"),
+        (lambda t: [t[0].replace("time", "seconds"), *t[1:]], "line 1: no column is called time"),
+        (lambda t: [*t[:3], t[3].replace(",", ";", 1), *t[4:]], "line 4: 10 values, but there are 11 headings"),
+        (lambda t: [*t[:3], t[3].rsplit(",", 1)[0] + ",yes", *t[4:]], "line 4, column contact.right_toe: 'yes'"),
+        (lambda t: [*t[:3], *t[4:]], "line 4: the time steps by 0.04 s"),
+        (lambda t: t[:1], "has 1 lines"),
+    ],
+)
+def test_a_broken_table_says_which_line_and_column(tmp_path, edit, message):
+    path, _, _ = _table(tmp_path / "clip.csv", edit)
+    with pytest.raises(ValueError, match=message):
+        load_motion(path)
+
+
+def test_files_that_are_not_there_and_options_that_do_not_go_with_them(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_motion(tmp_path / "none.npz")
+    with pytest.raises(ValueError, match=r"none of \.bvh, \.npz and \.csv"):
+        load_motion(tmp_path / "clip.fbx")
+    with pytest.raises(ValueError, match="go with BVH files"):
+        load_motion(tmp_path / "clip.npz", unit="cm")
+
+
+def test_another_rate_goes_through_the_frames():
+    rng = np.random.default_rng(2)
+    turns = Rotation.from_rotvec(np.outer(np.arange(7), [0.1, 0.2, 0.0])).as_quat(scalar_first=True)[:, None]
+    motion = HumanMotion("clip", 30.0, ("hip",), rng.normal(size=(7, 1, 3)), turns, contact=np.ones((7, 4), bool))
+    fine = motion.resampled(90.0)
+    np.testing.assert_allclose(fine.positions[::3], motion.positions, atol=1e-12)
+    np.testing.assert_allclose(fine.positions[1], (2 * motion.positions[0] + motion.positions[1]) / 3, atol=1e-12)
+    third = Rotation.from_rotvec([0.1 / 3, 0.2 / 3, 0.0]).as_quat(scalar_first=True)
+    np.testing.assert_allclose(known(fine.rotations)[1, 0], third, atol=1e-9)
+    assert fine.frames == 19 and known(fine.contact).all()
+    assert motion.resampled(10.0).frames == 3
+
+
+def test_a_robots_motion_comes_back_from_both_files(tmp_path):
+    rng = np.random.default_rng(3)
+    qpos = np.hstack([rng.normal(size=(4, 3)), Rotation.random(4, random_state=1).as_quat(scalar_first=True)])
+    motion = RobotMotion(30.0, ("hip", "knee"), np.hstack([qpos, rng.normal(size=(4, 2))]))
+    np.savez(tmp_path / "motion.npz", fps=motion.fps, joint_names=motion.joint_names, qpos=motion.qpos)
+    back = load_robot_motion(tmp_path / "motion.npz")
+    assert back.joint_names == motion.joint_names and (back.qpos == motion.qpos).all()
+    write_csv(motion, tmp_path / "motion.csv")
+    first = np.loadtxt(tmp_path / "motion.csv", delimiter=",")[0]
+    np.testing.assert_allclose(first[3:7], np.roll(motion.qpos[0, 3:7], -1), rtol=1e-8)
+    back = load_robot_motion(tmp_path / "motion.csv", joint_names=("hip", "knee"), fps=30.0)
+    np.testing.assert_allclose(back.qpos, motion.qpos, rtol=1e-8)
+    with pytest.raises(ValueError, match="say joint_names and fps"):
+        load_robot_motion(tmp_path / "motion.csv")
+    with pytest.raises(ValueError, match="line 1: 9 numbers, not 8"):
+        load_robot_motion(tmp_path / "motion.csv", joint_names=("hip",), fps=30.0)
+    with pytest.raises(ValueError, match="not of unit length in frame 0"):
+        RobotMotion(30.0, (), np.ones((1, 7)))
