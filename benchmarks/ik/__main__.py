@@ -1,12 +1,12 @@
 """Inverse kinematics of arms, beside mink and pink, judged by Pinocchio.
 
-    python -m benchmarks.ik [results.json] [--robots panda ur5 xarm7] [--poses 10000] [--peer-poses 100]
+    python -m benchmarks.ik [results.json] [--robots panda ur5 xarm7 kinova] [--poses 10000] [--peer-poses 100]
                             [--precision float32]
 
-Three sets of poses: of random configurations; of configurations with joints at limits and at 0; and out of reach by
-construction. A pose counts as found where Pinocchio, in double precision, says that it is within 1 mm and 0.01 rad. The
-peers get up to 8 starts of 100 steps each, without limits on speeds, on the first poses of each set. Times are of the
-whole call, compiling left out.
+Sets of poses: of random configurations; of configurations with joints at limits and at 0; farther away than the links
+are long; and, for a UR5, nearer to the first axis than its last joint can come. A pose counts as found where Pinocchio,
+in double precision, says that it is within 1 mm and 0.01 rad. The peers get up to 8 starts of 100 steps each, without
+limits on speeds, on the first poses of each set. Times are of the whole call, compiling left out.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ from rich.console import Console
 from rich.table import Table
 
 from ..machine import processor
-from ._arms import ARMS, Arm, Poses
+from ._arms import ABOUT_THE_BASE, ARMS, Arm, Poses
 from ._solvers import ORIENTATION, POSITION, Answer, ours, ours_one_by_one, with_mink, with_pink
 
-SETS = ("reachable", "at the edge", "out of reach")
 ONE_BY_ONE = 200
 _PACKAGES = ("jax", "jaxlib", "mink", "pin-pink", "pin", "numpy")
 
@@ -54,13 +53,13 @@ def judged(arm: Arm, poses: Poses, answer: Answer) -> dict[str, Any]:
 def measured(name: str, poses: int, peer_poses: int) -> dict[str, Any]:
     """All solvers on all sets of a robot."""
     arm, rng = Arm(name), np.random.default_rng(0)
-    sets = dict(
-        zip(
-            SETS,
-            (arm.reachable(poses, rng), arm.at_the_edge(poses // 10, rng), arm.out_of_reach(poses // 10, rng)),
-            strict=True,
-        )
-    )
+    sets = {
+        "reachable": arm.reachable(poses, rng),
+        "at the edge": arm.at_the_edge(poses // 10, rng),
+        "out of reach": arm.out_of_reach(poses // 10, rng),
+    }
+    if name in ABOUT_THE_BASE:
+        sets["too near the base"] = arm.too_near(poses // 10, rng)
     results: dict[str, Any] = {}
     for kind, given in sets.items():
         few = Poses(given.positions[:peer_poses], given.rotations[:peer_poses])

@@ -17,7 +17,15 @@ ARMS = {
         root="base_link", hand="tool0", amplitude=_STILL, urdf="ur_description/urdf/ur5_joint_limited_robot.urdf"
     ),
     "xarm7": Description(root="link_base", hand="link_eef", amplitude=_STILL, urdf="xarm_description/urdf/xarm7.urdf"),
+    "kinova": Description(
+        root="j2s6s200_link_base",
+        hand="j2s6s200_end_effector",
+        amplitude=_STILL,
+        urdf="kinova_description/robots/kinova.urdf",
+    ),
 }
+ABOUT_THE_BASE = ("ur5",)
+"""Arms whose last joint never comes nearer to the first one's axis than a length: the offset of their parallel axes."""
 _EDGE = 0.3
 """Chance of a joint to stand at a limit, and of one to stand at 0, in the poses at the edge."""
 
@@ -48,7 +56,9 @@ class Arm:
 
     def __init__(self, name: str) -> None:
         given = ARMS[name]
-        self.urdf, self.frame = lean_urdf(given), given.hand
+        # joints without an end have one in the file all the same, at two turns
+        self.urdf = lean_urdf(given).replace('type="continuous"', 'type="revolute"')
+        self.frame = given.hand
         self.model = pinocchio_model(self.urdf, False)
         self.data = self.model.createData()
         self.lower, self.upper = self.model.lowerPositionLimit.copy(), self.model.upperPositionLimit.copy()
@@ -80,6 +90,26 @@ class Arm:
         way *= length * rng.uniform(1.01, 2.0, (count, 1)) / np.linalg.norm(way, axis=1, keepdims=True)
         root = self.model.jointPlacements[1].translation
         return Poses(root + way, self.reachable(count, rng).rotations)
+
+    def too_near(self, count: int, rng: np.random.Generator) -> Poses:
+        """With the last joint nearer to the first one's axis than it can come, at 2 % to 98 % of that distance.
+
+        The last joint is beside the plane of the arm's links, which holds the first axis, by the same length in all
+        configurations; and at the same place in the frame's axes.
+        """
+        offset, tip = self._offset()
+        rotations = self.reachable(count, rng).rotations
+        turn, away = rng.uniform(0.0, 2.0 * np.pi, count), offset * rng.uniform(0.02, 0.98, count)
+        root = self.model.jointPlacements[1].translation
+        up = rng.uniform(-0.5, 0.5, count)
+        last = root + np.stack([away * np.cos(turn), away * np.sin(turn), up], 1)
+        return Poses(last - rotations @ tip, rotations)
+
+    def _offset(self) -> tuple[float, np.ndarray]:
+        """How far the last joint is from the plane of the links [m], and where it is in the frame's axes [m]. (3,)."""
+        tip = self.pose(pin.neutral(self.model)).actInv(self.data.oMi[-1].translation)
+        away = self.data.oMi[-1].translation - self.data.oMi[1].translation
+        return float(abs(self.data.oMi[2].rotation[:, 1] @ away)), tip
 
     def errors(self, q: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
         """Distances [m] and angles [rad] from the targets."""

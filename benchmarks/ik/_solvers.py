@@ -59,7 +59,7 @@ def ours_one_by_one(arm: Arm, poses: Poses) -> Answer:
 
 def with_mink(arm: Arm, poses: Poses) -> Answer:
     """Its closed loop without limits on speeds, from the middle of the ranges, then from random configurations."""
-    model = mujoco.MjModel.from_xml_string(_for_mujoco(arm.urdf))
+    model = mujoco.MjModel.from_xml_string(bodies_for_mujoco(arm.urdf))
     order = [int(model.joint(name).qposadr[0]) for name in arm.joints]
     configuration, limits = mink.Configuration(model), [mink.ConfigurationLimit(model, gain=1.0)]
     task = mink.FrameTask(arm.frame, "body", 1.0, 1.0, lm_damping=1.0)
@@ -120,7 +120,7 @@ def _from_several_starts(
     return q, converged, time.perf_counter() - start
 
 
-def _for_mujoco(urdf: str) -> str:
+def bodies_for_mujoco(urdf: str) -> str:
     """With links that are fixed to others kept as bodies, and masses where there are none."""
     spec = mujoco.MjSpec.from_string(urdf)
     spec.compiler.fusestatic = False
