@@ -20,6 +20,7 @@ from ...robot import Robot
 from ...solvers import Status
 from ._compiler import Compiler
 from ._hold import targets_here
+from ._obstacles import moved
 from ._push import Push
 from ._recorder import Recorder
 from ._snapshot import Recording, Snapshot
@@ -190,6 +191,15 @@ class ControlLoop:
             if owner is not None or timeout is not None:
                 self._leases[name] = _Lease(owner, until)
             self._retarget({name: aimed.target})
+
+    def place(self, obstacle: str, **changes: Float[np.ndarray, "..."]) -> None:
+        """Another position, rotation or size of an obstacle (``CollisionAvoidanceLimit.moved``), for all that runs."""
+        with self._editing, self._lock:
+            both = self._wanted is self._running
+            self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, **changes))
+            ran = self._running.limits
+            self._running = self._wanted if both else replace(self._running, limits=moved(ran, obstacle, **changes))
+            self._refresh()
 
     def let_go(self, owner: Hashable) -> None:
         """The owner has put its targets where it wants them: they stay."""

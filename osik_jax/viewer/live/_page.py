@@ -25,6 +25,7 @@ from ._desk import Desk
 from ._gizmos import Gizmos, Pose, gizmo_target
 from ._loop import ControlLoop
 from ._marks import BalanceMarks
+from ._obstacle_nodes import ObstacleNodes
 from ._panel import Panel
 from ._robot_nodes import RobotNodes
 from ._server import close_server, open_server
@@ -52,9 +53,9 @@ class LiveView:
         """Starts the server and the loop."""
         self._server = open_server(host, port, title)
         self.url = f"http://{host}:{self._server.get_port()}"
-        self._desk = Desk(session)
         robot = session.robot
         shapes, self._data = robot_parts(robot, look=look), mujoco.MjData(robot.mj_model)
+        self._desk = Desk(session, shapes)
         self._kinematics(session.q)
         seen, floor = shapes.corners(self._data), floor_height(robot, shapes, [self._data])
         size = float(np.linalg.norm(np.ptp(seen, axis=0)))
@@ -62,7 +63,8 @@ class LiveView:
         self._robot = RobotNodes(self._server.scene, robot, look=look)
         self._marks = BalanceMarks(self._server.scene, floor, size) if robot.floating_base else None
         self._gizmos = Gizmos(self._server.scene, size, self._drag)
-        self._panel = Panel(self._server, self._desk, size)
+        self._obstacles = ObstacleNodes(self._server.scene, size, self._place)
+        self._panel = Panel(self._server, self._desk, seen)
         self._polygon: SupportPolygon | None = None
         self._server.on_client_disconnect(self._gone)
         self._end = threading.Event()
@@ -127,6 +129,7 @@ class LiveView:
         with self._server.atomic():
             self._robot.place(self._data)
             self._gizmos.show(on)
+            self._obstacles.show(self._desk.obstacles)
             if self._marks is not None:
                 polygon = _polygon(on)
                 if polygon is not self._polygon:
@@ -149,6 +152,10 @@ class LiveView:
             self.loop.let_go(visitor)
         else:
             self.loop.release(visitor)
+
+    def _place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
+        """A visitor drags an obstacle."""
+        self._desk.move_obstacle(obstacle, position=position, rotation=rotation)
 
     def _gone(self, client: ClientHandle) -> None:
         """A visitor has closed the page."""
