@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from .demo import Motion
     from .robot import Robot
-    from .viewer import Look
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
 _EMBEDDED = ("nao", "arm7")
@@ -345,17 +344,6 @@ def _read_demo_robot(command: Demo, source: str) -> Robot:
     return read_robot(source, "floating" if stands else command.base)
 
 
-def _look(source: str) -> Look | None:
-    """What a URDF shows; an MJCF's own shapes are in its model already."""
-    from ._loading import is_mjcf, urdf_of_description
-    from .viewer import read_look
-
-    if os.path.isfile(source):
-        return None if is_mjcf(source) else read_look(source)
-    urdf = None if source in _EMBEDDED else urdf_of_description(source)
-    return None if urdf is None else read_look(urdf[0], package_dirs=urdf[1])
-
-
 def _info(command: Info) -> None:
     from rich.console import Console
 
@@ -545,6 +533,7 @@ def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:
 def _motion(command: Demo) -> Motion:
     """The motion that the options ask for."""
     from . import demo
+    from .viewer.live._source import RobotSource, source_look
 
     _check(command)
     if command.robot is not None:
@@ -556,7 +545,7 @@ def _motion(command: Demo) -> Motion:
                 frame=command.frame,
                 support=command.support,
                 duration=command.duration,
-                look=_look(command.robot),
+                look=source_look(RobotSource(command.robot)),
             )
     make = demo.single_support if command.motion == "single-support" else demo.double_support
     return make(command.duration)

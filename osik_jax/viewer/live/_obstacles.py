@@ -1,8 +1,8 @@
 """Obstacles of a page, and the limits that keep a robot off them and off itself.
 
-Obstacles are the world's shapes of the session's ``CollisionAvoidanceLimit``s. The limit that the page adds has room for
-so many of each kind: those that are not in use are far below the floor, so that adding, moving and removing one compiles
-nothing.
+Obstacles are the world's shapes of the session's ``CollisionAvoidanceLimit``s. The limit that the page adds has room
+for so many of each kind: those that are not in use are far below the floor, so that adding, moving and removing one
+compiles nothing.
 """
 
 from __future__ import annotations
@@ -74,7 +74,9 @@ def _slots(limit: Limit) -> Iterator[Obstacle]:
     if not isinstance(limit, CollisionAvoidanceLimit):
         return
     scene, own = limit.scene, len(limit.scene.geoms)
-    places = tuple(np.asarray(part, float) for part in (limit.shapes.position, limit.shapes.rotation, limit.shapes.size))
+    places = tuple(
+        np.asarray(part, float) for part in (limit.shapes.position, limit.shapes.rotation, limit.shapes.size)
+    )
     for number, name in enumerate(scene.names[own:]):
         position, rotation, size = (part[number] for part in places)
         kind = {Kind.SEGMENT: "ball", Kind.BOX: "box"}.get(scene.kinds[own + number])

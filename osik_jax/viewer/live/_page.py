@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 import time
 import webbrowser
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -28,7 +27,7 @@ from ._marks import BalanceMarks
 from ._obstacle_nodes import ObstacleNodes
 from ._panel import Panel
 from ._robot_nodes import RobotNodes
-from ._server import close_server, open_server
+from ._server import Served
 from ._session import Session
 from ._source import RobotSource
 from ._surroundings import add_surroundings
@@ -42,7 +41,7 @@ _WORDS = 6
 """The panel's figures change with every so many pictures."""
 
 
-class LiveView:
+class LiveView(Served):
     """A page that runs a session; ``serve`` makes one.
 
     Attributes:
@@ -51,8 +50,7 @@ class LiveView:
 
     def __init__(self, session: Session, *, look: Look | None, host: str, port: int, title: str) -> None:
         """Starts the server and the loop."""
-        self._server = open_server(host, port, title)
-        self.url = f"http://{host}:{self._server.get_port()}"
+        super().__init__(host, port, title)
         robot = session.robot
         shapes, self._data = robot_parts(robot, look=look), mujoco.MjData(robot.mj_model)
         self._desk = Desk(session, shapes)
@@ -67,8 +65,6 @@ class LiveView:
         self._panel = Panel(self._server, self._desk, seen)
         self._polygon: SupportPolygon | None = None
         self._server.on_client_disconnect(self._gone)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="osik-page", daemon=True)
         self._desk.loop.start()
         self._thread.start()
 
@@ -91,24 +87,8 @@ class LiveView:
         """
         self.loop.aim(task, target, timeout=timeout)
 
-    def wait(self) -> None:
-        """Blocks until ``stop`` is called from elsewhere, or Ctrl-C."""
-        while not self._end.wait(0.5):
-            pass
-
-    def stop(self) -> None:
-        """Ends the loop and the server."""
-        self._end.set()
-        if self._thread is not threading.current_thread():
-            self._thread.join(timeout=2.0)
+    def _close(self) -> None:
         self.loop.stop()
-        close_server(self._server)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def _run(self) -> None:
         """The thread that draws."""

@@ -17,7 +17,7 @@ from ._readout import error_table, joint_table, state_text, timing_text
 from ._session import session_from_json
 
 if TYPE_CHECKING:
-    from viser import GuiEvent, ViserServer
+    from viser import GuiDropdownHandle, GuiEvent, ViserServer
 
 _LIMIT_WORDS = {
     "ConfigurationLimit": "joint ranges",
@@ -171,7 +171,7 @@ class Panel:
         gui.add_markdown(f"The robot keeps off what is here: up to {most}. The first is compiled for.")
         kinds = gui.add_button_group("Add", tuple(SLOTS))
         kinds.on_click(self._guarded(lambda event: self._add_obstacle(event.target.value)))
-        self._obstacle = gui.add_dropdown("Chosen", (_NONE,), initial_value=_NONE)
+        self._obstacle: GuiDropdownHandle[str] = gui.add_dropdown("Chosen", (_NONE,))
         self._obstacle.on_update(lambda _: self._show_obstacle())
         most_edge = float(np.round(self._size, 2))
         self._edges = [
@@ -202,7 +202,7 @@ class Panel:
         """The names to choose from."""
         names = tuple(self._desk.obstacles) or (_NONE,)
         self._obstacle.options = names
-        self._obstacle.value = chosen if chosen in names else names[-1]
+        self._obstacle.value = chosen if chosen is not None and chosen in names else names[-1]
         self._show_obstacle()
 
     def _show_obstacle(self) -> None:

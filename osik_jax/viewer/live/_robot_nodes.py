@@ -17,6 +17,8 @@ from ._surfaces import Surface, part_triangles
 if TYPE_CHECKING:
     from viser import FrameHandle, SceneApi
 
+_APART = 1.1
+"""Robots stand so many of their widths apart."""
 _MOVED = 1e-7
 """Nodes that move less are left alone [m, or of a quaternion]."""
 
@@ -74,6 +76,18 @@ class RobotNodes:
                 frame.wxyz = now[3:]
             if moved.any():
                 self._shown[body] = now
+
+
+def side_by_side(span: Float[np.ndarray, "points 3"], count: int) -> list[Float[np.ndarray, "3"]]:
+    """By how much to move each of so many robots [m], whose points these are, the first to its left."""
+    width = _APART * float(np.ptp(span[:, 1]))
+    return [np.array([0.0, (0.5 * (count - 1) - k) * width, 0.0]) for k in range(count)]
+
+
+def add_label(scene: SceneApi, name: str, span: Float[np.ndarray, "points 3"]) -> None:
+    """A robot's name above its points [m]."""
+    at, height = span[:, :2].mean(0), span[:, 2].max() + 0.05 * float(np.ptp(span[:, 1]))
+    scene.add_label(f"/label {name}", name.replace("_", " "), position=(at[0], at[1], height))
 
 
 def _by_body(shapes: RobotParts, data: mujoco.MjData) -> dict[int, dict[tuple[int, int, int, int], Surface]]:

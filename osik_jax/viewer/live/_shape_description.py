@@ -27,7 +27,9 @@ def describe_shapes(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, d
     kinds = {kind: name for name, kind in _KINDS.items()}
     for number, name in enumerate(scene.names[own:]):
         if scene.kinds[own + number] not in kinds:
-            raise ValueError(f"a session file cannot hold the shape {name!r} of a CollisionAvoidanceLimit: it is a hull")
+            raise ValueError(
+                f"a session file cannot hold the shape {name!r} of a CollisionAvoidanceLimit: it is a hull"
+            )
         out[name] = {
             "shape": kinds[scene.kinds[own + number]],
             "frame": robot.frame_names[scene.frames[number]],
@@ -65,7 +67,7 @@ def shape_python(described: Mapping[str, Any]) -> str:
 
 
 def describe_pairs(limit: CollisionAvoidanceLimit, *, short: bool) -> dict[str, list[list[str]]]:
-    """Which pairs are kept apart: by their names, or, if it is to be short, with a glob for what links are taken for."""
+    """Which pairs are kept apart: by their names, or in short with a glob for what links are taken for."""
     if not short:
         return {"pairs": [list(pair) for pair in limit.pairs], "exclude": []}
 
