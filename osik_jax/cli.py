@@ -89,6 +89,8 @@ class View:
     """Port to listen at; 0 for any that is free."""
     browser: bool = True
     """Open the page in a browser."""
+    html: Path | None = None
+    """With a motion.npz: write a page that plays it without a server, instead of serving one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -582,13 +584,19 @@ def _view(command: View) -> None:
     from .viewer.live import _open
 
     with _told():
-        _open.check(command.host, command.port)
+        if command.html is not None and (command.file is None or command.file.suffix == ".json"):
+            raise CommandError("--html goes with a motion.npz")
+        _open.check(command.host, 0 if command.html is not None else command.port)
         source = _open.source_of(command.robot, {"auto": None, "floating": True, "fixed": False}[command.base])
         if command.file is not None and command.file.suffix == ".json":
             view = _open.open_session(command.file, host=command.host, port=command.port)
         else:
             robot = read_robot(source.robot, command.base)
             options: Any = dict(host=command.host, port=command.port)
+            if command.file is not None and command.html is not None:
+                _open.write_motion(command.file, robot, source, command.html)
+                print(f"written: {command.html}")
+                return
             if command.file is not None:
                 view = _open.open_motion(command.file, robot, source, **options)
             else:

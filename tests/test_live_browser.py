@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -100,8 +101,12 @@ def pixel(view: LiveView, point: np.ndarray) -> tuple[float, float]:
 
 
 def drag(view: LiveView, page: Page, axis: np.ndarray, by: float) -> None:
-    """Takes the handle's arrow along an axis, and moves it by a length [m]."""
-    grip = target(view) + 0.75 * view._gizmos._scale * axis
+    """Takes the arrow of the hand's handle along an axis, and moves it by a length [m]."""
+    pull(view, page, target(view) + 0.75 * view._gizmos._scale * axis, axis, by)
+
+
+def pull(view: LiveView, page: Page, grip: np.ndarray, axis: np.ndarray, by: float) -> None:
+    """Moves what is at a point along an axis by a length [m]."""
     start, end = pixel(view, grip), pixel(view, grip + by * axis)
     page.mouse.move(*start)
     page.wait_for_timeout(500)
@@ -150,6 +155,34 @@ def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, t
     assert np.all(np.abs(np.diff(q[:, 7:], axis=0)) <= top * view.loop.dt * (1.0 + 1e-9))
     assert np.all((q[:, 7:] >= lower) & (q[:, 7:] <= upper))
     assert view.loop.snapshot.failures == 0
+    visit.check()
+
+
+def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit, tmp_path: Path) -> None:
+    page, left = visit.page, np.array([0.0, 1.0, 0.0])
+    view.loop.change(lambda now: dataclasses.replace(now, scheme=osik.WeightedQP()))
+    page.get_by_role("tab", name="Obstacles").click()
+    page.get_by_text("ball", exact=True).click()
+    assert until(lambda: "ball 1" in view._desk.obstacles)
+    assert view.loop.wait_until_ready(300.0)
+    before = target(view)
+    ball = before + np.array([0.0, -0.15, 0.0])
+    view._desk.move_obstacle("ball 1", position=ball, size=np.array([0.04, 0.0, 0.0]))
+    page.wait_for_timeout(1500)
+    handle = view._obstacles._shown["ball 1"].handle
+    pull(view, page, ball + 0.75 * handle.scale * left, left, 0.14)
+    moved = view._desk.obstacles["ball 1"].position
+    assert moved[1] - ball[1] > 0.1
+    np.testing.assert_allclose(moved[[0, 2]], ball[[0, 2]], atol=1e-6)
+    assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 0.02)
+    data = next(mujoco_poses(ROBOT, view.loop.snapshot.q))
+    assert np.linalg.norm(mujoco_frame_pose(ROBOT, data, HAND)[0] - moved) > 0.04
+    assert away(view) > 0.01  # it had to give way
+    page.wait_for_timeout(1500)
+    page.screenshot(path=tmp_path / "obstacle.png")
+    page.get_by_role("button", name="Remove the one chosen").click()
+    assert until(lambda: not view._desk.obstacles)
+    assert until(lambda: away(view) < 1e-3)
     visit.check()
 
 

@@ -193,6 +193,11 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
             (["--port", "0", "nowhere.npz"], "no such file: nowhere.npz"),
             (["--port", "0", str(tmp_path / "motion.npz")], "another robot"),
             (["--port", "0", "--support", "l_soul"], "l_sole"),
+            (["--html", str(tmp_path / "page.html")], "--html goes with a motion.npz"),
+            (
+                [str(tmp_path / "motion.npz"), "--robot", "arm7", "--html", str(tmp_path / "no" / "page.html")],
+                "No such file",
+            ),
         ):
             assert main(["view", "--no-browser", *arguments]) == 2
             error = capsys.readouterr().err

@@ -35,13 +35,17 @@ class ObstacleNodes:
         """Takes the size of the robot [m], and what to call when somebody drags."""
         self._scene, self._scale, self._dragged = scene, 0.1 * size, dragged
         self._shown: dict[str, _Shown] = {}
-        self._held: set[str] = set()
+        self._held: dict[str, int] = {}
+        self._last: Mapping[str, Obstacle] | None = None
 
     def show(self, obstacles: Mapping[str, Obstacle]) -> None:
         """Has these obstacles and no others."""
+        if obstacles is self._last and not self._held:
+            return
+        self._last = obstacles
         for name in [name for name in self._shown if name not in obstacles]:
             self._shown.pop(name).handle.remove()
-            self._held.discard(name)
+            self._held.pop(name, None)
         for name, one in obstacles.items():
             shown = self._shown.get(name)
             if shown is None:
@@ -51,6 +55,11 @@ class ObstacleNodes:
             if not np.array_equal(shown.size, one.size):
                 self._draw(one)
                 self._shown[name] = shown._replace(size=one.size)
+
+    def drop(self, visitor: int) -> None:
+        """The visitor has gone, with all that he was dragging."""
+        for name in [name for name, holder in self._held.items() if holder == visitor]:
+            self._held.pop(name, None)
 
     def _handle(self, one: Obstacle) -> TransformControlsHandle:
         handle = self._scene.add_transform_controls(
@@ -66,9 +75,9 @@ class ObstacleNodes:
         @handle.on_update
         async def _(event: TransformControlsEvent) -> None:
             if event.phase == "end":
-                self._held.discard(one.name)
+                self._held.pop(one.name, None)
             else:
-                self._held.add(one.name)
+                self._held[one.name] = -1 if event.client_id is None else event.client_id
             rotation = np.zeros(9)
             mujoco.mju_quat2Mat(rotation, np.asarray(event.target.wxyz, float))
             self._dragged(one.name, np.asarray(event.target.position, float), rotation.reshape(3, 3))

@@ -64,6 +64,7 @@ class LiveView(Served):
         self._obstacles = ObstacleNodes(self._server.scene, size, self._place)
         self._panel = Panel(self._server, self._desk, seen)
         self._polygon: SupportPolygon | None = None
+        self._drawn: Session | None = None
         self._server.on_client_disconnect(self._gone)
         self._desk.loop.start()
         self._thread.start()
@@ -104,18 +105,23 @@ class LiveView(Served):
     def _draw(self) -> None:
         """The robot as it is now."""
         session = self._desk.session
-        on = session.active_tasks
         self._kinematics(self.loop.snapshot.q)
         with self._server.atomic():
             self._robot.place(self._data)
-            self._gizmos.show(on)
+            if session is not self._drawn or self._gizmos.held:
+                self._draw_session(session)
             self._obstacles.show(self._desk.obstacles)
             if self._marks is not None:
-                polygon = _polygon(on)
-                if polygon is not self._polygon:
-                    self._marks.show_polygon(polygon)
-                    self._polygon = polygon
                 self._marks.place(robot_com(session.robot, self._data))
+
+    def _draw_session(self, session: Session) -> None:
+        """What changes only with the session."""
+        on, self._drawn = session.active_tasks, session
+        self._gizmos.show(on)
+        polygon = _polygon(on)
+        if self._marks is not None and polygon is not self._polygon:
+            self._marks.show_polygon(polygon)
+            self._polygon = polygon
 
     def _kinematics(self, q: Float[np.ndarray, " nq"]) -> None:
         robot = self._desk.session.robot
@@ -140,6 +146,7 @@ class LiveView(Served):
     def _gone(self, client: ClientHandle) -> None:
         """A visitor has closed the page."""
         self._gizmos.drop(client.client_id)
+        self._obstacles.drop(client.client_id)
         self.loop.release(client.client_id)
 
 

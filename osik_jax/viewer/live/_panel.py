@@ -25,7 +25,8 @@ _LIMIT_WORDS = {
     "AccelerationLimit": "joint accelerations",
 }
 _ITSELF, _WORLD = "collisions with itself", "collisions with obstacles"
-_PLURALS, _NONE = {"ball": "balls", "box": "boxes"}, "none"
+_PLURALS = {"ball": "balls", "box": "boxes"}
+_NONE: str = "none"
 _WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
 _PUSH = 0.6
 """Speed of a push, in sizes of the robot a second."""
@@ -171,7 +172,8 @@ class Panel:
         gui.add_markdown(f"The robot keeps off what is here: up to {most}. The first is compiled for.")
         kinds = gui.add_button_group("Add", tuple(SLOTS))
         kinds.on_click(self._guarded(lambda event: self._add_obstacle(event.target.value)))
-        self._obstacle: GuiDropdownHandle[str] = gui.add_dropdown("Chosen", (_NONE,))
+        nothing: list[str] = [_NONE]
+        self._obstacle: GuiDropdownHandle[str] = gui.add_dropdown("Chosen", nothing)
         self._obstacle.on_update(lambda _: self._show_obstacle())
         most_edge = float(np.round(self._size, 2))
         self._edges = [

@@ -63,19 +63,16 @@ class RobotNodes:
                     color=color[:3],
                     opacity=opacity if color[3] >= 255 else color[3] / 255.0,
                 )
-        self._shown = {body: np.r_[data.xpos[body], data.xquat[body]] for body in self._frames}
+        self._bodies = np.array(list(self._frames), int)
+        self._position, self._quaternion = data.xpos[self._bodies], data.xquat[self._bodies]
 
     def place(self, data: mujoco.MjData) -> None:
         """Moves the bodies to where MuJoCo's kinematics has them."""
-        for body, frame in self._frames.items():
-            now = np.r_[data.xpos[body], data.xquat[body]]
-            moved = np.abs(now - self._shown[body]) > _MOVED
-            if moved[:3].any():
-                frame.position = now[:3]
-            if moved[3:].any():
-                frame.wxyz = now[3:]
-            if moved.any():
-                self._shown[body] = now
+        position, quaternion, frames = data.xpos[self._bodies], data.xquat[self._bodies], tuple(self._frames.values())
+        for k in np.flatnonzero(np.abs(position - self._position).max(1) > _MOVED):
+            frames[k].position = self._position[k] = position[k]
+        for k in np.flatnonzero(np.abs(quaternion - self._quaternion).max(1) > _MOVED):
+            frames[k].wxyz = self._quaternion[k] = quaternion[k]
 
 
 def side_by_side(span: Float[np.ndarray, "points 3"], count: int) -> list[Float[np.ndarray, "3"]]:
