@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -160,7 +159,7 @@ def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, t
 
 def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit, tmp_path: Path) -> None:
     page, left = visit.page, np.array([0.0, 1.0, 0.0])
-    view.loop.change(lambda now: dataclasses.replace(now, scheme=osik.WeightedQP()))
+    view._desk.take_scheme("Weighted QP")
     page.get_by_role("tab", name="Obstacles").click()
     page.get_by_text("ball", exact=True).click()
     assert until(lambda: "ball 1" in view._desk.obstacles)
