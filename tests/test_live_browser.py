@@ -83,9 +83,9 @@ def away(view: LiveView) -> float:
 
 
 def pixel(view: LiveView, point: np.ndarray) -> tuple[float, float]:
-    """Where the visitor sees a point of the world."""
-    (client,) = view._server.get_clients().values()
-    camera = client.camera
+    """Where the first visitor sees a point of the world."""
+    clients = view._server.get_clients()
+    camera = clients[min(clients)].camera
     w, x, y, z = camera.wxyz
     turn = np.array(
         [
@@ -185,9 +185,13 @@ def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit,
     visit.check()
 
 
-def test_a_visitor_who_leaves_in_the_middle_of_a_drag(view: LiveView, visit: Visit) -> None:
+def test_a_visitor_who_leaves_in_the_middle_of_a_drag_while_another_stays(view: LiveView, visit: Visit) -> None:
     page = visit.page
     assert until(lambda: len(view._server.get_clients()) == 1)
+    other = page.context.new_page()
+    other.goto(view.url)
+    assert until(lambda: len(view._server.get_clients()) == 2)
+    page.bring_to_front()
     grip = target(view) + 0.75 * view._gizmos._scale * np.array([0.0, 0.0, 1.0])
     page.mouse.move(*pixel(view, grip))
     page.wait_for_timeout(500)
@@ -195,9 +199,12 @@ def test_a_visitor_who_leaves_in_the_middle_of_a_drag(view: LiveView, visit: Vis
     page.mouse.move(*pixel(view, grip + np.array([0.0, 0.0, 0.3])), steps=4)
     assert until(lambda: bool(view._gizmos.held))
     page.goto("about:blank")
-    assert until(lambda: not view._server.get_clients() and not view._gizmos.held)
+    assert until(lambda: len(view._server.get_clients()) == 1 and not view._gizmos.held)
     assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 1e-2)
     assert until(lambda: away(view) < 1e-3)
+    other.get_by_text("running").first.wait_for()
+    other.close()
+    assert until(lambda: not view._server.get_clients())
 
 
 def test_an_exported_page_plays_without_a_server(visit: Visit, tmp_path: Path) -> None:

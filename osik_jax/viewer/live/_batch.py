@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 _FRAME = 1.0 / 30.0
 """Time between pictures [s]."""
+_APART = 0.6
+"""Robots stand so many of their sizes apart at least: they move."""
 _WORDS = 6
 """The panel's figures change with every so many pictures."""
 
@@ -66,8 +68,9 @@ class BatchView(Served):
         super().__init__(host, port, title)
         shapes = robot_parts(robot, look=look)
         span = np.concatenate([shapes.corners(data) for data in mujoco_poses(robot, q0)])
-        offsets = side_by_side(span, len(q0))
-        seen, size = np.concatenate([span + offset for offset in offsets]), float(np.linalg.norm(np.ptp(span, axis=0)))
+        size = float(np.linalg.norm(np.ptp(span, axis=0)))
+        offsets = side_by_side(span, len(q0), least=_APART * size)
+        seen = np.concatenate([span + offset for offset in offsets])
         add_surroundings(self._server, seen, floor_height(robot, shapes, mujoco_poses(robot, q0)))
         self._nodes, self._gizmos = [], []
         for lane, (name, offset) in enumerate(zip(self.names, offsets, strict=True)):

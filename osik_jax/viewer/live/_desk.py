@@ -26,9 +26,12 @@ from ._obstacles import PARKED, Obstacle, free_slot, keeps_off_world, moved, obs
 from ._session import Session
 from ._step import Controller, with_targets
 
+_DAMPING = 1e-6
+"""Of the hierarchical scheme: without any, joints shake where an obstacle holds back a task of high priority."""
+
 SCHEMES: dict[str, Callable[[], Scheme]] = {
     "Weighted QP": WeightedQP,
-    "Hierarchical QP": HierarchicalQP,
+    "Hierarchical QP": lambda: HierarchicalQP(damping=_DAMPING),
     "Null space": lambda: NullSpace(saturate=True),
 }
 """The schemes to choose from, all of which keep the limits."""

@@ -75,10 +75,13 @@ class RobotNodes:
             frames[k].wxyz = self._quaternion[k] = quaternion[k]
 
 
-def side_by_side(span: Float[np.ndarray, "points 3"], count: int) -> list[Float[np.ndarray, "3"]]:
-    """By how much to move each of so many robots [m], whose points these are, the first to its left."""
-    width = _APART * float(np.ptp(span[:, 1]))
-    return [np.array([0.0, (0.5 * (count - 1) - k) * width, 0.0]) for k in range(count)]
+def side_by_side(span: Float[np.ndarray, "points 3"], count: int, least: float = 0.0) -> list[Float[np.ndarray, "3"]]:
+    """By how much to move each of so many robots [m], whose points these are: from left to right in the page.
+
+    ``least`` is the least distance of neighbours [m].
+    """
+    width = max(_APART * float(np.ptp(span[:, 1])), least)
+    return [np.array([0.0, (k - 0.5 * (count - 1)) * width, 0.0]) for k in range(count)]
 
 
 def add_label(scene: SceneApi, name: str, span: Float[np.ndarray, "points 3"]) -> None:
