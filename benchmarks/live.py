@@ -1,7 +1,8 @@
 """How regular the control loop of a live view is, with a visitor connected: python -m benchmarks.live [--robot g1].
 
 Leads both hands along circles that leave the reach, for a minute; prints periods, step times, what broke a limit and
-how the memory grew. A visitor is a websocket that reads all that the page sends.
+how the memory grew. A visitor is a websocket that reads all that the page sends. Beside it a loop runs that only
+sleeps.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import asyncio
 import json
 import os
 import resource
+import subprocess
 import sys
 import threading
 import time
@@ -28,6 +30,26 @@ from osik_jax.viewer import LiveView
 from osik_jax.viewer.live import _open
 from osik_jax.viewer.live._default import find_hands
 from osik_jax.viewer.live._timing import Stopwatch
+
+_IDLE = """
+import json, sys, time
+import numpy as np
+dt, seconds = map(float, sys.argv[1:])
+starts, begin = [], time.perf_counter()
+deadline = begin
+while deadline - begin < seconds:
+    starts.append(time.perf_counter())
+    deadline += dt
+    time.sleep(max(deadline - time.perf_counter(), 0.0))
+    deadline = max(deadline, time.perf_counter() - 5.0 * dt)
+print(json.dumps(np.percentile(np.diff(starts), (50.0, 99.0, 100.0)).tolist()))
+"""
+"""A loop of the same rate that does nothing, in a process of its own: what the machine alone makes of the periods."""
+
+
+def idle(dt: float, seconds: float) -> subprocess.Popen[str]:
+    """Starts that loop."""
+    return subprocess.Popen([sys.executable, "-c", _IDLE, str(dt), str(seconds)], stdout=subprocess.PIPE, text=True)
 
 
 def visit(url: str, end: threading.Event) -> int:
@@ -87,11 +109,13 @@ def measure(name: str, seconds: float) -> dict[str, object]:
         view.loop.record()
         view.loop._stopwatch = Stopwatch(round(seconds / view.loop.dt))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        beside = idle(view.loop.dt, seconds)
         view.loop.resume()
         lead(view, robot, seconds, radius=0.35 if robot.floating_base else 0.2)
         timing, failures = view.loop.timing, view.loop.snapshot.failures
         after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         q, dt = view.loop.recorded().q, view.loop.dt
+        nothing = json.loads(beside.communicate()[0])
         end.set()
         visitor.join(timeout=5.0)
     return {
@@ -100,6 +124,7 @@ def measure(name: str, seconds: float) -> dict[str, object]:
         "steps": timing.steps,
         "period p50, p99, max of the whole session [ms]": [round(1e3 * x, 2) for x in timing.period],
         "step p50, p99, max of the whole session [ms]": [round(1e3 * x, 2) for x in timing.step],
+        "period of a loop beside it that does nothing [ms]": [round(1e3 * x, 2) for x in nothing],
         "failures": failures,
         **broken(robot, q, dt),
         "memory grew by [MB]": round((after - before) / 1024.0, 1),

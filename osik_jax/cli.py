@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from .demo import Motion
     from .robot import Robot
-    from .viewer import Look
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
 _EMBEDDED = ("nao", "arm7")
@@ -90,6 +89,8 @@ class View:
     """Port to listen at; 0 for any that is free."""
     browser: bool = True
     """Open the page in a browser."""
+    html: Path | None = None
+    """With a motion.npz: write a page that plays it without a server, instead of serving one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -345,17 +346,6 @@ def _read_demo_robot(command: Demo, source: str) -> Robot:
     return read_robot(source, "floating" if stands else command.base)
 
 
-def _look(source: str) -> Look | None:
-    """What a URDF shows; an MJCF's own shapes are in its model already."""
-    from ._loading import is_mjcf, urdf_of_description
-    from .viewer import read_look
-
-    if os.path.isfile(source):
-        return None if is_mjcf(source) else read_look(source)
-    urdf = None if source in _EMBEDDED else urdf_of_description(source)
-    return None if urdf is None else read_look(urdf[0], package_dirs=urdf[1])
-
-
 def _info(command: Info) -> None:
     from rich.console import Console
 
@@ -545,6 +535,7 @@ def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:
 def _motion(command: Demo) -> Motion:
     """The motion that the options ask for."""
     from . import demo
+    from .viewer.live._source import RobotSource, source_look
 
     _check(command)
     if command.robot is not None:
@@ -556,7 +547,7 @@ def _motion(command: Demo) -> Motion:
                 frame=command.frame,
                 support=command.support,
                 duration=command.duration,
-                look=_look(command.robot),
+                look=source_look(RobotSource(command.robot)),
             )
     make = demo.single_support if command.motion == "single-support" else demo.double_support
     return make(command.duration)
@@ -593,13 +584,19 @@ def _view(command: View) -> None:
     from .viewer.live import _open
 
     with _told():
-        _open.check(command.host, command.port)
+        if command.html is not None and (command.file is None or command.file.suffix == ".json"):
+            raise CommandError("--html goes with a motion.npz")
+        _open.check(command.host, 0 if command.html is not None else command.port)
         source = _open.source_of(command.robot, {"auto": None, "floating": True, "fixed": False}[command.base])
         if command.file is not None and command.file.suffix == ".json":
             view = _open.open_session(command.file, host=command.host, port=command.port)
         else:
             robot = read_robot(source.robot, command.base)
             options: Any = dict(host=command.host, port=command.port)
+            if command.file is not None and command.html is not None:
+                _open.write_motion(command.file, robot, source, command.html)
+                print(f"written: {command.html}")
+                return
             if command.file is not None:
                 view = _open.open_motion(command.file, robot, source, **options)
             else:

@@ -83,9 +83,9 @@ def away(view: LiveView) -> float:
 
 
 def pixel(view: LiveView, point: np.ndarray) -> tuple[float, float]:
-    """Where the visitor sees a point of the world."""
-    (client,) = view._server.get_clients().values()
-    camera = client.camera
+    """Where the first visitor sees a point of the world."""
+    clients = view._server.get_clients()
+    camera = clients[min(clients)].camera
     w, x, y, z = camera.wxyz
     turn = np.array(
         [
@@ -100,8 +100,12 @@ def pixel(view: LiveView, point: np.ndarray) -> tuple[float, float]:
 
 
 def drag(view: LiveView, page: Page, axis: np.ndarray, by: float) -> None:
-    """Takes the handle's arrow along an axis, and moves it by a length [m]."""
-    grip = target(view) + 0.75 * view._gizmos._scale * axis
+    """Takes the arrow of the hand's handle along an axis, and moves it by a length [m]."""
+    pull(view, page, target(view) + 0.75 * view._gizmos._scale * axis, axis, by)
+
+
+def pull(view: LiveView, page: Page, grip: np.ndarray, axis: np.ndarray, by: float) -> None:
+    """Moves what is at a point along an axis by a length [m]."""
     start, end = pixel(view, grip), pixel(view, grip + by * axis)
     page.mouse.move(*start)
     page.wait_for_timeout(500)
@@ -153,9 +157,41 @@ def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, t
     visit.check()
 
 
-def test_a_visitor_who_leaves_in_the_middle_of_a_drag(view: LiveView, visit: Visit) -> None:
+def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit, tmp_path: Path) -> None:
+    page, left = visit.page, np.array([0.0, 1.0, 0.0])
+    view._desk.take_scheme("Weighted QP")
+    page.get_by_role("tab", name="Obstacles").click()
+    page.get_by_text("ball", exact=True).click()
+    assert until(lambda: "ball 1" in view._desk.obstacles)
+    assert view.loop.wait_until_ready(300.0)
+    before = target(view)
+    ball = before + np.array([0.0, -0.15, 0.0])
+    view._desk.move_obstacle("ball 1", position=ball, size=np.array([0.04, 0.0, 0.0]))
+    page.wait_for_timeout(1500)
+    handle = view._obstacles._shown["ball 1"].handle
+    pull(view, page, ball + 0.75 * handle.scale * left, left, 0.14)
+    moved = view._desk.obstacles["ball 1"].position
+    assert moved[1] - ball[1] > 0.1
+    np.testing.assert_allclose(moved[[0, 2]], ball[[0, 2]], atol=1e-6)
+    assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 0.02)
+    data = next(mujoco_poses(ROBOT, view.loop.snapshot.q))
+    assert np.linalg.norm(mujoco_frame_pose(ROBOT, data, HAND)[0] - moved) > 0.04
+    assert away(view) > 0.01  # it had to give way
+    page.wait_for_timeout(1500)
+    page.screenshot(path=tmp_path / "obstacle.png")
+    page.get_by_role("button", name="Remove the one chosen").click()
+    assert until(lambda: not view._desk.obstacles)
+    assert until(lambda: away(view) < 1e-3)
+    visit.check()
+
+
+def test_a_visitor_who_leaves_in_the_middle_of_a_drag_while_another_stays(view: LiveView, visit: Visit) -> None:
     page = visit.page
     assert until(lambda: len(view._server.get_clients()) == 1)
+    other = page.context.new_page()
+    other.goto(view.url)
+    assert until(lambda: len(view._server.get_clients()) == 2)
+    page.bring_to_front()
     grip = target(view) + 0.75 * view._gizmos._scale * np.array([0.0, 0.0, 1.0])
     page.mouse.move(*pixel(view, grip))
     page.wait_for_timeout(500)
@@ -163,9 +199,12 @@ def test_a_visitor_who_leaves_in_the_middle_of_a_drag(view: LiveView, visit: Vis
     page.mouse.move(*pixel(view, grip + np.array([0.0, 0.0, 0.3])), steps=4)
     assert until(lambda: bool(view._gizmos.held))
     page.goto("about:blank")
-    assert until(lambda: not view._server.get_clients() and not view._gizmos.held)
+    assert until(lambda: len(view._server.get_clients()) == 1 and not view._gizmos.held)
     assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 1e-2)
     assert until(lambda: away(view) < 1e-3)
+    other.get_by_text("running").first.wait_for()
+    other.close()
+    assert until(lambda: not view._server.get_clients())
 
 
 def test_an_exported_page_plays_without_a_server(visit: Visit, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -162,17 +163,21 @@ def test_a_new_structure_takes_over_while_the_old_one_goes_on(loop: ControlLoop)
 
 
 def test_a_change_that_cannot_be_compiled_is_taken_back_and_told(loop: ControlLoop) -> None:
-    class Broken(osik.PostureTask):
-        def rows(self, robot: Any, kinematics: Any, q: Any) -> Any:
-            raise ValueError("this task has no rows")
-
-    made: Any = Broken
-    broken = made(ROBOT)
+    broken = _broken()
     loop.change(lambda now: Controller({**now.tasks, "broken": broken}, now.scheme, now.limits))
     assert until(lambda: "this task has no rows" in loop.snapshot.problem)
     assert "broken" not in loop.controller.tasks
     before = loop.snapshot.time
     assert until(lambda: loop.snapshot.time > before + 0.05)
+
+
+def _broken() -> osik.Task:
+    class Broken(osik.PostureTask):
+        def rows(self, robot: Any, kinematics: Any, q: Any) -> Any:
+            raise ValueError("this task has no rows")
+
+    made: Any = Broken
+    return made(ROBOT)
 
 
 def test_where_the_answer_is_not_finite_the_robot_stands_still(loop: ControlLoop) -> None:
@@ -218,10 +223,12 @@ def test_wrong_targets_raise_where_they_are_given(loop: ControlLoop) -> None:
 
 
 def test_pythons_own_settings_come_back_after_the_loop() -> None:
-    before = sys.getswitchinterval()
-    with ControlLoop(ROBOT, Controller(tasks(), osik.WeightedQP(), LIMITS)):
+    before, frozen = sys.getswitchinterval(), gc.get_freeze_count()
+    with ControlLoop(ROBOT, Controller({"broken": _broken()}, osik.WeightedQP(), LIMITS)) as loop:
+        assert until(lambda: "this task has no rows" in loop.snapshot.problem)
         assert sys.getswitchinterval() <= 5e-4 + 1e-9
     assert sys.getswitchinterval() == before
+    assert gc.get_freeze_count() == frozen
 
 
 def test_a_stopwatch_tells_percentiles_of_what_it_keeps() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import pytest
 
 import osik_jax as osik
 from osik_jax.cli import main
-from osik_jax.viewer import export_html, serve
+from osik_jax.retargeting._retarget import in_mujoco_order
+from osik_jax.viewer import export_html, serve, serve_batch
 from osik_jax.viewer._parts import Part, robot_parts
 from osik_jax.viewer.live._playback import read_motion
 from osik_jax.viewer.live._readout import error_text, joint_table
@@ -77,6 +79,26 @@ def test_motions_are_read_as_the_demo_and_rollouts_write_them(tmp_path: Path) ->
     assert read_motion(tmp_path / "rollout.npz", ARM).duration == pytest.approx(4 / 200)
 
 
+def test_motions_are_read_as_retargeting_writes_them(tmp_path: Path) -> None:
+    q = np.tile(np.asarray(NAO.q0), (4, 1))
+    q[:, :3] += [0.1, 0.2, 0.3]
+    q[:, NAO.joint_qpos_index("LElbowRoll")] = np.linspace(-1.0, -0.5, 4)
+    written = in_mujoco_order(NAO, q, 60.0)
+    arrays: Any = dict(qpos=written.qpos, joint_names=np.array(written.joint_names), fps=written.fps)
+    np.savez(tmp_path / "motion.npz", **arrays)
+    motion = read_motion(tmp_path / "motion.npz", NAO)
+    np.testing.assert_allclose(motion.runs["motion"], q, atol=1e-12)
+    assert motion.duration == pytest.approx(3 / 60)
+    with pytest.raises(ValueError, match="another robot"):
+        read_motion(tmp_path / "motion.npz", ARM)
+
+
+def test_motions_of_rollouts_have_their_rate(tmp_path: Path) -> None:
+    q = np.tile(np.asarray(ARM.q0), (5, 1))
+    np.savez(tmp_path / "rollout.npz", q=q)
+    assert read_motion(tmp_path / "rollout.npz", ARM).duration == pytest.approx(4 / 200)
+
+
 def test_an_exported_page_holds_everything(tmp_path: Path) -> None:
     q = np.tile(np.asarray(ARM.q0), (50, 1)) + np.linspace(0.0, 0.5, 50)[:, None]
     path = export_html(ARM, {"one": q, "other": q[::-1]}, tmp_path / "arm.html", dt=0.02, title="a <b> arm")
@@ -112,6 +134,50 @@ def test_a_page_is_served_and_a_visitor_who_goes_leaves_the_robot_at_rest() -> N
             serve(ARM, tasks, port=taken)
 
 
+def test_robots_side_by_side_each_with_its_own_numbers() -> None:
+    robots = {f"gain {gain}": arm_tasks(gain) for gain in (2.0, 40.0)}
+    with serve_batch(ARM, robots, port=0) as view:
+        position, rotation = robots["gain 2.0"]["hand"].target
+        target = position + np.array([-0.05, 0.08, -0.05])
+        with pytest.raises(KeyError, match=r"gain 40\.0"):
+            view.aim("gain 3", "hand", (target, rotation))
+        assert view.loop.wait_until_ready(120.0)
+        view.loop.pause()
+        for name in view.names:
+            view.aim(name, "hand", (target, rotation))
+        view.loop.reset()
+        view.loop.record()
+        view.loop.resume()
+        until(lambda: (view.loop.snapshot.recording or 0.0) > 0.3)
+        q = view.loop.recorded().q
+        assert q.shape[1:] == (2, ARM.nq)
+        for lane, (name, own) in enumerate(robots.items()):
+            aimed = {**own, "hand": own["hand"].replace(target=(target, rotation))}
+            alone = osik.rollout(ARM, ARM.q0, aimed, steps=40, dt=0.005)
+            np.testing.assert_allclose(q[1:41, lane], alone.q[1:41] if len(alone.q) > 40 else alone.q, atol=1e-8)
+            assert name in view._table()
+        view._dragging(0)("hand", (np.asarray(position), np.array([1.0, 0.0, 0.0, 0.0])), 7, "start")
+        second: Any = view._tasks[1]["hand"]
+        np.testing.assert_allclose(second.target[0], position, atol=1e-12)  # the handles move together
+        view._dragging(0)("hand", (np.asarray(position), np.array([1.0, 0.0, 0.0, 0.0])), 7, "end")
+        until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 1e-2)
+    with pytest.raises(ValueError, match="differ in more than numbers"):
+        serve_batch(ARM, {"one": arm_tasks(1.0), "other": {"posture": osik.PostureTask(ARM)}}, port=0)
+    with pytest.raises(ValueError, match="tasks is empty"):
+        serve_batch(ARM, {}, port=0)
+
+
+def arm_tasks(gain: float) -> dict[str, Any]:
+    return {"hand": osik.FrameTask(ARM, "hand", gain=gain), "posture": osik.PostureTask(ARM, weight=1e-4)}
+
+
+def until(holds: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "motion.npz", q=np.zeros((3, 7)))
     (tmp_path / "broken.urdf").write_text("<robot", encoding="utf-8")
@@ -127,6 +193,11 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
             (["--port", "0", "nowhere.npz"], "no such file: nowhere.npz"),
             (["--port", "0", str(tmp_path / "motion.npz")], "another robot"),
             (["--port", "0", "--support", "l_soul"], "l_sole"),
+            (["--html", str(tmp_path / "page.html")], "--html goes with a motion.npz"),
+            (
+                [str(tmp_path / "motion.npz"), "--robot", "arm7", "--html", str(tmp_path / "no" / "page.html")],
+                "No such file",
+            ),
         ):
             assert main(["view", "--no-browser", *arguments]) == 2
             error = capsys.readouterr().err

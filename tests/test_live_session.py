@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 
 import osik_jax as osik
 from osik_jax.viewer import Session, load_session
+from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live._default import default_session, find_hands
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._source import RobotSource
@@ -82,16 +84,29 @@ def test_its_lines_of_python_make_the_same_controller() -> None:
 
 
 def test_what_is_switched_off_is_as_if_it_were_not_there() -> None:
-    wanted = session(limits_off=frozenset({1}))
+    arm = osik.load_robot("arm7")
+    home = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
+    tasks = {
+        "hand": osik.FrameTask(arm, "hand", target=(home[0] - 0.05, home[1]), rows="position"),
+        "turn": osik.FrameTask(arm, "hand", target=(home[0], home[1] @ np.diag([1.0, -1.0, -1.0])), rows="orientation"),
+        "posture": osik.PostureTask(arm, weight=1e-3),
+    }
+    given: dict[str, Any] = dict(scheme=osik.WeightedQP(), dt=0.004, q=np.asarray(arm.q0))
+    limits = (osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": 0.1}))
+    wanted = Session(arm, tasks, limits=limits, off=frozenset({"turn"}), limits_off=frozenset({1}), **given)
     parts = wanted.controller()
-    off = osik.solve(ROBOT, jnp.asarray(wanted.q), parts.tasks, scheme=parts.scheme, limits=parts.limits, dt=wanted.dt)
-    np.testing.assert_allclose(off.velocity, answer(wanted).velocity, atol=1e-8)
-    assert np.abs(off.velocity).max() > 0.1  # as far as the limit that is off would let no joint go
-    assert parts.structure() == session(off=frozenset()).controller().structure()
+    off, left = (
+        osik.solve(arm, arm.q0, tasks, scheme=wanted.scheme, limits=limits, dt=wanted.dt).velocity
+        for tasks, limits in ((parts.tasks, parts.limits), (wanted.active_tasks, wanted.active_limits))
+    )
+    np.testing.assert_allclose(off, left, atol=1e-8)
+    assert np.abs(off).max() > 0.2  # as fast as the limit that is off would let no joint be
+    on = dataclasses.replace(wanted, off=frozenset(), limits_off=frozenset())
+    assert parts.structure() == on.controller().structure()
 
 
 def test_edits_at_the_desk() -> None:
-    desk = Desk(session())
+    desk = Desk(session(), robot_parts(ROBOT))
     desk.loop.aim("hand", (np.array([0.1, 0.1, 0.3]), np.eye(3)))
     desk.rank("foot", 2)
     desk.renumber("hand", weight=7.0)
@@ -123,8 +138,10 @@ def test_what_a_file_cannot_hold_is_refused_in_words(tmp_path: Path) -> None:
         session(tasks={"mine": made(ROBOT)}).to_json()
     with pytest.raises(ValueError, match="where the robot comes from is not known"):
         session(source=None).save(tmp_path / "session.json")
-    with pytest.raises(ValueError, match="CollisionAvoidanceLimit"):
-        session(limits=(osik.CollisionAvoidanceLimit(ROBOT),)).to_json()
+    hull = osik.CollisionShape.convex(np.random.default_rng(0).normal(size=(9, 3)), frame="l_wrist")
+    kept = osik.CollisionAvoidanceLimit(ROBOT, shapes={"stone": hull}, pairs=[("stone", "geom0")])
+    with pytest.raises(ValueError, match="cannot hold the shape 'stone'"):
+        session(limits=(kept,)).to_json()
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def _pictures(found: dict[str, Motion], work: Workload, case: Case) -> Iterator[
             canvas.page.text(x, SIZE[1] - 14, words, ha="center", va="bottom", fontsize=9.5, color=INK)
         canvas.title(16, 28, "The target of the hand (ring) is 0.35 m out of reach", fontsize=11)
         clock = f"t = {frame * DT:4.2f} s, {SLOWER} times slower"
-        canvas.page.text(16, 50, clock, fontsize=9, color=INK, family="monospace")
+        canvas.page.text(SIZE[0] - 16, 28, clock, ha="right", fontsize=9, color=INK, family="monospace")
         yield paint_over(drawer.image(stage.pose(sources, shifts), None), canvas.picture())
 
 

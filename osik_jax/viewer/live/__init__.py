@@ -1,5 +1,7 @@
 """A robot in the browser: a control loop of its own, and pages that show it. The pages need the extra ``viewer``."""
 
+from ._batch import BatchView as BatchView
+from ._batch import serve_batch as serve_batch
 from ._export import export_html as export_html
 from ._page import LiveView as LiveView
 from ._page import serve as serve

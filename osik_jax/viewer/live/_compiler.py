@@ -20,10 +20,12 @@ class Compiler:
         self,
         robot: Robot,
         dt: float,
+        batch: int | None,
         done: Callable[[Controller, Program], None],
         failed: Callable[[Controller, Exception], None],
     ) -> None:
-        """``done`` and ``failed`` are called in the thread that compiles."""
+        """Takes how many robots there are (None: one, without an axis), and what to call from the thread."""
+        self._batch = batch
         self._robot, self._dt, self._done, self._failed = robot, dt, done, failed
         self._programs: dict[tuple[Any, ...], Program] = {}
         self._asked: Controller | None = None
@@ -52,7 +54,7 @@ class Compiler:
     def _compile(self, controller: Controller) -> None:
         structure = controller.structure()
         try:
-            program = self._programs.get(structure) or compile_step(self._robot, controller, self._dt)
+            program = self._programs.get(structure) or compile_step(self._robot, controller, self._dt, self._batch)
         except Exception as error:  # whatever a task of somebody's own raises must not end the thread
             self._failed(controller, error)
             return

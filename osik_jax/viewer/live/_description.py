@@ -10,9 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from ...limits import CollisionAvoidanceLimit
 from ...robot import Robot
 from ...tasks import AdaptiveGain, PostureTask, SupportPolygon
 from ...tasks._pose import PoseTask
+from ._shape_description import describe_pairs, describe_shapes, rebuild_shape, shape_python
 
 Description = dict[str, Any]
 """``{"kind": name of the class, argument: plain value, ...}``; arguments that change nothing are left out."""
@@ -31,6 +33,8 @@ def describe(part: Any, robot: Robot) -> Description:
     if getattr(importlib.import_module("osik_jax"), kind, None) is not type(part):
         raise ValueError(f"{kind} is no class of osik_jax, so a session file cannot hold it")
     names = [name for name in inspect.signature(type(part)).parameters if name != "robot"]
+    if isinstance(part, CollisionAvoidanceLimit):
+        return _describe_collisions(part, robot)
     described = {"kind": kind} | {name: _argument(part, robot, name) for name in names}
     if not _makes(described, robot, part):
         raise ValueError(f"this {kind} has settings that a session file cannot hold")
@@ -38,6 +42,19 @@ def describe(part: Any, robot: Robot) -> Description:
         without = {key: value for key, value in described.items() if key != name}
         described = without if _makes(without, robot, part) else described
     return described
+
+
+def _describe_collisions(limit: CollisionAvoidanceLimit, robot: Robot) -> Description:
+    """Pairs by globs where these say the same, and by their names elsewhere."""
+    numbers = {name: _plain(getattr(limit, name)) for name in (*limit.replaceable, "max_pairs")}
+    shapes, any_distance = describe_shapes(limit, robot), {"q0_distance": -np.inf}
+    for short in (True, False):
+        pairs = describe_pairs(limit, short=short)
+        described = {"kind": "CollisionAvoidanceLimit", **pairs, "shapes": shapes, **any_distance, **numbers}
+        made = rebuild(described, robot)
+        if made.scene == limit.scene and made.max_pairs == limit.max_pairs:
+            return described
+    raise ValueError("this CollisionAvoidanceLimit has settings that a session file cannot hold")
 
 
 def _makes(described: Description, robot: Robot, part: Any) -> bool:
@@ -60,6 +77,12 @@ def rebuild(described: Mapping[str, Any], robot: Robot) -> Any:
         raise ValueError(f"{described.get('kind')!r} is no class of osik_jax")
     cls: Any = found
     arguments = {name: _live(value) for name, value in described.items() if name != "kind"}
+    if cls is CollisionAvoidanceLimit:
+        arguments |= {
+            "pairs": [tuple(pair) for pair in described["pairs"]],
+            "exclude": [tuple(pair) for pair in described["exclude"]],
+            "shapes": {name: rebuild_shape(one) for name, one in described["shapes"].items()},
+        }
     try:
         return cls(robot, **arguments) if _takes_robot(cls) else cls(**arguments)
     except TypeError as error:
@@ -70,7 +93,12 @@ def python(described: Mapping[str, Any]) -> str:
     """The expression that makes it, in a program that has ``import osik_jax as osik`` and a ``robot``."""
     kind = described["kind"]
     first = ["robot"] if _takes_robot(getattr(importlib.import_module("osik_jax"), kind)) else []
-    given = [f"{name}={_text(value)}" for name, value in described.items() if name != "kind"]
+    own: dict[str, str] = {}
+    if kind == "CollisionAvoidanceLimit":
+        shapes = ", ".join(f"{name!r}: {shape_python(one)}" for name, one in described["shapes"].items())
+        own = {name: repr([tuple(pair) for pair in described[name]]) for name in ("pairs", "exclude")}
+        own["shapes"] = f"{{{shapes}}}"
+    given = [f"{name}={own[name] if name in own else _text(value)}" for name, value in described.items()][1:]
     return f"osik.{kind}({', '.join(first + given)})"
 
 
@@ -106,7 +134,7 @@ def _plain(value: Any) -> Any:
 
 def _live(value: Any) -> Any:
     """Of plain data, what constructors take."""
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping) and "kind" in value:
         cls = _PARTS[value["kind"]]
         return cls(**{name: np.asarray(one, float) for name, one in value.items() if name != "kind"})
     return value

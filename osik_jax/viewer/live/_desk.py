@@ -5,24 +5,33 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..._tree import unknown_name
-from ...limits import VelocityLimit
+from ...collision import CollisionShape
+from ...limits import CollisionAvoidanceLimit, VelocityLimit
 from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ...tasks import FrameTask, Task
+from .._parts import RobotParts
+from ._covers import link_covers
 from ._description import describe, rebuild
 from ._hold import targets_here
 from ._loop import ControlLoop
+from ._obstacles import PARKED, Obstacle, free_slot, keeps_off_world, moved, obstacles_in, own_limit, world_limit
 from ._session import Session
 from ._step import Controller, with_targets
 
+_DAMPING = 1e-6
+"""Of the hierarchical scheme: without any, joints shake where an obstacle holds back a task of high priority."""
+
 SCHEMES: dict[str, Callable[[], Scheme]] = {
     "Weighted QP": WeightedQP,
-    "Hierarchical QP": HierarchicalQP,
+    "Hierarchical QP": lambda: HierarchicalQP(damping=_DAMPING),
     "Null space": lambda: NullSpace(saturate=True),
 }
 """The schemes to choose from, all of which keep the limits."""
@@ -35,9 +44,10 @@ class Desk:
         loop: runs the session's controller.
     """
 
-    def __init__(self, session: Session) -> None:
-        """Takes the session to start with; the loop does not run yet."""
-        self._session, self._lock = session, threading.RLock()
+    def __init__(self, session: Session, shapes: RobotParts) -> None:
+        """Takes the session to start with and what is drawn of its robot; the loop does not run yet."""
+        self._session, self._lock, self._shapes = session, threading.RLock(), shapes
+        self._seen: tuple[Any, dict[str, Obstacle]] = ((), {})
         controller = session.controller()
         self._told = (controller, session, session)
         self.loop = ControlLoop(session.robot, controller, dt=session.dt, q0=jnp.asarray(session.q))
@@ -126,6 +136,58 @@ class Desk:
                 for limit in self._session.limits
             ]
             self.edit(limits=tuple(limits))
+
+    @property
+    def obstacles(self) -> dict[str, Obstacle]:
+        """Those in use, by name."""
+        with self._lock:
+            if self._seen[0] is not self._session.limits:
+                self._seen = self._session.limits, obstacles_in(self._session.limits)
+            return self._seen[1]
+
+    def add_obstacle(self, kind: str, position: Float[np.ndarray, "3"], size: float) -> str:
+        """Puts a ball or a box there [m]; returns its name. The limit for obstacles is added with the first of them.
+
+        Raises:
+            ValueError: there are as many as there may be, or the robot has no links that move.
+        """
+        with self._lock:
+            if not any(map(keeps_off_world, self._session.limits)):
+                self._put_limit(world_limit(self._session.robot, self._covers, size))
+            name = free_slot(self._session.limits, kind)
+            if name is None:
+                count = sum(one.kind == kind for one in self.obstacles.values())
+                raise ValueError(f"there are {count} of these already; remove one, or drag it")
+            self.move_obstacle(name, position=position)
+            return name
+
+    def move_obstacle(self, name: str, **changes: Float[np.ndarray, "..."]) -> None:
+        """Another position, rotation or size of an obstacle; compiles nothing."""
+        with self._lock:
+            self._session = dataclasses.replace(self._session, limits=moved(self._session.limits, name, **changes))
+            self.loop.place(name, **changes)
+
+    def remove_obstacle(self, name: str) -> None:
+        """Takes an obstacle out of the way."""
+        self.move_obstacle(name, position=PARKED)
+
+    def avoid_itself(self) -> None:
+        """Adds the limit that keeps the robot off itself.
+
+        Raises:
+            ValueError: no two links of it are apart.
+        """
+        with self._lock:
+            session = self._session
+            self._put_limit(own_limit(session.robot, self._covers, session.q))
+
+    @cached_property
+    def _covers(self) -> dict[str, CollisionShape]:
+        """What links are taken for."""
+        return link_covers(self._session.robot, self._shapes)
+
+    def _put_limit(self, limit: CollisionAvoidanceLimit) -> None:
+        self.edit(limits=(*self._session.limits, limit))
 
     def load(self, session: Session) -> None:
         """Takes over another session of the same robot, at the configuration reached.

@@ -49,7 +49,15 @@ def export_html(
         ImportError: viser is not installed (the extra ``viewer``).
         ValueError: configurations of another robot, or none.
     """
-    motion = _motion(robot, trajectory, dt)
+    return write_page(robot, _motion(robot, trajectory, dt), Path(path), look=look, title=title)
+
+
+def write_page(robot: Robot, motion: Motion, out: Path, *, look: Look | None, title: str) -> Path:
+    """Writes a motion that has been read already.
+
+    Raises:
+        ImportError: viser is not installed.
+    """
     server = open_server("127.0.0.1", 0, title)
     try:
         cast = Cast(server, robot, motion, look, panel=False)
@@ -61,7 +69,6 @@ def export_html(
         page = serializer.as_html()
     finally:
         close_server(server)
-    out = Path(path)
     out.write_text(page.replace("<title>Viser</title>", f"<title>{_escaped(title)}</title>", 1), encoding="utf-8")
     return out
 

@@ -48,9 +48,9 @@ def gizmo_target(task: Task, pose: Pose) -> Any:
 class Gizmos:
     """The handles of a page."""
 
-    def __init__(self, scene: SceneApi, size: float, dragged: Dragged) -> None:
-        """Takes the size of the robot [m], and what to call when somebody drags."""
-        self._scene, self._scale, self._dragged = scene, 0.13 * size, dragged
+    def __init__(self, scene: SceneApi, size: float, dragged: Dragged, *, below: str = "") -> None:
+        """Takes the size of the robot [m], what to call when somebody drags, and the node to be below of."""
+        self._scene, self._scale, self._dragged, self._below = scene, 0.13 * size, dragged, below
         self._handles: dict[str, TransformControlsHandle] = {}
         self._held: dict[str, int] = {}
         self._turns: dict[str, bool] = {}
@@ -79,7 +79,7 @@ class Gizmos:
 
     def _add(self, name: str, task: Task, pose: Pose) -> None:
         handle = self._scene.add_transform_controls(
-            f"/targets/{name}",
+            f"{self._below}/targets/{name}",
             scale=self._scale,
             disable_rotations=not turns(task),
             depth_test=False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import sys
 import threading
 import time
@@ -11,6 +12,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -20,6 +22,7 @@ from ...robot import Robot
 from ...solvers import Status
 from ._compiler import Compiler
 from ._hold import targets_here
+from ._obstacles import moved
 from ._push import Push
 from ._recorder import Recorder
 from ._snapshot import Recording, Snapshot
@@ -56,6 +59,9 @@ class ControlLoop:
     The robot stands still while nothing is compiled yet, while paused, and wherever an answer is not finite. A target
     that somebody leads (``aim`` with an owner or a timeout) and then abandons becomes where the robot is.
 
+    A batch of robots runs in one program: q0 is (B, nq) then, and each number of the controller has a leading axis B.
+    So have targets, what the snapshot tells and what is recorded.
+
     Attributes:
         robot: the robot.
         dt: the period [s].
@@ -72,9 +78,12 @@ class ControlLoop:
         if not (np.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
         start = robot.q0 if q0 is None else q0
-        robot.check_configuration(start, "q0")
         self.robot, self.dt = robot, float(dt)
         self._start = np.asarray(start, robot.q0.dtype)
+        self._batched = self._start.ndim == 2
+        for row in self._start if self._batched else [start]:
+            robot.check_configuration(row, "q0")
+        still = np.zeros((*self._start.shape[:-1], robot.nv), self._start.dtype)
         self._editing, self._lock = threading.Lock(), threading.Lock()
         self._wanted = self._running = controller
         self._targets: dict[str, Any] = {}
@@ -83,19 +92,21 @@ class ControlLoop:
         self._job: _Job | None = None
         self._is_behind, self._problem = False, ""
         self._orders: deque[Callable[[], None]] = deque()
-        self._stopwatch, self._recorder, self._push = Stopwatch(), Recorder(self.dt), Push(robot.nv, self.dt)
-        self._snapshot = Snapshot(0.0, self._start, np.zeros(robot.nv), preparing=True)
-        self._state: State = (jnp.asarray(self._start), jnp.zeros(robot.nv, self._start.dtype), None)
+        self._stopwatch, self._recorder, self._push = Stopwatch(), Recorder(self.dt), Push(still, self.dt)
+        self._snapshot = Snapshot(0.0, self._start, still, preparing=True)
+        self._state: State = (jnp.asarray(self._start), jnp.asarray(still), None)
         self._program: Program | None = None
         self._stop = threading.Event()
-        self._compiler = Compiler(robot, self.dt, self._compiled, self._not_compiled)
+        batch = len(self._start) if self._batched else None
+        self._compiler = Compiler(robot, self.dt, batch, self._compiled, self._not_compiled)
         self._thread = threading.Thread(target=self._run, name="osik-control", daemon=True)
 
     def start(self) -> Self:
         """Starts the threads; the first step is compiled in the background.
 
         While it runs, Python's threads change places every half millisecond, not every five: the control thread would
-        wait that long for each of the others that computes.
+        wait that long for each of the others that computes. What was there when a program was compiled is left out of
+        garbage collection until the loop ends: going through all of JAX's objects takes up to 0.1 s.
         """
         self._switch_interval = sys.getswitchinterval()
         sys.setswitchinterval(min(_SWITCH_INTERVAL, self._switch_interval))
@@ -112,6 +123,7 @@ class ControlLoop:
         if self._thread.is_alive():
             self._thread.join()
             sys.setswitchinterval(self._switch_interval)
+            gc.unfreeze()
         self._compiler.stop()
 
     def __enter__(self) -> Self:
@@ -183,13 +195,23 @@ class ControlLoop:
         """
         if name not in self._wanted.tasks:
             raise unknown_name("task", name, tuple(self._wanted.tasks))
-        aimed: Any = self._wanted.tasks[name].replace(target=target)
+        task: Any = self._wanted.tasks[name]
+        aimed: Any = jax.vmap(_aim)(task, target) if self._batched else _aim(task, target)
         until = np.inf if timeout is None else time.monotonic() + timeout
         with self._lock:
             self._leases.pop(name, None)
             if owner is not None or timeout is not None:
                 self._leases[name] = _Lease(owner, until)
             self._retarget({name: aimed.target})
+
+    def place(self, obstacle: str, **changes: Float[np.ndarray, "..."]) -> None:
+        """Another position, rotation or size of an obstacle (``CollisionAvoidanceLimit.moved``), for all that runs."""
+        with self._editing, self._lock:
+            both = self._wanted is self._running
+            self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, **changes))
+            ran = self._running.limits
+            self._running = self._wanted if both else replace(self._running, limits=moved(ran, obstacle, **changes))
+            self._refresh()
 
     def let_go(self, owner: Hashable) -> None:
         """The owner has put its targets where it wants them: they stay."""
@@ -239,6 +261,8 @@ class ControlLoop:
 
     def _compiled(self, controller: Controller, program: Program) -> None:
         """The compiler has the program of a controller; it may no longer be the one that is asked for."""
+        if not self._stop.is_set():
+            gc.freeze()
         with self._lock:
             if controller.structure() == self._wanted.structure():
                 self._running, self._is_behind = self._wanted, False
@@ -281,21 +305,21 @@ class ControlLoop:
         if job.program is not self._program:
             self._program, self._state = job.program, (*self._state[:2], job.program.cold)
         state, status, errors = job.program.run(job.numbers, self._state, self._push.now())
-        before, code = self._snapshot, int(status)
+        before, codes = self._snapshot, np.asarray(status)
         q, velocity = np.asarray(state[0]), np.asarray(state[1])
-        usable = bool(np.isfinite(q).all()) and code != Status.NUMERICAL_ERROR
-        if usable:
+        usable = np.isfinite(q).all(-1, keepdims=True) & (codes != Status.NUMERICAL_ERROR)[..., None]
+        if usable.all():
             self._state = state
         else:
-            q, velocity = before.q, np.zeros_like(velocity)
-            self._state = (self._state[0], jnp.asarray(velocity), job.program.cold)
+            q, velocity = np.where(usable, q, before.q), np.where(usable, velocity, 0.0)
+            self._state = (jnp.asarray(q), jnp.asarray(velocity), job.program.cold)
         self._show(
             time=before.time + self.dt,
             q=q,
             velocity=velocity,
-            status=code,
+            status=int(codes.max()),
             errors={name: np.asarray(error) for name, error in errors.items()},
-            failures=before.failures + (not usable),
+            failures=before.failures + int(np.sum(~usable)),
             recording=self._recorder.add(q),
         )
 
@@ -319,7 +343,14 @@ class ControlLoop:
         """Targets of these tasks become where the robot is."""
         if not names:
             return
-        here = targets_here(self.robot, self._snapshot.q, self._running.tasks, names)
+        q, tasks = self._snapshot.q, self._running.tasks
+        each = [targets_here(self.robot, row, tasks, names) for row in np.atleast_2d(q)]
+        here = jax.tree.map(lambda *rows: np.stack(rows), *each) if self._batched else each[0]
         with self._lock:
             self._leases = {name: lease for name, lease in self._leases.items() if name not in names}
             self._retarget(here)
+
+
+def _aim(task: Any, target: Any) -> Any:
+    """The task with another target."""
+    return task.replace(target=target)

@@ -13,6 +13,7 @@ from ..._errors import warn
 from ...robot import Robot
 from .._parts import robot_parts
 from ._default import default_session
+from ._export import write_page
 from ._needs import import_viser
 from ._page import LiveView, serve_session
 from ._playback import Player, read_motion
@@ -83,6 +84,16 @@ def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, por
     """
     motion = read_motion(path, robot)
     return Player(robot, motion, look=source_look(source), host=host, port=port, title=path.name)
+
+
+def write_motion(path: Path, robot: Robot, source: RobotSource, page: Path) -> None:
+    """Writes a page that plays a motion without a server.
+
+    Raises:
+        FileNotFoundError, ValueError: as in ``read_motion``.
+        OSError: the page cannot be written.
+    """
+    write_page(robot, read_motion(path, robot), page, look=source_look(source), title=path.stem)
 
 
 def open_session(path: Path, *, host: str, port: int) -> LiveView:

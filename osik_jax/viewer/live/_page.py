@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 import time
 import webbrowser
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -25,9 +24,10 @@ from ._desk import Desk
 from ._gizmos import Gizmos, Pose, gizmo_target
 from ._loop import ControlLoop
 from ._marks import BalanceMarks
+from ._obstacle_nodes import ObstacleNodes
 from ._panel import Panel
 from ._robot_nodes import RobotNodes
-from ._server import close_server, open_server
+from ._server import Served
 from ._session import Session
 from ._source import RobotSource
 from ._surroundings import add_surroundings
@@ -41,7 +41,7 @@ _WORDS = 6
 """The panel's figures change with every so many pictures."""
 
 
-class LiveView:
+class LiveView(Served):
     """A page that runs a session; ``serve`` makes one.
 
     Attributes:
@@ -50,11 +50,10 @@ class LiveView:
 
     def __init__(self, session: Session, *, look: Look | None, host: str, port: int, title: str) -> None:
         """Starts the server and the loop."""
-        self._server = open_server(host, port, title)
-        self.url = f"http://{host}:{self._server.get_port()}"
-        self._desk = Desk(session)
+        super().__init__(host, port, title)
         robot = session.robot
         shapes, self._data = robot_parts(robot, look=look), mujoco.MjData(robot.mj_model)
+        self._desk = Desk(session, shapes)
         self._kinematics(session.q)
         seen, floor = shapes.corners(self._data), floor_height(robot, shapes, [self._data])
         size = float(np.linalg.norm(np.ptp(seen, axis=0)))
@@ -62,11 +61,11 @@ class LiveView:
         self._robot = RobotNodes(self._server.scene, robot, look=look)
         self._marks = BalanceMarks(self._server.scene, floor, size) if robot.floating_base else None
         self._gizmos = Gizmos(self._server.scene, size, self._drag)
-        self._panel = Panel(self._server, self._desk, size)
+        self._obstacles = ObstacleNodes(self._server.scene, size, self._place)
+        self._panel = Panel(self._server, self._desk, seen)
         self._polygon: SupportPolygon | None = None
+        self._drawn: Session | None = None
         self._server.on_client_disconnect(self._gone)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="osik-page", daemon=True)
         self._desk.loop.start()
         self._thread.start()
 
@@ -89,24 +88,8 @@ class LiveView:
         """
         self.loop.aim(task, target, timeout=timeout)
 
-    def wait(self) -> None:
-        """Blocks until ``stop`` is called from elsewhere, or Ctrl-C."""
-        while not self._end.wait(0.5):
-            pass
-
-    def stop(self) -> None:
-        """Ends the loop and the server."""
-        self._end.set()
-        if self._thread is not threading.current_thread():
-            self._thread.join(timeout=2.0)
+    def _close(self) -> None:
         self.loop.stop()
-        close_server(self._server)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def _run(self) -> None:
         """The thread that draws."""
@@ -122,17 +105,23 @@ class LiveView:
     def _draw(self) -> None:
         """The robot as it is now."""
         session = self._desk.session
-        on = session.active_tasks
         self._kinematics(self.loop.snapshot.q)
         with self._server.atomic():
             self._robot.place(self._data)
-            self._gizmos.show(on)
+            if session is not self._drawn or self._gizmos.held:
+                self._draw_session(session)
+            self._obstacles.show(self._desk.obstacles)
             if self._marks is not None:
-                polygon = _polygon(on)
-                if polygon is not self._polygon:
-                    self._marks.show_polygon(polygon)
-                    self._polygon = polygon
                 self._marks.place(robot_com(session.robot, self._data))
+
+    def _draw_session(self, session: Session) -> None:
+        """What changes only with the session."""
+        on, self._drawn = session.active_tasks, session
+        self._gizmos.show(on)
+        polygon = _polygon(on)
+        if self._marks is not None and polygon is not self._polygon:
+            self._marks.show_polygon(polygon)
+            self._polygon = polygon
 
     def _kinematics(self, q: Float[np.ndarray, " nq"]) -> None:
         robot = self._desk.session.robot
@@ -150,9 +139,14 @@ class LiveView:
         else:
             self.loop.release(visitor)
 
+    def _place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
+        """A visitor drags an obstacle."""
+        self._desk.move_obstacle(obstacle, position=position, rotation=rotation)
+
     def _gone(self, client: ClientHandle) -> None:
         """A visitor has closed the page."""
         self._gizmos.drop(client.client_id)
+        self._obstacles.drop(client.client_id)
         self.loop.release(client.client_id)
 
 

@@ -7,21 +7,26 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
+from ...limits import CollisionAvoidanceLimit, Limit
 from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
+from ._obstacles import SLOTS, keeps_off_world
 from ._readout import error_table, joint_table, state_text, timing_text
 from ._session import session_from_json
 
 if TYPE_CHECKING:
-    from viser import GuiEvent, ViserServer
+    from viser import GuiDropdownHandle, GuiEvent, ViserServer
 
 _LIMIT_WORDS = {
     "ConfigurationLimit": "joint ranges",
     "VelocityLimit": "joint speeds",
     "AccelerationLimit": "joint accelerations",
-    "CollisionAvoidanceLimit": "collisions",
 }
+_ITSELF, _WORLD = "collisions with itself", "collisions with obstacles"
+_PLURALS = {"ball": "balls", "box": "boxes"}
+_NONE: str = "none"
 _WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
 _PUSH = 0.6
 """Speed of a push, in sizes of the robot a second."""
@@ -30,9 +35,10 @@ _PUSH = 0.6
 class Panel:
     """Everything that is no scene."""
 
-    def __init__(self, server: ViserServer, desk: Desk, size: float) -> None:
-        """Adds the panel to the page of a robot of this size [m]."""
-        self._server, self._desk, self._size = server, desk, size
+    def __init__(self, server: ViserServer, desk: Desk, seen: Float[np.ndarray, "n 3"]) -> None:
+        """Adds the panel to the page of a robot that is where these points are [m]."""
+        self._server, self._desk, self._seen = server, desk, seen
+        self._size = float(np.linalg.norm(np.ptp(seen, axis=0)))
         gui = server.gui
         self._state = gui.add_markdown("")
         self._timing = gui.add_markdown("")
@@ -42,9 +48,12 @@ class Panel:
             self._add_tasks()
         with tabs.add_tab("Limits"):
             self._add_limits()
+        with tabs.add_tab("Obstacles"):
+            self._add_obstacles()
         with tabs.add_tab("Session"):
             self._add_session()
         self.refill()
+        self._fill_obstacles(None)
 
     def tell(self) -> None:
         """Shows what the loop says now."""
@@ -72,8 +81,7 @@ class Panel:
         title = next((t for t, make in SCHEMES.items() if type(make()) is type(session.scheme)), None)
         if title is not None:
             self._scheme.value = title
-        for number, box in self._limit_boxes.items():
-            box.value = number not in session.limits_off
+        self._fill_limits()
         self._show_chosen()
 
     def _add_buttons(self) -> None:
@@ -123,17 +131,96 @@ class Panel:
         self._errors = gui.add_markdown("")
 
     def _add_limits(self) -> None:
-        gui, session = self._server.gui, self._desk.session
-        self._limit_boxes: dict[int, Any] = {}
-        for number, limit in enumerate(session.limits):
-            kind = type(limit).__name__
-            box = gui.add_checkbox(_LIMIT_WORDS.get(kind, kind), initial_value=True)
-            box.on_update(self._guarded(lambda event, n=number: self._desk.switch_limit(n, event.target.value)))
-            self._limit_boxes[number] = box
+        gui = self._server.gui
+        self._limits = gui.add_folder("On and off")
+        self._limit_boxes: list[Any] = []
         speed = gui.add_slider("Speeds, share", 0.05, 1.0, step=0.05, initial_value=1.0)
         speed.on_update(self._guarded(lambda event: self._desk.slow_down(event.target.value)))
         gui.add_markdown("**Nearest to a limit**")
         self._joints = gui.add_markdown("")
+
+    def _fill_limits(self) -> None:
+        """A switch for each limit, and one for collisions of the robot with itself where there is none yet."""
+        session = self._desk.session
+        for box in self._limit_boxes:
+            box.remove()
+        self._limit_boxes.clear()
+        with self._limits:
+            for number, limit in enumerate(session.limits):
+                self._switch_limit(_words(limit), number not in session.limits_off, number)
+            if _ITSELF not in map(_words, session.limits):
+                self._switch_limit(_ITSELF, False, None)
+
+    def _switch_limit(self, words: str, on: bool, number: int | None) -> None:
+        """A switch for a limit; for None, for one that is added when it is switched on."""
+
+        def switch(event: GuiEvent[Any]) -> None:
+            if number is not None:
+                self._desk.switch_limit(number, event.target.value)
+            elif event.target.value:
+                event.target.value = False
+                self._desk.avoid_itself()
+                self._fill_limits()
+
+        box = self._server.gui.add_checkbox(words, initial_value=on)
+        box.on_update(self._guarded(switch))
+        self._limit_boxes.append(box)
+
+    def _add_obstacles(self) -> None:
+        gui = self._server.gui
+        most = " and ".join(f"{count} {_PLURALS[kind]}" for kind, count in SLOTS.items())
+        gui.add_markdown(f"The robot keeps off what is here: up to {most}. The first is compiled for.")
+        kinds = gui.add_button_group("Add", tuple(SLOTS))
+        kinds.on_click(self._guarded(lambda event: self._add_obstacle(event.target.value)))
+        nothing: list[str] = [_NONE]
+        self._obstacle: GuiDropdownHandle[str] = gui.add_dropdown("Chosen", nothing)
+        self._obstacle.on_update(lambda _: self._show_obstacle())
+        most_edge = float(np.round(self._size, 2))
+        self._edges = [
+            gui.add_slider(f"Size {axis} [m]", 0.01, most_edge, step=0.005, initial_value=0.01) for axis in "xyz"
+        ]
+        for edge in self._edges:
+            edge.on_update(self._guarded(lambda _: self._resize()))
+        remove = gui.add_button("Remove the one chosen")
+        remove.on_click(self._guarded(lambda _: self._remove_obstacle()))
+        self._show_obstacle()
+
+    def _add_obstacle(self, kind: str) -> None:
+        """In front of the robot, at half its height."""
+        low, high = self._seen.min(0), self._seen.max(0)
+        place = 0.5 * (low + high) + np.array([0.5 * (high - low)[0] + 0.2 * self._size, 0.0, 0.0])
+        count = len(self._desk.obstacles)
+        place[1] += 0.2 * self._size * ((count + 1) // 2) * (-1.0) ** count
+        name = self._desk.add_obstacle(kind, place, self._size)
+        self._fill_limits()
+        self._fill_obstacles(name)
+
+    def _remove_obstacle(self) -> None:
+        if self._obstacle.value in self._desk.obstacles:
+            self._desk.remove_obstacle(self._obstacle.value)
+            self._fill_obstacles(None)
+
+    def _fill_obstacles(self, chosen: str | None) -> None:
+        """The names to choose from."""
+        names = tuple(self._desk.obstacles) or (_NONE,)
+        self._obstacle.options = names
+        self._obstacle.value = chosen if chosen is not None and chosen in names else names[-1]
+        self._show_obstacle()
+
+    def _show_obstacle(self) -> None:
+        """The sliders stand where the chosen obstacle has its sizes: of a ball, its diameter."""
+        one = self._desk.obstacles.get(self._obstacle.value)
+        for axis, edge in enumerate(self._edges):
+            edge.visible = one is not None and (one.kind == "box" or axis == 0)
+            edge.label = "Diameter [m]" if one is not None and one.kind == "ball" else f"Size {'xyz'[axis]} [m]"
+            if one is not None and edge.visible:
+                edge.value = float(np.clip(2.0 * one.size[axis], edge.min, edge.max))
+
+    def _resize(self) -> None:
+        one = self._desk.obstacles.get(self._obstacle.value)
+        if one is not None:
+            half = [0.5 * edge.value if edge.visible else 0.0 for edge in self._edges]
+            self._desk.move_obstacle(one.name, size=np.array(half))
 
     def _add_session(self) -> None:
         gui = self._server.gui
@@ -153,6 +240,7 @@ class Panel:
     def _load(self, content: bytes) -> None:
         self._desk.load(session_from_json(content.decode("utf-8", errors="replace"), "the file"))
         self.refill()
+        self._fill_obstacles(None)
 
     def _send_motion(self, event: Any) -> None:
         """What was recorded, in the layout of ``osik demo``."""
@@ -211,3 +299,11 @@ class Panel:
                 event.client.add_notification("That does not work", " ".join(text.split()), color="red")
 
         return answer
+
+
+def _words(limit: Limit) -> str:
+    """What a switch is called."""
+    if isinstance(limit, CollisionAvoidanceLimit):
+        return _WORLD if keeps_off_world(limit) else _ITSELF
+    kind = type(limit).__name__
+    return _LIMIT_WORDS.get(kind, kind)

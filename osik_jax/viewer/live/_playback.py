@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from ..._tree import FREE
 from ...robot import Robot
 from .._look import Look
 from .._mujoco import mujoco_poses
 from .._outline import floor_height
 from .._parts import robot_parts
-from ._robot_nodes import RobotNodes
-from ._server import close_server, open_server
+from ._robot_nodes import RobotNodes, add_label, side_by_side
+from ._server import Served
 from ._surroundings import add_surroundings
 
 _FRAME = 1.0 / 30.0
 """Time between pictures [s]."""
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-_APART = 1.1
-"""Robots stand so many of their widths apart."""
 _RATE = 200.0
 """Of an array without times [Hz]."""
 
@@ -53,10 +51,11 @@ class Motion:
 
 
 def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
-    """Reads a motion that ``osik demo``, a live view or ``numpy.savez(path, q=rollout.q, time=...)`` wrote.
+    """Reads what ``osik demo``, ``osik retarget``, a view or ``numpy.savez(path, q=rollout.q, time=...)`` wrote.
 
     Runs are arrays (T, nq) called ``q`` or ``q_NAME``; times are ``time_NAME`` or ``time``, one fewer where they are
-    those of the steps; without any, there are 200 configurations a second.
+    those of the steps; without any, there are 200 configurations a second. What ``osik retarget`` writes is ``qpos``
+    with ``joint_names`` and ``fps``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -69,6 +68,8 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
         raise FileNotFoundError(f"no such file: {path}") from None
     except Exception as error:
         raise ValueError(f"{path} is no motion: it is not a .npz file of numpy") from error
+    if {"qpos", "joint_names", "fps"} <= arrays.keys():
+        arrays = _retargeted(arrays, robot, path)
     runs = {n.removeprefix("q").lstrip("_") or "motion": a for n, a in arrays.items() if n == "q" or n[:2] == "q_"}
     if not runs:
         raise ValueError(f"{path} is no motion: it has no array q or q_NAME, only {', '.join(arrays) or 'nothing'}")
@@ -79,6 +80,24 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
                 "numbers: is it the motion of another robot? Say which with --robot"
             )
     return Motion(runs, {name: _times(name, len(q), arrays) for name, q in runs.items()})
+
+
+def _retargeted(arrays: Mapping[str, np.ndarray], robot: Robot, path: Any) -> dict[str, np.ndarray]:
+    """The arrays q and time of a motion whose joints are called by their names."""
+    qpos, names = np.asarray(arrays["qpos"], float), [str(name) for name in arrays["joint_names"]]
+    tree = robot.tree
+    unknown = sorted(set(names) - set(tree.joint_names))
+    if unknown or not robot.floating_base or qpos.ndim != 2 or qpos.shape[1] != 7 + len(names):
+        what = f"it has no joint {unknown[0]}" if unknown else "its base is fixed, or the columns are others"
+        raise ValueError(f"{path} is the motion of another robot ({what}): say which with --robot")
+    free = next(tree.qpos_address[j] for j in tree.independent if tree.joint_types[j] == FREE)
+    q = np.tile(np.asarray(robot.q0, float), (len(qpos), 1))
+    q[:, free : free + 7] = qpos[:, :7]
+    for column, name in enumerate(names, 7):
+        joint = tree.joint_names.index(name)
+        if joint in tree.independent:
+            q[:, tree.qpos_address[joint]] = qpos[:, column]
+    return {"q": q, "time": np.arange(len(q)) / float(arrays["fps"])}
 
 
 def _times(name: str, count: int, arrays: Mapping[str, np.ndarray]) -> Float[np.ndarray, " T"]:
@@ -99,19 +118,15 @@ class Cast:
         """Adds a robot for each run, with the floor and a camera that leaves room for a panel or not."""
         shapes, self._robot, self._motion = robot_parts(robot, look=look), robot, motion
         spans = np.concatenate([_span(robot, shapes, q) for q in motion.runs.values()])
-        width = _APART * float(np.ptp(spans[:, 1]))
-        shifts = [(0.5 * (len(motion.runs) - 1) - k) * width for k in range(len(motion.runs))]
-        seen = np.concatenate([spans + np.array([0.0, shift, 0.0]) for shift in shifts])
+        offsets = side_by_side(spans, len(motion.runs))
+        seen = np.concatenate([spans + offset for offset in offsets])
         first = next(iter(motion.runs.values()))
         add_surroundings(server, seen, floor_height(robot, shapes, mujoco_poses(robot, first[:1])), panel=panel)
         self._nodes: dict[str, RobotNodes] = {}
-        for (name, _), shift in zip(motion.runs.items(), shifts, strict=True):
-            offset = np.array([0.0, shift, 0.0])
+        for name, offset in zip(motion.runs, offsets, strict=True):
             self._nodes[name] = RobotNodes(server.scene, robot, look=look, name=f"robot {name}", offset=offset)
             if len(motion.runs) > 1:
-                at = spans[:, :2].mean(0) + np.array([0.0, shift])
-                height = spans[:, 2].max() + 0.05 * width
-                server.scene.add_label(f"/label {name}", name.replace("_", " "), position=(at[0], at[1], height))
+                add_label(server.scene, name, spans + offset)
 
     def show(self, now: float) -> None:
         """Moves all robots to a time [s]."""
@@ -125,7 +140,7 @@ def _span(robot: Robot, shapes: Any, q: Float[np.ndarray, "T nq"]) -> Float[np.n
     return np.concatenate([shapes.corners(data) for data in mujoco_poses(robot, chosen)])
 
 
-class Player:
+class Player(Served):
     """A page that plays a motion, over and over.
 
     Attributes:
@@ -134,33 +149,13 @@ class Player:
 
     def __init__(self, robot: Robot, motion: Motion, *, look: Look | None, host: str, port: int, title: str) -> None:
         """Starts the server and plays."""
-        self._server = open_server(host, port, title)
-        self.url = f"http://{host}:{self._server.get_port()}"
+        super().__init__(host, port, title)
         self._cast, self._motion = Cast(self._server, robot, motion, look, panel=True), motion
         gui, length = self._server.gui, motion.duration
         self._time = gui.add_slider("Time [s]", 0.0, max(length, 1e-3), step=1e-3, initial_value=0.0)
         self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
         self._play = gui.add_checkbox("Play", initial_value=True)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="osik-player", daemon=True)
         self._thread.start()
-
-    def wait(self) -> None:
-        """Blocks until ``stop`` is called from elsewhere, or Ctrl-C."""
-        while not self._end.wait(0.5):
-            pass
-
-    def stop(self) -> None:
-        """Ends the player and the server."""
-        self._end.set()
-        self._thread.join(timeout=2.0)
-        close_server(self._server)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def _run(self) -> None:
         before = time.perf_counter()

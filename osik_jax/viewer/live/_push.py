@@ -15,12 +15,12 @@ _OVER = 1e-4
 class Push:
     """A velocity beside that of the controller."""
 
-    def __init__(self, nv: int, dt: float) -> None:
-        """Takes the number of dofs and the period [s]."""
-        self._share, self._velocity = float(np.exp(-dt / _FADES)), np.zeros(nv)
-        self._none = jnp.zeros(nv)
+    def __init__(self, still: Float[np.ndarray, "*batch nv"], dt: float) -> None:
+        """Takes velocities of 0 and the period [s]."""
+        self._share, self._velocity = float(np.exp(-dt / _FADES)), still.copy()
+        self._none = jnp.asarray(still)
 
-    def start(self, velocity: Float[np.ndarray, " nv"]) -> None:
+    def start(self, velocity: Float[np.ndarray, "*batch nv"]) -> None:
         """Pushes from now on."""
         self._velocity = np.asarray(velocity, float).copy()
 
@@ -28,7 +28,7 @@ class Push:
         """Pushes no longer."""
         self._velocity[:] = 0.0
 
-    def now(self) -> Float[Array, " nv"]:
+    def now(self) -> Float[Array, "*batch nv"]:
         """The velocity in this step; the next one's is weaker."""
         if not self._velocity.any():
             return self._none

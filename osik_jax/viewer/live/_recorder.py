@@ -21,12 +21,12 @@ class Recorder:
         self._dt, self._lock = dt, threading.Lock()
         self._rows: list[np.ndarray] | None = None
 
-    def start(self, q: Float[np.ndarray, " nq"]) -> None:
+    def start(self, q: Float[np.ndarray, "*batch nq"]) -> None:
         """Starts with a configuration, and forgets what was kept."""
         with self._lock:
             self._rows = [q.copy()]
 
-    def add(self, q: Float[np.ndarray, " nq"]) -> float | None:
+    def add(self, q: Float[np.ndarray, "*batch nq"]) -> float | None:
         """Keeps another one; returns how long the recording is [s], None where nothing is recorded."""
         with self._lock:
             if self._rows is None:

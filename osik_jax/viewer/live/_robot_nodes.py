@@ -17,6 +17,8 @@ from ._surfaces import Surface, part_triangles
 if TYPE_CHECKING:
     from viser import FrameHandle, SceneApi
 
+_APART = 1.1
+"""Robots stand so many of their widths apart."""
 _MOVED = 1e-7
 """Nodes that move less are left alone [m, or of a quaternion]."""
 
@@ -61,19 +63,31 @@ class RobotNodes:
                     color=color[:3],
                     opacity=opacity if color[3] >= 255 else color[3] / 255.0,
                 )
-        self._shown = {body: np.r_[data.xpos[body], data.xquat[body]] for body in self._frames}
+        self._bodies = np.array(list(self._frames), int)
+        self._position, self._quaternion = data.xpos[self._bodies], data.xquat[self._bodies]
 
     def place(self, data: mujoco.MjData) -> None:
         """Moves the bodies to where MuJoCo's kinematics has them."""
-        for body, frame in self._frames.items():
-            now = np.r_[data.xpos[body], data.xquat[body]]
-            moved = np.abs(now - self._shown[body]) > _MOVED
-            if moved[:3].any():
-                frame.position = now[:3]
-            if moved[3:].any():
-                frame.wxyz = now[3:]
-            if moved.any():
-                self._shown[body] = now
+        position, quaternion, frames = data.xpos[self._bodies], data.xquat[self._bodies], tuple(self._frames.values())
+        for k in np.flatnonzero(np.abs(position - self._position).max(1) > _MOVED):
+            frames[k].position = self._position[k] = position[k]
+        for k in np.flatnonzero(np.abs(quaternion - self._quaternion).max(1) > _MOVED):
+            frames[k].wxyz = self._quaternion[k] = quaternion[k]
+
+
+def side_by_side(span: Float[np.ndarray, "points 3"], count: int, least: float = 0.0) -> list[Float[np.ndarray, "3"]]:
+    """By how much to move each of so many robots [m], whose points these are: from left to right in the page.
+
+    ``least`` is the least distance of neighbours [m].
+    """
+    width = max(_APART * float(np.ptp(span[:, 1])), least)
+    return [np.array([0.0, (k - 0.5 * (count - 1)) * width, 0.0]) for k in range(count)]
+
+
+def add_label(scene: SceneApi, name: str, span: Float[np.ndarray, "points 3"]) -> None:
+    """A robot's name above its points [m]."""
+    at, height = span[:, :2].mean(0), span[:, 2].max() + 0.05 * float(np.ptp(span[:, 1]))
+    scene.add_label(f"/label {name}", name.replace("_", " "), position=(at[0], at[1], height))
 
 
 def _by_body(shapes: RobotParts, data: mujoco.MjData) -> dict[int, dict[tuple[int, int, int, int], Surface]]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import socket
-from typing import TYPE_CHECKING
+import threading
+from typing import TYPE_CHECKING, Self
 
 from ._needs import import_viser
 
@@ -13,6 +14,47 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 _BLUE = (28, 111, 184)
+
+
+class Served:
+    """A page with a thread that keeps it up to date: ``_run``, until ``_end``.
+
+    Attributes:
+        url: address of the page.
+    """
+
+    def __init__(self, host: str, port: int, title: str) -> None:
+        """Starts the server."""
+        self._server = open_server(host, port, title)
+        self.url = f"http://{host}:{self._server.get_port()}"
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="osik-page", daemon=True)
+
+    def wait(self) -> None:
+        """Blocks until ``stop`` is called from elsewhere, or Ctrl-C."""
+        while not self._end.wait(0.5):
+            pass
+
+    def stop(self) -> None:
+        """Ends all that runs, and the server."""
+        self._end.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout=2.0)
+        self._close()
+        close_server(self._server)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        """The thread that draws."""
+        raise NotImplementedError
+
+    def _close(self) -> None:
+        """Ends what runs beside the page."""
 
 
 def open_server(host: str, port: int, title: str) -> ViserServer:

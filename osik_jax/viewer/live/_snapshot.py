@@ -18,9 +18,9 @@ class Snapshot:
 
     Attributes:
         time: simulated since the start or the last reset [s].
-        q: configuration. (nq,)
+        q: configuration. (nq,), of a batch (B, nq), and so the others
         velocity: what the controller asked for. (nv,)
-        status: a ``Status`` code.
+        status: a ``Status`` code; of a batch, the highest.
         errors: of each task. {name: (m,)}
         failures: steps since the start or the last reset whose answer could not be used: the robot stood still.
         ready: whether a compiled step runs; before that, the robot stands still.
@@ -31,8 +31,8 @@ class Snapshot:
     """
 
     time: float
-    q: Float[np.ndarray, " nq"]
-    velocity: Float[np.ndarray, " nv"]
+    q: Float[np.ndarray, "*batch nq"]
+    velocity: Float[np.ndarray, "*batch nv"]
     status: int = int(Status.SOLVED)
     errors: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     failures: int = 0
@@ -48,8 +48,8 @@ class Recording(NamedTuple):
 
     Attributes:
         time: of each configuration [s]. (T,)
-        q: configurations. (T, nq)
+        q: configurations. (T, nq), of a batch (T, B, nq)
     """
 
     time: Float[np.ndarray, " T"]
-    q: Float[np.ndarray, "T nq"]
+    q: Float[np.ndarray, "T *batch nq"]

@@ -80,13 +80,14 @@ class Program:
     cold: Any
 
 
-def compile_step(robot: Robot, controller: Controller, dt: float) -> Program:
+def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | None = None) -> Program:
     """Compiles one step of a controller; takes seconds, in whichever thread calls it.
 
-    The push is a velocity (nv,) that the robot has on top of what the controller asks for.
+    The push is a velocity (nv,) that the robot has on top of what the controller asks for. Of a batch, all numbers,
+    states and pushes have a leading axis.
     """
     tree = jax.tree.structure(controller.parts())
-    numbers, push = controller.numbers(), jnp.zeros(robot.nv, robot.q0.dtype)
+    numbers, lead = controller.numbers(), () if batch is None else (batch,)
 
     def step(numbers: list[Array], state: State, push: Array) -> tuple[State, Array, dict[str, Array]]:
         tasks, scheme, limits = jax.tree.unflatten(tree, numbers)
@@ -96,7 +97,25 @@ def compile_step(robot: Robot, controller: Controller, dt: float) -> Program:
         moved = integrate(robot, q, answer.velocity + push, dt)
         return (moved, answer.velocity, answer.warm_start), answer.status, answer.error
 
-    still = jnp.zeros_like(push)
-    traced = jax.eval_shape(step, numbers, (robot.q0, still, None), push)
+    run = step if batch is None else jax.vmap(step)
+    q, still = jnp.broadcast_to(robot.q0, (*lead, robot.nq)), jnp.zeros((*lead, robot.nv), robot.q0.dtype)
+    traced = jax.eval_shape(run, numbers, (q, still, None), still)
     cold = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), traced[0][2])
-    return Program(jax.jit(step).lower(numbers, (robot.q0, still, cold), push).compile(), cold)
+    return Program(jax.jit(run).lower(numbers, (q, still, cold), still).compile(), cold)
+
+
+def stacked(controllers: Sequence[Controller]) -> Controller:
+    """One controller for a batch: each of its numbers has a leading axis.
+
+    Raises:
+        ValueError: they differ in more than numbers.
+    """
+    first = controllers[0]
+    if any(one.structure() != first.structure() for one in controllers):
+        raise ValueError(
+            "the robots of a batch differ in more than numbers: they need tasks of the same names and kinds"
+        )
+    parts = jax.tree.map(
+        lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *(c.parts() for c in controllers)
+    )
+    return Controller(*parts)

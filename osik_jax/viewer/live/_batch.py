@@ -1,0 +1,260 @@
+"""A page with several robots side by side: one controller whose numbers differ, one vmapped step."""
+
+from __future__ import annotations
+
+import io
+import webbrowser
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._checks import check_setting, check_tasks, checked_limits
+from ..._tree import unknown_name
+from ...limits import ConfigurationLimit, Limit, VelocityLimit
+from ...robot import Robot
+from ...schemes import Scheme, WeightedQP
+from ...tasks import FrameTask, Task
+from .._look import Look
+from .._mujoco import mujoco_poses
+from .._outline import floor_height
+from .._parts import robot_parts
+from ._gizmos import Gizmos, Pose, gizmo_target
+from ._loop import ControlLoop
+from ._readout import error_text, state_text, timing_text
+from ._robot_nodes import RobotNodes, add_label, side_by_side
+from ._server import Served
+from ._step import Controller, stacked
+from ._surroundings import add_surroundings
+
+if TYPE_CHECKING:
+    from viser import ClientHandle, GuiEvent
+
+_FRAME = 1.0 / 30.0
+"""Time between pictures [s]."""
+_APART = 0.6
+"""Robots stand so many of their sizes apart at least: they move."""
+_WORDS = 6
+"""The panel's figures change with every so many pictures."""
+
+
+class BatchView(Served):
+    """A page that runs a batch of robots; ``serve_batch`` makes one.
+
+    Attributes:
+        url: address of the page.
+        names: of the robots, in the order of the batch.
+        loop: runs the controller; its numbers, targets and configurations have a leading axis.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        controllers: Mapping[str, Controller],
+        q0: Float[np.ndarray, "B nq"],
+        *,
+        dt: float,
+        look: Look | None,
+        host: str,
+        port: int,
+        title: str,
+    ) -> None:
+        """Starts the server and the loop."""
+        self.names, self._robot = tuple(controllers), robot
+        self.loop = ControlLoop(robot, stacked(tuple(controllers.values())), dt=dt, q0=jnp.asarray(q0))
+        super().__init__(host, port, title)
+        shapes = robot_parts(robot, look=look)
+        span = np.concatenate([shapes.corners(data) for data in mujoco_poses(robot, q0)])
+        size = float(np.linalg.norm(np.ptp(span, axis=0)))
+        offsets = side_by_side(span, len(q0), least=_APART * size)
+        seen = np.concatenate([span + offset for offset in offsets])
+        add_surroundings(self._server, seen, floor_height(robot, shapes, mujoco_poses(robot, q0)))
+        self._nodes, self._gizmos = [], []
+        for lane, (name, offset) in enumerate(zip(self.names, offsets, strict=True)):
+            node = f"robot {name}"
+            self._nodes.append(RobotNodes(self._server.scene, robot, look=look, name=node, offset=offset))
+            add_label(self._server.scene, name, span + offset)
+            drag = self._dragging(lane)
+            self._gizmos.append(Gizmos(self._server.scene, size, drag, below=f"/{node}"))
+        self._told: tuple[Any, list[dict[str, Task]]] = (None, [])
+        self._add_panel()
+        self._server.on_client_disconnect(self._gone)
+        self.loop.start()
+        self._thread.start()
+
+    def aim(self, robot: str, task: str, target: Any) -> None:
+        """Gives a task of one of the robots another target.
+
+        Raises:
+            KeyError: no such robot or task.
+            TypeError, ValueError: no such target.
+        """
+        if robot not in self.names:
+            raise unknown_name("robot", robot, self.names)
+        lane = self.names.index(robot)
+        if task not in self._tasks[lane]:
+            raise unknown_name("task", task, tuple(self._tasks[lane]))
+        self._retarget(task, lane, target, together=False, owner=None)
+
+    @property
+    def _tasks(self) -> list[dict[str, Task]]:
+        """Of each robot, its tasks as they are now."""
+        controller = self.loop.controller
+        if self._told[0] is not controller:
+            plain = jax.tree.map(np.asarray, dict(controller.tasks))
+            self._told = controller, [jax.tree.map(lambda a, k=k: a[k], plain) for k in range(len(self.names))]
+        return self._told[1]
+
+    def _add_panel(self) -> None:
+        gui = self._server.gui
+        self._state, self._timing = gui.add_markdown(""), gui.add_markdown("")
+        buttons = gui.add_button_group("", ("Pause", "Reset"))
+        self._together = gui.add_checkbox("A handle moves those of all robots", initial_value=True)
+        record, motion = gui.add_button("Start recording"), gui.add_button("Stop, and download motion.npz")
+        self._errors = gui.add_markdown("")
+
+        @buttons.on_click
+        def _(event: GuiEvent[Any]) -> None:
+            if event.target.value == "Reset":
+                self.loop.reset()
+            else:
+                self.loop.resume() if self.loop.snapshot.paused else self.loop.pause()
+
+        record.on_click(lambda _: self.loop.record())
+        motion.on_click(self._send_motion)
+
+    def _send_motion(self, event: GuiEvent[Any]) -> None:
+        """What was recorded, in the layout of ``osik demo``."""
+        recording, buffer = self.loop.recorded(), io.BytesIO()
+        if len(recording.time) and event.client is not None:
+            runs = {f"q_{name}": recording.q[:, lane] for lane, name in enumerate(self.names)}
+            np.savez_compressed(buffer, allow_pickle=False, time=recording.time, **runs)
+            event.client.send_file_download("motion.npz", buffer.getvalue(), save_immediately=True)
+
+    def _run(self) -> None:
+        count = 0
+        while not self._end.wait(_FRAME):
+            with self._server.atomic():
+                for lane, data in enumerate(mujoco_poses(self._robot, self.loop.snapshot.q)):
+                    self._nodes[lane].place(data)
+                    self._gizmos[lane].show(self._tasks[lane])
+            if count % _WORDS == 0:
+                self._tell()
+            count += 1
+
+    def _tell(self) -> None:
+        snapshot = self.loop.snapshot
+        texts = (state_text(snapshot), timing_text(snapshot, self.loop.timing), self._table())
+        for handle, text in zip((self._state, self._timing, self._errors), texts, strict=True):
+            if handle.content != text:
+                handle.content = text
+
+    def _table(self) -> str:
+        """The errors of all tasks of all robots."""
+        errors = self.loop.snapshot.errors
+        rows = [
+            f"| {name} | "
+            + " | ".join(error_text(t, errors[name][k] if name in errors else None) for k, t in tasks)
+            + " |"
+            for name in self._tasks[0]
+            if (tasks := [(lane, own[name]) for lane, own in enumerate(self._tasks)])
+        ]
+        return "\n".join([f"| error | {' | '.join(self.names)} |", "|:--|" + "--:|" * len(self.names), *rows])
+
+    def _dragging(self, lane: int) -> Any:
+        """What is called when a handle of one of the robots is dragged."""
+
+        def drag(name: str, pose: Pose, visitor: int, phase: str) -> None:
+            if phase != "end":
+                target = gizmo_target(self._tasks[lane][name], pose)
+                self._retarget(name, lane, target, together=self._together.value, owner=visitor)
+            elif visitor in self._server.get_clients():
+                self.loop.let_go(visitor)
+            else:
+                self.loop.release(visitor)
+
+        return drag
+
+    def _retarget(self, name: str, lane: int, target: Any, *, together: bool, owner: int | None) -> None:
+        """Another target of one robot; the others', with it, by the same displacement and turn."""
+        own: Any = self._tasks[lane][name]
+        new = jax.tree.map(np.asarray, own.replace(target=target).target)
+        others: list[Any] = [tasks[name] for tasks in self._tasks]
+        each = [_displaced(task, own, new) if together else task.target for task in others]
+        each[lane] = new
+        self.loop.aim(name, jax.tree.map(lambda *rows: np.stack(rows), *each), owner=owner)
+
+    def _gone(self, client: ClientHandle) -> None:
+        """A visitor has closed the page: all robots stop whose handles he led."""
+        for gizmos in self._gizmos:
+            gizmos.drop(client.client_id)
+        self.loop.release(client.client_id)
+
+    def _close(self) -> None:
+        self.loop.stop()
+
+
+def _displaced(task: Any, led: Any, new: Any) -> Any:
+    """The target of a task, moved and turned as the led one's was."""
+    if not isinstance(task, FrameTask):
+        return np.asarray(task.target) + new - np.asarray(led.target)
+    (position, rotation), (old, turned) = task.target, led.target
+    return position + new[0] - old, new[1] @ turned.T @ rotation
+
+
+def serve_batch(
+    robot: Robot,
+    tasks: Mapping[str, Mapping[str, Task]],
+    *,
+    scheme: Scheme | None = None,
+    limits: Sequence[Limit] | None = None,
+    dt: float = 0.005,
+    q0: Float[Array, "B nq"] | Float[Array, " nq"] | None = None,
+    look: Look | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open_browser: bool = False,
+) -> BatchView:
+    """Shows several robots side by side, each with its own numbers of one controller, in one vmapped step.
+
+    Args:
+        robot: the robot that all of them are.
+        tasks: of each robot by its name, such as ``{"gain 5": {"hand": ...}, "gain 50": {"hand": ...}}``. They
+            have tasks of the same names and kinds, whose numbers (targets, weights, gains) differ.
+        scheme: as in ``osik_jax.solve``, for all.
+        limits: as in ``osik_jax.solve``, for all.
+        dt: time of a step, and period of the loop [s].
+        q0: where each of them starts, or all; default: ``robot.q0``. (B, nq) or (nq,)
+        look: what the robot's URDF shows, from ``read_look``; default: the model's own shapes.
+        host: address to listen at; 127.0.0.1 is this machine alone.
+        port: 0 for any that is free.
+        open_browser: opens the page in a browser.
+
+    Returns:
+        The view.
+
+    Raises:
+        ImportError: viser is not installed (the extra ``viewer``).
+        OSError: the port is in use.
+        TypeError, ValueError: as in ``osik_jax.solve``; no robots, or tasks that differ in more than numbers.
+    """
+    if not tasks:
+        raise ValueError("there are no robots: tasks is empty")
+    scheme = WeightedQP() if scheme is None else scheme
+    given = (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else tuple(limits)
+    check_setting("serve_batch(robot, tasks)", robot, scheme, dt)
+    checked_limits(robot, given)
+    for own in tasks.values():
+        check_tasks(own, robot)
+    start = np.asarray(robot.q0 if q0 is None else q0)
+    if start.shape not in ((robot.nq,), (len(tasks), robot.nq)):
+        raise ValueError(f"q0 has shape {start.shape}, expected ({robot.nq},) or ({len(tasks)}, {robot.nq})")
+    controllers = {name: Controller(dict(own), scheme, given) for name, own in tasks.items()}
+    q0s = np.broadcast_to(start, (len(tasks), robot.nq)).copy()
+    view = BatchView(robot, controllers, q0s, dt=dt, look=look, host=host, port=port, title="osik-jax")
+    if open_browser:
+        webbrowser.open(view.url)
+    return view

@@ -1,0 +1,154 @@
+"""Obstacles of a page, and the limits that keep a robot off them and off itself.
+
+Obstacles are the world's shapes of the session's ``CollisionAvoidanceLimit``s. The limit that the page adds has room
+for so many of each kind: those that are not in use are far below the floor, so that adding, moving and removing one
+compiles nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ...collision import CollisionShape
+from ...collision._geometry import Kind
+from ...collision._pairs import candidate_pairs, members
+from ...limits import CollisionAvoidanceLimit, Limit
+from ...robot import Robot
+from .._mujoco import mujoco_frame_pose, mujoco_poses
+
+SLOTS = {"ball": 3, "box": 3}
+"""So many of each kind may be in a page."""
+MARGIN = 0.01
+"""Least distance; of a robot with itself, of pairs that are farther apart where the robot starts [m]."""
+PARKED = np.array([0.0, 0.0, -1e3])
+"""Where what is not in use is [m]."""
+_ROWS = {"itself": 12, "world": 12}
+
+
+class Obstacle(NamedTuple):
+    """A shape of the world that can be dragged.
+
+    Attributes:
+        name: in its limit.
+        kind: ball or box.
+        position: of its middle [m]. (3,)
+        rotation: from its axes to the world's. (3, 3)
+        size: of a ball, the radius first; of a box, half its edges [m]. (3,)
+    """
+
+    name: str
+    kind: str
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    size: Float[np.ndarray, "3"]
+
+
+def obstacles_in(limits: Sequence[Limit]) -> dict[str, Obstacle]:
+    """The obstacles in use, by name."""
+    return {one.name: one for limit in limits for one in _slots(limit) if not _is_parked(one)}
+
+
+def free_slot(limits: Sequence[Limit], kind: str) -> str | None:
+    """The name of an obstacle of that kind that is not in use; None where there is none."""
+    parked = (one.name for limit in limits for one in _slots(limit) if one.kind == kind and _is_parked(one))
+    return next(parked, None)
+
+
+def keeps_off_world(limit: Limit) -> bool:
+    """Whether it has obstacles, in use or not."""
+    return any(True for _ in _slots(limit))
+
+
+def _is_parked(one: Obstacle) -> bool:
+    return bool(one.position[2] < 0.5 * PARKED[2])
+
+
+def _slots(limit: Limit) -> Iterator[Obstacle]:
+    """Balls and boxes of the world."""
+    if not isinstance(limit, CollisionAvoidanceLimit):
+        return
+    scene, own = limit.scene, len(limit.scene.geoms)
+    places = tuple(
+        np.asarray(part, float) for part in (limit.shapes.position, limit.shapes.rotation, limit.shapes.size)
+    )
+    for number, name in enumerate(scene.names[own:]):
+        position, rotation, size = (part[number] for part in places)
+        kind = {Kind.SEGMENT: "ball", Kind.BOX: "box"}.get(scene.kinds[own + number])
+        if scene.bodies[own + number] == 0 and kind and not (kind == "ball" and size[1] > 0.0):
+            yield Obstacle(name, kind, position, rotation, size)
+
+
+def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."]) -> tuple[Limit, ...]:
+    """The limits with an obstacle somewhere else, or of another size; as they are where none has it."""
+    return tuple(
+        limit.moved(name, **changes)
+        if isinstance(limit, CollisionAvoidanceLimit) and name in limit.scene.names[len(limit.scene.geoms) :]
+        else limit
+        for limit in limits
+    )
+
+
+def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float) -> CollisionAvoidanceLimit:
+    """Keeps links off obstacles, none of which is in use yet.
+
+    Args:
+        robot: the robot.
+        covers: what links are taken for.
+        size: of the robot [m].
+
+    Raises:
+        ValueError: no link moves.
+    """
+    edge = 0.06 * size
+    slots = {f"ball {number + 1}": CollisionShape.sphere(edge, PARKED) for number in range(SLOTS["ball"])}
+    slots |= {f"box {number + 1}": CollisionShape.box((edge, edge, edge), PARKED) for number in range(SLOTS["box"])}
+    pairs, shapes = list(product(slots, covers)), {**covers, **slots}
+    return CollisionAvoidanceLimit(
+        robot, pairs=pairs, shapes=shapes, minimum_distance=MARGIN, q0_distance=-np.inf, max_pairs=_ROWS["world"]
+    )
+
+
+def own_limit(
+    robot: Robot, covers: Mapping[str, CollisionShape], q: Float[np.ndarray, " nq"]
+) -> CollisionAvoidanceLimit:
+    """Keeps links off each other, but for those that are too near at q: neighbours of neighbours, by construction.
+
+    Raises:
+        ValueError: no two links can meet.
+    """
+    found = members(robot, covers)[len(robot.tree.geom_names) :]
+    model, data = _as_model(robot, covers, q)
+    kept = [
+        (found[i].name, found[j].name)
+        for i, j in candidate_pairs(robot, found, None, ())
+        if mujoco.mj_geomDistance(model, data, i, j, 10.0 * MARGIN, None) > MARGIN
+    ]
+    if not kept:
+        raise ValueError("no two links of this robot are apart where it starts")
+    return CollisionAvoidanceLimit(
+        robot, pairs=kept, shapes=covers, minimum_distance=MARGIN, q0_distance=-np.inf, max_pairs=_ROWS["itself"]
+    )
+
+
+def _as_model(
+    robot: Robot, covers: Mapping[str, CollisionShape], q: Float[np.ndarray, " nq"]
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The shapes as geoms of a model of MuJoCo's, in their order, where they are at q."""
+    spec, posed = mujoco.MjSpec(), next(mujoco_poses(robot, q))
+    for shape in covers.values():
+        position, rotation = mujoco_frame_pose(robot, posed, str(shape.frame))
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, (rotation @ np.asarray(shape.rotation, float)).ravel())
+        kind = mujoco.mjtGeom.mjGEOM_BOX if shape.kind is Kind.BOX else mujoco.mjtGeom.mjGEOM_CAPSULE
+        place = position + rotation @ np.asarray(shape.position, float)
+        spec.worldbody.add_geom(type=kind, size=np.asarray(shape.size, float), pos=place, quat=quaternion)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return model, data

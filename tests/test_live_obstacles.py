@@ -1,0 +1,166 @@
+"""Obstacles of a live view: what links are taken for, obstacles that move, a robot that keeps off them and itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.collision._geometry import Kind
+from osik_jax.viewer._mujoco import model_bodies, mujoco_poses
+from osik_jax.viewer._parts import RobotParts, robot_parts
+from osik_jax.viewer.live._covers import link_covers
+from osik_jax.viewer.live._default import default_session
+from osik_jax.viewer.live._desk import Desk
+from osik_jax.viewer.live._obstacles import MARGIN, _as_model
+from osik_jax.viewer.live._session import session_from_json
+from osik_jax.viewer.live._source import RobotSource
+from osik_jax.viewer.live._surfaces import part_triangles
+
+ARM, NAO = osik.load_robot("arm7"), osik.load_robot("nao")
+
+
+def until(holds: Callable[[], bool], seconds: float = 60.0) -> bool:
+    end = time.monotonic() + seconds
+    while not holds():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+@cache
+def looks(arm: bool) -> tuple[RobotParts, list[np.ndarray]]:
+    """What is drawn of a robot, and the points of each part in its own frame [m]."""
+    shapes = robot_parts(ARM if arm else NAO)
+    return shapes, [part_triangles(part).vertices for part in shapes.parts]
+
+
+def drawn(robot: osik.Robot, q: Any) -> dict[int, np.ndarray]:
+    """Of each of MuJoCo's bodies, the points of what is drawn in the world [m]."""
+    shapes, surfaces = looks(robot is ARM)
+    data, out = next(mujoco_poses(robot, q)), dict[int, list[np.ndarray]]()
+    for points, body, place, turn in zip(surfaces, shapes.bodies, *shapes.poses(data), strict=True):
+        out.setdefault(int(robot.mj_model.body_weldid[body]), []).append(points @ turn.T + place)
+    return {body: np.concatenate(points) for body, points in out.items()}
+
+
+@pytest.fixture(scope="module")
+def desk() -> Iterator[Desk]:
+    """An arm that keeps off itself and has a ball."""
+    desk = Desk(default_session(ARM, source=RobotSource("arm7")), robot_parts(ARM))
+    desk.avoid_itself()
+    assert desk.add_obstacle("ball", np.array([0.0, 2.0, 0.5]), 1.0) == "ball 1"
+    with desk.loop as loop:
+        assert loop.wait_until_ready(300.0)
+        yield desk
+
+
+@pytest.mark.parametrize("robot", [ARM, NAO])
+def test_links_are_within_what_they_are_taken_for(robot: osik.Robot) -> None:
+    covers, data = link_covers(robot, robot_parts(robot)), next(mujoco_poses(robot, np.asarray(robot.q0)))
+    points, bodies = drawn(robot, robot.q0), dict(zip(robot.tree.body_names, model_bodies(robot), strict=True))
+    assert len(covers) >= 6
+    for name, shape in covers.items():
+        body = bodies[str(shape.frame)]
+        assert name == f"{shape.frame}_shape"
+        own = (points[body] - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+        local, size = (own - np.asarray(shape.position)) @ np.asarray(shape.rotation), np.asarray(shape.size)
+        if shape.kind is Kind.BOX:
+            assert np.all(np.abs(local) <= size * (1.0 + 1e-9) + 1e-9)
+        else:
+            local[:, 2] -= np.clip(local[:, 2], -size[1], size[1])
+            assert np.linalg.norm(local, axis=1).max() <= size[0] * (1.0 + 1e-6) + 1e-9
+
+
+def hand(desk: Desk) -> np.ndarray:
+    """Where the hand is asked to be [m]."""
+    task: Any = desk.session.tasks["hand"]
+    return np.asarray(task.target[0])
+
+
+def gap(desk: Desk, q: np.ndarray) -> float:
+    """Between what is drawn of the links that move and the ball [m]."""
+    ball = desk.obstacles["ball 1"]
+    links = np.concatenate([points for body, points in drawn(ARM, q).items() if body])
+    return float(np.linalg.norm(links - ball.position, axis=1).min() - ball.size[0])
+
+
+def test_a_ball_on_the_way_is_kept_off_and_pushes_the_robot(desk: Desk) -> None:
+    home = osik.forward_kinematics(ARM, ARM.q0).frame_pose(ARM, "hand")
+    program, ahead = desk.loop._job, np.asarray(home[0]) + np.array([-0.1, 0.12, -0.1])
+    desk.move_obstacle("ball 1", position=ahead, size=np.array([0.05, 0.0, 0.0]))
+    desk.loop.record()
+    desk.loop.aim("hand", (ahead, home[1]))
+    assert until(lambda: (desk.loop.snapshot.recording or 0.0) > 1.5)
+    assert until(lambda: float(np.abs(desk.loop.snapshot.velocity).max()) < 0.02)
+    q = desk.loop.recorded().q
+    assert min(gap(desk, row) for row in q[::5]) > MARGIN - 1e-3
+    assert gap(desk, q[-1]) < 0.05  # it went as near as it may
+    desk.loop.record()
+    for step in range(40):  # dragged into the robot, at 3 cm a second
+        desk.move_obstacle("ball 1", position=ahead + 0.001 * step * np.array([0.0, -1.0, 0.0]))
+        time.sleep(0.033)
+    assert gap(desk, desk.loop.recorded().q[-1]) > 0.0
+    assert desk.loop.snapshot.failures == 0
+    assert program is not None and desk.loop._job is not None and desk.loop._job.program is program.program
+
+
+def test_a_hand_sent_into_its_own_arm(desk: Desk) -> None:
+    desk.move_obstacle("ball 1", position=np.array([0.0, 2.0, 0.5]))
+    home = osik.forward_kinematics(ARM, ARM.q0)
+    covers, limit = link_covers(ARM, robot_parts(ARM)), desk.session.limits[2]
+    assert isinstance(limit, osik.CollisionAvoidanceLimit)
+    desk.loop.record()
+    desk.loop.aim(
+        "hand", (home.frame_pose(ARM, "link0")[0] + np.array([0.0, 0.0, 0.2]), home.frame_pose(ARM, "hand")[1])
+    )
+    assert until(lambda: (desk.loop.snapshot.recording or 0.0) > 2.0)
+    names, q = list(covers), desk.loop.recorded().q
+    nearest = np.inf
+    for row in q[::10]:
+        model, data = _as_model(ARM, covers, row)
+        each = [mujoco.mj_geomDistance(model, data, names.index(a), names.index(b), 1.0, None) for a, b in limit.pairs]
+        nearest = min(nearest, *each)
+    assert 3.0 * MARGIN > nearest > MARGIN - 1e-3  # it came near, and no nearer
+
+
+def test_adding_moving_and_removing_compiles_nothing(desk: Desk) -> None:
+    program = desk.loop._job
+    assert desk.add_obstacle("box", np.array([0.0, 2.0, 0.5]), 1.0) == "box 1"
+    desk.move_obstacle("box 1", size=np.array([0.5, 0.1, 0.2]))
+    assert list(desk.obstacles) == ["ball 1", "box 1"]
+    np.testing.assert_array_equal(desk.obstacles["box 1"].size, [0.5, 0.1, 0.2])
+    for _ in range(2):
+        desk.add_obstacle("box", np.array([0.0, 3.0, 0.5]), 1.0)
+    with pytest.raises(ValueError, match="there are 3 of these already"):
+        desk.add_obstacle("box", np.zeros(3), 1.0)
+    for name in ("box 1", "box 2", "box 3"):
+        desk.remove_obstacle(name)
+    assert list(desk.obstacles) == ["ball 1"]
+    assert program is not None and desk.loop._job is not None and desk.loop._job.program is program.program
+    off = dataclasses.replace(desk.session, limits_off=frozenset({3})).controller()
+    assert len(off.limits) == 3 and off.structure() != desk.session.controller().structure()
+
+
+def test_obstacles_are_kept_by_sessions_and_lines_of_python(desk: Desk) -> None:
+    now = desk.session
+    again = session_from_json(now.to_json())
+    for one, other in zip(now.limits, again.limits, strict=True):
+        (leaves, tree), (others, same) = jax.tree.flatten(one), jax.tree.flatten(other)
+        assert tree == same and all(np.array_equal(a, b) for a, b in zip(leaves, others, strict=True))
+    names: dict[str, Any] = {}
+    exec(now.to_python().split("solution =")[0], names)
+    for one, other in zip(now.active_limits, names["limits"], strict=True):
+        (leaves, tree), (others, same) = jax.tree.flatten(one), jax.tree.flatten(other)
+        assert tree == same
+        for a, b in zip(leaves, others, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-14)
