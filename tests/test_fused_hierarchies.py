@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hierarchy_families import inequality_levels
 
-from osik_jax.solvers import Level, Tolerances, _cuda, solve_hqp
+from osik_jax.solvers import Level, Tolerances, _backends, solve_hqp
 from osik_jax.solvers._damping import one_each
 from osik_jax.solvers.hqp import _cascade, _fused, _kernel
 from osik_jax.solvers.hqp._kernel import Shape
@@ -117,23 +117,24 @@ def test_when_the_kernel_is_asked(monkeypatch):
         return _cascade.descend_all(layout, cap, stack, tolerances, warm)
 
     monkeypatch.setattr(_kernel, "solve", solve)
-    monkeypatch.setattr(_cuda, "find_spec", lambda name: name)
+    monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
 
-    def trace(n=3):
+    def trace(n=3, backend="auto"):
         _fused.descender.cache_clear()
         jax.clear_caches()
         levels = [Level(np.ones((1, n)), [-1.0], [1.0]), Level(np.ones((2, n)), [1.0, 2.0])]
-        jax.jit(lambda low: solve_hqp(levels, low, -low).x).lower(-np.ones(n))
+        jax.jit(lambda low: solve_hqp(levels, low, -low, backend=backend).x).lower(-np.ones(n))
 
     trace()
     assert asked == []  # no GPU
-    monkeypatch.setattr(_cuda, "available", lambda: True)
+    monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
     trace()
     assert asked[-1] == Shape(3, 2, (1, 2, 0), (True, False, False), (0,), (0,))
     count = len(asked)
     trace(130)  # too many variables
-    monkeypatch.setenv(_cuda.SWITCH, "0")
-    trace()
+    trace(backend="jax")
+    with pytest.raises(ValueError, match="backend='warp' has no kernel"):
+        trace(130, backend="warp")
     assert len(asked) == count
     _fused.descender.cache_clear()
     jax.clear_caches()

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .. import _cuda
+from .._backends import Backend, on_platforms, takes
 from .._double import in_double
 from .._lanes import in_lanes, with_the_rest
 from . import _kernel
@@ -30,20 +30,22 @@ _NEARLY = 1e3
 
 
 @cache
-def descender(layout: Layout, max_iterations: int | None) -> Callable[[Stack, Tolerances, WorkingSet | None], Descent]:
+def descender(
+    layout: Layout, max_iterations: int | None, backend: Backend
+) -> Callable[[Stack, Tolerances, WorkingSet | None], Descent]:
     """All levels of one problem, in double precision; a cap on the active-set iterations of one level."""
     cap = 10 * (layout.variables + layout.rows) if max_iterations is None else max_iterations
-    return in_lanes(in_double(partial(_descend_anywhere, layout, cap)))
+    return in_lanes(in_double(partial(_descend_anywhere, layout, cap, backend)))
 
 
 def _descend_anywhere(
-    layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
+    layout: Layout, cap: int, backend: Backend, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
 ) -> Descent:
-    plain = partial(descend_all, layout, cap)
-    if not (_cuda.wanted() and _kernel.Shape.of(layout).warps):
-        return plain(stack, tolerances, warm)
-    fused = partial(descended_and_checked, layout, cap)
-    return jax.lax.platform_dependent(stack, tolerances, warm, cuda=fused, default=plain)
+    kernels = {}
+    if takes(backend, "warp", fits=_kernel.Shape.of(layout).warps > 0):
+        kernels["warp"] = partial(descended_and_checked, layout, cap)
+    takes(backend, "numba", fits=False)
+    return on_platforms(kernels, partial(descend_all, layout, cap), stack, tolerances, warm)
 
 
 def descended_and_checked(

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .. import _cuda
+from .._backends import Backend, on_platforms, takes
 from .._dense import apply
 from .._lanes import in_lanes, with_the_rest
 from .._pivots import EQUALITY, INACTIVE, Noise
@@ -45,28 +45,28 @@ Propose = Callable[[QP, Array, Array, int], Proposal]
 
 
 @cache
-def searcher(max_iterations: int, gives_way: bool) -> Callable[[QP, Array, Array], Found]:
+def searcher(max_iterations: int, gives_way: bool, backend: Backend) -> Callable[[QP, Array, Array], Found]:
     """The search for one problem, with a cap on the changes of the active set.
 
     Args:
         max_iterations: the cap.
-        gives_way: whether rows may give way; where all are hard, the kernel is not asked.
+        gives_way: whether rows may give way; where all are hard, Warp's kernel is not asked.
+        backend: whose candidates are taken.
     """
-    return in_lanes(lambda qp, guess, tolerance: _search_anywhere(qp, guess, tolerance, max_iterations, gives_way))
+    return in_lanes(partial(_search_anywhere, cap=max_iterations, gives_way=gives_way, backend=backend))
 
 
-def _search_anywhere(qp: QP, guess: Array, tolerance: Array, cap: int, gives_way: bool) -> Found:
-    plain = partial(search, max_iterations=cap)
-    if not (gives_way and _fits(qp) and _cuda.wanted()):
-        return plain(qp, guess, tolerance)
+def _search_anywhere(qp: QP, guess: Array, tolerance: Array, *, cap: int, gives_way: bool, backend: Backend) -> Found:
     fused = partial(proposed_and_searched, propose=_kernel.propose, max_iterations=cap)
-    return jax.lax.platform_dependent(qp, guess, tolerance, cuda=fused, default=plain)
+    kernels = {"warp": fused} if takes(backend, "warp", fits=gives_way and _fits(qp)) else {}
+    takes(backend, "numba", fits=False)
+    return on_platforms(kernels, partial(search, max_iterations=cap), qp, guess, tolerance)
 
 
-def system_solver(qp: QP, active: Int[Array, " m"]) -> Callable[[Array], Array]:
+def system_solver(qp: QP, active: Int[Array, " m"], backend: Backend) -> Callable[[Array], Array]:
     """The inverse of the optimality conditions at an active set, as ``system_inverse``, by the kernel where it can."""
     lanes = jax.tree.map(lambda a: jax.ShapeDtypeStruct((1, *a.shape), a.dtype), qp)
-    if not (_fits(lanes) and _cuda.wanted()):
+    if not takes(backend, "warp", fits=_fits(lanes)):
         return system_inverse(qp, active)
     return lambda right: _solve_anywhere()(qp, active, right)
 
@@ -76,7 +76,7 @@ def _solve_anywhere() -> Callable[[QP, Array, Array], Array]:
     def plain(qp: QP, active: Array, right: Array) -> Array:
         return system_inverse(qp, active)(right)
 
-    return in_lanes(partial(jax.lax.platform_dependent, cuda=_solved_by_kernel, default=jax.vmap(plain)))
+    return in_lanes(partial(on_platforms, {"warp": _solved_by_kernel}, jax.vmap(plain)))
 
 
 def _solved_by_kernel(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
