@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool
 from .._backends import Backend, on_platforms, takes
 from .._double import in_double
 from .._lanes import in_lanes, with_the_rest
-from . import _kernel
+from . import _kernel, _numba
 from ._cascade import Descent, certified, descend_all
 from ._problem import Tolerances, WorkingSet
 from ._stack import Layout, Stack
@@ -43,16 +43,22 @@ def _descend_anywhere(
 ) -> Descent:
     kernels = {}
     if takes(backend, "warp", fits=_kernel.Shape.of(layout).warps > 0):
-        kernels["warp"] = partial(descended_and_checked, layout, cap)
-    takes(backend, "numba", fits=False)
+        kernels["warp"] = partial(descended_and_checked, layout, cap, _kernel.solve)
+    if takes(backend, "numba", fits=True):
+        kernels["numba"] = partial(descended_and_checked, layout, cap, _numba.solve)
     return on_platforms(kernels, partial(descend_all, layout, cap), stack, tolerances, warm)
 
 
 def descended_and_checked(
-    layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
+    layout: Layout,
+    cap: int,
+    solve: Callable[[Layout, Stack, Tolerances, WorkingSet | None, int], Descent],
+    stack: Stack,
+    tolerances: Tolerances,
+    warm: WorkingSet | None,
 ) -> Descent:
     """The kernel's answers where they pass the check, XLA's elsewhere; arguments as for ``descend_all``."""
-    end = jax.vmap(certified)(_kernel.solve(layout, stack, tolerances, warm, cap), stack, tolerances)
+    end = jax.vmap(certified)(solve(layout, stack, tolerances, warm, cap), stack, tolerances)
     fine = end.done & jax.vmap(_holds)(end, stack, tolerances)
 
     def again(at: Array, end: Descent) -> Descent:
