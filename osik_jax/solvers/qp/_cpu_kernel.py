@@ -19,7 +19,7 @@ def propose(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max
     p = qp.rows.shape[1]
     k, constraints = m + p, n + p
     most = max(n, k)
-    space = 2 * k * n + most**2 + p * (n + p) + 2 * constraints**2 + 17 * (most + constraints)  # as Work has it
+    space = 2 * k * n + most**2 + p * (n + p) + 2 * constraints**2 + 18 * (most + constraints)  # as Work has it
     given = (cost.matrix, cost.target, cost.weight, cost.damping, cost.center, qp.lower, qp.upper)
     x, y, active, report, _ = _target.call(
         "_weighted_qp",

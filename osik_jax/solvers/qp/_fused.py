@@ -42,7 +42,7 @@ _NEARLY, _SIGN = 30.0, 2.0
 Less is allowed of the last: such a multiplier says that the active set is not right, and what that costs is more the
 weaker the curvature is that the rows leave."""
 
-_ROUNDINGS = 1e3
+_ROUNDINGS = 1e2
 """Of the forces at a free variable, that it may be left with."""
 
 _FEW = 4

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._frame import compiled
+from ._frame import lean
 
 reordered = {"reassoc", "contract"}
 """What the compiler may do to a sum: add in another order, fuse a product with its sum."""
 
 
-@compiled(fastmath=reordered)
+@lean(fastmath=reordered)
 def dot(a, b, start, stop):
     """sum_i a_i b_i over start <= i < stop."""
     total = 0.0
@@ -22,21 +22,21 @@ def dot(a, b, start, stop):
     return total
 
 
-@compiled(fastmath=reordered)
+@lean(fastmath=reordered)
 def add_multiple(y, factor, x, n):
     """y += factor x, over the first n."""
     for i in range(n):
         y[i] += factor * x[i]
 
 
-@compiled
+@lean
 def fill(a, value):
     """a = value, everywhere."""
     for i in range(len(a)):
         a[i] = value
 
 
-@compiled
+@lean
 def cholesky(S, n, smallest):
     """L with L L' = S in the lower triangle of S; whether every pivot L_ii^2 is at least ``smallest`` of its S_ii."""
     for i in range(n):
@@ -50,14 +50,14 @@ def cholesky(S, n, smallest):
     return True
 
 
-@compiled
+@lean
 def forward(L, b, n):
     """b becomes L^-1 b."""
     for i in range(n):
         b[i] = (b[i] - dot(L[i], b, 0, i)) / L[i, i]
 
 
-@compiled
+@lean
 def backward(L, b, n):
     """b becomes L'^-1 b."""
     for i in range(n - 1, -1, -1):
@@ -65,7 +65,7 @@ def backward(L, b, n):
         add_multiple(b, -b[i], L[i], i)
 
 
-@compiled
+@lean
 def rotate(a, b, cosine, sine, start, n):
     """(a, b) become (cosine a + sine b, cosine b - sine a), from ``start`` to n: a Givens rotation."""
     for i in range(start, n):
@@ -74,7 +74,7 @@ def rotate(a, b, cosine, sine, start, n):
         b[i] = cosine * b[i] - sine * first
 
 
-@compiled
+@lean
 def add_row(R, v, n):
     """R becomes upper triangular R+ with R+'R+ = R'R + v v', by Givens rotations; v is used up."""
     for k in range(n):
@@ -83,7 +83,7 @@ def add_row(R, v, n):
             rotate(R[k], v, R[k, k] / length, v[k] / length, k, n)
 
 
-@compiled
+@lean
 def invert_upper(R, columns, n):
     """Row k of ``columns`` becomes column k of R^-1."""
     for k in range(n):

@@ -21,13 +21,11 @@ from numba import types
 from numba.extending import intrinsic
 from numba.np.numpy_support import carray
 
-_inner = partial(numba.njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+compiled = partial(numba.njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""Decorator of a kernel's functions, which are called by each other alone. Divisions by 0 are those of NumPy."""
 
-compiled = partial(_inner, _nrt=False)
-"""Decorator of a kernel's functions. Divisions by 0 are those of NumPy: nothing is raised.
-
-They are called by each other alone, and neither allocate nor count references: there is less to compile, and to do.
-"""
+lean = partial(compiled, _nrt=False)
+"""As ``compiled``, for functions that make no array: references are not counted, so there is less to compile."""
 
 _METADATA = 1  # XLA_FFI_Extension_Metadata
 _EXECUTE = 3  # XLA_FFI_ExecutionStage_EXECUTE
@@ -88,13 +86,13 @@ def size(buffers, k, axis):
     return _word(_word(buffer + 40) + 8 * (axis if axis >= 0 else rank + axis))
 
 
-@_inner
+@compiled
 def doubles(buffers, k, shape):
     """The k-th buffer as an array of float64 of that shape, without a copy."""
     return carray(_at(_word(_word(buffers + 8 * k) + 24), types.float64), shape)
 
 
-@_inner
+@compiled
 def integers(buffers, k, shape):
     """The k-th buffer as an array of int32 of that shape, without a copy."""
     return carray(_at(_word(_word(buffers + 8 * k) + 24), types.int32), shape)
@@ -112,19 +110,19 @@ def data(pointer):
     return _word(_word(pointer) + 24)
 
 
-@_inner
+@compiled
 def vector(address, n):
     """n float64 at an address."""
     return carray(_at(address, types.float64), (n,))
 
 
-@_inner
+@compiled
 def matrix(address, m, n):
     """m rows of n float64 at an address."""
     return carray(_at(address, types.float64), (m, n))
 
 
-@_inner
+@compiled
 def whole_numbers(address, n):
     """n int32 at an address."""
     return carray(_at(address, types.int32), (n,))

@@ -16,14 +16,14 @@ from __future__ import annotations
 import numpy as np
 
 from ._dense import add_multiple, add_row, dot, fill, invert_upper, rotate
-from ._frame import compiled
+from ._frame import lean
 
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 _DEPENDENT = 1e-14
 """Of |J'n|^2; a constraint of which the active ones leave less than this depends on them."""
 
 
-@compiled
+@lean
 def factor_cost(P, R, J, n):
     """J = U^-1, U'U the Hessian: rows of J are columns of the inverse. Nothing is squared (Givens rotations).
 
@@ -49,7 +49,7 @@ def factor_cost(P, R, J, n):
         J[q, q] = 1.0
 
 
-@compiled
+@lean
 def along_normal(P, J, i, n, d):
     """d = J'n_i; the rows of ``J`` are the columns of J."""
     N, m = len(P.lower), len(P.wanted)
@@ -60,7 +60,7 @@ def along_normal(P, J, i, n, d):
             d[k] = dot(J[k], P.rows[m + i - n], 0, n) + J[k, i] * np.sqrt(P.give[m + i - n])
 
 
-@compiled
+@lean
 def value_of(P, v, i, n):
     """n_i'v: a variable, or C_q x + t_q."""
     if i < n:
@@ -69,7 +69,7 @@ def value_of(P, v, i, n):
     return dot(P.rows[row], v, 0, n) + np.sqrt(P.give[row]) * v[i]
 
 
-@compiled
+@lean
 def most_violated(P, W, labels, v, d, n, count):
     """The constraint whose activation raises the dual objective most, gap^2 / |J2'n|^2; equalities first, -1 for none."""
     best, entering = 0.0, -1
@@ -88,7 +88,7 @@ def most_violated(P, W, labels, v, d, n, count):
     return entering
 
 
-@compiled
+@lean
 def add_constraint(R, J, d, w, count):
     """T and J with one more active constraint: a Householder reflection turns d2 into one number."""
     N = len(d)
@@ -106,7 +106,7 @@ def add_constraint(R, J, d, w, count):
         add_multiple(J[k], -d[k] / half, w, N)
 
 
-@compiled
+@lean
 def drop_constraint(R, J, l, count):
     """T and J without the l-th active constraint: its column goes, Givens rotations make T triangular again."""
     for k in range(l, count - 1):
@@ -123,7 +123,7 @@ def drop_constraint(R, J, l, count):
             rotate(J[k], J[k + 1], cosine, sine, k - k, J.shape[1])
 
 
-@compiled
+@lean
 def ratio_test(labels, order, u, r, count):
     """The active inequality whose multiplier reaches 0 first, and after how much; -1 and infinity for none."""
     shortest, leaving = np.inf, -1
@@ -133,7 +133,7 @@ def ratio_test(labels, order, u, r, count):
     return shortest, leaving
 
 
-@compiled
+@lean
 def dual_active_set(P, W, labels, x, most_changes):
     """Active constraints of the problem, from none but pinned variables, into ``labels``.
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ._dense import add_multiple, backward, cholesky, dot, fill, forward
-from ._frame import arguments, compiled, data, dimension, is_call, matrix, results, vector, whole_numbers
+from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
 from ._goldfarb_idnani import dual_active_set
 
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
@@ -28,10 +28,10 @@ _PATIENCE = 2
 """Exchanges that leave no fewer wrong signs, before the dual active set."""
 _SMALLEST_PIVOT = 1e2
 """Roundings of its diagonal element; a smaller pivot says that rows depend on each other."""
-_MOST_CORRECTIONS = 6
-_LAST_CORRECTION = 1e-7
-"""A correction by this share of x is the last: the next would be its square."""
-_WORTH = 0.1
+_MOST_CORRECTIONS = 10
+_LAST_CORRECTION = 1e-10
+"""A correction by this share of x is the last."""
+_WORTH = 0.25
 """A correction that is not this much smaller than the one before is rounding."""
 
 
@@ -57,7 +57,7 @@ class Work(NamedTuple):
 
     Fields: ``square`` (q, q) a Cholesky factor. ``scaled`` (k, n) rows over the roots of the damping. ``held`` (p, n) and
     ``schur`` (p, p): rows of C behind the factor of the Hessian. ``used`` (k,) numbers of rows. ``right`` (q,).
-    ``step`` and ``slope`` (n,). ``value_noise`` and ``multiplier_noise`` (N,). ``next`` (N,) labels. The rest is the dual
+    ``root``, ``step`` and ``slope`` (n,). ``value_noise`` and ``multiplier_noise`` (N,). ``next`` (N,) labels. The rest is the dual
     active set's: ``R``, ``J`` (N, N), ``point``, ``along``, ``reflected``, ``multipliers``, ``rates``, ``order`` (N,).
     """
 
@@ -68,6 +68,7 @@ class Work(NamedTuple):
     R: np.ndarray
     J: np.ndarray
     right: np.ndarray
+    root: np.ndarray
     step: np.ndarray
     slope: np.ndarray
     value_noise: np.ndarray
@@ -82,7 +83,7 @@ class Work(NamedTuple):
     order: np.ndarray
 
 
-@compiled
+@lean
 def begin(P, A, target, weight, C, compliance):
     """Fills in the problem: rows [sqrt(W) A; C] and the diagonal of A'WA + D."""
     m, n = A.shape
@@ -103,7 +104,7 @@ def begin(P, A, target, weight, C, compliance):
             P.rows[m + q, j] = C[q, j]
 
 
-@compiled
+@lean
 def first_labels(P, guess, labels):
     """The guess where the bounds that it names exist; pinned variables are active, equality rows where guessed."""
     n = len(P.damping)
@@ -117,13 +118,13 @@ def first_labels(P, guess, labels):
         labels[i] = EQUALITY if low == high and (i < n or guess[i] != INACTIVE) else label
 
 
-@compiled
+@lean
 def active_bound(P, label, i):
     """The bound at which constraint i is held."""
     return P.upper[i] if label == AT_UPPER else P.lower[i]
 
 
-@compiled
+@lean
 def used_rows(P, labels, used):
     """Numbers of the rows of the working set: all of the cost, the active ones of C; how many they are."""
     m, n = len(P.wanted), len(P.damping)
@@ -135,7 +136,7 @@ def used_rows(P, labels, used):
     return count
 
 
-@compiled
+@lean
 def residual(P, labels, i, x, z):
     """Of row i of the working set: wanted - row x - give z, which is 0 at the minimiser."""
     m, n = len(P.wanted), len(x)
@@ -143,58 +144,60 @@ def residual(P, labels, i, x, z):
     return wanted - dot(P.rows[i], x, 0, n) - P.give[i] * z[i]
 
 
-@compiled
+@lean
 def solve_in_row_space(P, W, labels, count, x, z):
     """Solves on the working set through a system as large as its rows (Sherman, Morrison, Woodbury).
 
-    The optimality conditions D (x - center) = B'z over the free variables and B x + E z = wanted, E = diag(give), give
+    With z the residuals of the rows of the cost and the multipliers of those of C, E = diag(give), the optimality
+    conditions D (x - center) = B'z over the free variables and B x + E z = wanted give
 
-        (B_F D_F^-1 B_F' + E) z = wanted - B x0,    x_F = center_F + D_F^-1 B_F'z,
+        S z = wanted - B x0,    x_F = center_F + D_F^-1 B_F'z,    S = B_F D_F^-1 B_F' + E,
 
-    where x0 is the center, and the bound where a variable is active. z are the multipliers: residuals of the rows of
-    the cost, multipliers of those of C. Corrections solve the same system for what is left of its right side.
+    where x0 is the center, and the bound where a variable is active: there nothing large cancels. Corrections are for
+    what x and z leave, -slope and gap: S dz = gap - B D^-1 (-slope), dx = D^-1 (-slope + B'dz).
     """
-    n, k = len(x), count
+    m, n, k = len(P.wanted), len(x), count
     for j in range(n):
-        if labels[j] == INACTIVE:
-            x[j], W.step[j] = P.center[j], 1.0 / np.sqrt(P.damping[j])
-        else:
-            x[j], W.step[j] = active_bound(P, labels[j], j), 0.0
+        free = labels[j] == INACTIVE
+        x[j] = P.center[j] if free else active_bound(P, labels[j], j)
+        W.root[j] = 1.0 / np.sqrt(P.damping[j]) if free else 0.0
+        W.step[j] = 0.0
     for a in range(k):
         row, scaled = P.rows[W.used[a]], W.scaled[a]
         for j in range(n):
-            scaled[j] = row[j] * W.step[j]
+            scaled[j] = row[j] * W.root[j]
         for b in range(a + 1):
             W.square[a, b] = dot(scaled, W.scaled[b], 0, n)
         W.square[a, a] += P.give[W.used[a]]
         z[W.used[a]] = 0.0
+        W.right[a] = residual(P, labels, W.used[a], x, z)
     if not cholesky(W.square, k, _SMALLEST_PIVOT * EPS):
         return False
     before = np.inf
     for _ in range(_MOST_CORRECTIONS):
-        for a in range(k):
-            W.right[a] = residual(P, labels, W.used[a], x, z)
         forward(W.square, W.right, k)
         backward(W.square, W.right, k)
         for a in range(k):
             z[W.used[a]] += W.right[a]
+            add_multiple(W.step, W.right[a], W.scaled[a], n)
         moved, far = 0.0, 0.0
         for j in range(n):
-            W.slope[j] = 0.0
-        for a in range(k):
-            add_multiple(W.slope, z[W.used[a]], W.scaled[a], n)
-        for j in range(n):
-            if labels[j] == INACTIVE:
-                new, root = P.center[j] + W.step[j] * W.slope[j], np.sqrt(P.diagonal[j])
-                moved, far = max(moved, abs(new - x[j]) * root), max(far, abs(new) * root)
-                x[j] = new
+            step, root = W.root[j] * W.step[j], np.sqrt(P.diagonal[j])
+            x[j] += step
+            moved, far = max(moved, abs(step) * root), max(far, abs(x[j]) * root)
         if before < np.inf and (moved <= _LAST_CORRECTION * far or moved > _WORTH * before):
             break
         before = moved
+        slope_of(P, W, labels, x, z)
+        for j in range(n):
+            W.step[j] = -W.root[j] * W.slope[j]
+        for a in range(k):
+            gap = 0.0 if a < m else residual(P, labels, W.used[a], x, z)
+            W.right[a] = gap - dot(W.scaled[a], W.step, 0, n)
     return True
 
 
-@compiled
+@lean
 def factor_hessian(P, W, labels, count):
     """Factors of H_F = B_F'B_F + D_F, with B the rows of the cost, and of what the active rows of C leave behind it.
 
@@ -231,7 +234,7 @@ def factor_hessian(P, W, labels, count):
     return cholesky(W.schur, count - m, _SMALLEST_PIVOT * EPS)
 
 
-@compiled
+@lean
 def solve_by_hessian(P, W, labels, count, x, z):
     """Solves on the working set through a system as large as x; for more rows than variables.
 
@@ -270,7 +273,7 @@ def solve_by_hessian(P, W, labels, count, x, z):
     return True
 
 
-@compiled
+@lean
 def slope_of(P, W, labels, x, z):
     """The slope D (x - center) - B'(wanted - B x) - C'y of the Lagrangian; the residuals of the cost go into z."""
     m, n = len(P.wanted), len(x)
@@ -283,7 +286,7 @@ def slope_of(P, W, labels, x, z):
             add_multiple(W.slope, -z[i], P.rows[i], n)
 
 
-@compiled
+@lean(inline="always")
 def solve_on(P, W, labels, x, z):
     """The minimiser with the active constraints as equalities and the others left out, by the smaller system.
 
@@ -296,7 +299,7 @@ def solve_on(P, W, labels, x, z):
     return sound
 
 
-@compiled
+@lean
 def measure_noise(P, W, tolerance, x, z):
     """Of each constraint, what counts as no violation and as no multiplier: ``tolerance`` of its scale.
 
@@ -337,7 +340,7 @@ def measure_noise(P, W, tolerance, x, z):
                 W.multiplier_noise[i] += tolerance * 1e-3 * abs(P.rows[q, i] * z[q])
 
 
-@compiled
+@lean
 def wanted_label(P, W, labels, i, x, z):
     """What constraint i should be: active where it is violated, inactive where its multiplier has the wrong sign."""
     m, n = len(P.wanted), len(x)
@@ -354,7 +357,7 @@ def wanted_label(P, W, labels, i, x, z):
     return INACTIVE if -labels[i] * multiplier < -W.multiplier_noise[i] else labels[i]
 
 
-@compiled
+@lean(inline="always")
 def search(P, W, labels, tolerance, most_changes, x, z, report):
     """Working set and minimiser of one problem: block pivoting from the guess, then the dual active set.
 
@@ -400,7 +403,6 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
         report[1] += 0 if cold else wrong
 
 
-@compiled
 def handle(frame):
     """One call of XLA: arguments as in ``qp._cpu_kernel.propose``, a leading axis of lanes on each."""
     if not is_call(frame):
@@ -424,11 +426,11 @@ def handle(frame):
     line = 8 * (q + N)
     W = Work(
         square, scaled, held, schur, R, J, vector(at, q), vector(at + line, n), vector(at + 2 * line, n),
-        vector(at + 3 * line, N), vector(at + 4 * line, N), vector(at + 5 * line, N), vector(at + 6 * line, N),
-        vector(at + 7 * line, N), vector(at + 8 * line, N), vector(at + 9 * line, N), whole_numbers(at + 10 * line, k),
-        whole_numbers(at + 11 * line, N), whole_numbers(at + 12 * line, N),
+        vector(at + 3 * line, n), vector(at + 4 * line, N), vector(at + 5 * line, N), vector(at + 6 * line, N),
+        vector(at + 7 * line, N), vector(at + 8 * line, N), vector(at + 9 * line, N), vector(at + 10 * line, N),
+        whole_numbers(at + 11 * line, k), whole_numbers(at + 12 * line, N), whole_numbers(at + 13 * line, N),
     )  # fmt: skip
-    at += 13 * line
+    at += 14 * line
     wanted, give, diagonal, z = vector(at, m), vector(at + line, k), vector(at + 2 * line, n), vector(at + 3 * line, k)
     for lane in range(lanes):
         first, last = 8 * n * lane, 8 * N * lane
