@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numba
 from numba import types
@@ -26,14 +26,15 @@ Function = Callable[..., Any]
 
 
 def compiled(function: Function | None = None, **options: Any) -> Any:
-    """Decorator of a kernel's functions.
+    """Decorator of a kernel's functions, which only other such functions can call; ``py_func`` is the one as written.
 
-    Divisions by 0 are those of NumPy: nothing is raised. Python cannot call the compiled functions, which spares a third
-    of the time that they take to compile; ``function.py_func`` is the function as it is written.
+    Divisions by 0 are those of NumPy: nothing is raised. Without what Python would need to call them, they take a third
+    less time to compile.
     """
     if function is None:
         return partial(compiled, **options)
-    return numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function)
+    options |= dict(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    return cast(Any, numba.njit)(**options)(function)
 
 
 _METADATA = 1  # XLA_FFI_Extension_Metadata
