@@ -21,21 +21,18 @@ def solve(
     zeros = WorkingSet(jnp.zeros((lanes, count, h), int), jnp.zeros((lanes, count, m), int))
     guess = zeros if warm is None else warm
     row_of_hard = [layout.place_of_row[layout.level_of_hard[q]].index(q) for q in range(n, h)]
-    outputs = dict(x=((n,), float), box=((n,), int), sides=((count, h), int), tight=((count, h), int))
-    outputs |= dict(missed=((count, m), int), own=((count, m), int), ranks=((count,), int))
-    outputs |= dict(multipliers=((count, h), float), reached=((count,), float), strengths=((count,), float))
-    outputs |= dict(residual=((), float), report=((3,), int))
+    floats = dict(x=(n,), multipliers=(count, h), reached=(count,), strengths=(count,), residual=())
+    ints = dict(box=(n,), sides=(count, h), tight=(count, h), missed=(count, m), own=(count, m))
+    ints |= dict(ranks=(count,), report=(3,))
     found = _target.call(
         "_hierarchy",
-        [((lanes, *shape), kind) for shape, kind in outputs.values()],
-        *(stack.levels.matrix, stack.levels.lower, stack.levels.upper, stack.equal, stack.hard[:, n:]),
-        *(stack.hard_lower, stack.hard_upper, stack.hard_equal, *guess),
-        jnp.stack(stack.damping[:3], -1),
-        stack.damping.bends,
-        jnp.stack(tolerances, -1),
+        [((lanes, *shape), kind) for kind, shapes in ((float, floats), (int, ints)) for shape in shapes.values()],
+        *(stack.levels.matrix, stack.levels.lower, stack.levels.upper, stack.hard[:, n:]),
+        *(stack.hard_lower, stack.hard_upper, jnp.stack(stack.damping[:3], -1), stack.damping.bends),
+        *(jnp.stack(tolerances, -1), stack.equal, stack.hard_equal, *guess),
         *(np.array(a, np.int32) for a in (layout.counts, layout.level_of_hard, row_of_hard, [max_iterations])),
     )
-    x, box, sides, tight, missed, own, ranks, multipliers, reached, strengths, residual, report = found
+    x, multipliers, reached, strengths, residual, box, sides, tight, missed, own, ranks, report = found
     return Descent(
         x=x,
         box=box,
