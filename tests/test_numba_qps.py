@@ -36,7 +36,7 @@ class Problems(NamedTuple):
 
 
 def problems(count: int, m: int = M, seed: int = 0, weakest: float = 1e-6) -> Problems:
-    """Feasible ones: weights over five decades, dampings from ``weakest``; bounds and rows of all kinds, hard and soft."""
+    """Feasible: weights over five decades, dampings from ``weakest``, all kinds of bounds and rows, hard or soft."""
     rng = np.random.default_rng(seed)
     inside = rng.normal(size=(count, N))
     A, C = rng.normal(size=(count, m, N)), rng.normal(size=(count, P, N))
@@ -67,10 +67,10 @@ def solved(p: Problems, backend: str = "numba", **options):
 
 
 def candidates(p: Problems):
-    count, m, _ = p.matrix.shape
+    count = len(p.matrix)
     cost = LeastSquares(*map(jnp.asarray, (p.matrix, p.target, p.weight, p.damping, np.zeros((count, N)))))
-    bounds = (jnp.asarray(np.concatenate(pair, 1)) for pair in ((p.lower, p.rows_lower), (p.upper, p.rows_upper)))
-    qp = QP(cost, jnp.asarray(p.rows), jnp.asarray(p.rows_compliance), *bounds)
+    lower, upper = (jnp.concatenate(pair, 1) for pair in ((p.lower, p.rows_lower), (p.upper, p.rows_upper)))
+    qp = QP(cost, jnp.asarray(p.rows), jnp.asarray(p.rows_compliance), lower, upper)
     return _cpu_kernel.propose(qp, jnp.zeros((count, N + P), int), jnp.full(count, 1e-12), 1000)
 
 
@@ -112,10 +112,10 @@ def test_as_daqp():
     g = -np.einsum("bm,bmi->bi", p.weight * p.target, p.matrix)
     dense = QPs(H, g, p.lower, p.upper, p.rows, p.rows_lower, p.rows_upper, np.asarray(found.x), np.ones_like(g))
     expected = [by_daqp(dense, i) for i in range(100)]
-    claimed = [i for i, x in enumerate(expected) if x is not None and found.status[i] == Status.SOLVED]
+    claimed = [(i, x) for i, x in enumerate(expected) if x is not None and found.status[i] == Status.SOLVED]
     assert len(claimed) > 90
-    for i in claimed:
-        np.testing.assert_allclose(found.x[i], expected[i], atol=1e-6)
+    for i, x in claimed:
+        np.testing.assert_allclose(found.x[i], x, atol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -123,8 +123,7 @@ def test_as_daqp():
 def test_recorded_problems(robot, dtype):
     """In both precisions; double is as exact as the records, single to its own rounding of the rows."""
     r = recorded_qps(robot)
-    count, m, n = r.A.shape
-    given = (r.A, r.b, np.ones((count, m)), r.lower, r.upper)
+    given = (r.A, r.b, np.ones(r.b.shape), r.lower, r.upper)
 
     def one(*data):
         return solve_least_squares_qp(*data, damping=QP_DAMPING, backend="numba")

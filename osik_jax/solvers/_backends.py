@@ -6,7 +6,7 @@ from kernels; the search needs none and is the definition. ``backend``, a static
     backend   weighted QP                          hierarchy                           null space
     "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    none
               hard rows, n <= 64, <= 32 soft rows  fit into shared memory
-    "numba"   none                                 CPUs: any precision, any shape      none
+    "numba"   CPUs: any precision, least squares   CPUs: any precision, any shape      none
     "jax"     none: the search alone, on any platform, and what ``jax.export`` takes
 
 "auto" takes what is installed and fits, and the search elsewhere. Which platform a program runs on is decided when it

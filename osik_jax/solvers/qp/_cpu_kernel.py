@@ -1,4 +1,4 @@
-"""Candidates for the weighted QP on a CPU: Numba's kernel (``kernels.numba._weighted_qp``) as a function of JAX arrays."""
+"""Candidates for weighted QPs on a CPU: Numba's kernel (``kernels/numba/_weighted_qp.py``), called from JAX."""
 
 from __future__ import annotations
 

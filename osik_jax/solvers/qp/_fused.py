@@ -1,4 +1,4 @@
-"""The search for the active set on a GPU: a kernel proposes, XLA certifies, and what is left goes to the search.
+"""The search for the active set: a kernel proposes, XLA certifies, and what is left goes to the search.
 
 Only what the check certifies is taken from the kernel, so answers do not rest on it. The check is the search's own, on
 data read anew; it costs two passes over the rows where a factorisation by XLA costs more than everything else. The

@@ -116,7 +116,8 @@ def solve_least_squares_qp(
         max_iterations: cap on changes of the active set (static).
         tolerance: relative violation that counts as none.
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
-            the platform, "jax" for none, "warp" (CUDA) for that or an error. It changes the time, not the answer.
+            the platform, "jax" for none, "numba" (CPUs) or "warp" (CUDA) for that or an error. It changes the time,
+            not the answer.
     """
     matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)
     n = matrix.shape[1]

@@ -1,4 +1,4 @@
-"""Small dense linear algebra of the kernels: loops over rows that are contiguous in memory, which the compiler vectorises.
+"""Small dense linear algebra of the kernels: loops over rows that are contiguous, which the compiler vectorises.
 
 Sums may be reordered; nothing else about floating point is relaxed, so that NaN and infinities behave as they should.
 """

@@ -1,14 +1,15 @@
-"""The dual active set from a cold start, with factors that are updated (D. Goldfarb, A. Idnani, "A numerically stable
-dual method for solving strictly convex quadratic programs", Mathematical Programming 27, 1983).
+"""The dual active set from a cold start, with factors that are updated.
 
-Rows of C may give way, so the unknowns are v = (x, s) with t = sqrt(E) s and E their compliances; the cost is 1/2 |s|^2
-more, and constraint i has the normal n_i = e_i for a bound, (C_q, sqrt(E_q) e_q) for a row. With N the normals of the
-active constraints, each in the direction in which it pushes,
+D. Goldfarb, A. Idnani, "A numerically stable dual method for solving strictly convex quadratic programs", Mathematical
+Programming 27, 1983. Rows of C may give way, so the unknowns are v = (x, s) with t = sqrt(E) s and E their
+compliances; the cost is 1/2 |s|^2 more, and constraint i has the normal n_i = e_i for a bound, (C_q, sqrt(E_q) e_q) for
+a row. With N the normals of the active constraints, each in the direction in which it pushes,
 
     Hessian = U'U,    J = U^-1 Q,    J'N = [T; 0]    with Q orthogonal, T upper triangular,
 
-and for a constraint n that enters, with d = J'n = [d1; d2]: z = J2 d2 is the way of v, r = T^-1 d1 that at which the
-multipliers of the active ones fall. The dual objective rises with every step, so that no active set comes back.
+and for a constraint n that enters, with d = J'n = [d1; d2]: z = J2 d2 is the direction of v, and the multipliers of
+the active constraints fall at the rates r = T^-1 d1. The dual objective rises with every step, so that no active set
+comes back.
 """
 
 from __future__ import annotations
@@ -71,7 +72,10 @@ def value_of(P, v, i, n):
 
 @lean
 def most_violated(P, W, labels, v, d, n, count):
-    """The constraint whose activation raises the dual objective most, gap^2 / |J2'n|^2; equalities first, -1 for none."""
+    """The constraint whose activation raises the dual objective most, -1 for none; equalities first.
+
+    By a full step it rises by half of gap^2 / |J2'n|^2.
+    """
     best, entering = 0.0, -1
     for i in range(len(labels)):
         if labels[i] != INACTIVE:
@@ -107,9 +111,9 @@ def add_constraint(R, J, d, w, count):
 
 
 @lean
-def drop_constraint(R, J, l, count):
-    """T and J without the l-th active constraint: its column goes, Givens rotations make T triangular again."""
-    for k in range(l, count - 1):
+def drop_constraint(R, J, place, count):
+    """T and J without the active constraint at a place: its column goes, Givens rotations make T triangular again."""
+    for k in range(place, count - 1):
         for i in range(k + 2):
             R[i, k] = R[i, k + 1]
         length = np.hypot(R[k, k], R[k + 1, k])
@@ -127,9 +131,9 @@ def drop_constraint(R, J, l, count):
 def ratio_test(labels, order, u, r, count):
     """The active inequality whose multiplier reaches 0 first, and after how much; -1 and infinity for none."""
     shortest, leaving = np.inf, -1
-    for l in range(count):
-        if labels[order[l]] != EQUALITY and r[l] > 0.0 and u[l] / r[l] < shortest:
-            shortest, leaving = u[l] / r[l], l
+    for i in range(count):
+        if labels[order[i]] != EQUALITY and r[i] > 0.0 and u[i] / r[i] < shortest:
+            shortest, leaving = u[i] / r[i], i
     return shortest, leaving
 
 
@@ -181,8 +185,8 @@ def dual_active_set(P, W, labels, x, most_changes):
             if not (full < np.inf or length < np.inf):
                 return -1
             length = min(length, full)
-            for l in range(count):
-                u[l] = max(u[l] - length * r[l], 0.0) if labels[order[l]] != EQUALITY else u[l] - length * r[l]
+            for i in range(count):
+                u[i] = max(u[i] - length * r[i], 0.0) if labels[order[i]] != EQUALITY else u[i] - length * r[i]
             pushed += length
             if full < np.inf:
                 for k in range(count, N):
@@ -196,6 +200,6 @@ def dual_active_set(P, W, labels, x, most_changes):
                 break
             drop_constraint(R, J, leaving, count)
             labels[order[leaving]] = INACTIVE
-            for l in range(leaving, count - 1):
-                order[l], u[l] = order[l + 1], u[l + 1]
+            for i in range(leaving, count - 1):
+                order[i], u[i] = order[i + 1], u[i + 1]
             count -= 1

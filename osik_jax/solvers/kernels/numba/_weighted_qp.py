@@ -4,9 +4,9 @@
     over lower <= [x; C x + t] <= upper
 
 A lane solves on its working set and looks at the signs: bounds that are crossed become active, those whose multiplier
-has the wrong sign become inactive, all at once (block pivoting). Where that stops helping, a dual active set begins anew
-(``_goldfarb_idnani``), which cannot cycle. Whatever comes of it is a candidate, which JAX certifies. Lanes that
-are left: rows that cannot hold, rows that depend on each other, numbers that are none.
+has the wrong sign become inactive, all at once (block pivoting). Where that stops helping, a dual active set begins
+anew (``_goldfarb_idnani``), which cannot cycle. Whatever comes of it is a candidate, which JAX certifies. No candidate
+comes of rows that cannot hold together, rows that depend on each other, and numbers that are none.
 """
 
 from __future__ import annotations
@@ -55,10 +55,11 @@ class Problem(NamedTuple):
 class Work(NamedTuple):
     """Space for one problem, used again by the next; k = m + p rows, N = n + p constraints, q = max(n, k).
 
-    Fields: ``square`` (q, q) a Cholesky factor. ``scaled`` (k, n) rows over the roots of the damping. ``held`` (p, n) and
-    ``schur`` (p, p): rows of C behind the factor of the Hessian. ``used`` (k,) numbers of rows. ``right`` (q,).
-    ``root``, ``step`` and ``slope`` (n,). ``value_noise`` and ``multiplier_noise`` (N,). ``next`` (N,) labels. The rest is the dual
-    active set's: ``R``, ``J`` (N, N), ``point``, ``along``, ``reflected``, ``multipliers``, ``rates``, ``order`` (N,).
+    Fields: ``square`` (q, q) a Cholesky factor. ``scaled`` (k, n) rows over the roots of the damping. ``held`` (p, n)
+    and ``schur`` (p, p): rows of C behind the factor of the Hessian. ``used`` (k,) numbers of rows. ``right`` (q,).
+    ``root``, ``step`` and ``slope`` (n,). ``value_noise`` and ``multiplier_noise`` (N,). ``next`` (N,) labels. The rest
+    is the dual active set's: ``R``, ``J`` (N, N), ``point``, ``along``, ``reflected``, ``multipliers``, ``rates``,
+    ``order`` (N,).
     """
 
     square: np.ndarray
@@ -201,8 +202,8 @@ def solve_in_row_space(P, W, labels, count, x, z):
 def factor_hessian(P, W, labels, count):
     """Factors of H_F = B_F'B_F + D_F, with B the rows of the cost, and of what the active rows of C leave behind it.
 
-    L L' = H_F in ``square``, V = L^-1 C_F' in the rows of ``held``, and the Schur complement V'V + E in ``schur``. Active
-    variables have a row and a column of the identity.
+    L L' = H_F in ``square``, V = L^-1 C_F' in the rows of ``held``, and the Schur complement V'V + E in ``schur``.
+    Active variables have a row and a column of the identity.
     """
     m, n = len(P.wanted), len(P.damping)
     for a in range(n):
@@ -238,8 +239,8 @@ def factor_hessian(P, W, labels, count):
 def solve_by_hessian(P, W, labels, count, x, z):
     """Solves on the working set through a system as large as x; for more rows than variables.
 
-    H_F dx - C_F'dy = slope and C_F dx + E dy = gap are solved, again and again, for what x and y leave of the optimality
-    conditions: dy = (V'V + E)^-1 (gap - V'L^-1 slope), dx = L'^-1 (L^-1 slope + V dy).
+    H_F dx - C_F'dy = slope and C_F dx + E dy = gap are solved, again and again, for what x and y leave of the
+    optimality conditions: dy = (V'V + E)^-1 (gap - V'L^-1 slope), dx = L'^-1 (L^-1 slope + V dy).
     """
     m, n, p = len(P.wanted), len(x), count - len(P.wanted)
     if not factor_hessian(P, W, labels, count):
