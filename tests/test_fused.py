@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recorded import QP_DAMPING, recorded_qps
 
-from osik_jax.solvers import Status, _cuda, solve_least_squares_qp
+from osik_jax.solvers import Status, _backends, solve_least_squares_qp
 from osik_jax.solvers.qp import _fused, _kernel, _search
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._kernel import Proposal, Shape
@@ -165,8 +165,8 @@ def beside_a_gpu(monkeypatch):
         nothing = jnp.zeros(len(guess), jnp.int32)
         return Proposal(jnp.full_like(qp.cost.damping, jnp.nan), jnp.zeros_like(qp.compliance), guess, *[nothing] * 3)
 
-    monkeypatch.setattr(_cuda, "available", lambda: True)
-    monkeypatch.setattr(_cuda, "find_spec", lambda name: name)
+    monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
+    monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
     monkeypatch.setattr(_kernel, "propose", propose)
     jax.clear_caches()
     yield asked
@@ -185,9 +185,9 @@ def test_a_cpu_beside_a_gpu_keeps_to_xla(batch, beside_a_gpu):
 def test_when_the_kernel_is_not_asked(batch, beside_a_gpu, monkeypatch, why):
     A, n, options = np.ones((4, 5), np.float32), 5, {}
     if why == "switched off":
-        monkeypatch.setenv(_cuda.SWITCH, "0")
+        options = dict(backend="jax")
     if why == "no warp":
-        monkeypatch.setattr(_cuda, "find_spec", lambda name: None)
+        monkeypatch.setattr(_backends, "installed", lambda name: False)
     if why == "double":
         A = A.astype(float)
     if why == "hard rows":
@@ -215,9 +215,9 @@ def test_the_kernel_is_asked_for_soft_rows_and_none(beside_a_gpu):
 
 
 def test_no_gpu_no_kernel():
-    assert not _cuda.available()
+    assert not _backends.cuda_is_default()
     with jax.default_device(jax.devices("cpu")[0]):
-        assert not _cuda.available()
+        assert not _backends.cuda_is_default()
 
 
 @pytest.mark.parametrize("shape", [Shape(35, 50, 0), Shape(32, 47, 32), Shape(64, 90, 8), Shape(1, 1, 0)])

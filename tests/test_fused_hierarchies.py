@@ -1,5 +1,6 @@
 """The hierarchy's kernel beside XLA, without a GPU: what it answers is taken only where it passes the check."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from hierarchy_families import inequality_levels
 
-from osik_jax.solvers import Level, Tolerances, _cuda, solve_hqp
+from osik_jax.solvers import Level, Tolerances, _backends, solve_hqp
 from osik_jax.solvers._damping import one_each
 from osik_jax.solvers.hqp import _cascade, _fused, _kernel
 from osik_jax.solvers.hqp._kernel import Shape
@@ -45,11 +46,11 @@ def batch() -> Batch:
     return Batch(layout, stack, tolerances, answers)
 
 
-def completed(batch, answer, monkeypatch):
+def completed(batch, answer):
     """The end, and the lanes in which the kernel's answer was taken."""
     marked = answer._replace(factorizations=jnp.full_like(answer.factorizations, 1000))
-    monkeypatch.setattr(_kernel, "solve", lambda *_: marked)
-    end = jax.jit(lambda s, t: _fused.descended_and_checked(batch.layout, CAP, s, t, None))(*batch[1:3])
+    check = partial(_fused.descended_and_checked, batch.layout, CAP, lambda *_: marked)
+    end = jax.jit(lambda s, t: check(s, t, None))(*batch[1:3])
     return end, end.factorizations == 1000
 
 
@@ -93,8 +94,8 @@ WRONG = {
 }
 
 
-def test_right_answers_are_taken(batch, monkeypatch):
-    end, taken = completed(batch, batch.answers, monkeypatch)
+def test_right_answers_are_taken(batch):
+    end, taken = completed(batch, batch.answers)
     assert taken.all()
     np.testing.assert_array_equal(end.x, batch.answers.x)
 
@@ -103,7 +104,7 @@ def test_right_answers_are_taken(batch, monkeypatch):
 def test_wrong_answers_are_not(batch, wrong, monkeypatch):
     """They are wrong in every third lane; blocks of 3, so that the last one is not full."""
     monkeypatch.setattr(_fused, "_BLOCK", 3)
-    end, taken = completed(batch, WRONG[wrong](batch), monkeypatch)
+    end, taken = completed(batch, WRONG[wrong](batch))
     np.testing.assert_array_equal(taken, ~some())
     assert end.done.all()
     np.testing.assert_allclose(end.x, batch.answers.x, rtol=0, atol=1e-12)
@@ -117,23 +118,24 @@ def test_when_the_kernel_is_asked(monkeypatch):
         return _cascade.descend_all(layout, cap, stack, tolerances, warm)
 
     monkeypatch.setattr(_kernel, "solve", solve)
-    monkeypatch.setattr(_cuda, "find_spec", lambda name: name)
+    monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
 
-    def trace(n=3):
+    def trace(n=3, backend="auto"):
         _fused.descender.cache_clear()
         jax.clear_caches()
         levels = [Level(np.ones((1, n)), [-1.0], [1.0]), Level(np.ones((2, n)), [1.0, 2.0])]
-        jax.jit(lambda low: solve_hqp(levels, low, -low).x).lower(-np.ones(n))
+        jax.jit(lambda low: solve_hqp(levels, low, -low, backend=backend).x).lower(-np.ones(n))
 
     trace()
     assert asked == []  # no GPU
-    monkeypatch.setattr(_cuda, "available", lambda: True)
+    monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
     trace()
     assert asked[-1] == Shape(3, 2, (1, 2, 0), (True, False, False), (0,), (0,))
     count = len(asked)
     trace(130)  # too many variables
-    monkeypatch.setenv(_cuda.SWITCH, "0")
-    trace()
+    trace(backend="jax")
+    with pytest.raises(ValueError, match="backend='warp' has no kernel"):
+        trace(130, backend="warp")
     assert len(asked) == count
     _fused.descender.cache_clear()
     jax.clear_caches()

@@ -1,5 +1,6 @@
 """The CUDA kernel, where there is a CUDA device: recorded and random QPs against float64 answers and the XLA route."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -9,22 +10,19 @@ import pytest
 from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, recorded_qps
 
-from osik_jax.solvers import Status, _cuda, solve_least_squares_qp
+from osik_jax.solvers import Status, _backends, solve_least_squares_qp
 from osik_jax.solvers.qp import _kernel
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
 
-usable = _cuda.available() and _cuda.find_spec("warp") is not None
+usable = _backends.cuda_is_default() and _backends.installed("warp")
 pytestmark = pytest.mark.skipif(not usable, reason="needs a CUDA device, JAX for it and Warp (extra cuda)")
 
 
-@pytest.fixture(params=["1", "0"], ids=["fused", "xla"])
-def route(request, monkeypatch):
-    """Both routes have to pass."""
-    monkeypatch.setenv(_cuda.SWITCH, request.param)
-    jax.clear_caches()
-    yield request.param
-    jax.clear_caches()
+@pytest.fixture(params=["warp", "jax"])
+def backend(request):
+    """Both have to pass."""
+    return request.param
 
 
 def single(*arrays: Any) -> list[jax.Array]:
@@ -37,10 +35,12 @@ def off(A, x, expected, b):
 
 
 @pytest.mark.parametrize("robot", ["g1", "nao"])
-def test_recorded_qps_cold_and_warm(robot, route):
+def test_recorded_qps_cold_and_warm(robot, backend):
     p = recorded_qps(robot)
     weight, lower, upper = np.ones_like(p.b), *single(p.lower, p.upper)
-    solve = jax.jit(jax.vmap(lambda *a: solve_least_squares_qp(*a[:5], damping=QP_DAMPING, warm_start=a[5])))
+    solve = jax.jit(
+        jax.vmap(lambda *a: solve_least_squares_qp(*a[:5], damping=QP_DAMPING, warm_start=a[5], backend=backend))
+    )
     start = jnp.zeros(lower.shape, jnp.int32)
     for warm in (False, True):
         s = solve(*single(p.A, p.b, weight), lower, upper, start)
@@ -51,13 +51,17 @@ def test_recorded_qps_cold_and_warm(robot, route):
         start = s.active
 
 
-def test_whole_body_family(route, rng):
+def test_whole_body_family(backend, rng):
     p = whole_body(rng, 2000)
-    solve = jax.vmap(lambda *a: solve_least_squares_qp(*a, damping=WHOLE_BODY_DAMPING))
-    s = jax.jit(solve)(*single(*p[:5]))
+
+    def solve(backend):
+        options = dict(damping=WHOLE_BODY_DAMPING, backend=backend)
+        return jax.jit(jax.vmap(lambda *a: solve_least_squares_qp(*a, **options)))
+
+    s = solve(backend)(*single(*p[:5]))
     with jax.default_device(jax.devices("cpu")[0]):
-        expected = np.asarray(jax.jit(solve)(*p[:5]).x)
-    assert (np.asarray(s.status) == Status.SOLVED).mean() > 0.85  # in single precision; the fused route has more
+        expected = np.asarray(solve("jax")(*p[:5]).x)
+    assert (np.asarray(s.status) == Status.SOLVED).mean() > 0.85  # in single precision; Warp's candidates give more
     fine = np.asarray(s.status) == Status.SOLVED
     error = off(np.sqrt(p.weight)[..., None] * p.A, s.x, expected, np.sqrt(p.weight) * p.b)
     assert error[fine].max() < 5e-5
@@ -81,17 +85,17 @@ def soft_problems(rng, count, n, m, p):
 
 
 @pytest.mark.parametrize("shape", [(3, 0, 2), (12, 20, 5), (31, 60, 1), (33, 40, 3), (48, 30, 32), (64, 50, 4)])
-def test_any_size_with_soft_rows(shape, route, rng):
+def test_any_size_with_soft_rows(shape, backend, rng):
     data = soft_problems(rng, 500, *shape)
 
-    def one(A, b, weight, lower, upper, C, low, high, compliance, damping, center):
+    def solve(backend, A, b, weight, lower, upper, C, low, high, compliance, damping, center):
         rows = dict(rows=C, rows_lower=low, rows_upper=high, rows_compliance=compliance) if shape[2] else {}
-        return solve_least_squares_qp(A, b, weight, lower, upper, **rows, damping=damping, center=center)
+        pulls = dict(damping=damping, center=center)
+        return solve_least_squares_qp(A, b, weight, lower, upper, **rows, **pulls, backend=backend)
 
-    solve = jax.vmap(one)
-    s = jax.jit(solve)(*single(*data))
+    s = jax.jit(jax.vmap(partial(solve, backend)))(*single(*data))
     with jax.default_device(jax.devices("cpu")[0]):
-        expected = jax.jit(solve)(*data)
+        expected = jax.jit(jax.vmap(partial(solve, "jax")))(*data)
     assert (s.status == Status.SOLVED).all()
     np.testing.assert_allclose(s.x, expected.x, atol=2e-4)
     np.testing.assert_allclose(s.row_multipliers, expected.row_multipliers, atol=5e-3)
@@ -126,19 +130,15 @@ def test_a_bad_lane_disturbs_no_other(rng):
     np.testing.assert_array_equal(np.asarray(bad.x)[others], np.asarray(good.x)[others])
 
 
-def test_derivatives_are_those_of_the_other_route(rng, monkeypatch):
+def test_derivatives_are_those_of_the_search():
     p = recorded_qps("nao")
     A, b, lower, upper = single(p.A[:50], p.b[:50], p.lower[:50], p.upper[:50])
 
-    def cost(b):
-        solve = jax.vmap(lambda *a: solve_least_squares_qp(*a, damping=QP_DAMPING).x)
+    def cost(b, backend):
+        solve = jax.vmap(lambda *a: solve_least_squares_qp(*a, damping=QP_DAMPING, backend=backend).x)
         return jnp.sum(jnp.einsum("bmn,bn->bm", A, solve(A, b, jnp.ones_like(b), lower, upper)) ** 2)
 
-    slopes = []
-    for route in ("1", "0"):
-        monkeypatch.setenv(_cuda.SWITCH, route)
-        jax.clear_caches()
-        slopes.append(np.asarray(jax.jit(jax.grad(cost))(b)))
+    slopes = [np.asarray(jax.jit(partial(jax.grad(cost), backend=backend))(b)) for backend in ("warp", "jax")]
     np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-4 * np.abs(slopes[1]).max())
 
 

@@ -1,5 +1,7 @@
 """The array-level hierarchy against certified level norms, quadprog, and its own lexicographic promise."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,13 +11,21 @@ from recorded import recorded_hierarchies
 
 from osik_jax.solvers import Level, Status, Tolerances, solve_hqp, solve_nullspace
 
-batched_hqp = jax.jit(jax.vmap(lambda levels, lower, upper: solve_hqp([Level(*a) for a in levels], lower, upper)))
+
+@partial(jax.jit, static_argnames="backend")
+def batched_hqp(levels, lower, upper, backend="auto"):
+    def solve(levels, lower, upper):
+        return solve_hqp([Level(*a) for a in levels], lower, upper, backend=backend)
+
+    return jax.vmap(solve)(levels, lower, upper)
+
+
 IMPROVED = 239
 """A recorded hierarchy whose second level is not at its optimum; see the last assertion of the test."""
 
 
-def solved(r):
-    return batched_hqp(r.levels, r.lower, r.upper)
+def solved(r, backend="auto"):
+    return batched_hqp(r.levels, r.lower, r.upper, backend=backend)
 
 
 @pytest.fixture(scope="module")
@@ -24,12 +34,11 @@ def recorded():
     return r, solved(r)
 
 
+@pytest.mark.parametrize("backend", ["auto", "jax"])
 @pytest.mark.parametrize("unit_rows", [False, True])
-def test_recorded_hierarchies(unit_rows, recorded):
-    r, s = recorded
-    if unit_rows:
-        r = recorded_hierarchies(unit_rows)
-        s = solved(r)
+def test_recorded_hierarchies(unit_rows, backend):
+    r = recorded_hierarchies(unit_rows)
+    s = solved(r, backend)
     assert (s.status == Status.SOLVED).all()
     assert ((r.lower <= s.x) & (s.x <= r.upper)).all()
     norms = np.stack([np.linalg.norm(w, axis=1) for w in s.slacks], 1)
@@ -43,13 +52,14 @@ def test_recorded_hierarchies(unit_rows, recorded):
         np.testing.assert_allclose(norms[IMPROVED, 1], second_level_by_quadprog(r, IMPROVED, x), atol=2e-8)
 
 
+@pytest.mark.parametrize("backend", ["auto", "jax"])
 @pytest.mark.parametrize("unit_rows", [False, True])
-def test_recorded_hierarchies_in_single_precision(unit_rows):
+def test_recorded_hierarchies_in_single_precision(unit_rows, backend):
     """Level norms within 1e-6, measured with the data before they were rounded."""
     r = recorded_hierarchies(unit_rows)
     with jax.enable_x64(False):
         levels, lower, upper = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (r.levels, r.lower, r.upper))
-        s = jax.device_get(batched_hqp(levels, lower, upper))
+        s = jax.device_get(batched_hqp(levels, lower, upper, backend=backend))
     assert s.x.dtype == np.float32
     assert (s.status == Status.SOLVED).all()
     assert ((lower <= s.x) & (s.x <= upper)).all()

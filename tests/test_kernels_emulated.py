@@ -11,7 +11,7 @@ from hierarchy_families import SMALL
 from lexicographic import certificate
 from recorded import QP_DAMPING, recorded_hierarchies, recorded_qps
 
-from osik_jax.solvers import Level, Status, _cuda, solve_hqp, solve_least_squares_qp
+from osik_jax.solvers import Level, Status, _backends, solve_hqp, solve_least_squares_qp
 from osik_jax.solvers.hqp import _fused as hqp_fused
 from osik_jax.solvers.hqp import _kernel as hqp_kernel
 from osik_jax.solvers.qp import _fused as qp_fused
@@ -45,8 +45,8 @@ def on_emulated_gpu(request, tmp_path_factory):
         return kernel
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_cuda, "available", lambda: True)
-        patch.setattr(_cuda, "find_spec", lambda name: name)
+        patch.setattr(_backends, "cuda_is_default", lambda: True)
+        patch.setattr(_backends, "installed", lambda name: name == "warp")
         patch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
         for module in (hqp_kernel, qp_kernel):
             patch.setattr(module, "_kernel", fake(module))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..solvers import Damping, WorkingSet, solve_hqp
+from ..solvers import Backend, Damping, WorkingSet, solve_hqp
+from ..solvers._backends import check_backend
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf, status_with
 
 
@@ -26,11 +27,13 @@ class HierarchicalQP(Scheme):
         curvature_damping: kappa, the share of what each priority's linear model leaves out that is added to its
             damping; 0 for none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         max_iterations: cap on the active-set iterations of one level (static).
+        backend: whose candidates for the answer are taken, as in ``solve_hqp`` (static).
     """
 
     damping: Float[Array, ""] = eqx.field(default=0.0, converter=as_leaf("damping"), kw_only=True)
     curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
     max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
+    backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
     def solve(self, problem: VelocityProblem, warm_start: WorkingSet | None = None) -> SchemeAnswer:
         """The velocity of one tick; the warm start is the working set of every level."""
@@ -42,6 +45,7 @@ class HierarchicalQP(Scheme):
             damping=self._damping(problem, hard=constraints is not None),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
+            backend=self.backend,
         )
         status = answer.status
         if constraints is not None:

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._joint_selection import concrete
-from ..solvers import Level, _cuda, solve_least_squares_qp
+from ..solvers import Backend, Level, solve_least_squares_qp
+from ..solvers._backends import check_backend, takes
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
 
@@ -35,11 +36,13 @@ class WeightedQP(Scheme):
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
             none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         max_iterations: cap on changes of the active set (static).
+        backend: whose candidates for the answer are taken, as in ``solve_least_squares_qp`` (static).
     """
 
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
     curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
     max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
+    backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
     def __check_init__(self) -> None:
         self._check()
@@ -59,26 +62,29 @@ class WeightedQP(Scheme):
             problem.lower,
             problem.upper,
             **_rows(intervals, problem.constraints()),
-            **_pulls([rows for rows in equalities if rows.dofs is not None], problem, damping),
+            **_pulls([rows for rows in equalities if rows.dofs is not None], problem, damping, self.backend),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
+            backend=self.backend,
         )
         return SchemeAnswer(
             answer.x, answer.status, answer.iterations, answer.factorizations, answer.kkt_residual, answer.active
         )
 
 
-def _least(problem: VelocityProblem) -> Float[Array, ""]:
+def _least(problem: VelocityProblem, backend: Backend) -> Float[Array, ""]:
     """The weakest damping that a kernel of single precision can tell from the rounding of the Hessian; 0 for none."""
     rows = list(problem.soft().values())
     dtype = problem.lower.dtype
-    if dtype != jnp.float32 or not rows or not _cuda.wanted():
+    if dtype != jnp.float32 or not rows or not takes(backend, "warp", fits=True):
         return jnp.zeros((), dtype)
     steepest = [jnp.max(r.weight * jnp.sum(r.jacobian**2, 1), initial=0.0) for r in rows]
     return jax.lax.stop_gradient(_ROUNDINGS * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
 
 
-def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Array, ""]) -> dict[str, Array]:
+def _pulls(
+    singles: list[TaskRows], problem: VelocityProblem, damping: Float[Array, ""], backend: Backend
+) -> dict[str, Array]:
     """Rows that each ask for one dof's velocity, with the damping: a strength and a centre for each dof."""
     n = problem.lower.shape[0]
     strength, pull = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)
@@ -88,7 +94,7 @@ def _pulls(singles: list[TaskRows], problem: VelocityProblem, damping: Float[Arr
         usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of nought is NaN
         weight, wanted = (jnp.append(a, 0.0)[place] for a in (usable, usable * rows.lower))
         strength, pull = strength + weight, pull + wanted
-    least = _least(problem)
+    least = _least(problem, backend)
     strength = jnp.where(strength < least, least, strength)
     center = pull / strength
     for rows in singles:

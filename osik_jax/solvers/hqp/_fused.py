@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .. import _cuda
+from .._backends import Backend, on_platforms, takes
 from .._double import in_double
 from .._lanes import in_lanes, with_the_rest
-from . import _kernel
+from . import _kernel, _numba
 from ._cascade import Descent, certified, descend_all
 from ._problem import Tolerances, WorkingSet
 from ._stack import Layout, Stack
@@ -30,27 +30,35 @@ _NEARLY = 1e3
 
 
 @cache
-def descender(layout: Layout, max_iterations: int | None) -> Callable[[Stack, Tolerances, WorkingSet | None], Descent]:
+def descender(
+    layout: Layout, max_iterations: int | None, backend: Backend
+) -> Callable[[Stack, Tolerances, WorkingSet | None], Descent]:
     """All levels of one problem, in double precision; a cap on the active-set iterations of one level."""
     cap = 10 * (layout.variables + layout.rows) if max_iterations is None else max_iterations
-    return in_lanes(in_double(partial(_descend_anywhere, layout, cap)))
+    return in_lanes(in_double(partial(_descend_anywhere, layout, cap, backend)))
 
 
 def _descend_anywhere(
-    layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
+    layout: Layout, cap: int, backend: Backend, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
 ) -> Descent:
-    plain = partial(descend_all, layout, cap)
-    if not (_cuda.wanted() and _kernel.Shape.of(layout).warps):
-        return plain(stack, tolerances, warm)
-    fused = partial(descended_and_checked, layout, cap)
-    return jax.lax.platform_dependent(stack, tolerances, warm, cuda=fused, default=plain)
+    kernels = {}
+    if takes(backend, "warp", fits=_kernel.Shape.of(layout).warps > 0):
+        kernels["warp"] = partial(descended_and_checked, layout, cap, _kernel.solve)
+    if takes(backend, "numba", fits=True):
+        kernels["numba"] = partial(descended_and_checked, layout, cap, _numba.solve)
+    return on_platforms(kernels, partial(descend_all, layout, cap), stack, tolerances, warm)
 
 
 def descended_and_checked(
-    layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
+    layout: Layout,
+    cap: int,
+    solve: Callable[[Layout, Stack, Tolerances, WorkingSet | None, int], Descent],
+    stack: Stack,
+    tolerances: Tolerances,
+    warm: WorkingSet | None,
 ) -> Descent:
     """The kernel's answers where they pass the check, XLA's elsewhere; arguments as for ``descend_all``."""
-    end = jax.vmap(certified)(_kernel.solve(layout, stack, tolerances, warm, cap), stack, tolerances)
+    end = jax.vmap(certified)(solve(layout, stack, tolerances, warm, cap), stack, tolerances)
     fine = end.done & jax.vmap(_holds)(end, stack, tolerances)
 
     def again(at: Array, end: Descent) -> Descent:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ... import _rules
+from .._backends import Backend, check_backend
 from .._box import inside, uncrossed
 from .._damping import Damping, one_each
 from .._level import Level
@@ -24,7 +25,7 @@ _RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
 """Rounding of the data makes rows independent that are not."""
 
 
-@partial(jax.jit, static_argnames="max_iterations")
+@partial(jax.jit, static_argnames=("max_iterations", "backend"))
 def solve_hqp(
     levels: Sequence[Level],
     lower: Float[ArrayLike, " n"],
@@ -34,6 +35,7 @@ def solve_hqp(
     warm_start: WorkingSet | None = None,
     max_iterations: int | None = None,
     tolerances: Tolerances | None = None,
+    backend: Backend = "auto",
 ) -> HQPSolution:
     """Lexicographic least squares: level k minimises |w_k|^2 among the minimisers of the levels before it.
 
@@ -57,6 +59,9 @@ def solve_hqp(
         warm_start: that of the solution of a problem nearby with the same levels. It changes the time, not the answer.
         max_iterations: cap on the active-set iterations of one level (static); default 10 (n + rows of the level).
         tolerances: what counts as zero; the default rank tolerance depends on the precision of the data.
+        backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
+            the platform, "jax" for none, "numba" (CPUs) or "warp" (CUDA) for those or an error. It changes the time,
+            not the answer.
 
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
@@ -81,7 +86,8 @@ def solve_hqp(
     )
     layout, stack = stacked(scaled, equal, low, high, (lower >= upper) & sane, damped)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
-    end = _rules.found(descender(layout, max_iterations)(*jax.lax.stop_gradient((stack, traced, warm_start))))
+    search = descender(layout, max_iterations, check_backend(backend))
+    end = _rules.found(search(*jax.lax.stop_gradient((stack, traced, warm_start))))
     nothing = jnp.maximum(NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
     x = with_derivative(end.x, end.decisions, stack, nothing)
     return _answer(levels, end, x, sane, possible, lower, upper)

@@ -7,29 +7,42 @@ data. Its derivative is one more solution of that system; the search is not diff
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ..._rules import custom_jvp
+from .._backends import Backend
 from .._dense import apply
 from .._pivots import INACTIVE
 from ._fused import system_solver
 from ._problem import QP, active_targets
 
 
-@custom_jvp
-def differentiable(x: Array, y: Array, active: Int[Array, " m"], qp: QP) -> tuple[Array, Array]:
-    """x and y as they are, with the derivatives of the minimiser and its row multipliers with respect to ``qp``."""
-    return x, y
+@cache
+def differentiable(backend: Backend) -> Callable[[Array, Array, Array, QP], tuple[Array, Array]]:
+    """x and y as they are, with the derivatives of the minimiser and its row multipliers with respect to ``qp``.
+
+    The function of x, y, the active set and the problem; ``backend`` may solve the linear systems of the derivative.
+    """
+
+    @custom_jvp
+    def attached(x: Array, y: Array, active: Int[Array, " m"], qp: QP) -> tuple[Array, Array]:
+        return x, y
+
+    @attached.defjvp
+    def _(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        x, y, active, qp = primals
+        x, y = attached(x, y, active, qp)
+        return (x, y), _rates(x, y, active, qp, tangents[3], backend)
+
+    return attached
 
 
-@differentiable.defjvp
-def _(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    x, y, active, qp = primals
-    rates = tangents[3]
-    x, y = differentiable(x, y, active, qp)
+def _rates(x: Array, y: Array, active: Array, qp: QP, rates: QP, backend: Backend) -> tuple[Array, Array]:
+    """Of x and y, from those of the problem."""
     n = x.shape[0]
     free, held = active[:n] == INACTIVE, active[n:] != INACTIVE
 
@@ -42,11 +55,11 @@ def _(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array
     pinned = jnp.where(free, 0.0, jax.jvp(lambda data: active_targets(data, active)[:n], (qp,), (rates,))[1])
     slope = jnp.where(free, slope - qp.cost.curvature(pinned), 0.0)
     gap = jnp.where(held, gap - apply(qp.rows, pinned), 0.0)
-    dx, dy = _linear_solve(qp, active, slope, gap)
-    return (x, y), (dx + pinned, dy)
+    dx, dy = _linear_solve(qp, active, slope, gap, backend)
+    return dx + pinned, dy
 
 
-def _linear_solve(qp: QP, active: Int[Array, " m"], slope: Array, gap: Array) -> tuple[Array, Array]:
+def _linear_solve(qp: QP, active: Int[Array, " m"], slope: Array, gap: Array, backend: Backend) -> tuple[Array, Array]:
     """dx, dy with H dx - C'dy = slope over the free variables and C dx + D dy = gap over the held rows, 0 elsewhere."""
     n = slope.shape[0]
     free, held = active[:n] == INACTIVE, active[n:] != INACTIVE
@@ -58,7 +71,7 @@ def _linear_solve(qp: QP, active: Int[Array, " m"], slope: Array, gap: Array) ->
         bottom = -apply(qp.rows, x) - qp.compliance * y
         return jnp.where(counts, jnp.concatenate([top, bottom]), point)
 
-    inverse = system_solver(jax.lax.stop_gradient(qp), active)
+    inverse = system_solver(jax.lax.stop_gradient(qp), active, backend)
 
     def solve(matvec: Callable[[Array], Array], right: Array) -> Array:
         return jnp.where(counts, inverse(right), right)

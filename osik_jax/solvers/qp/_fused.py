@@ -1,4 +1,4 @@
-"""The search for the active set on a GPU: a kernel proposes, XLA certifies, and what is left goes to the search.
+"""The search for the active set: a kernel proposes, XLA certifies, and what is left goes to the search.
 
 Only what the check certifies is taken from the kernel, so answers do not rest on it. The check is the search's own, on
 data read anew; it costs two passes over the rows where a factorisation by XLA costs more than everything else. The
@@ -15,15 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .. import _cuda
+from .._backends import Backend, on_platforms, takes
 from .._dense import apply
-from .._lanes import in_lanes, with_the_rest
+from .._double import in_double
+from .._lanes import in_lanes, with_a_few, with_the_rest
 from .._pivots import EQUALITY, INACTIVE, Noise
-from . import _kernel
+from . import _cpu_kernel, _kernel
 from ._cost import LeastSquares
 from ._factor import system_inverse
 from ._kernel import Proposal
-from ._problem import CERTIFIED, QP, active_targets, kkt_residual, scales_of
+from ._problem import CERTIFIED, QP, active_targets, forces, kkt_residual, scales_of
 from ._search import Found, optimal_on, possible, search
 
 _SHARE, _SMALLEST = 16, 1024
@@ -41,32 +42,39 @@ _NEARLY, _SIGN = 30.0, 2.0
 Less is allowed of the last: such a multiplier says that the active set is not right, and what that costs is more the
 weaker the curvature is that the rows leave."""
 
+_ROUNDINGS = 1e2
+"""Of the forces at a free variable, that it may be left with."""
+
+_FEW = 4
+"""Lanes that are searched together on a CPU."""
+
 Propose = Callable[[QP, Array, Array, int], Proposal]
 
 
 @cache
-def searcher(max_iterations: int, gives_way: bool) -> Callable[[QP, Array, Array], Found]:
+def searcher(max_iterations: int, gives_way: bool, backend: Backend) -> Callable[[QP, Array, Array], Found]:
     """The search for one problem, with a cap on the changes of the active set.
 
     Args:
         max_iterations: the cap.
-        gives_way: whether rows may give way; where all are hard, the kernel is not asked.
+        gives_way: whether rows may give way; where all are hard, Warp's kernel is not asked.
+        backend: whose candidates are taken.
     """
-    return in_lanes(lambda qp, guess, tolerance: _search_anywhere(qp, guess, tolerance, max_iterations, gives_way))
+    return in_lanes(partial(_search_anywhere, cap=max_iterations, gives_way=gives_way, backend=backend))
 
 
-def _search_anywhere(qp: QP, guess: Array, tolerance: Array, cap: int, gives_way: bool) -> Found:
-    plain = partial(search, max_iterations=cap)
-    if not (gives_way and _fits(qp) and _cuda.wanted()):
-        return plain(qp, guess, tolerance)
+def _search_anywhere(qp: QP, guess: Array, tolerance: Array, *, cap: int, gives_way: bool, backend: Backend) -> Found:
     fused = partial(proposed_and_searched, propose=_kernel.propose, max_iterations=cap)
-    return jax.lax.platform_dependent(qp, guess, tolerance, cuda=fused, default=plain)
+    kernels = {"warp": fused} if takes(backend, "warp", fits=gives_way and _fits(qp)) else {}
+    if takes(backend, "numba", fits=isinstance(qp.cost, LeastSquares)):
+        kernels["numba"] = partial(certified_or_searched, propose=_cpu_kernel.propose, max_iterations=cap)
+    return on_platforms(kernels, partial(search, max_iterations=cap), qp, guess, tolerance)
 
 
-def system_solver(qp: QP, active: Int[Array, " m"]) -> Callable[[Array], Array]:
+def system_solver(qp: QP, active: Int[Array, " m"], backend: Backend) -> Callable[[Array], Array]:
     """The inverse of the optimality conditions at an active set, as ``system_inverse``, by the kernel where it can."""
     lanes = jax.tree.map(lambda a: jax.ShapeDtypeStruct((1, *a.shape), a.dtype), qp)
-    if not (_fits(lanes) and _cuda.wanted()):
+    if not takes(backend, "warp", fits=_fits(lanes)):
         return system_inverse(qp, active)
     return lambda right: _solve_anywhere()(qp, active, right)
 
@@ -76,7 +84,7 @@ def _solve_anywhere() -> Callable[[QP, Array, Array], Array]:
     def plain(qp: QP, active: Array, right: Array) -> Array:
         return system_inverse(qp, active)(right)
 
-    return in_lanes(partial(jax.lax.platform_dependent, cuda=_solved_by_kernel, default=jax.vmap(plain)))
+    return in_lanes(partial(on_platforms, {"warp": _solved_by_kernel}, jax.vmap(plain)))
 
 
 def _solved_by_kernel(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
@@ -139,6 +147,37 @@ def proposed_and_searched(
         return end._replace(factorizations=end.factorizations + found.factorizations[at])
 
     return with_the_rest(found, fine, again, _block(len(tolerance)))
+
+
+def certified_or_searched(
+    qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, propose: Propose, max_iterations: int
+) -> Found:
+    """As ``proposed_and_searched``, in double precision whatever the data, and a few lanes at a time.
+
+    The certificate asks for more than in single precision: a slope of the free variables that is not told from 0.
+    """
+    holds = CERTIFIED[tolerance.dtype]
+
+    def candidates(qp: QP, guess: Array, tolerance: Array) -> Found:
+        proposal = propose(qp, jax.vmap(possible)(qp, guess), tolerance, max_iterations)
+        found = _found(qp, proposal)
+        fine = (proposal.settled != 0) & (proposal.iterations <= max_iterations)
+        fine &= jax.vmap(_certified)(qp, found, tolerance) & jax.vmap(_rests)(qp, found) & (found.residual <= holds)
+        return found._replace(done=fine, optimal=fine)
+
+    def again(given: tuple[QP, Array], found: Found) -> Found:
+        end = search(given[0], found.active, given[1], max_iterations=max_iterations)
+        return end._replace(factorizations=end.factorizations + found.factorizations)
+
+    found = in_double(candidates)(qp, guess, tolerance)
+    return with_a_few((qp, tolerance), found, found.done, again, _FEW)
+
+
+def _rests(qp: QP, found: Found) -> Bool[Array, ""]:
+    """Whether what the free variables are left with is rounding of the forces at them."""
+    left = qp.cost.gradient(found.x) - apply(qp.rows.T, found.row_multipliers)
+    rounding = _ROUNDINGS * float(jnp.finfo(left.dtype).eps) * forces(qp, found.x, found.row_multipliers)
+    return jnp.all((jnp.abs(left) <= rounding) | (found.active[: len(left)] != INACTIVE))
 
 
 def _block(lanes: int) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ... import _rules
+from .._backends import Backend, check_backend
 from .._box import inside, uncrossed
 from .._dense import apply
 from .._pivots import INACTIVE
@@ -24,7 +25,7 @@ from ._search import Found
 _TOLERANCE = 1e-12
 
 
-@partial(jax.jit, static_argnames="max_iterations")
+@partial(jax.jit, static_argnames=("max_iterations", "backend"))
 def solve_qp(
     hessian: Float[ArrayLike, "n n"],
     gradient: Float[ArrayLike, " n"],
@@ -38,6 +39,7 @@ def solve_qp(
     warm_start: Int[ArrayLike, " n+p"] | None = None,
     max_iterations: int | None = None,
     tolerance: Float[ArrayLike, ""] | None = None,
+    backend: Backend = "auto",
 ) -> QPSolution:
     """Minimises 1/2 x'Hx + g'x  subject to  lower <= x <= upper,  rows_lower <= rows x <= rows_upper.
 
@@ -57,6 +59,7 @@ def solve_qp(
         warm_start: ``active`` of the solution of a problem nearby. It changes the time, not the answer. (n + p,)
         max_iterations: cap on changes of the active set (static); default 20 (n + p).
         tolerance: violation that counts as none, relative to the scale of the constraint; default 1e-12.
+        backend: "auto" or "jax" (static): there is no kernel for this form.
 
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
@@ -66,10 +69,10 @@ def solve_qp(
     if found != (n, n):
         raise ValueError(f"hessian has shape {found}, gradient has length {n}")
     qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
-    return _solve(qp, warm_start, max_iterations, tolerance)
+    return _solve(qp, warm_start, max_iterations, tolerance, backend)
 
 
-@partial(jax.jit, static_argnames=("max_iterations", "rows_equalities"))
+@partial(jax.jit, static_argnames=("max_iterations", "rows_equalities", "backend"))
 def solve_least_squares_qp(
     matrix: Float[ArrayLike, "m n"],
     target: Float[ArrayLike, " m"],
@@ -87,6 +90,7 @@ def solve_least_squares_qp(
     warm_start: Int[ArrayLike, " n+p"] | None = None,
     max_iterations: int | None = None,
     tolerance: Float[ArrayLike, ""] | None = None,
+    backend: Backend = "auto",
 ) -> QPSolution:
     """Minimises 1/2 sum_i weight_i (matrix_i x - target_i)^2 + 1/2 damping |x - center|^2, constrained as ``solve_qp``.
 
@@ -111,6 +115,9 @@ def solve_least_squares_qp(
         warm_start: ``active`` of the solution of a problem nearby. (n + p,)
         max_iterations: cap on changes of the active set (static).
         tolerance: relative violation that counts as none.
+        backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
+            the platform, "jax" for none, "numba" (CPUs) or "warp" (CUDA) for that or an error. It changes the time,
+            not the answer.
     """
     matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)
     n = matrix.shape[1]
@@ -118,7 +125,7 @@ def solve_least_squares_qp(
     cost = LeastSquares(matrix, target, weight, *pulls)
     qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance, rows_equalities)
     gives_way = rows is None or (rows_compliance is not None and not any(rows_equalities or ()))
-    return _solve(qp, warm_start, max_iterations, tolerance, gives_way=gives_way)
+    return _solve(qp, warm_start, max_iterations, tolerance, backend, gives_way=gives_way)
 
 
 def _problem(
@@ -164,6 +171,7 @@ def _solve(
     guess: ArrayLike | None,
     max_iterations: int | None,
     tolerance: ArrayLike | None,
+    backend: Backend,
     *,
     gives_way: bool = False,
 ) -> QPSolution:
@@ -176,11 +184,11 @@ def _solve(
     low, high, crossed = uncrossed(safe.lower, _upper(safe))
     safe = replace(safe, lower=low, upper=high)
     cold = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
-    search = searcher(20 * m if max_iterations is None else max_iterations, gives_way)
+    search = searcher(20 * m if max_iterations is None else max_iterations, gives_way, check_backend(backend))
     found = _rules.found(search(*jax.lax.stop_gradient((safe, cold, allowed))))
     solved = replace(safe, compliance=jnp.where(found.infeasible, found.compliance, safe.compliance))
     answered = found.optimal | found.infeasible
-    moving = differentiable(found.x, found.row_multipliers, found.active, solved)
+    moving = differentiable(backend)(found.x, found.row_multipliers, found.active, solved)
     x, y = (jnp.where(answered, a, b) for a, b in zip(moving, (found.x, found.row_multipliers), strict=True))
     finite = sane & jnp.isfinite(x).all() & jnp.isfinite(y).all()
     x, y = jnp.where(finite, x, 0.0), jnp.where(finite, y, 0.0)

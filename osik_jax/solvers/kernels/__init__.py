@@ -1,0 +1,1 @@
+"""Kernels that propose answers; what they propose is certified, and differentiated, in JAX."""

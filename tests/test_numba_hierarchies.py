@@ -1,0 +1,208 @@
+"""Numba's kernel of hierarchies on a CPU: beside the search, in both precisions, and what happens where it fails."""
+
+import os
+import subprocess
+import sys
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hierarchy_families import SMALL, Hierarchies, Rows, stretched
+from lexicographic import certificate
+from recorded import recorded_hierarchies
+
+from osik_jax import HierarchicalQP
+from osik_jax.solvers import Damping, Level, Status, _backends, solve_hqp
+from osik_jax.solvers.hqp import _fused, _numba
+
+pytest.importorskip("numba")
+COUNT = 24
+DAMPED = [0.0, Damping(1e-3, 0.3, 2.0, 0.4), 1e-4, Damping(0.0, 0.5, 1.0)]
+
+
+@pytest.fixture(scope="module")
+def families() -> Hierarchies:
+    """Of each family some, in one batch."""
+    drawn = [draw(np.random.default_rng(k), COUNT) for k, draw in enumerate(SMALL.values())]
+    return jax.tree.map(lambda *a: np.concatenate(a), *drawn)
+
+
+@partial(jax.jit, static_argnames=("backend", "damped"))
+def solved(levels, lower, upper, warm_start=None, *, backend="numba", damped=False):
+    def one(levels, lower, upper, warm_start):
+        damping = DAMPED[: len(levels)] if damped else 0.0
+        given = [Level(*level) for level in levels]
+        return solve_hqp(given, lower, upper, warm_start=warm_start, backend=backend, damping=damping)
+
+    return jax.vmap(one)(levels, lower, upper, warm_start)
+
+
+def given(p):
+    return [tuple(level) for level in p.levels], p.lower, p.upper
+
+
+@pytest.fixture
+def nothing_is_searched(monkeypatch):
+    """What the kernel leaves over is lost: numbers that are NaN."""
+
+    def spoiled(end, done, again, block):
+        def lose(a):
+            missing = jnp.nan if jnp.issubdtype(a.dtype, jnp.floating) else a
+            return jnp.where(done.reshape(-1, *[1] * (a.ndim - 1)), a, missing)
+
+        return jax.tree.map(lose, end)
+
+    monkeypatch.setattr(_fused, "with_the_rest", spoiled)
+    _fused.descender.cache_clear()
+    jax.clear_caches()
+    yield
+    _fused.descender.cache_clear()
+    jax.clear_caches()
+
+
+def test_every_level_is_certified_and_nothing_is_left_to_the_search(families, nothing_is_searched):
+    cold = solved(*given(families))
+    for s in (cold, solved(*given(families), cold.warm_start)):
+        np.testing.assert_array_equal(s.status, Status.SOLVED)
+        x = np.asarray(s.x)
+        assert ((families.lower <= x) & (x <= families.upper)).all()
+        assert max(certificate(families, i, x[i]).max() for i in range(0, len(x), 3)) < 1e-10
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_answers_are_those_of_the_search(families, damped):
+    mine, search = (solved(*given(families), backend=b, damped=damped) for b in ("numba", "jax"))
+    np.testing.assert_array_equal(mine.status, search.status)
+    agree = np.abs(mine.x - search.x).max(1) < 1e-6 * (1.0 + np.abs(search.x).max(1))
+    assert agree.mean() > 0.99  # what is left: rows whose rank is at the tolerance
+    np.testing.assert_array_equal(np.asarray(mine.active)[agree] != 0, np.asarray(search.active)[agree] != 0)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_recorded_hierarchies(precision, nothing_is_searched):
+    r = recorded_hierarchies(unit_rows=True)
+    with jax.enable_x64(precision == "float64"):
+        levels, lower, upper = jax.tree.map(lambda a: jnp.asarray(a, precision), (r.levels, r.lower, r.upper))
+        cold = solved(levels, lower, upper)
+        warm = solved(levels, lower, upper, cold.warm_start)
+    for s in (cold, warm):
+        assert s.x.dtype == precision and (np.asarray(s.status) == Status.SOLVED).all()
+        for k, (A, low, high) in enumerate(r.levels):
+            value = np.einsum("bmn,bn->bm", A, np.asarray(s.x, float))
+            norm = np.linalg.norm(value - np.clip(value, low, high), axis=1)
+            bound = 2e-7 if precision == "float32" else 1e-10
+            np.testing.assert_allclose(norm, r.residual_norm[:, k], rtol=0, atol=bound)
+    assert np.mean(warm.factorizations) < 0.3 * np.mean(cold.factorizations)
+
+
+def test_vmap_is_a_loop_and_a_bad_lane_leaves_its_neighbours_alone(families):
+    p = jax.tree.map(lambda a: a[:5], families)
+    p.levels[1].A[3, 0, 0] = np.nan
+    levels, lower, upper = given(p)
+    s = solved(levels, lower, upper)
+    assert s.status[3] == Status.NUMERICAL_ERROR and np.isfinite(s.x).all()
+    nested = jax.tree.map(lambda a: a[None], (levels, lower, upper))
+    np.testing.assert_array_equal(jax.vmap(solved)(*nested).x[0], s.x)
+    for i in (0, 4):
+        alone = solved(*jax.tree.map(lambda a, i=i: a[i : i + 1], (levels, lower, upper)))
+        np.testing.assert_array_equal(alone.x[0], s.x[i])
+
+
+def test_what_the_kernel_leaves_over_is_searched(families, monkeypatch):
+    """A kernel that gives wrong answers in every third lane."""
+    p = jax.tree.map(lambda a: a[:6], families)
+    right, solve = solved(*given(p)), _numba.solve
+
+    def wrong(*args):
+        end = solve(*args)
+        return end._replace(x=jnp.where(jnp.arange(len(end.x))[:, None] % 3 == 0, jnp.nan, end.x))
+
+    monkeypatch.setattr(_numba, "solve", wrong)
+    _fused.descender.cache_clear()
+    jax.clear_caches()
+    s = solved(*given(p))
+    _fused.descender.cache_clear()
+    jax.clear_caches()
+    np.testing.assert_array_equal(s.status, Status.SOLVED)
+    np.testing.assert_allclose(s.x, right.x, atol=1e-9)
+
+
+def test_derivatives_are_those_of_differences():
+    A = np.random.default_rng(3).normal(size=(7, 5))
+    box = np.full(5, 0.4)
+
+    def norm(t, warm=None):
+        levels = [Level(A[:2], jnp.array([0.3, -0.2]) + t), Level(A[2:], A[2:, 0] * t + 0.5)]
+        return jnp.sum(jnp.sin(solve_hqp(levels, -box, box, backend="numba").x))
+
+    step = 1e-6
+    by_differences = (norm(0.2 + step) - norm(0.2 - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(norm)(0.2), by_differences, rtol=1e-6)
+    np.testing.assert_allclose(jax.jvp(norm, (0.2,), (1.0,))[1], by_differences, rtol=1e-6)
+    ends = jax.lax.scan(lambda t, _: (t + 0.01, norm(t)), 0.2, length=3)[1]
+    np.testing.assert_allclose(ends, [norm(0.2), norm(0.21), norm(0.22)], atol=1e-12)
+
+
+def test_a_backend_that_is_not_there(monkeypatch):
+    with pytest.raises(ValueError, match="backend is 'cuda'; backends: auto, jax, numba, warp"):
+        HierarchicalQP(backend="cuda")  # pyright: ignore[reportArgumentType]
+    with (
+        pytest.raises(RuntimeError, match="CUDA device")
+        if _backends.installed("warp")
+        else pytest.raises(ModuleNotFoundError, match=r"pip install 'osik-jax\[cuda\]'")
+    ):
+        HierarchicalQP(backend="warp")
+    monkeypatch.setattr(_backends, "installed", lambda package: False)
+    with pytest.raises(ModuleNotFoundError, match=r"backend='numba' needs Numba: pip install 'osik-jax\[numba\]'"):
+        HierarchicalQP(backend="numba")
+    assert not _backends.takes("auto", "numba", fits=True)
+
+
+def test_programs_for_other_machines():
+    """The search alone can be exported; one program is lowered for two platforms."""
+
+    def solve(target):
+        return solve_hqp([Level(np.ones((1, 3)), target)], -np.ones(3), np.ones(3), backend="jax").x
+
+    exported = jax.export.export(jax.jit(solve), platforms=["cpu", "cuda"])(np.ones(1))
+    np.testing.assert_allclose(exported.call(np.ones(1)), np.full(3, 1.0 / 3.0), atol=1e-12)
+
+
+def test_the_second_process_does_not_compile():
+    """Nor does importing the package import Numba."""
+    solved(*given(jax.tree.map(lambda a: a[:1], SMALL["conflicting"](np.random.default_rng(0), 1))))
+    code = """
+import sys, osik_jax
+assert "numba" not in sys.modules
+from osik_jax.solvers.kernels.numba import _target
+_target.register("_hierarchy")
+print(_target._registered["osik_jax_hierarchy"].cache_hits)
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["1"], ran.stderr
+
+
+@pytest.mark.slow
+def test_no_index_is_out_of_bounds():
+    """With every index checked: an exception would leave its lanes to the search, and print a line."""
+    code = f"import pytest; pytest.main(['-q', '-n', '0', '-k', 'certified or recorded', {__file__!r}])"
+    environment = os.environ | dict(NUMBA_BOUNDSCHECK="1")
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert "3 passed" in ran.stdout and "IndexError" not in ran.stdout + ran.stderr
+
+
+@pytest.mark.slow
+def test_ten_thousand_problems(rng):
+    """Lane by lane, level by level; ``python -m benchmarks.agreement`` goes on."""
+    p = stretched(rng, 2048)
+    batches = [p] + [draw(rng, 1024) for draw in SMALL.values()]
+    for p in batches:
+        mine, search = (solved(*given(p), backend=backend) for backend in ("numba", "jax"))
+        np.testing.assert_array_equal(mine.status, search.status)
+        for mine_k, search_k, level in zip(mine.slacks, search.slacks, p.levels, strict=True):
+            assert isinstance(level, Rows)
+            size = np.linalg.norm(level.A, axis=2).max(1, initial=0.0) * (1.0 + np.abs(search.x).max(1))
+            off = np.abs(np.linalg.norm(mine_k, axis=1) - np.linalg.norm(search_k, axis=1))
+            assert (off <= 1e-7 * size).mean() > 0.999

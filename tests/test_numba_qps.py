@@ -1,0 +1,200 @@
+"""Numba's kernel for weighted QPs: its candidates against the plain method, lane by lane, and against daqp."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from optimality import by_daqp
+from problem_families import QPs
+from recorded import QP_DAMPING, recorded_qps
+
+from osik_jax.solvers import Status, solve_least_squares_qp
+from osik_jax.solvers.qp import _cpu_kernel
+from osik_jax.solvers.qp._cost import LeastSquares
+from osik_jax.solvers.qp._problem import QP
+
+N, M, P = 12, 7, 5
+"""Variables, rows of the cost, rows of C: fewer rows than variables. ``MANY`` rows of the cost are more."""
+MANY = 16
+
+
+class Problems(NamedTuple):
+    """Arguments of ``solve_least_squares_qp`` with a leading axis, the lanes."""
+
+    matrix: np.ndarray
+    target: np.ndarray
+    weight: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    rows: np.ndarray
+    rows_lower: np.ndarray
+    rows_upper: np.ndarray
+    rows_compliance: np.ndarray
+    damping: np.ndarray
+
+
+def problems(count: int, m: int = M, seed: int = 0, weakest: float = 1e-6) -> Problems:
+    """Feasible: weights over five decades, dampings from ``weakest``, all kinds of bounds and rows, hard or soft."""
+    rng = np.random.default_rng(seed)
+    inside = rng.normal(size=(count, N))
+    A, C = rng.normal(size=(count, m, N)), rng.normal(size=(count, P, N))
+    low, high = inside - rng.exponential(0.5, (count, N)), inside + rng.exponential(0.5, (count, N))
+    low, high = np.where(rng.random(low.shape) < 0.2, -np.inf, low), np.where(rng.random(low.shape) < 0.2, np.inf, high)
+    pinned = rng.random(low.shape) < 0.05
+    low, high = np.where(pinned, inside, low), np.where(pinned, inside, high)
+    value = np.einsum("bpn,bn->bp", C, inside)
+    below, above = value - rng.exponential(0.5, value.shape), value + rng.exponential(0.5, value.shape)
+    one_sided, equal = rng.random(value.shape) < 0.3, rng.random(value.shape) < 0.15
+    below, above = np.where(equal, value, below), np.where(equal, value, np.where(one_sided, np.inf, above))
+    soft = rng.random(value.shape) < 0.5
+    below = np.where(soft & ~equal, below + 1.0, below)  # out of reach now and then
+    above = np.maximum(above, below)
+    return Problems(
+        *(A, 3.0 * rng.normal(size=(count, m)), 10.0 ** rng.uniform(-2.0, 3.0, (count, m)), low, high),
+        *(C, below, above, np.where(soft, 10.0 ** rng.uniform(-3.0, 1.0, value.shape), 0.0)),
+        10.0 ** rng.uniform(np.log10(weakest), 0.0, (count, N)),
+    )
+
+
+def solved(p: Problems, backend: str = "numba", **options):
+    def one(*data, **options):
+        *given, compliance, damping = data
+        return solve_least_squares_qp(*given, rows_compliance=compliance, damping=damping, backend=backend, **options)
+
+    return jax.jit(jax.vmap(one))(*map(jnp.asarray, p), **options)
+
+
+def candidates(p: Problems):
+    count = len(p.matrix)
+    cost = LeastSquares(*map(jnp.asarray, (p.matrix, p.target, p.weight, p.damping, np.zeros((count, N)))))
+    lower, upper = (jnp.concatenate(pair, 1) for pair in ((p.lower, p.rows_lower), (p.upper, p.rows_upper)))
+    qp = QP(cost, jnp.asarray(p.rows), jnp.asarray(p.rows_compliance), lower, upper)
+    return _cpu_kernel.propose(qp, jnp.zeros((count, N + P), int), jnp.full(count, 1e-12), 1000)
+
+
+def assert_same(p: Problems, found, expected) -> None:
+    """Statuses and working sets, and x in the metric of the Hessian's diagonal."""
+    np.testing.assert_array_equal(found.status, expected.status)
+    good = np.asarray(expected.status == Status.SOLVED)
+    unit = np.sqrt(np.einsum("bm,bmn->bn", p.weight, p.matrix**2) + p.damping)
+    off = np.max(np.abs(found.x - expected.x) * unit, 1) / np.max(np.abs(expected.x) * unit, 1)
+    assert off[good].max() < 1e-8
+    assert np.asarray(found.active == expected.active)[good].all(1).mean() > 0.99
+
+
+@pytest.mark.parametrize("m", [M, MANY])
+def test_lane_by_lane_as_the_plain_method(m):
+    p = problems(400, m)
+    found = solved(p)
+    assert_same(p, found, solved(p, "jax"))
+    assert (found.status == Status.SOLVED).all()
+    taken = candidates(p)
+    assert (taken.settled != 0).mean() > 0.99
+    np.testing.assert_array_equal(found.factorizations, taken.factorizations)  # no lane had to be searched
+    assert found.factorizations.max() > 3 and found.iterations.max() > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("m", [M, MANY])
+def test_many_lanes_as_the_plain_method(m):
+    p = problems(20_000, m, seed=1)
+    assert_same(p, solved(p), solved(p, "jax"))
+
+
+def test_as_daqp():
+    """Hard rows alone, which daqp has too."""
+    p = problems(100, seed=2, weakest=1e-2)._replace(rows_compliance=np.zeros((100, P)))
+    p = p._replace(rows_lower=np.where(p.rows_lower == p.rows_upper, p.rows_lower, p.rows_lower - 1.0))
+    found = solved(p)
+    H = np.einsum("bm,bmi,bmj->bij", p.weight, p.matrix, p.matrix) + p.damping[:, :, None] * np.eye(N)
+    g = -np.einsum("bm,bmi->bi", p.weight * p.target, p.matrix)
+    dense = QPs(H, g, p.lower, p.upper, p.rows, p.rows_lower, p.rows_upper, np.asarray(found.x), np.ones_like(g))
+    expected = [by_daqp(dense, i) for i in range(100)]
+    claimed = [(i, x) for i, x in enumerate(expected) if x is not None and found.status[i] == Status.SOLVED]
+    assert len(claimed) > 90
+    for i, x in claimed:
+        np.testing.assert_allclose(found.x[i], x, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("robot", ["nao", "g1"])
+def test_recorded_problems(robot, dtype):
+    """In both precisions; double is as exact as the records, single to its own rounding of the rows."""
+    r = recorded_qps(robot)
+    given = (r.A, r.b, np.ones(r.b.shape), r.lower, r.upper)
+
+    def one(*data):
+        return solve_least_squares_qp(*data, damping=QP_DAMPING, backend="numba")
+
+    found = jax.jit(jax.vmap(one))(*(jnp.asarray(a, dtype) for a in given))
+    assert found.x.dtype == dtype and (found.status == Status.SOLVED).all()
+    off = np.einsum("bmn,bn->bm", r.A, np.asarray(found.x, float) - r.solution)
+    assert np.abs(off).max() < (1e-12 if dtype is np.float64 else 1e-5)
+
+
+def test_a_warm_start_costs_one_factorization():
+    p = problems(64, seed=3)
+    cold = solved(p)
+    warm = solved(p, warm_start=cold.active)
+    np.testing.assert_array_equal(warm.factorizations, 1)
+    np.testing.assert_array_equal(warm.iterations, 0)
+    np.testing.assert_allclose(warm.x, cold.x, rtol=1e-9, atol=1e-12)
+
+
+def test_lanes_that_are_left_to_the_search():
+    """Rows that cannot hold, numbers that are none, crossed bounds, beside lanes that are as they were alone."""
+    p = problems(20, seed=4)
+    alone = solved(p)
+    rows, low, high = p.rows.copy(), p.rows_lower.copy(), p.rows_upper.copy()
+    compliance, target, lower = p.rows_compliance.copy(), p.target.copy(), p.lower.copy()
+    rows[3, 1], compliance[3, :2] = rows[3, 0], 0.0
+    low[3, :2], high[3, :2] = (1.0, -2.0), (2.0, -1.0)
+    target[7, 0] = np.nan
+    lower[11, 2] = np.where(np.isfinite(p.upper[11, 2]), p.upper[11, 2], 0.0) + 1.0
+    upper = p.upper.copy()
+    upper[11, 2] = lower[11, 2] - 1.0
+    bad = p._replace(
+        rows=rows, rows_lower=low, rows_upper=high, rows_compliance=compliance, target=target, lower=lower, upper=upper
+    )
+    found, plain = solved(bad), solved(bad, "jax")
+    np.testing.assert_array_equal(found.status, plain.status)
+    assert found.status[3] == Status.INFEASIBLE and found.status[7] == Status.NUMERICAL_ERROR
+    assert found.status[11] == Status.INFEASIBLE and np.isfinite(found.x).all()
+    np.testing.assert_allclose(found.x[3], plain.x[3], atol=1e-8)
+    others = np.setdiff1d(np.arange(20), [3, 7, 11])
+    np.testing.assert_array_equal(found.x[others], alone.x[others])
+
+
+def test_one_problem_is_a_lane_of_a_batch():
+    p = problems(20, seed=5)
+    batch = solved(p)
+    one = jax.jit(
+        lambda *data: solve_least_squares_qp(*data[:8], rows_compliance=data[8], damping=data[9], backend="numba")
+    )
+    for i in range(5):
+        alone = one(*(jnp.asarray(a[i]) for a in p))
+        np.testing.assert_array_equal(alone.active, batch.active[i])
+        np.testing.assert_allclose(alone.x, batch.x[i], rtol=1e-12, atol=1e-14)
+
+
+def test_derivatives_against_central_differences():
+    """Along one direction of all data, forward and reverse."""
+    p = problems(8, seed=6, weakest=1e-1)
+    rng = np.random.default_rng(7)
+    way = [rng.normal(size=a.shape) for a in (p.matrix, p.target, p.rows)]
+
+    def moved(t):
+        data = [a + t * d for a, d in zip((p.matrix, p.target, p.rows), way, strict=True)]
+        found = solved(p._replace(matrix=data[0], target=data[1], rows=data[2]))
+        return found.x, found.active
+
+    step = 1e-6
+    (ahead, same), (behind, _) = moved(step), moved(-step)
+    _, rate = jax.jvp(lambda t: moved(t)[0], (0.0,), (1.0,))
+    reverse = jax.grad(lambda t: jnp.sum(moved(t)[0] ** 2))(0.0)
+    kept = np.asarray(same == moved(-step)[1]).all(1)
+    assert kept.sum() >= 6
+    np.testing.assert_allclose(rate[kept], ((ahead - behind) / (2 * step))[kept], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(reverse, jnp.sum(2.0 * moved(0.0)[0] * rate), rtol=1e-9)
