@@ -27,6 +27,7 @@ from rich.table import Table
 
 import osik_jax as osik
 from osik_jax import tuning
+from osik_jax.runtime import configure_cpu
 
 FEET = {"left_foot": "l_sole", "right_foot": "r_sole"}
 HANDS = {"left_hand": "l_gripper", "right_hand": "r_gripper"}
@@ -236,6 +237,7 @@ def main(path: str | None = None) -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     if sys.argv[1:2] == ["--memory"]:
         jax.config.update("jax_enable_x64", True)
         report_memory(*map(int, sys.argv[2:4]))

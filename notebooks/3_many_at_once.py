@@ -33,6 +33,7 @@ import numpy as np
 
 import osik_jax as osik
 
+osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)  # double precision: controllers want it
 
 FAST = "OSIK_FAST" in os.environ  # the tests run this notebook with smaller sizes

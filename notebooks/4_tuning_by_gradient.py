@@ -40,6 +40,7 @@ import osik_jax as osik
 from osik_jax import physics, tuning
 from osik_jax.viewer import hero_picture
 
+osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)  # double precision: controllers want it
 jax.config.update("jax_disable_most_optimizations", True)  # compiled in half the time; not for long runs
 

@@ -1,6 +1,6 @@
 """Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
 
-from . import _runtime as _runtime  # first: it sets up XLA's CPU client
+from . import runtime as runtime
 from ._batches import batch_axes as batch_axes
 from ._batches import batched as batched
 from ._batches import stack as stack

@@ -238,6 +238,9 @@ def _run(command: _Command) -> int:
     """Runs a command in double precision; returns the exit code."""
     import jax
 
+    from .runtime import configure_cpu
+
+    configure_cpu()
     jax.config.update("jax_enable_x64", True)
     if isinstance(command, Info):
         _info(command)

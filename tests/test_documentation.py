@@ -20,6 +20,7 @@ PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 TEXTS = [*PAGES, *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "mkdocs.yml"))]
 PACKAGES = (
     "osik_jax",
+    "osik_jax.runtime",
     "osik_jax.solvers",
     "osik_jax.schemes",
     "osik_jax.physics",
@@ -37,7 +38,6 @@ OPTIONAL = (
     "torch",
     "pinocchio",
     "mink",
-    "mediapy",
     "osik_jax.viewer",
     "osik_jax.demo",
     "osik_jax.tuning",
