@@ -8,6 +8,7 @@ from importlib.metadata import version
 
 import jax
 
+from ._errors import OsikValueError
 from ._workers import ENOUGH, cores
 
 _UNTRIED_JAXLIB = (0, 13)  # the same bound as that of jax in pyproject.toml
@@ -42,7 +43,7 @@ def configure_cpu(
     """
     for name, value in (("workers", workers), ("lapack_threads", lapack_threads)):
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} is {value!r}; it is an integer, at least 1")
+            raise OsikValueError(f"{name} is {value!r}; it is an integer, at least 1")
     changes = _environment(workers, side_by_side)
     dispatch = _dispatch(asynchronous)
     late = [*changes, *([_ASYNCHRONOUS] if dispatch else [])]
