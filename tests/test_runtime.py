@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from osik_jax.runtime import _UNTRIED_JAXLIB, configure_cpu
+from osik_jax._cpu_settings import _UNTRIED_JAXLIB
+from osik_jax.runtime import configure_cpu
 
 OURS = "PJRT_NPROC", "OPENBLAS_NUM_THREADS", "XLA_FLAGS", "JAX_CPU_ENABLE_ASYNC_DISPATCH"
 SERIAL = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
