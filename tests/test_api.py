@@ -1,5 +1,7 @@
 """The short way in: ``solve`` with targets, the assembled problem, frame poses, what is raised."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -86,8 +88,9 @@ class TestBuildProblem:
     def test_refuses_what_solve_refuses(self, arm, tasks):
         with pytest.raises(osik.OsikError, match="no task"):
             osik.build_problem(arm, arm.q0, {})
+        wrong: Any = "arm"
         with pytest.raises(TypeError, match="build_problem"):
-            osik.build_problem("arm", arm.q0, tasks)
+            osik.build_problem(wrong, arm.q0, tasks)
 
 
 def test_errors_are_of_one_family_and_print_plainly(arm):
