@@ -127,7 +127,7 @@ plt.show()
 # %%
 arm = osik.load_robot("arm7")
 arm_limits = (osik.ConfigurationLimit(arm), osik.VelocityLimit(arm))
-wishes = {"hand": osik.FrameTask(arm, "hand", rows="position"), "posture": osik.PostureTask(arm)}
+wishes = {"hand": osik.FrameTask(arm, "hand", rows="position"), "posture": osik.PostureTask(arm, weight=1.0)}
 home, rotation = wishes["hand"].target
 wishes["hand"] = wishes["hand"].replace(target=(home + jnp.array([-0.2, 0.25, -0.2]), rotation))
 
