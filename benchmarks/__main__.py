@@ -30,6 +30,8 @@ from typing import Any
 
 from rich.console import Console
 
+from osik_jax.runtime import configure_cpu
+
 from . import figures, gradients, motions, report
 from .command_line import listed
 from .descriptions import ROBOTS
@@ -248,4 +250,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     sys.exit(main())

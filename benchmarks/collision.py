@@ -30,6 +30,7 @@ from rich.progress import track
 from rich.table import Table
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 
 from .capsules import G1, Capsule, shapes
 from .descriptions import ROBOTS, lean_urdf
@@ -267,4 +268,5 @@ def show_motions(motions: dict[str, dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

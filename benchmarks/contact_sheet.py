@@ -21,6 +21,7 @@ from PIL import Image
 
 import osik_jax as osik
 from osik_jax import cli, viewer
+from osik_jax.runtime import configure_cpu
 
 from .command_line import listed
 from .robots_table import PAGE, ROBOTS, file_of, load, write
@@ -137,4 +138,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from osik_jax.runtime import configure_cpu
 from osik_jax.tasks._curvature import pose_curvature
 
 from .descriptions import ROBOTS
@@ -84,4 +85,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -21,6 +21,7 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax import scaling
+from osik_jax.runtime import configure_cpu
 
 from .descriptions import ROBOTS
 from .processes import cores
@@ -97,4 +98,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 
 from . import throughput
 from .descriptions import ROBOTS
@@ -108,4 +109,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

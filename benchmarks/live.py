@@ -26,6 +26,7 @@ from websockets.typing import Subprotocol
 import osik_jax as osik
 from osik_jax.cli import read_robot
 from osik_jax.demo import guess_feet
+from osik_jax.runtime import configure_cpu
 from osik_jax.viewer import LiveView
 from osik_jax.viewer.live import _open
 from osik_jax.viewer.live._default import find_hands
@@ -147,4 +148,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -28,6 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 from osik_jax.tasks._rows import rows_of
 
 from .command_line import listed
@@ -158,4 +159,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

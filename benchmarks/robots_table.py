@@ -27,6 +27,7 @@ import numpy as np
 import pinocchio as pin
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 
 from .command_line import listed
 
@@ -259,4 +260,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 
 from .descriptions import ROBOTS
 from .device import device_bytes
@@ -98,4 +99,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

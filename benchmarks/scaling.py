@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from osik_jax.runtime import configure_cpu
 from osik_jax.scaling import device_mesh, sharded
 
 from .command_line import listed
@@ -129,4 +130,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

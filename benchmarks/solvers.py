@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import osik_jax
+from osik_jax.runtime import configure_cpu
 from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_qp
 from tests.recorded import QP_DAMPING, RecordedHierarchies, recorded_hierarchies, recorded_qps
 
@@ -167,4 +168,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 
 from .command_line import listed
 from .descriptions import ROBOTS, lean_urdf
@@ -273,4 +274,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -27,6 +27,7 @@ from rich.table import Table
 
 import osik_jax as osik
 from osik_jax import tuning
+from osik_jax.runtime import configure_cpu
 
 FEET = {"left_foot": "l_sole", "right_foot": "r_sole"}
 HANDS = {"left_hand": "l_gripper", "right_hand": "r_gripper"}
@@ -54,7 +55,7 @@ def nao_reaching(*, training: int = 32, held_out: int = 32, steps: int = 75, dt:
     tasks["com"] = osik.ComTask(robot, polygon=osik.support_polygon(robot, robot.q0, tuple(FEET.values()), margin=0.02))
     tasks["torso"] = osik.FrameTask(robot, "torso", rows="orientation")
     tasks |= {name: osik.FrameTask(robot, hand, rows="position") for name, hand in HANDS.items()}
-    tasks["posture"] = osik.PostureTask(robot)
+    tasks["posture"] = osik.PostureTask(robot, weight=1.0)
     loop = loop_of(robot, tasks, dt, steps)
     loss = (
         tuning.Tracking(*HANDS, after=0.5 * steps * dt)
@@ -73,7 +74,7 @@ def arm_reaching(*, training: int = 8, held_out: int = 8, steps: int = 30, dt: f
         "hand": osik.FrameTask(robot, "hand", rows="position", gain=osik.AdaptiveGain(10.0, 5.0, 1.0)),
         "wrist": osik.FrameTask(robot, "hand", rows="orientation"),
         "elbow": osik.FrameTask(robot, "link4", rows="position"),
-        "posture": osik.PostureTask(robot),
+        "posture": osik.PostureTask(robot, weight=1.0),
     }
     loop = loop_of(robot, tasks, dt, steps)
     loss = tuning.Tracking("hand", after=0.5 * steps * dt) + 1e-6 * tuning.Smoothness()
@@ -236,6 +237,7 @@ def main(path: str | None = None) -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     if sys.argv[1:2] == ["--memory"]:
         jax.config.update("jax_enable_x64", True)
         report_memory(*map(int, sys.argv[2:4]))

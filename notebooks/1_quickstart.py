@@ -36,6 +36,7 @@ from matplotlib.colors import LogNorm
 import osik_jax as osik
 from osik_jax.viewer import animate, hero_picture, mujoco_frame_pose, mujoco_poses, robot_com
 
+osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)  # double precision: controllers want it
 
 FAST = "OSIK_FAST" in os.environ  # the tests run this notebook with smaller sizes

@@ -38,6 +38,7 @@ from matplotlib.figure import Figure
 import osik_jax as osik
 from osik_jax.viewer import draw_robot, draw_target, draw_trail, mujoco_frame_pose, mujoco_poses, scene_axes
 
+osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)
 
 FAST = "OSIK_FAST" in os.environ  # the tests run this notebook with smaller sizes

@@ -40,6 +40,7 @@ import osik_jax as osik
 from osik_jax import physics, tuning
 from osik_jax.viewer import hero_picture
 
+osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)  # double precision: controllers want it
 jax.config.update("jax_disable_most_optimizations", True)  # compiled in half the time; not for long runs
 
@@ -72,7 +73,7 @@ tasks = {name: osik.FrameTask(robot, sole) for name, sole in feet.items()}
 tasks["com"] = osik.ComTask(robot, polygon=osik.support_polygon(robot, robot.q0, soles, margin=0.02))
 tasks["torso"] = osik.FrameTask(robot, "torso", rows="orientation")
 tasks |= {name: osik.FrameTask(robot, hand, rows="position") for name, hand in hands.items()}
-tasks["posture"] = osik.PostureTask(robot)
+tasks["posture"] = osik.PostureTask(robot, weight=1.0)
 limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))
 DT, STEPS = 0.025, 60
 loop = tuning.Loop(robot, tasks, scheme=osik.WeightedQP(damping=1e-6), limits=limits, dt=DT, steps=STEPS)
@@ -305,7 +306,7 @@ arm = osik.load_robot("arm7")
 ranked = {
     "hand": osik.FrameTask(arm, "hand", rows="position", gain=osik.AdaptiveGain(3.0, 1.0, 1.0), priority=1),
     "wrist": osik.FrameTask(arm, "hand", rows="orientation", gain=1.0, priority=2),
-    "posture": osik.PostureTask(arm, gain=1.0, priority=3),
+    "posture": osik.PostureTask(arm, gain=1.0, priority=3, weight=1.0),
 }
 arm_limits = (osik.ConfigurationLimit(arm), osik.VelocityLimit(arm))
 shifts = 0.06 * np.random.default_rng(1).normal(size=(16, 3))

@@ -35,6 +35,7 @@ from osik_jax import demo
 from osik_jax.solvers import Level, Status, solve_nullspace, solve_qp
 from osik_jax.viewer import hero_picture
 
+osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)  # double precision: controllers want it
 
 FAST = "OSIK_FAST" in os.environ  # the tests run this notebook with smaller sizes

@@ -1,14 +1,16 @@
 """Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
 
-from . import _runtime as _runtime  # first: it sets up XLA's CPU client
+from . import runtime as runtime
 from ._batches import batch_axes as batch_axes
 from ._batches import batched as batched
 from ._batches import stack as stack
+from ._errors import OsikError as OsikError
 from ._errors import OsikWarning as OsikWarning
 from ._version import installed_version as _installed_version
 from .collision import CollisionShape as CollisionShape
 from .control import Solution as Solution
 from .control import Trajectory as Trajectory
+from .control import build_problem as build_problem
 from .control import rollout as rollout
 from .control import solve as solve
 from .inverse import InverseKinematicsSolution as InverseKinematicsSolution
@@ -21,6 +23,7 @@ from .kinematics import difference as difference
 from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import frame_jacobian as frame_jacobian
 from .kinematics import frame_jacobians as frame_jacobians
+from .kinematics import frame_pose as frame_pose
 from .kinematics import integrate as integrate
 from .kinematics import mass_matrix as mass_matrix
 from .limits import AccelerationLimit as AccelerationLimit
@@ -41,6 +44,7 @@ from .schemes import NullSpace as NullSpace
 from .schemes import Scheme as Scheme
 from .schemes import WeightedQP as WeightedQP
 from .solvers import Status as Status
+from .solvers import raise_if_failed as raise_if_failed
 from .tasks import AdaptiveGain as AdaptiveGain
 from .tasks import AngularMomentumTask as AngularMomentumTask
 from .tasks import AxisAlignTask as AxisAlignTask

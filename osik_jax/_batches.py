@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ._errors import OsikValueError
 from ._names import find_leaves, leaf_names, replace_named
 from ._tree import KinematicTree, ModelHolder
 
@@ -58,7 +59,7 @@ def batched(tree: T, values: Mapping[str, Any]) -> T:
     lengths = {name: {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(value)} for name, value in values.items()}
     if len(set().union(*lengths.values())) > 1:
         shown = "; ".join(f"{k}: {', '.join(str(n[0]) if n else 'none' for n in v)}" for k, v in lengths.items())
-        raise ValueError(f"the lengths of the batch differ: {shown}")
+        raise OsikValueError(f"the lengths of the batch differ: {shown}")
     return replace_named(tree, leaf_names(tree), values, batched=True)
 
 
@@ -69,11 +70,11 @@ def stack(items: Sequence[T]) -> T:
         ValueError: there is nothing to stack, or structure differs: the message says what, and why it cannot.
     """
     if not items:
-        raise ValueError("there is nothing to stack")
+        raise OsikValueError("there is nothing to stack")
     for place, item in enumerate(items[1:], 1):
         reason = _difference(items[0], item, "")
         if reason is not None:
-            raise ValueError(f"item {place} does not stack on item 0: {reason}")
+            raise OsikValueError(f"item {place} does not stack on item 0: {reason}")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
 
 

@@ -8,6 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ._workers import warn_of_few_workers
+
 BLOCK = 16
 """Lanes that a CPU core takes through a tick at a time, so that what they need stays in its second cache.
 
@@ -24,6 +26,8 @@ def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) ->
         size: lanes in a block; the last block is filled up with copies of the first lane.
     """
     count = jax.tree.leaves(args)[0].shape[0]
+    if count > 1:
+        warn_of_few_workers()
     if count <= size or jax.default_backend() != "cpu":
         return function(*args)
     blocks = -(-count // size)

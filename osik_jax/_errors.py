@@ -1,4 +1,4 @@
-"""The category of this package's warnings, and how they are given."""
+"""The base of this package's exceptions, the category of its warnings, and how those are given."""
 
 from __future__ import annotations
 
@@ -7,6 +7,28 @@ import warnings
 from pathlib import Path
 
 _PACKAGE = str(Path(__file__).parent)
+
+
+class OsikError(Exception):
+    """Base of what this package raises for wrong input, beside Python's own type of it.
+
+    What is raised is a KeyError, TypeError or ValueError too, as the docstrings say: catch either.
+    """
+
+
+class OsikKeyError(OsikError, KeyError):
+    """A name that does not exist; its text prints as it is, without the quotes of a KeyError."""
+
+    def __str__(self) -> str:
+        return Exception.__str__(self)
+
+
+class OsikTypeError(OsikError, TypeError):
+    """An object of the wrong type."""
+
+
+class OsikValueError(OsikError, ValueError):
+    """A value that cannot be."""
 
 
 class OsikWarning(UserWarning):

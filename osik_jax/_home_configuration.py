@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ._errors import OsikTypeError, OsikValueError
 from ._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, unknown_name
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def _as_array(home: Any, dtype: Any) -> Array:
     try:
         return jnp.asarray(home, dtype)
     except (TypeError, ValueError):
-        raise TypeError(
+        raise OsikTypeError(
             f"home is {home!r}; it is a configuration (nq,), a mapping from joint names to values, or the name or "
             "number of a keyframe"
         ) from None
@@ -88,7 +89,7 @@ def _with_joints(robot: Robot, values: Mapping[str, Any]) -> Array:
         entries = _as_array(value, q.dtype)
         if entries.shape != (width,):
             layout = "x, y, z, then the quaternion w, x, y, z" if width == 7 else "a quaternion w, x, y, z"
-            raise ValueError(f"home of joint {name!r} has shape {entries.shape}, expected ({width},): {layout}")
+            raise OsikValueError(f"home of joint {name!r} has shape {entries.shape}, expected ({width},): {layout}")
         q = q.at[start : start + width].set(entries)
     return q
 
@@ -115,5 +116,5 @@ def _inside(robot: Robot, q: np.ndarray) -> Float[Array, " nq"]:
             if abs(inside[start] - q[start]) > _OUTSIDE:
                 out.append(f"{robot.tree.joint_names[joint]} is {q[start]:g}, its range is [{low:g}, {high:g}]")
     if out:
-        raise ValueError(f"home is outside the joints' ranges (radians, metres): {'; '.join(out)}")
+        raise OsikValueError(f"home is outside the joints' ranges (radians, metres): {'; '.join(out)}")
     return jnp.asarray(inside)

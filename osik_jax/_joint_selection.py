@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ._errors import OsikTypeError, OsikValueError
 from ._tree import DOF_WIDTH, FREE, HINGE, SLIDE, unknown_name
 from .robot import Robot
 
@@ -42,12 +43,12 @@ def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:
     if patterns is None:
         return [j for j in robot.tree.independent if robot.tree.joint_types[j] != FREE]
     if isinstance(patterns, str):
-        raise TypeError(f"joints is a sequence of names and globs, not one string: use ({patterns!r},)")
+        raise OsikTypeError(f"joints is a sequence of names and globs, not one string: use ({patterns!r},)")
     if not isinstance(patterns, Iterable):
-        raise TypeError(f"joints is {patterns!r}; it is a sequence of names and globs")
+        raise OsikTypeError(f"joints is {patterns!r}; it is a sequence of names and globs")
     found = sorted({joint for pattern in patterns for joint in select_joints(robot, pattern)})
     if not found:
-        raise ValueError(f"joints is empty; name at least one joint, or None for all of {robot.tree.dof_owners}")
+        raise OsikValueError(f"joints is empty; name at least one joint, or None for all of {robot.tree.dof_owners}")
     return found
 
 
@@ -98,7 +99,7 @@ def dof_values(robot: Robot, given: Any, default: Float[Array, " nv"], what: str
         return values
     values = as_array(given, what, dtype)
     if values.shape != (robot.nv,):
-        raise ValueError(
+        raise OsikValueError(
             f"{what} has shape {values.shape}, expected ({robot.nv},), one entry for each of "
             f"{', '.join(dof_names(robot))}; or give a mapping from joint names to values"
         )
@@ -115,7 +116,7 @@ def as_array(value: Any, what: str, dtype: Any) -> Array:
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError):
         shown = repr(value)
-        raise TypeError(f"{what} is {shown[:80]}; it is a number, or an array of numbers") from None
+        raise OsikTypeError(f"{what} is {shown[:80]}; it is a number, or an array of numbers") from None
 
 
 def concrete(value: Any) -> np.ndarray | None:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._errors import OsikValueError
 from ._tree import KinematicTree, unknown_name
 
 if TYPE_CHECKING:
@@ -45,7 +46,9 @@ def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) ->
     for pattern, factor in given.items():
         for body in _bodies(tree, pattern):
             if body in seen:
-                raise ValueError(f"{what} gives {tree.body_names[body]!r} twice, by {seen[body]!r} and by {pattern!r}")
+                raise OsikValueError(
+                    f"{what} gives {tree.body_names[body]!r} twice, by {seen[body]!r} and by {pattern!r}"
+                )
             seen[body] = pattern
             factors = factors.at[body].set(factor)
     return factors

@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import equinox as eqx
 
+from ._errors import OsikTypeError, OsikValueError
 from .robot import Robot
 
 
@@ -38,12 +39,12 @@ def _takes_robot(cls: type) -> bool:
 def check_robot(robot: Any, where: str) -> None:
     """Raises TypeError where it is no robot, ValueError where it is a stack of robots."""
     if not isinstance(robot, Robot):
-        raise TypeError(
+        raise OsikTypeError(
             f"{where}: robot is {robot!r}; it is a Robot, as osik_jax.load_robot and Robot.from_urdf return"
         )
     shape = getattr(robot.q0, "shape", None)
     if shape is not None and shape != (robot.nq,):
-        raise ValueError(
+        raise OsikValueError(
             f"{where}: robot is a stack of robots (its q0 has shape {shape}, one robot's has ({robot.nq},)). "
             "Take it apart with jax.vmap, or osik_jax.batched"
         )
@@ -52,7 +53,7 @@ def check_robot(robot: Any, where: str) -> None:
 def check_made_for(part: MadeForRobot, robot: Robot, what: str) -> None:
     """Raises ValueError where the part was made for a robot with other joints."""
     if part.made_for is not None and part.made_for != robot.tree.dof_owners:
-        raise ValueError(
+        raise OsikValueError(
             f"{what} is a {type(part).__name__} that was made for another robot, whose joints are: {part.made_for}. "
             f"Make it with this robot, whose joints are: {robot.tree.dof_owners}"
         )

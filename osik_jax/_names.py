@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ._errors import OsikValueError
 from ._tree import unknown_name
 
 T = TypeVar("T")
@@ -63,7 +64,7 @@ def replace_named(tree: T, names: Sequence[str], values: Mapping[str, Any], *, b
     for name, value in values.items():
         for place, new in _paired(names, name, value):
             if place in given:
-                raise ValueError(f"{names[place]} is given twice, by {given[place]!r} and by {name!r}")
+                raise OsikValueError(f"{names[place]} is given twice, by {given[place]!r} and by {name!r}")
             given[place] = name
             leaves[place] = _fitting(new, leaves[place], names[place], batched)
     return jax.tree.unflatten(structure, leaves)
@@ -74,7 +75,7 @@ def _paired(names: Sequence[str], name: str, value: Any) -> list[tuple[int, Any]
     places, new = find_leaves(names, name), jax.tree.leaves(value)
     if len(new) not in (1, len(places)):
         found = ", ".join(names[place] for place in places)
-        raise ValueError(f"{name!r} stands for {len(places)} arrays ({found}), but {len(new)} are given")
+        raise OsikValueError(f"{name!r} stands for {len(places)} arrays ({found}), but {len(new)} are given")
     return list(zip(places, new * len(places) if len(new) == 1 else new, strict=True))
 
 
@@ -83,10 +84,10 @@ def _fitting(value: Any, leaf: Any, name: str, batched: bool) -> Array:
     new, shape = jnp.asarray(value, jnp.result_type(leaf)), jnp.shape(leaf)
     lanes = new.shape[:1] if batched else ()
     if batched and new.ndim == 0:
-        raise ValueError(f"{name} is one number; it needs an axis in front, the batch")
+        raise OsikValueError(f"{name} is one number; it needs an axis in front, the batch")
     if new.shape[len(lanes) :] not in ((), shape):
         expected = f"{shape} with an axis in front, the batch" if batched else f"{shape} or a scalar"
-        raise ValueError(f"{name} has shape {new.shape}, expected {expected}")
+        raise OsikValueError(f"{name} has shape {new.shape}, expected {expected}")
     if new.shape != (*lanes, *shape):
         new = new.reshape(*lanes, *[1] * len(shape))
     return jnp.broadcast_to(new, (*lanes, *shape))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._errors import OsikValueError
 from ._joint_selection import as_array, concrete
 
 
@@ -37,7 +38,7 @@ def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Arra
     out = as_array(value, what, dtype)
     if out.shape not in ((), shape):
         expected = "a scalar" if shape == () else f"{shape} or a scalar"
-        raise ValueError(f"{what} has shape {out.shape}, expected {expected}. Batch with jax.vmap.")
+        raise OsikValueError(f"{what} has shape {out.shape}, expected {expected}. Batch with jax.vmap.")
     check_not_nan(out, what)
     return jnp.broadcast_to(out, shape)
 
@@ -46,21 +47,21 @@ def check_not_nan(value: Array, what: str) -> None:
     """Raises ValueError where a value can be seen to be NaN, which no number of a problem is."""
     seen = concrete(value)
     if seen is not None and np.isnan(seen).any():
-        raise ValueError(f"{what} is {seen}; it has to be numbers, not NaN")
+        raise OsikValueError(f"{what} is {seen}; it has to be numbers, not NaN")
 
 
 def check_finite(value: Array, what: str) -> None:
     """Raises ValueError where a value can be seen not to be finite."""
     seen = concrete(value)
     if seen is not None and not np.isfinite(seen).all():
-        raise ValueError(f"{what} is {seen}; it has to be finite")
+        raise OsikValueError(f"{what} is {seen}; it has to be finite")
 
 
 def check_not_negative(value: Array, what: str) -> None:
     """Raises ValueError where a value can be seen to be negative or not finite."""
     seen = concrete(value)
     if seen is not None and not (np.isfinite(seen).all() and (seen >= 0.0).all()):
-        raise ValueError(f"{what} is {seen}; it has to be finite and not negative")
+        raise OsikValueError(f"{what} is {seen}; it has to be finite and not negative")
 
 
 def as_bounds(lower: Any, upper: Any, rows: int, dtype: Any) -> tuple[Array | None, Array | None]:
@@ -80,7 +81,7 @@ def check_bounds(lower: Array | None, upper: Array | None) -> None:
         return
     if (low > high).any():
         rows = np.flatnonzero(low > high)
-        raise ValueError(f"lower > upper in rows {rows.tolist()}: lower {low[rows]}, upper {high[rows]}")
+        raise OsikValueError(f"lower > upper in rows {rows.tolist()}: lower {low[rows]}, upper {high[rows]}")
 
 
 def entries(values: np.ndarray, which: np.ndarray, names: Sequence[str] | None = None) -> str:
@@ -92,4 +93,4 @@ def entries(values: np.ndarray, which: np.ndarray, names: Sequence[str] | None =
 def check_count(what: str, value: Any, *, least: int = 1) -> None:
     """Raises ValueError for what is no integer, or less than ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{what} is {value!r}; it is an integer, at least {least}")
+        raise OsikValueError(f"{what} is {value!r}; it is an integer, at least {least}")

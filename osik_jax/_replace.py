@@ -8,6 +8,7 @@ from typing import Any, Self
 import equinox as eqx
 import jax.numpy as jnp
 
+from ._errors import OsikTypeError
 from ._numbers import as_vector
 
 
@@ -27,7 +28,7 @@ class Replaceable(eqx.Module):
         """
         for name in changes:
             if name not in self.replaceable:
-                raise TypeError(
+                raise OsikTypeError(
                     f"{type(self).__name__} has no {name!r} to replace; "
                     f"it has: {', '.join(self.replaceable)} (structure is fixed at construction)"
                 )

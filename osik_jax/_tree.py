@@ -12,6 +12,8 @@ import jax
 import mujoco
 import numpy as np
 
+from ._errors import OsikKeyError
+
 FREE, BALL, SLIDE, HINGE = (
     int(t)
     for t in (
@@ -65,7 +67,7 @@ def unknown_name(kind: str, name: object, available: tuple[str, ...]) -> KeyErro
     close = difflib.get_close_matches(str(name), available, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else "."
     kinds = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
-    return KeyError(f"no {kind} {name!r}{hint} {kinds}: {', '.join(available) or '(none)'}")
+    return OsikKeyError(f"no {kind} {name!r}{hint} {kinds}: {', '.join(available) or '(none)'}")
 
 
 @dataclasses.dataclass(frozen=True)

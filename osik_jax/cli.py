@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from ._errors import OsikValueError
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Column, Table
@@ -239,6 +241,9 @@ def _run(command: _Command) -> int:
     """Runs a command in double precision; returns the exit code."""
     import jax
 
+    from .runtime import configure_cpu
+
+    configure_cpu()
     jax.config.update("jax_enable_x64", True)
     if isinstance(command, Info):
         _info(command)
@@ -310,7 +315,7 @@ def read_robot(source: str, base: str = "auto") -> Robot:
     with _told():
         if source in _EMBEDDED and not os.path.exists(source):
             if base != "auto":
-                raise ValueError(f"--base goes with a file; {source} is what it is")
+                raise OsikValueError(f"--base goes with a file; {source} is what it is")
             return load_robot(source)
         path, floating = Path(source), {"auto": None, "floating": True, "fixed": False}[base]
         if not path.is_file():
@@ -528,7 +533,7 @@ def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:
     """ROLE=NAME as a mapping; None where there are none."""
     wrong = [pair for pair in pairs if "=" not in pair]
     if wrong:
-        raise ValueError(f"--mapping takes ROLE=NAME; got {', '.join(wrong)}")
+        raise OsikValueError(f"--mapping takes ROLE=NAME; got {', '.join(wrong)}")
     return {role: name for role, _, name in (pair.partition("=") for pair in pairs)} or None
 
 

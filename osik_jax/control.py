@@ -18,6 +18,7 @@ from ._checks import (
     check_rows,
     check_setting,
     check_steps,
+    check_target_names,
     check_targets,
     check_tasks,
     check_warm_start,
@@ -25,6 +26,7 @@ from ._checks import (
     checked_limits,
     solved_with,
 )
+from ._errors import OsikValueError
 from ._joint_selection import scalar_layout
 from ._rules import FOUND, blocked
 from ._sanity import cleaned, positive
@@ -101,6 +103,7 @@ def solve(
     scheme: Scheme | None = None,
     limits: Sequence[Limit] | None = None,
     dt: Float[Array, ""] | float = 0.005,
+    targets: Targets | None = None,
     warm_start: Any = None,
 ) -> Solution:
     """The velocity that serves the tasks best at configuration q.
@@ -117,6 +120,8 @@ def solve(
             VelocityLimit(robot))``; ``()``: none. Those that remember the last tick's velocity, such as
             ``AccelerationLimit``, need it each time: ``limit.after(solution.velocity)``.
         dt: time until the next tick [s].
+        targets: of some tasks, by name: what ``task.replace(target=...)`` takes, such as a pose as (position, rotation
+            matrix), (position, quaternion w x y z), a 4 x 4 matrix or a ``jaxlie.SE3``. The other tasks keep theirs.
         warm_start: that of the tick before (``Solution.warm_start``), with the same tasks, scheme and limits. It saves
             time and does not change the answer; one with wrong numbers costs time only.
 
@@ -125,6 +130,7 @@ def solve(
         look at ``status``, or call ``osik_jax.solvers.raise_if_failed`` outside jit.
 
     Raises:
+        KeyError: ``targets`` names a task that does not exist.
         TypeError: something that is no robot, task, scheme or limit, or no number.
         ValueError: q of the wrong length, not finite or with a quaternion of zeros; no task; dt <= 0; a task or limit
             that was made for another robot, the warm start of another problem; a robot that is a stack, or that has
@@ -136,9 +142,45 @@ def solve(
     check_setting("solve(robot, q, tasks)", robot, scheme, dt)
     limits = checked_limits(robot, limits)
     check_tasks(tasks, robot)
+    check_target_names(tasks, targets)
     check_warm_start(warm_start)
     q = checked_configuration(robot, q)
-    return _solve(robot, q, dict(tasks), scheme, limits, _tick(dt, q), warm_start)
+    return _solve(robot, q, aim(dict(tasks), targets), scheme, limits, _tick(dt, q), warm_start)
+
+
+def build_problem(
+    robot: Robot,
+    q: Float[Array, " nq"],
+    tasks: Tasks,
+    *,
+    limits: Sequence[Limit] | None = None,
+    dt: Float[Array, ""] | float = 0.005,
+    targets: Targets | None = None,
+) -> VelocityProblem:
+    """What ``solve`` hands to its scheme: the rows of the tasks, the box and the rows of the limits, assembled.
+
+    For solvers of your own, and to look at the numbers: ``problem.rows["hand"].jacobian``, ``problem.lower``. A scheme
+    takes it: ``scheme.solve(problem).velocity``. Pure; it is not compiled here, so call it inside your own ``jit``,
+    together with what uses it.
+
+    Args:
+        robot: the robot.
+        q: configuration. (nq,)
+        tasks: as in ``solve``.
+        limits: as in ``solve``.
+        dt: as in ``solve``.
+        targets: as in ``solve``.
+
+    Raises:
+        KeyError, TypeError, ValueError: as in ``solve``.
+    """
+    check_setting("build_problem(robot, q, tasks)", robot, None, dt)
+    bounds = _own_limits(robot, checked_limits(robot, limits))
+    check_tasks(tasks, robot)
+    check_target_names(tasks, targets)
+    q = checked_configuration(robot, q)
+    aimed = aim(dict(tasks), targets)
+    return _velocity_problem(robot, forward_kinematics(robot, q), q, aimed, bounds, _tick(dt, q))
 
 
 @jax.jit
@@ -255,7 +297,7 @@ def rollout(
     if feedback is not None and not callable(feedback):
         feedback = jnp.asarray(feedback)
         if feedback.shape != (steps, robot.nq):
-            raise ValueError(
+            raise OsikValueError(
                 f"feedback has shape {feedback.shape}; it is one configuration a tick, {(steps, robot.nq)}"
             )
     numbers, static = taken_apart((tasks if callable(tasks) else dict(tasks), feedback))

@@ -17,6 +17,7 @@ from jaxtyping import Array, DTypeLike, Float
 
 from . import _loading
 from ._describe import described
+from ._errors import OsikKeyError, OsikTypeError, OsikValueError
 from ._home_configuration import Home, home_configuration
 from ._links import Factors, scaled_leaves
 from ._tree import BALL, FREE, KinematicTree, ModelHolder
@@ -302,7 +303,9 @@ class Robot(eqx.Module):
     def _owner(self, name: str) -> int:
         joint = self.tree.joint(name)
         if joint in self.tree.locked:
-            raise KeyError(f"joint {name!r} is locked, so it has no place in q; joints: {', '.join(self.joint_names)}")
+            raise OsikKeyError(
+                f"joint {name!r} is locked, so it has no place in q; joints: {', '.join(self.joint_names)}"
+            )
         return {f: leader for f, leader, _ in self.tree.followers}.get(joint, joint)
 
     def mujoco_qpos(self, q: Float[Array, " nq"]) -> Float[Array, " nqfull"]:
@@ -322,7 +325,7 @@ class Robot(eqx.Module):
         for name, value in joints.items():
             joint = self.tree.joint(name)
             if self.tree.joint_types[joint] in (FREE, BALL):
-                raise ValueError(
+                raise OsikValueError(
                     f"joint {name!r} is free or ball: set its entries of q, from joint_qpos_index({name!r})"
                 )
             full = self.tree.full_qpos_address[joint]
@@ -364,9 +367,9 @@ class Robot(eqx.Module):
         """
         wanted = np.dtype(jnp.result_type(float) if dtype is float else dtype)
         if not jnp.issubdtype(wanted, np.floating):
-            raise TypeError(f"dtype is {dtype!r}; a robot's numbers are floating-point: float32 or float64")
+            raise OsikTypeError(f"dtype is {dtype!r}; a robot's numbers are floating-point: float32 or float64")
         if wanted == np.float64 and jnp.result_type(float) != wanted:
-            raise ValueError("float64 needs jax.config.update('jax_enable_x64', True) first")
+            raise OsikValueError("float64 needs jax.config.update('jax_enable_x64', True) first")
         return jax.tree.map(lambda leaf: leaf.astype(wanted), self)
 
     def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
@@ -423,7 +426,7 @@ class Robot(eqx.Module):
         """
         shape = jnp.shape(q)
         if shape != (self.nq,):
-            raise ValueError(
+            raise OsikValueError(
                 f"{name} has shape {shape}, this robot's configurations have shape ({self.nq},): "
                 f"{', '.join(self.tree.joint_names[j] for j in self.tree.independent)}. Batch with jax.vmap."
             )
@@ -431,13 +434,13 @@ class Robot(eqx.Module):
             return
         values = np.asarray(q)
         if not np.isfinite(values).all():
-            raise ValueError(f"{name} is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
+            raise OsikValueError(f"{name} is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
         for joint, start in self.tree.qpos_address.items():
             kind = self.tree.joint_types[joint]
             if kind in (FREE, BALL):
                 first = start + (3 if kind == FREE else 0)
                 if np.linalg.norm(values[first : first + 4]) < _UNIT_QUATERNION_TOLERANCE:
-                    raise ValueError(
+                    raise OsikValueError(
                         f"{name}[{first}:{first + 4}], the quaternion of joint {self.tree.joint_names[joint]!r}, is "
                         "zero; the identity is (1, 0, 0, 0)"
                     )
@@ -475,7 +478,7 @@ def load_robot(
         OsikWarning: as in ``Robot.from_mjcf`` and ``Robot.from_urdf``.
     """
     if not isinstance(name, str):
-        raise TypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, _loading.ROBOTS))}")
+        raise OsikTypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, _loading.ROBOTS))}")
     load = _loading.embedded if name in _loading.ROBOTS else _loading.described
     fields = load(
         name,

@@ -19,9 +19,9 @@ import jax
 import numpy as np
 import pytest
 
-import osik_jax
+from osik_jax.runtime import configure_cpu
 
-assert osik_jax  # imported before the first computation, as its users do: it sets up XLA's CPU client
+configure_cpu()
 jax.config.update("jax_enable_x64", True)
 
 

@@ -186,7 +186,7 @@ class TestClosedLoop:
 class TestInTheLoop:
     def test_rollout_hands_the_velocity_on(self, arm):
         """The first tick starts from the velocity that the limit was given; the loop by hand gives the same path."""
-        tasks = {"posture": osik.PostureTask(arm, target=arm.q0 + 0.3)}
+        tasks = {"posture": osik.PostureTask(arm, target=arm.q0 + 0.3, weight=1.0)}
         limit = osik.AccelerationLimit(arm, {"*": 5.0, "joint1": np.inf}, velocity=np.full(7, 0.2))
         limits, dt, scheme = (osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)), 0.01, osik.WeightedQP()
         path = osik.rollout(arm, arm.q0, tasks, scheme=scheme, limits=(*limits, limit), dt=dt, steps=40)

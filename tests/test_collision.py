@@ -494,7 +494,7 @@ def test_pairs_that_start_too_near_come_apart(arm, among):
 
 
 def test_moving_obstacles_and_numbers_compile_nothing(arm, avoidance):
-    tasks = {"posture": osik.PostureTask(arm)}
+    tasks = {"posture": osik.PostureTask(arm, weight=1.0)}
     programs = []
 
     @jax.jit
@@ -584,7 +584,7 @@ class TestTooNearAtHome:
             )
         assert {frozenset(pair) for pair in limit.pairs} == {frozenset({"hand", "ball"}), frozenset({"floor", "hand"})}
         assert limit.left_out == ()
-        tasks = {"posture": osik.PostureTask(arm)}
+        tasks = {"posture": osik.PostureTask(arm, weight=1.0)}
         path = osik.rollout(arm, arm.q0, tasks, limits=(limit,), dt=0.01, steps=60)
         place = limit.pairs.index(("hand", "ball"))
         gaps = jax.vmap(lambda q: limit.distances(arm, osik.forward_kinematics(arm, q))[place])(path.q)

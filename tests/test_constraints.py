@@ -275,7 +275,7 @@ class TestPrograms:
         assert len(traces) == 1
 
     def test_without_constraints_there_is_no_level_for_them(self, arm):
-        tasks = {"posture": osik.PostureTask(arm)}
+        tasks = {"posture": osik.PostureTask(arm, weight=1.0)}
         limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)
         kinematics = osik.forward_kinematics(arm, arm.q0)
         assert osik.limit_rows(arm, kinematics, arm.q0, limits, DT) is None

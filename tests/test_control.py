@@ -319,7 +319,7 @@ class TestDerivatives:
         scheme = osik.WeightedQP(damping=1e-2) if name == "weighted" else osik.NullSpace(damping=1e-2)
         hand = osik.FrameTask(arm, "hand", rows="position", target=(p, R))
         elbow = osik.FrameTask(arm, "link4", rows="position", upper=[np.inf, -0.002, np.inf], priority=2)
-        posture = osik.PostureTask(arm, priority=3)
+        posture = osik.PostureTask(arm, priority=3, weight=1.0)
 
         def f(x):
             tasks = {
@@ -356,7 +356,7 @@ class TestDerivatives:
         """Reverse mode through the scan: a cost of the whole path with respect to a gain and a weight."""
         p, R = home
         hand = osik.FrameTask(arm, "hand", rows="position", target=(p + np.array([0.1, 0.2, -0.1]), R))
-        posture = osik.PostureTask(arm, target=np.asarray(arm.q0) + 0.5)
+        posture = osik.PostureTask(arm, target=np.asarray(arm.q0) + 0.5, weight=1.0)
 
         def f(x):
             tasks = {"hand": hand.replace(gain=x[0]), "posture": posture.replace(weight=x[1])}
@@ -381,7 +381,7 @@ class TestStatus:
 
     def test_a_cap_on_iterations_is_said_and_the_box_still_holds(self, arm):
         """Speeds that bind need changes of the active set."""
-        tasks = {"posture": osik.PostureTask(arm, target=np.asarray(arm.q0) + 0.3)}
+        tasks = {"posture": osik.PostureTask(arm, target=np.asarray(arm.q0) + 0.3, weight=1.0)}
         limits = (osik.VelocityLimit(arm, velocity={"*": 0.1}),)
         for scheme in (osik.WeightedQP(max_iterations=1), osik.HierarchicalQP(max_iterations=1)):
             solution = osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=limits)
@@ -418,7 +418,11 @@ class TestMistakes:
         zeros[3:7] = 0.0
         with pytest.raises(ValueError, match=r"q\[3:7\], the quaternion of joint .*is zero"):
             osik.solve(
-                nao, jnp.asarray(zeros), {"posture": osik.PostureTask(nao)}, scheme=SCHEMES["weighted"], limits=()
+                nao,
+                jnp.asarray(zeros),
+                {"posture": osik.PostureTask(nao, weight=1.0)},
+                scheme=SCHEMES["weighted"],
+                limits=(),
             )
 
     def test_tasks(self, arm, tasks):

@@ -68,7 +68,7 @@ def test_met_and_linear_tasks_bend_nothing(arm):
     kinematics = osik.forward_kinematics(arm, q)
     met = osik.FrameTask(arm, "hand", target=kinematics.frame_pose(arm, "hand")).rows(arm, kinematics, q)
     assert met.curvature == 0.0
-    assert osik.PostureTask(arm).rows(arm, kinematics, q).curvature == 0.0
+    assert osik.PostureTask(arm, weight=1.0).rows(arm, kinematics, q).curvature == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_derivatives_where_little_room_is_left(scheme, arm):
     q0, away = bent(arm), 1.5 * jnp.array([1.0, 0.3, 0.2]) / jnp.linalg.norm(jnp.array([1.0, 0.3, 0.2]))
     rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")[1]
     hand = osik.FrameTask(arm, "hand", rows="position", target=(away, rotation), gain=10.0)
-    posture = osik.PostureTask(arm, target=q0, gain=10.0, priority=2)
+    posture = osik.PostureTask(arm, target=q0, gain=10.0, priority=2, weight=1.0)
     tasks = {"hand": hand, "posture": posture}
     path = jax.jit(lambda q: osik.rollout(arm, q, tasks, scheme=make(), dt=DT, steps=220).q[-1])(q0)
 
@@ -188,7 +188,9 @@ def test_its_share_is_traced(arm):
     @jax.jit
     def velocity(scheme):
         traces.append(1)
-        return osik.solve(arm, arm.q0, {"posture": osik.PostureTask(arm)}, scheme=scheme, limits=()).velocity
+        return osik.solve(
+            arm, arm.q0, {"posture": osik.PostureTask(arm, weight=1.0)}, scheme=scheme, limits=()
+        ).velocity
 
     for kappa in (0.0, 0.5, 1.0):
         velocity(osik.WeightedQP(curvature_damping=kappa))

@@ -20,6 +20,7 @@ PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 TEXTS = [*PAGES, *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "mkdocs.yml"))]
 PACKAGES = (
     "osik_jax",
+    "osik_jax.runtime",
     "osik_jax.solvers",
     "osik_jax.schemes",
     "osik_jax.physics",
@@ -37,7 +38,6 @@ OPTIONAL = (
     "torch",
     "pinocchio",
     "mink",
-    "mediapy",
     "osik_jax.viewer",
     "osik_jax.demo",
     "osik_jax.tuning",
@@ -145,12 +145,27 @@ def test_a_link_that_leads_nowhere_is_seen() -> None:
             assert_leads_somewhere(target, README)
 
 
+def test_badges_open_every_notebook() -> None:
+    opened = re.findall(
+        r"colab\.research\.google\.com/github/osik-jax/osik-jax/blob/main/(\S+?\.ipynb)", README.read_text()
+    )
+    assert sorted(opened) == sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("notebooks/*.ipynb"))
+
+
+def test_files_that_derivations_and_architecture_name_are_there() -> None:
+    for page in ("derivations.md", "dev/architecture.md"):
+        text = (ROOT / "docs" / page).read_text()
+        named = re.findall(r"`(osik_jax/[\w/.]+)`", text)
+        assert len(named) >= 8
+        assert [path for path in named if not (ROOT / path).exists()] == []
+
+
 def test_readme_is_a_page_of_a_package_index_too() -> None:
     """Which knows nothing of the files beside it: every address is whole, and pictures are the files themselves."""
     text = README.read_text()
     assert [target for target in LINK.findall(text) if not target.startswith("https://")] == []
     for picture in re.findall(r"!\[[^\]]*\]\(([^)\s]+)\)", text):
-        assert picture.startswith("https://raw.githubusercontent.com/")
+        assert picture.startswith(("https://raw.githubusercontent.com/", "https://colab.research.google.com/assets/"))
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=relative)

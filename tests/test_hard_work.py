@@ -102,7 +102,7 @@ class TestOutOfReach:
         work = workload("arm7")
         tasks: dict[str, osik.Task] = {"hand": osik.FrameTask(arm, "hand", rows="position")}
         if posture:
-            tasks["posture"] = osik.PostureTask(arm, target=jnp.full(7, 0.4), gain=10.0, priority=2)
+            tasks["posture"] = osik.PostureTask(arm, target=jnp.full(7, 0.4), gain=10.0, priority=2, weight=1.0)
         velocity, status, path = held(arm, tasks, SCHEMES[scheme](), places, gains)
         assert_calm(arm, velocity, status, LATE, limits=scheme != "null space")
         for lane, place in enumerate(places):
@@ -133,7 +133,10 @@ class TestAtTheStart:
         "method", [name if name in QUICK_METHODS else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]
     )
     def test_derivatives_are_central_differences(self, arm, rng, method):
-        tasks = {"hand": osik.FrameTask(arm, "hand", rows="position"), "posture": osik.PostureTask(arm, priority=2)}
+        tasks = {
+            "hand": osik.FrameTask(arm, "hand", rows="position"),
+            "posture": osik.PostureTask(arm, priority=2, weight=1.0),
+        }
         along, mix = rng.normal(size=(2, arm.nv))
         scheme = METHODS[method]()
 

@@ -324,7 +324,7 @@ class TestMistakes:
         with pytest.raises(TypeError, match="which is no pose"):
             osik.inverse_kinematics(arm, {"hand": "there"})
         with pytest.raises(ValueError, match="no task says where"):
-            osik.inverse_kinematics(arm, {"posture": osik.PostureTask(arm)})
+            osik.inverse_kinematics(arm, {"posture": osik.PostureTask(arm, weight=1.0)})
         with pytest.raises(KeyError, match="no task 'foot'"):
             osik.inverse_kinematics(arm, {"hand": osik.FrameTask(arm, "hand")}, targets={"foot": pose[None]})
         with pytest.raises(ValueError, match="targets go with tasks"):

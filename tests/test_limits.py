@@ -240,7 +240,7 @@ class TestGain:
     def test_a_joint_outside_comes_back(self, robot, gain):
         """Each step leaves at most the share that the gain says, whatever the tasks want; the speed limit holds."""
         dt, steps = 0.05, 40
-        outward = {"posture": osik.PostureTask(robot, target=_at(robot, [4.0, 2.0, 0.0]), gain=20.0)}
+        outward = {"posture": osik.PostureTask(robot, target=_at(robot, [4.0, 2.0, 0.0]), gain=20.0, weight=1.0)}
         limits = osik.ConfigurationLimit(robot, gain=gain), osik.VelocityLimit(robot)
         start = _at(robot, [2.0, 0.5, 0.0])
         path = osik.rollout(robot, start, outward, scheme=osik.WeightedQP(), limits=limits, dt=dt, steps=steps)

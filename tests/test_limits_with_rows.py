@@ -254,7 +254,7 @@ class TestLimitTask:
         soft = {
             "range": osik.LimitTask(arm, osik.ConfigurationLimit(arm)),
             "jerk": osik.LimitTask(arm, osik.AccelerationLimit(arm, {"*": 2.0})),
-            "posture": osik.PostureTask(arm, target=arm.q0.at[0].set(5.0), priority=2),
+            "posture": osik.PostureTask(arm, target=arm.q0.at[0].set(5.0), priority=2, weight=1.0),
         }
         path = osik.rollout(arm, arm.q0, soft, scheme=osik.HierarchicalQP(), dt=0.05, steps=60, limits=())
         assert np.abs(np.diff(np.asarray(path.solution.velocity), axis=0, prepend=0.0)).max() < 2.0 * 0.05 + 1e-9
@@ -264,7 +264,7 @@ class TestLimitTask:
     def test_mistakes(self, arm):
         make: Any = osik.LimitTask
         with pytest.raises(TypeError, match="not a Limit"):
-            make(arm, osik.PostureTask(arm))
+            make(arm, osik.PostureTask(arm, weight=1.0))
         task = osik.LimitTask(arm, osik.VelocityLimit(arm))
         assert task.replaceable == ("weight", "limit")
         with pytest.raises(ValueError, match="another structure"):

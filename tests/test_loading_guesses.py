@@ -207,7 +207,7 @@ class TestHome:
         arm = osik.load_robot("arm7").with_home(q)
         expected = osik.forward_kinematics(arm, q).frame_pose(arm, "hand")
         np.testing.assert_allclose(osik.FrameTask(arm, "hand").target[0], expected[0], atol=1e-14)
-        np.testing.assert_array_equal(np.asarray(osik.PostureTask(arm).target), q)
+        np.testing.assert_array_equal(np.asarray(osik.PostureTask(arm, weight=1.0).target), q)
 
     def test_in_a_program(self):
         arm = osik.load_robot("arm7")

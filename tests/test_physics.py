@@ -172,7 +172,7 @@ def test_falls_are_seen(nao, nao_world):
 
 def test_a_fall_ends_the_run(nao, nao_world):
     simulation = physics.Simulation(nao_world)
-    posture = {"posture": osik.PostureTask(nao, gain=1.0)}
+    posture = {"posture": osik.PostureTask(nao, gain=1.0, weight=1.0)}
 
     def push(t, simulation):
         simulation.push("torso", (0.0, 60.0, 0.0) if t > 0.1 else (0.0, 0.0, 0.0))
@@ -199,7 +199,7 @@ def test_steady_errors_are_those_of_theory(arm, arm_world, command, left):
     """Posture alone: the integrated command takes all droop away; looking ahead multiplies stiffness by gain x time."""
     simulation = physics.Simulation(arm_world)
     goal = arm.q0 + jnp.linspace(-0.1, 0.1, arm.nq)
-    posture = {"posture": osik.PostureTask(arm, target=goal, gain=5.0)}
+    posture = {"posture": osik.PostureTask(arm, target=goal, gain=5.0, weight=1.0)}
     recording = physics.simulate(
         simulation, posture, scheme=osik.WeightedQP(), dt=DT, steps=800, command=command, limits=()
     )
@@ -228,7 +228,7 @@ class Compilations(logging.Handler):
 
 def test_other_gains_compile_nothing(arm, arm_world):
     def run(gain, time):
-        task = {"posture": osik.PostureTask(arm, gain=gain)}
+        task = {"posture": osik.PostureTask(arm, gain=gain, weight=1.0)}
         command = physics.Lookahead(time)
         simulation = physics.Simulation(arm_world)
         return physics.simulate(simulation, task, scheme=osik.WeightedQP(), dt=DT, steps=3, command=command, limits=())
@@ -270,7 +270,12 @@ def test_mistakes_are_told(nao, arm, arm_world):
         simulation.push("torso", (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="one tick"):
         physics.simulate(
-            simulation, {"posture": osik.PostureTask(arm)}, scheme=osik.WeightedQP(), dt=DT, steps=0, limits=()
+            simulation,
+            {"posture": osik.PostureTask(arm, weight=1.0)},
+            scheme=osik.WeightedQP(),
+            dt=DT,
+            steps=0,
+            limits=(),
         )
 
 

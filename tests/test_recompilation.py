@@ -167,7 +167,7 @@ class Drift(eqx.Module):
 
 def test_callables_that_are_pytrees_may_change_their_numbers(arm):
     def run(speed, start, amount):
-        tasks = Push(osik.PostureTask(arm), start, speed)
+        tasks = Push(osik.PostureTask(arm, weight=1.0), start, speed)
         scheme = osik.WeightedQP()
         return osik.rollout(
             arm, arm.q0, tasks, scheme=scheme, dt=0.01, steps=STEPS, feedback=Drift(amount), limits=()
@@ -183,11 +183,11 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
 @pytest.mark.slow
 def test_what_is_static_compiles_again(arm):
     """The counter counts: an iteration cap, a priority, a task more, another number of ticks."""
-    task, scheme = osik.PostureTask(arm), osik.WeightedQP()
+    task, scheme = osik.PostureTask(arm, weight=1.0), osik.WeightedQP()
     osik.solve(arm, arm.q0, {"posture": task}, scheme=scheme, limits=())
     changes = (
         ({"posture": task}, osik.WeightedQP(max_iterations=50)),
-        ({"posture": osik.PostureTask(arm, priority=4)}, scheme),
+        ({"posture": osik.PostureTask(arm, priority=4, weight=1.0)}, scheme),
         ({"posture": task, "second": task}, scheme),
     )
     for tasks, other in changes:

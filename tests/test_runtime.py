@@ -1,4 +1,4 @@
-"""What importing the package does to the CPU runtime, and that it leaves alone what the user has set."""
+"""Importing changes nothing in the process; ``configure_cpu`` does, and leaves alone what the user has set."""
 
 import json
 import os
@@ -7,55 +7,131 @@ import sys
 import tomllib
 from pathlib import Path
 
-from osik_jax._runtime import _UNTRIED_JAXLIB
+import pytest
 
-PROBE = """
-import json, os, numpy, osik_jax, threadpoolctl
-pools = {p["filepath"]: p["num_threads"] for p in threadpoolctl.threadpool_info() if p["internal_api"] == "openblas"}
-print(json.dumps([os.environ["PJRT_NPROC"], os.environ.get("XLA_FLAGS", ""), pools]))
+from osik_jax._cpu_settings import _UNTRIED_JAXLIB
+from osik_jax.runtime import configure_cpu
+
+OURS = "PJRT_NPROC", "OPENBLAS_NUM_THREADS", "XLA_FLAGS", "JAX_CPU_ENABLE_ASYNC_DISPATCH"
+SERIAL = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+STATE = """
+import json, os, jax, numpy, scipy.linalg, threadpoolctl
+def state():
+    blas = [p for p in threadpoolctl.threadpool_info() if p["internal_api"] == "openblas"]
+    pools = {p["filepath"]: p["num_threads"] for p in blas}
+    return [dict(os.environ), dict(jax.config.values), pools]
 """
+IMPORT = STATE + "before = state(); import osik_jax, osik_jax.cli; print(json.dumps([before, state()], default=str))"
+CONFIGURE = (
+    STATE + "from osik_jax.runtime import configure_cpu; configure_cpu(); configure_cpu(); "
+    "import jax.numpy as jnp; jnp.zeros(3).block_until_ready(); configure_cpu(); "
+    "print(json.dumps(state(), default=str))"
+)
 
 
-def runtime(**settings):
-    ours = "PJRT_NPROC", "OPENBLAS_NUM_THREADS", "XLA_FLAGS"
-    env = {k: v for k, v in os.environ.items() if k not in ours} | settings
-    done = subprocess.run([sys.executable, "-c", PROBE], env=env, capture_output=True, text=True, check=True)
-    assert done.stdout.count("\n") == 1  # nothing else is printed, by us or by MJX
-    workers, flags, pools = json.loads(done.stdout)
+def in_a_process(script, **settings):
+    env = {k: v for k, v in os.environ.items() if k not in OURS} | settings
+    command = [sys.executable, "-c", script]
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=True)
+
+
+def configured(**settings):
+    environment, config, pools = json.loads(in_a_process(CONFIGURE, **settings).stdout)
     lapack = [threads for path, threads in pools.items() if "scipy" in path.split("site-packages")[-1].split("/")[1]]
-    return int(workers), flags, lapack
+    return environment, config, lapack
 
 
-def test_a_wide_pool_and_one_lapack_thread_by_default():
-    workers, flags, lapack = runtime()
-    assert workers >= 8
-    assert flags == "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+def test_an_import_changes_nothing_and_prints_nothing():
+    done = in_a_process(IMPORT, PYTHONWARNINGS="error")
+    before, after = json.loads(done.stdout)
+    assert before == after
+    assert done.stderr == ""
+
+
+def test_a_wide_pool_one_lapack_thread_and_programs_run_where_they_are_called():
+    environment, config, lapack = configured()
+    assert int(environment.get("PJRT_NPROC", os.cpu_count())) >= 8
+    assert environment["XLA_FLAGS"] == SERIAL
     assert lapack == [1]
+    assert config["jax_cpu_enable_async_dispatch"] is False
 
 
 def test_the_users_settings_stay():
     chosen = "--xla_cpu_enable_concurrency_optimized_scheduler=true"
-    workers, flags, lapack = runtime(PJRT_NPROC="3", OPENBLAS_NUM_THREADS="2", XLA_FLAGS=chosen)
-    assert (workers, flags) == (3, chosen)
+    environment, config, lapack = configured(
+        PJRT_NPROC="3", OPENBLAS_NUM_THREADS="2", XLA_FLAGS=chosen, JAX_CPU_ENABLE_ASYNC_DISPATCH="1"
+    )
+    assert (environment["PJRT_NPROC"], environment["XLA_FLAGS"]) == ("3", chosen)
     assert lapack == [min(2, os.cpu_count() or 1)]
-
-
-def test_programs_run_where_they_are_called_unless_set_back_after_the_import():
-    probe = """
-import jax, osik_jax, jax.numpy as jnp, sys
-if "back" in sys.argv: jax.config.update("jax_cpu_enable_async_dispatch", True)
-program, x = jax.jit(jnp.linalg.inv), jnp.eye(1200)
-jax.block_until_ready(program(x))
-print(program(x).is_ready())
-"""
-    for argument, done_on_return in (("", True), ("back", False)):
-        done = subprocess.run([sys.executable, "-c", probe, argument], capture_output=True, text=True, check=True)
-        assert done.stdout.strip() == str(done_on_return)
+    assert config["jax_cpu_enable_async_dispatch"] is True
 
 
 def test_other_flags_stay_beside_ours():
     other = "--xla_cpu_enable_fast_min_max=true"
-    assert runtime(XLA_FLAGS=other)[1] == f"{other} --xla_cpu_enable_concurrency_optimized_scheduler=false"
+    assert configured(XLA_FLAGS=other)[0]["XLA_FLAGS"] == f"{other} {SERIAL}"
+
+
+def test_too_late_is_told_and_changes_nothing():
+    script = (
+        STATE + "import jax.numpy as jnp; jnp.zeros(3); before = state(); from osik_jax.runtime import configure_cpu\n"
+        "try: configure_cpu(workers=64)\n"
+        "except RuntimeError as error: print(json.dumps([str(error), before == state()]))"
+    )
+    message, unchanged = json.loads(in_a_process(script).stdout)
+    assert "PJRT_NPROC" in message and "XLA_FLAGS" in message and "before the first" in message
+    assert unchanged
+
+
+@pytest.mark.parametrize("given", [dict(workers=0), dict(workers=2.5), dict(lapack_threads=True)])
+def test_counts_are_checked(given):
+    (name,) = given
+    with pytest.raises(ValueError, match=name):
+        configure_cpu(**given)
+
+
+LOCKED = """
+import sys, jax, jax.numpy as jnp
+if "configured" in sys.argv:
+    from osik_jax.runtime import configure_cpu
+    configure_cpu()
+def both(a, b):
+    return jnp.linalg.inv(a), jnp.linalg.inv(b)
+def again(_, pair):
+    return jax.tree.map(lambda new, old: old + 0.0 * new, jax.vmap(both)(*pair), pair)
+a = jnp.broadcast_to(2.0 * jnp.eye(12), (512, 12, 12))
+jax.block_until_ready(jax.jit(lambda a, b: jax.lax.fori_loop(0, 500, again, (a, b)))(a, 1.5 * a))
+print("done")
+"""
+
+
+def test_batches_of_factorisations_side_by_side_come_to_an_end():
+    """Without ``configure_cpu`` the same program waits for ever on two cores (jaxlib 0.10.2)."""
+    env = {k: v for k, v in os.environ.items() if k not in OURS}
+    done = subprocess.run(
+        [sys.executable, "-c", LOCKED, "configured"], env=env, capture_output=True, text=True, timeout=300
+    )
+    assert done.stdout == "done\n", done.stderr
+
+
+WARNED = """
+import os, warnings
+os.sched_getaffinity = lambda _: {0, 1}
+import jax, jax.numpy as jnp, osik_jax
+from osik_jax.solvers import solve_qp
+H, g, b = jnp.eye(2), jnp.ones(2), jnp.ones(2)
+with warnings.catch_warnings(record=True) as seen:
+    warnings.simplefilter("always")
+    solve_qp(H, g, -b, b)
+    alone = len(seen)
+    for _ in range(2):
+        jax.vmap(lambda g: solve_qp(H, g, -b, b).x)(jnp.ones((3, 2)))
+print(alone, [str(w.message) for w in seen if "configure_cpu" in str(w.message)].__len__())
+"""
+
+
+def test_batches_on_few_cores_that_are_not_configured_are_warned_of_once():
+    assert in_a_process(WARNED).stdout.strip() == "0 1"
+    assert in_a_process(WARNED, PJRT_NPROC="8").stdout.strip() == "0 0"
 
 
 def test_flags_are_set_for_every_jax_that_may_be_installed():

@@ -25,7 +25,7 @@ arm = osik.load_robot("arm7")
 limits = (osik.VelocityLimit(arm, velocity={'*': 0.4}),)
 q = arm.q0 + 0.3 * jax.random.normal(jax.random.key(0), (21, arm.nq))  # 21 lanes do not divide over 8 devices
 hand = osik.FrameTask(arm, "hand", rows="position", gain=3.0, priority=1)
-tasks = {"hand": hand, "posture": osik.PostureTask(arm, priority=2)}
+tasks = {"hand": hand, "posture": osik.PostureTask(arm, priority=2, weight=1.0)}
 many = osik.batched(tasks, {"posture.gain": jnp.linspace(1.0, 3.0, 21)})
 axes = (None, 0, osik.batch_axes(tasks, "posture.gain"))
 largest = lambda a, b: max(float(abs(x - y).max()) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))

@@ -467,7 +467,7 @@ class TestCentreOfMass:
         tasks = {
             **{foot: osik.FrameTask(robot, foot, gain=50.0) for foot in feet},
             "waist": osik.FrameTask(robot, "torso", target=(p + np.array([0.0, 0.1, -0.02]), R), gain=2.0, priority=3),
-            "posture": osik.PostureTask(robot, gain=1.0, priority=4),
+            "posture": osik.PostureTask(robot, gain=1.0, priority=4, weight=1.0),
         }
         limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))
         outside = {}

@@ -51,7 +51,7 @@ def _all_tasks(robot, frame, subtree, rng):
         "com zy, subtree": osik.ComTask(robot, axes="zy", subtree=subtree, target=[0.1, 0.2, 0.3]),
         "com bounds": osik.ComTask(robot, axes="xy", lower=[-0.1, 0.0]),
         "com polygon": osik.ComTask(robot, polygon=square()),
-        "posture": osik.PostureTask(robot),
+        "posture": osik.PostureTask(robot, weight=1.0),
         "some joints": osik.PostureTask(robot, joints=some),
         "joint bounds": osik.PostureTask(robot, joints=some, lower=-0.1, upper=0.1),
     }
@@ -84,7 +84,7 @@ class TestErrors:
             "foot": osik.FrameTask(nao, "l_sole"),
             "own": osik.FrameTask(nao, "l_sole", axes="frame"),
             "com": osik.ComTask(nao),
-            "posture": osik.PostureTask(nao),
+            "posture": osik.PostureTask(nao, weight=1.0),
         }
         for rows in rows_of_each(nao, tasks, nao.q0).values():
             np.testing.assert_allclose(rows.error, 0.0, atol=1e-14)
@@ -127,7 +127,7 @@ class TestGradients:
     def test_a_float32_robot_has_float32_tasks(self, arm):
         robot = jax.tree.map(lambda x: x.astype(jnp.float32), arm)
         task = osik.FrameTask(robot, "hand", gain=osik.AdaptiveGain(5.0, 1.0, 2.0), lower=-1.0)
-        for leaf in jax.tree.leaves((task, osik.ComTask(robot), osik.PostureTask(robot))):
+        for leaf in jax.tree.leaves((task, osik.ComTask(robot), osik.PostureTask(robot, weight=1.0))):
             assert leaf.dtype == jnp.float32
 
 
@@ -141,7 +141,7 @@ class TestBatchesAndCompilation:
         )
         numbers = jnp.asarray(rng.uniform(1.0, 2.0, (count, 3)))
         frame = osik.FrameTask(nao, "r_wrist", gain=osik.AdaptiveGain(10.0, 1.0, 2.0), lower=-0.1)
-        com, posture = osik.ComTask(nao), osik.PostureTask(nao)
+        com, posture = osik.ComTask(nao), osik.PostureTask(nao, weight=1.0)
 
         def rows(p, R, n):
             tasks = {
@@ -173,7 +173,7 @@ class TestBatchesAndCompilation:
                 "home": osik.FrameTask(robot, "hand"),
                 "frame": osik.FrameTask(robot, "hand", target=(jnp.full(3, 0.1), jnp.eye(3)), axes="frame"),
                 "com": osik.ComTask(robot, axes="xy", lower=0.1),
-                "posture": osik.PostureTask(robot, target=robot.q0 + 0.1),
+                "posture": osik.PostureTask(robot, target=robot.q0 + 0.1, weight=1.0),
             }
             limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))
             return rows_of_each(robot, tasks, robot.q0), osik.limit_box(robot, robot.q0, limits, 0.01)
@@ -198,7 +198,7 @@ class TestBatchesAndCompilation:
         tasks = {
             "pose": osik.FrameTask(arm, frame, lower=-0.1, gain=osik.AdaptiveGain(3, 2, 1)),
             "com": osik.ComTask(arm, polygon=square()),
-            "posture": osik.PostureTask(arm),
+            "posture": osik.PostureTask(arm, weight=1.0),
         }
         total(tasks, arm.q0)
         pose = tasks["pose"]
@@ -220,7 +220,7 @@ class TestBatchesAndCompilation:
         assert len(traces) == 1
 
     def test_a_replaced_task_is_another_one(self, arm):
-        task = osik.PostureTask(arm, gain=2.0)
+        task = osik.PostureTask(arm, gain=2.0, weight=1.0)
         assert task.replace(gain=3.0).gain == 3.0
         assert task.gain == 2.0
         assert task.replace() is task
@@ -275,7 +275,7 @@ class TestMistakes:
         with pytest.raises(ValueError, match="lower > upper"):
             task.replace(lower=1.0, upper=0.0)
         with pytest.raises(ValueError, match=r"target has shape \(3,\), expected \(7,\)"):
-            osik.PostureTask(arm).replace(target=np.zeros(3))
+            osik.PostureTask(arm, weight=1.0).replace(target=np.zeros(3))
         with pytest.raises(ValueError, match="rotation"):
             osik.FrameTask(arm, "hand").replace(target=2 * np.eye(4))
 
@@ -300,7 +300,7 @@ def test_rows_of_all_tasks_together_are_those_of_each():
         "box": osik.FrameTask(robot, "l_gripper", lower=-0.1, upper=[0.1, np.inf, 0.2, 1.0, 1.0, 1.0]),
         "doubled": Doubled(robot, "torso"),
         "com": osik.ComTask(robot),
-        "posture": osik.PostureTask(robot),
+        "posture": osik.PostureTask(robot, weight=1.0),
     }
     q = osik.integrate(robot, robot.q0, 0.1 * jnp.cos(jnp.arange(robot.nv)))
     kinematics = osik.forward_kinematics(robot, q)

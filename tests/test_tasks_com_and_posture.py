@@ -41,7 +41,7 @@ class TestAgainstMink:
         robot, q, configuration, _, _ = beside_mink
         theirs = mink.PostureTask(robot.mj_model, cost=1.0)
         theirs.set_target(np.asarray(robot.mujoco_qpos(robot.q0)))
-        rows = rows_of_each(robot, {"a": osik.PostureTask(robot)}, q)["a"]
+        rows = rows_of_each(robot, {"a": osik.PostureTask(robot, weight=1.0)}, q)["a"]
         error = theirs.compute_error(configuration)
         address = [robot.mj_model.joint(name).dofadr[0] for name in robot.joint_names]
         np.testing.assert_allclose(rows.error, error[address], atol=1e-12)
@@ -112,4 +112,4 @@ class TestMistakes:
         with pytest.raises(TypeError, match="not both"):
             osik.PostureTask(nao, target=nao.q0, lower=0.0)
         with pytest.raises(ValueError, match=r"target has shape \(4,\)"):
-            osik.PostureTask(nao, target=np.zeros(4))
+            osik.PostureTask(nao, target=np.zeros(4), weight=1.0)

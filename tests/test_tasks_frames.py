@@ -341,7 +341,7 @@ class TestClosedLoop:
         """The posture turns the head away by 1.5 and 0.7 rad; the point stays within 0.4 rad of its axis."""
         ahead, behind = [1.0, 0.0, 0.1], [-1.0, 0.01, 0.1]
         field = osik.LookAtTask(head, "head", axis=(1, 0, 0), target=ahead, half_angle=0.4, weight=1e6)
-        posture = osik.PostureTask(head, target=[1.5, 0.7], gain=5.0, priority=2)
+        posture = osik.PostureTask(head, target=[1.5, 0.7], gain=5.0, priority=2, weight=1.0)
 
         def run(field, posture):
             tasks = {"field": field, "posture": posture}

@@ -216,7 +216,7 @@ class TestClosedLoop:
 
     def test_low_acceleration_smooths(self, arm):
         """By hand, one joint: v = (w1 gain (target - q) + w2 v_last) / (w1 + w2)."""
-        posture = osik.PostureTask(arm, target=arm.q0 + 0.5, gain=5.0)
+        posture = osik.PostureTask(arm, target=arm.q0 + 0.5, gain=5.0, weight=1.0)
         smooth = osik.LowAccelerationTask(arm, weight=3.0)
         tasks, scheme = {"posture": posture, "smooth": smooth}, osik.WeightedQP(damping=1e-12)
         run = osik.rollout(arm, arm.q0, tasks, scheme=scheme, dt=DT, steps=20, limits=())

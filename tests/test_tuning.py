@@ -123,7 +123,9 @@ class TestNames:
 
     def test_a_task_named_like_a_part(self, arm):
         with pytest.raises(ValueError, match="a task cannot be called 'scheme'"):
-            tuning.Loop(arm, {"scheme": osik.PostureTask(arm)}, scheme=osik.WeightedQP(), steps=1, limits=())
+            tuning.Loop(
+                arm, {"scheme": osik.PostureTask(arm, weight=1.0)}, scheme=osik.WeightedQP(), steps=1, limits=()
+            )
 
 
 BOUNDS = [
@@ -234,7 +236,7 @@ class TestScenarios:
 def path(arm, rng, steps=5):
     """A trajectory of random numbers, with errors of three tasks."""
     q = np.asarray(arm.q0) + 0.5 * rng.normal(size=(steps + 1, 7))
-    solution = osik.solve(arm, arm.q0, {"p": osik.PostureTask(arm)}, scheme=osik.NullSpace(), limits=())
+    solution = osik.solve(arm, arm.q0, {"p": osik.PostureTask(arm, weight=1.0)}, scheme=osik.NullSpace(), limits=())
     error = {"hand": rng.normal(size=(steps, 3)), "com": rng.normal(size=(steps, 2)), "posture": np.zeros((steps, 7))}
     solution = eqx.tree_at(lambda s: (s.velocity, s.error), solution, (rng.normal(size=(steps, 7)), error))
     return osik.Trajectory(DT * jnp.arange(steps), jnp.asarray(q), jax.tree.map(jnp.asarray, solution))
@@ -245,7 +247,7 @@ def judged(arm):
     tasks = {
         "hand": osik.FrameTask(arm, "hand", rows="position"),
         "com": osik.ComTask(arm, lower=[-0.2, -np.inf], upper=[0.3, 0.1], axes="xy"),
-        "posture": osik.PostureTask(arm),
+        "posture": osik.PostureTask(arm, weight=1.0),
     }
     loop = tuning.Loop(arm, tasks, scheme=osik.WeightedQP(), dt=DT, steps=5, limits=())
     return path(arm, np.random.default_rng(3)), loop

@@ -25,7 +25,7 @@ def loop():
     robot = osik.load_robot("nao")
     tasks: dict[str, osik.Task] = {name: osik.FrameTask(robot, sole) for name, sole in FEET.items()}
     tasks["waist"] = osik.FrameTask(robot, "torso")
-    tasks["posture"] = osik.PostureTask(robot)
+    tasks["posture"] = osik.PostureTask(robot, weight=1.0)
     limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)
     return tuning.Loop(robot, tasks, scheme=osik.WeightedQP(), limits=limits, dt=0.04, steps=40)
 

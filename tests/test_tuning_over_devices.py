@@ -98,7 +98,9 @@ def test_two_processes_tune_as_one(eight):
 
 def test_mistakes():
     arm = osik.load_robot("arm7")
-    loop = tuning.Loop(arm, {"posture": osik.PostureTask(arm)}, scheme=osik.NullSpace(), limits=(), dt=0.05, steps=1)
+    loop = tuning.Loop(
+        arm, {"posture": osik.PostureTask(arm, weight=1.0)}, scheme=osik.NullSpace(), limits=(), dt=0.05, steps=1
+    )
     mesh: Any = 8
     scenarios = tuning.Scenarios(q0=arm.q0[None])
     with pytest.raises(TypeError, match=r"mesh is 8; it is a jax\.sharding\.Mesh"):

@@ -13,6 +13,8 @@ import argparse
 
 import jax
 
+from osik_jax.runtime import configure_cpu
+
 from ._page import PAGE, cases, outcome, page
 
 
@@ -31,4 +33,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

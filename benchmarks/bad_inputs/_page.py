@@ -57,7 +57,8 @@ class Case:
             answer = self.run()
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1].filename
-            assert self.error is not None and type(error) is self.error, f"{self.given}: {type(error)}: {error}"
+            own = type(error).__bases__ if isinstance(error, osik.OsikError) else (type(error),)
+            assert self.error in own, f"{self.given}: {type(error)}: {error}"
             assert last.startswith(PACKAGE), f"{self.given}: raised in {last}"
             text = str(error.args[0] if isinstance(error, KeyError) else error)
             assert self.words in text, f"{self.given}: {self.words!r} is not in {text!r}"

@@ -19,6 +19,8 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
+from osik_jax.runtime import configure_cpu
+
 from ..processes import PeerUnavailable
 from ..robots import workload
 from ._cases import cases
@@ -81,4 +83,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

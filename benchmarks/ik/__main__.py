@@ -23,6 +23,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from osik_jax.runtime import configure_cpu
+
 from ..machine import processor
 from ._arms import ABOUT_THE_BASE, ARMS, Arm, Poses
 from ._solvers import ORIENTATION, POSITION, Answer, ours, ours_one_by_one, with_mink, with_pink
@@ -121,4 +123,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 
 from ..descriptions import ROBOTS
 from ..machine import processor
@@ -158,4 +159,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 from osik_jax.scaling import sharded
 
 from ..device import device_bytes, device_name
@@ -53,6 +54,7 @@ class Runner:
     ) -> None:
         if devices > 1:
             jax.config.update("jax_num_cpu_devices", devices)
+        configure_cpu()
         jax.config.update("jax_enable_x64", precision == "float64")
         self.work, self.batch, self.resident = work, batch, resident
         self.robot = standing(work)

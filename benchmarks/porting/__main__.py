@@ -15,6 +15,8 @@ import logging
 
 import jax
 
+from osik_jax.runtime import configure_cpu
+
 from . import mobile, squat, step
 
 PARTS = {"step": step.report, "squat": squat.report, "mobile": mobile.report}
@@ -31,4 +33,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

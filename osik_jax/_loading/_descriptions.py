@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
 
+from .._errors import OsikKeyError, OsikValueError
 from .._tree import unknown_name
 from ._embedded import ROBOTS
 from ._mjcf import from_mjcf
@@ -36,8 +37,8 @@ def described(name: str, **options: Any) -> dict[str, Any]:
         return from_urdf(module.URDF_PATH, package_dirs=_package_dirs(module), **options)
     xacro = getattr(module, "XACRO_PATH", None)
     if xacro is None:
-        raise ValueError(f"robot {name!r} comes neither as MJCF nor as URDF")
-    raise ValueError(f"robot {name!r} comes as xacro: run xacro on {xacro!r} and load what it writes")
+        raise OsikValueError(f"robot {name!r} comes neither as MJCF nor as URDF")
+    raise OsikValueError(f"robot {name!r} comes as xacro: run xacro on {xacro!r} and load what it writes")
 
 
 def urdf_of_description(name: str) -> tuple[str, list[str]] | None:
@@ -68,7 +69,7 @@ def _unknown(name: str, known: Iterable[str]) -> KeyError:
     short = name.removesuffix(SUFFIX)
     close += [other for other in available if short and short in other and other not in close]
     hint = f"; did you mean {', '.join(map(repr, close[:_NEAREST]))}?" if close else "."
-    return KeyError(f"no robot {name!r}{hint} robots: {', '.join(ROBOTS)}, and robot_descriptions.DESCRIPTIONS")
+    return OsikKeyError(f"no robot {name!r}{hint} robots: {', '.join(ROBOTS)}, and robot_descriptions.DESCRIPTIONS")
 
 
 def _package_dirs(module: ModuleType) -> list[str]:

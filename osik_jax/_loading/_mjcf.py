@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from .._errors import OsikValueError
 from ._mjmodel import LEAST_INERTIA, as_mapping, element_names, from_mjmodel
 from ._source import Source, check_root, parse_xml, read_source
 
@@ -29,7 +30,7 @@ def from_mjcf(
     try:
         model = _model(source, floating_base)
     except ValueError as error:
-        raise ValueError(f"{source.label}: {error}") from None
+        raise OsikValueError(f"{source.label}: {error}") from None
     locked = as_mapping(locked_joints)
     if floating_base is False:
         locked = dict.fromkeys(_free_joints(model)) | locked
@@ -85,7 +86,7 @@ def _strip_files(spec: mujoco.MjSpec, error: ValueError) -> None:
     geoms = [g for g in spec.geoms if g.meshname in lost["meshes"] or g.hfieldname in lost["hfields"]]
     for geom in geoms:
         if _gives_mass(spec, geom):
-            raise ValueError(
+            raise OsikValueError(
                 f"body {geom.parent.name!r} takes its mass from the mesh file {lost['meshes'][geom.meshname]!r}, which "
                 f"cannot be read ({error}); give the body an <inertial>, or the file"
             )
@@ -124,13 +125,13 @@ def _add_base(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     owners = {int(model.body_rootid[b]) for b in model.jnt_bodyid}
     names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
     if len(owners) != 1:
-        raise ValueError(
+        raise OsikValueError(
             "floating_base=True needs one root body with joints below it; "
             f"bodies in the world with joints: {', '.join(names[b] for b in sorted(owners)) or '(none)'}"
         )
     (root,) = owners
     if model.body_jntnum[root]:
-        raise ValueError(f"floating_base=True, but the root body {names[root]!r} already has a joint of its own")
+        raise OsikValueError(f"floating_base=True, but the root body {names[root]!r} already has a joint of its own")
     body = next(body for body in spec.worldbody.bodies if body.id == root)
     body.add_freejoint(name=FLOATING_BASE)
     pose = np.concatenate([model.body_pos[root], model.body_quat[root]])

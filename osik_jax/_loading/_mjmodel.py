@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._errors import warn
+from .._errors import OsikTypeError, OsikValueError, warn
 from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder, unknown_name
 
 VELOCITY_LIMIT_PREFIX = "velocity_limit/"
@@ -64,7 +64,7 @@ def from_mjmodel(
 ) -> dict[str, Any]:
     """The fields of a Robot from a MuJoCo model; see ``Robot.from_mjmodel``."""
     if not isinstance(model, mujoco.MjModel):
-        raise TypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
+        raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
     names = element_names(model, mujoco.mjtObj.mjOBJ_JOINT, "joint", model.njnt)
     body_names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
     _check(model, names, body_names)
@@ -87,7 +87,7 @@ def from_mjmodel(
         locked=tuple(sorted(locked)),
     )
     if tree.nv == 0:
-        raise ValueError(f"the model has no joint left to move; joints: {', '.join(names)}, all locked")
+        raise OsikValueError(f"the model has no joint left to move; joints: {', '.join(names)}, all locked")
     low, high = _ranges(model, names, position_limits or {})
     lower, upper, speed = _limits(tree, followers, low, high, _speeds(model, names, velocity_limits or {}))
     _warn_of_frozen(tree, lower, upper, position_limits or {})
@@ -125,7 +125,7 @@ def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count
 def as_mapping(locked: Iterable[str] | Mapping[str, float]) -> dict[str, float | None]:
     """Names or globs of joints to lock; None where no value is given."""
     if isinstance(locked, str):
-        raise TypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
+        raise OsikTypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
     return dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked)
 
 
@@ -159,15 +159,15 @@ def _float_array(value: ArrayLike) -> Any:
 
 def _check(model: mujoco.MjModel, names: tuple[str, ...], body_names: tuple[str, ...]) -> None:
     if model.njnt == 0:
-        raise ValueError(f"the model has no joint, so nothing can move; bodies: {', '.join(body_names)}")
+        raise OsikValueError(f"the model has no joint, so nothing can move; bodies: {', '.join(body_names)}")
     moving = model.body_weldid != 0
     if not model.body_mass[moving].sum() > _MASSLESS * model.nbody:
         moving_names = (name for name, moves in zip(body_names, moving, strict=True) if moves)
-        raise ValueError(f"nothing that moves has a mass; give one of these an inertial: {', '.join(moving_names)}")
+        raise OsikValueError(f"nothing that moves has a mass; give one of these an inertial: {', '.join(moving_names)}")
     for joint, name in enumerate(names):
         low, high = model.jnt_range[joint]
         if low > high:  # which MuJoCo may take for "no limit"
-            raise ValueError(f"joint {name!r} has limits with lower > upper: [{low}, {high}]")
+            raise OsikValueError(f"joint {name!r} has limits with lower > upper: [{low}, {high}]")
 
 
 def _asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[str, float | None]) -> dict[int, Lock]:
@@ -179,11 +179,11 @@ def _asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[s
             if value is None:
                 out[joint] = Lock(model.qpos0[start : start + QPOS_WIDTH[kind]].copy(), given=False)
             elif kind in (FREE, BALL):
-                raise ValueError(
+                raise OsikValueError(
                     f"joint {names[joint]!r} is free or ball: it can only be locked where the model has it"
                 )
             elif not math.isfinite(value):
-                raise ValueError(f"joint {names[joint]!r} cannot be locked at {value}")
+                raise OsikValueError(f"joint {names[joint]!r} cannot be locked at {value}")
             else:
                 out[joint] = Lock(np.array([float(value)]), given=True)
     return out
@@ -220,7 +220,7 @@ def _resolve(
     table: dict[int, Follower] = {}
     for relation in relations:
         if relation.joint in table or relation.joint in constants:
-            raise ValueError(f"joint {names[relation.joint]!r} is tied by more than one joint equality")
+            raise OsikValueError(f"joint {names[relation.joint]!r} is tied by more than one joint equality")
         table[relation.joint] = relation
     locked = {joint: lock.value for joint, lock in asked.items() if joint not in table} | dict(constants)
     followers = []
@@ -230,7 +230,7 @@ def _resolve(
             locked[joint] = follower.multiplier * locked[follower.leader] + follower.offset
             _check_lock(names, follower, asked.get(joint), locked[joint])
         elif joint in asked:
-            raise ValueError(
+            raise OsikValueError(
                 f"joint {names[joint]!r} cannot be locked alone: it mimics {names[follower.leader]!r}, lock that one"
             )
         else:
@@ -244,7 +244,7 @@ def _end_of_chain(names: tuple[str, ...], table: Mapping[int, Follower], joint: 
     seen = [joint]
     while leader in table:
         if leader in seen:
-            raise ValueError(f"joints mimic each other in a circle: {', '.join(names[j] for j in seen)}")
+            raise OsikValueError(f"joints mimic each other in a circle: {', '.join(names[j] for j in seen)}")
         seen.append(leader)
         _, leader, m, o = table[leader]
         multiplier, offset = multiplier * m, multiplier * o + offset
@@ -253,7 +253,7 @@ def _end_of_chain(names: tuple[str, ...], table: Mapping[int, Follower], joint: 
 
 def _check_lock(names: tuple[str, ...], follower: Follower, asked: Lock | None, value: np.ndarray) -> None:
     if asked is not None and asked.given and abs(asked.value - value).max() > _LOCK_TOLERANCE:
-        raise ValueError(
+        raise OsikValueError(
             f"joint {names[follower.joint]!r} cannot be locked at {asked.value[0]}: it mimics "
             f"{names[follower.leader]!r}, which puts it at {value[0]}"
         )
@@ -353,7 +353,7 @@ def _speeds(model: mujoco.MjModel, names: tuple[str, ...], given: Mapping[str, f
 def _set_speed(speeds: np.ndarray, names: tuple[str, ...], pattern: str, value: float) -> None:
     for joint in match_joints(pattern, names):
         if not value > 0.0:
-            raise ValueError(f"the velocity limit of joint {names[joint]!r} is {value}; it has to be positive")
+            raise OsikValueError(f"the velocity limit of joint {names[joint]!r} is {value}; it has to be positive")
         speeds[joint] = value
 
 
@@ -370,7 +370,7 @@ def _ranges(
         lower, upper = _range(limits, pattern)
         for joint in joints:
             if not scalar[joint]:
-                raise ValueError(f"joint {pattern!r} is free or ball; only hinges and slides have a range")
+                raise OsikValueError(f"joint {pattern!r} is free or ball; only hinges and slides have a range")
             low[joint], high[joint] = lower, upper
     return low, high
 
@@ -379,9 +379,9 @@ def _range(limits: tuple[float, float], pattern: str) -> tuple[float, float]:
     try:
         lower, upper = (float(value) for value in limits)
     except (TypeError, ValueError):
-        raise TypeError(f"position_limits[{pattern!r}] is {limits!r}; it is a pair (lower, upper)") from None
+        raise OsikTypeError(f"position_limits[{pattern!r}] is {limits!r}; it is a pair (lower, upper)") from None
     if not lower <= upper:
-        raise ValueError(f"position_limits[{pattern!r}] is {limits!r}; lower has to be less than upper")
+        raise OsikValueError(f"position_limits[{pattern!r}] is {limits!r}; lower has to be less than upper")
     return lower, upper
 
 
@@ -395,7 +395,7 @@ def _limits(
         low[leader], high[leader] = max(low[leader], a), min(high[leader], b)
         speed[leader] = min(speed[leader], speed[joint] / abs(multiplier))
         if low[leader] > high[leader]:
-            raise ValueError(
+            raise OsikValueError(
                 f"joint {tree.joint_names[leader]!r} and its follower {tree.joint_names[joint]!r} have no position "
                 f"in common: lower {low[leader]} > upper {high[leader]}"
             )

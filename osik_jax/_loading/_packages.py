@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from urllib.parse import unquote
 
+from .._errors import OsikTypeError
+
 _PACKAGE_SCHEMES = ("package://", "model://")
 _FILE_SCHEME = "file://"
 
@@ -24,7 +26,7 @@ class Packages:
 
     def __init__(self, folders: Iterable[str | os.PathLike[str]] = ()) -> None:
         if isinstance(folders, str):
-            raise TypeError(f"package_dirs is a sequence of folders, not one string: use ({folders!r},)")
+            raise OsikTypeError(f"package_dirs is a sequence of folders, not one string: use ({folders!r},)")
         self.folders = tuple(Path(folder) for folder in folders)
 
     def path(self, address: object, *, beside: Path | None = None) -> Path:

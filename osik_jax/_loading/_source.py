@@ -9,6 +9,8 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import NamedTuple
 
+from .._errors import OsikTypeError, OsikValueError
+
 _ROOTS = {"robot": "a URDF: use Robot.from_urdf", "mujoco": "an MJCF: use Robot.from_mjcf", "sdf": "an SDF"}
 
 
@@ -41,9 +43,9 @@ def read_source(given: str | os.PathLike[str], kind: str) -> Source:
         ValueError: an empty text.
     """
     if not isinstance(given, str | os.PathLike):
-        raise TypeError(f"{given!r} is no {kind}: give a path, or the XML text itself")
+        raise OsikTypeError(f"{given!r} is no {kind}: give a path, or the XML text itself")
     if not str(given).strip():
-        raise ValueError(f"the {kind} is an empty text: give a path, or the XML text itself")
+        raise OsikValueError(f"the {kind} is an empty text: give a path, or the XML text itself")
     if isinstance(given, str) and given.lstrip("\ufeff \t\r\n").startswith("<"):
         return Source("the XML text", given.lstrip("\ufeff \t\r\n"), None)
     path = Path(given)
@@ -63,14 +65,14 @@ def parse_xml(source: Source) -> ElementTree.Element:
     except ElementTree.ParseError as error:
         line, column = error.position
         reason = str(error).partition(":")[0]
-        raise ValueError(f"{source.label}: broken XML at line {line}, column {column + 1}: {reason}") from None
+        raise OsikValueError(f"{source.label}: broken XML at line {line}, column {column + 1}: {reason}") from None
 
 
 def check_root(root: ElementTree.Element, expected: str, source: Source) -> None:
     """Raises ValueError where the root element is not ``expected`` ("robot" or "mujoco")."""
     if root.tag != expected:
         what = _ROOTS.get(root.tag, "not a robot description that can be read here")
-        raise ValueError(f"{source.label}: the root element is <{root.tag}>, not <{expected}>: this is {what}")
+        raise OsikValueError(f"{source.label}: the root element is <{root.tag}>, not <{expected}>: this is {what}")
 
 
 def _without_comments(content: str | bytes) -> str | bytes:

@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from .._errors import warn
+from .._errors import OsikValueError, warn
 from .._feet import find_feet
 from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, as_mapping, from_mjmodel, quaternion
 from ._packages import Packages, is_uri
@@ -54,7 +54,7 @@ def from_urdf(
             _add_meshes(spec, description, packages, source.path)
         model = spec.compile()
     except ValueError as error:
-        raise ValueError(f"{source.label}: {error}") from None
+        raise OsikValueError(f"{source.label}: {error}") from None
     locked = as_mapping(locked_joints)
     if floating_base is False:
         locked = {j.name: None for j in description.joints if j.kind == "floating"} | locked
@@ -70,7 +70,7 @@ def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
     kind = "floating" if wanted and not has_one else "fixed"
     base = Joint(_base_name(urdf), kind, WORLD, urdf.root, IDENTITY, np.zeros(3), -math.inf, math.inf, math.inf, None)
     if WORLD in urdf.links:
-        raise ValueError(f"only the root link may be called {WORLD!r}, and the root link is {urdf.root!r}")
+        raise OsikValueError(f"only the root link may be called {WORLD!r}, and the root link is {urdf.root!r}")
     world = Link(WORLD, 0.0, IDENTITY, np.zeros((3, 3)), ())
     return Urdf(urdf.name, {WORLD: world, **urdf.links}, (base, *urdf.joints), WORLD)
 
@@ -101,7 +101,7 @@ def _freed_from_world(urdf: Urdf) -> Urdf:
     """Turns the one fixed joint below a root link called world into the floating base."""
     first, *others = [joint for joint in urdf.joints if joint.parent == WORLD] or [None]
     if first is None or others or first.kind != "fixed":
-        raise ValueError(
+        raise OsikValueError(
             f"floating_base=True, but the root link is {WORLD!r}: one fixed joint has to hang from it, to be freed. "
             f"Joints there: {', '.join(j.name for j in (first, *others) if j) or '(none)'}"
         )
@@ -144,7 +144,9 @@ def urdf_spec(urdf: Urdf) -> mujoco.MjSpec:
 
 def _free_pose(joint: Joint, fixed_at: Mapping[str, Pose]) -> Pose:
     if joint.parent not in fixed_at:
-        raise ValueError(f"floating joint {joint.name!r} hangs from {joint.parent!r}, which moves: it has to be fixed")
+        raise OsikValueError(
+            f"floating joint {joint.name!r} hangs from {joint.parent!r}, which moves: it has to be fixed"
+        )
     return fixed_at[joint.parent] @ joint.origin
 
 
@@ -204,7 +206,7 @@ def _add_meshes(spec: mujoco.MjSpec, urdf: Urdf, packages: Packages, beside: Pat
 
 def _check_mesh(path: Path, link: str) -> None:
     if path.suffix.lower() not in _MESH_SUFFIXES:
-        raise ValueError(
+        raise OsikValueError(
             f"link {link!r}: MuJoCo cannot read the mesh {str(path)!r}; it reads {', '.join(_MESH_SUFFIXES)}"
         )
 

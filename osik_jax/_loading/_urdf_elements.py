@@ -11,6 +11,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from .._errors import OsikValueError
+
 JOINT_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating")
 _SCALAR = ("revolute", "continuous", "prismatic")
 _Color = tuple[float, ...]
@@ -97,7 +99,7 @@ def read_urdf(element: ElementTree.Element) -> Urdf:
     colors = {m.get("name", ""): color for m in element.findall("material") if (color := _rgba(m))}
     links = _by_name("link", (_link(e, colors) for e in element.findall("link")))
     if not links:
-        raise ValueError("the URDF has no <link>")
+        raise OsikValueError("the URDF has no <link>")
     joints = _by_name("joint", (_joint(e) for e in element.findall("joint")))
     root = _root(links, joints)
     _check_mimics(joints)
@@ -108,7 +110,7 @@ def _refuse_xacro(element: ElementTree.Element) -> None:
     for child in element.iter():
         if isinstance(child.tag, str) and "xacro" in child.tag.rpartition("}")[0]:
             name = child.tag.rpartition("}")[2]
-            raise ValueError(f"the file holds the xacro element <xacro:{name}>: run xacro and load what it writes")
+            raise OsikValueError(f"the file holds the xacro element <xacro:{name}>: run xacro and load what it writes")
 
 
 _Named = TypeVar("_Named", Link, Joint)
@@ -118,7 +120,7 @@ def _by_name(kind: str, items: Iterable[_Named]) -> dict[str, _Named]:
     out: dict[str, _Named] = {}
     for item in items:
         if item.name in out:
-            raise ValueError(f"two {kind}s are called {item.name!r}")
+            raise OsikValueError(f"two {kind}s are called {item.name!r}")
         out[item.name] = item
     return out
 
@@ -126,7 +128,7 @@ def _by_name(kind: str, items: Iterable[_Named]) -> dict[str, _Named]:
 def _attribute(element: ElementTree.Element | None, name: str, where: str) -> str:
     value = None if element is None else element.get(name)
     if value is None:
-        raise ValueError(f"{where}: the attribute {name!r} is missing")
+        raise OsikValueError(f"{where}: the attribute {name!r} is missing")
     return value
 
 
@@ -136,7 +138,9 @@ def _numbers(text: str, count: int, where: str) -> np.ndarray:
     except ValueError:
         values = np.full(0, np.nan)
     if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{where}: {text!r} is not {'a finite number' if count == 1 else f'{count} finite numbers'}")
+        raise OsikValueError(
+            f"{where}: {text!r} is not {'a finite number' if count == 1 else f'{count} finite numbers'}"
+        )
     return values
 
 
@@ -159,7 +163,7 @@ def _origin(element: ElementTree.Element, where: str) -> Pose:
 def _from_quaternion(quaternion: np.ndarray, where: str) -> np.ndarray:
     length = np.linalg.norm(quaternion)
     if length == 0.0:
-        raise ValueError(f"{where}: the quaternion is zero")
+        raise OsikValueError(f"{where}: the quaternion is zero")
     w, *xyz = quaternion / length
     x, y, z = xyz
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -190,7 +194,7 @@ def _inertial(element: ElementTree.Element | None, where: str) -> tuple[float, P
     mass_element = element.find("mass")
     mass = 0.0 if mass_element is None else _number(mass_element, "value", f"{where}, mass")
     if mass < 0.0:
-        raise ValueError(f"{where}: the mass {mass} is negative")
+        raise OsikValueError(f"{where}: the mass {mass} is negative")
     moments = element.find("inertia")
     inertia = np.zeros((3, 3))
     for row, column in np.ndindex(3, 3):
@@ -237,7 +241,7 @@ def _joint(element: ElementTree.Element) -> Joint:
     kind = _attribute(element, "type", where)
     if kind not in JOINT_KINDS:
         advice = "; write it as two prismatic joints and a continuous one" if kind == "planar" else ""
-        raise ValueError(
+        raise OsikValueError(
             f"{where} has the type {kind!r}, which is not supported{advice}. Types: {', '.join(JOINT_KINDS)}"
         )
     lower, upper, speed = _joint_limits(element.find("limit"), kind, where)
@@ -259,7 +263,7 @@ def _axis(element: ElementTree.Element | None, where: str) -> np.ndarray:
     axis = np.array([1.0, 0.0, 0.0]) if element is None else _numbers(element.get("xyz", "1 0 0"), 3, f"{where}, axis")
     length = np.linalg.norm(axis)
     if length == 0.0:
-        raise ValueError(f"{where}: the axis is zero")
+        raise OsikValueError(f"{where}: the axis is zero")
     return axis / length
 
 
@@ -270,13 +274,13 @@ def _joint_limits(element: ElementTree.Element | None, kind: str, where: str) ->
     where = f"{where}, limit"
     speed = _number(element, "velocity", where, "0")
     if speed < 0.0:
-        raise ValueError(f"{where}: the velocity {speed} is negative")
+        raise OsikValueError(f"{where}: the velocity {speed} is negative")
     speed = speed or math.inf
     if kind == "continuous":
         return -math.inf, math.inf, speed
     lower, upper = (_number(element, name, where, "0") for name in ("lower", "upper"))
     if lower > upper:
-        raise ValueError(f"{where}: lower {lower} > upper {upper}")
+        raise OsikValueError(f"{where}: lower {lower} > upper {upper}")
     return lower, upper, speed
 
 
@@ -294,20 +298,20 @@ def _root(links: Mapping[str, Link], joints: Mapping[str, Joint]) -> str:
     for joint in joints.values():
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
-                raise ValueError(f"joint {joint.name!r}: {_no_such('link', link, links)} (its {role})")
+                raise OsikValueError(f"joint {joint.name!r}: {_no_such('link', link, links)} (its {role})")
         if joint.child in parent_joint:
-            raise ValueError(
+            raise OsikValueError(
                 f"link {joint.child!r} is the child of two joints, {parent_joint[joint.child]!r} and {joint.name!r}: "
                 "a URDF is a tree, and closed loops cannot be written in it"
             )
         parent_joint[joint.child] = joint.name
     roots = [name for name in links if name not in parent_joint]
     if not roots:
-        raise ValueError(
+        raise OsikValueError(
             f"the joints form a loop: every link has a parent, so there is no root. links: {', '.join(links)}"
         )
     if len(roots) > 1:
-        raise ValueError(f"{len(roots)} links have no parent, one has to be the root: {', '.join(roots)}")
+        raise OsikValueError(f"{len(roots)} links have no parent, one has to be the root: {', '.join(roots)}")
     return roots[0]
 
 
@@ -324,7 +328,7 @@ def _parents_first(root: str, links: Mapping[str, Link], joints: Mapping[str, Jo
             yield joint
     if len(reached) < len(links):
         lost = ", ".join(name for name in links if name not in reached)
-        raise ValueError(f"the joints form a loop that the root {root!r} does not reach: {lost}")
+        raise OsikValueError(f"the joints form a loop that the root {root!r} does not reach: {lost}")
 
 
 def _check_mimics(joints: Mapping[str, Joint]) -> None:
@@ -333,11 +337,11 @@ def _check_mimics(joints: Mapping[str, Joint]) -> None:
             continue
         leader = joints.get(joint.mimic.leader)
         if leader is None:
-            raise ValueError(
+            raise OsikValueError(
                 f"joint {joint.name!r} mimics what is not there: {_no_such('joint', joint.mimic.leader, joints)}"
             )
         if leader.kind not in _SCALAR:
-            raise ValueError(f"joint {joint.name!r} mimics {leader.name!r}, which is {leader.kind}")
+            raise OsikValueError(f"joint {joint.name!r} mimics {leader.name!r}, which is {leader.kind}")
         _check_chain(joint, joints)
 
 
@@ -345,7 +349,7 @@ def _check_chain(joint: Joint, joints: Mapping[str, Joint]) -> None:
     chain = [joint.name]
     while (mimic := joints[chain[-1]].mimic) is not None and mimic.leader in joints:
         if mimic.leader in chain:
-            raise ValueError(f"mimic joints follow each other in a circle: {' -> '.join([*chain, mimic.leader])}")
+            raise OsikValueError(f"mimic joints follow each other in a circle: {' -> '.join([*chain, mimic.leader])}")
         chain.append(mimic.leader)
 
 

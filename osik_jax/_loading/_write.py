@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
 from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, quaternion, rotation_matrix
 from ._urdf_elements import IDENTITY, Pose
@@ -40,7 +41,7 @@ class _JointPlace(NamedTuple):
 def to_mjcf(robot: Robot) -> str:
     """The robot as MJCF; see ``Robot.to_mjcf``."""
     if np.ndim(robot.body_position) != 2:
-        raise ValueError(
+        raise OsikValueError(
             f"a stack of robots, body_position {np.shape(robot.body_position)}: write them one by one, "
             "jax.tree.map(lambda leaf: leaf[0], robots)"
         )
@@ -193,10 +194,10 @@ def _range(robot: Robot, joint: int) -> dict[str, ArrayLike]:
     if np.isinf(lower).all() and np.isinf(upper).all():
         return {}
     if tree.joint_types[joint] in (FREE, BALL):
-        raise ValueError(f"joint {name!r} is free or ball: MJCF has no place for its position limits")
+        raise OsikValueError(f"joint {name!r} is free or ball: MJCF has no place for its position limits")
     low, high = float(lower[0]), float(upper[0])
     if math.isinf(low) or math.isinf(high):
-        raise ValueError(f"joint {name!r} is limited on one side, [{low}, {high}]: MJCF has both limits or none")
+        raise OsikValueError(f"joint {name!r} is limited on one side, [{low}, {high}]: MJCF has both limits or none")
     # MuJoCo asks for lower < upper: equal limits are one unit in the last place apart.
     return dict(range=(low, max(high, math.nextafter(low, math.inf))))
 
@@ -212,7 +213,7 @@ def _one(values: ArrayLike, joint: str, what: str) -> float:
     """The one value that all dofs of a joint share."""
     first, *others = np.asarray(values, float)
     if any(other != first for other in others):
-        raise ValueError(f"the dofs of joint {joint!r} differ in {what}: MJCF has one value a joint")
+        raise OsikValueError(f"the dofs of joint {joint!r} differ in {what}: MJCF has one value a joint")
     return float(first)
 
 
@@ -228,7 +229,7 @@ def _add_frames(robot: Robot, bodies: list[ElementTree.Element]) -> None:
         if name not in done:
             _put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
         elif not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(pose, done[name], strict=True)):
-            raise ValueError(
+            raise OsikValueError(
                 f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
             )
 

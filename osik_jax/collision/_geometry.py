@@ -14,6 +14,7 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from ..kinematics._rigid import rotate
 from ._distance import Core
 
@@ -85,7 +86,7 @@ def convex_hull(points: np.ndarray) -> UnitCore:
     try:
         hull = scipy.spatial.ConvexHull(np.asarray(points, float))
     except (scipy.spatial.QhullError, ValueError) as error:
-        raise ValueError(f"these {len(points)} points have no convex hull: {str(error).splitlines()[0]}") from None
+        raise OsikValueError(f"these {len(points)} points have no convex hull: {str(error).splitlines()[0]}") from None
     faces, normals = hull.simplices, hull.equations[:, :3]
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     normals_of_edges = np.tile(np.arange(len(faces)), 3)

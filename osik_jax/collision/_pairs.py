@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 
+from .._errors import OsikTypeError, OsikValueError
 from .._tree import KinematicTree, unknown_name
 from ..robot import Robot
 from ._geometry import KINDS, Kind
@@ -58,7 +59,7 @@ def members(robot: Robot, shapes: Mapping[str, CollisionShape]) -> list[Member]:
         out.append(Member(name, (called, tree.body_names[body]), KINDS.get(kind), body, masks, link))
     for name, shape in shapes.items():
         if name in tree.geom_names:
-            raise ValueError(f"a shape is called {name!r}, and so is a geom of the robot; call it something else")
+            raise OsikValueError(f"a shape is called {name!r}, and so is a geom of the robot; call it something else")
         body = 0 if shape.frame is None else tree.frame_bodies[tree.frame(shape.frame)]
         aliases = (shape.frame or tree.body_names[0], tree.body_names[body])
         out.append(Member(name, aliases, shape.kind, body))
@@ -88,18 +89,18 @@ def candidate_pairs(
     for pattern in pairs or ():
         asked = _named_pairs(scene, [pattern]) - excluded
         if asked and asked.isdisjoint(found) and found:
-            raise ValueError(
+            raise OsikValueError(
                 f"pairs asks for {pattern!r}, none of which can be kept apart: what is on one body or on neighbouring "
                 "ones, on two planes, or what the model's <exclude> names does not count"
             )
     odd = sorted({scene[k].name for pair in found for k in pair if scene[k].kind is None})
     if odd:
-        raise ValueError(
+        raise OsikValueError(
             f"no distance to these geoms can be computed (height field or SDF); exclude them: {', '.join(odd)}"
         )
     if not found:
         solid = ", ".join(member.name for member in scene if member.solid) or "none"
-        raise ValueError(
+        raise OsikValueError(
             "no pair of shapes is left to keep apart: those of the same or of neighbouring bodies, geoms that do not "
             f"collide (contype and conaffinity) and excluded ones do not count; what collides: {solid}"
         )
@@ -111,7 +112,7 @@ def _checked(pairs: Patterns) -> list[tuple[str, str]]:
     checked: list[Any] = [pairs] if isinstance(pairs, str) else list(pairs)
     for pair in checked:
         if not isinstance(pair, tuple | list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
-            raise TypeError(f"pairs is a sequence of pairs of names, such as [('hand', 'torso')]; got {pairs!r}")
+            raise OsikTypeError(f"pairs is a sequence of pairs of names, such as [('hand', 'torso')]; got {pairs!r}")
     return [(first, second) for first, second in checked]
 
 
@@ -145,7 +146,7 @@ def _named_pairs(scene: Sequence[Member], patterns: Patterns) -> set[tuple[int, 
 
 def _excluded(scene: Sequence[Member], exclude: Iterable[str | tuple[str, str]]) -> set[tuple[int, int]]:
     if isinstance(exclude, str):
-        raise TypeError(f"exclude is a sequence of names and pairs of names, not one string: use ({exclude!r},)")
+        raise OsikTypeError(f"exclude is a sequence of names and pairs of names, not one string: use ({exclude!r},)")
     patterns = [(one, "*") if isinstance(one, str) else one for one in exclude]
     return _named_pairs(scene, patterns)
 
@@ -165,7 +166,7 @@ def _match(scene: Sequence[Member], pattern: str) -> list[int]:
             return found
     seen = [member.name for member in scene if pattern in member.aliases]
     if seen:
-        raise ValueError(
+        raise OsikValueError(
             f"nothing of {pattern!r} is there to be met: contype and conaffinity of its geoms are 0. Name the geoms "
             f"themselves to keep them apart ({', '.join(seen)}), or add shapes to it"
         )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete
 from ._geometry import Kind, UnitCore, convex_hull
 
@@ -148,7 +149,7 @@ class CollisionShape(eqx.Module):
 def _vector(value: Any, what: str) -> Float[Array, "3"]:
     out = jnp.asarray(value, float)
     if out.shape != (3,):
-        raise ValueError(f"{what} has shape {out.shape}, expected (3,)")
+        raise OsikValueError(f"{what} has shape {out.shape}, expected (3,)")
     return out
 
 
@@ -162,7 +163,7 @@ def _sizes(*sizes: Any) -> Float[Array, "3"]:
 def _check_positive(value: Any, what: str) -> None:
     seen = concrete(value)
     if seen is not None and not (seen > 0.0).all():
-        raise ValueError(f"{what} is {seen}; it has to be positive [m]")
+        raise OsikValueError(f"{what} is {seen}; it has to be positive [m]")
 
 
 def _rotation(value: Any) -> Float[Array, "3 3"]:
@@ -170,12 +171,12 @@ def _rotation(value: Any) -> Float[Array, "3 3"]:
         return jnp.eye(3)
     out = jnp.asarray(value, float)
     if out.shape != (3, 3):
-        raise ValueError(f"rotation has shape {out.shape}, expected (3, 3)")
+        raise OsikValueError(f"rotation has shape {out.shape}, expected (3, 3)")
     seen = concrete(out)
     if seen is not None:
         off = np.abs(seen @ seen.T - np.eye(3)).max()
         if not (off < _ROTATION_TOLERANCE and np.linalg.det(seen) > 0.0):
-            raise ValueError("rotation is no rotation matrix: its columns are not right-handed unit vectors")
+            raise OsikValueError("rotation is no rotation matrix: its columns are not right-handed unit vectors")
     return out
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from .._feet import find_feet
 from .._home import compiled_kinematics
 from ..limits import ConfigurationLimit, VelocityLimit
@@ -53,13 +54,13 @@ def file_motion(
     for chosen in (moving, *standing):
         robot.tree.frame(chosen)
     if robot.floating_base and not standing:
-        raise ValueError(
+        raise OsikValueError(
             "the base floats and none of the frames looks like a foot: say which ones stand with --support NAME..., or "
             "--base fixed; "
             f"frames: {', '.join(robot.frame_names)}"
         )
     if moving in standing:
-        raise ValueError(f"frame {moving!r} cannot both move and stand; choose another --frame or --support")
+        raise OsikValueError(f"frame {moving!r} cannot both move and stand; choose another --frame or --support")
     outline = robot_outline(robot, robot.q0, look)
     q0 = start(robot, outline, moving, standing, _foot_rows(standing))
     if robot.floating_base:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from .._blocks import in_blocks
 from .._checks import check_setting, checked_configuration, checked_limits
+from .._errors import OsikTypeError, OsikValueError
 from .._joint_selection import concrete
 from .._numbers import check_count
 from ..limits import ConfigurationLimit, Limit
@@ -119,7 +120,7 @@ def inverse_kinematics(
     start: dict[str, Any] = dict(route=problem.route, warm=q0 is not None)
     traced = _is_traced((robot, problem.goals, settings))
     if all and traced:
-        raise TypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
+        raise OsikTypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
     if traced or nearest or all:
         run = partial(_explored, robot, settings=settings, seeds=seeds, steps=steps, near=nearest, **start)
         found, outcomes = run(problem.goals) if traced else in_chunks(lambda goals, _: run(goals), problem.goals)
@@ -221,10 +222,10 @@ def checked_tolerance(value: Any, dtype: Any) -> Any:
     out = (jnp if _is_traced(value) else np).asarray(value, dtype)
     seen = concrete(out)
     if out.shape != () or (seen is not None and not (np.isfinite(seen) and seen > 0.0)):
-        raise ValueError(f"a tolerance is {value!r}; it is one positive number, in metres or radians")
+        raise OsikValueError(f"a tolerance is {value!r}; it is one positive number, in metres or radians")
     least = 1e-4 if out.dtype == jnp.float32 else 1e-11
     if seen is not None and seen < least:
-        raise ValueError(f"a tolerance is {value!r}; {out.dtype} can tell errors of {least:g} and more")
+        raise OsikValueError(f"a tolerance is {value!r}; {out.dtype} can tell errors of {least:g} and more")
     return out
 
 

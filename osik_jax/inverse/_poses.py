@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete
 from ..robot import Robot
 from ..tasks._targets import as_pose, pose_array
@@ -42,12 +43,12 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
             raise type(error)(f"targets[{name!r}]: {error}") from None
     counts = {name: position.shape[0] for name, (position, _, _) in parts.items() if position.ndim == 2}
     if len(set(counts.values())) > 1:
-        raise ValueError(
+        raise OsikValueError(
             f"the numbers of targets differ: {', '.join(f'{name}: {count}' for name, count in counts.items())}"
         )
     count = next(iter(counts.values()), None)
     if count == 0:
-        raise ValueError("there are no targets: the poses have a leading axis of length 0")
+        raise OsikValueError("there are no targets: the poses have a leading axis of length 0")
     shape = (count or 1,)
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(parts))
     numbers = jnp if traced else np  # an operation of JAX's costs as much as a short search
@@ -67,7 +68,7 @@ def _one(value: Any, dtype: Any) -> tuple[Array, Array, tuple[bool, ...]]:
     if pose[0].ndim == 1:
         return *as_pose(pose, dtype), _POSE
     if pose[0].ndim != 2 or pose[1].ndim not in (2, 3) or len(pose[0]) != len(pose[1]):
-        raise ValueError(
+        raise OsikValueError(
             f"got positions of shape {pose[0].shape} and rotations of shape {pose[1].shape}; many poses are positions "
             "(n, 3) with rotation matrices (n, 3, 3) or quaternions w x y z (n, 4), or matrices (n, 4, 4)"
         )
@@ -85,14 +86,14 @@ def _split(value: Any, dtype: Any) -> tuple[Array, Array]:
     if isinstance(value, tuple | list):
         return pose_array(value[0], dtype, _ACCEPTED), pose_array(value[1], dtype, _ACCEPTED)
     if value.shape[-2:] != (4, 4) or value.ndim > 3:
-        raise ValueError(f"got an array of shape {value.shape}; a pose is a (4, 4) matrix, a position is (3,)")
+        raise OsikValueError(f"got an array of shape {value.shape}; a pose is a (4, 4) matrix, a position is (3,)")
     return value[..., :3, 3], value[..., :3, :3]
 
 
 def _check_finite(array: Array) -> None:
     seen = concrete(array)
     if seen is not None and not np.isfinite(seen).all():
-        raise ValueError("the targets' positions have to be finite")
+        raise OsikValueError("the targets' positions have to be finite")
 
 
 def _check_many(position: Array, rotation: Array) -> None:
@@ -108,4 +109,4 @@ def _check_many(position: Array, rotation: Array) -> None:
         wrong = ~((residual < _TOLERANCE) & (np.linalg.det(seen) > 0.0))
     if wrong.any():
         numbers = np.flatnonzero(wrong)[:10].tolist()
-        raise ValueError(f"rotations that are none (R R' = I and det R = 1, or quaternions of length 1): {numbers}")
+        raise OsikValueError(f"rotations that are none (R R' = I and det R = 1, or quaternions of length 1): {numbers}")

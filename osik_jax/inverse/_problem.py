@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._errors import OsikTypeError, OsikValueError
 from .._tree import unknown_name
 from ..limits import CollisionAvoidanceLimit, Limit, PositionBarrier
 from ..robot import Robot
@@ -46,9 +47,11 @@ def read_problem(
         TypeError, KeyError, ValueError: as ``inverse_kinematics``.
     """
     if not isinstance(tasks, Mapping):
-        raise TypeError(f"tasks is a {type(tasks).__name__}; it is a dict from names of frames to poses, or to tasks")
+        raise OsikTypeError(
+            f"tasks is a {type(tasks).__name__}; it is a dict from names of frames to poses, or to tasks"
+        )
     if not tasks:
-        raise ValueError("there is nothing to reach: give a frame a pose, or at least one task")
+        raise OsikValueError("there is nothing to reach: give a frame a pose, or at least one task")
     poses = {name: value for name, value in tasks.items() if not isinstance(value, Task)}
     for name in poses:
         robot.tree.frame(name)
@@ -57,7 +60,7 @@ def read_problem(
     plain = len(poses) == len(tasks) and is_plain(robot.tree, tuple(poses))
     if goal is not None and plain and boxed and scheme is None:
         if targets is not None:
-            raise ValueError("targets go with tasks; many poses are arrays with one more axis in front")
+            raise OsikValueError("targets go with tasks; many poses are arrays with one more axis in front")
         return Problem(ChainRoute(tuple(poses), rows), goal, None, count is not None)
     return _of_tasks(robot, tasks, poses, (goal, rows, count), targets, scheme, limits)
 
@@ -90,7 +93,7 @@ def _aims(targets: Any, tasks: Mapping[str, Task], count: int | None) -> tuple[d
     if targets is None:
         return {}, count
     if not isinstance(targets, Mapping):
-        raise TypeError(f"targets is a {type(targets).__name__}; it is a dict from names of tasks to many targets")
+        raise OsikTypeError(f"targets is a {type(targets).__name__}; it is a dict from names of tasks to many targets")
     aims: dict[str, Any] = {}
     for name, value in targets.items():
         if name not in tasks:
@@ -99,7 +102,7 @@ def _aims(targets: Any, tasks: Mapping[str, Task], count: int | None) -> tuple[d
         lengths = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(aims[name])}
         if len(lengths) != 1 or lengths == {()} or (count is not None and lengths != {(count,)}):
             expected = "one length" if count is None else f"length {count}, as those of the others"
-            raise ValueError(
+            raise OsikValueError(
                 f"targets[{name!r}] has leading axes {sorted(lengths)}; they are the targets, of {expected}"
             )
         (count,) = lengths.pop()

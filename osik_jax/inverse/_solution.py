@@ -9,6 +9,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._errors import OsikValueError
+
 _NEAR = 5e-3
 """Pairs that are nearer than this to what they may be are told of [m]."""
 
@@ -68,7 +70,9 @@ class InverseKinematicsSolution(eqx.Module):
         many = np.ndim(self.converged) > 0
         if many != (index is not None):
             count = len(np.asarray(self.converged)) if many else 1
-            raise ValueError(f"explain({'' if index is None else index}): there are {count} targets; give one's number")
+            raise OsikValueError(
+                f"explain({'' if index is None else index}): there are {count} targets; give one's number"
+            )
         pick = (lambda a: np.asarray(a)) if index is None else (lambda a: np.asarray(a)[index])
         errors = f"{pick(self.position_error):.3g} m and {pick(self.orientation_error):.3g} rad off"
         if pick(self.converged):

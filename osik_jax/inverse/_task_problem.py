@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._checks import check_tasks
+from .._errors import OsikValueError
 from .._joint_selection import dof_names
 from .._tree import HINGE, SLIDE
 from ..kinematics import forward_kinematics
@@ -108,7 +109,7 @@ def read_tasks(robot: Robot, given: Mapping[str, Any]) -> dict[str, Task]:
     """
     check_tasks(given, robot)
     if not any(is_goal(task) for task in given.values()):
-        raise ValueError("no task says where anything has to be: give a FrameTask, a ComTask or another on a place")
+        raise OsikValueError("no task says where anything has to be: give a FrameTask, a ComTask or another on a place")
     tasks = {}
     for name, task in given.items():
         still = {field: 0.0 for field in ("target_velocity",) if field in task.replaceable}

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from .._made_for import check_robot
 from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
 from ..robot import Robot
@@ -55,6 +56,15 @@ class Kinematics(eqx.Module):
         rotations = self.body_rotation[bodies]
         positions = self.body_position[bodies] + rotate(rotations, robot.frame_position[ids])
         return positions, compose(rotations, robot.frame_rotation[ids])
+
+
+def frame_pose(robot: Robot, kinematics: Kinematics, frame: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Position [m] and rotation (frame axes to world axes) of a body, link, site or geom: a pose, as targets take it.
+
+    Raises:
+        KeyError: no such frame.
+    """
+    return kinematics.frame_pose(robot, frame)
 
 
 def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
@@ -163,7 +173,7 @@ def _body_moments(
         root = robot.tree.frame_bodies[robot.tree.frame(subtree)]
         below = robot.tree.descendants[root]
         if not isinstance(mass, Tracer) and not np.asarray(mass)[below].sum() > 0.0:
-            raise ValueError(f"the subtree of {subtree!r} has no mass, so it has no centre of mass")
+            raise OsikValueError(f"the subtree of {subtree!r} has no mass, so it has no centre of mass")
         mass = jnp.where(below, mass, 0.0)
     centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
     return mass, mass[:, None] * centers

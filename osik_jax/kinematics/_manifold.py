@@ -7,6 +7,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from .._made_for import check_robot
 from .._tree import BALL, FREE
 from ..robot import Robot
@@ -25,7 +26,7 @@ def integrate(
     check_robot(robot, "integrate(robot, q, v)")
     robot.check_configuration(q)
     if jnp.shape(v) != (robot.nv,):
-        raise ValueError(f"v has shape {jnp.shape(v)}, this robot's velocities have shape ({robot.nv},)")
+        raise OsikValueError(f"v has shape {jnp.shape(v)}, this robot's velocities have shape ({robot.nv},)")
     step = jnp.asarray(v) * dt
     q = jnp.asarray(q, jnp.result_type(q, step))
     scalar_q, scalar_v, quaternions = _layout(robot)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete, dof_names, dof_values, scalar_layout
 from .._numbers import check_bounds, entries
 from ..robot import Robot
@@ -90,7 +91,7 @@ class AccelerationLimit(Limit):
         check_bounds(self.lower, self.upper)
         seen = concrete(self.acceleration)
         if seen is not None and not (seen > 0.0).all():
-            raise ValueError(f"accelerations have to be positive: {entries(seen, ~(seen > 0.0), names)}")
+            raise OsikValueError(f"accelerations have to be positive: {entries(seen, ~(seen > 0.0), names)}")
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
         """The limit for the next tick, once this one's answer is ``velocity``."""

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete
 from .._numbers import as_bounds, as_scalar, check_bounds
 from ..kinematics import Kinematics, frame_jacobian
@@ -61,10 +62,10 @@ class PositionBarrier(Limit):
         given = jnp.asarray(np.eye(3) if normals is None else normals, dtype)
         self.normals = jnp.atleast_2d(given)
         if self.normals.ndim != 2 or self.normals.shape[1] != 3:
-            raise ValueError(f"normals has shape {given.shape}, expected (m, 3) or (3,)")
+            raise OsikValueError(f"normals has shape {given.shape}, expected (m, 3) or (3,)")
         low, high = as_bounds(lower, upper, len(self.normals), dtype)
         if low is None or high is None:
-            raise ValueError("a PositionBarrier needs lower, upper or both")
+            raise OsikValueError("a PositionBarrier needs lower, upper or both")
         self.lower, self.upper = low, high
         self.gain = as_scalar(gain, "gain", dtype)
         self._check()
@@ -84,9 +85,9 @@ class PositionBarrier(Limit):
         check_bounds(self.lower, self.upper)
         gain, normals = concrete(self.gain), concrete(self.normals)
         if gain is not None and not gain > 0.0:
-            raise ValueError(f"gain is {gain}; it has to be positive: at 0 the frame could not move")
+            raise OsikValueError(f"gain is {gain}; it has to be positive: at 0 the frame could not move")
         if normals is not None and not (np.isfinite(normals).all() and (np.abs(normals).max(1) > 0.0).all()):
-            raise ValueError(f"normals have to be finite and not 0: {normals}")
+            raise OsikValueError(f"normals have to be finite and not 0: {normals}")
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal, Self
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete
 from .._made_for import MadeForRobot
 from .._replace import Replaceable
@@ -88,7 +89,7 @@ def limit_box(
     """
     seen = concrete(dt)
     if seen is not None and not (seen > 0.0).all():
-        raise ValueError(f"dt is {dt}; it has to be positive, in seconds")
+        raise OsikValueError(f"dt is {dt}; it has to be positive, in seconds")
     dtype = jnp.result_type(jnp.asarray(q), robot.q0)
     lower, upper = jnp.full(robot.nv, -jnp.inf, dtype), jnp.full(robot.nv, jnp.inf, dtype)
     parts = [part for limit in limits for part in limit.parts()]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import warn
+from .._errors import OsikTypeError, OsikValueError, warn
 from .._home import home_kinematics
 from .._joint_selection import concrete
 from .._numbers import as_scalar, as_vector
@@ -104,7 +104,7 @@ class CollisionAvoidanceLimit(Limit):
         max_pairs: int = 20,
     ):
         if isinstance(max_pairs, bool) or not isinstance(max_pairs, int) or max_pairs < 1:
-            raise ValueError(f"max_pairs is {max_pairs!r}; it is the number of rows, an integer from 1 up")
+            raise OsikValueError(f"max_pairs is {max_pairs!r}; it is the number of rows, an integer from 1 up")
         dtype = robot.q0.dtype
         self.minimum_distance = _number(minimum_distance, "minimum_distance", dtype)
         self.detection_distance = _number(detection_distance, "detection_distance", dtype)
@@ -194,7 +194,7 @@ class CollisionAvoidanceLimit(Limit):
     def _check(self) -> None:
         least, most = concrete(self.minimum_distance), concrete(self.detection_distance)
         if least is not None and most is not None and not (most > least).all():
-            raise ValueError(f"detection_distance is {most}; it has to be more than minimum_distance, {least}")
+            raise OsikValueError(f"detection_distance is {most}; it has to be more than minimum_distance, {least}")
 
 
 def _time_to_meet(gap: Float[Array, " pairs"], jacobian: Float[Array, "pairs nv"]) -> Float[Array, " pairs"]:
@@ -216,7 +216,7 @@ def _number(value: ArrayLike | Array, name: str, dtype: Any) -> Float[Array, ""]
     out = as_vector(value, (), name, dtype)
     seen = concrete(out)
     if seen is not None and not np.isfinite(seen).all():
-        raise ValueError(f"{name} is {seen}; it has to be finite [m]")
+        raise OsikValueError(f"{name} is {seen}; it has to be finite [m]")
     return out
 
 
@@ -234,7 +234,7 @@ def _apart_at_home(
     scene, added, hulls = _assembled(robot, found, shapes, possible)
     distances = concrete(_home_distances(robot, scene, added, hulls)), concrete(least)
     if distances[0] is None or distances[1] is None:
-        raise TypeError("which pairs are apart at q0 cannot be told from traced numbers; give q0_distance=-inf")
+        raise OsikTypeError("which pairs are apart at q0 cannot be told from traced numbers; give q0_distance=-inf")
     taking_part = _taking_part(possible)
     apart = {
         tuple(sorted((taking_part[i], taking_part[j]))): float(distance)
@@ -242,7 +242,7 @@ def _apart_at_home(
     }
     near = {pair: apart[pair] for pair in possible if pair not in whatever and apart[pair] < distances[1]}
     if len(near) == len(possible):
-        raise ValueError(
+        raise OsikValueError(
             f"all {len(possible)} pairs are nearer than {least} m at q0; a smaller q0_distance keeps them: "
             f"{_shown([(found[i].name, found[j].name) for i, j in near], list(near.values()))}"
         )

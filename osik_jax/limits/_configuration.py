@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete, dof_names, dof_values, scalar_layout
 from .._numbers import check_bounds
 from ..robot import Robot
@@ -100,7 +101,7 @@ def _as_gain(robot: Robot, value: ArrayLike | Array | Mapping[str, float]) -> Fl
 def _check_gain(gain: Array) -> None:
     seen = concrete(gain)
     if seen is not None and not ((seen > 0.0) & (seen <= 1.0)).all():
-        raise ValueError(f"gain is {seen}; it is the share of the way that a step may take, above 0 and up to 1")
+        raise OsikValueError(f"gain is {seen}; it is the share of the way that a step may take, above 0 and up to 1")
 
 
 def _check(robot: Robot, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -109,9 +110,9 @@ def _check(robot: Robot, lower: np.ndarray, upper: np.ndarray) -> None:
     crossed = np.flatnonzero(~(lower <= upper))
     if len(crossed):
         what = ", ".join(f"{names[i]} ({lower[i]} > {upper[i]})" for i in crossed)
-        raise ValueError(f"limits with lower > upper: {what}")
+        raise OsikValueError(f"limits with lower > upper: {what}")
     scalar, _ = scalar_layout(robot)
     bounded = np.flatnonzero(~scalar & (np.isfinite(lower) | np.isfinite(upper)))
     if len(bounded):
         what = ", ".join(dict.fromkeys(names[i] for i in bounded))
-        raise ValueError(f"only hinges and slides have a range; leave these infinite: {what}")
+        raise OsikValueError(f"only hinges and slides have a range; leave these infinite: {what}")

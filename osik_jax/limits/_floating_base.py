@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete
 from .._numbers import as_vector
 from .._tree import FREE, unknown_name
@@ -55,9 +56,9 @@ class FloatingBaseVelocityLimit(Limit):
         joint: str | None = None,
     ):
         if linear is None and angular is None:
-            raise ValueError("a FloatingBaseVelocityLimit needs linear, angular or both")
+            raise OsikValueError("a FloatingBaseVelocityLimit needs linear, angular or both")
         if axes not in ("base", "world"):
-            raise ValueError(f"axes is {axes!r}; it is 'base' or 'world'")
+            raise OsikValueError(f"axes is {axes!r}; it is 'base' or 'world'")
         self.axes, self.joint = axes, _free_joint(robot, joint)
         self.linear, self.angular = _speeds(robot, linear, "linear"), _speeds(robot, angular, "angular")
 
@@ -97,9 +98,9 @@ def _free_joint(robot: Robot, name: str | None) -> int:
     tree = robot.tree
     free = {tree.joint_names[j]: j for j in tree.independent if tree.joint_types[j] == FREE}
     if not free:
-        raise ValueError("the robot has no free joint; load it with floating_base=True, or use a VelocityLimit")
+        raise OsikValueError("the robot has no free joint; load it with floating_base=True, or use a VelocityLimit")
     if name is None and len(free) > 1:
-        raise ValueError(f"which free joint? joint is one of: {', '.join(free)}")
+        raise OsikValueError(f"which free joint? joint is one of: {', '.join(free)}")
     if name is not None and name not in free:
         raise unknown_name("free joint", name, tuple(free))
     return free[name] if name is not None else next(iter(free.values()))
@@ -116,4 +117,4 @@ def _speeds(robot: Robot, value: ArrayLike | Array | None, what: str) -> Float[A
 def _check_speeds(speeds: Float[Array, "3"], what: str) -> None:
     seen = concrete(speeds)
     if seen is not None and not np.all(seen >= 0.0):
-        raise ValueError(f"{what} is {seen}; speeds have to be 0 or more")
+        raise OsikValueError(f"{what} is {seen}; speeds have to be 0 or more")

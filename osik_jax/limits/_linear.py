@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete
 from .._numbers import as_bounds, check_bounds
 from ..kinematics import Kinematics
@@ -42,10 +43,10 @@ class LinearLimit(Limit):
         dtype = robot.q0.dtype
         self.matrix = jnp.asarray(matrix, dtype)
         if self.matrix.ndim != 2 or self.matrix.shape[1] != robot.nv:
-            raise ValueError(f"matrix has shape {self.matrix.shape}, expected (m, {robot.nv}): a row acts on v")
+            raise OsikValueError(f"matrix has shape {self.matrix.shape}, expected (m, {robot.nv}): a row acts on v")
         low, high = as_bounds(lower, upper, len(self.matrix), dtype)
         if low is None or high is None:
-            raise ValueError("a LinearLimit needs lower, upper or both")
+            raise OsikValueError("a LinearLimit needs lower, upper or both")
         self.lower, self.upper = low, high
         self._check()
 
@@ -60,4 +61,4 @@ class LinearLimit(Limit):
         check_bounds(self.lower, self.upper)
         seen = concrete(self.matrix)
         if seen is not None and not np.isfinite(seen).all():
-            raise ValueError(f"matrix is not finite in rows {np.flatnonzero(~np.isfinite(seen).all(1)).tolist()}")
+            raise OsikValueError(f"matrix is not finite in rows {np.flatnonzero(~np.isfinite(seen).all(1)).tolist()}")

@@ -8,6 +8,7 @@ from typing import ClassVar
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete, dof_names, dof_values
 from .._numbers import entries
 from ..robot import Robot
@@ -45,4 +46,4 @@ class VelocityLimit(Limit):
     def _check(self, names: Sequence[str] | None = None) -> None:
         seen = concrete(self.velocity)
         if seen is not None and not (seen >= 0.0).all():
-            raise ValueError(f"velocity limits have to be 0 or more: {entries(seen, ~(seen >= 0.0), names)}")
+            raise OsikValueError(f"velocity limits have to be 0 or more: {entries(seen, ~(seen >= 0.0), names)}")

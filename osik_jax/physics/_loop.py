@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import check_targets
+from .._errors import OsikValueError
 from .._structure import is_number
 from ..control import Solution, Targets, Tasks, aim, remembering, solve
 from ..kinematics import integrate
@@ -134,7 +135,7 @@ def simulate(
         TypeError, ValueError: as in ``solve``; ``dt`` is no whole number of timesteps; ``targets`` do not fit.
     """
     if steps < 1:
-        raise ValueError(f"steps is {steps}; there has to be one tick at least")
+        raise OsikValueError(f"steps is {steps}; there has to be one tick at least")
     check_targets(tasks, targets, steps)
     robot = simulation.world.robot
     numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), is_number)

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from .._errors import OsikValueError
 from .._joint_selection import select_joints
 from .._tree import BALL, FREE
 from ..robot import Robot
@@ -30,9 +31,9 @@ class Servo:
 
     def __post_init__(self) -> None:
         if not (self.stiffness > 0.0 and math.isfinite(self.stiffness) and 0.0 <= self.damping < math.inf):
-            raise ValueError(f"{self}: the stiffness has to be positive, the damping not negative, both finite")
+            raise OsikValueError(f"{self}: the stiffness has to be positive, the damping not negative, both finite")
         if self.effort is not None and not self.effort > 0.0:
-            raise ValueError(f"{self}: the effort has to be positive")
+            raise OsikValueError(f"{self}: the effort has to be positive")
 
 
 def choose_servos(robot: Robot, given: Mapping[str, Servo]) -> dict[str, Servo]:
@@ -43,11 +44,11 @@ def choose_servos(robot: Robot, given: Mapping[str, Servo]) -> dict[str, Servo]:
     for joint in robot.tree.independent:
         name, kind = robot.tree.joint_names[joint], robot.tree.joint_types[joint]
         if kind == BALL:
-            raise ValueError(f"joint {name!r} is a ball joint, which no servo can turn")
+            raise OsikValueError(f"joint {name!r} is a ball joint, which no servo can turn")
         if kind != FREE:
             found = chosen.get(joint, own.get(joint))
             if found is None:
-                raise ValueError(
+                raise OsikValueError(
                     f"joint {name!r} has no position actuator in the robot's model: give servos={{{name!r}: "
                     "Servo(stiffness, damping, effort)}; a glob such as '*' stands for many"
                 )

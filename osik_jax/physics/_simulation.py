@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from .._tree import FREE, QPOS_WIDTH, unknown_name
 from ._world import World, frame_pose
 
@@ -92,7 +93,7 @@ class Simulation:
         """
         targets = np.asarray(command)[self._targets]
         if not np.isfinite(targets).all():
-            raise ValueError(f"the command of {', '.join(self._spoiled(targets))} is not finite")
+            raise OsikValueError(f"the command of {', '.join(self._spoiled(targets))} is not finite")
         self.data.ctrl[:] = targets
         mujoco.mj_step(self.model, self.data, self._substeps(duration))
         mujoco.mj_forward(self.model, self.data)
@@ -103,7 +104,7 @@ class Simulation:
     def _substeps(self, duration: float) -> int:
         steps = duration / self.model.opt.timestep
         if not (steps > 0.5 and math.isclose(steps, round(steps), rel_tol=1e-6)):
-            raise ValueError(f"{duration} s is no whole number of timesteps of {self.model.opt.timestep} s")
+            raise OsikValueError(f"{duration} s is no whole number of timesteps of {self.model.opt.timestep} s")
         return round(steps)
 
     def push(self, body: str, force: tuple[float, float, float]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from .._tree import BALL, FREE
 from ..robot import Robot
 from ._servo import Servo as Servo
@@ -96,7 +97,7 @@ def build_world(
             (ball), a locked joint that is free or ball, or a number out of range.
     """
     if not (0.0 < timestep < math.inf and 0.0 <= friction < math.inf):
-        raise ValueError(
+        raise OsikValueError(
             f"timestep is {timestep} and friction {friction}; the one has to be positive, neither infinite"
         )
     points = _contact_points(robot, feet)
@@ -123,18 +124,18 @@ def _contact_points(robot: Robot, feet: Feet | None) -> dict[str, Float[np.ndarr
         feet = [n.removesuffix("_corner_0") for n in names if n.endswith("_corner_0")]
         feet = [name for name in feet if name in names]
     if isinstance(feet, str):
-        raise TypeError(f"feet is a sequence of names or a mapping, not one string: use ({feet!r},)")
+        raise OsikTypeError(f"feet is a sequence of names or a mapping, not one string: use ({feet!r},)")
     given = dict(feet) if isinstance(feet, Mapping) else {name: sole_points(robot, name) for name in feet}
     out = {name: np.atleast_2d(np.asarray(points, float)) for name, points in given.items()}
     for name, points in out.items():
         robot.tree.frame(name)
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
-            raise ValueError(
+            raise OsikValueError(
                 f"foot {name!r} has no contact points: give feet={{{name!r}: points}}, finite and (k, 3) in the frame "
                 f"[m]; or its model sites {name}_corner_0, {name}_corner_1, ..., or a box that collides"
             )
     if robot.floating_base and not out:
-        raise ValueError("a floating robot needs feet={frame: contact points (k, 3)} to stand on")
+        raise OsikValueError("a floating robot needs feet={frame: contact points (k, 3)} to stand on")
     return out
 
 
@@ -317,7 +318,7 @@ def _add_ties(spec: mujoco.MjSpec, robot: Robot) -> None:
         _tie(spec, tree.joint_names[follower], tree.joint_names[leader], constant, multiplier)
     for joint in tree.locked:
         if tree.joint_types[joint] in (FREE, BALL):
-            raise ValueError(f"joint {tree.joint_names[joint]!r} is locked, and free or ball: nothing can hold it")
+            raise OsikValueError(f"joint {tree.joint_names[joint]!r} is locked, and free or ball: nothing can hold it")
         at = tree.full_qpos_address[joint]
         _tie(spec, tree.joint_names[joint], "", offset[at] - reference[at], 0.0)
 

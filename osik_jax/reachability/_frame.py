@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from ..inverse._chain import is_plain, jacobian, place
 from ..inverse._chain_problem import ChainRoute, Settings
 from ..inverse._chain_search import ChainSearch, Goal
@@ -64,7 +65,7 @@ def read_frame(robot: Robot, name: str, limits: Sequence[Limit] | None, key: int
     """
     robot.tree.frame(name)
     if not is_plain(robot.tree, (name,)):
-        raise ValueError(
+        raise OsikValueError(
             f"{name!r} is not carried by hinges and slides alone: what moves freely gets everywhere, and what no joint "
             "moves gets nowhere. Of a robot with a free base, load it bolted down (floating_base=False, --base fixed)"
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from .._errors import OsikTypeError, OsikValueError
 from .._numbers import check_count
 from ..robot import Robot
 from ._frame import Frame, read_frame
@@ -82,12 +83,12 @@ def checked_grid(grid: object) -> Grid:
     """
     expected = "it is (x, y, z): the coordinates along each axis, increasing [m]"
     if not isinstance(grid, tuple | list) or len(grid) != 3:
-        raise TypeError(f"grid is {grid!r}; {expected}")
+        raise OsikTypeError(f"grid is {grid!r}; {expected}")
     try:
         axes = tuple(np.asarray(axis, float) for axis in grid)
     except (TypeError, ValueError):
-        raise TypeError(f"grid is {grid!r}; {expected}") from None
+        raise OsikTypeError(f"grid is {grid!r}; {expected}") from None
     for name, axis in zip("xyz", axes, strict=True):
         if axis.ndim != 1 or not axis.size or not np.isfinite(axis).all() or not (np.diff(axis) > 0.0).all():
-            raise ValueError(f"{name} of the grid is {axis}; {expected}")
+            raise OsikValueError(f"{name} of the grid is {axis}; {expected}")
     return axes  # pyright: ignore[reportReturnType]

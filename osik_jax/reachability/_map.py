@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._errors import OsikValueError
 from ..scaling._chunk_file import whole_file
 
 if TYPE_CHECKING:
@@ -98,9 +99,9 @@ def load_map(path: str | os.PathLike[str]) -> ReachabilityMap:
     with np.load(path, allow_pickle=False) as file:
         missing = [name for name in ("format", *names) if name not in getattr(file, "files", ())]
         if missing:
-            raise ValueError(f"{os.fspath(path)} is no reachability map: it has no {missing[0]}")
+            raise OsikValueError(f"{os.fspath(path)} is no reachability map: it has no {missing[0]}")
         if int(file["format"]) != _FORMAT:
-            raise ValueError(f"{os.fspath(path)} has format {file['format']}; this version reads {_FORMAT}")
+            raise OsikValueError(f"{os.fspath(path)} has format {file['format']}; this version reads {_FORMAT}")
         arrays: dict[str, Any] = {name: file[name] for name in names}
     arrays["frame"] = str(arrays["frame"])
     return ReachabilityMap(**arrays)

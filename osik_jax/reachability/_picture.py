@@ -13,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
+from .._errors import OsikValueError
 from ..viewer._scene import INK
 from ._map import ReachabilityMap
 
@@ -60,7 +61,7 @@ def _nearest(axes: Sequence[np.ndarray], at: Any) -> tuple[int, int, int]:
     except (TypeError, ValueError):
         point = np.zeros(0)
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise ValueError(f"at is {at!r}; it is a point x y z [m]")
+        raise OsikValueError(f"at is {at!r}; it is a point x y z [m]")
     return tuple(  # pyright: ignore[reportReturnType]
         int(np.abs(axis - value).argmin()) for axis, value in zip(axes, point, strict=True)
     )

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._checks import check_setting, checked_limits
+from .._errors import OsikValueError
 from .._numbers import check_count
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import checked_tolerance
@@ -114,7 +115,9 @@ def _rotations(robot: Robot, frame: str, given: int | ArrayLike | Array) -> Floa
         return spread_rotations(int(given)).astype(robot.q0.dtype)
     shape = np.shape(given)
     if shape[1:] not in ((3, 3), (4,)) or not shape[0]:
-        raise ValueError(f"orientations have shape {shape}; they are matrices (m, 3, 3), or quaternions w x y z (m, 4)")
+        raise OsikValueError(
+            f"orientations have shape {shape}; they are matrices (m, 3, 3), or quaternions w x y z (m, 4)"
+        )
     goal, _, _ = read_poses(robot, {frame: (np.zeros((shape[0], 3)), given)})
     return np.asarray(goal.rotation[:, 0])
 

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._errors import OsikValueError
+
 _RESULT = "result."
 _JOB, _PART, _NAMES, _LANES = "job", "part", "names", "lanes"
 _FILE = re.compile(r"(\d{8,})(?:\.(\d+)-of-(\d+))?\.npz")
@@ -21,7 +23,7 @@ Block = tuple[int, int]
 """First lane, and the one after the last, counted within the chunk."""
 
 
-class DamagedFile(ValueError):
+class DamagedFile(OsikValueError):
     """A file cannot be read, or holds something else than its name says.
 
     Attributes:
@@ -33,7 +35,7 @@ class DamagedFile(ValueError):
         super().__init__(f"{self.found}; call run_in_chunks again with the same arguments, it makes the file anew")
 
 
-class OtherJob(ValueError):
+class OtherJob(OsikValueError):
     """A file has results of another job."""
 
 
@@ -105,7 +107,7 @@ def _check_type(name: str, dtype: np.dtype) -> None:
     """Raises for Python objects, which only pickle keeps, and types that come back as bytes, such as bfloat16."""
     known = not dtype.hasobject and np.dtype(dtype.str) == dtype
     if not known and dtype.names is None:
-        raise ValueError(f"{name or 'the result'} is of type {dtype}, which no .npz keeps; NumPy's own numbers do")
+        raise OsikValueError(f"{name or 'the result'} is of type {dtype}, which no .npz keeps; NumPy's own numbers do")
 
 
 @contextlib.contextmanager

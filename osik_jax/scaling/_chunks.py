@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._errors import OsikValueError
 from .._names import leaf_names
 from ._chunk_file import Block, Part, read_chunk, remove_partial_files, write_chunk
 from ._fingerprint import differences, fingerprint, identifier
@@ -127,7 +128,7 @@ class _Job:
         made = self.batch(start, stop)
         if _lengths(made) != {stop - start}:
             found = ", ".join(str(n) for n in sorted(_lengths(made))) or "none"
-            raise ValueError(f"batch({start}, {stop}) made arrays of {found} lanes, expected {stop - start}")
+            raise OsikValueError(f"batch({start}, {stop}) made arrays of {found} lanes, expected {stop - start}")
         return made
 
     def inputs(self, k: int) -> Any:
@@ -172,20 +173,20 @@ def _lengths(tree: Any) -> set[int]:
 def _lanes(batch: Any, count: int | None) -> int:
     if callable(batch):
         if count is None:
-            raise ValueError("batch is a function, so count has to say how many lanes there are")
+            raise OsikValueError("batch is a function, so count has to say how many lanes there are")
         return _positive(count, "count")
     if count is not None:
-        raise ValueError("count goes with a batch that is a function; of arrays it is their length")
+        raise OsikValueError("count goes with a batch that is a function; of arrays it is their length")
     lengths = _lengths(batch)
     if len(lengths) != 1 or 0 in lengths:
         found = ", ".join(str(n) for n in sorted(lengths)) or "nothing is given"
-        raise ValueError(f"a batch is arrays with the lanes in front, of one length, at least 1; lengths: {found}")
+        raise OsikValueError(f"a batch is arrays with the lanes in front, of one length, at least 1; lengths: {found}")
     return lengths.pop()
 
 
 def _positive(value: Any, name: str) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name} is {value!r}; it is a number of lanes, at least 1")
+        raise OsikValueError(f"{name} is {value!r}; it is a number of lanes, at least 1")
     return int(value)
 
 
@@ -222,13 +223,13 @@ def _rows(result: Any, size: int, chunk: int) -> tuple[list[Block], dict[str, np
     wrong = [name for name, leaf in zip(names, leaves, strict=True) if np.shape(leaf)[:1] != (chunk,)]
     if wrong or not leaves:
         found = f"{wrong[0] or 'it'} does not" if wrong else "there are none"
-        raise ValueError(f"the function's results have the lanes in front, {chunk} of them: {found}")
+        raise OsikValueError(f"the function's results have the lanes in front, {chunk} of them: {found}")
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"two arrays of the function's results are called {twice!r}")
+        raise OsikValueError(f"two arrays of the function's results are called {twice!r}")
     parts = [_blocks(leaf, chunk) for leaf in leaves]
     if any(part.keys() != parts[0].keys() for part in parts):
-        raise ValueError("the function's results are split over devices in different ways; make it with sharded")
+        raise OsikValueError("the function's results are split over devices in different ways; make it with sharded")
     starts = sorted(start for start in parts[0] if start < size)
     blocks = [(start, min(start + len(parts[0][start]), size)) for start in starts]
     arrays = [
@@ -241,7 +242,7 @@ def _blocks(leaf: Any, chunk: int) -> dict[int, Any]:
     """Rows on this process's devices, by the first lane."""
     if not isinstance(leaf, jax.Array) or leaf.is_fully_addressable:
         if jax.process_count() > 1:
-            raise ValueError("the function's results are of this process alone; for several, make it with sharded")
+            raise OsikValueError("the function's results are of this process alone; for several, make it with sharded")
         return {0: np.asarray(leaf)}
     shards = {shard.index[0].indices(chunk)[0]: shard.data for shard in leaf.addressable_shards}
     return {start: np.asarray(data) for start, data in shards.items()}
@@ -261,7 +262,9 @@ class _Layout:
         first, known = self.known
         if known != found:
             changed = "; ".join(differences(known, found))
-            raise ValueError(f"the function's results of chunk {chunk} are not like those of chunk {first}: {changed}")
+            raise OsikValueError(
+                f"the function's results of chunk {chunk} are not like those of chunk {first}: {changed}"
+            )
 
 
 def _bytes(tree: Any) -> int:
@@ -270,7 +273,7 @@ def _bytes(tree: Any) -> int:
 
 def _in_memory(job: _Job, progress: Progress) -> Any:
     if jax.process_count() > 1:
-        raise ValueError("several processes have no memory in common: name a folder, out=...")
+        raise OsikValueError("several processes have no memory in common: name a folder, out=...")
     parts: list[dict[str, np.ndarray]] = []
     layout, result = _Layout(), None
     with reported(job.count, 0, progress) as advance:

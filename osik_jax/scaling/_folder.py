@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from .._errors import OsikValueError
 from ._chunk_file import DamagedFile, Part, check_chunk, chunk_files, complete
 from ._fingerprint import differences
 from ._saved import read_manifest, write_manifest
@@ -36,7 +37,7 @@ def claim(folder: Path, manifest: Mapping[str, Any], process: int, processes: in
     old = _old_manifest(folder)
     changed = [line for line in differences(old or manifest, manifest) if not line.startswith("job was")]
     if changed:
-        raise ValueError(f"{folder} has another job in it; name another folder. What differs: {'; '.join(changed)}")
+        raise OsikValueError(f"{folder} has another job in it; name another folder. What differs: {'; '.join(changed)}")
     found = _undamaged(folder, manifest["job"], process, processes)
     if old is None:
         write_manifest(folder, manifest)

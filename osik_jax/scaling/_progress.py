@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from .._errors import OsikTypeError
 from .._progress import progress_bar
 
 Progress = bool | Callable[[int, int], Any]
@@ -16,7 +17,7 @@ Progress = bool | Callable[[int, int], Any]
 def check_progress(progress: Any) -> None:
     """Raises TypeError for what is neither True, False nor a function."""
     if not isinstance(progress, bool) and not callable(progress):
-        raise TypeError(f"progress is {progress!r}; it is True, False, or a function of the lanes done and of all")
+        raise OsikTypeError(f"progress is {progress!r}; it is True, False, or a function of the lanes done and of all")
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._errors import OsikKeyError, OsikTypeError, OsikValueError
 from .._names import leaf_names
 from ._chunk_file import Block, DamagedFile, Part, chunk_files, complete, opened, read_chunk, result_names, whole_file
 from ._fingerprint import identifier
@@ -45,7 +46,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     except (ValueError, TypeError, KeyError) as error:
         raise DamagedFile(path, f"is damaged ({error})") from error
     if form != FORMAT:
-        raise ValueError(
+        raise OsikValueError(
             f"{folder} has format {form!r}, and this version reads and writes {FORMAT}: name another folder for a job; "
             "np.load opens the files of this one"
         )
@@ -97,7 +98,7 @@ class Saved:
         for path in chunk_files(self.folder).values():
             with opened(path) as file:
                 return result_names(file)
-        raise ValueError(f"{self.folder} has no finished chunk")
+        raise OsikValueError(f"{self.folder} has no finished chunk")
 
     def __getitem__(self, lanes: slice) -> Any:
         """The results of a slice of lanes: a pytree like ``like``, or a dict by name.
@@ -106,7 +107,7 @@ class Saved:
             ValueError: lanes that are missing.
         """
         if not isinstance(lanes, slice):
-            raise TypeError(f"lanes are a slice, not {lanes!r}: use [{lanes} : {lanes} + 1]")
+            raise OsikTypeError(f"lanes are a slice, not {lanes!r}: use [{lanes} : {lanes} + 1]")
         arrays = self.read(self.names, lanes)
         if self.like is None:
             return arrays
@@ -121,10 +122,10 @@ class Saved:
         """
         unknown = [name for name in names if name not in self.names]
         if unknown:
-            raise KeyError(f"no array {unknown[0]!r}; arrays: {', '.join(self.names)}")
+            raise OsikKeyError(f"no array {unknown[0]!r}; arrays: {', '.join(self.names)}")
         start, stop, step = lanes.indices(len(self))
         if step < 1:
-            raise ValueError(f"the step of a slice of lanes is positive, not {step}")
+            raise OsikValueError(f"the step of a slice of lanes is positive, not {step}")
         size = self.manifest["chunk"]
         touched = range(start // size, -(-stop // size)) if stop > start else ()
         parts = [self._chunk(k, names, max(start - k * size, 0), min(stop - k * size, size)) for k in touched]
@@ -145,7 +146,7 @@ class Saved:
         parts = self._parts(chunk)
         if not parts:
             count = len(self.missing)
-            raise ValueError(
+            raise OsikValueError(
                 f"chunk {chunk} of {self.folder} is missing, with {count - 1} more of {self.chunks}: call "
                 "run_in_chunks again, it goes on where it was; if hosts wrote to folders of their own, join them"
             )
@@ -186,6 +187,6 @@ def load(folder: str | os.PathLike[str], *, like: Any = None) -> Saved:
     """
     saved = Saved(Path(folder), like)
     if like is not None and (len(saved.missing) < saved.chunks) and set(leaf_names(like)) != set(saved.names):
-        raise ValueError(f"like has the arrays {', '.join(leaf_names(like))}; saved are {', '.join(saved.names)}")
+        raise OsikValueError(f"like has the arrays {', '.join(leaf_names(like))}; saved are {', '.join(saved.names)}")
     len(saved)
     return saved

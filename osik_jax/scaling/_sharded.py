@@ -13,6 +13,8 @@ from jax.core import Tracer
 from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from .._errors import OsikTypeError, OsikValueError
+
 _SHARED = -1
 """In the place of an axis: every device has all of it."""
 
@@ -53,9 +55,9 @@ def sharded(
         TypeError: a function that cannot be called, or a mesh that is none.
     """
     if not callable(function):
-        raise TypeError(f"{function!r} is no function")
+        raise OsikTypeError(f"{function!r} is no function")
     if mesh is not None and not isinstance(mesh, Mesh):
-        raise TypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as device_mesh(jax.devices()[:2])")
+        raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as device_mesh(jax.devices()[:2])")
     return ShardedFunction(function, in_axes, device_mesh() if mesh is None else mesh, donate_argnums)
 
 
@@ -102,7 +104,7 @@ class ShardedFunction:
         leaves, program = self._program(args)
         count = program.count(leaves)
         if count % self.mesh.size:
-            raise ValueError(f"{count} lanes do not divide over {self.mesh.size} devices")
+            raise OsikValueError(f"{count} lanes do not divide over {self.mesh.size} devices")
         return jax.tree.unflatten(program.structure, program.placed(leaves))
 
     def _program(self, args: tuple[Any, ...]) -> tuple[list[Any], _Program]:
@@ -152,11 +154,11 @@ class _Program:
         for i, axis in self._split:
             shape = np.shape(leaves[i])
             if not 0 <= axis < len(shape):
-                raise ValueError(f"in_axes has axis {axis} for an array of shape {shape}")
+                raise OsikValueError(f"in_axes has axis {axis} for an array of shape {shape}")
             lengths.add(shape[axis])
         if len(lengths) != 1 or 0 in lengths:
             found = ", ".join(str(n) for n in sorted(lengths)) or "none, for in_axes splits no argument"
-            raise ValueError(f"the arguments that are split need one number of lanes, at least 1; found: {found}")
+            raise OsikValueError(f"the arguments that are split need one number of lanes, at least 1; found: {found}")
         return lengths.pop()
 
     def reachable(self, leaves: list[Any]) -> list[Any]:
@@ -202,7 +204,7 @@ def _making_empty_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
 def _flat_axes(in_axes: Any, args: tuple[Any, ...]) -> list[int]:
     if isinstance(in_axes, (tuple, list)):
         if len(in_axes) != len(args):
-            raise ValueError(f"in_axes has {len(in_axes)} parts, for {len(args)} arguments")
+            raise OsikValueError(f"in_axes has {len(in_axes)} parts, for {len(args)} arguments")
         in_axes = tuple(in_axes)
     marked = jax.tree.map(lambda axis: _SHARED if axis is None else axis, in_axes, is_leaf=lambda axis: axis is None)
     return jax.tree.leaves(jax.tree.broadcast(marked, args))

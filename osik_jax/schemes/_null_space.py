@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from ..solvers import Damping, Level, NullSpaceSolution, solve_nullspace
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
@@ -54,11 +55,11 @@ class NullSpace(Scheme):
 
     def __check_init__(self):
         if self.order not in ("forward", "reverse"):
-            raise ValueError(f"order is {self.order!r}; orders: forward, reverse")
+            raise OsikValueError(f"order is {self.order!r}; orders: forward, reverse")
         if not isinstance(self.saturate, bool):
-            raise ValueError(f"saturate is {self.saturate!r}; it is True or False")
+            raise OsikValueError(f"saturate is {self.saturate!r}; it is True or False")
         if self.saturate and self.order == "reverse":
-            raise ValueError("saturate needs order='forward': saturation goes from the first priority down")
+            raise OsikValueError("saturate needs order='forward': saturation goes from the first priority down")
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
         """The velocity of one tick."""

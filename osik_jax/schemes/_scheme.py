@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from .._errors import OsikValueError
 from .._numbers import as_scalar
 from .._replace import Replaceable
 from ..limits import LimitRows
@@ -194,7 +195,7 @@ def as_cap(value: Any) -> int | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-        raise ValueError(f"max_iterations is {value!r}; it is an integer, or None for the solver's own cap")
+        raise OsikValueError(f"max_iterations is {value!r}; it is an integer, or None for the solver's own cap")
     return int(value)
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._errors import OsikValueError
 from .._joint_selection import concrete
 from ..solvers import Backend, Level, solve_least_squares_qp
 from ..solvers._backends import check_backend, takes
@@ -50,7 +51,7 @@ class WeightedQP(Scheme):
     def _check(self) -> None:
         seen = concrete(self.damping)
         if seen is not None and not (seen > 0.0).all():
-            raise ValueError(f"damping is {seen}; a WeightedQP needs it positive, or the velocity is not unique")
+            raise OsikValueError(f"damping is {seen}; a WeightedQP needs it positive, or the velocity is not unique")
 
     def solve(self, problem: VelocityProblem, warm_start: Int[Array, " m"] | None = None) -> SchemeAnswer:
         """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError
 from ..kinematics import Kinematics, centroidal_momentum_matrix
 from ..robot import Robot
 from ._com import check_axes
@@ -61,7 +62,7 @@ class AngularMomentumTask(Task):
         hard: bool = False,
     ):
         if target is not None and (lower is not None or upper is not None):
-            raise TypeError("an AngularMomentumTask has a target or bounds (lower, upper), not both")
+            raise OsikTypeError("an AngularMomentumTask has a target or bounds (lower, upper), not both")
         self.axes = check_axes(axes)
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype

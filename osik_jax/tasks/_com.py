@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from ..kinematics import Kinematics, center_of_mass, com_jacobian
 from ..robot import Robot
 from ._curvature import jacobian_curvature
@@ -148,7 +149,7 @@ class ComTask(Task):
     def _convert(self, name: str, value: Any) -> Any:
         if name == "polygon":
             if not isinstance(value, SupportPolygon):
-                raise TypeError(f"polygon is a SupportPolygon (see support_polygon), got {type(value).__name__}")
+                raise OsikTypeError(f"polygon is a SupportPolygon (see support_polygon), got {type(value).__name__}")
             return _cast(value, self.weight.dtype)
         if name in ("target", "target_velocity"):
             return self._along_axes(value, name)
@@ -169,17 +170,17 @@ def check_axes(axes: str) -> str:
         ValueError: they are not.
     """
     if not axes or len(set(axes)) != len(axes) or not set(axes) <= set("xyz"):
-        raise ValueError(f"axes is {axes!r}; it is made of x, y and z, each at most once")
+        raise OsikValueError(f"axes is {axes!r}; it is made of x, y and z, each at most once")
     return axes
 
 
 def _check_exclusive(target: Any, velocity: Any, lower: Any, upper: Any, polygon: Any, axes: str) -> None:
     bounds = lower is not None or upper is not None
     if target is not None and bounds:
-        raise TypeError("a ComTask has a target or bounds (lower, upper), not both")
+        raise OsikTypeError("a ComTask has a target or bounds (lower, upper), not both")
     if polygon is None:
         return
     if not isinstance(polygon, SupportPolygon):
-        raise TypeError(f"polygon is a SupportPolygon (see support_polygon), got {type(polygon).__name__}")
+        raise OsikTypeError(f"polygon is a SupportPolygon (see support_polygon), got {type(polygon).__name__}")
     if target is not None or velocity is not None or bounds or axes != "xyz":
-        raise TypeError("a ComTask with a polygon takes no target, target_velocity, lower, upper or axes")
+        raise OsikTypeError("a ComTask with a polygon takes no target, target_velocity, lower, upper or axes")

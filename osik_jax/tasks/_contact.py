@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError
 from ..kinematics import Kinematics
 from ..kinematics._rigid import cross
 from ..robot import Robot
@@ -93,7 +94,7 @@ class ContactTask(PlaneTask):
         self.frame, self.sliding = frame, bool(sliding)
         self.contact = option("contact", contact, ("point", "plane"))
         if contact == "point" and axis is not None:
-            raise TypeError("a contact at a point has no axis that stands on the plane; contact='plane' has")
+            raise OsikTypeError("a contact at a point has no axis that stands on the plane; contact='plane' has")
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         self.weight = as_weight(weight, self._weight_rows, dtype)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from .._loading._mjmodel import element_names
 from .._tree import KinematicTree, unknown_name
 from ..kinematics import Kinematics, frame_jacobians
@@ -189,13 +190,13 @@ def _selected(robot: Robot, names: Iterable[str] | None) -> list[int]:
         active = np.flatnonzero(model.eq_active0)
         found = [int(e) for e in active if int(model.eq_type[e]) in _TYPES and not _is_kept(model, int(e))]
         if not found:
-            raise ValueError(
+            raise OsikValueError(
                 "the model has no active connect, weld or joint constraint that is not a mimic or locked joint; "
                 f"constraints: {', '.join(available) or '(none)'}"
             )
         return found
     if isinstance(names, str):
-        raise TypeError(f"constraints is a sequence of names, not one string: use ({names!r},)")
+        raise OsikTypeError(f"constraints is a sequence of names, not one string: use ({names!r},)")
     numbers = set()
     for name in names:
         if name not in available:
@@ -203,16 +204,16 @@ def _selected(robot: Robot, names: Iterable[str] | None) -> list[int]:
         numbers.add(available.index(name))
         _check_kind(robot, available.index(name), name)
     if not numbers:
-        raise ValueError(f"there is no constraint to keep; constraints: {', '.join(available)}")
+        raise OsikValueError(f"there is no constraint to keep; constraints: {', '.join(available)}")
     return sorted(numbers)
 
 
 def _check_kind(robot: Robot, e: int, name: str) -> None:
     if int(robot.mj_model.eq_type[e]) not in _TYPES:
         kind = mujoco.mjtEq(int(robot.mj_model.eq_type[e])).name
-        raise ValueError(f"constraint {name!r} is of kind {kind}; it can be connect, weld or joint")
+        raise OsikValueError(f"constraint {name!r} is of kind {kind}; it can be connect, weld or joint")
     if _is_kept(robot.mj_model, e):
-        raise ValueError(f"constraint {name!r} holds already: its joint is a mimic joint of the robot, or locked")
+        raise OsikValueError(f"constraint {name!r} holds already: its joint is a mimic joint of the robot, or locked")
 
 
 def _is_kept(model: mujoco.MjModel, e: int) -> bool:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from .._structure import Static, put_together, taken_apart
 from ..kinematics import Kinematics, forward_kinematics, integrate
 from ..kinematics._rates import kinematics_rates
@@ -79,7 +80,7 @@ class FunctionTask(Task):
         hard: bool = False,
     ):
         if not callable(function):
-            raise TypeError(f"function is a {type(function).__name__}; it is called with (robot, kinematics, q)")
+            raise OsikTypeError(f"function is a {type(function).__name__}; it is called with (robot, kinematics, q)")
         _check_signature(function)
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
@@ -92,7 +93,7 @@ class FunctionTask(Task):
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
         self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
         if target is not None and self.lower is not None:
-            raise TypeError("a FunctionTask has a target or bounds (lower, upper), not both")
+            raise OsikTypeError("a FunctionTask has a target or bounds (lower, upper), not both")
         self.target = None
         if self.lower is None:
             self.target = as_vector(0.0 if target is None else target, (rows,), "target", dtype)
@@ -157,14 +158,14 @@ class FunctionTask(Task):
         """Those of another function of the same structure, in the precision of the ones they replace."""
         numbers, structure = taken_apart(function)
         if structure != self.structure:
-            raise TypeError(
+            raise OsikTypeError(
                 "the function's structure differs, not its numbers alone (an integer is structure: write 0.0 for 0); "
                 "make another FunctionTask of it"
             )
         new = jax.tree.map(lambda old, a: jnp.asarray(a, old.dtype), self.numbers, numbers)
         for old, a in zip(jax.tree.leaves(self.numbers), jax.tree.leaves(new), strict=True):
             if a.shape != old.shape:
-                raise ValueError(f"an array of the function has shape {a.shape}, expected {old.shape}")
+                raise OsikValueError(f"an array of the function has shape {a.shape}, expected {old.shape}")
         return new
 
     def _check(self) -> None:
@@ -180,7 +181,9 @@ def _check_signature(function: Function) -> None:
     try:
         signature.bind(None, None, None)
     except TypeError as error:
-        raise TypeError(f"the function takes {signature}; it is called with (robot, kinematics, q): {error}") from None
+        raise OsikTypeError(
+            f"the function takes {signature}; it is called with (robot, kinematics, q): {error}"
+        ) from None
 
 
 def _length(robot: Robot, function: Function) -> int:
@@ -188,5 +191,5 @@ def _length(robot: Robot, function: Function) -> int:
     x = jax.eval_shape(lambda r, q: function(r, forward_kinematics(r, q), q), robot, robot.q0)
     shape = getattr(x, "shape", None)
     if shape is None or len(shape) > 1 or 0 in shape:
-        raise ValueError(f"the function returns {x}; it returns a scalar or an array (m,)")
+        raise OsikValueError(f"the function returns {x}; it returns a scalar or an array (m,)")
     return shape[0] if shape else 1

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from ._leaves import as_scalar, concrete
 
 
@@ -41,7 +42,7 @@ class AdaptiveGain(eqx.Module):
         self.decay = as_scalar(decay, "decay")
         high, low = concrete(self.maximum), concrete(self.minimum)
         if high is not None and low is not None and high < low:
-            raise ValueError(f"an AdaptiveGain needs maximum >= minimum, got maximum {high} and minimum {low}")
+            raise OsikValueError(f"an AdaptiveGain needs maximum >= minimum, got maximum {high} and minimum {low}")
 
     def __call__(self, error: Float[Array, " m"]) -> Float[Array, ""]:
         """Gain [1/s] at this error."""

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from .._joint_selection import concrete, is_scalar, select_joints
 from ..kinematics import Kinematics
 from ..robot import Robot
@@ -79,7 +80,7 @@ class JointCouplingTask(Task):
         self.target_velocity = as_vector(velocity, (1,), "target_velocity", dtype)
         self.lower, self.upper = as_bounds(lower, upper, 1, dtype)
         if target is not None and self.lower is not None:
-            raise TypeError("a JointCouplingTask has a target or bounds (lower, upper), not both")
+            raise OsikTypeError("a JointCouplingTask has a target or bounds (lower, upper), not both")
         self.target = None
         if self.lower is None:
             self.target = as_vector(0.0 if target is None else target, (1,), "target", dtype)
@@ -116,12 +117,12 @@ class JointCouplingTask(Task):
 def _by_joint(robot: Robot, ratios: Mapping[str, float]) -> dict[int, float]:
     """Ratios by joint, in the order of v."""
     if not isinstance(ratios, Mapping):
-        raise TypeError(f"ratios is a {type(ratios).__name__}; it is a mapping from joint names to factors")
+        raise OsikTypeError(f"ratios is a {type(ratios).__name__}; it is a mapping from joint names to factors")
     found = {joint: value for name, value in ratios.items() for joint in select_joints(robot, name)}
     seen = [concrete(value) for value in found.values()]
     if not found or all(value is not None and not value.any() for value in seen):
-        raise ValueError(f"ratios is {dict(ratios)}; at least one joint has a ratio that is not 0")
+        raise OsikValueError(f"ratios is {dict(ratios)}; at least one joint has a ratio that is not 0")
     turning = [robot.tree.joint_names[j] for j in found if not is_scalar(robot, j)]
     if turning:
-        raise ValueError(f"ratios are of the values of hinges and slides; leave out {', '.join(turning)}")
+        raise OsikValueError(f"ratios are of the values of hinges and slides; leave out {', '.join(turning)}")
     return {joint: found[joint] for joint in sorted(found)}

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._joint_selection import dofs_of, select_all
 from ..kinematics import Kinematics
 from ..robot import Robot
@@ -130,7 +131,7 @@ class FreezeTask(VelocityTask):
     ):
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
         if not self.joints:
-            raise ValueError("a FreezeTask needs at least one joint")
+            raise OsikValueError("a FreezeTask needs at least one joint")
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
         """Nought."""

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._home import home_kinematics as home_kinematics
 from .._joint_selection import as_array as as_array
 from .._joint_selection import concrete as concrete
@@ -35,7 +36,7 @@ def as_own_weight(value: Any) -> Float[Array, "..."]:
     """
     rows = np.shape(value)
     if len(rows) > 1:
-        raise ValueError(f"weight has shape {rows}, expected a scalar or a vector. Batch with jax.vmap.")
+        raise OsikValueError(f"weight has shape {rows}, expected a scalar or a vector. Batch with jax.vmap.")
     own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
     return as_weight(value, rows[0] if rows else None, value.dtype if own else float)
 
@@ -49,7 +50,7 @@ def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...]
     out = as_array(value, "weight", dtype)
     if out.shape not in ((), (rows,)):
         each = "" if rows is None else f", or ({rows},): one for each row"
-        raise ValueError(f"weight has shape {out.shape}, expected a scalar{each}. Batch with jax.vmap.")
+        raise OsikValueError(f"weight has shape {out.shape}, expected a scalar{each}. Batch with jax.vmap.")
     check_not_negative(out, "weight")
     return out if out.shape else jnp.broadcast_to(out, like)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from .._made_for import check_made_for
 from ..kinematics import Kinematics
 from ..limits import Limit, limit_box, limit_rows
@@ -49,7 +50,7 @@ class LimitTask(Task):
         hard: bool = False,
     ):
         if not isinstance(limit, Limit):
-            raise TypeError(f"limit is a {type(limit).__name__}, not a Limit")
+            raise OsikTypeError(f"limit is a {type(limit).__name__}, not a Limit")
         check_made_for(limit, robot, "limit")
         self.limit = limit
         self.priority, self.hard = check_priority(priority), hard
@@ -91,5 +92,5 @@ class LimitTask(Task):
         if name != "limit":
             return super()._convert(name, value)
         if jax.tree.structure(value) != jax.tree.structure(self.limit):
-            raise ValueError(f"limit is a {type(value).__name__} of another structure than the task's")
+            raise OsikValueError(f"limit is a {type(value).__name__} of another structure than the task's")
         return value

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from .._joint_selection import select_all
 from .._tree import DOF_WIDTH, KinematicTree
 from ..kinematics import Kinematics, forward_kinematics, frame_jacobian, integrate
@@ -101,7 +102,7 @@ class ManipulabilityTask(Task):
         self.axes = option("axes", axes, ("world", "frame"))
         self.dofs = _moving_dofs(robot.tree, body, select_all(robot, joints))
         if len(self.dofs) < sum(self.kept):
-            raise ValueError(
+            raise OsikValueError(
                 f"{len(self.dofs)} dofs of the chosen joints move {frame!r}, which cannot go {sum(self.kept)} ways: "
                 "its manipulability is 0 everywhere. Choose fewer rows or more joints"
             )
@@ -111,10 +112,10 @@ class ManipulabilityTask(Task):
         self.gain = as_gain(gain, dtype)
         self.lower, self.upper = as_bounds(lower, upper, 1, dtype)
         if target is not None and self.lower is not None:
-            raise TypeError("a ManipulabilityTask has a target or bounds (lower, upper), not both")
+            raise OsikTypeError("a ManipulabilityTask has a target or bounds (lower, upper), not both")
         climbs = target is None and self.lower is None
         if climbs and target_velocity is not None:
-            raise TypeError("a target_velocity is that of a target or of bounds; there are none")
+            raise OsikTypeError("a target_velocity is that of a target or of bounds; there are none")
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target = None if target is None else as_vector(target, (), "target", dtype)
         self.target_velocity = None if climbs else as_vector(velocity, (), "target_velocity", dtype)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._framed import FramedTask
@@ -120,7 +121,7 @@ def check_frames(robot: Robot, frame: str, target_frame: str | None) -> None:
     if target_frame is not None:
         robot.tree.frame(target_frame)
     if frame == target_frame:
-        raise ValueError(f"frame and target_frame are both {frame!r}; the one never moves as seen from the other")
+        raise OsikValueError(f"frame and target_frame are both {frame!r}; the one never moves as seen from the other")
 
 
 def as_direction(value: Any, what: str, dtype: Any) -> Float[Array, "3"]:
@@ -132,7 +133,7 @@ def as_direction(value: Any, what: str, dtype: Any) -> Float[Array, "3"]:
     out = as_vector(value, (3,), what, dtype)
     seen = concrete(out)
     if seen is not None and not (np.isfinite(seen).all() and seen.any()):
-        raise ValueError(f"{what} is {seen}; a direction is finite and not 0")
+        raise OsikValueError(f"{what} is {seen}; a direction is finite and not 0")
     return out
 
 
@@ -204,5 +205,5 @@ def _as_half_angle(value: Any, dtype: Any) -> Float[Array, ""]:
     out = as_vector(value, (), "half_angle", dtype)
     seen = concrete(out)
     if seen is not None and not (0.0 < seen <= math.pi):
-        raise ValueError(f"half_angle is {seen}; it is an angle in rad, above 0 and up to pi. None: an equality")
+        raise OsikValueError(f"half_angle is {seen}; it is an angle in rad, above 0 and up to pi. None: an equality")
     return out

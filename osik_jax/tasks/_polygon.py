@@ -11,6 +11,7 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from .._home import compiled_kinematics
 from ..robot import Robot
 
@@ -66,18 +67,20 @@ def support_polygon(
     given = dict(corners or {})
     for name in given:
         if name not in frames:
-            raise ValueError(f"corners are given for {name!r}, which is not among the frames: {', '.join(frames)}")
+            raise OsikValueError(f"corners are given for {name!r}, which is not among the frames: {', '.join(frames)}")
     if isinstance(frames, str):
-        raise TypeError(f"frames is a sequence of names, not one string: use ({frames!r},)")
+        raise OsikTypeError(f"frames is a sequence of names, not one string: use ({frames!r},)")
     if not margin >= 0.0:
-        raise ValueError(f"margin is {margin}; it has to be 0 or more, in metres")
+        raise OsikValueError(f"margin is {margin}; it has to be 0 or more, in metres")
     points = np.concatenate([_ground_points(robot, q, name, given.get(name)) for name in frames] or [np.zeros((0, 2))])
     polygon = _hull(points)
     if polygon is None:
-        raise ValueError(f"the contact corners of {', '.join(frames)} span no area on the ground:\n{points}")
+        raise OsikValueError(f"the contact corners of {', '.join(frames)} span no area on the ground:\n{points}")
     drawn_in = _draw_in(polygon, margin) if margin else polygon
     if drawn_in is None:
-        raise ValueError(f"a margin of {margin} m leaves nothing of the support polygon with vertices\n{polygon[2]}")
+        raise OsikValueError(
+            f"a margin of {margin} m leaves nothing of the support polygon with vertices\n{polygon[2]}"
+        )
     normals, offsets, vertices = (jnp.asarray(x, robot.q0.dtype) for x in drawn_in)
     return SupportPolygon(normals, offsets, vertices)
 
@@ -95,7 +98,7 @@ def _ground_points(robot: Robot, q: Array, frame: str, corners: ArrayLike | None
         return np.asarray(kinematics.frame_poses(robot, names)[0])[:, :2]
     local = np.asarray(corners, float)
     if local.ndim != 2 or local.shape[1] != 3 or not np.isfinite(local).all():
-        raise ValueError(f"the corners of {frame!r} are finite points (k, 3) in its frame, got shape {local.shape}")
+        raise OsikValueError(f"the corners of {frame!r} are finite points (k, 3) in its frame, got shape {local.shape}")
     position, rotation = map(np.asarray, kinematics.frame_pose(robot, frame))
     return (position + local @ rotation.T)[:, :2]
 
@@ -107,7 +110,7 @@ def _corner_names(robot: Robot, frame: str) -> list[str]:
         names.append(f"{frame}_corner_{len(names)}")
     if not names:
         having = sorted(name.removesuffix("_corner_0") for name in known if name.endswith("_corner_0"))
-        raise ValueError(
+        raise OsikValueError(
             f"frame {frame!r} has no contact corners: give corners={{{frame!r}: points (k, 3) in its frame [m]}}, or "
             f"put sites {frame}_corner_0, {frame}_corner_1, ... in the model; frames that have them: "
             f"{', '.join(having) or '(none)'}"

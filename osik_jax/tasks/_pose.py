@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from .._tree import unknown_name
 from ..robot import Robot
 from ._curvature import pose_curvature
@@ -78,7 +79,9 @@ class PoseTask(FramedTask):
         self.axes = _axes(axes, outer_axes, self.error)
         self.orientation_jacobian = option("orientation_jacobian", orientation_jacobian, ("analytic", "geometric"))
         if self.coupled and self.orientation_jacobian == "geometric":
-            raise ValueError("error='se3' has its own Jacobian; orientation_jacobian='geometric' goes with 'decoupled'")
+            raise OsikValueError(
+                "error='se3' has its own Jacobian; orientation_jacobian='geometric' goes with 'decoupled'"
+            )
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         self.target = as_pose(home if target is None else target, dtype, rest=self._rest(home))
@@ -200,7 +203,7 @@ def _axes(axes: str | None, outer_axes: str, error: str) -> str:
     """Along which the rows are: by default the outer ones, and for a twist the frame's, which it always has."""
     if error == "se3":
         if axes not in (None, "frame"):
-            raise ValueError(f"axes is {axes!r}; the rows of error='se3' are along the frame's own axes, 'frame'")
+            raise OsikValueError(f"axes is {axes!r}; the rows of error='se3' are along the frame's own axes, 'frame'")
         return "frame"
     return outer_axes if axes is None else option("axes", axes, (outer_axes, "frame"))
 
@@ -229,7 +232,7 @@ def option(name: str, value: str, available: tuple[str, ...]) -> str:
         ValueError: it is not; the message lists them.
     """
     if value not in available:
-        raise ValueError(f"{name} is {value!r}; it is one of: {', '.join(map(repr, available))}")
+        raise OsikValueError(f"{name} is {value!r}; it is one of: {', '.join(map(repr, available))}")
     return value
 
 
@@ -241,9 +244,9 @@ def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
     """
     if isinstance(rows, str):
         if rows not in _ROWS:
-            raise ValueError(unknown_name("row set", rows, tuple(_ROWS)).args[0])
+            raise OsikValueError(unknown_name("row set", rows, tuple(_ROWS)).args[0])
         return _ROWS[rows]
     mask = tuple(bool(row) for row in rows)
     if len(mask) != 6 or not any(mask):
-        raise ValueError(f"rows has six booleans (x, y, z, rotation about x, y, z), at least one true; got {rows}")
+        raise OsikValueError(f"rows has six booleans (x, y, z, rotation about x, y, z), at least one true; got {rows}")
     return mask

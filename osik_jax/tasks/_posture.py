@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from .._joint_selection import dofs_of, is_scalar, select_all
 from .._tree import BALL, DOF_WIDTH, FREE
 from ..kinematics import Kinematics, difference
@@ -20,6 +21,9 @@ from ._gain import AdaptiveGain, as_gain
 from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_bounds, check_finite
 from ._rotation import inverse_left_jacobian
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+
+_BACKGROUND = 1e-3
+"""Weight of a posture of the whole robot: other tasks of the same priority win against it."""
 
 
 class PostureTask(Task):
@@ -40,7 +44,8 @@ class PostureTask(Task):
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; rows are in the order of v whatever the order here.
             Default: all but the free base, which has to be named to take part.
         weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0.
+            globs to weights, in which a joint that is not named has 0. Default: 1e-3 for a target of the whole robot,
+            so that other tasks win; 1 where joints are named, and for bounds.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
@@ -66,7 +71,7 @@ class PostureTask(Task):
         lower: ArrayLike | Array | None = None,
         upper: ArrayLike | Array | None = None,
         joints: Iterable[str] | None = None,
-        weight: WeightLike = 1.0,
+        weight: WeightLike | None = None,
         gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
         priority: int = 1,
         hard: bool = False,
@@ -77,6 +82,8 @@ class PostureTask(Task):
         self.gain = as_gain(gain, dtype)
         dofs = dofs_of(robot, self.joints)
         rows = len(dofs)
+        if weight is None:
+            weight = _BACKGROUND if joints is None and lower is None and upper is None else 1.0
         self.weight = as_joint_weight(robot, weight, dofs)
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
@@ -150,7 +157,7 @@ class PostureTask(Task):
         target = as_array(value, name, self.weight.dtype)
         check_finite(target, name)
         if target.shape != self.target.shape:
-            raise ValueError(f"target has shape {target.shape}, expected {self.target.shape}. Batch with jax.vmap.")
+            raise OsikValueError(f"target has shape {target.shape}, expected {self.target.shape}. Batch with jax.vmap.")
         return target
 
     def _check(self) -> None:
@@ -160,7 +167,7 @@ class PostureTask(Task):
 def _check_bounded(robot: Robot, joints: tuple[int, ...], target: Any) -> None:
     """Raises where bounds make no sense."""
     if target is not None:
-        raise TypeError("a PostureTask has a target or bounds (lower, upper), not both")
+        raise OsikTypeError("a PostureTask has a target or bounds (lower, upper), not both")
     turning = [robot.tree.joint_names[j] for j in joints if not is_scalar(robot, j)]
     if turning:
-        raise ValueError(f"bounds are on the values of hinges and slides; leave out {', '.join(turning)}")
+        raise OsikValueError(f"bounds are on the values of hinges and slides; leave out {', '.join(turning)}")

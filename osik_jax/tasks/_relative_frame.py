@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
@@ -81,7 +82,7 @@ class RelativeFrameTask(PoseTask):
         robot.tree.frame(frame)
         robot.tree.frame(root)
         if frame == root:
-            raise ValueError(f"frame and root are both {frame!r}; the pose of a frame in itself never changes")
+            raise OsikValueError(f"frame and root are both {frame!r}; the pose of a frame in itself never changes")
         self.root = root
         super().__init__(
             robot,

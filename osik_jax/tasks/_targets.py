@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikTypeError, OsikValueError
 from ._leaves import check_finite, concrete
 
 Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
@@ -75,7 +76,7 @@ def pose_array(value: Any, dtype: Any, accepted: str | None = None) -> Array:
     try:
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError):
-        raise TypeError(f"got {type(value).__name__}, which is no pose; {accepted or _ACCEPTED}") from None
+        raise OsikTypeError(f"got {type(value).__name__}, which is no pose; {accepted or _ACCEPTED}") from None
 
 
 _ACCEPTED = (
@@ -87,7 +88,7 @@ _ACCEPTED = (
 def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
     alone = "; here a position (3,) alone will do" if rest[1] is not None else ""
     alone += "; here a rotation alone will do" if rest[0] is not None else ""
-    return ValueError(f"got {what}; {_ACCEPTED}{alone}. Batch with jax.vmap.")
+    return OsikValueError(f"got {what}; {_ACCEPTED}{alone}. Batch with jax.vmap.")
 
 
 def _rotation(given: Float[Array, "3 3"] | Float[Array, "4"]) -> Float[Array, "3 3"]:
@@ -103,7 +104,7 @@ def _rotation(given: Float[Array, "3 3"] | Float[Array, "4"]) -> Float[Array, "3
 def _check_quaternion(wxyz: Float[Array, "4"]) -> None:
     seen = concrete(wxyz)
     if seen is not None and not abs(np.linalg.norm(seen) - 1.0) < _TOLERANCE:
-        raise ValueError(f"the target's quaternion (w, x, y, z) has to be of length 1 to {_TOLERANCE}, got {seen}")
+        raise OsikValueError(f"the target's quaternion (w, x, y, z) has to be of length 1 to {_TOLERANCE}, got {seen}")
 
 
 def _check_matrix(rotation: Float[Array, "3 3"]) -> None:
@@ -112,10 +113,10 @@ def _check_matrix(rotation: Float[Array, "3 3"]) -> None:
         return
     residual = np.abs(seen @ seen.T - np.eye(3)).max()
     if not (residual < _TOLERANCE and np.linalg.det(seen) > 0.0):
-        raise ValueError(f"the target's rotation is not one (R R' = I to {_TOLERANCE}, det R = 1):\n{seen}")
+        raise OsikValueError(f"the target's rotation is not one (R R' = I to {_TOLERANCE}, det R = 1):\n{seen}")
 
 
 def _check_last_row(matrix: Float[Array, "4 4"]) -> None:
     seen = concrete(matrix)
     if seen is not None and not np.abs(seen[3] - [0.0, 0.0, 0.0, 1.0]).max() < _TOLERANCE:
-        raise ValueError(f"the last row of a pose's matrix is 0 0 0 1, got {seen[3]}; is it transposed?")
+        raise OsikValueError(f"the last row of a pose's matrix is 0 0 0 1, got {seen[3]}; is it transposed?")

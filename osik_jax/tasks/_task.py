@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._errors import OsikTypeError, OsikValueError
 from .._home import compiled_kinematics
 from .._made_for import MadeForRobot
 from .._replace import Replaceable
@@ -84,7 +85,7 @@ class Task(MadeForRobot, Replaceable):
     def __check_init__(self) -> None:
         check_priority(self.priority)
         if not isinstance(self.hard, bool | np.bool_):
-            raise TypeError(f"hard is {self.hard!r}; it is True (a constraint, above every priority) or False")
+            raise OsikTypeError(f"hard is {self.hard!r}; it is True (a constraint, above every priority) or False")
 
     @abc.abstractmethod
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
@@ -119,7 +120,7 @@ class Task(MadeForRobot, Replaceable):
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         """The numbers with which the error at q is 0, by name."""
-        raise TypeError(f"this {type(self).__name__} has no target that a configuration could set")
+        raise OsikTypeError(f"this {type(self).__name__} has no target that a configuration could set")
 
     @property
     def _weight_rows(self) -> int | None:
@@ -139,7 +140,9 @@ class Task(MadeForRobot, Replaceable):
 def check_priority(priority: int) -> int:
     """The priority as an int, if it is an integer from 1 up, Python's or NumPy's."""
     if isinstance(priority, bool) or not isinstance(priority, int | np.integer) or priority < 1:
-        raise ValueError(f"a priority is an integer, 1 for the most important task, 2 for the next; got {priority!r}")
+        raise OsikValueError(
+            f"a priority is an integer, 1 for the most important task, 2 for the next; got {priority!r}"
+        )
     return int(priority)
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
+from .._errors import OsikTypeError, OsikValueError
 from .._structure import Static, put_together, taken_apart
 from ..scaling._sharded import moved
 from ..solvers import Status
@@ -89,7 +90,9 @@ def scenario_loss(loss: LossFunction, loop: Loop, scenario: Scenarios) -> tuple[
     trajectory, own = run_one(loop, scenario)
     value = jnp.asarray(loss(trajectory, own))
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
-        raise ValueError(f"the loss returned shape {value.shape} of {value.dtype}; it is one number for a trajectory")
+        raise OsikValueError(
+            f"the loss returned shape {value.shape} of {value.dtype}; it is one number for a trajectory"
+        )
     sound = (trajectory.solution.status != Status.NUMERICAL_ERROR).all()
     return value, jnp.isfinite(value) & sound
 
@@ -191,17 +194,19 @@ def _evaluate(numbers: Any, scenarios: Scenarios, *, static: Static, chunk: int,
 def check_loss(loss: Any) -> None:
     """Raises TypeError where a loss cannot be called with a trajectory and a loop."""
     if not callable(loss):
-        raise TypeError(f"the loss is {loss!r}; it is a function of a trajectory and a loop, such as Tracking('hand')")
+        raise OsikTypeError(
+            f"the loss is {loss!r}; it is a function of a trajectory and a loop, such as Tracking('hand')"
+        )
     try:
         inspect.signature(loss).bind(None, None)
     except TypeError:
-        raise TypeError(f"the loss {loss!r} has to take two arguments: the trajectory and the loop") from None
+        raise OsikTypeError(f"the loss {loss!r} has to take two arguments: the trajectory and the loop") from None
 
 
 def check_mesh(mesh: Any) -> None:
     """Raises TypeError where a mesh is none."""
     if mesh is not None and not isinstance(mesh, Mesh):
-        raise TypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as osik_jax.scaling.device_mesh()")
+        raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as osik_jax.scaling.device_mesh()")
 
 
 def chunk_size(chunk: int | None, count: int, mesh: Mesh | None = None) -> int:
@@ -210,5 +215,5 @@ def chunk_size(chunk: int | None, count: int, mesh: Mesh | None = None) -> int:
     if chunk is None:
         return min(count, 64) if jax.default_backend() == "cpu" else count
     if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:
-        raise ValueError(f"chunk is {chunk!r}; it is how many scenarios run at a time")
+        raise OsikValueError(f"chunk is {chunk!r}; it is how many scenarios run at a time")
     return min(chunk, count)

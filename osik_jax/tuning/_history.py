@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._errors import OsikValueError
 from ._parameters import ParameterSpace
 
 _FORMAT = 1
@@ -113,11 +114,13 @@ def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: A
     with np.load(path, allow_pickle=False) as file:
         arrays = dict(file)
     if arrays.get("format") != _FORMAT:
-        raise ValueError(f"{os.fspath(path)} is no state of a tuning that this version can read")
+        raise OsikValueError(f"{os.fspath(path)} is no state of a tuning that this version can read")
     for name, value in _described(space).items():
         saved = arrays[f"space/{name}"]
         if saved.shape != value.shape or not (saved == value).all():
-            raise ValueError(f"the parameters are not those saved in {os.fspath(path)}: {name} {saved}, now {value}")
+            raise OsikValueError(
+                f"the parameters are not those saved in {os.fspath(path)}: {name} {saved}, now {value}"
+            )
     history = History(**{name: arrays[f"history/{name}"] for name in History.__dataclass_fields__})
     return State(jnp.asarray(arrays["vector"]), _restored(arrays, optimizer, path), history)
 
@@ -132,5 +135,5 @@ def _restored(arrays: dict[str, np.ndarray], optimizer: Any, path: str | os.Path
     leaves, structure = jax.tree.flatten(optimizer)
     saved = [arrays[f"optimizer/{i}"] for i in range(sum(name.startswith("optimizer/") for name in arrays))]
     if [leaf.shape for leaf in saved] != [np.shape(leaf) for leaf in leaves]:
-        raise ValueError(f"{os.fspath(path)} was saved with another optimizer: it has arrays of other shapes")
+        raise OsikValueError(f"{os.fspath(path)} was saved with another optimizer: it has arrays of other shapes")
     return jax.tree.unflatten(structure, [jnp.asarray(new, old.dtype) for new, old in zip(saved, leaves, strict=True)])

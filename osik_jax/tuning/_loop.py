@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from .._errors import OsikValueError
 from .._names import leaf_names, replace_named
 from .._structure import is_number
 from ..control import Targets, Tasks, Trajectory, rollout
@@ -62,7 +63,7 @@ class Loop(eqx.Module):
         self.dt = jnp.asarray(dt, robot.q0.dtype)
         taken = [name for name in _PARTS if not callable(tasks) and name in tasks]
         if taken:
-            raise ValueError(f"a task cannot be called {taken[0]!r}: that is another part of the loop; rename it")
+            raise OsikValueError(f"a task cannot be called {taken[0]!r}: that is another part of the loop; rename it")
 
     @property
     def names(self) -> tuple[str, ...]:

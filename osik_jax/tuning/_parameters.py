@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .._errors import OsikTypeError, OsikValueError
 from .._names import find_leaves
 from .._structure import is_number
 from ._loop import Loop
@@ -83,7 +84,9 @@ class ParameterSpace(eqx.Module):
 
     def __init__(self, loop: Loop, parameters: Sequence[str | Parameter]):
         if isinstance(parameters, (str, Parameter)):
-            raise TypeError(f"parameters is a sequence of names and Parameters, not one alone: use [{parameters!r}]")
+            raise OsikTypeError(
+                f"parameters is a sequence of names and Parameters, not one alone: use [{parameters!r}]"
+            )
         numbers = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(loop, is_number))]
         entries = _entries(loop.names, numbers, [_as_parameter(p) for p in parameters])
         self.names = tuple(entry.name for entry in entries)
@@ -158,7 +161,7 @@ class _Entry:
 
 def _as_parameter(given: Any) -> Parameter:
     if not isinstance(given, (str, Parameter)):
-        raise TypeError(f"a parameter is a name or a Parameter, got {given!r}")
+        raise OsikTypeError(f"a parameter is a name or a Parameter, got {given!r}")
     return Parameter(given) if isinstance(given, str) else given
 
 
@@ -168,11 +171,11 @@ def _entries(names: tuple[str, ...], numbers: list[np.ndarray], parameters: list
     for parameter in parameters:
         for leaf in find_leaves(names, parameter.name):
             if leaf in taken:
-                raise ValueError(f"{names[leaf]} is tuned twice, by {taken[leaf]!r} and by {parameter.name!r}")
+                raise OsikValueError(f"{names[leaf]} is tuned twice, by {taken[leaf]!r} and by {parameter.name!r}")
             taken[leaf] = parameter.name
             entries += _entries_of_leaf(names[leaf], leaf, numbers[leaf], parameter)
     if not entries:
-        raise ValueError(f"there is no finite number to tune; numbers: {', '.join(names)}")
+        raise OsikValueError(f"there is no finite number to tune; numbers: {', '.join(names)}")
     return sorted(entries, key=lambda entry: list(taken).index(entry.leaf))
 
 
@@ -195,11 +198,13 @@ def _entry(name: str, leaf: int, place: int, value: float, parameter: Parameter)
     high = np.inf if parameter.upper is None else float(parameter.upper)
     log = _is_log(name, start, low) if parameter.log is None else parameter.log
     if not low < high:
-        raise ValueError(f"{parameter.name}: the lower bound {low} is not below the upper bound {high}")
+        raise OsikValueError(f"{parameter.name}: the lower bound {low} is not below the upper bound {high}")
     if log and not start > 0.0:
-        raise ValueError(f"{name} is {start}; in log space it begins at a positive number: Parameter(..., initial=...)")
+        raise OsikValueError(
+            f"{name} is {start}; in log space it begins at a positive number: Parameter(..., initial=...)"
+        )
     if not low < start < high:
-        raise ValueError(f"{name} begins at {start}, which is not between its bounds, {low} and {high}")
+        raise OsikValueError(f"{name} begins at {start}, which is not between its bounds, {low} and {high}")
     if log:
         with np.errstate(divide="ignore"):
             return _Entry(name, leaf, place, True, start, float(np.log(max(low, 0.0))), float(np.log(high)), 1.0)
@@ -219,4 +224,4 @@ def overlap(space: ParameterSpace, loop: Loop, values: Mapping[str, Any]) -> Non
     for name in values:
         both = [loop.names[leaf] for leaf in find_leaves(loop.names, name) if leaf in tuned]
         if both:
-            raise ValueError(f"{both[0]} is a parameter, so scenarios cannot set it")
+            raise OsikValueError(f"{both[0]} is a parameter, so scenarios cannot set it")

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._errors import OsikKeyError, OsikTypeError, OsikValueError
 from .._names import find_leaves, replace_named
 from .._structure import is_number
 from ..control import Trajectory
@@ -48,7 +49,7 @@ class Scenarios(eqx.Module):
         lengths = {leaf.shape[:1] for leaf in jax.tree.leaves(self)}
         if len(lengths) != 1 or lengths & {(), (0,)}:
             found = ", ".join(str(n[0]) if n else "none" for n in sorted(lengths)) or "nothing is given"
-            raise ValueError(f"scenarios are arrays with one leading axis of one length; lengths: {found}")
+            raise OsikValueError(f"scenarios are arrays with one leading axis of one length; lengths: {found}")
 
     def __len__(self) -> int:
         """How many there are."""
@@ -57,7 +58,7 @@ class Scenarios(eqx.Module):
     def __getitem__(self, which: Any) -> Scenarios:
         """Some of them: a slice, or an array of indices or of booleans."""
         if isinstance(which, int):
-            raise TypeError(f"scenarios are many: use [{which} : {which + 1}]")
+            raise OsikTypeError(f"scenarios are many: use [{which} : {which + 1}]")
         return jax.tree.map(lambda leaf: leaf[which], self)
 
     def fitted(self, loop: Loop) -> Scenarios:
@@ -78,14 +79,14 @@ class Scenarios(eqx.Module):
     def _check_targets(self, loop: Loop) -> None:
         if callable(loop.tasks):
             if self.targets:
-                raise ValueError("targets go with a dict of tasks; a function of time sets them itself")
+                raise OsikValueError("targets go with a dict of tasks; a function of time sets them itself")
             return
         for name, target in self.targets.items():
             if name not in loop.tasks:
-                raise KeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(loop.tasks)}")
+                raise OsikKeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(loop.tasks)}")
             for leaf in jax.tree.leaves(target):
                 if leaf.shape[1:2] != (loop.steps,):
-                    raise ValueError(
+                    raise OsikValueError(
                         f"targets[{name!r}] has shape {leaf.shape}; it is (n, {loop.steps}, ...), one target a tick. "
                         f"For targets that stand still: values={{'{name}.target': ...}}"
                     )
@@ -94,7 +95,7 @@ class Scenarios(eqx.Module):
 def _starts(q0: Array, loop: Loop) -> Float[Array, "n nq"]:
     """In the precision of the loop; configurations of its robot."""
     if q0.shape[1:] != (loop.robot.nq,):
-        raise ValueError(f"q0 has shape {q0.shape}, expected (n, {loop.robot.nq})")
+        raise OsikValueError(f"q0 has shape {q0.shape}, expected (n, {loop.robot.nq})")
     return q0.astype(loop.robot.q0.dtype)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
+from .._errors import OsikTypeError, OsikValueError
 from .._structure import Static, put_together, taken_apart
 from ._evaluate import Evaluation, Problem, check_loss, check_mesh, chunk_size, replicas, replicated, shares
 from ._history import History, State, load_state, save_state
@@ -141,7 +142,7 @@ def _optimizer(given: Any) -> optax.GradientTransformationExtraArgs:
     if given is None:
         return _default_optimizer
     if not (callable(getattr(given, "init", None)) and callable(getattr(given, "update", None))):
-        raise TypeError(f"optimizer is {given!r}; it is an optax.GradientTransformation, such as optax.adam(0.1)")
+        raise OsikTypeError(f"optimizer is {given!r}; it is an optax.GradientTransformation, such as optax.adam(0.1)")
     return optax.with_extra_args_support(given)
 
 
@@ -155,9 +156,9 @@ def _first_state(space: ParameterSpace, optimizer: optax.GradientTransformationE
     if not isinstance(resume, Tuning):
         return load_state(resume, space, fresh.optimizer)
     if resume.space.names != space.names:
-        raise ValueError(f"the parameters are not those to resume: {resume.space.names}, now {space.names}")
+        raise OsikValueError(f"the parameters are not those to resume: {resume.space.names}, now {space.names}")
     if jax.tree.structure(resume.state.optimizer) != jax.tree.structure(fresh.optimizer):
-        raise ValueError("the optimizer is not the one to resume: its state has another structure")
+        raise OsikValueError("the optimizer is not the one to resume: its state has another structure")
     return resume.state
 
 
@@ -182,7 +183,7 @@ def _compiled_step(
         vector, memory, row = _step(numbers, at, memory, batches, static=static, chunks=chunks, optimizer=optimizer)
         row = {name: np.asarray(value) for name, value in row.items()}
         if row["dropped"] == len(scenarios):
-            raise ValueError(
+            raise OsikValueError(
                 f"no training scenario can be kept in iteration {len(state.history)}: each has a loss or gradient "
                 "that is not finite, or a tick that failed on a NaN; look at it with osik_jax.tuning.evaluate"
             )
@@ -233,7 +234,7 @@ def _step(
 def _result(loop: Loop, space: ParameterSpace, state: State, stopped: str) -> Tuning:
     history = state.history
     if not len(history):
-        raise ValueError("iterations is 0: there is nothing to report")
+        raise OsikValueError("iterations is 0: there is nothing to report")
     best = history.best
     vector = jnp.asarray(history.vectors[best])
     return Tuning(

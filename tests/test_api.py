@@ -1,0 +1,121 @@
+"""The short way in: ``solve`` with targets, the assembled problem, frame poses, what is raised."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.tasks import _posture
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+@pytest.fixture(scope="module")
+def tasks(arm):
+    return {"hand": osik.FrameTask(arm, "hand", gain=5.0), "posture": osik.PostureTask(arm)}
+
+
+@pytest.fixture(scope="module")
+def pose(arm):
+    position, rotation = osik.frame_pose(arm, osik.forward_kinematics(arm, arm.q0), "hand")
+    return position + 0.05, rotation @ jaxlie.SO3.from_z_radians(0.3).as_matrix()
+
+
+def test_frame_pose_is_that_of_mujoco(arm):
+    import mujoco
+
+    data = mujoco.MjData(arm.mj_model)
+    data.qpos[:] = arm.mujoco_qpos(arm.q0)
+    mujoco.mj_kinematics(arm.mj_model, data)
+    position, rotation = osik.frame_pose(arm, osik.forward_kinematics(arm, arm.q0), "hand")
+    site = data.site("hand")
+    np.testing.assert_allclose(position, site.xpos, atol=1e-12)
+    np.testing.assert_allclose(rotation, site.xmat.reshape(3, 3), atol=1e-12)
+
+
+class TestTargetsOfSolve:
+    def test_are_as_replaced(self, arm, tasks, pose):
+        wanted = osik.solve(arm, arm.q0, tasks | {"hand": tasks["hand"].replace(target=pose)}).velocity
+        rotation = jaxlie.SO3.from_matrix(pose[1])
+        whole = jnp.eye(4).at[:3, 3].set(pose[0]).at[:3, :3].set(pose[1])
+        rigid = jaxlie.SE3.from_rotation_and_translation(rotation, pose[0])
+        for given in (pose, (pose[0], rotation.wxyz), whole, rigid):
+            found = osik.solve(arm, arm.q0, tasks, targets={"hand": given}).velocity
+            np.testing.assert_allclose(found, wanted, atol=1e-12)
+        assert np.abs(wanted).max() > 0.1
+
+    def test_are_batched_by_vmap(self, arm, tasks, pose):
+        positions = pose[0] + jnp.linspace(-0.02, 0.02, 3)[:, None]
+
+        def velocity(p):
+            return osik.solve(arm, arm.q0, tasks, targets={"hand": (p, pose[1])}).velocity
+
+        np.testing.assert_allclose(jax.vmap(velocity)(positions), [velocity(p) for p in positions], atol=1e-10)
+
+    def test_that_are_wrong_are_refused(self, arm, tasks, pose):
+        with pytest.raises(KeyError, match="'hnad', which is no task; tasks: hand, posture"):
+            osik.solve(arm, arm.q0, tasks, targets={"hnad": pose})
+        with pytest.raises(TypeError, match="targets is a tuple"):
+            osik.solve(arm, arm.q0, tasks, targets=pose)
+        with pytest.raises(osik.OsikError, match="position"):
+            osik.solve(arm, arm.q0, tasks, targets={"hand": np.zeros(5)})
+
+
+class TestBuildProblem:
+    def test_its_answer_is_that_of_solve(self, arm, tasks, pose):
+        for scheme in (osik.WeightedQP(), osik.NullSpace()):
+            wanted = osik.solve(arm, arm.q0, tasks, scheme=scheme, targets={"hand": pose}, dt=0.01)
+            problem = osik.build_problem(arm, arm.q0, tasks, targets={"hand": pose}, dt=0.01)
+            np.testing.assert_allclose(scheme.solve(problem).velocity, wanted.velocity, atol=1e-9)
+
+    def test_has_the_rows_and_the_box(self, arm, tasks):
+        problem = osik.build_problem(arm, arm.q0, tasks, limits=())
+        assert np.isinf(problem.lower).all() and np.isinf(problem.upper).all()
+        kinematics = osik.forward_kinematics(arm, arm.q0)
+        jacobian = osik.frame_jacobian(arm, kinematics, "hand")
+        np.testing.assert_allclose(problem.rows["hand"].jacobian[:3], jacobian[:3], atol=1e-12)
+        own = osik.build_problem(arm, arm.q0, tasks)
+        np.testing.assert_array_less(own.lower, own.upper)
+        assert np.isfinite(own.lower).all()
+
+    def test_refuses_what_solve_refuses(self, arm, tasks):
+        with pytest.raises(osik.OsikError, match="no task"):
+            osik.build_problem(arm, arm.q0, {})
+        wrong: Any = "arm"
+        with pytest.raises(TypeError, match="build_problem"):
+            osik.build_problem(wrong, arm.q0, tasks)
+
+
+def test_errors_are_of_one_family_and_print_plainly(arm):
+    with pytest.raises(osik.OsikError) as caught:
+        osik.FrameTask(arm, "hnad")
+    assert isinstance(caught.value, KeyError)
+    assert str(caught.value).startswith("no frame 'hnad'; did you mean 'hand'?")
+    with pytest.raises(osik.OsikError) as caught:
+        osik.solve(arm, arm.q0[:3], {"p": osik.PostureTask(arm)})
+    assert isinstance(caught.value, ValueError)
+
+
+def test_a_posture_lets_other_tasks_win(arm, pose):
+    background, named = osik.PostureTask(arm), osik.PostureTask(arm, joints=("*",))
+    assert (background.weight == _posture._BACKGROUND).all()
+    assert (named.weight == 1.0).all() and (osik.PostureTask(arm, upper=1.0).weight == 1.0).all()
+    hand = osik.FrameTask(arm, "hand", gain=5.0).replace(target=pose)
+    scheme = osik.WeightedQP(curvature_damping=0.0)  # which would keep the hand back too
+
+    def missed(posture):
+        tasks = {"hand": hand, "posture": posture}
+        return np.abs(osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=()).slack["hand"]).max()
+
+    assert missed(background) < 0.05 * missed(named)
+
+
+def test_what_failed_is_raised_at_the_top_level_too(arm):
+    osik.raise_if_failed(osik.solve(arm, arm.q0, {"p": osik.PostureTask(arm)}))
