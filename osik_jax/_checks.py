@@ -115,10 +115,13 @@ def check_steps(steps: Any) -> None:
         raise OsikValueError(f"steps is {steps!r}; it is the number of ticks, an integer")
 
 
-def check_target_names(tasks: Mapping[str, Task], targets: Any) -> None:
+_BY_TICK = "targets by tick"
+
+
+def check_target_names(tasks: Mapping[str, Task], targets: Any, what: str = "targets") -> None:
     """Raises where targets are no mapping, or for a task that does not exist."""
     if targets is not None and not isinstance(targets, Mapping):
-        raise OsikTypeError(f"targets is a {type(targets).__name__}; it is a dict from task names to targets")
+        raise OsikTypeError(f"targets is a {type(targets).__name__}; it is a dict from task names to {what}")
     for name in targets or {}:
         if name not in tasks:
             raise OsikKeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(tasks)}")
@@ -136,7 +139,7 @@ def check_targets(
             raise OsikValueError("targets go with a dict of tasks; a function of time sets them itself")
         return
     check_tasks(tasks, robot)
-    check_target_names(tasks, targets)
+    check_target_names(tasks, targets, _BY_TICK)
     for name, target in (targets or {}).items():
         for leaf in jax.tree.leaves(target):
             if not eqx.is_array_like(leaf):
