@@ -1,5 +1,6 @@
 """Numba's kernel for weighted QPs: its candidates against the plain method, lane by lane, and against daqp."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ from osik_jax.solvers.qp._problem import QP
 N, M, P = 12, 7, 5
 """Variables, rows of the cost, rows of C: fewer rows than variables. ``MANY`` rows of the cost are more."""
 MANY = 16
+COUNT = 200
 
 
 class Problems(NamedTuple):
@@ -35,7 +37,7 @@ class Problems(NamedTuple):
     damping: np.ndarray
 
 
-def problems(count: int, m: int = M, seed: int = 0, weakest: float = 1e-6) -> Problems:
+def problems(count: int = COUNT, m: int = M, seed: int = 0, weakest: float = 1e-6) -> Problems:
     """Feasible: weights over five decades, dampings from ``weakest``, all kinds of bounds and rows, hard or soft."""
     rng = np.random.default_rng(seed)
     inside = rng.normal(size=(count, N))
@@ -58,12 +60,15 @@ def problems(count: int, m: int = M, seed: int = 0, weakest: float = 1e-6) -> Pr
     )
 
 
-def solved(p: Problems, backend: str = "numba", **options):
-    def one(*data, **options):
-        *given, compliance, damping = data
-        return solve_least_squares_qp(*given, rows_compliance=compliance, damping=damping, backend=backend, **options)
+@partial(jax.jit, static_argnames="backend")
+def solved(p: Problems, backend="numba", warm_start=None):
+    def one(p: Problems, warm_start):
+        *given, compliance, damping = p
+        options = dict(rows_compliance=compliance, damping=damping, warm_start=warm_start)
+        return solve_least_squares_qp(*given, **options, backend=backend)
 
-    return jax.jit(jax.vmap(one))(*map(jnp.asarray, p), **options)
+    none = jnp.zeros((len(p.target), N + P), int)
+    return jax.vmap(one)(p, none if warm_start is None else warm_start)
 
 
 def candidates(p: Problems):
@@ -86,7 +91,7 @@ def assert_same(p: Problems, found, expected) -> None:
 
 @pytest.mark.parametrize("m", [M, MANY])
 def test_lane_by_lane_as_the_plain_method(m):
-    p = problems(400, m)
+    p = problems(m=m)
     found = solved(p)
     assert_same(p, found, solved(p, "jax"))
     assert (found.status == Status.SOLVED).all()
@@ -105,15 +110,15 @@ def test_many_lanes_as_the_plain_method(m):
 
 def test_as_daqp():
     """Hard rows alone, which daqp has too."""
-    p = problems(100, seed=2, weakest=1e-2)._replace(rows_compliance=np.zeros((100, P)))
+    p = problems(seed=2, weakest=1e-2)._replace(rows_compliance=np.zeros((COUNT, P)))
     p = p._replace(rows_lower=np.where(p.rows_lower == p.rows_upper, p.rows_lower, p.rows_lower - 1.0))
     found = solved(p)
     H = np.einsum("bm,bmi,bmj->bij", p.weight, p.matrix, p.matrix) + p.damping[:, :, None] * np.eye(N)
     g = -np.einsum("bm,bmi->bi", p.weight * p.target, p.matrix)
     dense = QPs(H, g, p.lower, p.upper, p.rows, p.rows_lower, p.rows_upper, np.asarray(found.x), np.ones_like(g))
-    expected = [by_daqp(dense, i) for i in range(100)]
+    expected = [by_daqp(dense, i) for i in range(COUNT)]
     claimed = [(i, x) for i, x in enumerate(expected) if x is not None and found.status[i] == Status.SOLVED]
-    assert len(claimed) > 90
+    assert len(claimed) > 0.9 * COUNT
     for i, x in claimed:
         np.testing.assert_allclose(found.x[i], x, atol=1e-6)
 
@@ -135,7 +140,7 @@ def test_recorded_problems(robot, dtype):
 
 
 def test_a_warm_start_costs_one_factorization():
-    p = problems(64, seed=3)
+    p = problems(seed=3)
     cold = solved(p)
     warm = solved(p, warm_start=cold.active)
     np.testing.assert_array_equal(warm.factorizations, 1)
@@ -145,7 +150,7 @@ def test_a_warm_start_costs_one_factorization():
 
 def test_lanes_that_are_left_to_the_search():
     """Rows that cannot hold, numbers that are none, crossed bounds, beside lanes that are as they were alone."""
-    p = problems(20, seed=4)
+    p = problems(seed=4)
     alone = solved(p)
     rows, low, high = p.rows.copy(), p.rows_lower.copy(), p.rows_upper.copy()
     compliance, target, lower = p.rows_compliance.copy(), p.target.copy(), p.lower.copy()
@@ -163,17 +168,17 @@ def test_lanes_that_are_left_to_the_search():
     assert found.status[3] == Status.INFEASIBLE and found.status[7] == Status.NUMERICAL_ERROR
     assert found.status[11] == Status.INFEASIBLE and np.isfinite(found.x).all()
     np.testing.assert_allclose(found.x[3], plain.x[3], atol=1e-8)
-    others = np.setdiff1d(np.arange(20), [3, 7, 11])
+    others = np.setdiff1d(np.arange(COUNT), [3, 7, 11])
     np.testing.assert_array_equal(found.x[others], alone.x[others])
 
 
 def test_one_problem_is_a_lane_of_a_batch():
-    p = problems(20, seed=5)
+    p = problems(seed=5)
     batch = solved(p)
     one = jax.jit(
         lambda *data: solve_least_squares_qp(*data[:8], rows_compliance=data[8], damping=data[9], backend="numba")
     )
-    for i in range(5):
+    for i in range(20):
         alone = one(*(jnp.asarray(a[i]) for a in p))
         np.testing.assert_array_equal(alone.active, batch.active[i])
         np.testing.assert_allclose(alone.x, batch.x[i], rtol=1e-12, atol=1e-14)
@@ -181,7 +186,7 @@ def test_one_problem_is_a_lane_of_a_batch():
 
 def test_derivatives_against_central_differences():
     """Along one direction of all data, forward and reverse."""
-    p = problems(8, seed=6, weakest=1e-1)
+    p = problems(seed=6, weakest=1e-1)
     rng = np.random.default_rng(7)
     way = [rng.normal(size=a.shape) for a in (p.matrix, p.target, p.rows)]
 
@@ -191,10 +196,10 @@ def test_derivatives_against_central_differences():
         return found.x, found.active
 
     step = 1e-6
-    (ahead, same), (behind, _) = moved(step), moved(-step)
+    (ahead, same), (behind, other) = moved(step), moved(-step)
     _, rate = jax.jvp(lambda t: moved(t)[0], (0.0,), (1.0,))
     reverse = jax.grad(lambda t: jnp.sum(moved(t)[0] ** 2))(0.0)
-    kept = np.asarray(same == moved(-step)[1]).all(1)
-    assert kept.sum() >= 6
+    kept = np.asarray(same == other).all(1)
+    assert kept.mean() > 0.9
     np.testing.assert_allclose(rate[kept], ((ahead - behind) / (2 * step))[kept], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(reverse, jnp.sum(2.0 * moved(0.0)[0] * rate), rtol=1e-9)
