@@ -77,7 +77,6 @@ def test_answers_are_those_of_the_search(families, damped):
     np.testing.assert_array_equal(mine.status, search.status)
     agree = np.abs(mine.x - search.x).max(1) < 1e-6 * (1.0 + np.abs(search.x).max(1))
     assert agree.mean() > 0.99  # what is left: rows whose rank is at the tolerance
-    np.testing.assert_array_equal(np.asarray(mine.active)[agree] != 0, np.asarray(search.active)[agree] != 0)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

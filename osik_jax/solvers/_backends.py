@@ -16,6 +16,8 @@ is lowered, not when it is traced (``on_platforms``).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
@@ -81,7 +83,19 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
                 f"backend={kernel!r} has no kernel for problems of this kind, precision or shape; take 'auto'"
             )
         return True
-    return backend == "auto" and fits and installed(kernel) and (kernel != "warp" or cuda_is_default())
+    if not (backend == "auto" and fits and installed(kernel)):
+        return False
+    return cuda_is_default() if kernel == "warp" else _can_be_imported(kernel)
+
+
+@cache
+def _can_be_imported(package: str) -> bool:
+    """Numba refuses releases of NumPy and of Python that are newer than itself."""
+    try:
+        import_module(package)
+    except Exception:
+        return False
+    return True
 
 
 def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., Any], *args: Any) -> Any:

@@ -43,7 +43,7 @@ def land(task: Task, x: Float[Array, " n"], working: WorkingSet, tolerances: Tol
     """
     level = task.level
     held = hold(task, working.hard, tolerances.rank)
-    held = jax.lax.optimization_barrier(held)  # one LAPACK call after another: see osik_jax/_runtime.py
+    held = jax.lax.optimization_barrier(held)  # one LAPACK call after another: see osik_jax/runtime.py
     side = jnp.zeros_like(working.hard).at[held.rows].set(jnp.where(held.valid, working.hard[held.rows], 0))
     counts = working.own != 0
     goal = jnp.where(counts, jnp.where(working.own == 1, level.upper, level.lower), 0.0)

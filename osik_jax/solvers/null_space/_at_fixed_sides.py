@@ -72,7 +72,7 @@ def _descend(decisions: Decision, problem: Problem) -> Answer:
 
 def _level(decision: Decision, room: Room) -> Answer:
     scale, projector = _stop(room, decision)
-    # one factorisation after another: see osik_jax/_runtime.py
+    # one factorisation after another: see osik_jax/runtime.py
     scale, side = jax.lax.optimization_barrier((scale, decision.side))
     x = jnp.where(side != 0, room.bound(side), _settle(room, scale, side, _dual_basis(room.projector, side)))
     return jnp.where(decision.done, x, room.start), projector, jnp.where(decision.done, scale, 0.0)
