@@ -33,6 +33,8 @@ _LATE = 5
 """A loop that is so many periods late starts counting anew instead of catching up."""
 _SWITCH_INTERVAL = 5e-4
 """[s]"""
+_loops: set[int] = set()
+"""Those that run: the last of them gives Python's garbage collection its objects back."""
 
 
 class _Job(NamedTuple):
@@ -110,6 +112,7 @@ class ControlLoop:
         """
         self._switch_interval = sys.getswitchinterval()
         sys.setswitchinterval(min(_SWITCH_INTERVAL, self._switch_interval))
+        _loops.add(id(self))
         atexit.register(self.stop)
         self._compiler.thread.start()
         self._compiler.ask(self._wanted)
@@ -123,7 +126,9 @@ class ControlLoop:
         if self._thread.is_alive():
             self._thread.join()
             sys.setswitchinterval(self._switch_interval)
-            gc.unfreeze()
+            _loops.discard(id(self))
+            if not _loops:
+                gc.unfreeze()
         self._compiler.stop()
 
     def __enter__(self) -> Self:

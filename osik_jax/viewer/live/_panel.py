@@ -169,7 +169,7 @@ class Panel:
     def _add_obstacles(self) -> None:
         gui = self._server.gui
         most = " and ".join(f"{count} {_PLURALS[kind]}" for kind, count in SLOTS.items())
-        gui.add_markdown(f"The robot keeps off what is here: up to {most}. The first is compiled for.")
+        gui.add_markdown(f"The robot keeps off what is here: up to {most}. For the first one, a program is compiled.")
         kinds = gui.add_button_group("Add", tuple(SLOTS))
         kinds.on_click(self._guarded(lambda event: self._add_obstacle(event.target.value)))
         nothing: list[str] = [_NONE]
