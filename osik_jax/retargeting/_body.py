@@ -74,7 +74,8 @@ class Build:
         ankle: how far the ankles are above the soles [m].
         hips: from the root body's origin to the midpoint of the hips [m]. (3,)
         turn: of the root body. (3, 3)
-        scale: robot over person; None: the ratio of their legs.
+        scale: robot over person; None: the ratio of their legs, and stretch.
+        stretch: what that ratio is multiplied with.
         q0: the home configuration. (nq,)
         lower: ends of the joints' ranges [rad or m]. (nv,)
         upper: the other ends. (nv,)
@@ -87,6 +88,7 @@ class Build:
     hips: Float[np.ndarray, "3"]
     turn: Float[np.ndarray, "3 3"]
     scale: float | None
+    stretch: float
     q0: Float[np.ndarray, " nq"]
     lower: Float[np.ndarray, " nv"]
     upper: Float[np.ndarray, " nv"]
@@ -110,6 +112,7 @@ class Build:
             hips=0.5 * (points["left_hip"] + points["right_hip"]) - positions[-1],
             turn=turns[-1],
             scale=profile.scale,
+            stretch=profile.stretch,
             q0=np.asarray(robot.q0),
             lower=np.asarray(robot.position_lower),
             upper=np.asarray(robot.position_upper),
@@ -118,7 +121,7 @@ class Build:
 
     def goals(self, person: Person) -> Goals:
         """What a person asks of the robot: the path is scaled, and the ankles stand as high as the robot's do."""
-        scale = self.leg / person.leg if self.scale is None else self.scale
+        scale = self.stretch * self.leg / person.leg if self.scale is None else self.scale
         root = scale * person.root
         root[:, 2] += self.ankle - scale * person.ankle
         dtype = self.q0.dtype

@@ -28,7 +28,7 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-3, 1e8
 _CALMER, _CAREFUL = 0.3, 4.0
 """Factors of the damping after a step that was good, and after one that was not; the latter doubles each time."""
 
-_LITTLE, _SETTLED = 3e-3, 2
+_LITTLE, _SETTLED = 1e-2, 2
 """A gain that is little, as a share of what the wishes cost, and how many of them in a row are the end."""
 
 
@@ -81,8 +81,8 @@ def make_plan(
 
     Levenberg and Marquardt's method. Bounds that have to hold begin soft and get stiffer with each step that is
     taken, so that limbs find their way before feet and limits pin them down. It ends when two steps in a row gained
-    less than a small part of what the wishes cost, with all bounds at their full stiffness. Steps that were refused count
-    where the bounds are kept.
+    less than a small part of what the wishes cost, with all bounds at their full stiffness. Refused steps
+    count where the bounds are kept.
     """
     identity = jnp.eye(body.robot.nv, dtype=start.dtype)
 

@@ -127,7 +127,7 @@ class Retargeter:
         out: str | os.PathLike[str] | None = None,
         progress: bool = True,
     ) -> list[Retargeted]:
-        """Many clips of any lengths, some at a time in one program for each power of two that lengths go up to.
+        """Many clips of any lengths, some at a time, in one program for all clips of about one length.
 
         Args:
             motions: the clips.
@@ -147,7 +147,7 @@ class Retargeter:
         clips = [self._prepared_by_name(motion, mapping, fps) for motion in motions]
         groups: dict[int, list[int]] = {}
         for i, clip in enumerate(clips):
-            groups.setdefault(_power_of_two(clip.frames), []).append(i)
+            groups.setdefault(_rounded_up(clip.frames), []).append(i)
         found: dict[int, Retargeted] = {}
         shared = (self._body, self.profile.weights, self.limits, np.asarray(self.max_iterations))
         for length, members in sorted(groups.items()):
@@ -226,8 +226,10 @@ def _lane(clip: _Clip, length: int) -> tuple[Goals, Array, Bounds, np.ndarray]:
     return jax.tree.map(np.asarray, (goals, start, clip.bounds, np.asarray(clip.dt)))
 
 
-def _power_of_two(frames: int) -> int:
-    return max(_LENGTHS, 1 << (frames - 1).bit_length())
+def _rounded_up(frames: int) -> int:
+    """A length that clips of about as many frames share: at most a quarter more, and few different ones."""
+    step = max(_LENGTHS, (1 << (frames - 1).bit_length()) // 8)
+    return -(-frames // step) * step
 
 
 @jax.jit
