@@ -89,7 +89,7 @@ def _point(values: Any) -> str:
 def _parsed(text: str, source: str) -> Profile:
     try:
         data = tomllib.loads(text)
-        known = {"pelvis", "torso", "scale", "keypoints", "feet", "weights", "capsules"}
+        known = {"pelvis", "torso", "scale", "stretch", "keypoints", "feet", "weights", "capsules"}
         for name in data:
             if name not in known:
                 raise unknown_name("entry", name, tuple(sorted(known)))
