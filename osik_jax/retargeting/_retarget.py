@@ -214,7 +214,7 @@ class _Clip(NamedTuple):
     person: Person
     frames: int
     goals: Goals
-    start: Array
+    start: np.ndarray
     bounds: Bounds
     dt: float
 
