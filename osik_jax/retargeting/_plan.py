@@ -28,7 +28,7 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-3, 1e8
 _CALMER, _CAREFUL = 0.3, 4.0
 """Factors of the damping after a step that was good, and after one that was not; the latter doubles each time."""
 
-_LITTLE, _SETTLED = 1e-2, 2
+_LITTLE, _SETTLED = 3e-3, 2
 """A gain that is little, as a share of what the wishes cost, and how many of them in a row are the end."""
 
 
