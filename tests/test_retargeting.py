@@ -13,11 +13,13 @@ from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax import cli
+from osik_jax._home import home_kinematics
 from osik_jax.retargeting import (
     HumanMotion,
     Retargeter,
     find_profile,
     find_roles,
+    fit,
     guess_profile,
     load_motion,
     load_profile,
@@ -27,7 +29,7 @@ from osik_jax.retargeting import (
     save_profile,
 )
 from osik_jax.retargeting._banded import BandedSystem, solve_banded
-from osik_jax.retargeting._body import bounds_of, goals_of, home_points
+from osik_jax.retargeting._body import Build, pairs_apart
 from osik_jax.retargeting._contact import find_contact, find_ground
 from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._g1 import g1_urdf
@@ -82,28 +84,27 @@ def test_a_banded_system_is_solved_as_the_dense_one():
 def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
     profile = find_profile(nao)
     person = read_person(load_motion(dance), find_roles(load_motion(dance).joint_names))
-    goals = jax.tree.map(lambda leaf: leaf[7], goals_of(nao, profile, person))
-    body, bounds = Body.of(nao, profile, None), bounds_of(nao, jnp.full(nao.nv, 240.0), 1.0 / FPS)
+    build = Build.of(nao, profile)
+    goals = jax.tree.map(lambda leaf: leaf[7], build.goals(person))
+    body, bounds = Body.of(nao, profile, pairs_apart(nao, profile)[:1]), build.bounds(np.full(nao.nv, 240.0), 1.0 / FPS)
     rng = np.random.default_rng(1)
     q = osik.integrate(nao, nao.q0, jnp.asarray(rng.normal(scale=0.1, size=nao.nv)))
     # where a turn's goal is met the rotation vector's derivative is the angular velocity itself
-    kinematics = osik.forward_kinematics(nao, q)
-    turned = [kinematics.frame_pose(nao, frame)[1] for frame in (profile.pelvis, "l_sole", "r_sole")]
+    turned = home_kinematics(dataclasses.replace(nao, q0=q)).frame_poses(nao, (profile.pelvis, "l_sole", "r_sole"))[1]
     own = [turn @ home.T for turn, home in zip(turned, (body.home[0], body.home[2], body.home[3]), strict=True)]
     goals = dataclasses.replace(goals, pelvis=own[0], feet=jnp.stack(own[1:]))
 
-    def residuals(q):
-        rows = frame_rows(body, q, goals, profile.weights, bounds)
-        return jnp.concatenate([rows.soft.residual, rows.stiff.residual, rows.stance.point.ravel()])
+    @jax.jit
+    @jax.vmap
+    def rows_at(move):
+        return frame_rows(body, osik.integrate(nao, q, move), goals, profile.weights, bounds)
 
-    rows = jax.jit(frame_rows)(body, q, goals, profile.weights, bounds)
-    jacobian = np.concatenate([rows.soft.jacobian, rows.stiff.jacobian, rows.stance.jacobian.reshape(8, -1)])
     step = 1e-6
-    moved = jax.jit(jax.vmap(lambda move: residuals(osik.integrate(nao, q, move))))
-    slopes = np.asarray(moved(step * jnp.eye(nao.nv)) - moved(-step * jnp.eye(nao.nv))).T / (2.0 * step)
-    inside = np.ones(len(slopes), bool)
-    inside[len(rows.soft.residual) + 8 : len(rows.soft.residual) + 8 + len(nao.joint_names)] = False  # ranges
-    np.testing.assert_allclose(slopes[inside], jacobian[inside], atol=2e-8)
+    rows = rows_at(step * jnp.concatenate([jnp.zeros((1, nao.nv)), jnp.eye(nao.nv), -jnp.eye(nao.nv)]))
+    values = np.concatenate([rows.residual, rows.stance], 1)
+    jacobian = np.concatenate([rows.jacobian[0], rows.stance_jacobian[0]])
+    slopes = (values[1 : nao.nv + 1] - values[nao.nv + 1 :]).T / (2.0 * step)
+    np.testing.assert_allclose(slopes, jacobian, atol=2e-8)
 
 
 def test_nao_dances_with_its_feet_where_they_are(nao, danced):
@@ -280,7 +281,9 @@ def test_a_guess_sees_the_same_robot(nao):
     same = {role for role in NEEDED if guess.keypoints[role] == own.keypoints[role]}
     assert same == set(NEEDED) - {"left_wrist", "right_wrist", "left_hip", "right_hip"}
     assert guess.keypoints["left_wrist"][0] == "l_gripper"
-    np.testing.assert_allclose(home_points(nao, guess)["left_hip"], home_points(nao, own)["left_hip"], atol=1e-9)
+    np.testing.assert_allclose(
+        Build.of(nao, guess).points["left_hip"], Build.of(nao, own).points["left_hip"], atol=1e-9
+    )
     assert guess.feet == own.feet and guess.pelvis == "torso" and guess.torso is None
 
 
@@ -318,6 +321,7 @@ def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
         ("limb = 1.0", "limb = -1.0", "weights.limb is -1.0"),
         ("left_hip = ", "left_hips = ", "no keypoints left_hip"),
         ("scale = 0.8", "scale = 0.0", "scale is 0.0"),
+        ("scale = 0.8", "stretch = 0.0", "stretch is 0.0"),
         ("[feet.left]", "[feet.left", "is no TOML"),
         ("radius = ", "radius = -", "radius and the length have to be more than 0"),
     ):
@@ -334,3 +338,24 @@ def test_clips_that_are_too_short_or_lack_joints_are_refused(nao, dance):
         retarget(nao, short)
     with pytest.raises(ValueError, match="has no left_hip"):
         retarget(nao, HumanMotion("clip", 30.0, ("Hips",), np.zeros((5, 1, 3))))
+
+
+@pytest.mark.slow
+def test_a_fit_lowers_the_loss_of_what_it_learns_from(nao, dance, tmp_path):
+    motion = load_motion(dance)
+    start = load_profile("nao")
+    start = dataclasses.replace(start, weights=dataclasses.replace(start.weights, smooth=2.0))
+    found = fit(nao, [motion], profile=start, held_out=[motion], steps=4)
+    assert found.before["train"] == found.before["held_out"]
+    assert found.losses.min() < 0.95 * found.losses[0]
+    assert found.after["train"]["total"] < found.before["train"]["total"]
+    assert float(found.profile.weights.smooth) < 2.0
+    save_profile(found.profile, tmp_path / "robot.toml")
+    assert load_profile(tmp_path / "robot.toml") == found.profile
+
+
+def test_a_fit_needs_clips_and_steps(nao, dance):
+    with pytest.raises(ValueError, match="no clips to learn from"):
+        fit(nao, [])
+    with pytest.raises(ValueError, match="steps is 0"):
+        fit(nao, [load_motion(dance)], steps=0)

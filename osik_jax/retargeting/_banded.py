@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
+from jax import lax
 from jaxtyping import Array, Float
 
 
@@ -28,32 +27,37 @@ def solve_banded(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Arra
     """The solution x of ``system x = right``, by a Cholesky factorisation from the first block to the last.
 
     With L the factor, row t of blocks is ``L2 = S L[t-2]^-T`` (two frames back), ``L1 = (B - L2 L1[t-1]^T) L[t-1]^-T``
-    and ``L L^T = A - L1 L1^T - L2 L2^T``.
+    and ``L L^T = A - L1 L1^T - L2 L2^T``. The blocks on the diagonal are kept as inverses: of blocks this small,
+    products take a third of the time of substitutions.
     """
     n = right.shape[-1]
     identity, zero = jnp.eye(n, dtype=right.dtype), jnp.zeros((n, n), right.dtype)
+    none = jnp.zeros(n, right.dtype)
     first = system.first.at[0].set(0.0)
     second = system.second.at[:2].set(0.0)
 
     def down(carry, row):
-        factor1, factor2, below1, y1, y2 = carry
+        inverse1, inverse2, below1, y1, y2 = carry
         diagonal, one_back, two_back, b = row
-        far = solve_triangular(factor2, jnp.diag(two_back), lower=True).T
-        near = solve_triangular(factor1, (one_back - far @ below1.T).T, lower=True).T
-        factor = jnp.linalg.cholesky(diagonal - near @ near.T - far @ far.T)
-        y = solve_triangular(factor, b - near @ y1 - far @ y2, lower=True)
-        return (factor, factor1, near, y, y1), (factor, near, far, y)
+        far = two_back[:, None] * inverse2.T
+        near = (one_back - far @ below1.T) @ inverse1.T
+        both = jnp.concatenate([near, far], 1)
+        factor = lax.linalg.cholesky(diagonal - both @ both.T, symmetrize_input=False)
+        inverse = lax.linalg.triangular_solve(factor, identity, left_side=True, lower=True)
+        y = inverse @ (b - near @ y1 - far @ y2)
+        return (inverse, inverse1, near, y, y1), (inverse, near, y)
 
-    start = (identity, identity, zero, jnp.zeros(n, right.dtype), jnp.zeros(n, right.dtype))
-    _, (factor, near, far, y) = jax.lax.scan(down, start, (system.diagonal, first, second, right))
+    _, (inverse, near, y) = lax.scan(
+        down, (identity, identity, zero, none, none), (system.diagonal, first, second, right)
+    )
 
     def up(carry, row):
-        x1, x2, near1, far2, far1 = carry
-        factor, near, far, y = row
-        x = solve_triangular(factor, y - near1.T @ x1 - far2.T @ x2, lower=True, trans="T")
-        return (x, x1, near, far1, far), x
+        x1, x2, near1 = carry
+        inverse, near, y, two_on = row
+        # row t + 2 couples to t by L2 = S L[t]^-T, so that L2^T x = L[t]^-1 S x
+        x = inverse.T @ (y - near1.T @ x1 - inverse @ (two_on * x2))
+        return (x, x1, near), x
 
-    # the block that couples frame t to t + 2 was made in row t + 2, so it arrives two steps late on the way back
-    start = (jnp.zeros(n, right.dtype), jnp.zeros(n, right.dtype), zero, zero, zero)
-    _, x = jax.lax.scan(up, start, (factor, near, far, y), reverse=True)
+    two_on = jnp.roll(second, -2, 0)
+    _, x = lax.scan(up, (none, none, zero), (inverse, near, y, two_on), reverse=True)
     return x

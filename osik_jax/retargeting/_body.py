@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+from collections.abc import Mapping
 
-import jax.numpy as jnp
+import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from .._home import home_kinematics
@@ -19,24 +21,32 @@ from ._profile import Profile
 from ._terms import Bounds
 
 JOINTS_APART = 3
+_CAPSULE = "capsule "
 _INSET, _SHARE = 1e-3, 0.98
 
 
 def shapes_apart(robot: Robot, profile: Profile) -> CollisionAvoidanceLimit | None:
     """What keeps the profile's capsules apart: those with three joints and more between them that are apart at home."""
     shapes = {
-        f"capsule {i}": CollisionShape.capsule(c.radius, c.start, c.end, frame=c.frame)
+        f"{_CAPSULE}{i}": CollisionShape.capsule(c.radius, c.start, c.end, frame=c.frame)
         for i, c in enumerate(profile.capsules)
     }
     bodies = [robot.tree.frame_bodies[robot.tree.frame(c.frame)] for c in profile.capsules]
     pairs = [
-        (f"capsule {i}", f"capsule {j}")
+        (f"{_CAPSULE}{i}", f"{_CAPSULE}{j}")
         for i, j in itertools.combinations(range(len(bodies)), 2)
         if joints_between(robot, bodies[i], bodies[j]) >= JOINTS_APART
     ]
     if not pairs:
         return None
     return CollisionAvoidanceLimit(robot, pairs=pairs, shapes=shapes, minimum_distance=0.0, q0_distance=0.0)
+
+
+def pairs_apart(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
+    """The pairs of ``shapes_apart``, as numbers of the profile's capsules."""
+    apart = shapes_apart(robot, profile)
+    named = [] if apart is None else apart.scene.pair_names
+    return [(int(a.removeprefix(_CAPSULE)), int(b.removeprefix(_CAPSULE))) for a, b in named]
 
 
 def joints_between(robot: Robot, a: int, b: int) -> int:
@@ -54,69 +64,88 @@ def joints_between(robot: Robot, a: int, b: int) -> int:
     return first.index(common) + second.index(common)
 
 
-def leg_length(robot: Robot, profile: Profile) -> float:
-    """Thigh and shank at home, the mean of both legs [m]."""
-    points = home_points(robot, profile)
-    return 0.5 * float(sum(np.linalg.norm(points[b] - points[a]) for a, b in LIMBS[:4]))
+@dataclasses.dataclass(frozen=True)
+class Build:
+    """How a robot with its profile is built, measured at home; NumPy throughout, for work clip by clip.
 
+    Attributes:
+        points: where the keypoints are [m]. (3,) each
+        leg: thigh and shank, the mean of both legs [m].
+        ankle: how far the ankles are above the soles [m].
+        hips: from the root body's origin to the midpoint of the hips [m]. (3,)
+        turn: of the root body. (3, 3)
+        scale: robot over person; None: the ratio of their legs, and stretch.
+        stretch: what that ratio is multiplied with.
+        q0: the home configuration. (nq,)
+        lower: ends of the joints' ranges [rad or m]. (nv,)
+        upper: the other ends. (nv,)
+        speed: limits [rad/s or m/s]. (nv,)
+    """
 
-def ankle_height(robot: Robot, profile: Profile) -> float:
-    """How far the ankles are above the soles at home [m]."""
-    points, kinematics = home_points(robot, profile), home_kinematics(robot)
-    soles = []
-    for frame, point in profile.corners:
-        position, rotation = kinematics.frame_pose(robot, frame)
-        soles.append(float((position + rotation @ jnp.array(point))[2]))
-    ankles = [points[f"{side}_ankle"][2] for side in SIDES]
-    return float(np.mean(ankles) - np.mean(soles))
+    points: Mapping[str, Float[np.ndarray, "3"]]
+    leg: float
+    ankle: float
+    hips: Float[np.ndarray, "3"]
+    turn: Float[np.ndarray, "3 3"]
+    scale: float | None
+    stretch: float
+    q0: Float[np.ndarray, " nq"]
+    lower: Float[np.ndarray, " nv"]
+    upper: Float[np.ndarray, " nv"]
+    speed: Float[np.ndarray, " nv"]
 
+    @classmethod
+    def of(cls, robot: Robot, profile: Profile) -> Build:
+        """The measures of a robot."""
+        kinematics = jax.tree.map(np.asarray, home_kinematics(robot))
+        root = robot.tree.body_names[robot.tree.root]
+        places = [*profile.keypoints.values(), *profile.corners, (root, (0.0, 0.0, 0.0))]
+        positions, turns = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
+        positions = positions + np.einsum("kij,kj->ki", turns, np.array([point for _, point in places]))
+        points = dict(zip(profile.keypoints, positions, strict=False))
+        soles = positions[len(points) : -1, 2]
+        ankles = [points[f"{side}_ankle"][2] for side in SIDES]
+        return cls(
+            points=points,
+            leg=0.5 * float(sum(np.linalg.norm(points[b] - points[a]) for a, b in LIMBS[:4])),
+            ankle=float(np.mean(ankles) - np.mean(soles)),
+            hips=0.5 * (points["left_hip"] + points["right_hip"]) - positions[-1],
+            turn=turns[-1],
+            scale=profile.scale,
+            stretch=profile.stretch,
+            q0=np.asarray(robot.q0),
+            lower=np.asarray(robot.position_lower),
+            upper=np.asarray(robot.position_upper),
+            speed=np.asarray(robot.velocity_limit),
+        )
 
-def home_points(robot: Robot, profile: Profile) -> dict[str, Float[np.ndarray, "3"]]:
-    """Where the keypoints are at home [m]."""
-    kinematics, out = home_kinematics(robot), {}
-    for role, (frame, point) in profile.keypoints.items():
-        position, rotation = kinematics.frame_pose(robot, frame)
-        out[role] = np.asarray(position) + np.asarray(rotation) @ np.array(point)
-    return out
+    def goals(self, person: Person) -> Goals:
+        """What a person asks of the robot: the path is scaled, and the ankles stand as high as the robot's do."""
+        scale = self.stretch * self.leg / person.leg if self.scale is None else self.scale
+        root = scale * person.root
+        root[:, 2] += self.ankle - scale * person.ankle
+        dtype = self.q0.dtype
+        return Goals(
+            directions=person.directions.astype(dtype),
+            pelvis=person.pelvis.astype(dtype),
+            torso=person.torso.astype(dtype),
+            root=root.astype(dtype),
+            feet=person.feet.astype(dtype),
+            contact=person.contact.astype(dtype),
+            present=np.ones(len(root), dtype),
+        )
 
+    def first_guess(self, goals: Goals) -> Float[np.ndarray, "F nq"]:
+        """The home posture with the pelvis where and as the person's is."""
+        turn = np.asarray(goals.pelvis)
+        q = np.tile(self.q0, (len(turn), 1))
+        q[:, :3] = np.asarray(goals.root) - turn @ self.hips
+        q[:, 3:7] = Rotation.from_matrix(turn @ self.turn).as_quat(scalar_first=True)
+        return q
 
-def goals_of(robot: Robot, profile: Profile, person: Person) -> Goals:
-    """What a person asks of the robot: the path is scaled, and the ankles stand as high as the robot's do."""
-    scale = leg_length(robot, profile) / person.leg if profile.scale is None else profile.scale
-    root = scale * person.root
-    root[:, 2] += ankle_height(robot, profile) - scale * person.ankle
-    dtype = robot.q0.dtype
-    return Goals(
-        directions=jnp.asarray(person.directions, dtype),
-        pelvis=jnp.asarray(person.pelvis, dtype),
-        torso=jnp.asarray(person.torso, dtype),
-        root=jnp.asarray(root, dtype),
-        feet=jnp.asarray(person.feet, dtype),
-        contact=jnp.asarray(person.contact, dtype),
-        present=jnp.ones(len(root), dtype),
-    )
-
-
-def first_guess(robot: Robot, profile: Profile, goals: Goals) -> Float[Array, "F nq"]:
-    """The home posture with the pelvis where and as the person's is."""
-    points, kinematics = home_points(robot, profile), home_kinematics(robot)
-    root = robot.tree.body_names[robot.tree.root]
-    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, root))
-    hips = 0.5 * (points["left_hip"] + points["right_hip"]) - position
-    turn = np.asarray(goals.pelvis)
-    q = np.tile(np.asarray(robot.q0), (len(turn), 1))
-    q[:, :3] = np.asarray(goals.root) - turn @ hips
-    q[:, 3:7] = Rotation.from_matrix(turn @ rotation).as_quat(scalar_first=True)
-    return jnp.asarray(q, robot.q0.dtype)
-
-
-def bounds_of(robot: Robot, acceleration: Float[Array, " nv"], dt: float) -> Bounds:
-    """What joints may do in the plan: a little less than they can, so that the last pass has room."""
-    lower, upper = robot.position_lower, robot.position_upper
-    inset = jnp.minimum(_INSET, 0.01 * (upper - lower))
-    return Bounds(
-        lower=lower + inset,
-        upper=upper - inset,
-        step=_SHARE * robot.velocity_limit * dt,
-        change=_SHARE * acceleration * dt**2,
-    )
+    def bounds(self, acceleration: Float[np.ndarray, " nv"], dt: float) -> Bounds:
+        """What joints may do in the plan: a little less than they can, so that the last pass has room."""
+        inset = np.minimum(_INSET, 0.01 * (self.upper - self.lower))
+        step, change = _SHARE * self.speed * dt, _SHARE * np.asarray(acceleration) * dt**2
+        bounds = Bounds(self.lower + inset, self.upper - inset, step, change)
+        return Bounds(*(x.astype(self.q0.dtype) for x in bounds))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import re
 from typing import NamedTuple
 
@@ -13,13 +15,17 @@ from .._home import home_kinematics
 from ..kinematics import Kinematics
 from ..physics._world import contact_corners, sole_points
 from ..robot import Robot
+from ._body import JOINTS_APART, joints_between
 from ._person import SIDES
 from ._profile import Capsule, Foot, Place, Point, Profile
 
 _FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
 _LEG_RADIUS, _ARM_RADIUS, _TRUNK_RADIUS = 0.18, 0.18, 0.3
 _HAND = 0.6
-_SAME = 1e-6
+_LEAST_MASS, _THINNEST, _WIDE, _LONG = 3e-3, 0.1, 1.6, 0.9
+"""Links that count, as a share of the robot's mass; what is flatter is not trusted; a trunk that is wider gets two
+capsules; how much of an ellipsoid's length a capsule has."""
+_SAME, _ROOM = 1e-6, 6e-3
 _ORIGIN: Point = (0.0, 0.0, 0.0)
 
 
@@ -159,7 +165,84 @@ def _pair(points: np.ndarray) -> tuple[Point, Point]:
 
 
 def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[Capsule, ...]:
-    """Limbs as capsules from joint to joint, hands that go on, and the trunk as one that ends below its shoulders."""
+    """Links as their masses show them; limbs whose links say nothing as capsules from joint to joint."""
+    seen, tree = _massive(robot, (profile.pelvis, profile.torso)), robot.tree
+    bodies = {tree.frame_bodies[tree.frame(capsule.frame)] for capsule in seen}
+
+    def is_seen(frame: str, end: str | None) -> bool:
+        first = tree.frame_bodies[tree.frame(frame)]
+        below = set(np.flatnonzero(tree.descendants[first]).tolist())
+        behind = (
+            set() if end is None else set(np.flatnonzero(tree.descendants[tree.frame_bodies[tree.frame(end)]]).tolist())
+        )
+        return bool(bodies & (below - behind))
+
+    plain = _plain_capsules(kinematics, profile, robot)
+    missing = [capsule for capsule, end in plain if not is_seen(capsule.frame, end)]
+    return _apart_at_home(robot, kinematics, [*seen, *missing])
+
+
+def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule]) -> tuple[Capsule, ...]:
+    """Capsules made thinner, by up to a half, that overlap at home: such pairs would not be kept apart."""
+    tree, out = robot.tree, []
+    bodies = [tree.frame_bodies[tree.frame(c.frame)] for c in capsules]
+    poses = [kinematics.frame_pose(robot, c.frame) for c in capsules]
+    axes = [[np.asarray(p) + np.asarray(R) @ np.array(x) for x in (c.start, c.end)]
+            for c, (p, R) in zip(capsules, poses, strict=True)]  # fmt: skip
+    share = np.ones(len(capsules))
+    for i, j in itertools.combinations(range(len(capsules)), 2):
+        if joints_between(robot, bodies[i], bodies[j]) < JOINTS_APART:
+            continue
+        between = _between(*axes[i], *axes[j]) - _ROOM
+        most = between / (capsules[i].radius + capsules[j].radius)
+        if 0.5 < most < 1.0:
+            share[[i, j]] = np.minimum(share[[i, j]], most)
+    for capsule, factor in zip(capsules, share, strict=True):
+        out.append(dataclasses.replace(capsule, radius=round(float(factor) * capsule.radius, 6)))
+    return tuple(out)
+
+
+def _between(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float:
+    """How far the segment from a to b is from that from c to d, by 33 points of each [m]."""
+    along = np.linspace(0.0, 1.0, 33)[:, None]
+    first, second = a + along * (b - a), c + along * (d - c)
+    return float(np.linalg.norm(first[:, None] - second[None], axis=-1).min())
+
+
+def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
+    """Each link as the solid ellipsoid of its inertia, and that as one capsule; a wide trunk as two side by side.
+
+    An ellipsoid of semi-axes a, b, c and mass m turns about the first with ``m (b^2 + c^2) / 5``.
+    """
+    model, out = robot.mj_model, []
+    names = set(robot.frame_names)
+    for body in range(1, model.nbody):
+        mass, inertia = float(model.body_mass[body]), model.body_inertia[body]
+        name = model.body(body).name
+        if name not in names or not mass > _LEAST_MASS * float(model.body_mass.sum()):
+            continue
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body_iquat[body])
+        axes = np.sqrt(np.maximum(2.5 / mass * (inertia.sum() - 2.0 * inertia), 0.0))
+        long, wide, thin = np.argsort(-axes)
+        if not axes[thin] > _THINNEST * axes[long]:
+            continue
+        apart = name in trunk and axes[wide] > _WIDE * axes[thin]
+        radius = float(axes[thin] if apart else 0.5 * (axes[wide] + axes[thin]))
+        along, aside = turn.reshape(3, 3)[:, long], turn.reshape(3, 3)[:, wide]
+        reach = max(_LONG * axes[long] - radius, 0.05 * radius)
+        for shift in (axes[wide] - radius, radius - axes[wide]) if apart else (0.0,):
+            centre = model.body_ipos[body] + shift * aside
+            ends = _pair(np.stack([centre - reach * along, centre + reach * along]))
+            out.append(Capsule(name, *ends, round(radius, 6)))
+    return out
+
+
+def _plain_capsules(kinematics: Kinematics, profile: Profile, robot: Robot) -> list[tuple[Capsule, str | None]]:
+    """Limbs as capsules from joint to joint, hands that go on, and the trunk as one that ends below its shoulders.
+
+    With each, the frame where what it stands for ends; None: nowhere before the end of the limb.
+    """
 
     def place(role: str) -> np.ndarray:
         frame, point = profile.keypoints[role]
@@ -184,15 +267,17 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
             along = (end - start) / length
             frame = profile.keypoints[f"{side}_{a}"][0]
             ends = inside(frame, start + radius * along, end - 0.5 * radius * along)
-            out.append(Capsule(frame, *ends, round(radius, 6)))
+            out.append((Capsule(frame, *ends, round(radius, 6)), profile.keypoints[f"{side}_{b}"][0]))
         elbow, wrist = place(f"{side}_elbow"), place(f"{side}_wrist")
         radius = 1.2 * _ARM_RADIUS * float(np.linalg.norm(wrist - elbow))
         frame = profile.keypoints[f"{side}_wrist"][0]
-        out.append(Capsule(frame, *inside(frame, wrist, wrist + _HAND * (wrist - elbow)), round(radius, 6)))
+        ends = inside(frame, wrist, wrist + _HAND * (wrist - elbow))
+        out.append((Capsule(frame, *ends, round(radius, 6)), None))
     shoulders, hips = ([place(f"{side}_{role}") for side in SIDES] for role in ("shoulder", "hip"))
     top, bottom = 0.5 * (shoulders[0] + shoulders[1]), 0.5 * (hips[0] + hips[1])
     radius = _TRUNK_RADIUS * float(np.linalg.norm(shoulders[0] - shoulders[1]))
     trunk = profile.torso or profile.pelvis
     up = (top - bottom) / np.linalg.norm(top - bottom)
     ends = inside(trunk, bottom + 1.5 * radius * up, top - 0.5 * radius * up)
-    return (*out, Capsule(trunk, *ends, round(radius, 6)))
+    arm = profile.keypoints["left_shoulder"][0]
+    return [*out, (Capsule(trunk, *ends, round(radius, 6)), arm)]

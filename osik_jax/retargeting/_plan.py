@@ -16,7 +16,7 @@ from .._joint_selection import scalar_layout
 from ..kinematics import difference, integrate
 from ._banded import BandedSystem, solve_banded
 from ._goals import Goals, Weights
-from ._terms import Body, Bounds, Stance, frame_rows
+from ._terms import Body, Bounds, frame_rows
 
 _LARGEST_STEP = 0.5
 """Of any dof in an iteration [rad or m]: what the linear model is good for."""
@@ -81,7 +81,8 @@ def make_plan(
 
     Levenberg and Marquardt's method. Bounds that have to hold begin soft and get stiffer with each step that is
     taken, so that limbs find their way before feet and limits pin them down. It ends when two steps in a row gained
-    less than a small part of what the wishes cost, with all bounds at their full stiffness.
+    less than a small part of what the wishes cost, with all bounds at their full stiffness. Refused steps
+    count where the bounds are kept.
     """
     identity = jnp.eye(body.robot.nv, dtype=start.dtype)
 
@@ -99,7 +100,8 @@ def make_plan(
         factor = jnp.where(better, _CALMER, state.growth)
         damping = jnp.clip(state.damping * factor, _LEAST_DAMPING, _MOST_DAMPING)
         growth = jnp.where(better, _CAREFUL, 2.0 * state.growth)
-        little = better & (state.stiffness >= 1.0) & (before - after < _LITTLE * there.soft)
+        kept = here.stiff < _LITTLE * here.soft
+        little = (state.stiffness >= 1.0) & (before - after < _LITTLE * here.soft) & (better | kept)
         settled = jnp.where(little, state.settled + 1, jnp.where(better, 0, state.settled))
         ready = jnp.where(better, before - after < _SLOWING * before, state.ready)
         stuck = ~better & (state.damping >= _MOST_DAMPING)
@@ -165,46 +167,37 @@ def _linearised(
     body: Body, q: Float[Array, "F nq"], goals: Goals, weights: Weights, bounds: Bounds, stiffness: Float[Array, ""]
 ) -> _Linearised:
     rows = jax.vmap(lambda x, g: frame_rows(body, x, g, weights, bounds))(q, goals)
-    soft_weight = rows.soft.weight * goals.present[:, None]
-    stiff_weight = rows.stiff.weight * goals.present[:, None]
-    jacobian = jnp.concatenate([rows.soft.jacobian, rows.stiff.jacobian], 1)
-    residual = jnp.concatenate([rows.soft.residual, rows.stiff.residual], 1)
-    weighted = jacobian * jnp.concatenate([soft_weight, stiffness * stiff_weight], 1)[..., None]
-    diagonal = jnp.matmul(jnp.swapaxes(weighted, 1, 2), jacobian)
-    gradient = jnp.einsum("fmi,fm->fi", weighted, residual)
-    soft = 0.5 * jnp.sum(soft_weight * rows.soft.residual**2)
-    stiff = 0.5 * jnp.sum(stiff_weight * rows.stiff.residual**2)
-    system = BandedSystem(diagonal, jnp.zeros_like(diagonal), jnp.zeros_like(gradient))
+    there, own = goals.present[:, None], rows.joints
+    weight = there * (rows.soft + stiffness * rows.stiff)
+    # standing points do not move from one frame to the next: p_t - p_t-1, with derivatives in both frames
+    point, moving = rows.stance, rows.stance_jacobian
+    move = point - jnp.roll(point, 1, 0)
+    held = jnp.repeat(_weights_between(goals, weights), 2, axis=-1)
+    soft = 0.5 * (jnp.sum(there * rows.soft * rows.residual**2) + jnp.sum(there * own.soft_weight * own.soft**2))
+    stiff = jnp.sum(there * rows.stiff * rows.residual**2) + jnp.sum(there * own.stiff_weight * own.stiff**2)
+    stiff = 0.5 * (stiff + jnp.sum(held * move**2))
+    held = stiffness * held
+    jacobian = jnp.concatenate([rows.jacobian, moving], 1)
+    square = jnp.concatenate([weight, held + jnp.roll(held, -1, 0)], 1)
+    pull = jnp.concatenate([weight * rows.residual, held * move - jnp.roll(held * move, -1, 0)], 1)
+    diagonal = jnp.matmul(jnp.swapaxes(jacobian * square[..., None], 1, 2), jacobian)
+    first = -jnp.matmul(jnp.swapaxes(moving * held[..., None], 1, 2), jnp.roll(moving, 1, 0))
+    gradient = jnp.sum(jacobian * pull[..., None], 1)
+    gradient += there * (own.soft_weight * own.soft + stiffness * own.stiff_weight * own.stiff)
+    alone = there * (own.soft_weight + stiffness * own.stiff_weight)
+    system = BandedSystem(diagonal, first, jnp.zeros_like(gradient))
     here = _Linearised(system, gradient, soft, stiff)
-    here = _with_standing_points(here, rows.stance, _weights_between(goals, weights), stiffness)
-    return _with_steps(here, *_between(body, q, goals, weights, bounds, stiffness))
+    return _with_steps(here, alone, *_between(body, q, goals, weights, bounds, stiffness))
 
 
-def _with_standing_points(here: _Linearised, stance: Stance, weight: Float[Array, "F 4"], stiffness) -> _Linearised:
-    """Standing points do not move from one frame to the next: ``p_t - p_t-1``, with derivatives in both frames."""
-    frames, n = here.gradient.shape
-    own, point = stance.jacobian.reshape(frames, 8, n), stance.point.reshape(frames, 8)
-    before = jnp.roll(own, 1, 0)
-    move, weight = point - jnp.roll(point, 1, 0), jnp.repeat(weight, 2, axis=-1)
-    stiff = here.stiff + 0.5 * jnp.sum(weight * move**2)
-    weight = stiffness * weight
-    weighted, weighted_before = (jnp.swapaxes(x * weight[..., None], 1, 2) for x in (own, before))
-    back = jnp.roll(jnp.matmul(weighted_before, before), -1, 0)
-    diagonal = here.system.diagonal + jnp.matmul(weighted, own) + back
-    first = here.system.first - jnp.matmul(weighted, before)
-    pulled_back = jnp.roll(jnp.einsum("fim,fm->fi", weighted_before, move), -1, 0)
-    gradient = here.gradient + jnp.einsum("fim,fm->fi", weighted, move) - pulled_back
-    return _Linearised(here.system._replace(diagonal=diagonal, first=first), gradient, here.soft, stiff)
-
-
-def _with_steps(here: _Linearised, steps: _Hinge, changes: _Hinge) -> _Linearised:
-    """Speeds and accelerations, in all dofs apart.
+def _with_steps(here: _Linearised, alone: Float[Array, "F nv"], steps: _Hinge, changes: _Hinge) -> _Linearised:
+    """What dofs cost by themselves, with their speeds and accelerations.
 
     ``step_t = q_t+1 - q_t`` has derivatives (-1, 1), ``change_t = q_t+2 - 2 q_t+1 + q_t`` has (1, -2, 1).
     """
     n = here.gradient.shape[-1]
     w, c = steps.weight, changes.weight
-    main = jnp.zeros_like(here.gradient).at[:-1].add(w).at[1:].add(w)
+    main = alone.at[:-1].add(w).at[1:].add(w)
     main = main.at[:-2].add(c).at[1:-1].add(4.0 * c).at[2:].add(c)
     near = jnp.zeros_like(main).at[1:].add(-w).at[1:-1].add(-2.0 * c).at[2:].add(-2.0 * c)
     far = here.system.second.at[2:].add(c)

@@ -48,7 +48,8 @@ class Profile:
         torso: the frame that turns as the person's chest; None: the robot's trunk does not bend.
         feet: the left and the right foot.
         capsules: shapes that are kept from each other and above the floor.
-        scale: robot over person: what the person's path is multiplied with; None: the ratio of their legs.
+        scale: robot over person: what the person's path is multiplied with; None: the ratio of their legs, and stretch.
+        stretch: what the ratio of legs is multiplied with.
         weights: of what the robot is asked for.
     """
 
@@ -58,6 +59,7 @@ class Profile:
     feet: Mapping[str, Foot]
     capsules: tuple[Capsule, ...] = ()
     scale: float | None = None
+    stretch: float = 1.0
     weights: Weights = dataclasses.field(default_factory=Weights)
 
     def __post_init__(self) -> None:
@@ -68,6 +70,8 @@ class Profile:
             raise ValueError(f"the profile has feet {', '.join(self.feet) or 'none'}; it needs left and right")
         if self.scale is not None and not self.scale > 0.0:
             raise ValueError(f"scale is {self.scale}; it is robot over person, more than 0")
+        if not self.stretch > 0.0:
+            raise ValueError(f"stretch is {self.stretch}; it has to be more than 0")
 
     @property
     def frames(self) -> tuple[str, ...]:

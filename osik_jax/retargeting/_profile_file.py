@@ -66,6 +66,7 @@ def profile_text(profile: Profile) -> str:
     lines = [f'pelvis = "{profile.pelvis}"']
     lines += [] if profile.torso is None else [f'torso = "{profile.torso}"']
     lines += [] if profile.scale is None else [f"scale = {profile.scale!r}"]
+    lines += [] if profile.stretch == 1.0 else [f"stretch = {profile.stretch!r}"]
     lines += ["", "[keypoints]"]
     lines += [f'{role} = {{ frame = "{f}", point = {_point(p)} }}' for role, (f, p) in profile.keypoints.items()]
     for side, foot in profile.feet.items():
@@ -88,7 +89,7 @@ def _point(values: Any) -> str:
 def _parsed(text: str, source: str) -> Profile:
     try:
         data = tomllib.loads(text)
-        known = {"pelvis", "torso", "scale", "keypoints", "feet", "weights", "capsules"}
+        known = {"pelvis", "torso", "scale", "stretch", "keypoints", "feet", "weights", "capsules"}
         for name in data:
             if name not in known:
                 raise unknown_name("entry", name, tuple(sorted(known)))
@@ -99,6 +100,7 @@ def _parsed(text: str, source: str) -> Profile:
             feet={side: _foot(_entry(data, "feet"), side) for side in SIDES},
             capsules=tuple(_capsule(entry, i) for i, entry in enumerate(data.get("capsules", ()))),
             scale=data.get("scale"),
+            stretch=data.get("stretch", 1.0),
             weights=_weights(data.get("weights", {})),
         )
     except tomllib.TOMLDecodeError as error:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -18,7 +17,7 @@ from .._tree import FREE
 from ..limits import AccelerationLimit, ConfigurationLimit, Limit, VelocityLimit
 from ..robot import Robot
 from ..scaling import Saved, run_in_chunks
-from ._body import bounds_of, first_guess, goals_of, shapes_apart
+from ._body import Build, pairs_apart
 from ._finish import follow
 from ._goals import Goals, Weights
 from ._motion import HumanMotion
@@ -105,7 +104,9 @@ class Retargeter:
         check_profile(robot, self.profile)
         self.limits = _limits(robot, acceleration)
         self.max_iterations = max_iterations
-        self._body = Body.of(robot, self.profile, shapes_apart(robot, self.profile))
+        self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile))
+        self._build = Build.of(robot, self.profile)
+        self._acceleration = np.asarray(self.limits[2].acceleration)
 
     def retarget(
         self, motion: HumanMotion, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
@@ -126,7 +127,7 @@ class Retargeter:
         out: str | os.PathLike[str] | None = None,
         progress: bool = True,
     ) -> list[Retargeted]:
-        """Many clips of any lengths, some at a time in one program for each power of two that lengths go up to.
+        """Many clips of any lengths, some at a time, in one program for all clips of about one length.
 
         Args:
             motions: the clips.
@@ -146,7 +147,7 @@ class Retargeter:
         clips = [self._prepared_by_name(motion, mapping, fps) for motion in motions]
         groups: dict[int, list[int]] = {}
         for i, clip in enumerate(clips):
-            groups.setdefault(_power_of_two(clip.frames), []).append(i)
+            groups.setdefault(_rounded_up(clip.frames), []).append(i)
         found: dict[int, Retargeted] = {}
         shared = (self._body, self.profile.weights, self.limits, np.asarray(self.max_iterations))
         for length, members in sorted(groups.items()):
@@ -166,15 +167,14 @@ class Retargeter:
 
     def _prepared(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Clip:
         """What a clip asks for."""
-        robot, profile = self.robot, self.profile
         motion = motion if fps is None else motion.resampled(fps)
         if motion.frames < 3:
             raise ValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
         person = read_person(motion, find_roles(motion.joint_names, mapping))
-        goals = goals_of(robot, profile, person)
-        goals, start = padded(goals, first_guess(robot, profile, goals), -motion.frames % _LENGTHS)
+        goals = self._build.goals(person)
+        goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % _LENGTHS)
         dt = 1.0 / motion.fps
-        return _Clip(person, motion.frames, goals, start, bounds_of(robot, self.limits[2].acceleration, dt), dt)
+        return _Clip(person, motion.frames, goals, start, self._build.bounds(self._acceleration, dt), dt)
 
     def _prepared_by_name(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Clip:
         try:
@@ -214,7 +214,7 @@ class _Clip(NamedTuple):
     person: Person
     frames: int
     goals: Goals
-    start: Array
+    start: np.ndarray
     bounds: Bounds
     dt: float
 
@@ -226,8 +226,10 @@ def _lane(clip: _Clip, length: int) -> tuple[Goals, Array, Bounds, np.ndarray]:
     return jax.tree.map(np.asarray, (goals, start, clip.bounds, np.asarray(clip.dt)))
 
 
-def _power_of_two(frames: int) -> int:
-    return max(_LENGTHS, 1 << (frames - 1).bit_length())
+def _rounded_up(frames: int) -> int:
+    """A length that clips of about as many frames share: at most a quarter more, and few different ones."""
+    step = max(_LENGTHS, (1 << (frames - 1).bit_length()) // 8)
+    return -(-frames // step) * step
 
 
 @jax.jit
@@ -296,22 +298,23 @@ def _limits(
     return ConfigurationLimit(robot), VelocityLimit(robot), most
 
 
-def padded(goals: Goals, start: Float[Array, "F nq"], more: int) -> tuple[Goals, Float[Array, "T nq"]]:
+def padded(goals: Goals, start: Float[np.ndarray, "F nq"], more: int) -> tuple[Goals, Float[np.ndarray, "T nq"]]:
     """Goals and first guess with frames behind the end, so that clips of about one length share a program."""
     frames = len(start)
 
-    def longer(leaf: Array) -> Array:
-        return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], more, 0)])
+    def longer(leaf: np.ndarray) -> np.ndarray:
+        return np.concatenate([leaf, np.repeat(leaf[-1:], more, 0)])
 
     goals, start = jax.tree.map(longer, (goals, start))
-    present = jnp.where(jnp.arange(frames + more) < frames, goals.present, 0.0)
+    present = np.where(np.arange(frames + more) < frames, goals.present, 0.0).astype(start.dtype)
     return dataclasses.replace(goals, present=present, contact=goals.contact * present[:, None]), start
 
 
 def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
     """A motion with all joints of the robot's model, those that are locked and those that follow others too."""
     tree = robot.tree
-    qpos = np.asarray(jax.vmap(robot.mujoco_qpos)(jnp.asarray(q)))
+    index, coefficient = tree.qpos_source
+    qpos = q[:, index] * coefficient + np.asarray(robot.qpos_offset)
     joints = [j for j, kind in enumerate(tree.joint_types) if kind != FREE]
     base = next(j for j, kind in enumerate(tree.joint_types) if kind == FREE)
     at = int(tree.full_qpos_address[base])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,10 +13,10 @@ from jaxtyping import Array, Float
 
 from .._home import home_kinematics
 from .._joint_selection import scalar_layout
-from ..collision._scene import separation_jacobian
-from ..kinematics import Kinematics, forward_kinematics, frame_jacobians
+from ..collision._distance import Core, _segment_parameters, between_segments
+from ..kinematics import Kinematics, forward_kinematics
+from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import cross, rotate
-from ..limits import CollisionAvoidanceLimit
 from ..robot import Robot
 from ..tasks._rotation import dot, rotation_log
 from ._goals import Goals, Weights
@@ -24,6 +25,8 @@ from ._profile import Place, Profile
 
 _SHORTEST = 1e-6
 _PAIRS = 12
+_CLEARANCE, _SWINGING = 3e-3, 1e-3
+"""How far soles that do not stand are kept above the floor [m], and what that weighs beside standing."""
 
 
 class Body(eqx.Module):
@@ -32,69 +35,80 @@ class Body(eqx.Module):
     Attributes:
         robot: the robot.
         offsets: of each place in its frame [m]. (places, 3)
-        radii: of the capsules but the feet's, which have their corners [m]. (capsules,)
-        apart: what keeps shapes apart; None: nothing does.
+        radii: of the capsules [m]. (capsules,)
         home: how pelvis, chest and feet are turned at home, where the person's axes are the world's. (4, 3, 3)
-        frames: of each place: keypoints, pelvis, torso, feet, corners, both ends of each of these capsules (static).
+        frames: of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static).
         keys: the role of each keypoint (static).
         bends: whether the trunk bends (static).
+        above: the capsules that are kept above the floor: all but the feet's, which have their corners (static).
+        pairs: the capsules that are kept apart (static).
     """
 
     robot: Robot
     offsets: Float[Array, "places 3"]
     radii: Float[Array, " capsules"]
-    apart: CollisionAvoidanceLimit | None
     home: Float[Array, "4 3 3"]
     frames: tuple[str, ...] = eqx.field(static=True)
     keys: tuple[str, ...] = eqx.field(static=True)
     bends: bool = eqx.field(static=True)
+    above: tuple[int, ...] = eqx.field(static=True)
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, robot: Robot, profile: Profile, apart: CollisionAvoidanceLimit | None) -> Body:
-        """The robot with this profile."""
+    def of(cls, robot: Robot, profile: Profile, pairs: Sequence[tuple[int, int]]) -> Body:
+        """The robot with this profile, whose capsules are kept apart in these pairs."""
         origin = (0.0, 0.0, 0.0)
         places: list[Place] = list(profile.keypoints.values())
         places += [(profile.pelvis, origin), (profile.torso or profile.pelvis, origin)]
         places += [(profile.feet[side].frame, origin) for side in ("left", "right")]
         places += profile.corners
         turned = [frame for frame, _ in places[len(profile.keypoints) : len(profile.keypoints) + 4]]
-        feet = {robot.tree.frame_bodies[robot.tree.frame(foot.frame)] for foot in profile.feet.values()}
-        above = [c for c in profile.capsules if robot.tree.frame_bodies[robot.tree.frame(c.frame)] not in feet]
-        for capsule in above:
+        for capsule in profile.capsules:
             places += [(capsule.frame, capsule.start), (capsule.frame, capsule.end)]
+        feet = {robot.tree.frame_bodies[robot.tree.frame(foot.frame)] for foot in profile.feet.values()}
+        bodies = [robot.tree.frame_bodies[robot.tree.frame(capsule.frame)] for capsule in profile.capsules]
         return cls(
             robot=robot,
             offsets=jnp.array([point for _, point in places], robot.q0.dtype),
-            radii=jnp.array([capsule.radius for capsule in above], robot.q0.dtype),
-            apart=apart,
+            radii=jnp.array([capsule.radius for capsule in profile.capsules], robot.q0.dtype),
             home=home_kinematics(robot).frame_poses(robot, turned)[1],
             frames=tuple(frame for frame, _ in places),
             keys=tuple(profile.keypoints),
             bends=profile.torso is not None,
+            above=tuple(i for i, body in enumerate(bodies) if body not in feet),
+            pairs=tuple((int(i), int(j)) for i, j in pairs),
         )
 
 
-class Rows(NamedTuple):
-    """Residuals with their Jacobians; what is minimised is half the weighted sum of squares."""
+class Joints(NamedTuple):
+    """What hinges and slides cost by themselves: residuals and weights, of wishes and of bounds. (nv,) each."""
 
-    residual: Float[Array, " m"]
-    jacobian: Float[Array, "m nv"]
-    weight: Float[Array, " m"]
-
-
-class Stance(NamedTuple):
-    """Where heels and toes are in the plane of the floor."""
-
-    point: Float[Array, "4 2"]
-    jacobian: Float[Array, "4 2 nv"]
+    soft: Float[Array, " nv"]
+    soft_weight: Float[Array, " nv"]
+    stiff: Float[Array, " nv"]
+    stiff_weight: Float[Array, " nv"]
 
 
 class FrameRows(NamedTuple):
-    """What one frame asks for: wishes, bounds that have to hold, and where heels and toes are."""
+    """What one frame asks for; what is minimised is half the weighted sum of squared residuals.
 
-    soft: Rows
-    stiff: Rows
-    stance: Stance
+    Attributes:
+        residual: of wishes and of bounds that have to hold. (m,)
+        jacobian: its derivative. (m, nv)
+        soft: weights of wishes, 0 in the rows of bounds. (m,)
+        stiff: weights of bounds, 0 in the rows of wishes. (m,)
+        joints: what each joint costs by itself.
+        stance: x and y of left heel and toe and of right heel and toe. (8,)
+        stance_jacobian: its derivative. (8, nv)
+    """
+
+    residual: Float[Array, " m"]
+    jacobian: Float[Array, "m nv"]
+    soft: Float[Array, " m"]
+    stiff: Float[Array, " m"]
+    joints: Joints
+    stance: Float[Array, "8"]
+    stance_jacobian: Float[Array, "8 nv"]
 
 
 class Bounds(NamedTuple):
@@ -113,6 +127,41 @@ class Bounds(NamedTuple):
     change: Float[Array, " nv"]
 
 
+class _Motion(NamedTuple):
+    """How dofs move what is fixed to their bodies: velocities at a point that all share, and angular ones.
+
+    A direction n at a point p of a body has the rate ``n . (linear + angular x (p - origin))``, where a dof moves it.
+    """
+
+    origin: Float[Array, "3"]
+    columns: Float[Array, "nvfull 6"]
+
+    @classmethod
+    def of(cls, robot: Robot, kinematics: Kinematics) -> _Motion:
+        origin = kinematics.body_position[robot.tree.root]
+        linear = kinematics.dof_linear + cross(kinematics.dof_anchor - origin, kinematics.dof_angular)
+        return cls(origin, jnp.concatenate([linear, kinematics.dof_angular], -1))
+
+    def rates(self, moves: Array | np.ndarray, direction: Float[Array, "m 3"], point: Float[Array, "m 3"]) -> Array:
+        """Of points along directions; ``moves`` says which dofs move them. (m, nvfull)."""
+        return self._times(moves, jnp.concatenate([direction, cross(point - self.origin, direction)], -1))
+
+    def turns(self, moves: Array | np.ndarray, axis: Float[Array, "m 3"]) -> Array:
+        """Angular velocities about axes. (m, nvfull)."""
+        return self._times(moves, jnp.concatenate([jnp.zeros_like(axis), axis], -1))
+
+    def _times(self, moves, wrench: Float[Array, "m 6"]) -> Array:
+        return jnp.where(moves, jnp.matmul(wrench, self.columns.T, precision="highest"), 0.0)
+
+
+class _Rows(NamedTuple):
+    """Some rows of a frame, their derivatives by all the model's dofs, and a weight of each."""
+
+    residual: Float[Array, " m"]
+    rates: Float[Array, "m nvfull"]
+    weight: Float[Array, " m"]
+
+
 def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weights, bounds: Bounds) -> FrameRows:
     """All rows of one frame, and its standing points."""
     robot = body.robot
@@ -120,114 +169,142 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
     names = tuple(dict.fromkeys(body.frames))
     index = np.array([names.index(name) for name in body.frames])
     positions, rotations = kinematics.frame_poses(robot, names)
-    jacobians = frame_jacobians(robot, kinematics, names)
-    arms = rotate(rotations[index], body.offsets)
-    points = positions[index] + arms
-    turning = jacobians[index, 3:]
-    moving = jacobians[index, :3] + cross(turning, arms[:, :, None], along=-2)
-    place = _Places(points, moving, rotations[index], turning)
+    bodies = np.array([robot.tree.frame_bodies[robot.tree.frame(name)] for name in body.frames])
     k = len(body.keys)
-    corners = slice(k + 4, k + 12)
-    soft = [
-        _limbs(place, body.keys, goals, weights),
-        _turn(place, k, dot(goals.pelvis, body.home[0]), weights.pelvis),
-        _root(place, body.keys, goals, weights),
-        *(_turn(place, k + 2 + i, dot(goals.feet[i], body.home[2 + i]), weights.foot) for i in range(2)),
-        _posture(robot, q, weights),
-    ]
+    place = _Places(
+        positions[index] + rotate(rotations[index], body.offsets),
+        rotations[index[k : k + 4]],
+        robot.tree.moves[bodies],
+        _Motion.of(robot, kinematics),
+    )
+    turned = [_turn(place, k, 0, dot(goals.pelvis, body.home[0]), weights.pelvis)]
+    turned += [_turn(place, k, 2 + i, dot(goals.feet[i], body.home[2 + i]), weights.foot) for i in range(2)]
     if body.bends:
-        soft.append(_turn(place, k + 1, dot(goals.torso, body.home[1]), weights.torso))
-    stiff = [
-        _soles(points[corners, 2], moving[corners, 2], goals.contact, weights.stance),
-        _ranges(robot, q, weights, bounds),
-    ]
-    if len(body.radii):
-        stiff.append(_floor(points[k + 12 :, 2], moving[k + 12 :, 2], jnp.repeat(body.radii, 2), weights.stance))
-    if body.apart is not None:
-        stiff.append(_apart(body, kinematics, weights))
-    means = (points[corners].reshape(4, 2, 3).mean(1), moving[corners].reshape(4, 2, 3, -1).mean(1))
-    return FrameRows(_stacked(soft), _stacked(stiff), Stance(means[0][:, :2], means[1][:, :2]))
-
-
-def _stacked(parts: list[Rows]) -> Rows:
-    return Rows(*(jnp.concatenate(column) for column in zip(*parts, strict=True)))
+        turned.append(_turn(place, k, 1, dot(goals.torso, body.home[1]), weights.torso))
+    soft = [_limbs(place, body.keys, goals, weights), _root(place, body.keys, goals, weights), *turned]
+    corners = slice(k + 4, k + 12)
+    stiff = [_soles(place, corners, goals.contact, weights.stance)]
+    if body.above:
+        stiff.append(_floor(place, k + 12, body, weights.stance))
+    if body.pairs:
+        stiff.append(_apart(place, k + 12, body, weights))
+    wishes, needs = (_Rows(*(jnp.concatenate(column) for column in zip(*part, strict=True))) for part in (soft, stiff))
+    stance, along = _stance(place, corners)
+    rates = independent_columns(robot.tree, jnp.concatenate([wishes.rates, needs.rates, along]))
+    return FrameRows(
+        residual=jnp.concatenate([wishes.residual, needs.residual]),
+        jacobian=rates[:-8],
+        soft=jnp.concatenate([wishes.weight, jnp.zeros_like(needs.weight)]),
+        stiff=jnp.concatenate([jnp.zeros_like(wishes.weight), needs.weight]),
+        joints=_joints(robot, q, weights, bounds),
+        stance=stance,
+        stance_jacobian=rates[-8:],
+    )
 
 
 class _Places(NamedTuple):
-    """Points, how they move, and the frames that they are fixed to."""
+    """Points, how trunk and feet are turned, and which dofs move the bodies that the points are fixed to."""
 
     points: Float[Array, "k 3"]
-    moving: Float[Array, "k 3 nv"]
-    rotations: Float[Array, "k 3 3"]
-    turning: Float[Array, "k 3 nv"]
+    rotations: Float[Array, "4 3 3"]
+    moves: np.ndarray
+    motion: _Motion
 
 
-def _limbs(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights) -> Rows:
+def _limbs(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights) -> _Rows:
     """Direction of each limb less the person's: ``d - u``, with ``d' = (I - d d^T) / length (J_b - J_a)``."""
     first, second = (np.array([keys.index(limb[i]) for limb in LIMBS]) for i in range(2))
     across = place.points[second] - place.points[first]
     length = jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), _SHORTEST)
     direction = across / length
-    rate = (place.moving[second] - place.moving[first]) / length[..., None]
-    rate = rate - direction[:, :, None] * jnp.sum(direction[:, :, None] * rate, 1, keepdims=True)
+    sideways = (jnp.eye(3, dtype=length.dtype) - direction[:, :, None] * direction[:, None]) / length[..., None]
+    sideways = sideways.reshape(-1, 3)
+    ends = []
+    for index in (first, second):
+        index = np.repeat(index, 3)
+        ends.append(place.motion.rates(place.moves[index], sideways, place.points[index]))
     residual = (direction - goals.directions).ravel()
-    return Rows(residual, rate.reshape(-1, rate.shape[-1]), jnp.full(residual.shape, weights.limb))
+    return _Rows(residual, ends[1] - ends[0], jnp.full(residual.shape, weights.limb))
 
 
-def _turn(place: _Places, i: int, wanted: Float[Array, "3 3"], weight: Float[Array, ""]) -> Rows:
+def _turn(place: _Places, first: int, i: int, wanted: Float[Array, "3 3"], weight: Float[Array, ""]) -> _Rows:
     """The rotation vector from the wanted axes to a frame's."""
-    return Rows(rotation_log(dot(place.rotations[i], wanted.T)), place.turning[i], jnp.full(3, weight))
+    axes = jnp.eye(3, dtype=wanted.dtype)
+    rates = place.motion.turns(place.moves[np.full(3, first + i)], axes)
+    return _Rows(rotation_log(dot(place.rotations[i], wanted.T)), rates, jnp.full(3, weight))
 
 
-def _root(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights) -> Rows:
-    hips = np.array([keys.index("left_hip"), keys.index("right_hip")])
-    return Rows(place.points[hips].mean(0) - goals.root, place.moving[hips].mean(0), weights.root)
+def _root(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights) -> _Rows:
+    rates, hips = [], [keys.index("left_hip"), keys.index("right_hip")]
+    for hip in hips:
+        point = jnp.broadcast_to(place.points[hip], (3, 3))
+        rates.append(place.motion.rates(place.moves[np.full(3, hip)], 0.5 * jnp.eye(3, dtype=point.dtype), point))
+    residual = place.points[np.array(hips)].mean(0) - goals.root
+    return _Rows(residual, rates[0] + rates[1], weights.root)
 
 
-def _soles(
-    height: Float[Array, "8"], rate: Float[Array, "8 nv"], contact: Float[Array, "4"], weight: Float[Array, ""]
-) -> Rows:
-    """Corners that stand are at height 0, the others not below."""
+def _heights(place: _Places, some: slice | np.ndarray) -> tuple[Array, Array]:
+    """Heights of points, and their rates."""
+    points = place.points[some]
+    up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], points.dtype), points.shape)
+    return points[:, 2], place.motion.rates(place.moves[some], up, points)
+
+
+def _soles(place: _Places, corners: slice, contact: Float[Array, "4"], weight: Float[Array, ""]) -> _Rows:
+    """Corners that stand are at height 0, the others not below a clearance.
+
+    Those weigh less, for they come and go from one iteration to the next: the clearance is there to be dipped into.
+    """
+    height, rates = _heights(place, corners)
     stands = jnp.repeat(contact, 2) > 0.5
-    return Rows(height, rate, jnp.where(stands | (height < 0.0), weight, 0.0))
+    gap = height - jnp.where(stands, 0.0, _CLEARANCE)
+    return _Rows(gap, rates, jnp.where(stands, weight, jnp.where(gap < 0.0, _SWINGING * weight, 0.0)))
 
 
-def _floor(
-    height: Float[Array, " k"], rate: Float[Array, "k nv"], radius: Float[Array, " k"], weight: Float[Array, ""]
-) -> Rows:
+def _stance(place: _Places, corners: slice) -> tuple[Array, Array]:
+    """Where the middles of heels and toes are in the plane of the floor, x and y in turn, and their rates."""
+    points = place.points[corners].reshape(4, 2, 3).mean(1)
+    axes = jnp.tile(jnp.eye(3, dtype=points.dtype)[:2], (4, 1))
+    moves = np.repeat(place.moves[corners][::2], 2, 0)
+    return points[:, :2].ravel(), place.motion.rates(moves, axes, jnp.repeat(points, 2, 0))
+
+
+def _floor(place: _Places, first: int, body: Body, weight: Float[Array, ""]) -> _Rows:
     """Ends of capsules not below the floor."""
-    gap = height - radius
-    return Rows(gap, rate, jnp.where(gap < 0.0, 0.1 * weight, 0.0))
+    above = np.array(body.above)
+    height, rates = _heights(place, first + np.stack([2 * above, 2 * above + 1], 1).ravel())
+    gap = height - jnp.repeat(body.radii[above], 2) - _CLEARANCE
+    return _Rows(gap, rates, jnp.where(gap < 0.0, _SWINGING * weight, 0.0))
 
 
-def _posture(robot: Robot, q: Float[Array, " nq"], weights: Weights) -> Rows:
-    """Joints near home."""
-    dofs, position, jacobian = _joints(robot, q)
-    home = _joints(robot, robot.q0)[1]
-    return Rows(position - home, jacobian, jnp.full(len(dofs), weights.posture))
-
-
-def _ranges(robot: Robot, q: Float[Array, " nq"], weights: Weights, bounds: Bounds) -> Rows:
-    """Joints inside their ranges."""
-    dofs, position, jacobian = _joints(robot, q)
-    outside = position - jnp.clip(position, bounds.lower[dofs], bounds.upper[dofs])
-    return Rows(outside, jacobian, jnp.where(outside != 0.0, weights.limit, 0.0))
-
-
-def _joints(robot: Robot, q: Float[Array, " nq"]) -> tuple[np.ndarray, Array, Array]:
-    """The dofs that are hinges or slides, where they are, and their rows of the identity."""
+def _joints(robot: Robot, q: Float[Array, " nq"], weights: Weights, bounds: Bounds) -> Joints:
+    """Joints near home, and inside their ranges."""
     scalar, index = scalar_layout(robot)
-    dofs = np.flatnonzero(scalar)
-    return dofs, q[index[dofs]], jnp.eye(robot.nv, dtype=q.dtype)[dofs]
+    position = jnp.where(scalar, q[index], 0.0)
+    outside = jnp.where(scalar, position - jnp.clip(position, bounds.lower, bounds.upper), 0.0)
+    return Joints(
+        soft=jnp.where(scalar, position - robot.q0[index], 0.0),
+        soft_weight=jnp.where(scalar, weights.posture, 0.0),
+        stiff=outside,
+        stiff_weight=jnp.where(outside != 0.0, weights.limit, 0.0),
+    )
 
 
-def _apart(body: Body, kinematics: Kinematics, weights: Weights) -> Rows:
-    """The pairs of shapes that are nearest, where they are nearer than the margin."""
-    assert body.apart is not None
-    near = body.apart._nearest(body.robot, kinematics)
-    nearest_ones = jax.lax.top_k(-near.distance, min(_PAIRS, len(near.distance)))[1]
-    near = jax.tree.map(lambda a: a[nearest_ones], near)
-    bodies = jnp.asarray(body.apart.scene.pair_bodies)[nearest_ones]
-    rate = separation_jacobian(body.robot.tree, kinematics, near, bodies)
+def _apart(place: _Places, first: int, body: Body, weights: Weights) -> _Rows:
+    """The pairs of capsules that are nearest, where they are nearer than the margin."""
+    pairs = np.array(body.pairs)
+    axes = place.points[first:].reshape(-1, 2, 3)
+    start, along = axes[:, 0], axes[:, 1] - axes[:, 0]
+    a, b = pairs.T
+    s, t = jax.vmap(_segment_parameters)(along[a], along[b], start[a] - start[b])
+    between = start[b] + t[:, None] * along[b] - start[a] - s[:, None] * along[a]
+    distance = jnp.sqrt(jnp.sum(between**2, -1)) - body.radii[a] - body.radii[b]
+    # single precision is enough to choose, and several times as fast
+    chosen = jax.lax.top_k(-distance.astype(jnp.float32), min(_PAIRS, len(pairs)))[1]
+    pair = jnp.asarray(pairs)[chosen]
+    none = jnp.zeros((len(chosen), 0, 3), axes.dtype)
+    near = jax.vmap(between_segments)(*(Core(axes[i], none, none, body.radii[i]) for i in pair.T))
+    moves = jnp.asarray(place.moves[first::2])[pair]
+    rates = [place.motion.rates(moves[:, i], near.normal, p) for i, p in enumerate((near.point_a, near.point_b))]
     gap = near.distance - weights.margin
-    return Rows(gap, rate, jnp.where(gap < 0.0, weights.apart, 0.0))
+    return _Rows(gap, rates[1] - rates[0], jnp.where(gap < 0.0, weights.apart, 0.0))
