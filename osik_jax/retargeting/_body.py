@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -125,15 +126,12 @@ class Build:
         root = scale * person.root
         root[:, 2] += self.ankle - scale * person.ankle
         dtype = self.q0.dtype
-        return Goals(
-            directions=person.directions.astype(dtype),
-            pelvis=person.pelvis.astype(dtype),
-            torso=person.torso.astype(dtype),
-            root=root.astype(dtype),
-            feet=person.feet.astype(dtype),
-            contact=person.contact.astype(dtype),
-            present=np.ones(len(root), dtype),
-        )
+        parts: dict[str, Any] = {  # NumPy's arrays: each one of JAX's would cost more than its numbers
+            **{name: getattr(person, name) for name in ("directions", "pelvis", "torso", "feet", "contact")},
+            "root": root,
+            "present": np.ones(len(root)),
+        }
+        return Goals(**{name: part.astype(dtype) for name, part in parts.items()})
 
     def first_guess(self, goals: Goals) -> Float[np.ndarray, "F nq"]:
         """The home posture with the pelvis where and as the person's is."""
@@ -147,5 +145,5 @@ class Build:
         """What joints may do in the plan: a little less than they can, so that the last pass has room."""
         inset = np.minimum(_INSET, 0.01 * (self.upper - self.lower))
         step, change = _SHARE * self.speed * dt, _SHARE * np.asarray(acceleration) * dt**2
-        bounds = Bounds(self.lower + inset, self.upper - inset, step, change)
-        return Bounds(*(x.astype(self.q0.dtype) for x in bounds))
+        parts: list[Any] = [self.lower + inset, self.upper - inset, step, change]
+        return Bounds(*(part.astype(self.q0.dtype) for part in parts))

@@ -218,7 +218,7 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
     names = set(robot.frame_names)
     for body in range(1, model.nbody):
         mass, inertia = float(model.body_mass[body]), model.body_inertia[body]
-        name = model.body(body).name
+        name = str(model.body(body).name)
         if name not in names or not mass > _LEAST_MASS * float(model.body_mass.sum()):
             continue
         turn = np.zeros(9)
