@@ -42,8 +42,8 @@ _NEARLY, _SIGN = 30.0, 2.0
 Less is allowed of the last: such a multiplier says that the active set is not right, and what that costs is more the
 weaker the curvature is that the rows leave."""
 
-_ROUNDINGS = 1e2
-"""Of the forces at a free variable, that it may be left with."""
+_ROUNDINGS = 4.0
+"""Of the forces at a variable, times eps: how hard it may still be pulled to where it may go."""
 
 _FEW = 4
 """Lanes that are searched together on a CPU."""
@@ -154,16 +154,18 @@ def certified_or_searched(
 ) -> Found:
     """As ``proposed_and_searched``, in double precision whatever the data, and a few lanes at a time.
 
-    The certificate asks for more than in single precision: a slope of the free variables that is not told from 0.
+    The certificate asks for more than in single precision: a slope that is not told from none.
     """
     holds = CERTIFIED[tolerance.dtype]
 
     def candidates(qp: QP, guess: Array, tolerance: Array) -> Found:
-        proposal = propose(qp, jax.vmap(possible)(qp, guess), tolerance, max_iterations)
-        found = _found(qp, proposal)
-        fine = (proposal.settled != 0) & (proposal.iterations <= max_iterations)
+        start = jax.vmap(possible)(qp, guess)
+        proposal = propose(qp, start, tolerance, max_iterations)
+        found, within = _found(qp, proposal), proposal.iterations <= max_iterations
+        fine = (proposal.settled != 0) & within
         fine &= jax.vmap(_certified)(qp, found, tolerance) & jax.vmap(_rests)(qp, found) & (found.residual <= holds)
-        return found._replace(done=fine, optimal=fine)
+        # the search has the cap too: it may not begin where more changes than that have led
+        return found._replace(done=fine, optimal=fine, active=jnp.where(within[:, None], found.active, start))
 
     def again(given: tuple[QP, Array], found: Found) -> Found:
         end = search(given[0], found.active, given[1], max_iterations=max_iterations)
@@ -174,10 +176,12 @@ def certified_or_searched(
 
 
 def _rests(qp: QP, found: Found) -> Bool[Array, ""]:
-    """Whether what the free variables are left with is rounding of the forces at them."""
-    left = qp.cost.gradient(found.x) - apply(qp.rows.T, found.row_multipliers)
-    rounding = _ROUNDINGS * float(jnp.finfo(left.dtype).eps) * forces(qp, found.x, found.row_multipliers)
-    return jnp.all((jnp.abs(left) <= rounding) | (found.active[: len(left)] != INACTIVE))
+    """Whether no variable is pulled to where it may go by more than rounding of the forces at it."""
+    pull = apply(qp.rows.T, found.row_multipliers) - qp.cost.gradient(found.x)
+    active = found.active[: len(pull)]
+    up, down = (active == INACTIVE) | (active == -1), (active == INACTIVE) | (active == 1)
+    rounding = _ROUNDINGS * float(jnp.finfo(pull.dtype).eps) * forces(qp, found.x, found.row_multipliers)
+    return jnp.all((~up | (pull <= rounding)) & (~down | (-pull <= rounding)))
 
 
 def _block(lanes: int) -> int:

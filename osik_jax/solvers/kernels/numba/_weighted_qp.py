@@ -24,6 +24,9 @@ INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 EPS = 2.220446049250313e-16
 _NOUGHT = 100.0
 """Roundings of what the cost pulls at x; an x that is no larger is 0."""
+_TOLD_FROM_NONE = 1.0
+"""Roundings of the forces at a variable on a bound; a multiplier of the wrong sign that is larger lets it go. Tolerances
+of the cost's curvature would not do: a weak task, such as a posture, pulls with less than those."""
 _PATIENCE = 2
 """Exchanges that leave no fewer wrong signs, before the dual active set."""
 _SMALLEST_PIVOT = 1e2
@@ -336,9 +339,23 @@ def measure_noise(P, W, tolerance, x, z):
         scale = min(most * reach, longest * span) + abs(value) + (nearest if nearest < np.inf else 0.0)
         W.value_noise[i] = tolerance * scale
         W.multiplier_noise[i] = tolerance * scale / max(reach, 1e-300) ** 2
-        if i < n:
-            for q in range(m, len(P.give)):
-                W.multiplier_noise[i] += tolerance * 1e-3 * abs(P.rows[q, i] * z[q])
+    measure_forces(P, W, x, z)
+
+
+@lean
+def measure_forces(P, W, x, z):
+    """Of each variable on a bound, what counts as no multiplier: rounding of what pulls at it, none against another."""
+    m, n = len(P.wanted), len(x)
+    for j in range(n):
+        W.multiplier_noise[j] = _TOLD_FROM_NONE * EPS * P.damping[j] * (abs(x[j]) + abs(P.center[j]))
+    for i in range(len(P.give)):
+        size, row = abs(z[i]), P.rows[i]
+        if i < m:
+            size = abs(P.wanted[i])
+            for j in range(n):
+                size += abs(row[j] * x[j])
+        for j in range(n):
+            W.multiplier_noise[j] += _TOLD_FROM_NONE * EPS * size * abs(row[j])
 
 
 @lean
