@@ -20,7 +20,8 @@ N, TASKS = WHOLE_BODY
 @jax.jit
 @jax.vmap
 def solve(A, b, weight, lower, upper, damping, center, warm_start):
-    return solve_least_squares_qp(A, b, weight, lower, upper, damping=damping, center=center, warm_start=warm_start)
+    more = dict(damping=damping, center=center, warm_start=warm_start)
+    return solve_least_squares_qp(A, b, weight, lower, upper, **more, backend="jax")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def test_the_search_is_for_the_other_lanes(planted, monkeypatch):
     monkeypatch.setattr(_search, "_search", lambda given, start, **_: start)
 
     def lane(A, b, weight, lower, upper, damping, center, warm_start):  # a cap of its own, so compiled anew
-        more = dict(damping=damping, center=center, warm_start=warm_start, max_iterations=777)
+        more = dict(damping=damping, center=center, warm_start=warm_start, max_iterations=777, backend="jax")
         return solve_least_squares_qp(A, b, weight, lower, upper, **more)
 
     s = jax.jit(jax.vmap(lane))(*data, guess)

@@ -33,6 +33,10 @@ _MISSING = {
 }
 
 
+_LOWERS_NO_DOUBLE = (0, 12)
+_WITHOUT_NUMBA = "auto without numba"
+
+
 def check_backend(backend: Any) -> Backend:
     """The backend, if it is one and what it needs is there.
 
@@ -48,6 +52,23 @@ def check_backend(backend: Any) -> Backend:
     if backend == "warp" and not cuda_is_default():
         raise RuntimeError("backend='warp' needs a CUDA device, and JAX's default device is none (jax.devices())")
     return backend
+
+
+def here(backend: Backend) -> Any:
+    """The backend for a program in the precision that JAX is set to: in single, JAX 0.12 lowers no kernel for CPUs.
+
+    It lowers double precision inside such a program wrongly where platforms differ, so "auto" takes the search there.
+
+    Raises:
+        RuntimeError: "numba" was asked for where that is so.
+    """
+    if jax.config.jax_enable_x64 or jax.__version_info__ < _LOWERS_NO_DOUBLE:
+        return backend
+    if backend == "numba":
+        raise RuntimeError(
+            f"backend='numba' needs jax_enable_x64 with jax {jax.__version__}, or a jax before 0.12; take 'auto'"
+        )
+    return _WITHOUT_NUMBA if backend == "auto" else backend
 
 
 def installed(package: str) -> bool:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ... import _rules
-from .._backends import Backend, check_backend
+from .._backends import Backend, check_backend, here
 from .._box import inside, uncrossed
 from .._damping import Damping, one_each
 from .._level import Level
@@ -86,7 +86,7 @@ def solve_hqp(
     )
     layout, stack = stacked(scaled, equal, low, high, (lower >= upper) & sane, damped)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
-    search = descender(layout, max_iterations, check_backend(backend))
+    search = descender(layout, max_iterations, here(check_backend(backend)))
     end = _rules.found(search(*jax.lax.stop_gradient((stack, traced, warm_start))))
     nothing = jnp.maximum(NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
     x = with_derivative(end.x, end.decisions, stack, nothing)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ... import _rules
-from .._backends import Backend, check_backend
+from .._backends import Backend, check_backend, here
 from .._box import inside, uncrossed
 from .._dense import apply
 from .._pivots import INACTIVE
@@ -184,7 +184,7 @@ def _solve(
     low, high, crossed = uncrossed(safe.lower, _upper(safe))
     safe = replace(safe, lower=low, upper=high)
     cold = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
-    search = searcher(20 * m if max_iterations is None else max_iterations, gives_way, check_backend(backend))
+    search = searcher(20 * m if max_iterations is None else max_iterations, gives_way, here(check_backend(backend)))
     found = _rules.found(search(*jax.lax.stop_gradient((safe, cold, allowed))))
     solved = replace(safe, compliance=jnp.where(found.infeasible, found.compliance, safe.compliance))
     answered = found.optimal | found.infeasible
