@@ -22,6 +22,7 @@ from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import jax
+import jax.numpy as jnp
 
 Backend = Literal["auto", "jax", "numba", "warp"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
@@ -62,7 +63,7 @@ def here(backend: Backend) -> Any:
     Raises:
         RuntimeError: "numba" was asked for where that is so.
     """
-    if jax.config.jax_enable_x64 or jax.__version_info__ < _LOWERS_NO_DOUBLE:
+    if jnp.result_type(float) == jnp.float64 or jax.__version_info__ < _LOWERS_NO_DOUBLE:
         return backend
     if backend == "numba":
         raise RuntimeError(

@@ -25,8 +25,9 @@ EPS = 2.220446049250313e-16
 _NOUGHT = 100.0
 """Roundings of what the cost pulls at x; an x that is no larger is 0."""
 _TOLD_FROM_NONE = 1.0
-"""Roundings of the forces at a variable on a bound; a multiplier of the wrong sign that is larger lets it go. Tolerances
-of the cost's curvature would not do: a weak task, such as a posture, pulls with less than those."""
+"""Roundings of the forces at a variable on a bound; a multiplier of the wrong sign that is larger lets it go.
+
+Tolerances of the cost's curvature would not do: a weak task, such as a posture, pulls with less than those."""
 _PATIENCE = 2
 """Exchanges that leave no fewer wrong signs, before the dual active set."""
 _SMALLEST_PIVOT = 1e2
