@@ -1,35 +1,36 @@
 """How regular the control loop of a live view is, with a visitor connected: python -m benchmarks.live [--robot g1].
 
 Leads both hands along circles that leave the reach, for a minute; prints periods, step times, what broke a limit and
-how the memory grew. A visitor is a websocket that reads all that the page sends. Beside it a loop runs that only
-sleeps.
+how the memory grew. With ``--obstacles`` the robot keeps off itself and off a ball in the way of one hand, and what is
+drawn of it is held against the ball. A visitor is a websocket, in a process of its own, that reads all that the page
+sends. Beside it a loop runs that only sleeps.
 """
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
 import os
 import resource
 import subprocess
 import sys
-import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from websockets.asyncio.client import connect
-from websockets.typing import Subprotocol
 
 import osik_jax as osik
 from osik_jax.cli import read_robot
 from osik_jax.demo import guess_feet
 from osik_jax.runtime import configure_cpu
 from osik_jax.viewer import LiveView
+from osik_jax.viewer._mujoco import mujoco_poses
+from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live import _open
 from osik_jax.viewer.live._default import find_hands
+from osik_jax.viewer.live._surfaces import part_triangles
 from osik_jax.viewer.live._timing import Stopwatch
 
 _IDLE = """
@@ -48,26 +49,46 @@ print(json.dumps(np.percentile(np.diff(starts), (50.0, 99.0, 100.0)).tolist()))
 """A loop of the same rate that does nothing, in a process of its own: what the machine alone makes of the periods."""
 
 
+_BALL, _BALL_AHEAD = 0.05, 0.12
+"""Radius of the ball, and how far ahead of the hand it is [m]."""
+
+
 def idle(dt: float, seconds: float) -> subprocess.Popen[str]:
     """Starts that loop."""
     return subprocess.Popen([sys.executable, "-c", _IDLE, str(dt), str(seconds)], stdout=subprocess.PIPE, text=True)
 
 
-def visit(url: str, end: threading.Event) -> int:
-    """Reads what the page sends until the end; how many bytes that were."""
+_VISITOR = """
+import asyncio, sys
+from websockets.asyncio.client import connect
+
+async def read(url, protocol):
+    size = 0
+    async with connect(url, subprotocols=[protocol], max_size=None) as socket:
+        print("here", flush=True)
+        end = asyncio.get_running_loop().run_in_executor(None, sys.stdin.readline)
+        while not end.done():
+            try:
+                size += len(await asyncio.wait_for(socket.recv(), 0.5))
+            except TimeoutError:
+                continue
+    print(size)
+
+asyncio.run(read(*sys.argv[1:]))
+"""
+"""Reads what the page sends until it is told to end; a process of its own, as browsers are."""
+
+
+def visit(url: str) -> subprocess.Popen[str]:
+    """Starts a visitor; returns once it is connected."""
     import viser
 
-    async def read() -> int:
-        size, protocol = 0, Subprotocol(f"viser-v{viser.__version__}")
-        async with connect(url.replace("http", "ws"), subprotocols=[protocol], max_size=None) as socket:
-            while not end.is_set():
-                try:
-                    size += len(await asyncio.wait_for(socket.recv(), 0.5))
-                except TimeoutError:
-                    continue
-        return size
-
-    return asyncio.run(read())
+    arguments = [url.replace("http", "ws"), f"viser-v{viser.__version__}"]
+    visitor = subprocess.Popen(
+        [sys.executable, "-c", _VISITOR, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert visitor.stdout is not None and visitor.stdout.readline() == "here\n", "the visitor did not get in"
+    return visitor
 
 
 def lead(view: LiveView, robot: osik.Robot, seconds: float, radius: float) -> None:
@@ -94,31 +115,58 @@ def broken(robot: osik.Robot, q: np.ndarray, dt: float) -> dict[str, int]:
     return dict(too_fast=int(fast.any(1).sum()), outside=int(outside.any(1).sum()))
 
 
-def measure(name: str, seconds: float) -> dict[str, object]:
+def put_ball(view: LiveView, robot: osik.Robot) -> None:
+    """A ball ahead of the first hand; and the robot is to keep off itself."""
+    tasks: Any = view.session.tasks
+    position, _ = tasks[find_hands(robot)[0]].target
+    view._desk.avoid_itself()
+    ball = view._desk.add_obstacle("ball", np.asarray(position) + np.array([_BALL_AHEAD, 0.0, 0.1]), 1.0)
+    view._desk.move_obstacle(ball, size=np.array([_BALL, 0.0, 0.0]))
+
+
+def nearest(view: LiveView, robot: osik.Robot, q: np.ndarray) -> float:
+    """Least distance of what is drawn of the robot from the ball, at every hundredth configuration [m]."""
+    (ball,) = view._desk.obstacles.values()
+    shapes = robot_parts(robot)
+    surfaces = [part_triangles(part).vertices for part in shapes.parts]
+    least = np.inf
+    for row in q[::100]:
+        poses = shapes.poses(next(mujoco_poses(robot, row)))
+        for points, place, turn in zip(surfaces, *poses, strict=True):
+            least = min(least, float(np.linalg.norm(points @ turn.T + place - ball.position, axis=1).min()))
+    return least - float(ball.size[0])
+
+
+def resident() -> float:
+    """Memory of this process [MB], on Linux."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+def measure(name: str, seconds: float, obstacles: bool) -> dict[str, object]:
     """One session."""
     source = _open.source_of(name, None)
     robot = read_robot(source.robot)
     feet = guess_feet(robot) if robot.floating_base else ()
-    load, end = os.getloadavg()[0], threading.Event()
+    load = os.getloadavg()[0]
     with _open.open_robot(robot, source, feet, host="127.0.0.1", port=0) as view:
+        if obstacles:
+            put_ball(view, robot)
         view.loop.wait_until_ready(300.0)
-        sizes: list[int] = []
-        visitor = threading.Thread(target=lambda: sizes.append(visit(view.url, end)), daemon=True)
-        visitor.start()
+        visitor = visit(view.url)
         time.sleep(5.0)
         view.loop.pause()
         view.loop.record()
         view.loop._stopwatch = Stopwatch(round(seconds / view.loop.dt))
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        before = resident()
         beside = idle(view.loop.dt, seconds)
         view.loop.resume()
         lead(view, robot, seconds, radius=0.35 if robot.floating_base else 0.2)
         timing, failures = view.loop.timing, view.loop.snapshot.failures
-        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        q, dt = view.loop.recorded().q, view.loop.dt
+        after, q, dt = resident(), view.loop.recorded().q, view.loop.dt
+        gap = {"nearest to the ball [mm]": round(1e3 * nearest(view, robot, q), 1)} if obstacles else {}
         nothing = json.loads(beside.communicate()[0])
-        end.set()
-        visitor.join(timeout=5.0)
+        read = int(visitor.communicate("end\n")[0])
     return {
         "robot": name,
         "seconds": seconds,
@@ -128,8 +176,10 @@ def measure(name: str, seconds: float) -> dict[str, object]:
         "period of a loop beside it that does nothing [ms]": [round(1e3 * x, 2) for x in nothing],
         "failures": failures,
         **broken(robot, q, dt),
-        "memory grew by [MB]": round((after - before) / 1024.0, 1),
-        "visitor read [MB]": round(sum(sizes) / 2**20, 1),
+        **gap,
+        "memory grew by [MB]": round(after - before, 1),
+        "of which the recording has [MB]": round(q.nbytes / 2**20, 1),
+        "visitor read [MB]": round(read / 2**20, 1),
         "load average before": round(load, 2),
         "cores": os.cpu_count(),
         "jax": jax.__version__,
@@ -141,9 +191,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.live", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--robot", default="nao")
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--obstacles", action="store_true")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    json.dump(measure(given.robot, given.seconds), sys.stdout, indent=1)
+    json.dump(measure(given.robot, given.seconds, given.obstacles), sys.stdout, indent=1)
     print()
 
 

@@ -1,18 +1,60 @@
-"""A progress bar."""
+"""A progress bar, and times as one says them."""
 
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 
 
 @contextlib.contextmanager
-def progress_bar(total: int, done: int = 0) -> Iterator[Callable[[int, str], None]]:
-    """A bar on the error stream, and a function to tell how many are done and how it goes; "compiling" until then."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+def progress_bar(total: int, done: int = 0, *, unit: str) -> Iterator[Callable[[int, str], None]]:
+    """A bar on the error stream, and a function to tell how many are done and how it goes; "compiling" until then.
 
-    columns = (MofNCompleteColumn(), BarColumn(bar_width=30), TimeRemainingColumn(), TextColumn("{task.description}"))
+    Args:
+        total: of how many.
+        done: that are done already.
+        unit: what they are, in the plural.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    def counted(completed: int) -> str:
+        return f"{completed:,} of {total:,} {unit}"
+
+    columns = (TextColumn("{task.fields[counted]}"), BarColumn(bar_width=30), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("compiling", total=total, completed=done)
-        yield lambda completed, description: bar.update(task, completed=completed, description=description)
+        task = bar.add_task("compiling", total=total, completed=done, counted=counted(done))
+        pace = Pace(done, time.perf_counter())
+
+        def update(completed: int, description: str) -> None:
+            seconds = pace.seconds_left(completed, total, time.perf_counter())
+            left = f"about {spoken(seconds)} left" if completed < total else ""
+            told = ", ".join(part for part in (description, left) if part)
+            bar.update(task, completed=completed, counted=counted(completed), description=told)
+
+        yield update
+
+
+class Pace:
+    """How long the rest will take, from how long it took since the first were done: they had to be compiled for."""
+
+    def __init__(self, done: int, now: float) -> None:
+        """Takes how many are done already, and the time [s]."""
+        self._done, self._then, self._first = done, now, True
+
+    def seconds_left(self, done: int, total: int, now: float) -> float:
+        """For the rest, at a time when so many are done [s]."""
+        seconds = (now - self._then) / max(done - self._done, 1) * (total - done)
+        if self._first:
+            self._done, self._then, self._first = done, now, False
+        return seconds
+
+
+def spoken(seconds: float) -> str:
+    """A time as one says it: no more exact than it is known."""
+    if seconds < 90.0:
+        return f"{max(5 * round(seconds / 5.0), 5)} s"
+    if seconds < 5400.0:
+        return f"{0.5 * round(seconds / 30.0):g} min"
+    return f"{0.5 * round(seconds / 1800.0):g} h"

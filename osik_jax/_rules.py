@@ -25,6 +25,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
+from jax.typing import ArrayLike
 
 from ._blocks import in_blocks
 
@@ -80,12 +81,12 @@ _ruled = Primitive("ruled")
 _ruled.multiple_results = True
 
 
-def _run(*leaves: jax.Array, body: Any, **_: Any) -> list[jax.Array]:
+def _run(*leaves: ArrayLike, body: Any, **_: Any) -> list[ArrayLike]:
     return jaxpr_as_fun(body)(*leaves)
 
 
 def _differentiate(
-    leaves: Sequence[jax.Array],
+    leaves: Sequence[ArrayLike],
     rates: Sequence[Any],
     *,
     body: Any,
@@ -93,7 +94,7 @@ def _differentiate(
     tree: Any,
     lanes: tuple[tuple[int | None, ...], ...],
     block: int | None,
-) -> tuple[list[jax.Array], list[Any]]:
+) -> tuple[list[ArrayLike], list[Any]]:
     inexact = [jnp.issubdtype(jnp.result_type(leaf), jnp.inexact) for leaf in leaves]
     known = [ad.instantiate_zeros(rate) if moves else None for rate, moves in zip(rates, inexact, strict=True)]
     function = partial(_apply, rule, tree)
@@ -114,14 +115,14 @@ def _apply(rule: Callable[..., tuple[Any, Any]], tree: Any, leaves: list[Any], r
 
 
 def _batch(
-    leaves: Sequence[jax.Array],
+    leaves: Sequence[ArrayLike],
     axes: Sequence[int | None],
     *,
     body: Any,
     lanes: tuple[tuple[int | None, ...], ...],
     block: int | None,
     **rest: Any,
-) -> tuple[list[jax.Array], list[int]]:
+) -> tuple[list[ArrayLike], list[int]]:
     axes = tuple(axes)
     wide = jax.vmap(jaxpr_as_fun(body), in_axes=axes)
     wider = jax.make_jaxpr(_in_blocks(wide, axes, block) if block else wide)(*leaves)
@@ -132,7 +133,7 @@ def _batch(
 def _in_blocks(wide: Callable[..., Any], axes: tuple[int | None, ...], size: int) -> Callable[..., Any]:
     """A function of many lanes, some lanes at a time; arrays that all lanes share stay shared."""
 
-    def function(*leaves: jax.Array) -> Any:
+    def function(*leaves: ArrayLike) -> Any:
         own = {i: jnp.moveaxis(leaves[i], axis, 0) for i, axis in enumerate(axes) if axis is not None}
 
         def some(lanes: dict[int, jax.Array]) -> Any:

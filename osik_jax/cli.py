@@ -74,11 +74,12 @@ class Demo:
 class View:
     """Shows a robot in the browser: drag its hands, feet and waist, and it follows. Needs the extra viewer.
 
-    With a file: plays the motion.npz that osik demo wrote, or opens a session that a view has saved.
+    With a file: plays the motion.npz that osik demo wrote, opens a session that a view has saved, or shows slices of
+    the map.npz that osik reach wrote.
     """
 
     file: Annotated[Path | None, tyro.conf.Positional] = None
-    """A motion.npz to play, or a session.json to open. Default: drag the robot."""
+    """A motion.npz to play, a session.json to open, or a map.npz. Default: drag the robot."""
     robot: str = "nao"
     """A URDF or MJCF file, or nao, arm7, g1 (from the package example-robot-data), or a name of robot_descriptions."""
     base: Literal["auto", "floating", "fixed"] = "auto"
@@ -205,6 +206,11 @@ class Retarget:
     """Of a BVH: the axis that points up. Default: found from the skeleton."""
     animation: bool = True
     """Write the film (motion.gif)."""
+    live: bool = False
+    """Frame by frame: CLIP is replayed at its own rate, as it would come from a person; - reads JSON lines from stdin
+    and writes JSON lines to stdout, and nothing to a folder."""
+    look_ahead: int = 8
+    """With --live: how many frames the robot is behind the person."""
 
 
 _Command = Demo | Ik | Reach | Retarget | View | Info
@@ -460,6 +466,7 @@ def _demo(command: Demo) -> None:
     from rich.markup import escape
 
     from . import demo
+    from ._progress import spoken
 
     console = Console()
     motion, dt = _motion(command), 1.0 / command.frequency
@@ -469,7 +476,7 @@ def _demo(command: Demo) -> None:
         console.print(f"[yellow]note:[/yellow] {escape(note)}")
     settings: Any = dict(schemes=command.schemes, dt=dt, animation=command.animation)
     seconds = demo.estimate_seconds(motion, physics=command.physics, **settings)
-    console.print(f"{escape(motion.title)}: this will take about {_spoken(seconds)}")
+    console.print(f"{escape(motion.title)}: this will take about {spoken(seconds)}")
     settings["renderer"] = command.renderer
     with _writing(out), _progress(console) as announce:
         if command.physics:
@@ -486,6 +493,8 @@ def _demo(command: Demo) -> None:
 
 
 def _retarget(command: Retarget) -> None:
+    if command.live:
+        return _retarget_live(command)
     from rich.console import Console
     from rich.markup import escape
 
@@ -504,13 +513,62 @@ def _retarget(command: Retarget) -> None:
         _, figures = retarget_to_folder(
             retargeter, motion, command.out, mapping=mapping, fps=command.fps, animation=command.animation
         )
+    _print_retargeted(console, figures, command.out)
+
+
+def _retarget_live(command: Retarget) -> None:
+    """A clip at its own rate, or a stream on stdin."""
+    import numpy as np
+    from rich.console import Console
+    from rich.markup import escape
+
+    from . import retargeting
+    from .retargeting._command import write_folder
+    from .retargeting._live_command import replay, stream
+
+    console = Console()
+    with _told():
+        profile = None if command.profile is None else retargeting.load_profile(command.profile)
+        robot, mapping = _robot_to_retarget(command.robot), _mapping(command.mapping)
+
+        def make(standing: retargeting.HumanMotion) -> retargeting.LiveRetargeter:
+            return retargeting.LiveRetargeter(
+                robot,
+                standing,
+                profile=profile,
+                mapping=mapping,
+                acceleration=command.acceleration,
+                look_ahead=command.look_ahead,
+            )
+
+        if command.clip == "-":
+            stream(make, sys.stdin, sys.stdout)
+            return
+        unit = None if command.unit is None else _number_or_name(command.unit)
+        motion = retargeting.load_motion(command.clip, unit=unit, up=command.up)
+        motion = motion if command.fps is None else motion.resampled(command.fps)
+        command.out.mkdir(parents=True, exist_ok=True)
+        console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")
+        result, frames = replay(make, motion)
+        figures = write_folder(result, motion.name, command.out, animation=command.animation)
+    spent = 1e3 * np.array([frame.seconds for frame in frames])
+    waiting = 1e3 * command.look_ahead / motion.fps
+    console.print(
+        f"the robot is {waiting + np.median(spent):.0f} ms behind: {command.look_ahead} frames of look-ahead are "
+        f"{waiting:.0f} ms, and computing took {np.median(spent):.1f} ms a frame ({spent.max():.1f} at most)"
+    )
+    _print_retargeted(console, figures, command.out)
+
+
+def _print_retargeted(console: Console, figures: dict[str, Any], out: Path) -> None:
+    """What came of a clip."""
     joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
     console.print(
         f"segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {feet['slip_mm_max']:.2f} mm, soles "
         f"{feet['float_mm_max']:.2f} mm above and {feet['below_floor_mm_max']:.2f} mm below the floor at most, "
         f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
     )
-    console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
+    console.print(f"written to {out}: {', '.join(sorted(os.listdir(out)))}")
 
 
 def _robot_to_retarget(source: str) -> Robot:
@@ -589,7 +647,9 @@ def _view(command: View) -> None:
     from .viewer.live import _open
 
     with _told():
-        if command.html is not None and (command.file is None or command.file.suffix == ".json"):
+        if command.html is not None and (
+            command.file is None or command.file.suffix == ".json" or _open.is_map(command.file)
+        ):
             raise CommandError("--html goes with a motion.npz")
         _open.check(command.host, 0 if command.html is not None else command.port)
         source = _open.source_of(command.robot, {"auto": None, "floating": True, "fixed": False}[command.base])
@@ -603,7 +663,8 @@ def _view(command: View) -> None:
                 print(f"written: {command.html}")
                 return
             if command.file is not None:
-                view = _open.open_motion(command.file, robot, source, **options)
+                opened = _open.open_map if _open.is_map(command.file) else _open.open_motion
+                view = opened(command.file, robot, source, **options)
             else:
                 feet = command.support or _feet(robot)
                 view = _open.open_robot(robot, source, feet, **options)
@@ -629,13 +690,6 @@ def _writing(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise CommandError(f"cannot write to {folder}: {error.strerror or error}; it may be incomplete") from error
-
-
-def _spoken(seconds: float) -> str:
-    """A time as one says it: no more exact than it is known."""
-    if seconds < 90.0:
-        return f"{max(5 * round(seconds / 5.0), 5)} s"
-    return f"{0.5 * round(seconds / 30.0):g} min"
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from ._blocks import BLOCK
 from ._checks import (
@@ -97,7 +97,7 @@ class Trajectory(eqx.Module):
 
 def solve(
     robot: Robot,
-    q: Float[Array, " nq"],
+    q: Num[ArrayLike, " nq"] | Sequence[float],
     tasks: Tasks,
     *,
     scheme: Scheme | None = None,
@@ -150,7 +150,7 @@ def solve(
 
 def build_problem(
     robot: Robot,
-    q: Float[Array, " nq"],
+    q: Num[ArrayLike, " nq"] | Sequence[float],
     tasks: Tasks,
     *,
     limits: Sequence[Limit] | None = None,
@@ -250,7 +250,7 @@ def _finite(x: Array) -> Array:
 
 def rollout(
     robot: Robot,
-    q0: Float[Array, " nq"],
+    q0: Num[ArrayLike, " nq"] | Sequence[float],
     tasks: Tasks | Callable[[Array], Tasks],
     *,
     scheme: Scheme | None = None,
@@ -258,7 +258,7 @@ def rollout(
     dt: Float[Array, ""] | float = 0.005,
     steps: int,
     targets: Targets | None = None,
-    feedback: Feedback | Float[Array, "steps nq"] | None = None,
+    feedback: Feedback | Float[ArrayLike, "steps nq"] | None = None,
 ) -> Trajectory:
     """The closed loop: solve, integrate, repeat, in one compiled scan.
 

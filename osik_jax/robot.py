@@ -13,7 +13,7 @@ import jax.core
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, DTypeLike, Float
+from jaxtyping import Array, ArrayLike, DTypeLike, Float, Num
 
 from . import _loading
 from ._describe import described
@@ -308,12 +308,12 @@ class Robot(eqx.Module):
             )
         return {f: leader for f, leader, _ in self.tree.followers}.get(joint, joint)
 
-    def mujoco_qpos(self, q: Float[Array, " nq"]) -> Float[Array, " nqfull"]:
+    def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
         """The configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
         index, coefficient = self.tree.qpos_source
         return jnp.asarray(q)[index] * coefficient + self.qpos_offset
 
-    def configuration(self, joints: Mapping[str, float], *, base: Float[Array, " nq"] | None = None) -> Array:
+    def configuration(self, joints: Mapping[str, float], *, base: Num[ArrayLike, " nq"] | None = None) -> Array:
         """``q0`` (or ``base``) with the named hinge and slide joints set; setting a follower moves its leader. (nq,).
 
         Raises:
@@ -417,7 +417,7 @@ class Robot(eqx.Module):
             Path(path).write_text(text, encoding="utf-8")
         return text
 
-    def check_configuration(self, q: Float[Array, " nq"], name: str = "q") -> None:
+    def check_configuration(self, q: Num[ArrayLike, " nq"], name: str = "q") -> None:
         """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
 
         Args:

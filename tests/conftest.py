@@ -1,10 +1,13 @@
-"""Shared by all tests: double precision, quick compilation, one seed, compiled programs dropped after each file."""
+"""Shared by all tests: double precision, quick compilation that is not done twice, one seed, memory that stays flat."""
 
+import atexit
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
 from importlib.util import find_spec
+from pathlib import Path
 
 # Most of the suite's time is XLA's: without its optimiser and with its older fusions compiling takes a quarter of that.
 # The gate runs the recorded problems and the demos as users do.
@@ -14,6 +17,13 @@ os.environ.setdefault(
     # jaxlib 0.11 does not know this one, and unknown flags end the process
     + (" --xla_cpu_use_fusion_emitters=false" if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11) else ""),
 )
+
+# A program that was compiled before is read from a folder, which all files and processes of a run share.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="osik-tests-")
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
 import numpy as np
@@ -25,6 +35,8 @@ configure_cpu()
 jax.config.update("jax_enable_x64", True)
 
 
+MOST_MEMORY = 4 * 2**30
+"""What a process may hold after a file of tests, in bytes, before it drops its compiled programs."""
 WITH_TORCH = "test_beside_pytorch_kinematics.py"
 WITH_BROWSER = "test_live_browser.py"
 NOT_INSTALLED = {} if find_spec("pytorch_kinematics") else {WITH_TORCH: "pytorch-kinematics"}
@@ -46,6 +58,16 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs() -> Iterator[None]:
-    """Keeps memory flat: hundreds of compiled programs would stay until the end."""
+    """Keeps memory within bounds: the compiled programs of all files would stay until the end."""
     yield
-    jax.clear_caches()
+    if memory_in_use() > MOST_MEMORY:
+        jax.clear_caches()
+
+
+def memory_in_use() -> int:
+    """What this process holds, in bytes; more than any bound where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return MOST_MEMORY + 1
+    return pages * os.sysconf("SC_PAGE_SIZE")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from task_checks import moved_by
 
 import osik_jax as osik
 from osik_jax.viewer import mujoco_poses, robot_com
@@ -226,22 +227,29 @@ class TestScaledLinks:
         length, mass = LONGER[name]
         scaled = robot.scaled(length=length, mass=mass)
         model = edited_model(robot, spelled_out(robot, length), spelled_out(robot, mass))
-        q = osik.integrate(robot, robot.q0, jnp.asarray(0.4 * rng.normal(size=robot.nv)), 1.0)
+        q = moved_by(robot, robot.q0, jnp.asarray(0.4 * rng.normal(size=robot.nv)))
         data = mujoco.MjData(model)
         data.qpos[:] = np.asarray(robot.mujoco_qpos(q))
         mujoco.mj_forward(model, data)
-        kin = jax.jit(osik.forward_kinematics)(scaled, q)
         sites = [name for name in robot.frame_names if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) >= 0]
+
+        @jax.jit
+        def of(robot, q):
+            kin = osik.forward_kinematics(robot, q)
+            places = kin.frame_poses(robot, (*robot.body_names, *sites))[0]
+            return places, osik.center_of_mass(robot, kin), osik.mass_matrix(robot, kin)
+
+        places, center, inertia = map(np.asarray, of(scaled, q))
         expected = [data.body(name).xpos for name in robot.body_names] + [data.site(name).xpos for name in sites]
-        np.testing.assert_allclose(kin.frame_poses(scaled, (*robot.body_names, *sites))[0], expected, atol=1e-9)
+        np.testing.assert_allclose(places, expected, atol=1e-9)
         moving = np.where(model.body_weldid != 0, model.body_mass, 0.0)
-        np.testing.assert_allclose(osik.center_of_mass(scaled, kin), moving @ data.xipos / moving.sum(), atol=1e-9)
-        v = jnp.asarray(rng.normal(size=robot.nv))
+        np.testing.assert_allclose(center, moving @ data.xipos / moving.sum(), atol=1e-9)
+        v = rng.normal(size=robot.nv)
         data.qvel[:] = full_velocity(robot, v)
         mujoco.mj_energyVel(model, data)
-        np.testing.assert_allclose(v @ osik.mass_matrix(scaled, kin) @ v / 2.0, data.energy[1], rtol=1e-12)
+        np.testing.assert_allclose(v @ inertia @ v / 2.0, data.energy[1], rtol=1e-12)
         before = robot_com(robot, next(mujoco_poses(robot, q)))
-        assert np.abs(np.asarray(osik.center_of_mass(scaled, kin)) - before).max() > 1e-3
+        assert np.abs(center - before).max() > 1e-3
 
     def test_one_factor_for_all_is_a_larger_robot(self, arm):
         scaled = arm.scaled(length=2.0, mass=8.0)

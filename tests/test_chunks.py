@@ -17,6 +17,7 @@ import pytest
 from jax.core import Tracer
 
 from osik_jax import scaling
+from osik_jax._progress import Pace
 from osik_jax.scaling._chunk_file import DamagedFile, Part, check_chunk, read_chunk
 
 X = np.arange(20.0)
@@ -357,6 +358,32 @@ def test_results_that_would_not_come_back(tmp_path, function, message):
     with pytest.raises(ValueError, match=message):
         run(tmp_path, function)
     assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+
+
+def test_the_bar_says_how_many_of_what_are_done(tmp_path, capfd):
+    """Those of an earlier job count as done."""
+
+    def stop(done: int, count: int) -> None:
+        if done == 12:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, program, shared=(3.0,), progress=stop)
+    counted = Counted()
+    assert_right(run(tmp_path, counted, shared=(3.0,), progress=True, unit="clips"))
+    assert len(counted.ran) == 2
+    shown = capfd.readouterr().err
+    assert "20 of 20 clips" in shown and "a second" in shown and "left" not in shown
+    run(None, program, shared=(3.0,), progress=True)
+    assert "20 of 20 lanes" in capfd.readouterr().err
+
+
+def test_the_time_left_is_that_of_the_pace_since_the_first_were_done():
+    """600 s of compiling count only while nothing else is known."""
+    pace = Pace(1000, 50.0)
+    assert pace.seconds_left(1100, 2000, 650.0) == pytest.approx(600.0 / 100 * 900)
+    assert pace.seconds_left(1400, 2000, 680.0) == pytest.approx(30.0 / 300 * 600)
+    assert pace.seconds_left(1700, 2000, 750.0) == pytest.approx(100.0 / 600 * 300)
 
 
 def test_progress_as_a_function(tmp_path):

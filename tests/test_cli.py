@@ -14,6 +14,7 @@ import pytest
 
 import osik_jax as osik
 from osik_jax import cli, demo
+from osik_jax._progress import spoken
 from osik_jax.demo import _folder
 from osik_jax.viewer import _opengl
 
@@ -161,12 +162,13 @@ def test_an_interrupt_ends_in_one_line(tmp_path, arm_file):
 
 
 def test_times_are_told_no_more_exactly_than_they_are_known():
-    assert [cli._spoken(seconds) for seconds in (0.2, 42.0, 89.0, 100.0, 340.0)] == [
+    assert [spoken(seconds) for seconds in (0.2, 42.0, 89.0, 100.0, 340.0, 9500.0)] == [
         "5 s",
         "40 s",
         "90 s",
         "1.5 min",
         "5.5 min",
+        "2.5 h",
     ]
 
 

@@ -14,6 +14,7 @@ import quadprog
 from derivative_checks import assert_exact, check
 from hierarchy_families import Hierarchies, Rows
 from lexicographic import certificate, norms, reference
+from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.schemes import VelocityProblem
@@ -59,7 +60,7 @@ def lanes(arm):
 def case(arm, lane, *, hard=("elbow",), bound=2.0):
     """The elbow's position kept, the hand far from its place, rows on the joints."""
     q, place, matrix, lower, upper = lane
-    p, R = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
+    p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
     tasks = {
         "elbow": osik.FrameTask(arm, "link4", rows=(True, True) + (False,) * 4, gain=1.0, hard="elbow" in hard),
         "side": osik.FrameTask(
@@ -277,7 +278,7 @@ class TestPrograms:
     def test_without_constraints_there_is_no_level_for_them(self, arm):
         tasks = {"posture": osik.PostureTask(arm, weight=1.0)}
         limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)
-        kinematics = osik.forward_kinematics(arm, arm.q0)
+        kinematics = kinematics_at(arm, arm.q0)
         assert osik.limit_rows(arm, kinematics, arm.q0, limits, DT) is None
         rows = {name: task.rows(arm, kinematics, arm.q0) for name, task in tasks.items()}
         free = jnp.full(arm.nv, jnp.inf)

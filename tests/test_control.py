@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.solvers import raise_if_failed
@@ -31,7 +32,7 @@ def arm():
 
 @pytest.fixture(scope="module")
 def home(arm):
-    return tuple(map(np.asarray, osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")))
+    return tuple(map(np.asarray, kinematics_at(arm, arm.q0).frame_pose(arm, "hand")))
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,9 @@ def paths(home):
     return home[0] + np.stack([0.2 * t, 0.1 * np.sin(8.0 * t), -0.1 * t], 1), turn @ home[1]
 
 
+step = jax.jit(osik.integrate)
+
+
 def loop(robot, q, tasks_at, scheme, limits, dt=DT, steps=STEPS, measured=None):
     """The rollout in Python."""
     qs, solutions, warm_start = [np.asarray(q)], [], None
@@ -59,7 +63,7 @@ def loop(robot, q, tasks_at, scheme, limits, dt=DT, steps=STEPS, measured=None):
         q = q if measured is None else measured(k, q)
         solutions.append(osik.solve(robot, q, tasks_at(k), scheme=scheme, limits=limits, dt=dt, warm_start=warm_start))
         warm_start = solutions[-1].warm_start
-        q = osik.integrate(robot, q, solutions[-1].velocity, dt)
+        q = step(robot, q, solutions[-1].velocity, dt)
         qs.append(np.asarray(q))
     return np.array(qs), jax.tree.map(lambda *leaves: np.stack(leaves), *solutions)
 

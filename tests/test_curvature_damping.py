@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from task_checks import kinematics_at
 
 import osik_jax as osik
 
@@ -64,18 +65,20 @@ def test_the_bound_is_near_the_greatest_curvature(arm, rng):
 
 
 def test_met_and_linear_tasks_bend_nothing(arm):
-    q = bent(arm)
-    kinematics = osik.forward_kinematics(arm, q)
-    met = osik.FrameTask(arm, "hand", target=kinematics.frame_pose(arm, "hand")).rows(arm, kinematics, q)
-    assert met.curvature == 0.0
-    assert osik.PostureTask(arm, weight=1.0).rows(arm, kinematics, q).curvature == 0.0
+    @jax.jit
+    def curvatures(q):
+        kinematics = osik.forward_kinematics(arm, q)
+        met = osik.FrameTask(arm, "hand", target=kinematics.frame_pose(arm, "hand"))
+        return [task.rows(arm, kinematics, q).curvature for task in (met, osik.PostureTask(arm, weight=1.0))]
+
+    assert curvatures(bent(arm)) == [0.0, 0.0]
 
 
 @pytest.fixture(scope="module")
 def beyond(arm):
     """Of each scheme: three seconds towards a point that is half a metre out of reach, damped and not."""
     q0 = bent(arm)
-    rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")[1]
+    rotation = kinematics_at(arm, q0).frame_pose(arm, "hand")[1]
     away = jnp.array([1.0, 0.3, 0.2]) / jnp.linalg.norm(jnp.array([1.0, 0.3, 0.2]))
     task = osik.FrameTask(arm, "hand", rows="position", target=(1.5 * away, rotation), gain=50.0)
     limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)
@@ -105,7 +108,7 @@ def test_out_of_reach_it_comes_to_rest(scheme, beyond):
 def test_inside_it_is_as_exact_as_without(scheme, arm):
     """A hand that follows a circle, the whole error asked for in one tick."""
     q0 = bent(arm)
-    p, rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")
+    p, rotation = kinematics_at(arm, q0).frame_pose(arm, "hand")
     t = 2.0 * np.pi * np.arange(200) * DT
     path = p + 0.05 * np.c_[1.0 - np.cos(t), np.sin(t), 0.0 * t]
     targets = {"hand": (path, np.broadcast_to(rotation, (200, 3, 3)))}
@@ -116,7 +119,7 @@ def test_inside_it_is_as_exact_as_without(scheme, arm):
     def errors(kappa):
         scheme_ = SCHEMES[scheme](curvature_damping=kappa)
         motion = osik.rollout(arm, q0, tasks, scheme=scheme_, limits=(), dt=DT, steps=200, targets=targets)
-        ends = jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "hand")[0])(motion.q[1:])
+        ends = jax.vmap(lambda q: kinematics_at(arm, q).frame_pose(arm, "hand")[0])(motion.q[1:])
         return jnp.linalg.norm(ends - path, axis=1)
 
     damped, plain = np.asarray(errors(jnp.array([1.0, 0.0])))
@@ -131,10 +134,9 @@ def test_inside_it_is_as_exact_as_without(scheme, arm):
 def test_derivatives_with_the_damping_on(scheme, arm):
     """By target, gain, configuration and the damping's own share, against central differences; second ones too."""
     q0 = bent(arm)
-    p, rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")
+    p, rotation = kinematics_at(arm, q0).frame_pose(arm, "hand")
     posture = osik.PostureTask(arm, weight=0.1, gain=1.0, priority=2)
 
-    @jax.jit
     def velocity(t):
         hand = osik.FrameTask(
             arm, "hand", rows="position", target=(p + jnp.array([0.5, 0.2, 0.1 + t]), rotation), gain=20.0 + t
@@ -143,15 +145,18 @@ def test_derivatives_with_the_damping_on(scheme, arm):
         made = SCHEMES[scheme](curvature_damping=1.0 + t)
         return osik.solve(arm, q, {"hand": hand, "posture": posture}, scheme=made, limits=(), dt=DT).velocity
 
-    h = 5e-5
-    for function in (velocity, jax.jit(jax.jacfwd(velocity))):
-        near, far = function(h) - function(-h), function(2.0 * h) - function(-2.0 * h)
+    def once(t):
+        return jax.jvp(velocity, (t,), (1.0,))
+
+    h, twice = 5e-5, jax.jit(lambda t: jax.jvp(once, (t,), (1.0,)))
+    there = {k: twice(k * h)[0] for k in (-2, -1, 1, 2)}  # the velocity and its derivative
+    (_, slope), rates = twice(0.0)
+    for part, found in enumerate(rates):
+        near, far = there[1][part] - there[-1][part], there[2][part] - there[-2][part]
         expected = (8.0 * near - far) / (12.0 * h)
-        found = jax.jvp(function, (0.0,), (1.0,))[1]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-    np.testing.assert_allclose(
-        jax.jacrev(velocity)(0.0), jax.jacfwd(velocity)(0.0), rtol=0, atol=1e-9 * np.abs(expected).max()
-    )
+    reverse = jax.jit(jax.jacrev(velocity))(0.0)
+    np.testing.assert_allclose(reverse, slope, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.slow
@@ -160,7 +165,7 @@ def test_derivatives_where_little_room_is_left(scheme, arm):
     """On the way to a target out of reach, with a posture below: by target, gain, configuration and share."""
     make = SCHEMES.get(scheme, lambda **numbers: osik.NullSpace(saturate=True, **numbers))
     q0, away = bent(arm), 1.5 * jnp.array([1.0, 0.3, 0.2]) / jnp.linalg.norm(jnp.array([1.0, 0.3, 0.2]))
-    rotation = osik.forward_kinematics(arm, q0).frame_pose(arm, "hand")[1]
+    rotation = kinematics_at(arm, q0).frame_pose(arm, "hand")[1]
     hand = osik.FrameTask(arm, "hand", rows="position", target=(away, rotation), gain=10.0)
     posture = osik.PostureTask(arm, target=q0, gain=10.0, priority=2, weight=1.0)
     tasks = {"hand": hand, "posture": posture}

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax import demo, viewer
@@ -119,7 +120,7 @@ def test_an_arm_rises_above_its_base_and_a_hanging_one_hangs():
     for turn, reach, side in ((0.0, -0.3, 1.0), (np.pi, 0.3, -1.0)):
         robot = osik.Robot.from_mjcf(arm.format(turn, reach))
         motion = motion_of(robot)
-        height = osik.forward_kinematics(robot, motion.q0).frame_pose(robot, "tool")[0][2]
+        height = kinematics_at(robot, motion.q0).frame_pose(robot, "tool")[0][2]
         assert side * height > 0.0, (turn, height)
 
 
@@ -135,7 +136,7 @@ def test_a_walker_stands_on_the_floor():
     robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
     motion = demo.file_motion(robot, name="solo12", look=look)
     assert viewer.robot_outline(robot, motion.q0, look).lowest == pytest.approx(0.0, abs=1e-9)
-    heights = [osik.forward_kinematics(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
+    heights = [kinematics_at(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
     assert len(heights) == 4 and np.ptp(heights) < 1e-3 and max(heights) < 0.05
     assert motion.notes == ()
 

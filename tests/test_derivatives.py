@@ -165,7 +165,7 @@ class TestSwitches:
 
         def answer(column):
             levels = [Level(jnp.diag(jnp.array([1.0, column])), [5.0, 0.5]), Level([[0.0, 1.0]], [2.0])]
-            return solve_hqp(levels, [-1.0, -0.3], [1.0, 0.3]).x
+            return solve_hqp(levels, jnp.array([-1.0, -0.3]), jnp.array([1.0, 0.3])).x
 
         np.testing.assert_array_equal(answer(column), [1.0, 0.3])
         np.testing.assert_allclose(jax.jacfwd(answer)(column), 0.0, rtol=0, atol=1e-9)

@@ -83,7 +83,9 @@ def heading_anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
 
-LONG = {"docs/batches.md", "docs/porting.md", "docs/tasks_and_limits.md"}
+LONG = {
+    f"docs/{name}.md" for name in ("batches", "porting", "scaling", "solvers", "tasks_and_limits", "tuning", "viewer")
+}
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from task_checks import assert_every_number_counts, assert_jacobians, at_each, rows_of_each
+from task_checks import assert_every_number_counts, assert_jacobians, at_each, moved_by, rows_of_each
 
 import osik_jax as osik
 from osik_jax.kinematics._rates import kinematics_rates
@@ -104,7 +104,8 @@ def tasks(robot):
 @pytest.fixture(scope="module")
 def configurations(robot):
     rng = np.random.default_rng(4)
-    return jax.vmap(lambda v: osik.integrate(robot, robot.q0, v))(jnp.asarray(rng.uniform(-1.5, 1.5, (3, robot.nv))))
+    moves = jnp.asarray(rng.uniform(-1.5, 1.5, (3, robot.nv)))
+    return jax.vmap(moved_by, in_axes=(None, None, 0))(robot, robot.q0, moves)
 
 
 @pytest.fixture(scope="module")

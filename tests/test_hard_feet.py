@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from task_checks import kinematics_at, moved_by
 
 import osik_jax as osik
 from osik_jax.solvers import Status
@@ -24,8 +25,8 @@ def setting():
     robot = osik.load_robot("nao")
     rng = np.random.default_rng(1)
     moves = rng.uniform(-0.02, 0.02, (LANES, robot.nv))
-    q = jax.vmap(lambda v: osik.integrate(robot, robot.q0, v))(jnp.asarray(moves))
-    p, R = osik.forward_kinematics(robot, robot.q0).frame_pose(robot, "l_gripper")
+    q = jax.vmap(moved_by, in_axes=(None, None, 0))(robot, robot.q0, jnp.asarray(moves))
+    p, R = kinematics_at(robot, robot.q0).frame_pose(robot, "l_gripper")
     feet = {foot: osik.FrameTask(robot, foot, hard=True, gain=2.0) for foot in ("l_sole", "r_sole")}
     hand = osik.FrameTask(robot, "l_gripper", target=(p + np.array([1.0, 0.3, 0.2]), R), rows="position", weight=1e6)
     tasks = {**feet, "hand": hand, "posture": osik.PostureTask(robot, weight=1e-2, priority=2)}

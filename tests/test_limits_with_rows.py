@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from derivative_checks import assert_exact, check
+from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.solvers import Status
@@ -150,7 +151,7 @@ class TestBarrier:
 
     def test_a_hand_that_wants_through(self, arm):
         """The hand slides along the walls, and does not pass them by more than the path curves in a tick."""
-        p, R = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
+        p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
         tasks = {
             "hand": osik.FrameTask(arm, "hand", target=(p + np.array([0.3, 0.2, 0.0]), R), orientation_weight=0.0),
             "posture": osik.PostureTask(arm, weight=1e-4, priority=2),
@@ -220,7 +221,7 @@ def solve(robot, tasks, scheme, limits):
 
 class TestLimitTask:
     def tasks(self, arm, limit, priority):
-        p, R = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
+        p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
         return {
             "hand": osik.FrameTask(arm, "hand", target=(p + np.array([0.2, 0.3, 0.1]), R), rows="position", priority=2),
             "speed": osik.LimitTask(arm, limit, priority=priority),
@@ -246,7 +247,7 @@ class TestLimitTask:
         beyond = v - np.clip(v, -0.5, 0.5)
         np.testing.assert_allclose(s.slack["speed"], beyond, atol=1e-15)
         assert np.abs(beyond).max() > 0.1
-        J = np.asarray(osik.frame_jacobian(arm, osik.forward_kinematics(arm, arm.q0), "hand"))[:3]
+        J = np.asarray(osik.frame_jacobian(arm, kinematics_at(arm, arm.q0), "hand"))[:3]
         null = np.linalg.svd(J)[2][3:]
         np.testing.assert_allclose(null @ beyond, 0.0, atol=1e-9)  # its gradient, where the hand leaves freedom
 

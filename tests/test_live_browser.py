@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from made_up_map import WHOLE, made_up_map
 from playwright.sync_api import Page, sync_playwright
+from waiting import until
 
 import osik_jax as osik
-from osik_jax.viewer import LiveView, export_html, serve_session
+from osik_jax.viewer import LiveView, ReachView, export_html, serve_reach, serve_session
 from osik_jax.viewer._mujoco import mujoco_frame_pose, mujoco_poses
 from osik_jax.viewer.live._default import default_session
 from osik_jax.viewer.live._source import RobotSource
@@ -24,15 +25,6 @@ FEET, HAND = ("l_sole", "r_sole"), "l_gripper"
 ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIZE = {"width": 900, "height": 600}
 HERE = ("http://127.0.0.1", "ws://127.0.0.1", "blob:", "data:", "file:")
-
-
-def until(holds: Callable[[], bool], seconds: float = 60.0) -> bool:
-    end = time.monotonic() + seconds
-    while not holds():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.05)
-    return True
 
 
 class Visit:
@@ -82,7 +74,7 @@ def away(view: LiveView) -> float:
     return float(np.linalg.norm(mujoco_frame_pose(ROBOT, data, HAND)[0] - target(view)))
 
 
-def pixel(view: LiveView, point: np.ndarray) -> tuple[float, float]:
+def pixel(view: LiveView | ReachView, point: np.ndarray) -> tuple[float, float]:
     """Where the first visitor sees a point of the world."""
     clients = view._server.get_clients()
     camera = clients[min(clients)].camera
@@ -220,4 +212,31 @@ def test_an_exported_page_plays_without_a_server(visit: Visit, tmp_path: Path) -
     page.wait_for_timeout(2000)
     assert float(clock.input_value()) != before
     page.screenshot(path=tmp_path / "exported.png")
+    visit.check()
+
+
+def test_a_click_on_a_slice_and_a_drag_past_it(visit: Visit, tmp_path: Path) -> None:
+    """A click brings the robot there; a drag turns the camera and nothing else."""
+    arm, page = osik.load_robot("arm7"), visit.page
+    found = made_up_map(arm)
+    visit.requests.clear()
+    with serve_reach(arm, found, port=0) as view:
+        page.goto(view.url)
+        assert until(lambda: len(view._server.get_clients()) == 1)
+        view.show("y", 0.0)
+        page.get_by_text("y = 0.000 m").wait_for()
+        page.wait_for_timeout(3000)
+        page.mouse.click(*pixel(view, found.positions[WHOLE]))
+        assert until(lambda: view._placed == WHOLE)
+        page.get_by_text("0.200 0.000 0.400").wait_for()
+        page.screenshot(path=tmp_path / "reach.png")
+        (camera,) = (client.camera for client in view._server.get_clients().values())
+        before = camera.position.copy()
+        page.mouse.move(150.0, 300.0)
+        page.mouse.down()
+        page.mouse.move(350.0, 300.0, steps=8)
+        page.mouse.up()
+        assert until(lambda: float(np.linalg.norm(camera.position - before)) > 0.1)
+        assert view._placed == WHOLE
+        page.goto("about:blank")
     visit.check()

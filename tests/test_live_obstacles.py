@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
@@ -12,6 +12,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from waiting import until
 
 import osik_jax as osik
 from osik_jax.collision._geometry import Kind
@@ -26,15 +27,6 @@ from osik_jax.viewer.live._source import RobotSource
 from osik_jax.viewer.live._surfaces import part_triangles
 
 ARM, NAO = osik.load_robot("arm7"), osik.load_robot("nao")
-
-
-def until(holds: Callable[[], bool], seconds: float = 60.0) -> bool:
-    end = time.monotonic() + seconds
-    while not holds():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.01)
-    return True
 
 
 @cache

@@ -5,13 +5,13 @@ from __future__ import annotations
 import socket
 import time
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from waiting import until
 
 import osik_jax as osik
 from osik_jax.cli import main
@@ -148,7 +148,7 @@ def test_robots_side_by_side_each_with_its_own_numbers() -> None:
         view.loop.reset()
         view.loop.record()
         view.loop.resume()
-        until(lambda: (view.loop.snapshot.recording or 0.0) > 0.3)
+        assert until(lambda: (view.loop.snapshot.recording or 0.0) > 0.3)
         q = view.loop.recorded().q
         assert q.shape[1:] == (2, ARM.nq)
         for lane, (name, own) in enumerate(robots.items()):
@@ -160,7 +160,7 @@ def test_robots_side_by_side_each_with_its_own_numbers() -> None:
         second: Any = view._tasks[1]["hand"]
         np.testing.assert_allclose(second.target[0], position, atol=1e-12)  # the handles move together
         view._dragging(0)("hand", (np.asarray(position), np.array([1.0, 0.0, 0.0, 0.0])), 7, "end")
-        until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 1e-2)
+        assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 1e-2)
     with pytest.raises(ValueError, match="differ in more than numbers"):
         serve_batch(ARM, {"one": arm_tasks(1.0), "other": {"posture": osik.PostureTask(ARM)}}, port=0)
     with pytest.raises(ValueError, match="tasks is empty"):
@@ -169,13 +169,6 @@ def test_robots_side_by_side_each_with_its_own_numbers() -> None:
 
 def arm_tasks(gain: float) -> dict[str, Any]:
     return {"hand": osik.FrameTask(ARM, "hand", gain=gain), "posture": osik.PostureTask(ARM, weight=1e-4)}
-
-
-def until(holds: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

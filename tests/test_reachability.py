@@ -279,4 +279,7 @@ def test_the_command_writes_a_map_and_a_picture_and_goes_on(planar, tmp_path, ca
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.npz", "map.png", "planar.xml"]
     found = reachability.load_map(out)
     assert found.reached.shape[3] == 8 and 50 <= found.share.size <= 60
-    assert f"{found.share.size} (" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert f"{found.share.size} (" in told.out
+    tried = int((found.beyond_reach == 0.0).sum())
+    assert f"{tried} of {tried} positions" in told.err

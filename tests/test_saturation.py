@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from optimality import outside_cone
+from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.solvers import Level, Status, solve_nullspace
@@ -471,7 +472,7 @@ class TestScheme:
     @pytest.fixture(scope="class")
     @staticmethod
     def tasks(arm):
-        p, R = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
+        p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
         height = osik.FrameTask(arm, "hand", rows=(False, False, True, False, False, False), priority=1)
         far = p + jnp.array([0.3, 0.0, 0.0]), R
         return {"height": height, "hand": osik.FrameTask(arm, "hand", rows="position", target=far, priority=2)}

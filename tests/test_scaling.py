@@ -283,7 +283,7 @@ def test_in_memory_with_a_bar(capsys):
     got = scaling.run_in_chunks(scaling.sharded(lambda x: {"y": x + 1.0}), x, chunk=4)
     assert isinstance(got["y"], np.ndarray)
     np.testing.assert_array_equal(got["y"], np.asarray(x) + 1.0)
-    assert "10/10" in capsys.readouterr().err
+    assert "10 of 10 lanes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 import scipy.optimize
+from task_checks import kinematics_at, moved_by
 
 import osik_jax as osik
 from osik_jax.schemes import limit_potential_gradient
@@ -50,7 +51,7 @@ def g1_path() -> Path:
 
 
 def at_home(robot, frame):
-    kinematics = jax.jit(osik.forward_kinematics)(robot, robot.q0)
+    kinematics = kinematics_at(robot, robot.q0)
     return tuple(map(np.asarray, kinematics.frame_pose(robot, frame)))
 
 
@@ -108,7 +109,7 @@ def configurations(case, rng, spread=0.3):
     moves[0] = 0.0
     if robot.floating_base:
         moves[:, :6] *= 0.1
-    q = np.array(jax.vmap(lambda v: osik.integrate(robot, robot.q0, v))(jnp.asarray(moves)))
+    q = np.array(jax.vmap(moved_by, in_axes=(None, None, 0))(robot, robot.q0, jnp.asarray(moves)))
     joints = q[:, 7 * robot.floating_base :]
     low, high = (np.asarray(b)[6 * robot.floating_base :] for b in (robot.position_lower, robot.position_upper))
     np.clip(joints, low, high, out=joints)
@@ -228,7 +229,7 @@ class TestWeightedQP:
         """Error and Jacobian of a FrameTask are mink's to second order in the error: the feet stay, the rest moves."""
         robot, gain, ticks = g1.robot, 8.0, 60
         feet = ("left_ankle_roll_link", "right_ankle_roll_link")
-        c = np.asarray(osik.center_of_mass(robot, osik.forward_kinematics(robot, robot.q0)))
+        c = np.asarray(osik.center_of_mass(robot, kinematics_at(robot, robot.q0)))
         goal, turn = c + np.array([0.02, 0.03, -0.08]), "right_wrist_yaw_link"
         R = at_home(robot, turn)[1] @ mink.SO3.exp(np.array([0.5, -0.4, 0.3])).as_matrix()
         posture = np.array(robot.q0)
@@ -336,7 +337,7 @@ class TestNullSpace:
     def test_the_potential_leads_away_from_limits_and_keeps_the_task(self, arm):
         robot = arm.robot
         q0 = robot.configuration({"joint1": 2.6, "joint3": -2.6, "joint5": 2.6})
-        p = np.asarray(osik.forward_kinematics(robot, q0).frame_pose(robot, "hand")[0])
+        p = np.asarray(kinematics_at(robot, q0).frame_pose(robot, "hand")[0])
         tasks = {"position": osik.FrameTask(robot, "hand", target=(p, np.eye(3)), rows="position")}
         run = {
             gain: osik.rollout(robot, q0, tasks, scheme=undamped(gain), limits=arm.limits, dt=0.01, steps=100)
@@ -433,10 +434,13 @@ class TestHierarchicalQP:
             np.testing.assert_allclose(ours.velocity[k], expected, rtol=0, atol=1e-8)
 
     def test_one_level_equals_the_weighted_qp(self, arm, rng):
-        case = dataclasses.replace(arm, tasks=arm_tasks(arm.robot, (1, 1, 1), (5.0, 2.0, 0.1)))
-        q = configurations(case, rng)
+        q, weights = configurations(arm, rng), (5.0, 2.0, 0.1)
         schemes = osik.HierarchicalQP(curvature_damping=0.0), osik.WeightedQP(damping=1e-11, curvature_damping=0.0)
-        hierarchical, weighted = (solve_lanes(case, q, scheme) for scheme in schemes)
+        ranks = (1, 1, 1), (1, 2, 3)  # which a weighted QP does not look at: a program that is there already
+        hierarchical, weighted = (
+            solve_lanes(dataclasses.replace(arm, tasks=arm_tasks(arm.robot, rank, weights)), q, scheme)
+            for scheme, rank in zip(schemes, ranks, strict=True)
+        )
         np.testing.assert_allclose(hierarchical.velocity, weighted.velocity, rtol=0, atol=1e-8)
 
     def test_growing_weights_tend_to_it(self, arm, rng):

@@ -215,7 +215,8 @@ class TestAt:
     def test_the_error_is_nought_there_and_was_not_before(self, nao, tasks, rng):
         q = jnp.asarray(anywhere(nao, rng))
         before = rows_of_each(nao, tasks, q)
-        after = rows_of_each(nao, {name: task.at(nao, q) for name, task in tasks.items()}, q)
+        there = jax.jit(lambda q: {name: task.at(nao, q) for name, task in tasks.items()})(q)
+        after = rows_of_each(nao, there, q)
         for name, rows in after.items():
             assert np.abs(before[name].error).max() > 1e-3, name
             np.testing.assert_allclose(rows.error, 0.0, atol=2e-8, err_msg=name)

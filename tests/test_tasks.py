@@ -302,13 +302,20 @@ def test_rows_of_all_tasks_together_are_those_of_each():
         "com": osik.ComTask(robot),
         "posture": osik.PostureTask(robot, weight=1.0),
     }
-    q = osik.integrate(robot, robot.q0, 0.1 * jnp.cos(jnp.arange(robot.nv)))
-    kinematics = osik.forward_kinematics(robot, q)
-    together = jax.jit(lambda q: rows_of(robot, osik.forward_kinematics(robot, q), q, tasks))(q)
-    direct = rows_of(robot, kinematics, q, tasks)
-    assert list(direct) == list(tasks)
-    for name, task in tasks.items():
-        alone = task.rows(robot, kinematics, q)
-        assert direct[name].is_equality == alone.is_equality == (name != "box")
+    q = moved_by(robot, robot.q0, 0.1 * np.cos(np.arange(robot.nv)))
+    kinds = []
+
+    @jax.jit
+    def both(q):
+        kinematics = osik.forward_kinematics(robot, q)
+        together = rows_of(robot, kinematics, q, tasks)
+        each = {name: task.rows(robot, kinematics, q) for name, task in tasks.items()}
+        kinds.extend({name: own.is_equality for name, own in rows.items()} for rows in (together, each))
+        return together, each
+
+    together, each = both(q)
+    assert [list(kind) for kind in kinds] == 2 * [list(tasks)]
+    assert kinds[0] == kinds[1] == {name: name != "box" for name in tasks}
+    for name, alone in each.items():
         for ours, expected in zip(jax.tree.leaves(together[name]), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-13)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from problem_families import PLANTED
 from recorded import QP_DAMPING, recorded_hierarchies, recorded_qps
+from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.solvers import Level, Status, WorkingSet, solve_hqp, solve_least_squares_qp, solve_qp
@@ -103,7 +104,7 @@ def test_bounds_that_levels_were_at_and_left_are_part_of_the_scale(rng):
 def reaching():
     """A hand that is told to go faster than its joints can."""
     arm = osik.load_robot("arm7")
-    kinematics = osik.forward_kinematics(arm, arm.q0)
+    kinematics = kinematics_at(arm, arm.q0)
     frame = arm.frame_names[-1]
     p, R = kinematics.frame_pose(arm, frame)
     hand = osik.FrameTask(arm, frame, target=(p + jnp.array([-0.3, 0.3, 0.2]), R), gain=20.0, priority=1)

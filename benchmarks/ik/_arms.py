@@ -48,6 +48,7 @@ class Arm:
 
     Attributes:
         urdf: the text of its description.
+        root: link that stands still.
         frame: that is brought to the targets.
         lower: of the joints, in Pinocchio's order [rad].
         upper: likewise.
@@ -58,7 +59,7 @@ class Arm:
         given = ARMS[name]
         # joints without an end have one in the file all the same, at two turns
         self.urdf = lean_urdf(given).replace('type="continuous"', 'type="revolute"')
-        self.frame = given.hand
+        self.root, self.frame = given.root, given.hand
         self.model = pinocchio_model(self.urdf, False)
         self.data = self.model.createData()
         self.lower, self.upper = self.model.lowerPositionLimit.copy(), self.model.upperPositionLimit.copy()

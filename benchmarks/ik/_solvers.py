@@ -1,7 +1,9 @@
-"""Ours, mink and pink, from poses to configurations in Pinocchio's order of joints."""
+"""Ours and the peers', from poses to configurations in Pinocchio's order of joints."""
 
 from __future__ import annotations
 
+import json
+import subprocess
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +16,7 @@ import pinocchio as pin
 
 import osik_jax as osik
 
+from ..processes import ROOT, PeerUnavailable
 from ._arms import Arm, Poses
 
 POSITION, ORIENTATION = 1e-3, 1e-2
@@ -100,6 +103,34 @@ def with_pink(arm: Arm, poses: Poses) -> Answer:
         return configuration.q.copy(), False
 
     return _from_several_starts(arm, poses, search)
+
+
+def with_pytracik(arm: Arm, poses: Poses, python: str) -> tuple[Answer, str]:
+    """TRAC-IK in the environment of an interpreter, and the version of pytracik.
+
+    Raises:
+        PeerUnavailable: it did not answer; the message is its last line.
+    """
+    question = dict(
+        urdf=arm.urdf,
+        base=arm.root,
+        frame=arm.frame,
+        lower=arm.lower.tolist(),
+        upper=arm.upper.tolist(),
+        positions=poses.positions.tolist(),
+        rotations=poses.rotations.tolist(),
+        tolerance=POSITION / 2.0,
+    )
+    command = [python, "-m", "benchmarks.ik.with_pytracik"]
+    try:
+        done = subprocess.run(command, input=json.dumps(question), capture_output=True, text=True, cwd=ROOT)
+    except OSError as error:
+        raise PeerUnavailable(f"{python}: {error.strerror}") from None
+    if done.returncode:
+        said = [line for line in done.stderr.splitlines() if line.strip()]
+        raise PeerUnavailable(said[-1] if said else "it ended without a word")
+    answer = json.loads(done.stdout)
+    return (np.array(answer["q"]), np.array(answer["found"]), answer["seconds"]), answer["version"]
 
 
 def _from_several_starts(

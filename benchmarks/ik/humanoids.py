@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +66,18 @@ class Judge:
     def __init__(self, robot: osik.Robot) -> None:
         self.robot, self.data = robot, mujoco.MjData(robot.mj_model)
 
+    def along(self, q: np.ndarray) -> Iterator[None]:
+        """Moves to one configuration after the other. (n, nq)."""
+        for own in np.asarray(jax.jit(jax.vmap(self.robot.mujoco_qpos))(jnp.asarray(q)), float):
+            self._move(own)
+            yield
+
     def at(self, q: np.ndarray) -> None:
-        """Moves there."""
-        self.data.qpos[:] = np.asarray(self.robot.mujoco_qpos(jnp.asarray(q)))
+        """Moves to one. (nq,)."""
+        self._move(np.asarray(self.robot.mujoco_qpos(jnp.asarray(q))))
+
+    def _move(self, qpos: np.ndarray) -> None:
+        self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.robot.mj_model, self.data)
         mujoco.mj_comPos(self.robot.mj_model, self.data)
 
@@ -79,9 +89,8 @@ class Judge:
         return of.xpos.copy(), of.xmat.reshape(3, 3).copy()
 
 
-def errors(judge: Judge, q: np.ndarray, wanted: dict[str, tuple[np.ndarray, np.ndarray]], free: tuple[str, ...]) -> Any:
-    """Largest distance and angle of any frame at q; those that are free may turn."""
-    judge.at(q)
+def errors(judge: Judge, wanted: dict[str, tuple[np.ndarray, np.ndarray]], free: tuple[str, ...]) -> Any:
+    """Largest distance and angle of any frame where the judge is; those that are free may turn."""
     away, turned = [], [0.0]
     for name, (position, rotation) in wanted.items():
         p, r = judge.pose(name)
@@ -102,13 +111,9 @@ def measured(name: str, poses: int) -> dict[str, Any]:
         **{hand: osik.FrameTask(robot, hand, rows=rows, orientation_weight=0.05) for hand in hands},
         "posture": osik.PostureTask(robot, weight=1e-4),
     }
-    held: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     judge.at(np.asarray(robot.q0))
     held = {foot: judge.pose(foot) for foot in ROBOTS[name].feet}
-    goals: list[dict[str, tuple[np.ndarray, np.ndarray]]] = []
-    for own in q:
-        judge.at(own)
-        goals.append({hand: judge.pose(hand) for hand in hands})
+    goals = [{hand: judge.pose(hand) for hand in hands} for _ in judge.along(q)]
     targets = {hand: tuple(np.stack([goal[hand][part] for goal in goals]) for part in (0, 1)) for hand in hands}
 
     def find() -> osik.InverseKinematicsSolution:
@@ -119,12 +124,12 @@ def measured(name: str, poses: int) -> dict[str, Any]:
     found = find()
     configurations, seconds = np.asarray(found.q), time.perf_counter() - start
     free = () if name == "g1" else hands
-    judged = [errors(judge, own, held | goal, free) for own, goal in zip(configurations, goals, strict=True)]
-    balance = []
-    for own in configurations:
-        judge.at(own)
-        balance.append(float(polygon.distance(judge.data.subtree_com[0][:2])))
+    judged, centres = [], []
+    for goal, _ in zip(goals, judge.along(configurations), strict=True):
+        judged.append(errors(judge, held | goal, free))
+        centres.append(judge.data.subtree_com[0][:2].copy())
     away, turned = np.array(judged).T
+    balance = jax.vmap(polygon.distance)(jnp.asarray(centres))
     good = (away <= POSITION) & (turned <= ORIENTATION) & (np.array(balance) >= -POSITION)
     joints = configurations[:, 7:].astype(float)
     lower, upper = np.asarray(robot.position_lower)[6:], np.asarray(robot.position_upper)[6:]

@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import osik_jax as osik
+from osik_jax.runtime import configure_cpu
 
 from ..machine import processor
 from ._arms import Arm, Poses
@@ -195,4 +196,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure_cpu()
     main()

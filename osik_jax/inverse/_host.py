@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 _CHUNK = {"cpu": 1024}
@@ -38,6 +37,9 @@ def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
     Args:
         function: of a chunk's goals, and which of them are looked for.
         goals: pytree with the targets in front.
+
+    Returns:
+        NumPy arrays.
     """
     count = len(jax.tree.leaves(goals)[0])
     size = min(_power_of_two(count), _CHUNK.get(jax.default_backend(), _OTHER_CHUNK))
@@ -55,7 +57,7 @@ def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
         first = run(0)  # compiles
         with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
             parts = [first, *threads.map(run, starts[1:])]
-    return jax.tree.map(lambda *own: jnp.asarray(np.concatenate(own)), *parts)
+    return jax.tree.map(lambda *own: np.concatenate(own), *parts) if len(parts) > 1 else parts[0]
 
 
 def _power_of_two(count: int) -> int:

@@ -127,7 +127,7 @@ def inverse_kinematics(
         found = _with_all(found, outcomes, problem.route.entries(robot)) if all else found
     else:
         found = _searched(robot, problem.goals, settings, seeds * (1 + restarts), steps, **start)
-    return found if problem.many else jax.tree.map(lambda a: jnp.asarray(a[0]), found)
+    return jax.tree.map(jnp.asarray, found if problem.many else jax.tree.map(lambda a: a[0], found))
 
 
 def _searched(
@@ -205,6 +205,9 @@ def _inward(bound: Array, sign: float) -> Array:
     """A bound in single precision may be beyond the one that was meant, by its rounding: the next number is not."""
     if bound.dtype != jnp.float32:
         return bound
+    if not _is_traced(bound):
+        seen = np.asarray(bound)
+        return np.where(np.isfinite(seen), np.nextafter(seen, np.float32(sign * np.inf)), seen)  # pyright: ignore
     inner = jnp.nextafter(bound, jnp.full_like(bound, sign * jnp.inf))
     return bound + jax.lax.stop_gradient(jnp.where(jnp.isfinite(bound), inner - bound, 0.0))
 

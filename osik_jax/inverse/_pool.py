@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ class Errors(NamedTuple):
     cost: Float[Array, "..."]
 
 
+@runtime_checkable
 class Search(Protocol):
     """One way to search: a pytree, whose methods take arrays with the lanes in front."""
 

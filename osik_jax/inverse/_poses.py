@@ -59,11 +59,10 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
 
 def _one(value: Any, dtype: Any) -> tuple[Array, Array, tuple[bool, ...]]:
     """Position (3,) or (n, 3), rotation likewise, and rows."""
-    identity = jnp.eye(3, dtype=dtype)
     array = None if _has_parts(value) else pose_array(value, dtype, _ACCEPTED)
     if array is not None and array.shape[-1:] == (3,) and array.ndim <= 2:
         _check_finite(array)
-        return array, jnp.broadcast_to(identity, (*array.shape[:-1], 3, 3)), _POSITION
+        return array, jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*array.shape[:-1], 3, 3)), _POSITION
     pose = _split(value if array is None else array, dtype)
     if pose[0].ndim == 1:
         return *as_pose(pose, dtype), _POSE

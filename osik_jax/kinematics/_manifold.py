@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikValueError
 from .._made_for import check_robot
@@ -14,7 +14,7 @@ from ..robot import Robot
 
 
 def integrate(
-    robot: Robot, q: Float[Array, " nq"], v: Float[Array, " nv"], dt: Float[Array, ""] | float = 1.0
+    robot: Robot, q: Num[ArrayLike, " nq"], v: Num[ArrayLike, " nv"], dt: Float[Array, ""] | float = 1.0
 ) -> Float[Array, " nq"]:
     """Configuration reached from q at velocity v held for dt [s]. Quaternions come back normalised.
 
@@ -37,7 +37,7 @@ def integrate(
     return out
 
 
-def difference(robot: Robot, qa: Float[Array, " nq"], qb: Float[Array, " nq"]) -> Float[Array, " nv"]:
+def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"]) -> Float[Array, " nv"]:
     """The velocity that goes from qa to qb in unit time, so that integrating it from qa arrives at qb. (nv,).
 
     Rotations go the short way round: no angle is greater than pi.

@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
-from .._errors import OsikValueError
 from ..viewer._scene import INK
 from ._map import ReachabilityMap
+from ._slices import NOTHING, cell_edges, fullest, nearest, share_colors
 
-_NOTHING = "#e6e8eb"
 _PLANES = ((0, 1), (0, 2), (1, 2))
-_PALE = 0.15
-"""Share of the colours at the light end that is left out, so that a small share differs from none."""
 
 
 def draw_slices(found: ReachabilityMap, at: tuple[float, float, float] | None = None) -> Figure:
     """As ``ReachabilityMap.figure``."""
     axes = found.x, found.y, found.z
     share = found.share
-    spot = _fullest(share) if at is None else _nearest(axes, at)
+    spot = fullest(share) if at is None else nearest(axes, at)
     planes = [plane for plane in _PLANES if all(len(axes[i]) > 1 for i in plane)] or [_PLANES[0]]
     figure = Figure(figsize=(4.4 * len(planes) + 0.9, 5.0), dpi=130, facecolor="white")
     figure.set_layout_engine("constrained", rect=(0.005, 0.01, 0.99, 0.87))
     FigureCanvasAgg(figure)
     for place, plane in zip(figure.subplots(1, len(planes), squeeze=False)[0], planes, strict=True):
         _draw_slice(place, found, share, spot, plane)
-    colors = ScalarMappable(Normalize(0.0, 100.0), _colors())
+    colors = ScalarMappable(Normalize(0.0, 100.0), share_colors())
     bar = figure.colorbar(colors, ax=figure.axes, shrink=0.8, pad=0.015)
     bar.set_label(f"of {len(found.rotations)} orientations reached [%]", color=INK)
     note = "grey: none found; white: proven out of reach; line: the joints at home"
@@ -43,41 +36,16 @@ def draw_slices(found: ReachabilityMap, at: tuple[float, float, float] | None = 
     return figure
 
 
-def _colors() -> ListedColormap:
-    from matplotlib import colormaps
-
-    return ListedColormap(colormaps["YlGnBu"](np.linspace(_PALE, 1.0, 256)))
-
-
-def _fullest(share: Float[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
-    """Of each axis, where the slice across it holds most."""
-    sums = (share.sum(tuple(j for j in range(3) if j != i)) for i in range(3))
-    return tuple(int(values.argmax()) for values in sums)  # pyright: ignore[reportReturnType]
-
-
-def _nearest(axes: Sequence[np.ndarray], at: Any) -> tuple[int, int, int]:
-    try:
-        point = np.asarray(at, float)
-    except (TypeError, ValueError):
-        point = np.zeros(0)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise OsikValueError(f"at is {at!r}; it is a point x y z [m]")
-    return tuple(  # pyright: ignore[reportReturnType]
-        int(np.abs(axis - value).argmin()) for axis, value in zip(axes, point, strict=True)
-    )
-
-
 def _draw_slice(
     place: Axes, found: ReachabilityMap, share: np.ndarray, spot: tuple[int, int, int], plane: tuple[int, int]
 ) -> None:
     across = 3 - sum(plane)
     axes = found.x, found.y, found.z
     values, beyond = (np.take(field, spot[across], across).T for field in (share, found.beyond_reach > 0.0))
-    width = min((float(np.diff(axis).min()) for axis in axes if len(axis) > 1), default=0.01)
-    edges = [_edges(axes[i], width) for i in plane]
+    edges = [cell_edges(axes)[i] for i in plane]
     nothing = np.ma.masked_where(beyond | (values > 0.0), np.zeros_like(values))
-    place.pcolormesh(*edges, nothing, cmap=ListedColormap([_NOTHING]))
-    place.pcolormesh(*edges, np.ma.masked_where(values == 0.0, values), cmap=_colors(), vmin=0.0, vmax=1.0)
+    place.pcolormesh(*edges, nothing, cmap=ListedColormap([NOTHING]))
+    place.pcolormesh(*edges, np.ma.masked_where(values == 0.0, values), cmap=share_colors(), vmin=0.0, vmax=1.0)
     place.plot(*found.links[:, plane].T, "-o", color="#f08c3a", linewidth=2.0, markersize=3.5, alpha=0.9)
     place.set_aspect("equal")
     names = "xyz"
@@ -85,10 +53,3 @@ def _draw_slice(
     place.set_ylabel(f"{names[plane[1]]} [m]", color=INK)
     place.set_title(f"{names[across]} = {axes[across][spot[across]]:.3g} m", fontsize=10, color=INK)
     place.tick_params(labelsize=8)
-
-
-def _edges(axis: Float[np.ndarray, " n"], width: float) -> Float[np.ndarray, " n_1"]:
-    """Where the cells of coordinates end: halfway between them; a lone one has the width given."""
-    between = 0.5 * (axis[1:] + axis[:-1])
-    ends = (axis[:2].mean(), axis[-2:].mean()) if len(axis) > 1 else (axis[0] + 0.5 * width,) * 2
-    return np.concatenate([[2.0 * axis[0] - ends[0]], between, [2.0 * axis[-1] - ends[1]]])

@@ -66,7 +66,8 @@ def reachability_map(
         orientation_tolerance: largest angle to an orientation [rad].
         out: folder for what is finished, as in ``run_in_chunks``: called again with the same arguments, a job that was
             killed goes on where it was. Default: none.
-        progress: whether to show a bar; or a function of the number of positions that are done and of all.
+        progress: whether to show a bar; or a function of the number of positions that are done and of all. Those that
+            are proven out of reach are not counted.
 
     Raises:
         KeyError: no such frame; the message lists those that exist.
@@ -149,6 +150,7 @@ def _run(
         out=out,
         label=f"reachability of {frame.name}",
         progress=progress,
+        unit="positions",
     )
     return found if out is None else found[:]
 

@@ -4,6 +4,9 @@ from ._bvh import read_bvh as read_bvh
 from ._goals import Weights as Weights
 from ._guess import guess_profile as guess_profile
 from ._keypoints import read_keypoints as read_keypoints
+from ._live import LiveFrame as LiveFrame
+from ._live import LiveRetargeter as LiveRetargeter
+from ._live import LiveStatus as LiveStatus
 from ._load import load_motion as load_motion
 from ._motion import HumanMotion as HumanMotion
 from ._profile import Capsule as Capsule

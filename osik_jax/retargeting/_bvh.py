@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from .._errors import OsikKeyError, OsikValueError
 from ._motion import HumanMotion
 from ._rotations import about, continuous, multiply, rotate
 
@@ -46,7 +47,7 @@ class _Lines:
 
     def next(self, expected: str) -> list[str]:
         if self._at == len(self._lines):
-            raise ValueError(f"{self.path} ends where {expected} should come")
+            raise OsikValueError(f"{self.path} ends where {expected} should come")
         self._at += 1
         return self._lines[self._at - 1][1]
 
@@ -230,16 +231,16 @@ def _scale(path: str, unit: str | float | None, size: float) -> float:
     """Metres a unit."""
     if isinstance(unit, str):
         if unit not in UNITS:
-            raise KeyError(f"no unit {unit!r}; units: {', '.join(UNITS)}, or metres a unit as a number")
+            raise OsikKeyError(f"no unit {unit!r}; units: {', '.join(UNITS)}, or metres a unit as a number")
         return UNITS[unit]
     if unit is not None:
         if not (np.isfinite(unit) and unit > 0.0):
-            raise ValueError(f"unit is {unit}; it is metres a unit, more than 0")
+            raise OsikValueError(f"unit is {unit}; it is metres a unit, more than 0")
         return float(unit)
     for factor in UNITS.values():
         if _HEIGHTS[0] <= factor * size <= _HEIGHTS[1]:
             return factor
-    raise ValueError(
+    raise OsikValueError(
         f"{path}: the rest pose is {size:.4g} units large, which is no person's size in any of {', '.join(UNITS)}: say "
         "what a unit is with unit=METRES"
     )

@@ -34,11 +34,16 @@ def retarget_to_folder(
     """
     out.mkdir(parents=True, exist_ok=True)
     result = retargeter.retarget(motion, mapping=mapping, fps=fps)
+    return result, write_folder(result, motion.name, out, animation=animation)
+
+
+def write_folder(result: Retargeted, name: str, out: Path, *, animation: bool) -> dict[str, Any]:
+    """Writes what ``retarget_to_folder`` says, and returns the report."""
     result.save(out / "motion.npz")
     write_csv(result.motion, out / "motion.csv")
-    figures = {"clip": motion.name, **report(result)}
+    figures = {"clip": name, **report(result)}
     (out / "report.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     save_profile(result.profile, out / "profile.toml")
     if animation:
         film(result, out / "motion.gif")
-    return result, figures
+    return figures

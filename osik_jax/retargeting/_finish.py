@@ -32,24 +32,36 @@ def follow(
         the configurations, and how far the farthest joint of each is from the plan's [rad or m]. (F, nq), (F,)
     """
     dt = jnp.asarray(dt, plan.dtype)
-    spare = _SPARE * _accelerations(robot, limits)
 
     def step(state: tuple[Array, Array], goals: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        (q, velocity), (goal, following) = state, goals
-        lower, upper = limit_box(robot, q, remembering(tuple(limits), velocity, True), dt)
-        behind = difference(robot, q, goal)
-        back = jnp.sign(behind) * stopping_speed(jnp.abs(behind), spare, dt)
-        v = jnp.clip(difference(robot, goal, following) / dt + back, lower, upper)
-        q = integrate(robot, q, v, dt)
-        return (q, v), (q, jnp.abs(difference(robot, q, following)).max())
+        q, velocity = inside_limits(robot, *state, *goals, limits, dt)
+        return (q, velocity), (q, jnp.abs(difference(robot, q, goals[1])).max())
 
-    start = _inside(robot, plan[0])
+    start = inside_ranges(robot, plan[0])
     others = [part for limit in limits for part in limit.parts() if part.kind != "acceleration"]
     velocity = difference(robot, start, plan[jnp.minimum(1, len(plan) - 1)]) / dt
     velocity = jnp.clip(velocity, *limit_box(robot, start, others, dt))
     _, (q, off) = jax.lax.scan(step, (start, velocity), (plan[:-1], plan[1:]))
     first = jnp.abs(difference(robot, start, plan[0])).max()
     return jnp.concatenate([start[None], q]), jnp.concatenate([first[None], off])
+
+
+def inside_limits(
+    robot: Robot,
+    q: Float[Array, " nq"],
+    velocity: Float[Array, " nv"],
+    goal: Float[Array, " nq"],
+    following: Float[Array, " nq"],
+    limits: Sequence[Limit],
+    dt: Float[Array, ""],
+) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
+    """The next configuration, and the velocity that leads to it: from beside ``goal`` towards the one that follows."""
+    spare = _SPARE * _accelerations(robot, limits)
+    lower, upper = limit_box(robot, q, remembering(tuple(limits), velocity, True), dt)
+    behind = difference(robot, q, goal)
+    back = jnp.sign(behind) * stopping_speed(jnp.abs(behind), spare, dt)
+    v = jnp.clip(difference(robot, goal, following) / dt + back, lower, upper)
+    return integrate(robot, q, v, dt), v
 
 
 def _accelerations(robot: Robot, limits: Sequence[Limit]) -> Float[Array, " nv"]:
@@ -61,7 +73,7 @@ def _accelerations(robot: Robot, limits: Sequence[Limit]) -> Float[Array, " nv"]
     return most
 
 
-def _inside(robot: Robot, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
+def inside_ranges(robot: Robot, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
     """A configuration with its joints inside their ranges."""
     scalar, index = scalar_layout(robot)
     at = index[scalar]

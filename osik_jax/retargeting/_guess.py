@@ -10,6 +10,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from .._errors import OsikValueError
 from .._feet import find_feet
 from .._home import home_kinematics
 from ..kinematics import Kinematics
@@ -48,11 +49,13 @@ def guess_profile(robot: Robot) -> Profile:
         ValueError: the base does not float, or two legs and two arms are not found.
     """
     if not robot.floating_base:
-        raise ValueError("a robot that is bolted down cannot walk as a person does: load it with floating_base=True")
+        raise OsikValueError(
+            "a robot that is bolted down cannot walk as a person does: load it with floating_base=True"
+        )
     kinematics, tree = home_kinematics(robot), robot.tree
     feet = find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
     if len(feet) != 2:
-        raise ValueError(f"two feet are needed, and {len(feet)} frames look like some: {', '.join(feet) or 'none'}")
+        raise OsikValueError(f"two feet are needed, and {len(feet)} frames look like some: {', '.join(feet) or 'none'}")
     feet = sorted(feet, key=lambda name: -_y(kinematics.frame_pose(robot, name)[0]))
     legs = _chains(robot, kinematics, [tree.frame_bodies[tree.frame(name)] for name in feet])
     used = {body for leg in legs for body in leg.bodies}
@@ -90,7 +93,9 @@ def _chain(robot: Robot, kinematics: Kinematics, end: int, other: int) -> _Chain
     above = robot.tree.descendants[:, end] & ~robot.tree.descendants[:, other]
     bodies = tuple(int(b) for b in np.flatnonzero(above) if b != robot.tree.root)
     if len(bodies) < 3:
-        raise ValueError(f"the limb that ends in {robot.tree.body_names[end]} has {len(bodies)} joints; it needs three")
+        raise OsikValueError(
+            f"the limb that ends in {robot.tree.body_names[end]} has {len(bodies)} joints; it needs three"
+        )
     return _Chain(bodies, np.asarray(kinematics.body_position)[list(bodies)])
 
 
@@ -100,10 +105,12 @@ def _hands(robot: Robot, kinematics: Kinematics, used: set[int]) -> list[int]:
     outermost = sorted(set(range(2, len(tree.body_parents))) - set(tree.body_parents) - used)
     named = [b for b in outermost if re.search(r"head|neck|camera", tree.body_names[b], re.IGNORECASE) is None]
     if len(named) < 2:
-        raise ValueError(f"two arms are needed; bodies at ends of limbs: {[tree.body_names[b] for b in named]}")
+        raise OsikValueError(f"two arms are needed; bodies at ends of limbs: {[tree.body_names[b] for b in named]}")
     left, right = max(named, key=lambda b: position[b, 1]), min(named, key=lambda b: position[b, 1])
     if not position[left, 1] > 0.0 > position[right, 1]:
-        raise ValueError("no arm is on the left or on the right of the base; x has to be forward and y left at home")
+        raise OsikValueError(
+            "no arm is on the left or on the right of the base; x has to be forward and y left at home"
+        )
     return [left, right]
 
 
@@ -113,7 +120,7 @@ def _bend(anchors: np.ndarray, first: int) -> int:
     near = [min(np.linalg.norm(a - anchors[first]), np.linalg.norm(a - anchors[-1])) for a in anchors]
     best = max(near[1:-1], default=0.0)
     if best < _SAME:
-        raise ValueError("a limb has no joint between its ends; it cannot bend as a person's does")
+        raise OsikValueError("a limb has no joint between its ends; it cannot bend as a person's does")
     return next(i for i, value in enumerate(near) if value > 0.999 * best and 0 < i < len(near) - 1)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from .._errors import OsikValueError
 from ._motion import CONTACT_POINTS, HumanMotion
 from ._rotations import continuous
 
@@ -45,17 +46,17 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as data:
             if not hasattr(data, "files"):
-                raise ValueError("it holds one array and not several by name")
+                raise OsikValueError("it holds one array and not several by name")
             return {name: data[name] for name in data.files}
     except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"{path} cannot be read as an .npz of plain arrays: {error}") from None
+        raise OsikValueError(f"{path} cannot be read as an .npz of plain arrays: {error}") from None
 
 
 def _from_npz(path: Path) -> HumanMotion:
     arrays = load_arrays(path)
     missing = [name for name in ("fps", "positions", "joint_names") if name not in arrays]
     if missing:
-        raise ValueError(f"{path} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
+        raise OsikValueError(f"{path} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
     contact = arrays.get("contact")
     if contact is not None and contact.ndim == 2 and contact.shape[1] == 2:
         contact = contact[:, [0, 0, 1, 1]]
@@ -73,7 +74,7 @@ def _from_npz(path: Path) -> HumanMotion:
             ground=None if ground is None else float(_number(path, arrays, "ground")),
         )
     except ValueError as error:
-        raise ValueError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from None
+        raise OsikValueError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from None
 
 
 def _numbers(path: Path, arrays: dict[str, np.ndarray], name: str) -> Any:
@@ -81,14 +82,14 @@ def _numbers(path: Path, arrays: dict[str, np.ndarray], name: str) -> Any:
     if name not in arrays:
         return None
     if arrays[name].dtype.kind not in "fiub":
-        raise ValueError(f"{path}: {name} is of type {arrays[name].dtype}; it has to be numbers")
+        raise OsikValueError(f"{path}: {name} is of type {arrays[name].dtype}; it has to be numbers")
     return arrays[name].astype(float)
 
 
 def _number(path: Path, arrays: dict[str, np.ndarray], name: str) -> float:
     values = np.ravel(_numbers(path, arrays, name))
     if values.size != 1:
-        raise ValueError(f"{path}: {name} is one number, not {values.size}")
+        raise OsikValueError(f"{path}: {name} is one number, not {values.size}")
     return float(values[0])
 
 
@@ -98,7 +99,7 @@ def _from_csv(path: Path) -> HumanMotion:
     with path.open(newline="", encoding="utf-8") as file:
         rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if row]
     if len(rows) < 3:
-        raise ValueError(f"{path} has {len(rows)} lines; it needs one of headings and two of numbers at least")
+        raise OsikValueError(f"{path} has {len(rows)} lines; it needs one of headings and two of numbers at least")
     headings = [name.strip() for name in rows[0][1]]
     names = _joints(path, headings)
     values = np.array([_row(path, number, row, headings) for number, row in rows[1:]])
@@ -118,16 +119,16 @@ def _from_csv(path: Path) -> HumanMotion:
 def _joints(path: Path, headings: list[str]) -> tuple[str, ...]:
     """Names of the joints that the headings have all three coordinates of."""
     if "time" not in headings:
-        raise ValueError(f"{path}, line 1: no column is called time; columns: {', '.join(headings)}")
+        raise OsikValueError(f"{path}, line 1: no column is called time; columns: {', '.join(headings)}")
     twice = sorted({name for name in headings if headings.count(name) > 1})
     if twice:
-        raise ValueError(f"{path}, line 1: columns occur twice: {', '.join(twice)}")
+        raise OsikValueError(f"{path}, line 1: columns occur twice: {', '.join(twice)}")
     others = [name for name in headings if name != "time" and not name.startswith("contact.")]
     names = tuple(dict.fromkeys(name.rpartition(".")[0] for name in others))
     expected = {f"{name}.{axis}" for name in names for axis in _AXES}
     wrong = sorted(expected.symmetric_difference(others))
     if wrong or not names:
-        raise ValueError(
+        raise OsikValueError(
             f"{path}, line 1: a joint has the three columns NAME.x, NAME.y and NAME.z; missing or of no joint: "
             f"{', '.join(wrong) or 'all'}"
         )
@@ -136,7 +137,7 @@ def _joints(path: Path, headings: list[str]) -> tuple[str, ...]:
 
 def _row(path: Path, number: int, row: list[str], headings: list[str]) -> list[float]:
     if len(row) != len(headings):
-        raise ValueError(f"{path}, line {number}: {len(row)} values, but there are {len(headings)} headings")
+        raise OsikValueError(f"{path}, line {number}: {len(row)} values, but there are {len(headings)} headings")
     out = []
     for heading, text in zip(headings, row, strict=True):
         try:
@@ -144,7 +145,7 @@ def _row(path: Path, number: int, row: list[str], headings: list[str]) -> list[f
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
-            raise ValueError(f"{path}, line {number}, column {heading}: {text!r} is no finite number")
+            raise OsikValueError(f"{path}, line {number}, column {heading}: {text!r} is no finite number")
         out.append(value)
     return out
 
@@ -156,5 +157,7 @@ def _rate(path: Path, time: np.ndarray, lines: list[int]) -> float:
     uneven = np.flatnonzero((np.abs(steps - step) > 0.1 * abs(step)) | (steps <= 0.0))
     if uneven.size:
         where = lines[int(uneven[0]) + 1]
-        raise ValueError(f"{path}, line {where}: the time steps by {steps[uneven[0]]:.4g} s, elsewhere by {step:.4g} s")
+        raise OsikValueError(
+            f"{path}, line {where}: the time steps by {steps[uneven[0]]:.4g} s, elsewhere by {step:.4g} s"
+        )
     return float(len(steps) / (time[-1] - time[0]))

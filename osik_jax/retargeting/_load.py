@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from .._errors import OsikValueError
 from ._bvh import Up, read_bvh
 from ._keypoints import read_keypoints
 from ._motion import HumanMotion
@@ -28,7 +29,7 @@ def load_motion(path: str | os.PathLike[str], *, unit: str | float | None = None
     if ending == ".bvh":
         return read_bvh(path, unit=unit, up=up)
     if ending not in (".npz", ".csv"):
-        raise ValueError(f"{path} is none of .bvh, .npz and .csv")
+        raise OsikValueError(f"{path} is none of .bvh, .npz and .csv")
     if unit is not None or up is not None:
-        raise ValueError("unit and up go with BVH files; keypoints are metres, z up")
+        raise OsikValueError("unit and up go with BVH files; keypoints are metres, z up")
     return read_keypoints(path)

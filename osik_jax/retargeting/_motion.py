@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._errors import OsikValueError
 from .._tree import unknown_name
 from ._rotations import continuous, slerp
 
@@ -46,24 +47,26 @@ class HumanMotion:
     def __post_init__(self) -> None:
         frames, joints = len(self.positions), len(self.joint_names)
         if not (np.isfinite(self.fps) and self.fps > 0.0):
-            raise ValueError(f"fps is {self.fps}; it is frames a second, more than 0")
+            raise OsikValueError(f"fps is {self.fps}; it is frames a second, more than 0")
         repeated = sorted({name for name in self.joint_names if self.joint_names.count(name) > 1})
         if repeated:
-            raise ValueError(f"joint names occur twice: {', '.join(repeated)}")
+            raise OsikValueError(f"joint names occur twice: {', '.join(repeated)}")
         if frames < 1 or joints < 1:
-            raise ValueError(f"a motion has a frame and a joint at least; this one has {frames} and {joints}")
+            raise OsikValueError(f"a motion has a frame and a joint at least; this one has {frames} and {joints}")
         _check_array("positions", self.positions, (frames, joints, 3))
         _check_array("rest_positions", self.rest_positions, (joints, 3))
         _check_array("rotations", self.rotations, (frames, joints, 4))
         if self.contact is not None and np.shape(self.contact) != (frames, 4):
-            raise ValueError(f"contact has shape {np.shape(self.contact)}, expected {(frames, 4)}: {CONTACT_POINTS}")
+            raise OsikValueError(
+                f"contact has shape {np.shape(self.contact)}, expected {(frames, 4)}: {CONTACT_POINTS}"
+            )
         if self.ground is not None and not np.isfinite(self.ground):
-            raise ValueError(f"ground is {self.ground}; it is a height in metres")
+            raise OsikValueError(f"ground is {self.ground}; it is a height in metres")
         if self.rotations is not None:
             length = np.linalg.norm(self.rotations, axis=-1)
             if np.abs(length - 1.0).max() > _UNIT:
                 frame, joint = np.unravel_index(np.argmax(np.abs(length - 1.0)), length.shape)
-                raise ValueError(
+                raise OsikValueError(
                     f"rotations are unit quaternions w x y z; that of {self.joint_names[joint]} in frame {frame} has "
                     f"length {length[frame, joint]:.4g}"
                 )
@@ -97,7 +100,7 @@ class HumanMotion:
             ValueError: a rate that is not positive.
         """
         if not (np.isfinite(fps) and fps > 0.0):
-            raise ValueError(f"fps is {fps}; it is frames a second, more than 0")
+            raise OsikValueError(f"fps is {fps}; it is frames a second, more than 0")
         if fps == self.fps or self.frames == 1:
             return dataclasses.replace(self, fps=float(fps))
         at = np.arange(int(np.floor(self.seconds * fps + 1e-9)) + 1) / fps * self.fps
@@ -124,7 +127,7 @@ def _check_array(name: str, value: np.ndarray | None, shape: tuple[int, ...]) ->
     if value is None:
         return
     if np.shape(value) != shape:
-        raise ValueError(f"{name} has shape {np.shape(value)}, expected {shape}")
+        raise OsikValueError(f"{name} has shape {np.shape(value)}, expected {shape}")
     wrong = ~np.isfinite(value)
     if wrong.any():
-        raise ValueError(f"{name} is not finite at {tuple(np.argwhere(wrong)[0].tolist())}")
+        raise OsikValueError(f"{name} is not finite at {tuple(np.argwhere(wrong)[0].tolist())}")

@@ -80,28 +80,63 @@ def foot_axes(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.stack([x, y, np.cross(x, y)], -1)
 
 
-def read_person(motion: HumanMotion, roles: Mapping[str, str]) -> Person:
-    """The person in a clip.
+@dataclasses.dataclass(frozen=True)
+class Measures:
+    """What of a person does not change while they move.
+
+    Attributes:
+        leg: length of a leg, thigh and shank [m].
+        ankle: height of the ankles above the floor when standing [m].
+        ground: height of the floor [m].
+        flat: of each side, knee, ankle and toe of a foot that is flat on the floor [m]. (1, 3) each
+        straight: axes of pelvis and chest in the rest pose; None where that is not known. (1, 3, 3) each
+    """
+
+    leg: float
+    ankle: float
+    ground: float
+    flat: Mapping[str, Mapping[str, np.ndarray]]
+    straight: tuple[np.ndarray, np.ndarray] | None
+
+
+def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
+    """What a clip shows of the person's build.
 
     Args:
         motion: the clip.
         roles: of each of a person's joints, what the clip calls it (``find_roles``).
     """
     points = {role: motion.track(name) for role, name in roles.items()}
-    rest = None
+    straight, flat = None, {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
     if motion.rest_positions is not None:
         at = {role: motion.joint_names.index(name) for role, name in roles.items()}
         rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
-    points = _with_soles(points, rest)
-    soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
-    ground = find_ground(soles) if motion.ground is None else motion.ground
-    contact = find_contact(soles, motion.fps, ground) if motion.contact is None else motion.contact
-    points = {role: track - [0.0, 0.0, ground] for role, track in points.items()}
-    straight = None if rest is None else _turns(_with_soles(rest, rest))
-    turns = _turns(points)
-    pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
+        flat = {side: {**rest, **_toes(rest, side)} for side in SIDES}
+        straight = _turns(_with_soles(rest, flat))
     legs = [np.linalg.norm(points[b] - points[a], axis=-1).mean() for a, b in LIMBS[:4]]
+    soles = _with_soles(points, flat)
+    found = np.stack([soles[name] for name in CONTACT_POINTS], 1)
+    ground = find_ground(found) if motion.ground is None else motion.ground
     ankles = np.minimum(points["left_ankle"][:, 2], points["right_ankle"][:, 2])
+    ankle = float(np.percentile(ankles, 5)) - ground
+    return Measures(0.5 * float(sum(legs)), ankle, ground, flat, straight)
+
+
+def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measures | None = None) -> Person:
+    """The person in a clip.
+
+    Args:
+        motion: the clip.
+        roles: of each of a person's joints, what the clip calls it (``find_roles``).
+        measures: of the person, where the clip is too short to show them; None: the clip's own.
+    """
+    known = measure(motion, roles) if measures is None else measures
+    points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
+    soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
+    contact = find_contact(soles, motion.fps, known.ground) if motion.contact is None else motion.contact
+    points = {role: track - [0.0, 0.0, known.ground] for role, track in points.items()}
+    turns, straight = _turns(points), known.straight
+    pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
     return Person(
         fps=motion.fps,
         points=points,
@@ -111,8 +146,8 @@ def read_person(motion: HumanMotion, roles: Mapping[str, str]) -> Person:
         root=0.5 * (points["left_hip"] + points["right_hip"]),
         feet=np.stack([_foot(points, side) for side in SIDES], 1),
         contact=np.asarray(contact, bool),
-        leg=0.5 * float(sum(legs)),
-        ankle=float(np.percentile(ankles, 5)),
+        leg=known.leg,
+        ankle=known.ankle,
     )
 
 
@@ -140,15 +175,15 @@ def _foot(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
     return foot_axes(points[f"{side}_toe"] - points[f"{side}_heel"], shank)
 
 
-def _with_soles(points: Mapping[str, np.ndarray], rest: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarray]:
+def _with_soles(
+    points: Mapping[str, np.ndarray], flat: Mapping[str, Mapping[str, np.ndarray]]
+) -> dict[str, np.ndarray]:
     """The points with heels and toes, where the clip has none: fixed to the foot as they are in a flat one."""
     out = dict(points)
     for side in SIDES:
-        if f"{side}_toe" not in out:
-            out[f"{side}_toe"] = _toe(out, side)
+        out |= _toes(out, side)
         if f"{side}_heel" not in out:
-            flat = _flat(out, side) if rest is None else {**rest, **{k: v for k, v in _toes(rest, side).items()}}
-            out[f"{side}_heel"] = _heel(out, flat, side)
+            out[f"{side}_heel"] = _heel(out, flat[side], side)
     return out
 
 

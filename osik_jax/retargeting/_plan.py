@@ -6,10 +6,13 @@ and acceleration) is one sum of squares over all frames. Limits are met by leadi
 
 from __future__ import annotations
 
+import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._joint_selection import scalar_layout
@@ -24,12 +27,23 @@ _LARGEST_STEP = 0.5
 _SOFTEST, _STIFFENING, _SLOWING = 1e-4, 10.0, 0.5
 """Stiffness of the bounds at first, its growth, and the share of the cost below which a step's gain lets it grow."""
 
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-3, 1e8
-_CALMER, _CAREFUL = 0.3, 4.0
-"""Factors of the damping after a step that was good, and after one that was not; the latter doubles each time."""
+_FIXED = 1e15
+"""Damping of frames that do not move."""
 
-_LITTLE, _SETTLED = 3e-3, 2
+_FIRST_DAMPING, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING = 1e-2, 1e-3, 1.0, 1e8
+_CALMER, _CAREFUL = 0.3, 4.0
+"""Factors of the damping after a step that was good, and after one that was not; the latter doubles each time.
+
+With bounds at their full stiffness, and after a step that was refused, it is ``_STIFF_DAMPING`` at least: less lets
+stretched legs swing from one end of what the bounds leave them to the other.
+"""
+
+_LITTLE, _SETTLED = 5e-3, 2
 """A gain that is little, as a share of what the wishes cost, and how many of them in a row are the end."""
+
+_SMOOTHNESS = ("smooth", "smooth_base")
+_STRIDE, _COARSE_ITERATIONS = 4, 8
+"""The frames that are worked on first, one in so many, and for how long at most."""
 
 
 class Plan(NamedTuple):
@@ -47,12 +61,27 @@ class Plan(NamedTuple):
 
 
 class _Linearised(NamedTuple):
-    """Gauss-Newton's system at some configurations, with its gradient and its cost."""
+    """Gauss-Newton's system at some configurations, with its gradient and what each frame costs."""
 
     system: BandedSystem
     gradient: Float[Array, "F nv"]
-    soft: Float[Array, ""]
-    stiff: Float[Array, ""]
+    soft: Float[Array, " F"]
+    stiff: Float[Array, " F"]
+
+    @property
+    def costs(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """What the wishes cost, and the bounds."""
+        return self.soft.sum(), self.stiff.sum()
+
+
+class _Clip(NamedTuple):
+    """What a plan is made for; ``free`` is 1 for frames that may move, 0 for those that are past."""
+
+    body: Body
+    goals: Goals
+    weights: Weights
+    bounds: Bounds
+    free: Float[Array, " F"]
 
 
 class _State(NamedTuple):
@@ -67,6 +96,15 @@ class _State(NamedTuple):
     settled: Int[Array, ""]
     iterations: Int[Array, ""]
 
+    @classmethod
+    def at(
+        cls, clip: _Clip, q: Float[Array, "F nq"], stiffness: float = _SOFTEST, damping: float = _FIRST_DAMPING
+    ) -> _State:
+        """Before the first iteration."""
+        hard, damped, growth = (jnp.asarray(x, q.dtype) for x in (stiffness, damping, _CAREFUL))
+        here, none = _linearised(clip, q, hard), jnp.array(0)
+        return cls(q, here, hard, jnp.array(False), damped, growth, none, none)
+
 
 @jax.jit
 def make_plan(
@@ -80,45 +118,96 @@ def make_plan(
     """The configurations that serve a clip's goals best, from a first guess.
 
     Levenberg and Marquardt's method. Bounds that have to hold begin soft and get stiffer with each step that is
-    taken, so that limbs find their way before feet and limits pin them down. It ends when two steps in a row gained
-    less than a small part of what the wishes cost, with all bounds at their full stiffness. Refused steps
-    count where the bounds are kept.
+    taken, so that limbs find their way before feet and limits pin them down; they do so on a part of the frames first,
+    which is a quarter of the work. It ends when two steps in a row gained less than a small part of what the wishes
+    cost, with all bounds at their full stiffness. Refused steps count where the bounds are kept.
     """
-    identity = jnp.eye(body.robot.nv, dtype=start.dtype)
+    clip = _Clip(body, goals, weights, bounds, jnp.ones(len(start), start.dtype))
 
-    def improve(state: _State) -> _State:
-        here = state.here
-        damped = here.system._replace(diagonal=here.system.diagonal + state.damping * identity)
-        move = -solve_banded(damped, here.gradient)
-        longest = jnp.abs(move).max(-1, keepdims=True)
-        move = move * jnp.minimum(1.0, _LARGEST_STEP / jnp.maximum(longest, _LARGEST_STEP))
-        candidate = jax.vmap(lambda a, b: integrate(body.robot, a, b))(state.q, move)
-        stiffer = jnp.where(state.ready, jnp.minimum(state.stiffness * _STIFFENING, 1.0), state.stiffness)
-        there = _linearised(body, candidate, goals, weights, bounds, stiffer)
-        before, after = (x.soft + state.stiffness * x.stiff for x in (here, there))
-        better = after < before
-        factor = jnp.where(better, _CALMER, state.growth)
-        damping = jnp.clip(state.damping * factor, _LEAST_DAMPING, _MOST_DAMPING)
-        growth = jnp.where(better, _CAREFUL, 2.0 * state.growth)
-        kept = here.stiff < _LITTLE * here.soft
-        little = (state.stiffness >= 1.0) & (before - after < _LITTLE * here.soft) & (better | kept)
-        settled = jnp.where(little, state.settled + 1, jnp.where(better, 0, state.settled))
-        ready = jnp.where(better, before - after < _SLOWING * before, state.ready)
-        stuck = ~better & (state.damping >= _MOST_DAMPING)
-        old, new = (state.q, here, state.stiffness), (candidate, there, stiffer)
-        q, here, stiffness = jax.tree.map(lambda a, b: jnp.where(better, b, a), old, new)
-        return _State(
-            q, here, stiffness, ready, damping, growth, jnp.where(stuck, _SETTLED, settled), state.iterations + 1
-        )
+    def goes_on(state: _State) -> Bool[Array, ""]:
+        return (state.settled < _SETTLED) & (state.iterations < max_iterations)
 
-    softest = jnp.asarray(_SOFTEST, start.dtype)
-    here = _linearised(body, start, goals, weights, bounds, softest)
-    damping, growth = jnp.asarray(_FIRST_DAMPING, start.dtype), jnp.asarray(_CAREFUL, start.dtype)
-    first = _State(start, here, softest, jnp.array(False), damping, growth, jnp.array(0), jnp.array(0))
-    last = jax.lax.while_loop(
-        lambda state: (state.settled < _SETTLED) & (state.iterations < max_iterations), improve, first
+    q = _from_a_part(clip, start)
+    last = jax.lax.while_loop(goes_on, partial(_improved, clip), _State.at(clip, q))
+    return Plan(last.q, jnp.stack(last.here.costs), last.iterations)
+
+
+@jax.jit
+def mend_plan(
+    body: Body,
+    goals: Goals,
+    weights: Weights,
+    bounds: Bounds,
+    q: Float[Array, "F nq"],
+    free: Float[Array, " F"],
+    iterations: Int[Array, ""] | int,
+) -> Plan:
+    """A plan that is nearly good, made better by some iterations with bounds at their full stiffness.
+
+    Args:
+        body: the robot.
+        goals: of the frames.
+        weights: of the goals.
+        bounds: of the joints.
+        q: the plan. (F, nq)
+        free: 1 for frames that may move, 0 for those that are past. (F,)
+        iterations: how many.
+    """
+    clip = _Clip(body, goals, weights, bounds, free)
+    state = _State.at(clip, q, stiffness=1.0, damping=_STIFF_DAMPING)
+    last = jax.lax.while_loop(lambda state: state.iterations < iterations, partial(_improved, clip), state)
+    return Plan(last.q, jnp.stack(last.here.costs), last.iterations)
+
+
+def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq"]:
+    """A better first guess: one frame in four is worked on with soft bounds, and what it moves the others move too."""
+    robot, frames = clip.body.robot, len(start)
+    part = slice(None, None, _STRIDE)
+    wide = dataclasses.replace(clip.weights, **{k: getattr(clip.weights, k) / _STRIDE**3 for k in _SMOOTHNESS})
+    less = clip._replace(
+        goals=jax.tree.map(lambda leaf: leaf[part], clip.goals),
+        free=clip.free[part],
+        weights=wide,
+        bounds=clip.bounds._replace(step=_STRIDE * clip.bounds.step, change=_STRIDE**2 * clip.bounds.change),
     )
-    return Plan(last.q, jnp.stack([last.here.soft, last.here.stiff]), last.iterations)
+
+    def goes_on(state: _State) -> Bool[Array, ""]:
+        return ~state.ready & (state.iterations < _COARSE_ITERATIONS)
+
+    found = jax.lax.while_loop(goes_on, partial(_improved, less), _State.at(less, start[part])).q
+    move = jax.vmap(lambda a, b: difference(robot, a, b))(start[part], found)
+    at = np.arange(frames) / _STRIDE
+    before = np.minimum(at.astype(int), len(move) - 1)
+    share = (at - before)[:, None]
+    move = (1.0 - share) * move[before] + share * move[np.minimum(before + 1, len(move) - 1)]
+    return jax.vmap(lambda a, b: integrate(robot, a, b))(start, move)
+
+
+def _improved(clip: _Clip, state: _State) -> _State:
+    """One system solved, and its step taken if it makes things better."""
+    robot, here = clip.body.robot, state.here
+    identity, free = jnp.eye(robot.nv, dtype=state.q.dtype), clip.free[:, None]
+    held = jnp.where(free == 1.0, state.damping, _FIXED)
+    damped = here.system._replace(diagonal=here.system.diagonal + held[..., None] * identity)
+    move = -free * solve_banded(damped, free * here.gradient)
+    longest = jnp.abs(move).max(-1, keepdims=True)
+    move = move * jnp.minimum(1.0, _LARGEST_STEP / jnp.maximum(longest, _LARGEST_STEP))
+    candidate = jax.vmap(lambda a, b: integrate(robot, a, b))(state.q, move)
+    stiffer = jnp.where(state.ready, jnp.minimum(state.stiffness * _STIFFENING, 1.0), state.stiffness)
+    there = _linearised(clip, candidate, stiffer)
+    (soft, stiff), (soft_there, stiff_there) = here.costs, there.costs
+    before, after = soft + state.stiffness * stiff, soft_there + state.stiffness * stiff_there
+    better = after < before
+    least = jnp.where(~better | (stiffer >= 1.0), _STIFF_DAMPING, _LEAST_DAMPING)
+    damping = jnp.clip(state.damping * jnp.where(better, _CALMER, state.growth), least, _MOST_DAMPING)
+    growth = jnp.where(better, _CAREFUL, 2.0 * state.growth)
+    little = (state.stiffness >= 1.0) & (before - after < _LITTLE * soft) & (better | (stiff < _LITTLE * soft))
+    settled = jnp.where(little, state.settled + 1, jnp.where(better, 0, state.settled))
+    settled = jnp.where(~better & (state.damping >= _MOST_DAMPING), _SETTLED, settled)
+    ready = jnp.where(better, before - after < _SLOWING * before, state.ready)
+    old, new = (state.q, here, state.stiffness), (candidate, there, stiffer)
+    q, here, stiffness = jax.tree.map(lambda a, b: jnp.where(better, b, a), old, new)
+    return _State(q, here, stiffness, ready, damping, growth, settled, state.iterations + 1)
 
 
 def _weights_between(goals: Goals, weights: Weights) -> Float[Array, "F 4"]:
@@ -132,8 +221,8 @@ class _Hinge(NamedTuple):
 
     weight: Float[Array, "F nv"]
     gradient: Float[Array, "F nv"]
-    soft: Float[Array, ""]
-    stiff: Float[Array, ""]
+    soft: Float[Array, " F"]
+    stiff: Float[Array, " F"]
 
 
 def _hinge(
@@ -146,8 +235,13 @@ def _hinge(
     """What is beyond a bound counts as a share of it: limits are kept as well at any rate of frames."""
     over = value - jnp.clip(value, -bound, bound)
     beyond = jnp.where(over != 0.0, limit / bound**2, 0.0)
-    soft, stiff = (0.5 * jnp.sum(w * x**2) for w, x in ((smooth, value), (beyond, over)))
-    return _Hinge(smooth + stiffness * beyond, smooth * value + stiffness * beyond * over, soft, stiff)
+    pull = smooth * value + stiffness * beyond * over
+    return _Hinge(smooth + stiffness * beyond, pull, _halves(smooth, value), _halves(beyond, over))
+
+
+def _halves(weight: Float[Array, "F n"] | Float[Array, " n"], residual: Float[Array, "F n"]) -> Float[Array, " F"]:
+    """Of each frame, half the weighted sum of squares."""
+    return 0.5 * jnp.sum(weight * residual**2, -1)
 
 
 def _between(body: Body, q, goals: Goals, weights: Weights, bounds: Bounds, stiffness):
@@ -163,9 +257,8 @@ def _between(body: Body, q, goals: Goals, weights: Weights, bounds: Bounds, stif
     return steps, changes
 
 
-def _linearised(
-    body: Body, q: Float[Array, "F nq"], goals: Goals, weights: Weights, bounds: Bounds, stiffness: Float[Array, ""]
-) -> _Linearised:
+def _linearised(clip: _Clip, q: Float[Array, "F nq"], stiffness: Float[Array, ""]) -> _Linearised:
+    body, goals, weights, bounds, _ = clip
     rows = jax.vmap(lambda x, g: frame_rows(body, x, g, weights, bounds))(q, goals)
     there, own = goals.present[:, None], rows.joints
     weight = there * (rows.soft + stiffness * rows.stiff)
@@ -173,9 +266,9 @@ def _linearised(
     point, moving = rows.stance, rows.stance_jacobian
     move = point - jnp.roll(point, 1, 0)
     held = jnp.repeat(_weights_between(goals, weights), 2, axis=-1)
-    soft = 0.5 * (jnp.sum(there * rows.soft * rows.residual**2) + jnp.sum(there * own.soft_weight * own.soft**2))
-    stiff = jnp.sum(there * rows.stiff * rows.residual**2) + jnp.sum(there * own.stiff_weight * own.stiff**2)
-    stiff = 0.5 * (stiff + jnp.sum(held * move**2))
+    soft = _halves(there * rows.soft, rows.residual) + _halves(there * own.soft_weight, own.soft)
+    stiff = _halves(there * rows.stiff, rows.residual) + _halves(there * own.stiff_weight, own.stiff)
+    stiff += _halves(held, move)
     held = stiffness * held
     jacobian = jnp.concatenate([rows.jacobian, moving], 1)
     square = jnp.concatenate([weight, held + jnp.roll(held, -1, 0)], 1)
@@ -208,5 +301,8 @@ def _with_steps(here: _Linearised, alone: Float[Array, "F nv"], steps: _Hinge, c
     system = BandedSystem(
         here.system.diagonal + main[:, :, None] * spread, here.system.first + near[:, :, None] * spread, far
     )
-    soft, stiff = here.soft + steps.soft + changes.soft, here.stiff + steps.stiff + changes.stiff
+    soft, stiff = (
+        own.at[1:].add(step).at[2:].add(change)
+        for own, step, change in ((here.soft, steps.soft, changes.soft), (here.stiff, steps.stiff, changes.stiff))
+    )
     return _Linearised(system, gradient, soft, stiff)

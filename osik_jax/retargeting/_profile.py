@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
+from .._errors import OsikValueError
 from ._goals import Weights
 from ._person import NEEDED, SIDES
 
@@ -65,13 +66,13 @@ class Profile:
     def __post_init__(self) -> None:
         missing = [role for role in NEEDED if role not in self.keypoints]
         if missing:
-            raise ValueError(f"the profile has no keypoints {', '.join(missing)}; it needs {', '.join(NEEDED)}")
+            raise OsikValueError(f"the profile has no keypoints {', '.join(missing)}; it needs {', '.join(NEEDED)}")
         if set(self.feet) != set(SIDES):
-            raise ValueError(f"the profile has feet {', '.join(self.feet) or 'none'}; it needs left and right")
+            raise OsikValueError(f"the profile has feet {', '.join(self.feet) or 'none'}; it needs left and right")
         if self.scale is not None and not self.scale > 0.0:
-            raise ValueError(f"scale is {self.scale}; it is robot over person, more than 0")
+            raise OsikValueError(f"scale is {self.scale}; it is robot over person, more than 0")
         if not self.stretch > 0.0:
-            raise ValueError(f"stretch is {self.stretch}; it has to be more than 0")
+            raise OsikValueError(f"stretch is {self.stretch}; it has to be more than 0")
 
     @property
     def frames(self) -> tuple[str, ...]:

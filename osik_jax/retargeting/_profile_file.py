@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .._errors import OsikValueError
 from .._tree import unknown_name
 from ..robot import Robot
 from ._goals import Weights
@@ -104,14 +105,14 @@ def _parsed(text: str, source: str) -> Profile:
             weights=_weights(data.get("weights", {})),
         )
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{source} is no TOML: {error}") from None
+        raise OsikValueError(f"{source} is no TOML: {error}") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{source}: {error.args[0] if error.args else error}") from None
+        raise OsikValueError(f"{source}: {error.args[0] if error.args else error}") from None
 
 
 def _entry(data: Mapping[str, Any], name: str) -> Any:
     if name not in data:
-        raise ValueError(f"there is no {name}; there is {', '.join(data) or 'nothing'}")
+        raise OsikValueError(f"there is no {name}; there is {', '.join(data) or 'nothing'}")
     return data[name]
 
 
@@ -122,7 +123,7 @@ def _place(entry: Mapping[str, Any], what: str) -> Place:
 def _as_point(value: Any, what: str) -> Point:
     numbers = np.asarray(value)
     if numbers.shape != (3,) or numbers.dtype.kind not in "fi" or not np.isfinite(numbers).all():
-        raise ValueError(f"{what} is {value!r}; a point is three numbers in metres")
+        raise OsikValueError(f"{what} is {value!r}; a point is three numbers in metres")
     x, y, z = (float(number) for number in numbers)
     return x, y, z
 
@@ -133,7 +134,7 @@ def _foot(feet: Mapping[str, Any], side: str) -> Foot:
     for part in ("heel", "toe"):
         points = _entry(entry, part)
         if len(points) != 2:
-            raise ValueError(f"feet.{side}.{part} has {len(points)} points; it is the left and the right corner")
+            raise OsikValueError(f"feet.{side}.{part} has {len(points)} points; it is the left and the right corner")
         parts.append((_as_point(points[0], f"feet.{side}.{part}"), _as_point(points[1], f"feet.{side}.{part}")))
     return Foot(str(_entry(entry, "frame")), *parts)
 
@@ -142,7 +143,7 @@ def _capsule(entry: Mapping[str, Any], number: int) -> Capsule:
     start, end = (_as_point(_entry(entry, name), f"capsules, number {number}, {name}") for name in ("start", "end"))
     radius = float(_entry(entry, "radius"))
     if not radius > 0.0 or start == end:
-        raise ValueError(f"capsules, number {number}: the radius and the length have to be more than 0")
+        raise OsikValueError(f"capsules, number {number}: the radius and the length have to be more than 0")
     return Capsule(str(_entry(entry, "frame")), start, end, radius)
 
 
@@ -154,5 +155,7 @@ def _weights(entry: Mapping[str, Any]) -> Weights:
         numbers = np.asarray(value)
         shape = np.shape(getattr(Weights(), name))
         if numbers.shape != shape or numbers.dtype.kind not in "fi" or not (numbers >= 0).all():
-            raise ValueError(f"weights.{name} is {value!r}; it is {'three numbers' if shape else 'a number'}, not < 0")
+            raise OsikValueError(
+                f"weights.{name} is {value!r}; it is {'three numbers' if shape else 'a number'}, not < 0"
+            )
     return Weights(**entry)

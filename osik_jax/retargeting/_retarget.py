@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .._errors import OsikValueError
 from .._joint_selection import scalar_layout
 from .._tree import FREE
 from ..limits import AccelerationLimit, ConfigurationLimit, Limit, VelocityLimit
@@ -30,7 +31,7 @@ from ._skeletons import find_roles
 from ._terms import Body, Bounds
 
 ACCELERATION = 240.0
-_LENGTHS = 32
+_LENGTHS = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +46,8 @@ class Retargeted:
         human: where the person's joints were, the floor at height 0 [m]. (F, J, 3)
         human_names: of them: roles, and ``root``, the midpoint of the hips.
         contact: whether left heel, left toe, right heel and right toe stand. (F, 4)
-        iterations: systems that the plan took.
-        cost: what is left of the wishes, and of the bounds that have to hold.
+        iterations: systems that the plan took; 0 where it was made frame by frame.
+        cost: what is left of the wishes, and of the bounds that have to hold; 0 where it was made frame by frame.
         off_plan: how far the farthest joint is from the plan in each frame because a limit held it [rad or m]. (F,)
     """
 
@@ -98,11 +99,11 @@ class Retargeter:
         max_iterations: int = 100,
     ):
         if not robot.floating_base:
-            raise ValueError("retargeting moves a robot's base: load the robot with floating_base=True")
+            raise OsikValueError("retargeting moves a robot's base: load the robot with floating_base=True")
         self.robot = robot
         self.profile = find_profile(robot) if profile is None else profile
         check_profile(robot, self.profile)
-        self.limits = _limits(robot, acceleration)
+        self.limits = own_limits(robot, acceleration)
         self.max_iterations = max_iterations
         self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile))
         self._build = Build.of(robot, self.profile)
@@ -159,6 +160,7 @@ class Retargeter:
                 shared=shared,
                 out=None if out is None else Path(out) / f"frames_{length}",
                 progress=progress,
+                unit="clips",
             )
             results = solved[:] if isinstance(solved, Saved) else solved
             for lane, i in enumerate(members):
@@ -169,7 +171,7 @@ class Retargeter:
         """What a clip asks for."""
         motion = motion if fps is None else motion.resampled(fps)
         if motion.frames < 3:
-            raise ValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
+            raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
         person = read_person(motion, find_roles(motion.joint_names, mapping))
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % _LENGTHS)
@@ -183,20 +185,28 @@ class Retargeter:
             raise type(error)(f"{motion.name}: {error.args[0]}") from error
 
     def _finished(self, clip: _Clip, solved: Solved) -> Retargeted:
-        person, frames = clip.person, clip.frames
-        q = np.asarray(solved.q)[:frames]
-        return Retargeted(
-            robot=self.robot,
-            profile=self.profile,
-            motion=in_mujoco_order(self.robot, q, person.fps),
-            q=q,
-            human=np.stack([*person.points.values(), person.root], 1),
-            human_names=(*person.points, "root"),
-            contact=person.contact,
-            iterations=int(solved.iterations),
-            cost=(float(solved.cost[0]), float(solved.cost[1])),
-            off_plan=np.asarray(solved.off_plan)[:frames],
-        )
+        q, off = (np.asarray(part)[: clip.frames] for part in (solved.q, solved.off_plan))
+        cost = float(solved.cost[0]), float(solved.cost[1])
+        made = as_retargeted(self.robot, self.profile, clip.person, q, off)
+        return dataclasses.replace(made, iterations=int(solved.iterations), cost=cost)
+
+
+def as_retargeted(
+    robot: Robot, profile: Profile, person: Person, q: Float[np.ndarray, "F nq"], off_plan: Float[np.ndarray, " F"]
+) -> Retargeted:
+    """The record of a motion that was made from a person's."""
+    return Retargeted(
+        robot=robot,
+        profile=profile,
+        motion=in_mujoco_order(robot, q, person.fps),
+        q=q,
+        human=np.stack([*person.points.values(), person.root], 1),
+        human_names=(*person.points, "root"),
+        contact=person.contact,
+        iterations=0,
+        cost=(0.0, 0.0),
+        off_plan=off_plan,
+    )
 
 
 class Solved(NamedTuple):
@@ -285,7 +295,7 @@ def retarget(
     return own.retarget(motion, mapping=mapping, fps=fps)
 
 
-def _limits(
+def own_limits(
     robot: Robot, acceleration: float | Mapping[str, float]
 ) -> tuple[ConfigurationLimit, VelocityLimit, AccelerationLimit]:
     """The robot's own limits, and that on accelerations of its joints."""
@@ -293,7 +303,7 @@ def _limits(
         most = AccelerationLimit(robot, acceleration)
     else:
         if not acceleration > 0.0:
-            raise ValueError(f"acceleration is {acceleration}; it has to be more than 0")
+            raise OsikValueError(f"acceleration is {acceleration}; it has to be more than 0")
         most = AccelerationLimit(robot, np.where(scalar_layout(robot)[0], acceleration, np.inf))
     return ConfigurationLimit(robot), VelocityLimit(robot), most
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from .._errors import OsikValueError
 from ._keypoints import load_arrays
 
 
@@ -32,17 +33,19 @@ class RobotMotion:
 
     def __post_init__(self) -> None:
         if self.qpos.ndim != 2 or self.qpos.shape[1] != 7 + len(self.joint_names) or not len(self.qpos):
-            raise ValueError(
+            raise OsikValueError(
                 f"qpos has shape {self.qpos.shape}, expected (F, {7 + len(self.joint_names)}): the free joint's seven "
                 f"numbers and {len(self.joint_names)} joints"
             )
         if not np.isfinite(self.qpos).all():
-            raise ValueError(f"qpos is not finite in frame {int(np.argwhere(~np.isfinite(self.qpos))[0][0])}")
+            raise OsikValueError(f"qpos is not finite in frame {int(np.argwhere(~np.isfinite(self.qpos))[0][0])}")
         off = np.abs(np.linalg.norm(self.qpos[:, 3:7], axis=1) - 1.0)
         if off.max() > 1e-3:
-            raise ValueError(f"the base's quaternion (columns 3 to 6) is not of unit length in frame {off.argmax()}")
+            raise OsikValueError(
+                f"the base's quaternion (columns 3 to 6) is not of unit length in frame {off.argmax()}"
+            )
         if not (np.isfinite(self.fps) and self.fps > 0.0):
-            raise ValueError(f"fps is {self.fps}; it is frames a second, more than 0")
+            raise OsikValueError(f"fps is {self.fps}; it is frames a second, more than 0")
 
 
 def load_robot_motion(
@@ -64,17 +67,19 @@ def load_robot_motion(
         arrays = load_arrays(source)
         missing = [name for name in ("fps", "qpos", "joint_names") if name not in arrays]
         if missing:
-            raise ValueError(f"{source} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
+            raise OsikValueError(f"{source} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
         names = tuple(str(name) for name in arrays["joint_names"].ravel())
         return RobotMotion(float(arrays["fps"]), names, arrays["qpos"].astype(float))
     if joint_names is None or fps is None:
-        raise ValueError(f"{source}: a CSV holds numbers alone; say joint_names and fps")
+        raise OsikValueError(f"{source}: a CSV holds numbers alone; say joint_names and fps")
     if not source.is_file():
         raise FileNotFoundError(f"no such file: {source}")
     rows = [_numbers(source, number, line) for number, line in enumerate(source.read_text().splitlines(), 1) if line]
     ragged = [number for number, row in enumerate(rows, 1) if len(row) != 7 + len(joint_names)]
     if ragged:
-        raise ValueError(f"{source}, line {ragged[0]}: {len(rows[ragged[0] - 1])} numbers, not {7 + len(joint_names)}")
+        raise OsikValueError(
+            f"{source}, line {ragged[0]}: {len(rows[ragged[0] - 1])} numbers, not {7 + len(joint_names)}"
+        )
     values = np.array(rows).reshape(len(rows), -1)
     return RobotMotion(fps, tuple(joint_names), values[:, [0, 1, 2, 6, 3, 4, 5, *range(7, values.shape[1])]])
 
@@ -89,4 +94,4 @@ def _numbers(path: Path, number: int, line: str) -> list[float]:
     try:
         return [float(word) for word in line.split(",")]
     except ValueError:
-        raise ValueError(f"{path}, line {number}: not numbers between commas: {line[:60]!r}") from None
+        raise OsikValueError(f"{path}, line {number}: not numbers between commas: {line[:60]!r}") from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
+from .._errors import OsikValueError
 from .._tree import unknown_name
 from ._person import NEEDED, OPTIONAL
 
@@ -77,7 +78,7 @@ def _checked(joint_names: tuple[str, ...], mapping: Mapping[str, str]) -> dict[s
 def _check_complete(joint_names: tuple[str, ...], roles: Mapping[str, str]) -> None:
     missing = [role for role in NEEDED if role not in roles]
     if missing:
-        raise ValueError(
+        raise OsikValueError(
             f"the clip has no {', '.join(missing)} that can be told by name; say which joint is which with "
             f"mapping={{role: joint}}; joints: {', '.join(joint_names)}"
         )

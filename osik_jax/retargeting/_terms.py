@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._home import home_kinematics
 from .._joint_selection import scalar_layout
-from ..collision._distance import Core, _segment_parameters, between_segments
+from ..collision._distance import Nearest, _across, _rounded, _segment_parameters
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import cross, rotate
@@ -297,14 +297,20 @@ def _apart(place: _Places, first: int, body: Body, weights: Weights) -> _Rows:
     start, along = axes[:, 0], axes[:, 1] - axes[:, 0]
     a, b = pairs.T
     s, t = jax.vmap(_segment_parameters)(along[a], along[b], start[a] - start[b])
-    between = start[b] + t[:, None] * along[b] - start[a] - s[:, None] * along[a]
-    distance = jnp.sqrt(jnp.sum(between**2, -1)) - body.radii[a] - body.radii[b]
+    on_a, on_b = start[a] + s[:, None] * along[a], start[b] + t[:, None] * along[b]
+    apart = jnp.sqrt(jnp.sum((on_b - on_a) ** 2, -1)) - body.radii[a] - body.radii[b]
     # single precision is enough to choose, and several times as fast
-    chosen = jax.lax.top_k(-distance.astype(jnp.float32), min(_PAIRS, len(pairs)))[1]
-    pair = jnp.asarray(pairs)[chosen]
-    none = jnp.zeros((len(chosen), 0, 3), axes.dtype)
-    near = jax.vmap(between_segments)(*(Core(axes[i], none, none, body.radii[i]) for i in pair.T))
-    moves = jnp.asarray(place.moves[first::2])[pair]
+    chosen = jax.lax.top_k(-apart.astype(jnp.float32), min(_PAIRS, len(pairs)))[1]
+    middle, radii = start + 0.5 * along, jnp.stack([body.radii[a], body.radii[b]], -1)
+    found = jnp.concatenate([on_a, on_b, along[a], along[b], middle[b] - middle[a], radii], -1)[chosen]
+    near = jax.vmap(_nearest)(found)
+    moves = jnp.asarray(place.moves[first::2][pairs])[chosen]
     rates = [place.motion.rates(moves[:, i], near.normal, p) for i, p in enumerate((near.point_a, near.point_b))]
     gap = near.distance - weights.margin
     return _Rows(gap, rates[1] - rates[0], jnp.where(gap < 0.0, weights.apart, 0.0))
+
+
+def _nearest(found: Float[Array, "17"]) -> Nearest:
+    """Two capsules, by the nearest points of their axes, the axes, the way between their middles, and the radii."""
+    on_a, on_b, along_a, along_b, outward, radii = jnp.split(found, (3, 6, 9, 12, 15))
+    return _rounded(on_a, on_b, radii[0], radii[1], _across(along_a, along_b, outward))

@@ -34,6 +34,7 @@ def run_in_chunks(
     out: str | os.PathLike[str] | None = None,
     label: str = "",
     progress: Progress = True,
+    unit: str = "lanes",
 ) -> Any:
     """``function(batch, *shared)``, some lanes at a time; on disk, a job that was killed goes on where it was.
 
@@ -62,6 +63,7 @@ def run_in_chunks(
         label: a word for what the function does, kept in the manifest.
         progress: whether to show a bar; or a function of the number of lanes that are done and of all, called after
             each chunk, when it is written (on several hosts by the first process).
+        unit: what the bar calls the lanes, in the plural.
 
     Returns:
         With ``out``, a ``Saved``; without, the results as NumPy arrays.
@@ -80,15 +82,15 @@ def run_in_chunks(
     check_progress(progress)
     job = _Job(function, batch, shared, _lanes(batch, count), _positive(chunk, "chunk"))
     if out is None:
-        return _in_memory(job, progress)
+        return _in_memory(job, progress, unit)
     folder = Path(out)
     with only_job(folder, jax.process_index()) as alone:
         if alone:
             remove_partial_files(folder)
-        return Saved(folder, _to_disk(job, folder, label, progress))
+        return Saved(folder, _to_disk(job, folder, label, progress, unit))
 
 
-def _to_disk(job: _Job, folder: Path, label: str, progress: Progress) -> Any:
+def _to_disk(job: _Job, folder: Path, label: str, progress: Progress, unit: str) -> Any:
     """Runs the chunks that are missing; returns a pytree of the structure of the results."""
     process, processes, manifest = jax.process_index(), jax.process_count(), job.manifest(label)
     finished = claim(folder, manifest, process, processes)
@@ -99,7 +101,7 @@ def _to_disk(job: _Job, folder: Path, label: str, progress: Progress) -> Any:
     if finished and todo:
         part = next(iter(finished.values()))[0]
         layout.check(read_chunk(folder / part.file_name, part, manifest["job"])[1], part.chunk)
-    with reported(job.count, job.count - missing, progress if process == 0 else False) as advance:
+    with reported(job.count, job.count - missing, progress if process == 0 else False, unit) as advance:
         for k, result in _one_ahead(job, todo):
             blocks, arrays = _rows(result, job.size(k), job.chunk)
             layout.check(arrays, k)
@@ -271,12 +273,12 @@ def _bytes(tree: Any) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-def _in_memory(job: _Job, progress: Progress) -> Any:
+def _in_memory(job: _Job, progress: Progress, unit: str) -> Any:
     if jax.process_count() > 1:
         raise OsikValueError("several processes have no memory in common: name a folder, out=...")
     parts: list[dict[str, np.ndarray]] = []
     layout, result = _Layout(), None
-    with reported(job.count, 0, progress) as advance:
+    with reported(job.count, 0, progress, unit) as advance:
         for k, result in _one_ahead(job, range(job.chunks)):
             _, arrays = _rows(result, job.size(k), job.chunk)
             layout.check(arrays, k)

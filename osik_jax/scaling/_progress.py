@@ -21,17 +21,18 @@ def check_progress(progress: Any) -> None:
 
 
 @contextlib.contextmanager
-def reported(total: int, done: int, progress: Progress) -> Iterator[Callable[[int], None]]:
-    """A function to tell how many more lanes are done; it draws a bar, or calls the function given."""
+def reported(total: int, done: int, progress: Progress, unit: str) -> Iterator[Callable[[int], None]]:
+    """A function to tell how many more lanes are done; it draws a bar that calls them so, or calls what is given."""
     with contextlib.ExitStack() as stack:
-        update = stack.enter_context(progress_bar(total, done)) if progress is True else None
+        update = stack.enter_context(progress_bar(total, done, unit=unit)) if progress is True else None
         start, own = time.perf_counter(), 0
 
         def advance(more: int) -> None:
             nonlocal own
             own += more
             if update is not None:
-                update(done + own, f"{own / (time.perf_counter() - start):,.0f} lanes/s")
+                rate = own / (time.perf_counter() - start)
+                update(done + own, f"{rate:,.0f} a second" if rate >= 10.0 else f"{rate:.2g} a second")
             elif callable(progress):
                 progress(done + own, total)
 

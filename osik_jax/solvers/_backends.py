@@ -7,7 +7,7 @@ from kernels; the search needs none and is the definition. ``backend``, a static
     "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    none
               hard rows, n <= 64, <= 32 soft rows  fit into shared memory
     "numba"   CPUs: any precision, least squares   CPUs: any precision, any shape      none
-    "jax"     none: the search alone, on any platform, and what ``jax.export`` takes
+    "jax"     none: the search alone, on any platform
 
 "auto" takes what is installed and fits, and the search elsewhere. Which platform a program runs on is decided when it
 is lowered, not when it is traced (``on_platforms``).
@@ -23,6 +23,8 @@ from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
+
+from .._errors import OsikValueError
 
 Backend = Literal["auto", "jax", "numba", "warp"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
@@ -47,7 +49,7 @@ def check_backend(backend: Any) -> Backend:
         RuntimeError: "warp" without a CUDA device.
     """
     if backend not in BACKENDS:
-        raise ValueError(f"backend is {backend!r}; backends: {', '.join(BACKENDS)}")
+        raise OsikValueError(f"backend is {backend!r}; backends: {', '.join(BACKENDS)}")
     if backend in _MISSING and not installed(backend):
         raise ModuleNotFoundError(_MISSING[backend], name=backend)
     if backend == "warp" and not cuda_is_default():
@@ -101,7 +103,7 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
     if backend == kernel:
         check_backend(backend)
         if not fits:
-            raise ValueError(
+            raise OsikValueError(
                 f"backend={kernel!r} has no kernel for problems of this kind, precision or shape; take 'auto'"
             )
         return True

@@ -10,14 +10,15 @@ the residual is that of the damped step itself: a fixed point, found from share 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from .._errors import OsikValueError
 from ._dense import apply, product
-from ._level import Level, positive_root
+from ._level import positive_root
 
 PASSES = 3
 """Steps towards the fixed point; each makes what is damped too much smaller by the factor unmet / s^2."""
@@ -33,12 +34,18 @@ BENDS = 1e-6
 """Of the largest cost of a variable, what another has to cost to count: less may be rounding."""
 
 
+@runtime_checkable
 class Rows(Protocol):
     """Rows of a level, weights multiplied in."""
 
     @property
     def matrix(self) -> Float[Array, "m n"]:
         """A."""
+        ...
+
+    @property
+    def equal(self) -> Bool[Array, " m"]:
+        """Rows to be treated as equalities."""
         ...
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -68,7 +75,7 @@ def one_each(damping: Any, count: int, n: int, dtype: jnp.dtype) -> Damping:
     single = isinstance(damping, Damping) or not isinstance(damping, Sequence)
     given = [damping] * count if single else list(damping)
     if len(given) != count:
-        raise ValueError(f"there are {len(given)} dampings and {count} levels")
+        raise OsikValueError(f"there are {len(given)} dampings and {count} levels")
     whole = [one if isinstance(one, Damping) else Damping(one) for one in given]
     constant, unmet, demand, bends = (
         jnp.array([jnp.asarray(part, dtype) for part in parts], dtype) for parts in _fields(whole)
@@ -83,7 +90,7 @@ def _fields(whole: Sequence[Damping]) -> list[list]:
 
 def effective(
     damping: Damping,
-    level: Level,
+    level: Rows,
     x: Float[Array, " n"],
     projector: Float[Array, "n n"],
     lower: Float[Array, " n"],

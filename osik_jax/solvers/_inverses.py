@@ -45,7 +45,7 @@ def _by_row_factors(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array
 
 
 @_by_row_factors.defjvp
-def _by_row_factors_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+def _by_row_factors_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
     space, X, D = _by_row_factors(a, cutoff, damping)
     dX = _columns(lambda w: _inverse_rate(a, X, da, w), a)
@@ -54,7 +54,7 @@ def _by_row_factors_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -
 
 
 @row_space_and_motion.defjvp
-def _row_space_and_motion_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+def _row_space_and_motion_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     (a, wanted, cutoff, damping), (da, d_wanted, _, d_damping) = primals, tangents
     space, X, D = _by_row_factors(a, cutoff, damping)
     rate = _damped_rate(a, X, D, damping, da, d_damping, wanted) + apply(D, d_wanted)
@@ -86,14 +86,14 @@ def _by_pivots(matrix: Array, rank: Array, cutoff: Array) -> tuple[Array, Array]
 
 
 @_by_pivots.defjvp
-def _by_pivots_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+def _by_pivots_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     (a, rank, cutoff), (da, *_) = primals, tangents
     space, X = _by_pivots(a, rank, cutoff)
     return (space, X), (_space_rate(space, X, da), _columns(lambda w: _inverse_rate(a, X, da, w), a))
 
 
 @row_space_and_motion_of_rank.defjvp
-def _row_space_and_motion_of_rank_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+def _row_space_and_motion_of_rank_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     (a, wanted, rank, cutoff), (da, d_wanted, *_) = primals, tangents
     space, X = _by_pivots(a, rank, cutoff)
     rate = _inverse_rate(a, X, da, wanted) + apply(X, d_wanted)
@@ -172,7 +172,7 @@ def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Arr
 
 
 @_with_gram.defjvp
-def _with_gram_jvp(primals: tuple[Array, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+def _with_gram_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     """Of K A' and K where damped; of the Moore-Penrose inverse at constant rank (Golub, Pereyra 1973) where not."""
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
     D, K = _with_gram(a, cutoff, damping)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from ._box import uncrossed
 from ._dense import apply
 
@@ -52,9 +53,9 @@ class Level(eqx.Module):
         rows = self.matrix.shape[:-1]
         for name, array in (("lower", self.lower), ("upper", self.upper), ("weight", self.weight)):
             if array is not None and array.shape != rows:
-                raise ValueError(f"{name} has shape {array.shape}; the matrix {self.matrix.shape} asks for {rows}")
+                raise OsikValueError(f"{name} has shape {array.shape}; the matrix {self.matrix.shape} asks for {rows}")
         if len(self.equalities) != count:
-            raise ValueError(f"equalities has {len(self.equalities)} flags; the matrix has {count} rows")
+            raise OsikValueError(f"equalities has {len(self.equalities)} flags; the matrix has {count} rows")
 
     @property
     def equality(self) -> bool:

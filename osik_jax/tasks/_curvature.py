@@ -70,8 +70,8 @@ def _largest(pull: Float[Array, " m"]) -> Float[Array, ""]:
     return jnp.where(largest > 0.0, largest, 1.0)
 
 
-def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "m nv"]) -> Float[Array, ""]:
-    """Bound for any rows: the pull's length times the size (Frobenius norm) of their Jacobian."""
+def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"]) -> Float[Array, ""]:
+    """Bound for any rows: the pull's length times the Frobenius norm of their Jacobian, or of one that they combine."""
     return length(pull) * safe_norm(jacobian.ravel())
 
 

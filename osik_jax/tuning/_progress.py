@@ -15,7 +15,7 @@ def reported(iterations: int, *, shown: bool) -> Iterator[Callable[[History], No
     if not shown:
         yield lambda history: None
         return
-    with progress_bar(iterations) as update:
+    with progress_bar(iterations, unit="iterations") as update:
         yield lambda history: update(len(history), describe(history))
 
 

@@ -25,9 +25,11 @@ from ._scene import draw_trail as draw_trail
 from ._scene import scene_axes as scene_axes
 from .live import BatchView as BatchView
 from .live import LiveView as LiveView
+from .live import ReachView as ReachView
 from .live import Session as Session
 from .live import export_html as export_html
 from .live import load_session as load_session
 from .live import serve as serve
 from .live import serve_batch as serve_batch
+from .live import serve_reach as serve_reach
 from .live import serve_session as serve_session

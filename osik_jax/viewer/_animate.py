@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from .._errors import OsikValueError
 from ..robot import Robot
 from ._look import Look
 from ._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
@@ -125,9 +126,9 @@ def animate(
 
 def _check_path(path: Path) -> None:
     if path.suffix not in (".gif", ".mp4"):
-        raise ValueError(f"cannot write {path.name!r}: the suffix has to be .gif or .mp4")
+        raise OsikValueError(f"cannot write {path.name!r}: the suffix has to be .gif or .mp4")
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        raise ValueError(f"cannot write {path.name!r}: the program ffmpeg is not installed; write a .gif")
+        raise OsikValueError(f"cannot write {path.name!r}: the program ffmpeg is not installed; write a .gif")
 
 
 def _each(support: Polygons | Float[np.ndarray, "m 2"] | None, ticks: np.ndarray) -> Polygons | None:

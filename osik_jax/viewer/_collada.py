@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from PIL import Image
 
+from .._errors import OsikValueError
+
 _Element = ElementTree.Element
 _Color = tuple[float, float, float, float]
 
@@ -42,15 +44,15 @@ def read_collada(path: Path) -> list[Triangles]:
     try:
         root = _without_namespaces(ElementTree.parse(path).getroot())
     except ElementTree.ParseError as error:
-        raise ValueError(f"{path}: broken XML: {error}") from error
+        raise OsikValueError(f"{path}: broken XML: {error}") from error
     if root.tag != "COLLADA":
-        raise ValueError(f"{path}: the root element is <{root.tag}>, not <COLLADA>")
+        raise OsikValueError(f"{path}: the root element is <{root.tag}>, not <COLLADA>")
     try:
         parts = _Document(root, path).parts()
     except (KeyError, IndexError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: broken COLLADA: {error!r}") from error
+        raise OsikValueError(f"{path}: broken COLLADA: {error!r}") from error
     if not parts:
-        raise ValueError(f"{path}: no triangles in the scene")
+        raise OsikValueError(f"{path}: no triangles in the scene")
     return parts
 
 

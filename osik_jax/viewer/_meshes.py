@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from .._errors import OsikValueError
 from ._collada import Triangles, read_collada
 
 SUFFIXES = (".dae", ".stl", ".obj", ".msh")
@@ -21,14 +22,14 @@ def read_mesh(path: Path) -> list[Triangles]:
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"{path}: a mesh has to be one of {', '.join(SUFFIXES)}")
+        raise OsikValueError(f"{path}: a mesh has to be one of {', '.join(SUFFIXES)}")
     if suffix == ".dae":
         parts = read_collada(path)
     else:
         parts = [_text_stl(path) if suffix == ".stl" and _is_text(path) else _by_mujoco(path)]
     solid = [part for part in parts if _has_area(part)]
     if not solid:
-        raise ValueError(f"{path}: nothing in it has a surface")
+        raise OsikValueError(f"{path}: nothing in it has a surface")
     return solid
 
 

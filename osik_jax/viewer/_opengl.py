@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -25,6 +25,7 @@ _failures: list[str] = []
 """Why OpenGL does not work here, once that is known: MuJoCo 4.0 aborts the process at its second failure."""
 
 
+@runtime_checkable
 class Renderer(Protocol):
     """Draws a stage."""
 

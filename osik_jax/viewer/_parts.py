@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
+from .._errors import OsikValueError
 from ..robot import Robot
 from ._look import Look
 from ._mujoco import model_bodies, mujoco_poses
@@ -162,7 +163,7 @@ def robot_parts(robot: Robot, *, style: Style = "auto", look: Look | None = None
     if geoms and (style == "geoms" or _cover(model, [model.geom_bodyid[part.index] for part in geoms])):
         return RobotParts(model, "geoms", geoms, tips)
     if style == "geoms":
-        raise ValueError("the model has no geom to draw; use style='sticks'")
+        raise OsikValueError("the model has no geom to draw; use style='sticks'")
     return RobotParts(model, "sticks", _sticks(robot, tips), tips)
 
 
@@ -171,7 +172,7 @@ def _link_bodies(model: mujoco.MjModel, look: Look) -> list[int]:
     bodies = {name: mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in {s.link for s in look.shapes}}
     strange = sorted(name for name, body in bodies.items() if body < 0)
     if strange:
-        raise ValueError(f"the look is another robot's: this one has no links {', '.join(strange)}")
+        raise OsikValueError(f"the look is another robot's: this one has no links {', '.join(strange)}")
     return [bodies[shape.link] for shape in look.shapes]
 
 

@@ -60,6 +60,35 @@ class Descent(NamedTuple):
     done: Bool[Array, ""]
 
 
+def descent_of(
+    x: Array,
+    multipliers: Array,
+    reached: Array,
+    strengths: Array,
+    residual: Array,
+    box: Array,
+    sides: Array,
+    tight: Array,
+    missed: Array,
+    own: Array,
+    ranks: Array,
+    report: Array,
+) -> Descent:
+    """What a kernel gives for a batch; ``report`` has whether it came to an end, iterations and factorisations."""
+    return Descent(
+        x=x,
+        box=box,
+        decisions=Decision(jnp.where(strengths[:, :, None] > 0.0, sides, tight), tight, missed, ranks),
+        working=WorkingSet(sides, own),
+        multipliers=multipliers,
+        reached=reached,
+        residual=residual,
+        iterations=report[:, 1],
+        factorizations=report[:, 2],
+        done=report[:, 0] != 0,
+    )
+
+
 def descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None) -> Descent:
     """All levels, all lanes: every array has a leading axis, the lanes, and then perhaps one of levels.
 
@@ -130,7 +159,7 @@ def _start(stack: Stack) -> _Cascade:
     )
 
 
-_Outcome = tuple[Decision, WorkingSet, Float[Array, "B h"], Float[Array, " B"]]
+_Outcome = tuple[Decision, WorkingSet, Float[Array, "*B h"], Float[Array, "*B"]]
 
 
 def _task(layout: Layout, k: Int[Array, ""], stack: Stack, level: Level, cascade: _Cascade) -> Task:

@@ -17,9 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._damping import BENDS, LEAST, PASSES, ROOM, SPENT
-from ._cascade import Descent
+from ._cascade import Descent, descent_of
 from ._problem import Tolerances, WorkingSet
-from ._replay import Decision
 from ._stack import Layout, Stack
 
 _MOST_ROWS, _MOST_HARD_ROWS = 64, 32
@@ -105,18 +104,7 @@ def solve(
     )
     sides, tight, multipliers = (a.reshape(lanes, count, h) for a in (sides, tight, multipliers))
     missed, own = (a.reshape(lanes, count, m) for a in (missed, own))
-    return Descent(
-        x=x,
-        box=box,
-        decisions=Decision(jnp.where(strengths[:, :, None] > 0.0, sides, tight), tight, missed, ranks),
-        working=WorkingSet(sides, own),
-        multipliers=multipliers,
-        reached=reached,
-        residual=residual[:, 0],
-        iterations=report[:, 1],
-        factorizations=report[:, 2],
-        done=report[:, 0] != 0,
-    )
+    return descent_of(x, multipliers, reached, strengths, residual[:, 0], box, sides, tight, missed, own, ranks, report)
 
 
 @cache

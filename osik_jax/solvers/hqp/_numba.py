@@ -6,9 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..kernels.numba import _target
-from ._cascade import Descent
+from ._cascade import Descent, descent_of
 from ._problem import Tolerances, WorkingSet
-from ._replay import Decision
 from ._stack import Layout, Stack
 
 
@@ -32,16 +31,5 @@ def solve(
         *(jnp.stack(tolerances, -1), stack.equal, stack.hard_equal, *guess),
         *(np.array(a, np.int32) for a in (layout.counts, layout.level_of_hard, row_of_hard, [max_iterations])),
     )
-    x, multipliers, reached, strengths, residual, box, sides, tight, missed, own, ranks, report = found
-    return Descent(
-        x=x,
-        box=box,
-        decisions=Decision(jnp.where(strengths[:, :, None] > 0.0, sides, tight), tight, missed, ranks),
-        working=WorkingSet(sides, own),
-        multipliers=multipliers,
-        reached=reached,
-        residual=residual,
-        iterations=report[:, 1],
-        factorizations=report[:, 2],
-        done=report[:, 0] != 0,
-    )
+    names = (*floats, *ints)
+    return descent_of(**dict(zip(names, found, strict=True)))

@@ -70,7 +70,8 @@ def _descend(decisions: Decision, problem: Problem) -> Answer:
     return x, projector, scales
 
 
-def _level(decision: Decision, room: Room) -> Answer:
+def _level(decision: Decision, room: Room) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
+    """x, the projector, and the scale."""
     scale, projector = _stop(room, decision)
     # one factorisation after another: see osik_jax/runtime.py
     scale, side = jax.lax.optimization_barrier((scale, decision.side))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from ..._errors import OsikValueError
 from .._box import clip_to_box, uncrossed
 from .._damping import Damping, one_each
 from .._status import Status
@@ -71,9 +72,9 @@ def solve_nullspace(
     dtype = jnp.result_type(*(level.matrix for level in levels))
     box = _bounds(lower, upper, n, dtype)
     if order not in ORDERS:
-        raise ValueError(f"order is {order!r}; orders: {', '.join(ORDERS)}")
+        raise OsikValueError(f"order is {order!r}; orders: {', '.join(ORDERS)}")
     if box is not None and order == "reverse":
-        raise ValueError("bounds need order='forward': saturation goes from the highest level down")
+        raise OsikValueError("bounds need order='forward': saturation goes from the highest level down")
     pull = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True)
     possible = ~jnp.stack(crossed).any()
@@ -108,7 +109,7 @@ def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] |
     )
     for name, bound in (("lower", low), ("upper", high)):
         if bound.shape != (n,):
-            raise ValueError(f"{name} has shape {bound.shape}; the levels ask for {(n,)}")
+            raise OsikValueError(f"{name} has shape {bound.shape}; the levels ask for {(n,)}")
     return low, high
 
 

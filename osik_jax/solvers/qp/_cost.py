@@ -91,7 +91,7 @@ class LeastSquares(eqx.Module):
         pulls = self.weight * (apply(size, jnp.abs(x)) + jnp.abs(self.target))
         return apply(size.T, pulls) + self.damping * (jnp.abs(x) + jnp.abs(self.center))
 
-    def root(self, free: Bool[Array, " n"]) -> Float[Array, "m+n n"]:
+    def root(self, free: Bool[Array, " n"]) -> Float[Array, "m_and_n n"]:
         """R with R'R = H over the free variables, ones for the others; nothing is squared."""
         own = jnp.where(free, jnp.sqrt(self.damping), 1.0)
         return jnp.concatenate([jnp.sqrt(self.weight)[:, None] * self.matrix * free, jnp.diag(own)])

@@ -33,7 +33,7 @@ class Factor(NamedTuple):
     schur_half: Float[Array, "p p"]  # inverse of held rows' Schur complement = schur_half' schur_half
 
 
-def factorize(qp: QP, hessian: Float[Array, "n n"], active: Int[Array, " n+p"]) -> Factor:
+def factorize(qp: QP, hessian: Float[Array, "n n"], active: Int[Array, " n_and_p"]) -> Factor:
     """Factors at an active set; a ridge of a few roundings keeps a semidefinite Hessian from breaking it."""
     n, p = hessian.shape[0], qp.rows.shape[0]
     unit = float(jnp.finfo(hessian.dtype).eps)
@@ -52,7 +52,9 @@ def factorize(qp: QP, hessian: Float[Array, "n n"], active: Int[Array, " n+p"]) 
     return Factor(free, held, lower, backward(lower, reach), half_inverse(cholesky(schur + jnp.diag(ridge))))
 
 
-def minimize_on(qp: QP, factor: Factor, active: Int[Array, "B n+p"]) -> tuple[Float[Array, "B n"], Float[Array, "B p"]]:
+def minimize_on(
+    qp: QP, factor: Factor, active: Int[Array, "B n_and_p"]
+) -> tuple[Float[Array, "B n"], Float[Array, "B p"]]:
     """Minimisers and row multipliers with the active constraints as equalities and the others left out.
 
     Every argument has a leading axis, the lanes; all are refined until the last correction is small in each.
@@ -107,7 +109,7 @@ def _share(dx: Float[Array, " n"], x: Float[Array, " n"]) -> Float[Array, ""]:
 
 
 def _correction(
-    qp: QP, factor: Factor, target: Float[Array, " n+p"], x: Float[Array, " n"], y: Float[Array, " p"]
+    qp: QP, factor: Factor, target: Float[Array, " n_and_p"], x: Float[Array, " n"], y: Float[Array, " p"]
 ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
     """Of x and y, from exact residuals."""
     slope = apply(qp.rows.T, y) - qp.cost.gradient(x)
@@ -127,7 +129,9 @@ def solve_system(
     return step + apply(factor.through, dy), dy
 
 
-def system_inverse(qp: QP, active: Int[Array, " n+p"]) -> Callable[[Float[Array, " n+p"]], Float[Array, " n+p"]]:
+def system_inverse(
+    qp: QP, active: Int[Array, " n_and_p"]
+) -> Callable[[Float[Array, " n_and_p"]], Float[Array, " n_and_p"]]:
     """From slope and -gap to dx and dy as in ``solve_system``; 0 for active variables and for rows that are not held.
 
     One refinement: products with A keep what the factor of A'WA has lost.

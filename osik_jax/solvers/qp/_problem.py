@@ -41,7 +41,7 @@ class QP(eqx.Module):
     known: tuple[bool, ...] | None = eqx.field(default=None, static=True)
 
     @property
-    def equality(self) -> Bool[Array, " n+p"]:
+    def equality(self) -> Bool[Array, " n_and_p"]:
         """Constraints that are known to be equalities, and those whose bounds are equal."""
         equal = self.lower == self.upper
         return equal if self.known is None else equal | np.array(self.known)
@@ -80,7 +80,7 @@ class QPSolution(eqx.Module):
     active: Int[Array, " n+p"]
 
 
-def active_targets(qp: QP, active: Int[Array, " n+p"]) -> Float[Array, " n+p"]:
+def active_targets(qp: QP, active: Int[Array, " n_and_p"]) -> Float[Array, " n_and_p"]:
     """The bound that each active constraint sits at, 0 for the others (never infinite)."""
     at_lower = (active != INACTIVE) & (active != AT_UPPER)
     return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ... import _rules
+from ..._errors import OsikValueError
 from .._backends import Backend, check_backend, here
 from .._box import inside, uncrossed
 from .._dense import apply
@@ -36,7 +37,7 @@ def solve_qp(
     rows_upper: Float[ArrayLike, " p"] | None = None,
     *,
     rows_compliance: Float[ArrayLike, " p"] | None = None,
-    warm_start: Int[ArrayLike, " n+p"] | None = None,
+    warm_start: Int[ArrayLike, " n_and_p"] | None = None,
     max_iterations: int | None = None,
     tolerance: Float[ArrayLike, ""] | None = None,
     backend: Backend = "auto",
@@ -64,11 +65,11 @@ def solve_qp(
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
     """
-    cost = Quadratic(jnp.asarray(hessian), jnp.asarray(gradient))
-    n, found = cost.linear.shape[0], cost.matrix.shape
-    if found != (n, n):
-        raise ValueError(f"hessian has shape {found}, gradient has length {n}")
-    qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
+    hessian, gradient = jnp.asarray(hessian), jnp.asarray(gradient)
+    n = gradient.shape[0]
+    if hessian.shape != (n, n):
+        raise OsikValueError(f"hessian has shape {hessian.shape}, gradient has length {n}")
+    qp = _problem(Quadratic(hessian, gradient), n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
     return _solve(qp, warm_start, max_iterations, tolerance, backend)
 
 
@@ -87,7 +88,7 @@ def solve_least_squares_qp(
     center: Float[ArrayLike, "..."] = 0.0,
     rows_compliance: Float[ArrayLike, " p"] | None = None,
     rows_equalities: tuple[bool, ...] | None = None,
-    warm_start: Int[ArrayLike, " n+p"] | None = None,
+    warm_start: Int[ArrayLike, " n_and_p"] | None = None,
     max_iterations: int | None = None,
     tolerance: Float[ArrayLike, ""] | None = None,
     backend: Backend = "auto",
@@ -144,7 +145,7 @@ def _problem(
     if rows is None:
         rows, rows_lower, rows_upper = jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
     if rows_lower is None or rows_upper is None:
-        raise ValueError("rows need rows_lower and rows_upper; use -inf or inf for a side without bound")
+        raise OsikValueError("rows need rows_lower and rows_upper; use -inf or inf for a side without bound")
     stack = [
         jnp.concatenate([jnp.asarray(a, dtype), jnp.asarray(b, dtype)])
         for a, b in ((lower, rows_lower), (upper, rows_upper))
@@ -152,16 +153,16 @@ def _problem(
     rows = jnp.asarray(rows, dtype)
     p = rows.shape[0]
     if stack[0].shape != (n + p,) or stack[1].shape != stack[0].shape:
-        raise ValueError(
+        raise OsikValueError(
             f"bounds do not fit: {n} variables, {p} rows, {stack[0].shape[0]} lower bounds "
             f"and {stack[1].shape[0]} upper bounds"
         )
     compliance = jnp.zeros(p, dtype) if compliance is None else jnp.asarray(compliance, dtype)
     if compliance.shape != (p,):
-        raise ValueError(f"rows_compliance has shape {compliance.shape}; there are {p} rows")
+        raise OsikValueError(f"rows_compliance has shape {compliance.shape}; there are {p} rows")
     equalities = (False,) * p if equalities is None else equalities
     if len(equalities) != p:
-        raise ValueError(f"rows_equalities has {len(equalities)} flags; there are {p} rows")
+        raise OsikValueError(f"rows_equalities has {len(equalities)} flags; there are {p} rows")
     known = (False,) * n + equalities if any(equalities) else None
     return QP(cost, rows, compliance, stack[0], stack[1], known)
 
@@ -209,7 +210,7 @@ def _solve(
     )
 
 
-def _upper(qp: QP) -> Float[Array, " n+p"]:
+def _upper(qp: QP) -> Float[Array, " n_and_p"]:
     """Upper bounds, those of known equalities exactly the lower ones."""
     return qp.upper if qp.known is None else jnp.where(np.array(qp.known), qp.lower, qp.upper)
 

@@ -41,8 +41,8 @@ class RowFactor(NamedTuple):
     free: Bool[Array, " n"]
     held: Bool[Array, " p"]
     root: Float[Array, " n"]  # of the inverse damping, 0 where not free
-    scaled: Float[Array, "m+p n"]  # B
-    lower: Float[Array, "m+p m+p"]  # Cholesky factor of S
+    scaled: Float[Array, "m_and_p n"]  # B
+    lower: Float[Array, "m_and_p m_and_p"]  # Cholesky factor of S
     loss: Float[Array, ""]  # what a correction leaves of itself to the next
     sound: Bool[Array, ""]
 
@@ -56,7 +56,7 @@ def has_few_rows(qp: QP) -> bool:
 
 
 def minimize_through_rows(
-    qp: QP, active: Int[Array, "B n+p"]
+    qp: QP, active: Int[Array, "B n_and_p"]
 ) -> tuple[Float[Array, "B n"], Float[Array, "B p"], Bool[Array, " B"]]:
     """As ``minimize_on``, and whether the factors are worth something; every argument has a leading axis, the lanes."""
     factor = jax.vmap(_factorize)(qp, active)
@@ -68,7 +68,7 @@ def minimize_through_rows(
     return x, y, factor.sound & settled
 
 
-def _factorize(qp: QP, active: Int[Array, " n+p"]) -> RowFactor:
+def _factorize(qp: QP, active: Int[Array, " n_and_p"]) -> RowFactor:
     cost, n = qp.cost, active.shape[0] - qp.rows.shape[0]
     assert isinstance(cost, LeastSquares)
     free, held = active[:n] == INACTIVE, active[n:] != INACTIVE
@@ -86,15 +86,17 @@ def _factorize(qp: QP, active: Int[Array, " n+p"]) -> RowFactor:
 
 
 def _solve(
-    factor: RowFactor, asked: Float[Array, " m+p"], slope: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Float[Array, " m+p"]]:
+    factor: RowFactor, asked: Float[Array, " m_and_p"], slope: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, " m_and_p"]]:
     """dx, z with D dx - B'z = slope and B dx + diag(1, compliance) z = asked, B in the units of ``asked``."""
     pull = factor.root * slope
     z = backward(factor.lower, forward(factor.lower, asked - apply(factor.scaled, pull)))
     return factor.root * (pull + apply(factor.scaled.T, z)), z
 
 
-def _first(qp: QP, factor: RowFactor, target: Float[Array, " n+p"]) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
+def _first(
+    qp: QP, factor: RowFactor, target: Float[Array, " n_and_p"]
+) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
     """From the centre of the damping, where nothing large has to cancel."""
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
@@ -107,7 +109,7 @@ def _first(qp: QP, factor: RowFactor, target: Float[Array, " n+p"]) -> tuple[Flo
 
 
 def _correction(
-    qp: QP, factor: RowFactor, target: Float[Array, " n+p"], x: Float[Array, " n"], y: Float[Array, " p"]
+    qp: QP, factor: RowFactor, target: Float[Array, " n_and_p"], x: Float[Array, " n"], y: Float[Array, " p"]
 ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
     """Of x and y, from exact residuals."""
     n, m = len(x), len(factor.lower) - len(y)

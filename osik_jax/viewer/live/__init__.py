@@ -6,5 +6,7 @@ from ._export import export_html as export_html
 from ._page import LiveView as LiveView
 from ._page import serve as serve
 from ._page import serve_session as serve_session
+from ._reach import ReachView as ReachView
+from ._reach import serve_reach as serve_reach
 from ._session import Session as Session
 from ._session import load_session as load_session

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._checks import check_setting, check_tasks, checked_limits
+from ..._errors import OsikValueError
 from ..._tree import unknown_name
 from ...limits import ConfigurationLimit, Limit, VelocityLimit
 from ...robot import Robot
@@ -242,7 +243,7 @@ def serve_batch(
         TypeError, ValueError: as in ``osik_jax.solve``; no robots, or tasks that differ in more than numbers.
     """
     if not tasks:
-        raise ValueError("there are no robots: tasks is empty")
+        raise OsikValueError("there are no robots: tasks is empty")
     scheme = WeightedQP() if scheme is None else scheme
     given = (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else tuple(limits)
     check_setting("serve_batch(robot, tasks)", robot, scheme, dt)
@@ -251,7 +252,7 @@ def serve_batch(
         check_tasks(own, robot)
     start = np.asarray(robot.q0 if q0 is None else q0)
     if start.shape not in ((robot.nq,), (len(tasks), robot.nq)):
-        raise ValueError(f"q0 has shape {start.shape}, expected ({robot.nq},) or ({len(tasks)}, {robot.nq})")
+        raise OsikValueError(f"q0 has shape {start.shape}, expected ({robot.nq},) or ({len(tasks)}, {robot.nq})")
     controllers = {name: Controller(dict(own), scheme, given) for name, own in tasks.items()}
     q0s = np.broadcast_to(start, (len(tasks), robot.nq)).copy()
     view = BatchView(robot, controllers, q0s, dt=dt, look=look, host=host, port=port, title="osik-jax")

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..._errors import OsikValueError
 from ...limits import CollisionAvoidanceLimit
 from ...robot import Robot
 from ...tasks import AdaptiveGain, PostureTask, SupportPolygon
@@ -31,13 +32,13 @@ def describe(part: Any, robot: Robot) -> Description:
     """
     kind = type(part).__name__
     if getattr(importlib.import_module("osik_jax"), kind, None) is not type(part):
-        raise ValueError(f"{kind} is no class of osik_jax, so a session file cannot hold it")
+        raise OsikValueError(f"{kind} is no class of osik_jax, so a session file cannot hold it")
     names = [name for name in inspect.signature(type(part)).parameters if name != "robot"]
     if isinstance(part, CollisionAvoidanceLimit):
         return _describe_collisions(part, robot)
     described = {"kind": kind} | {name: _argument(part, robot, name) for name in names}
     if not _makes(described, robot, part):
-        raise ValueError(f"this {kind} has settings that a session file cannot hold")
+        raise OsikValueError(f"this {kind} has settings that a session file cannot hold")
     for name in names:
         without = {key: value for key, value in described.items() if key != name}
         described = without if _makes(without, robot, part) else described
@@ -54,7 +55,7 @@ def _describe_collisions(limit: CollisionAvoidanceLimit, robot: Robot) -> Descri
         made = rebuild(described, robot)
         if made.scene == limit.scene and made.max_pairs == limit.max_pairs:
             return described
-    raise ValueError("this CollisionAvoidanceLimit has settings that a session file cannot hold")
+    raise OsikValueError("this CollisionAvoidanceLimit has settings that a session file cannot hold")
 
 
 def _makes(described: Description, robot: Robot, part: Any) -> bool:
@@ -74,7 +75,7 @@ def rebuild(described: Mapping[str, Any], robot: Robot) -> Any:
     """
     found = getattr(importlib.import_module("osik_jax"), str(described.get("kind")), None)
     if not inspect.isclass(found):
-        raise ValueError(f"{described.get('kind')!r} is no class of osik_jax")
+        raise OsikValueError(f"{described.get('kind')!r} is no class of osik_jax")
     cls: Any = found
     arguments = {name: _live(value) for name, value in described.items() if name != "kind"}
     if cls is CollisionAvoidanceLimit:
@@ -86,7 +87,7 @@ def rebuild(described: Mapping[str, Any], robot: Robot) -> Any:
     try:
         return cls(robot, **arguments) if _takes_robot(cls) else cls(**arguments)
     except TypeError as error:
-        raise ValueError(f"{cls.__name__}: {error}") from error
+        raise OsikValueError(f"{cls.__name__}: {error}") from error
 
 
 def python(described: Mapping[str, Any]) -> str:
@@ -113,7 +114,7 @@ def _argument(part: Any, robot: Robot, name: str) -> Any:
     if name == "joints" and isinstance(part, PostureTask):
         return [robot.tree.joint_names[joint] for joint in part.joints]
     if not hasattr(part, name):
-        raise ValueError(f"a session file cannot hold a {type(part).__name__}: its {name} is not kept")
+        raise OsikValueError(f"a session file cannot hold a {type(part).__name__}: its {name} is not kept")
     return _plain(getattr(part, name))
 
 
@@ -129,7 +130,7 @@ def _plain(value: Any) -> Any:
         return np.asarray(value).tolist()
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise ValueError(f"a session file cannot hold a {type(value).__name__}")
+    raise OsikValueError(f"a session file cannot hold a {type(value).__name__}")
 
 
 def _live(value: Any) -> Any:

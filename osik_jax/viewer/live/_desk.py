@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..._errors import OsikValueError
 from ..._tree import unknown_name
 from ...collision import CollisionShape
 from ...limits import CollisionAvoidanceLimit, VelocityLimit
@@ -157,7 +158,7 @@ class Desk:
             name = free_slot(self._session.limits, kind)
             if name is None:
                 count = sum(one.kind == kind for one in self.obstacles.values())
-                raise ValueError(f"there are {count} of these already; remove one, or drag it")
+                raise OsikValueError(f"there are {count} of these already; remove one, or drag it")
             self.move_obstacle(name, position=position)
             return name
 
@@ -196,7 +197,7 @@ class Desk:
             ValueError: a session of another robot.
         """
         if session.robot.tree != self._session.robot.tree:
-            raise ValueError("the session is of another robot: start osik view with it")
+            raise OsikValueError("the session is of another robot: start osik view with it")
         self.edit(**{f.name: getattr(session, f.name) for f in dataclasses.fields(session) if f.name != "robot"})
 
     def task(self, name: str) -> Task:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..._errors import OsikValueError
 from ...control import Trajectory
 from ...robot import Robot
 from .._look import Look
@@ -82,10 +83,12 @@ def _motion(robot: Robot, trajectory: Any, dt: float | None) -> Motion:
     runs = {str(name): np.asarray(q, float) for name, q in given.items()}
     for name, q in runs.items():
         if q.ndim != 2 or len(q) == 0 or q.shape[1] != robot.nq or not np.isfinite(q).all():
-            raise ValueError(f"run {name!r} has shape {q.shape}; it is configurations (T, {robot.nq}), all finite")
+            raise OsikValueError(f"run {name!r} has shape {q.shape}; it is configurations (T, {robot.nq}), all finite")
     period = 0.005 if dt is None else float(dt)
     if not (runs and np.isfinite(period) and period > 0.0):
-        raise ValueError(f"there are {len(runs)} runs and dt is {period}; it takes one at least, and a positive time")
+        raise OsikValueError(
+            f"there are {len(runs)} runs and dt is {period}; it takes one at least, and a positive time"
+        )
     return Motion(runs, {name: np.arange(len(q)) * period for name, q in runs.items()})
 
 

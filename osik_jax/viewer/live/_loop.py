@@ -17,12 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._errors import OsikValueError
 from ..._tree import unknown_name
 from ...robot import Robot
 from ...solvers import Status
 from ._compiler import Compiler
 from ._hold import targets_here
 from ._obstacles import moved
+from ._priority import run_before_others
 from ._push import Push
 from ._recorder import Recorder
 from ._snapshot import Recording, Snapshot
@@ -31,8 +33,10 @@ from ._timing import Stopwatch, Timing
 
 _LATE = 5
 """A loop that is so many periods late starts counting anew instead of catching up."""
-_SWITCH_INTERVAL = 5e-4
+_SWITCH_INTERVAL = 5e-5
 """[s]"""
+_HALF_A_MICROSECOND = 5e-7
+"""Python keeps that interval in whole microseconds, and cuts off."""
 _loops: set[int] = set()
 """Those that run: the last of them gives Python's garbage collection its objects back."""
 
@@ -78,7 +82,7 @@ class ControlLoop:
             ValueError: q0 does not fit, or dt is not positive.
         """
         if not (np.isfinite(dt) and dt > 0.0):
-            raise ValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
+            raise OsikValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
         start = robot.q0 if q0 is None else q0
         self.robot, self.dt = robot, float(dt)
         self._start = np.asarray(start, robot.q0.dtype)
@@ -106,8 +110,8 @@ class ControlLoop:
     def start(self) -> Self:
         """Starts the threads; the first step is compiled in the background.
 
-        While it runs, Python's threads change places every half millisecond, not every five: the control thread would
-        wait that long for each of the others that computes. What was there when a program was compiled is left out of
+        While it runs, Python's threads change places every 0.05 ms, not every 5: the control thread would wait that
+        long for each of the others that computes. What was there when a program was compiled is left out of
         garbage collection until the loop ends: going through all of JAX's objects takes up to 0.1 s.
         """
         self._switch_interval = sys.getswitchinterval()
@@ -125,7 +129,7 @@ class ControlLoop:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
-            sys.setswitchinterval(self._switch_interval)
+            sys.setswitchinterval(self._switch_interval + _HALF_A_MICROSECOND)
             _loops.discard(id(self))
             if not _loops:
                 gc.unfreeze()
@@ -282,6 +286,7 @@ class ControlLoop:
 
     def _run(self) -> None:
         """The control thread."""
+        run_before_others()
         deadline = time.perf_counter()
         while not self._stop.is_set():
             self._tick()

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ..._errors import OsikValueError
 from ...collision import CollisionShape
 from ...collision._geometry import Kind
 from ...collision._pairs import candidate_pairs, members
@@ -130,7 +131,7 @@ def own_limit(
         if mujoco.mj_geomDistance(model, data, i, j, 10.0 * MARGIN, None) > MARGIN
     ]
     if not kept:
-        raise ValueError("no two links of this robot are apart where it starts")
+        raise OsikValueError("no two links of this robot are apart where it starts")
     return CollisionAvoidanceLimit(
         robot, pairs=kept, shapes=covers, minimum_distance=MARGIN, q0_distance=-np.inf, max_pairs=_ROWS["itself"]
     )

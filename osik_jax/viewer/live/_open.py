@@ -9,7 +9,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from ..._errors import warn
+from ..._errors import OsikValueError, warn
+from ...reachability import load_map
 from ...robot import Robot
 from .._parts import robot_parts
 from ._default import default_session
@@ -17,6 +18,7 @@ from ._export import write_page
 from ._needs import import_viser
 from ._page import LiveView, serve_session
 from ._playback import Player, read_motion
+from ._reach import ReachView, check_map, serve_reach
 from ._server import check_port
 from ._session import load_session
 from ._source import RobotSource, source_look
@@ -84,6 +86,30 @@ def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, por
     """
     motion = read_motion(path, robot)
     return Player(robot, motion, look=source_look(source), host=host, port=port, title=path.name)
+
+
+def is_map(path: Path) -> bool:
+    """Whether a file is what ``osik reach`` writes, rather than a motion."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return "reached" in getattr(file, "files", ())
+    except (OSError, ValueError):
+        return False  # what is wrong with it is told where it is read
+
+
+def open_map(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> ReachView:
+    """A map of what a frame reaches.
+
+    Raises:
+        ValueError: a map of another version, or of another robot.
+        OSError: the port is in use.
+    """
+    found = load_map(path)
+    try:
+        check_map(robot, found)
+    except ValueError as error:
+        raise OsikValueError(f"{path}: {error}; say which with --robot") from None
+    return serve_reach(robot, found, look=source_look(source), host=host, port=port)
 
 
 def write_motion(path: Path, robot: Robot, source: RobotSource, page: Path) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from ..._errors import OsikValueError
 from ...limits import CollisionAvoidanceLimit, Limit
 from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
@@ -246,7 +247,7 @@ class Panel:
         """What was recorded, in the layout of ``osik demo``."""
         recording = self._desk.loop.recorded()
         if not len(recording.time):
-            raise ValueError("nothing was recorded")
+            raise OsikValueError("nothing was recorded")
         buffer = io.BytesIO()
         np.savez_compressed(buffer, time=recording.time, q_live=recording.q)
         self._send(event, "motion.npz", buffer.getvalue())

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ..._errors import OsikValueError
 from ..._tree import FREE
 from ...robot import Robot
 from .._look import Look
@@ -67,15 +68,15 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
     except FileNotFoundError:
         raise FileNotFoundError(f"no such file: {path}") from None
     except Exception as error:
-        raise ValueError(f"{path} is no motion: it is not a .npz file of numpy") from error
+        raise OsikValueError(f"{path} is no motion: it is not a .npz file of numpy") from error
     if {"qpos", "joint_names", "fps"} <= arrays.keys():
         arrays = _retargeted(arrays, robot, path)
     runs = {n.removeprefix("q").lstrip("_") or "motion": a for n, a in arrays.items() if n == "q" or n[:2] == "q_"}
     if not runs:
-        raise ValueError(f"{path} is no motion: it has no array q or q_NAME, only {', '.join(arrays) or 'nothing'}")
+        raise OsikValueError(f"{path} is no motion: it has no array q or q_NAME, only {', '.join(arrays) or 'nothing'}")
     for name, q in runs.items():
         if q.ndim != 2 or len(q) == 0 or q.shape[1] != robot.nq or not np.isfinite(q).all():
-            raise ValueError(
+            raise OsikValueError(
                 f"{path}: run {name!r} has shape {q.shape}, and the robot's configurations have {robot.nq} finite "
                 "numbers: is it the motion of another robot? Say which with --robot"
             )
@@ -89,7 +90,7 @@ def _retargeted(arrays: Mapping[str, np.ndarray], robot: Robot, path: Any) -> di
     unknown = sorted(set(names) - set(tree.joint_names))
     if unknown or not robot.floating_base or qpos.ndim != 2 or qpos.shape[1] != 7 + len(names):
         what = f"it has no joint {unknown[0]}" if unknown else "its base is fixed, or the columns are others"
-        raise ValueError(f"{path} is the motion of another robot ({what}): say which with --robot")
+        raise OsikValueError(f"{path} is the motion of another robot ({what}): say which with --robot")
     free = next(tree.qpos_address[j] for j in tree.independent if tree.joint_types[j] == FREE)
     q = np.tile(np.asarray(robot.q0, float), (len(qpos), 1))
     q[:, free : free + 7] = qpos[:, :7]

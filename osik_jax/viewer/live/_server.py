@@ -6,9 +6,11 @@ import contextlib
 import io
 import socket
 import threading
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Self
 
 from ._needs import import_viser
+from ._priority import run_after_others
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 _BLUE = (28, 111, 184)
 
 
-class Served:
+class Served(ABC):
     """A page with a thread that keeps it up to date: ``_run``, until ``_end``.
 
     Attributes:
@@ -28,7 +30,7 @@ class Served:
         self._server = open_server(host, port, title)
         self.url = f"http://{host}:{self._server.get_port()}"
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="osik-page", daemon=True)
+        self._thread = threading.Thread(target=self._draw_all, name="osik-page", daemon=True)
 
     def wait(self) -> None:
         """Blocks until ``stop`` is called from elsewhere, or Ctrl-C."""
@@ -49,11 +51,15 @@ class Served:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _run(self) -> None:
-        """The thread that draws."""
-        raise NotImplementedError
+    def _draw_all(self) -> None:
+        run_after_others()
+        self._run()
 
-    def _close(self) -> None:
+    @abstractmethod
+    def _run(self) -> None:
+        """Draws, in a thread of its own, until ``_end``."""
+
+    def _close(self) -> None:  # noqa: B027 (a page that plays a file runs nothing)
         """Ends what runs beside the page."""
 
 

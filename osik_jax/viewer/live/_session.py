@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..._errors import OsikValueError
 from ...limits import ConfigurationLimit, Limit, VelocityLimit
 from ...robot import Robot
 from ...schemes import Scheme
@@ -87,7 +88,9 @@ class Session:
             ValueError: as in ``save``.
         """
         if self.source is None:
-            raise ValueError("where the robot comes from is not known, so the session cannot be saved: give source=")
+            raise OsikValueError(
+                "where the robot comes from is not known, so the session cannot be saved: give source="
+            )
         content = {
             "format": _FORMAT,
             "robot": dataclasses.asdict(self.source),
@@ -108,7 +111,7 @@ class Session:
             ValueError: as in ``save``.
         """
         if self.source is None:
-            raise ValueError("where the robot comes from is not known, so no program can load it: give source=")
+            raise OsikValueError("where the robot comes from is not known, so no program can load it: give source=")
         tasks = {name: python(describe(task, self.robot)) for name, task in self.active_tasks.items()}
         limits = [python(describe(limit, self.robot)) for limit in self.active_limits]
         lines = [
@@ -155,11 +158,11 @@ def session_from_json(text: str, where: str = "this") -> Session:
     except ValueError:
         known = False
     if not known:
-        raise ValueError(f"{where} is no session of osik view ({_FORMAT})")
+        raise OsikValueError(f"{where} is no session of osik view ({_FORMAT})")
     try:
         return _session(content)
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {error.args[0] if error.args else error}") from error
+        raise OsikValueError(f"{where}: {error.args[0] if error.args else error}") from error
 
 
 def _session(content: Mapping[str, Any]) -> Session:

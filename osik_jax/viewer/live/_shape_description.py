@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._errors import OsikValueError
 from ...collision import CollisionShape
 from ...collision._geometry import Kind
 from ...limits import CollisionAvoidanceLimit
@@ -27,7 +28,7 @@ def describe_shapes(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, d
     kinds = {kind: name for name, kind in _KINDS.items()}
     for number, name in enumerate(scene.names[own:]):
         if scene.kinds[own + number] not in kinds:
-            raise ValueError(
+            raise OsikValueError(
                 f"a session file cannot hold the shape {name!r} of a CollisionAvoidanceLimit: it is a hull"
             )
         out[name] = {
@@ -46,7 +47,7 @@ def rebuild_shape(described: Mapping[str, Any]) -> CollisionShape:
     """
     kind = _KINDS.get(described["shape"])
     if kind is None:
-        raise ValueError(f"{described['shape']!r} is no shape: there are {', '.join(_KINDS)}")
+        raise OsikValueError(f"{described['shape']!r} is no shape: there are {', '.join(_KINDS)}")
     plain = CollisionShape.sphere(1.0)
     numbers = {k: np.asarray(described[k], plain.position.dtype) for k in ("position", "rotation", "size")}
     return CollisionShape(kind, described["frame"], **numbers)  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..._errors import OsikValueError
 from ...control import remembering, solve
 from ...kinematics import integrate
 from ...limits import Limit
@@ -112,7 +113,7 @@ def stacked(controllers: Sequence[Controller]) -> Controller:
     """
     first = controllers[0]
     if any(one.structure() != first.structure() for one in controllers):
-        raise ValueError(
+        raise OsikValueError(
             "the robots of a batch differ in more than numbers: they need tasks of the same names and kinds"
         )
     parts = jax.tree.map(

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
+from inspect import unwrap
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,7 @@ def _load(handle: Any) -> Any:
     """
     numba = import_module("numba")
     compiler = partial(numba.cfunc, "int64(int64)", error_model="numpy")
+    handle = unwrap(handle)
     folder, before = cache_folder(), numba.config.CACHE_DIR
     try:
         numba.config.CACHE_DIR = folder

@@ -1,0 +1,131 @@
+"""What ``osik retarget --live`` does: a clip replayed at its own rate, or a stream of JSON lines."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, TextIO
+
+import numpy as np
+
+from .._errors import OsikValueError
+from ..robot import Robot
+from ._live import LiveFrame, LiveRetargeter
+from ._motion import HumanMotion
+from ._person import read_person
+from ._retarget import Retargeted, as_retargeted, in_mujoco_order
+
+Make = Callable[[HumanMotion], LiveRetargeter]
+"""A retargeter for a person who stands as in these frames."""
+
+
+def replay(make: Make, motion: HumanMotion, *, paced: bool = True) -> tuple[Retargeted, list[LiveFrame]]:
+    """A clip frame by frame, each when it is due; the whole clip shows how the person is built.
+
+    Args:
+        make: makes the retargeter.
+        motion: the clip.
+        paced: whether to wait until a frame is due.
+
+    Returns:
+        what came of it, and its frames.
+    """
+    live = make(motion)
+    person = read_person(motion, live.roles)
+    for _ in range(live.look_ahead + 2):  # so that all is compiled when the first frame comes
+        live.step(motion.positions[0])
+    live.reset()
+    found, began = [], time.perf_counter()
+    for f, positions in enumerate(motion.positions):
+        if paced:
+            time.sleep(max(0.0, began + f / motion.fps - time.perf_counter()))
+        found.append(live.step(positions, None if motion.contact is None else motion.contact[f]))
+    frames = [frame for frame in found if frame is not None] + live.finish()
+    contact = np.array([frame.contact for frame in frames])
+    q = np.array([frame.q for frame in frames])
+    person = dataclasses.replace(person, contact=contact)
+    off = np.array([frame.off_plan for frame in frames])
+    return as_retargeted(live.robot, live.profile, person, q, off), frames
+
+
+def stream(make: Make, lines: Iterable[str], out: TextIO) -> int:
+    """Reads a person's frames as JSON lines, and writes the robot's as they come.
+
+    The first line says ``{"fps": 30, "joint_names": [...]}``, with ``"standing": [[x, y, z], ...]`` where the person's
+    first frame does not show them standing. Each other line is a frame: ``{"positions": [[x, y, z], ...]}`` in metres,
+    z up, null for a joint that is not seen, with ``"contact": [...]`` where that is known; ``null`` is a frame that did
+    not come. Written is ``{"frame": 0, "qpos": [...], "contact": [...], "status": "followed"}``, in MuJoCo's order,
+    after a line with ``joint_names`` and ``latency`` in seconds.
+
+    Returns:
+        how many frames were written.
+
+    Raises:
+        ValueError: a line is broken; the message says which, and what is wrong.
+    """
+    rows = _rows(lines)
+    head = next(rows, (1, None))[1]
+    if not isinstance(head, dict) or not {"fps", "joint_names"} <= set(head):
+        raise OsikValueError("line 1 has to be an object with fps and joint_names")
+    live, written = None, 0
+    for number, row in rows:
+        try:
+            positions, contact = _frame(row)
+            if live is None and positions is None:
+                continue
+            if live is None:
+                live = make(_standing(head, positions))
+                names = in_mujoco_order(live.robot, np.asarray(live.robot.q0)[None], head["fps"]).joint_names
+                _write(out, {"joint_names": names, "latency": live.latency})
+            frame = live.step(positions, contact)
+        except (ValueError, TypeError, KeyError) as error:
+            raise OsikValueError(f"line {number}: {error.args[0]}") from error
+        written += _written(out, live.robot, written, [] if frame is None else [frame])
+    return written if live is None else written + _written(out, live.robot, written, live.finish())
+
+
+def _rows(lines: Iterable[str]) -> Iterator[tuple[int, Any]]:
+    for number, line in enumerate(lines, 1):
+        if line.strip():
+            try:
+                yield number, json.loads(line)
+            except json.JSONDecodeError as error:
+                raise OsikValueError(f"line {number} is no JSON: {error.msg}") from error
+
+
+def _frame(row: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Positions and contact of a line."""
+    if row is None:
+        return None, None
+    if not isinstance(row, dict) or "positions" not in row:
+        raise OsikValueError("a frame is an object with positions, or null")
+    contact = row.get("contact")
+    return _points(row["positions"]), None if contact is None else np.array(contact, bool)
+
+
+def _points(rows: Any) -> np.ndarray:
+    return np.array([[math.nan] * 3 if row is None else row for row in rows], float)
+
+
+def _standing(head: dict[str, Any], positions: np.ndarray | None) -> HumanMotion:
+    """The person as they stand: by the first line, or in the first frame."""
+    still = positions if head.get("standing") is None else _points(head["standing"])
+    if still is None or not np.isfinite(still).all():
+        raise OsikValueError("the first frame has joints that are not seen; give a pose of standing in the first line")
+    return HumanMotion("stream", float(head["fps"]), tuple(head["joint_names"]), still[None])
+
+
+def _written(out: TextIO, robot: Robot, first: int, frames: Sequence[LiveFrame]) -> int:
+    """Writes frames, numbered from the first; returns how many."""
+    for number, frame in enumerate(frames, first):
+        qpos = in_mujoco_order(robot, frame.q[None], 1.0).qpos[0]
+        row = {"frame": number, "qpos": qpos.tolist(), "contact": frame.contact.tolist()}
+        _write(out, {**row, "status": frame.status.name.lower()})
+    return len(frames)
+
+
+def _write(out: TextIO, row: dict[str, Any]) -> None:
+    print(json.dumps(row), file=out, flush=True)

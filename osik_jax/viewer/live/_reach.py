@@ -1,0 +1,293 @@
+"""A page with a robot and a slice of what one of its frames reaches."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..._errors import OsikTypeError, OsikValueError
+from ..._tree import unknown_name
+from ...reachability import ReachabilityMap
+from ...reachability._slices import NOTHING, cell_edges, nearest, share_colors, slice_colors
+from ...robot import Robot
+from .._look import Look
+from .._mujoco import mujoco_poses
+from .._parts import robot_parts
+from ._robot_nodes import RobotNodes
+from ._server import Served
+from ._surroundings import add_surroundings
+
+if TYPE_CHECKING:
+    from viser import GuiEvent, ImageHandle, SceneClickEvent
+
+Axis = Literal["x", "y", "z"]
+_FRAME = 1.0 / 30.0
+"""Time between looks at the panel [s]."""
+_AXES = ("x", "y", "z")
+_PIXELS = 768
+"""Along the longer side of a slice: cells are sharp where each is many of them."""
+_SOLID, _FAINT = 210, 90
+"""Alpha where something is reached, and where nothing was found: the robot is seen behind it."""
+
+
+class Slice(NamedTuple):
+    """A slice as a picture in space, whose rows go along its second axis and whose columns along its first.
+
+    Attributes:
+        image: red, green, blue, alpha. (h, w, 4)
+        center: of the picture, world axes [m]. (3,)
+        size: along the first axis and the second [m]. (2,)
+        wxyz: from the picture's axes to world axes. (4,)
+    """
+
+    image: UInt8[np.ndarray, "h w 4"]
+    center: Float[np.ndarray, "3"]
+    size: tuple[float, float]
+    wxyz: Float[np.ndarray, "4"]
+
+
+class ReachView(Served):
+    """A page that shows a slice of a map; ``serve_reach`` makes one.
+
+    Attributes:
+        url: address of the page.
+        map: what is shown.
+    """
+
+    def __init__(
+        self, robot: Robot, found: ReachabilityMap, *, look: Look | None, host: str, port: int, title: str
+    ) -> None:
+        """Starts the server."""
+        super().__init__(host, port, title)
+        self.map, self._robot = found, robot
+        self._axes = found.x, found.y, found.z
+        corners = robot_parts(robot, look=look).corners(next(mujoco_poses(robot, np.asarray(robot.q0))))
+        seen = np.concatenate([corners, found.positions[found.reached.any(-1)]])
+        add_surroundings(self._server, seen, float(seen[:, 2].min()))
+        self._nodes = RobotNodes(self._server.scene, robot, look=look)
+        self._picture: ImageHandle | None = None
+        self._drawn: tuple[int, int] | None = None
+        self._cell: tuple[int, int, int] | None = None
+        self._placed: tuple[int, int, int] | None = None
+        self._add_panel()
+        self._server.scene.on_click()(self._clicked)
+        self._thread.start()
+
+    def show(self, across: Axis, at: float) -> None:
+        """Shows the slice across an axis whose coordinate is nearest [m].
+
+        Raises:
+            KeyError: no such axis.
+            ValueError: no finite number.
+        """
+        if across not in _AXES:
+            raise unknown_name("axis", across, _AXES)
+        if not np.isfinite(at):
+            raise OsikValueError(f"at is {at!r}; it is a coordinate [m]")
+        axis = self._axes[_AXES.index(across)]
+        slider = self._sliders[across]
+        slider.value = min(max(float(axis[np.abs(axis - at).argmin()]), slider.min), slider.max)
+        self._across.value = across
+
+    def stand(self, position: Sequence[float] | None) -> bool:
+        """Puts the robot into the most manipulable configuration of the grid's nearest position; None: home.
+
+        Returns:
+            Whether the map has one; else the robot stays where it is.
+
+        Raises:
+            ValueError: no point.
+        """
+        cell = None if position is None else nearest(self._axes, position)
+        if cell is not None and not self.map.reached[cell].any():
+            return False
+        self._cell = cell
+        return True
+
+    def _add_panel(self) -> None:
+        gui, found = self._server.gui, self.map
+        spot = nearest(self._axes, found.links[0])
+        flat = next((name for name, axis in zip(_AXES, self._axes, strict=True) if len(axis) == 1), "y")
+        self._across = gui.add_dropdown("Slice across", _AXES, initial_value=flat)
+        self._sliders = {
+            name: _slider(gui, name, axis, float(axis[at]), visible=name == flat)
+            for name, axis, at in zip(_AXES, self._axes, spot, strict=True)
+        }
+        self._words = gui.add_markdown("")
+        gui.add_markdown(f"Of {len(found.rotations)} orientations, {found.frame} reaches")
+        gui.add_image(_legend(), format="png")
+        gui.add_markdown("0 % (left) to 100 % (right). Grey: none found. Clear: proven out of reach.")
+        self._told = gui.add_markdown("Click on the slice: the robot goes there.")
+        home = gui.add_button("Robot at home")
+
+        @home.on_click
+        def _(_: GuiEvent[Any]) -> None:
+            self.stand(None)
+
+    def _run(self) -> None:
+        """The thread that draws."""
+        while not self._end.wait(_FRAME):
+            self._draw()
+
+    def _draw(self) -> None:
+        """What has changed since it was drawn."""
+        across = _AXES.index(self._across.value)
+        index = int(np.abs(self._axes[across] - self._sliders[_AXES[across]].value).argmin())
+        if (across, index) != self._drawn:
+            with self._server.atomic():
+                self._draw_slice(across, index)
+            self._drawn = across, index
+        if self._cell != self._placed:
+            cell = self._cell
+            with self._server.atomic():
+                self._draw_robot(cell)
+            self._placed = cell
+
+    def _draw_slice(self, across: int, index: int) -> None:
+        for name, slider in self._sliders.items():
+            slider.visible = name == _AXES[across]
+        made = slice_picture(self.map, across, index)
+        if self._picture is None or self._drawn is None or self._drawn[0] != across:
+            self._picture = self._server.scene.add_image(
+                "/slice", made.image, *made.size, format="png", cast_shadow=False, receive_shadow=False
+            )
+            self._picture.wxyz = made.wxyz
+        else:
+            self._picture.image = made.image
+        self._picture.position = made.center
+        self._words.content = slice_words(self.map, across, index)
+
+    def _draw_robot(self, cell: tuple[int, int, int] | None) -> None:
+        q = np.asarray(self._robot.q0) if cell is None else self.map.q[cell]
+        self._nodes.place(next(mujoco_poses(self._robot, q)))
+        self._told.content = "The robot is at home." if cell is None else _cell_words(self.map, cell)
+
+    def _clicked(self, event: SceneClickEvent) -> None:
+        """A visitor clicks into the scene: on the slice, or past it."""
+        if self._drawn is None:
+            return
+        across, index = self._drawn
+        origin, way = np.asarray(event.ray_origin), np.asarray(event.ray_direction)
+        ahead = (self._axes[across][index] - origin[across]) / way[across] if way[across] else -1.0
+        point = origin + ahead * way
+        low, high = np.array([edges[[0, -1]] for edges in cell_edges(self._axes)]).T
+        if ahead <= 0.0 or not np.all((point >= low) & (point <= high)):
+            return
+        if not self.stand(point.tolist()):
+            self._told.content = "Nothing is reached there."
+
+
+def slice_picture(found: ReachabilityMap, across: int, index: int) -> Slice:
+    """The slice across an axis at one of its coordinates, as a page draws it."""
+    axes = found.x, found.y, found.z
+    first, second = (i for i in range(3) if i != across)
+    edges = cell_edges(axes)
+    length = {i: float(edges[i][-1] - edges[i][0]) for i in (first, second)}
+    cells = [_cell_of_pixels(edges[i], _PIXELS * length[i] / max(length.values())) for i in (second, first)]
+    colors = np.moveaxis(slice_colors(found, across, index), 0, 1)
+    some = np.take(found.reached.any(-1), index, across).T
+    colors[..., 3] = np.where(colors[..., 3] > 0, np.where(some, _SOLID, _FAINT), 0)
+    center = np.array([0.5 * (edges[i][0] + edges[i][-1]) for i in range(3)])
+    center[across] = axes[across][index]
+    turn, wxyz = np.zeros((3, 3)), np.empty(4)
+    turn[first, 0] = turn[second, 1] = 1.0
+    turn[:, 2] = np.cross(turn[:, 0], turn[:, 1])
+    mujoco.mju_mat2Quat(wxyz, turn.ravel())
+    return Slice(colors[np.ix_(*cells)], center, (length[first], length[second]), wxyz)
+
+
+def _cell_of_pixels(edges: Float[np.ndarray, " n_1"], number: float) -> np.ndarray:
+    """Which cell each of so many pixels side by side belongs to."""
+    count = max(round(number), 1)
+    places = edges[0] + (np.arange(count) + 0.5) / count * (edges[-1] - edges[0])
+    return np.clip(np.searchsorted(edges, places) - 1, 0, len(edges) - 2)
+
+
+def slice_words(found: ReachabilityMap, across: int, index: int) -> str:
+    """How much of a slice is reached."""
+    share, beyond = (np.take(field, index, across) for field in (found.share, found.beyond_reach > 0.0))
+    at, some = (found.x, found.y, found.z)[across][index], share > 0.0
+    mean = f", on average in {share[some].mean():.0%} of the orientations" if some.any() else ""
+    return (
+        f"**{_AXES[across]} = {at:.3f} m**: {some.sum():,} of {some.size:,} positions reached{mean}; "
+        f"{beyond.sum():,} proven out of reach"
+    )
+
+
+def _cell_words(found: ReachabilityMap, cell: tuple[int, int, int]) -> str:
+    place = " ".join(f"{value:.3f}" for value in found.positions[cell])
+    return (
+        f"At **{place}** m: {found.reached[cell].sum()} of {len(found.rotations)} orientations reached; manipulability "
+        f"{found.manipulability[cell]:.3g}, of the configuration shown"
+    )
+
+
+def _slider(gui: Any, name: str, axis: Float[np.ndarray, " n"], at: float, *, visible: bool) -> Any:
+    """Of the coordinates of an axis; one alone cannot be moved."""
+    spacing = float(np.diff(axis).min()) if len(axis) > 1 else 1.0
+    digits = max(3, int(np.ceil(1.0 - np.log10(spacing))))
+    step, (low, high, start) = 10.0**-digits, (round(float(value), digits) for value in (axis[0], axis[-1], at))
+    return gui.add_slider(
+        f"{name} [m]", low, max(high, low + step), step, start, disabled=len(axis) == 1, visible=visible
+    )
+
+
+def _legend() -> UInt8[np.ndarray, "h w 4"]:
+    from matplotlib.colors import to_rgba
+
+    strip = np.concatenate([np.tile(to_rgba(NOTHING), (24, 1)), share_colors()(np.linspace(0.0, 1.0, 300))])
+    return np.round(255.0 * np.broadcast_to(strip, (14, *strip.shape))).astype(np.uint8)
+
+
+def serve_reach(
+    robot: Robot,
+    found: ReachabilityMap,
+    *,
+    look: Look | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open_browser: bool = False,
+) -> ReachView:
+    """Shows a map in a page: the robot, and a slice coloured by the share of orientations that are reached.
+
+    The panel has the axis and the place of the slice. A click on the slice puts the robot into the configuration that
+    the map has there.
+
+    Args:
+        robot: the robot that the map is of.
+        found: from ``reachability_map`` or ``load_map``.
+        look: what the robot's URDF shows, from ``read_look``; default: the model's own shapes.
+        host: address to listen at; 127.0.0.1 is this machine alone.
+        port: 0 for any that is free.
+        open_browser: opens the page in a browser.
+
+    Returns:
+        The view.
+
+    Raises:
+        ImportError: viser is not installed (the extra ``viewer``).
+        OSError: the port is in use.
+        TypeError: no map.
+        ValueError: a map of another robot.
+    """
+    check_map(robot, found)
+    view = ReachView(robot, found, look=look, host=host, port=port, title=f"Reach of {found.frame}")
+    if open_browser:
+        webbrowser.open(view.url)
+    return view
+
+
+def check_map(robot: Robot, found: ReachabilityMap) -> None:
+    """Raises TypeError for what is no map, ValueError for one of another robot."""
+    if not isinstance(found, ReachabilityMap):
+        raise OsikTypeError(f"found is {found!r}; it is a ReachabilityMap, of reachability_map or load_map")
+    if found.q.shape[-1] != robot.nq or found.frame not in robot.frame_names:
+        raise OsikValueError(
+            f"the map is of another robot: of {found.frame!r}, with configurations of {found.q.shape[-1]} numbers; "
+            f"this one's have {robot.nq}, and its frames are {', '.join(robot.frame_names)}"
+        )

@@ -1,0 +1,144 @@
+"""Retargeting frame by frame: beside the whole clip, and with a stream that is noisy and has holes."""
+
+import dataclasses
+import io
+import json
+
+import numpy as np
+import pytest
+from motion_files import dancer, write_bvh
+
+import osik_jax as osik
+from osik_jax import cli
+from osik_jax.retargeting import LiveRetargeter, LiveStatus, load_motion, report, retarget
+from osik_jax.retargeting._live_command import replay, stream
+
+LOOK_AHEAD = 5
+
+
+@pytest.fixture(scope="module")
+def nao():
+    return osik.load_robot("nao")
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory):
+    return load_motion(write_bvh(tmp_path_factory.mktemp("clips") / "dance.bvh", dancer(45), 0.01))
+
+
+@pytest.fixture(scope="module")
+def live(nao, motion):
+    """One retargeter for all tests, since each compiles for seconds; ``reset`` comes first."""
+    return LiveRetargeter(nao, motion, look_ahead=LOOK_AHEAD)
+
+
+def streamed(live, frames):
+    live.reset()
+    found = [live.step(frame) for frame in frames]
+    assert all(frame is None for frame in found[:LOOK_AHEAD])
+    return [frame for frame in found if frame is not None] + live.finish()
+
+
+def joints_of(robot, frames):
+    return np.array([frame.q for frame in frames])[:, [robot.joint_qpos_index(name) for name in robot.joint_names]]
+
+
+def assert_limits_hold(robot, frames, fps, acceleration=240.0):
+    dofs = [robot.joint_dof_index(name) for name in robot.joint_names]
+    low, high, fast = (np.asarray(x)[dofs] for x in (robot.position_lower, robot.position_upper, robot.velocity_limit))
+    q = joints_of(robot, frames)
+    assert (q >= low - 1e-12).all() and (q <= high + 1e-12).all()
+    speed = np.diff(q, axis=0) * fps
+    assert (np.abs(speed) <= fast * (1.0 + 1e-9)).all()
+    assert np.abs(np.diff(speed, axis=0)).max() * fps <= acceleration * (1.0 + 1e-9)
+
+
+def test_frame_by_frame_is_near_the_whole_clip(nao, motion, live):
+    whole = retarget(nao, motion)
+    result, frames = replay(lambda _: live, motion, paced=False)
+    assert len(frames) == motion.frames and live.latency == pytest.approx(LOOK_AHEAD / motion.fps)
+    assert {frame.status for frame in frames} == {LiveStatus.FOLLOWED}
+    apart = np.degrees(np.abs(joints_of(nao, frames) - joints_of(nao, [Frame(q) for q in whole.q])))
+    assert apart.mean() < 1.0
+    figures, best = report(result), report(whole)
+    assert figures["feet"]["slip_mm_max"] < 0.1
+    assert figures["feet"]["float_mm_max"] < 0.1 and figures["feet"]["below_floor_mm_max"] < 0.1
+    assert figures["tracking"]["segment_angle_deg_mean"] < best["tracking"]["segment_angle_deg_mean"] + 0.5
+    assert_limits_hold(nao, frames, motion.fps)
+
+
+class Frame:
+    def __init__(self, q):
+        self.q = q
+
+
+def test_limits_hold_on_a_noisy_stream_with_holes(nao, motion, live):
+    rng = np.random.default_rng(0)
+    noisy = motion.positions + rng.normal(scale=0.03, size=motion.positions.shape)
+    noisy[rng.random(noisy.shape[:2]) < 0.1] = np.nan
+    noisy[20] += [3.0, 0.0, 1.0]  # a frame in which somebody else was seen
+    gone = rng.random(len(noisy)) < 0.15
+    frames = streamed(live, [None if lost else seen for lost, seen in zip(gone, noisy, strict=True)])
+    assert len(frames) == motion.frames and np.isfinite([frame.q for frame in frames]).all()
+    assert LiveStatus.FILLED in {frame.status for frame in frames}
+    assert_limits_hold(nao, frames, motion.fps)
+
+
+def test_a_person_who_is_lost_leaves_the_robot_at_rest(nao, motion, live):
+    frames = streamed(live, [*motion.positions[:20], *[None] * 25])
+    assert [frame.status for frame in frames][-20:] == [LiveStatus.LOST] * 20
+    q = joints_of(nao, frames)
+    assert np.abs(np.diff(q[-5:], axis=0)).max() * motion.fps < 0.02  # rad/s
+    assert np.abs(np.diff(q[:20], axis=0)).max() * motion.fps > 0.5
+    assert_limits_hold(nao, frames, motion.fps)
+
+
+def test_short_streams_and_wrong_frames(motion, live):
+    live.reset()
+    assert live.finish() == []
+    assert live.step(motion.positions[0]) is None and len(live.finish()) == 1
+    live.reset()
+    with pytest.raises(ValueError, match=r"a frame has shape \(3, 3\), expected \(23, 3\): Hips, "):
+        live.step(motion.positions[0, :3])
+    live.step(motion.positions[0], [True] * 4)
+    with pytest.raises(ValueError, match="in some frames and not in others"):
+        live.step(motion.positions[1])
+    with pytest.raises(ValueError, match="look_ahead is 0"):
+        LiveRetargeter(live.robot, motion, look_ahead=0)
+
+
+def lines_of(motion):
+    yield json.dumps({"fps": motion.fps, "joint_names": motion.joint_names, "standing": motion.positions[0].tolist()})
+    for f, row in enumerate(motion.positions.tolist()):
+        seen = [None if f == 5 and j == 2 else point for j, point in enumerate(row)]
+        yield "null" if f == 3 else json.dumps({"positions": seen})
+
+
+def test_json_lines_in_json_lines_out(motion, live):
+    short = dataclasses.replace(motion, positions=motion.positions[:12], rotations=None)
+    live.reset()
+    out = io.StringIO()
+    assert stream(lambda _: live, lines_of(short), out) == 12
+    head, *rows = (json.loads(line) for line in out.getvalue().splitlines())
+    assert head["latency"] == live.latency and "HeadYaw" in head["joint_names"]
+    assert [row["frame"] for row in rows] == list(range(12))
+    assert all(len(row["qpos"]) == 7 + len(head["joint_names"]) for row in rows)
+    assert [row["status"] for row in rows][3] == "filled" and [row["status"] for row in rows][5] == "filled"
+    for lines, message in (
+        (["{}"], "line 1 has to be an object with fps and joint_names"),
+        (["{"], "line 1 is no JSON"),
+        ([next(lines_of(short)), "[1]"], "line 2: a frame is an object with positions, or null"),
+    ):
+        live.reset()
+        with pytest.raises(ValueError, match=message):
+            stream(lambda _: live, lines, io.StringIO())
+
+
+def test_the_command_replays_a_clip(tmp_path, capsys):
+    clip = write_bvh(tmp_path / "short.bvh", dancer(12), 0.01)
+    arguments = [str(clip), "--live", "--look-ahead", str(LOOK_AHEAD), "--no-animation", "--out", str(tmp_path / "out")]
+    assert cli.main(["retarget", *arguments]) == 0
+    told = capsys.readouterr().out
+    assert "5 frames of look-ahead are 167 ms" in " ".join(told.split())
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"motion.npz", "motion.csv", "report.json", "profile.toml"}
