@@ -10,6 +10,7 @@ import pytest
 from recorded import QP_DAMPING, recorded_qps
 
 from osik_jax.solvers import Status, _backends, solve_least_squares_qp
+from osik_jax.solvers._lanes import with_the_rest
 from osik_jax.solvers.qp import _fused, _kernel, _search
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._kernel import Proposal, Shape
@@ -233,3 +234,18 @@ def test_what_the_text_is_compiled_for(shape):
     n, m, p = shape
     assert first == f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};"
     assert Shape(65, 10, 0).warps == Shape(64, 1000, 0).warps == Shape(10, 10, 33).warps == 0
+
+
+@pytest.mark.parametrize("lanes", [1, 4])
+def test_what_no_lane_needs_is_not_computed(lanes):
+    """XLA takes out of a loop what is the same in each round, and of one lane that is everything."""
+
+    def solve(matrices, done):
+        return with_the_rest(matrices[:, 0], done, lambda at, _: jnp.linalg.cholesky(matrices[at])[:, 0], min(2, lanes))
+
+    matrices = jnp.tile(4.0 * jnp.eye(3), (lanes, 1, 1))
+    program = jax.jit(solve).lower(matrices, jnp.ones(lanes, bool)).compile()
+    always, sometimes = (text.count("potrf") for text in reversed(program.as_text().split("ENTRY")))
+    assert (always, sometimes > 0) == (0, True)
+    for done in (jnp.ones(lanes, bool), jnp.zeros(lanes, bool)):
+        np.testing.assert_array_equal(program(matrices, done), matrices[:, 0] / jnp.where(done, 1.0, 2.0)[:, None])

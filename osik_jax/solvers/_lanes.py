@@ -58,6 +58,8 @@ def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, A
         block: lanes that are worked on together; a block that is not full has copies of the last lane.
     """
     lanes = len(done)
+    if lanes == 1:  # XLA would see that every round of the loop has the same numbers, and go through it beforehand
+        return jax.lax.cond(done[0], lambda: state, lambda: again(jnp.zeros(1, int), state))
 
     def body(carry: tuple[Any, Array]) -> tuple[Any, Array]:
         state, done = carry
