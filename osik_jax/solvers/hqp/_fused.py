@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,8 @@ _BLOCK = 256
 _NEARLY = 1e3
 """Feasibility tolerances that an answer may be off its bounds by."""
 
+Solve = Callable[[Layout, Stack, Tolerances, WorkingSet | None, int], Descent]
+
 
 @cache
 def descender(
@@ -41,30 +44,48 @@ def descender(
 def _descend_anywhere(
     layout: Layout, cap: int, backend: Backend, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
 ) -> Descent:
-    kernels = {}
+    whole, kernels = partial(descend_all, layout, cap), {}
     if takes(backend, "warp", fits=_kernel.Shape.of(layout).warps > 0):
         kernels["warp"] = partial(descended_and_checked, layout, cap, _kernel.solve)
-    if takes(backend, "numba", fits=True):
+    if not takes(backend, "numba", fits=True):
+        return on_platforms(kernels, whole, stack, tolerances, warm)
+    if kernels or jax.default_backend() != "cpu":
         kernels["numba"] = partial(descended_and_checked, layout, cap, _numba.solve)
-    return on_platforms(kernels, partial(descend_all, layout, cap), stack, tolerances, warm)
+        return on_platforms(kernels, whole, stack, tolerances, warm)
+    # the search is traced once for all platforms, and on those without the kernel nothing is solved before it
+    checked = partial(_checked, layout, cap, _numba.solve)
+    end = on_platforms({"numba": checked}, partial(_unsolved, checked), stack, tolerances, warm)
+    return _with_the_rest(layout, cap, end, stack, tolerances, warm)
 
 
 def descended_and_checked(
-    layout: Layout,
-    cap: int,
-    solve: Callable[[Layout, Stack, Tolerances, WorkingSet | None, int], Descent],
-    stack: Stack,
-    tolerances: Tolerances,
-    warm: WorkingSet | None,
+    layout: Layout, cap: int, solve: Solve, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
 ) -> Descent:
     """The kernel's answers where they pass the check, XLA's elsewhere; arguments as for ``descend_all``."""
-    end = jax.vmap(certified)(solve(layout, stack, tolerances, warm, cap), stack, tolerances)
-    fine = end.done & jax.vmap(_holds)(end, stack, tolerances)
+    end = _checked(layout, cap, solve, stack, tolerances, warm)
+    return _with_the_rest(layout, cap, end, stack, tolerances, warm)
 
+
+def _checked(
+    layout: Layout, cap: int, solve: Solve, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
+) -> Descent:
+    """The kernel's answers, done where they pass the check."""
+    end = jax.vmap(certified)(solve(layout, stack, tolerances, warm, cap), stack, tolerances)
+    return end._replace(done=end.done & jax.vmap(_holds)(end, stack, tolerances))
+
+
+def _unsolved(like: Callable[..., Descent], *args: Any) -> Descent:
+    """No answer for any lane, in the shapes of those that a function gives."""
+    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(like, *args))
+
+
+def _with_the_rest(
+    layout: Layout, cap: int, end: Descent, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None
+) -> Descent:
     def again(at: Array, end: Descent) -> Descent:
         return descend_all(layout, cap, *jax.tree.map(lambda a: a[at], (stack, tolerances, warm)))
 
-    return with_the_rest(end, fine, again, min(_BLOCK, len(fine)))
+    return with_the_rest(end, end.done, again, min(_BLOCK, len(end.done)))
 
 
 def _holds(end: Descent, stack: Stack, tolerances: Tolerances) -> Bool[Array, ""]:

@@ -25,7 +25,7 @@ from ._cost import LeastSquares
 from ._factor import system_inverse
 from ._kernel import Proposal
 from ._problem import CERTIFIED, QP, active_targets, forces, kkt_residual, scales_of
-from ._search import Found, optimal_on, possible, search
+from ._search import Found, optimal_on, possible, search, unsearched
 
 _SHARE, _SMALLEST = 16, 1024
 """Lanes that are left are solved in blocks of a 16th of the batch, of 1,024 lanes at least."""
@@ -64,11 +64,22 @@ def searcher(max_iterations: int, gives_way: bool, backend: Backend) -> Callable
 
 
 def _search_anywhere(qp: QP, guess: Array, tolerance: Array, *, cap: int, gives_way: bool, backend: Backend) -> Found:
-    fused = partial(proposed_and_searched, propose=_kernel.propose, max_iterations=cap)
-    kernels = {"warp": fused} if takes(backend, "warp", fits=gives_way and _fits(qp)) else {}
-    if takes(backend, "numba", fits=isinstance(qp.cost, LeastSquares)):
-        kernels["numba"] = partial(certified_or_searched, propose=_cpu_kernel.propose, max_iterations=cap)
-    return on_platforms(kernels, partial(search, max_iterations=cap), qp, guess, tolerance)
+    whole = partial(search, max_iterations=cap)
+    on_gpu = partial(proposed_and_searched, propose=_kernel.propose, max_iterations=cap)
+    kernels = {"warp": on_gpu} if takes(backend, "warp", fits=gives_way and _fits(qp)) else {}
+    if not takes(backend, "numba", fits=isinstance(qp.cost, LeastSquares)):
+        return on_platforms(kernels, whole, qp, guess, tolerance)
+    holds = CERTIFIED[tolerance.dtype]
+    candidates = in_double(partial(certified_candidates, propose=_cpu_kernel.propose, max_iterations=cap, holds=holds))
+    left = partial(search_what_is_left, max_iterations=cap)
+    if kernels or jax.default_backend() != "cpu":
+
+        def on_cpu(qp: QP, guess: Array, tolerance: Array) -> Found:
+            return left(qp, tolerance, candidates(qp, guess, tolerance))
+
+        return on_platforms(kernels | {"numba": on_cpu}, whole, qp, guess, tolerance)
+    # the search is traced once for all platforms, and on those without the kernel nothing is found before it
+    return left(qp, tolerance, on_platforms({"numba": candidates}, unsearched, qp, guess, tolerance))
 
 
 def system_solver(qp: QP, active: Int[Array, " m"], backend: Backend) -> Callable[[Array], Array]:
@@ -149,29 +160,33 @@ def proposed_and_searched(
     return with_the_rest(found, fine, again, _block(len(tolerance)))
 
 
-def certified_or_searched(
-    qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, propose: Propose, max_iterations: int
+def certified_candidates(
+    qp: QP,
+    guess: Int[Array, "B m"],
+    tolerance: Float[Array, " B"],
+    *,
+    propose: Propose,
+    max_iterations: int,
+    holds: float,
 ) -> Found:
-    """As ``proposed_and_searched``, in double precision whatever the data, and a few lanes at a time.
+    """Proposals, done where they are certified: by a residual of ``holds`` at most, and a slope not told from none."""
+    start = jax.vmap(possible)(qp, guess)
+    proposal = propose(qp, start, tolerance, max_iterations)
+    found, within = _found(qp, proposal), proposal.iterations <= max_iterations
+    fine = (proposal.settled != 0) & within
+    fine &= jax.vmap(_certified)(qp, found, tolerance) & jax.vmap(_rests)(qp, found)
+    fine &= found.residual <= holds
+    # the search has the cap too: it may not begin where more changes than that have led
+    return found._replace(done=fine, optimal=fine, active=jnp.where(within[:, None], found.active, start))
 
-    The certificate asks for more than in single precision: a slope that is not told from none.
-    """
-    holds = CERTIFIED[tolerance.dtype]
 
-    def candidates(qp: QP, guess: Array, tolerance: Array) -> Found:
-        start = jax.vmap(possible)(qp, guess)
-        proposal = propose(qp, start, tolerance, max_iterations)
-        found, within = _found(qp, proposal), proposal.iterations <= max_iterations
-        fine = (proposal.settled != 0) & within
-        fine &= jax.vmap(_certified)(qp, found, tolerance) & jax.vmap(_rests)(qp, found) & (found.residual <= holds)
-        # the search has the cap too: it may not begin where more changes than that have led
-        return found._replace(done=fine, optimal=fine, active=jnp.where(within[:, None], found.active, start))
+def search_what_is_left(qp: QP, tolerance: Float[Array, " B"], found: Found, *, max_iterations: int) -> Found:
+    """The search, a few lanes at a time, in those that are not done; it goes on from their active sets."""
 
     def again(given: tuple[QP, Array], found: Found) -> Found:
         end = search(given[0], found.active, given[1], max_iterations=max_iterations)
         return end._replace(factorizations=end.factorizations + found.factorizations)
 
-    found = in_double(candidates)(qp, guess, tolerance)
     return with_a_few((qp, tolerance), found, found.done, again, _FEW)
 
 

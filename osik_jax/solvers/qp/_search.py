@@ -54,21 +54,11 @@ class Found(NamedTuple):
     residual: Float[Array, ""]  # of the optimality conditions
 
 
-def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int) -> Found:
-    """The search for a batch: every argument has a leading axis, the lanes. A cap on the changes of the active set.
-
-    It is in double precision whatever the data: which bounds are active is yes or no, and a weak damping beside heavy
-    rows is below the rounding of single precision.
-    """
-    whole = partial(_found, cap=max_iterations, holds=CERTIFIED[qp.lower.dtype])
-    return in_double(whole)(qp, guess, tolerance)
-
-
-def _found(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, cap: int, holds: float) -> Found:
-    """The answers, and where there is none, a careful step."""
+def unsearched(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> Found:
+    """Where a search begins: nothing found, at the bounds of the guess that exist."""
     lanes, n, dtype = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1], qp.lower.dtype
     nothing, no = jnp.zeros(lanes, jnp.int32), jnp.zeros(lanes, bool)
-    start = Found(
+    return Found(
         x=jnp.zeros((lanes, n), dtype),
         row_multipliers=jnp.zeros(qp.rows.shape[:2], dtype),
         active=jax.vmap(possible)(qp, guess),
@@ -81,8 +71,23 @@ def _found(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, c
         descended=no,
         infeasible=no,
         compliance=qp.compliance,
-        residual=jnp.zeros(lanes, dtype),
+        residual=jnp.zeros_like(tolerance),
     )
+
+
+def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int) -> Found:
+    """The search for a batch: every argument has a leading axis, the lanes. A cap on the changes of the active set.
+
+    It is in double precision whatever the data: which bounds are active is yes or no, and a weak damping beside heavy
+    rows is below the rounding of single precision.
+    """
+    whole = partial(_found, cap=max_iterations, holds=CERTIFIED[qp.lower.dtype])
+    return in_double(whole)(qp, guess, tolerance)
+
+
+def _found(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, cap: int, holds: float) -> Found:
+    """The answers, and where there is none, a careful step."""
+    lanes, start = len(guess), unsearched(qp, guess, tolerance)
     search_one = partial(_search, cap=cap, holds=holds)
     if lanes == 1 or jax.default_backend() != "cpu" or not has_few_rows(qp):
         found = search_one((qp, tolerance), start)
