@@ -26,7 +26,7 @@ import numpy as np
 from numba import int64
 
 from ..._damping import BENDS, LEAST, PASSES, ROOM, SPENT
-from ._frame import arguments, compiled, doubles, integers, is_call, results, size
+from ._frame import arguments, compiled, doubles, integers, is_call, lean, results, size
 
 _ATTEMPTS = 4  # at a working-set guess, before the primal active set takes over
 _PATIENCE = 20  # steps of no length, before the least index decides
@@ -62,7 +62,7 @@ left, one a row (m, m), S a square matrix above its diagonal and its Cholesky fa
 box), the level at work, and what is known of it."""
 
 
-@compiled(fastmath={"reassoc", "contract"})
+@lean(fastmath={"reassoc", "contract"})
 def dot(a, b, start, stop):
     """``sum_j a_j b_j`` over some columns."""
     total = 0.0
@@ -71,34 +71,34 @@ def dot(a, b, start, stop):
     return total
 
 
-@compiled
+@lean
 def add(a, by, b, start, stop):
     """``a += by b`` in some columns."""
     for j in range(start, stop):
         a[j] += by * b[j]
 
 
-@compiled
+@lean
 def copy(a, b, count):
     """``b = a`` in the first columns."""
     for j in range(count):
         b[j] = a[j]
 
 
-@compiled
+@lean
 def clear(a, start, stop):
     """0 in some columns."""
     for j in range(start, stop):
         a[j] = 0
 
 
-@compiled
+@lean
 def clip(a, low, high):
     """The nearest point of an interval."""
     return min(max(a, low), high)
 
 
-@compiled
+@lean
 def reflection(row, at, n, turn):
     """The vector v of ``I - scale v v'``, which takes a row's columns from ``at`` on into that one; and its scale."""
     norm = sqrt(dot(row, row, at, n))
@@ -109,7 +109,7 @@ def reflection(row, at, n, turn):
     return 1.0 / (norm * (norm + abs(head)))
 
 
-@compiled
+@lean
 def reflect(rows, first_row, stop_row, turn, scale, at, n):
     """Some rows times ``I - scale v v'``."""
     for q in range(first_row, stop_row):
@@ -119,7 +119,7 @@ def reflect(rows, first_row, stop_row, turn, scale, at, n):
             add(row, -by, turn, at, n)
 
 
-@compiled
+@lean
 def from_basis(F, J, s, start, stop, out):
     """``out = Z turn``, over some columns."""
     Z = F[s.Z : s.Z + s.h]
@@ -127,7 +127,7 @@ def from_basis(F, J, s, start, stop, out):
         out[i] = dot(Z[i], F[TURN], start, stop)
 
 
-@compiled
+@lean
 def to_basis(F, J, s, start, a, out):
     """``out = Z' a``, in the columns from ``start`` on."""
     Z = F[s.Z : s.Z + s.h]
@@ -138,7 +138,7 @@ def to_basis(F, J, s, start, a, out):
             add(out, a[i], Z[i], start, n)
 
 
-@compiled
+@lean
 def hard_value(F, J, s, q, d):
     """Hard row q times d."""
     hard_rows = F[s.hard : s.hard + s.h - s.n]
@@ -146,7 +146,7 @@ def hard_value(F, J, s, q, d):
     return d[q] if q < n else dot(hard_rows[q - n], d, 0, n)
 
 
-@compiled
+@lean
 def cholesky(F, J, s, count, ridge):
     """``L L' = S + ridge I``; L goes below the diagonal of S, the inverse of its diagonal to ``inverse``."""
     S = F[s.S : s.S + s.rows]
@@ -158,7 +158,7 @@ def cholesky(F, J, s, count, ridge):
             S[a, k] = (S[k, a] - dot(S[a], S[k], 0, k)) * F[INVERSE, k]
 
 
-@compiled
+@lean
 def cholesky_solve(F, J, s, count, y):
     """``y <- (L L')^-1 y``."""
     S = F[s.S : s.S + s.rows]
@@ -169,7 +169,7 @@ def cholesky_solve(F, J, s, count, y):
         add(y, -y[k], S[k], 0, k)
 
 
-@compiled
+@lean
 def gram(F, J, s, count, start):
     """Above and on the diagonal of S, ``R R'`` over the columns from ``start`` on; its trace."""
     R = F[s.R : s.R + s.rows]
@@ -182,7 +182,7 @@ def gram(F, J, s, count, start):
     return trace
 
 
-@compiled
+@lean
 def project(F, J, s, start):
     """``R = A Z`` for the rows that count (0 for the others), in the columns from ``start`` on."""
     Z = F[s.Z : s.Z + s.h]
@@ -198,7 +198,7 @@ def project(F, J, s, start):
                     add(row, A[a, i], Z[i], start, n)
 
 
-@compiled
+@lean
 def hold(F, J, s):
     """Rotates the active hard rows into the columns [first, open); rows that depend on others are let go.
 
@@ -228,7 +228,7 @@ def hold(F, J, s):
             J[SIDE, q] = 0
 
 
-@compiled
+@lean
 def fit(F, J, s):
     """Factors the rows that count within the free columns: ``Q' (A Z) = R`` by reflections with column pivoting.
 
@@ -271,7 +271,7 @@ def fit(F, J, s):
         cholesky(F, J, s, s.rank, s.damping + _RIDGE * s.size**2)
 
 
-@compiled
+@lean
 def least_squares(F, J, s):
     """The step d in the free columns that makes ``1/2 |slack + A d|^2 + 1/2 damping |x + d|^2`` least.
 
@@ -304,7 +304,7 @@ def least_squares(F, J, s):
     from_basis(F, J, s, s.open, n, F[STEP])
 
 
-@compiled
+@lean
 def restore(F, J, s):
     """The shortest step that brings the active rows to their bounds: ``(N Z) t = bound - N x`` by substitution."""
     Z = F[s.Z : s.Z + s.h]
@@ -316,7 +316,7 @@ def restore(F, J, s):
     from_basis(F, J, s, s.first, s.open, F[STEP])
 
 
-@compiled
+@lean
 def judge(F, J, s):
     """Multipliers of the active rows, ``sum_q N_q multiplier_q = -gradient`` in their columns, and stationarity.
 
@@ -346,7 +346,7 @@ def judge(F, J, s):
         add(F[TURN], -F[MULTIPLIER, q], Z[q], s.first, j)
 
 
-@compiled
+@lean
 def look(F, J, s):
     """Values and slacks of the level at x, their norm, and the root of twice its cost."""
     A = F[s.A : s.A + s.rows]
@@ -363,31 +363,31 @@ def look(F, J, s):
     s.missing = sqrt(square + s.damping * dot(F[X], F[X], 0, n))
 
 
-@compiled
+@lean
 def roundoff(s):
     """Slopes of the level's cost under this are roundoff."""
     return s.size * s.step_tol * (s.size * s.reach + s.missing)
 
 
-@compiled
+@lean
 def sign_tolerance(s):
     """A multiplier has the wrong sign where it is wrong by more than this."""
     return s.multiplier_tol * s.steepness + roundoff(s)
 
 
-@compiled
+@lean
 def is_stationary(s):
     """Whether what is left of the gradient in the free columns is roundoff."""
     return s.residual <= 10.0 * (s.multiplier_tol * s.size * s.missing + roundoff(s))
 
 
-@compiled
+@lean
 def may_block(F, J, s, q):
     """Whether a hard row can stop this level: not frozen, and of the box or of a level above."""
     return J[FROZEN, q] == 0 and J[LEVEL_OF, q] < s.level
 
 
-@compiled
+@lean
 def level_damping(F, J, s, constant):
     """``constant + unmet share``, share the part of the demand that the step with this very damping misses.
 
@@ -434,7 +434,7 @@ def level_damping(F, J, s, constant):
     return damping if damping > least else 0.0
 
 
-@compiled
+@lean
 def usable(at, low, high):
     """The side of a working-set guess, 0 where its bound does not exist."""
     if at < 0 and isfinite(low):
@@ -442,7 +442,7 @@ def usable(at, low, high):
     return 1 if at > 0 and isfinite(high) else 0
 
 
-@compiled
+@lean
 def solve_on_working_set(F, J, s):
     """The minimiser of the level with the active rows at their bounds and the rows that count as near as can be."""
     copy(F[START], F[X], s.n)
@@ -461,7 +461,7 @@ def solve_on_working_set(F, J, s):
     s.missing = sqrt(dot(F[SLACK], F[SLACK], 0, s.rows) + s.damping * dot(F[X], F[X], 0, s.n))
 
 
-@compiled
+@lean
 def own_slack(F, J, s):
     """Slacks of the rows that count, from the side that they count on."""
     A = F[s.A : s.A + s.rows]
@@ -470,7 +470,7 @@ def own_slack(F, J, s):
         F[SLACK, a] = dot(A[a], F[X], 0, s.n) - goal if J[COUNTS, a] != 0 else 0.0
 
 
-@compiled
+@lean
 def improve_working_set(F, J, s):
     """Holds what is violated, releases what pulls, and lets rows count that miss their interval; all at once.
 
@@ -499,7 +499,7 @@ def improve_working_set(F, J, s):
     return feasible, consistent, signs, turned
 
 
-@compiled
+@lean
 def try_guess(F, J, s, guess_hard, guess_own):
     """The minimiser on a guessed working set; where it is not the optimum, on what it shows to be better, a few times.
 
@@ -537,7 +537,7 @@ def try_guess(F, J, s, guess_hard, guess_own):
     return False, feasible
 
 
-@compiled
+@lean
 def line_slope(F, J, s, t, along_x, along_d):
     """The derivative at t of the level's cost along ``x + t d``."""
     total = along_x + t * along_d
@@ -548,7 +548,7 @@ def line_slope(F, J, s, t, along_x, along_d):
     return total
 
 
-@compiled
+@lean
 def line_search(F, J, s, along_x, along_d):
     """The t >= 0 that makes the level's cost least along ``x + t d``: convex, and quadratic between knots.
 
@@ -575,7 +575,7 @@ def line_search(F, J, s, along_x, along_d):
     return before
 
 
-@compiled
+@lean
 def step_length(F, J, s):
     """How far the hard rows let the step go, and which of them stops it (the least index among equals)."""
     stride = sqrt(dot(F[STEP], F[STEP], 0, s.n))
@@ -591,7 +591,7 @@ def step_length(F, J, s):
     return nearest, which, towards
 
 
-@compiled
+@lean
 def most_wrong(F, J, s, least_index):
     """The active row whose multiplier has the wrong sign by most, or the first of these; -1 for none."""
     tolerance, worst, which = sign_tolerance(s), 0.0, int64(-1)
@@ -603,7 +603,7 @@ def most_wrong(F, J, s, least_index):
     return which
 
 
-@compiled
+@lean
 def primal_active_set(F, J, s, most, factored):
     """From a feasible point to the level's optimum, feasible all the way; whether it was found.
 
@@ -664,7 +664,7 @@ def primal_active_set(F, J, s, most, factored):
     return False
 
 
-@compiled
+@lean
 def narrow_box(F, J, s, bends):
     """The box of the levels below: what they may spend of the progress of a level that is out of reach.
 
@@ -689,7 +689,7 @@ def narrow_box(F, J, s, bends):
             F[LOW, i], F[HIGH, i] = max(F[LOW, i], F[X, i] - room), min(F[HIGH, i], F[X, i] + room)
 
 
-@compiled
+@lean
 def freeze(F, J, s, hard_place, sides, tight, missed, own, multipliers):
     """What the level decides for those below: active rows that push, and its own rows that miss their interval.
 
@@ -733,7 +733,7 @@ def freeze(F, J, s, hard_place, sides, tight, missed, own, multipliers):
     return rank if tie else s.rank
 
 
-@compiled
+@lean
 def cut_off(F, J, s):
     """Takes what is decided out of the basis: the active rows' columns and the row space of the level's factor."""
     Z = F[s.Z : s.Z + s.h]
@@ -747,7 +747,7 @@ def cut_off(F, J, s):
     s.first = s.open + s.rank
 
 
-@compiled
+@lean
 def begin_level(F, J, s, rows, lower, upper, equal, constant):
     """The level's numbers to the workspace."""
     A, n, total = F[s.A : s.A + s.rows], s.n, 0.0
@@ -765,7 +765,7 @@ def begin_level(F, J, s, rows, lower, upper, equal, constant):
     copy(F[X], F[START], n)
 
 
-@compiled
+@lean
 def begin(F, J, s, hard, low, high, equal):
     """The box's nearest point to 0, and a basis of what its pinned variables leave: columns of the identity."""
     Z, hard_rows = F[s.Z : s.Z + s.h], F[s.hard : s.hard + s.h - s.n]
@@ -804,7 +804,7 @@ def workspace(s):
     return np.zeros((s.hard + s.h - s.n, width)), np.zeros((INTEGERS, width), np.int32)
 
 
-@compiled
+@lean
 def how_many(a, stop):
     """How many of the first integers are not 0."""
     count = 0
