@@ -27,6 +27,7 @@ from numba import int64
 
 from ..._damping import BENDS, LEAST, PASSES, ROOM, SPENT
 from ._frame import arguments, compiled, doubles, integers, is_call, lean, results, size
+from ._vectors import SLACK, add, add_squares, dot
 
 _ATTEMPTS = 4  # at a working-set guess, before the primal active set takes over
 _PATIENCE = 20  # steps of no length, before the least index decides
@@ -60,22 +61,6 @@ _SCALARS = np.dtype([(a, np.int64) for a in _WHOLE.split()] + [(a, np.float64) f
 (h, n), A the level's rows (m, n), R their triangular factor in the columns of Z (m, n), V its reflections from the
 left, one a row (m, m), S a square matrix above its diagonal and its Cholesky factor below (m, m), hard rows beside the
 box), the level at work, and what is known of it."""
-
-
-@lean(fastmath={"reassoc", "contract"})
-def dot(a, b, start, stop):
-    """``sum_j a_j b_j`` over some columns."""
-    total = 0.0
-    for j in range(start, stop):
-        total += a[j] * b[j]
-    return total
-
-
-@lean
-def add(a, by, b, start, stop):
-    """``a += by b`` in some columns."""
-    for j in range(start, stop):
-        a[j] += by * b[j]
 
 
 @lean
@@ -244,8 +229,7 @@ def fit(F, J, s):
         k = s.rank
         clear(F[TURN], s.open, n)  # squares of the columns, from row k down
         for a in range(k, m):
-            for j in range(s.open, n):
-                F[TURN, j] += R[a, j] * R[a, j]
+            add_squares(F[TURN], R[a], s.open, n)
         best, which = -1.0, int64(-1)
         for j in range(s.open, n):
             if F[TURN, j] > best:
@@ -801,7 +785,8 @@ def workspace(s):
     s.R, s.V, s.S = s.A + s.m, s.A + 2 * s.m, s.A + 3 * s.m
     s.hard = s.S + s.m
     width = max(s.n, s.h, s.m)
-    return np.zeros((s.hard + s.h - s.n, width)), np.zeros((INTEGERS, width), np.int32)
+    rows = s.hard + s.h - s.n
+    return np.zeros(rows * width + SLACK)[: rows * width].reshape((rows, width)), np.zeros((INTEGERS, width), np.int32)
 
 
 @lean
