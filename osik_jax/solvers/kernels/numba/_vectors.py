@@ -2,12 +2,12 @@
 
 A compiler that vectorises a loop takes 16 or 32 numbers at once and leaves the rest to scalar code: all there is, for
 rows as short as those of a robot. Here the last eight are masked. Numbers after ``stop`` are read, and written back as
-they were: arrays need ``SLACK`` of them behind the last row. With Numba's bounds checks on, these are plain loops.
+they were: an array needs ``BEYOND`` of them after its last row. With Numba's bounds checks on, these are plain loops.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 from llvmlite import ir
 from numba import config, types
@@ -18,9 +18,10 @@ from ._frame import lean
 
 WIDTH = 8
 """Numbers of a block; LLVM splits it where registers are shorter."""
-SLACK = WIDTH - 1
+BEYOND = WIDTH - 1
+"""Numbers after the last row that may be read."""
 
-_CHECKED = bool(config.BOUNDSCHECK)
+_CHECKED = bool(cast(Any, config).BOUNDSCHECK)
 _DOUBLE, _INDEX, _LANE = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
 _BLOCK = ir.VectorType(_DOUBLE, WIDTH)
 _INDICES = ir.VectorType(_INDEX, WIDTH)
@@ -28,11 +29,11 @@ _INDICES = ir.VectorType(_INDEX, WIDTH)
 
 def _in_blocks(builder: Any, start: Any, stop: Any, body: Any) -> None:
     """``body(j, None)`` for blocks from j on, and ``body(j, mask)`` for the numbers that are left."""
-    length = builder.sub(stop, start)
-    whole = builder.add(start, builder.and_(length, _INDEX(-WIDTH)))
+    stop = builder.select(builder.icmp_signed("<", start, stop), stop, start)
+    whole = builder.add(start, builder.and_(builder.sub(stop, start), _INDEX(-WIDTH)))
     with cgutils.for_range_slice(builder, start, whole, _INDEX(WIDTH), inc=True) as (j, _):
         body(j, None)
-    with cgutils.if_unlikely(builder, builder.icmp_signed("<", whole, stop)):
+    with builder.if_then(builder.icmp_signed("<", whole, stop)):
         left = _splat(builder, builder.sub(stop, whole), _INDICES)
         body(whole, builder.icmp_signed("<", _INDICES(list(range(WIDTH))), left))
 
@@ -63,6 +64,7 @@ def _sum(builder: Any, block: Any) -> Any:
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, j: Any) -> Any:
     """To the block from number j of an array on."""
+    assert kind.layout == "C" and kind.dtype == types.float64, kind
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [j]), _BLOCK.as_pointer())
 
@@ -106,7 +108,7 @@ def _add_squares(typing_context, a, b, start, stop):
 
 def _update(context: Any, builder: Any, signature: Any, arguments: Any, factor: Any) -> None:
     """``a += factor(b) b`` for the first array among the arguments and the last one."""
-    ends = (0, len(arguments) - 3)
+    ends, (start, stop) = (0, len(arguments) - 3), arguments[-2:]
 
     def body(j, mask):
         into, of = (_pointer(context, builder, signature.args[k], arguments[k], j) for k in ends)
@@ -114,11 +116,10 @@ def _update(context: Any, builder: Any, signature: Any, arguments: Any, factor: 
         after = _multiply_add(builder, factor(x), x, before)
         builder.store(after if mask is None else builder.select(mask, after, before), into, align=8)
 
-    _in_blocks(builder, *arguments[-2:], body)
+    _in_blocks(builder, start, stop, body)
 
 
-_blocks: dict[str, Any] = {one.__name__: intrinsic(one) for one in (_dot, _add, _add_squares)}
-_dot_in_blocks, _add_in_blocks, _add_squares_in_blocks = _blocks.values()
+_dot_in_blocks, _add_in_blocks, _add_squares_in_blocks = map(cast(Any, intrinsic), (_dot, _add, _add_squares))
 
 
 @lean
