@@ -185,6 +185,31 @@ print(_target._registered["osik_jax_hierarchy"].cache_hits)
     assert ran.stdout.split() == ["1"], ran.stderr
 
 
+def test_rows_in_blocks_are_those_of_numpy():
+    """Of every length and from every start; numbers beside the range are neither used nor changed."""
+    import numba
+
+    from osik_jax.solvers.kernels.numba import _vectors
+
+    @numba.njit
+    def all_three(a, b, c, d, start, stop):
+        _vectors.add(c, 0.3, b, start, stop)
+        _vectors.add_squares(d, b, start, stop)
+        return _vectors.dot(a, b, start, stop)
+
+    rng = np.random.default_rng(0)
+    for start, stop in [(8, 3), *((i, i + k) for i in (0, 3, 8) for k in range(34))]:
+        whole = np.full((4, 64), np.nan)
+        whole[:, start:stop] = rng.normal(size=whole[:, start:stop].shape)
+        a, b, c, d = whole.copy()
+        total = all_three(a, b, c, d, start, stop)
+        inside = whole[:, start:stop]
+        np.testing.assert_allclose(total, inside[0] @ inside[1], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(c[start:stop], inside[2] + 0.3 * inside[1], rtol=1e-14, atol=1e-15)
+        np.testing.assert_allclose(d[start:stop], inside[3] + inside[1] ** 2, rtol=1e-14, atol=1e-15)
+        assert np.isnan(np.delete([c, d], np.s_[start : max(start, stop)], axis=1)).all()
+
+
 @pytest.mark.slow
 def test_no_index_is_out_of_bounds():
     """With every index checked: an exception would leave its lanes to the search, and print a line."""
