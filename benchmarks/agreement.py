@@ -1,10 +1,12 @@
 """Kernels beside the search, problem by problem: random hierarchies solved with both backends.
 
-    python -m benchmarks.agreement [--count 1000000] [--backend numba] [--seed 0]
+    python -m benchmarks.agreement [--count 1000000] [--backend numba] [--solver hqp] [--seed 0]
 
 Of each family of ``tests/hierarchy_families.py`` as many as of the others. Each line gives the problems so far, those
 whose verdicts differ, those in which a level's residual norm differs by more than 1e-7 of the level's size, the largest
-such difference, and those that the kernel left over for the search.
+such difference, and those that the kernel left over for the search. With ``--solver nullspace`` the same levels are
+projected, without their box: there an inequality counts where the levels above leave it violated, and some of the
+degenerate ones are on their bound but for a rounding.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from osik_jax.solvers import HQPSolution, Level, solve_hqp
+from osik_jax.solvers import HQPSolution, Level, NullSpaceSolution, solve_hqp, solve_nullspace
 from osik_jax.solvers.hqp import _fused
 from tests.hierarchy_families import SMALL
 
@@ -26,12 +28,15 @@ APART = 1e-7
 """Of a level's size, a difference that counts."""
 
 
-@partial(jax.jit, static_argnames="backend")
-def solved(levels: Any, lower: Any, upper: Any, backend: str) -> HQPSolution:
+@partial(jax.jit, static_argnames=("solver", "backend"))
+def solved(levels: Any, lower: Any, upper: Any, solver: str, backend: Any) -> HQPSolution | NullSpaceSolution:
     """A batch, by one backend."""
 
-    def one(levels: Any, lower: Any, upper: Any) -> HQPSolution:
-        return solve_hqp([Level(*level) for level in levels], lower, upper, backend=backend)
+    def one(levels: Any, lower: Any, upper: Any) -> HQPSolution | NullSpaceSolution:
+        given = [Level(*level) for level in levels]
+        if solver == "nullspace":
+            return solve_nullspace(given, backend=backend)
+        return solve_hqp(given, lower, upper, backend=backend)
 
     return jax.vmap(one)(levels, lower, upper)
 
@@ -41,6 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.agreement", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--backend", default="numba")
+    parser.add_argument("--solver", default="hqp", choices=("hqp", "nullspace"))
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -60,7 +66,7 @@ def main() -> None:
         for name, draw in SMALL.items():
             p = draw(rng, BATCH)
             data = [tuple(level) for level in p.levels], p.lower, p.upper
-            mine, search = (solved(*data, backend=backend) for backend in (asked.backend, "jax"))
+            mine, search = (solved(*data, solver=asked.solver, backend=backend) for backend in (asked.backend, "jax"))
             off = np.zeros(BATCH)
             for a, b, level in zip(mine.slacks, search.slacks, p.levels, strict=True):
                 rows = np.sqrt(level.weight)[..., None] * level.A

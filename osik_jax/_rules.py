@@ -39,7 +39,10 @@ def found(tree: Any) -> Any:
 
 
 def custom_jvp(function: Callable[..., Any]) -> Ruled:
-    """As ``jax.custom_jvp``, for functions of pytrees of arrays by position, with inexact arrays as results."""
+    """As ``jax.custom_jvp``, for functions of pytrees of arrays by position, with inexact arrays as results.
+
+    What is given by keyword is static; the rule is given it too.
+    """
     return Ruled(function)
 
 
@@ -70,10 +73,11 @@ class Ruled:
         self.rule = rule
         return rule
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: Any, **options: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
-        body, shapes = jax.make_jaxpr(self.function, return_shape=True)(*args)
-        results = _ruled.bind(*leaves, body=body, rule=self.rule, tree=tree, lanes=(), block=self.block)
+        function, rule = (partial(f, **options) if options else f for f in (self.function, self.rule))
+        body, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+        results = _ruled.bind(*leaves, body=body, rule=rule, tree=tree, lanes=(), block=self.block)
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
 

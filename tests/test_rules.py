@@ -171,3 +171,21 @@ def test_shapes_are_known_without_running():
     assert (out["wave"].shape, out["wave"].dtype) == ((9, 2), jnp.float64)
     assert (out["count"].shape, out["count"].dtype) == ((9,), jnp.int32)
     assert jax.eval_shape(jax.hessian(chain), 1.0).shape == ()
+
+
+@custom_jvp
+def scaled(x, *, by):
+    return by * jnp.sin(x)
+
+
+@scaled.defjvp
+def _scaled_jvp(primals, tangents, *, by):
+    return scaled(*primals, by=by), by * jnp.cos(primals[0]) * tangents[0]
+
+
+def test_what_is_given_by_keyword_is_static():
+    ours, plainly = (
+        jax.vmap(jax.jit(jax.grad(jax.grad(f))))(X[:, 0, 0])
+        for f in (lambda x: scaled(x, by=3.0), lambda x: 3.0 * jnp.sin(x))
+    )
+    np.testing.assert_allclose(ours, plainly, rtol=1e-14)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from ..solvers import Damping, Level, NullSpaceSolution, solve_nullspace
+from ..solvers import Backend, Damping, Level, NullSpaceSolution, solve_nullspace
+from ..solvers._backends import check_backend
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
 
@@ -43,6 +44,7 @@ class NullSpace(Scheme):
         margin: joints are taken to be at least this share of their range away from either limit.
         rank_tolerance: rows that stand out of the span of others by less than this share of the size (Frobenius norm)
             of their level's weighted rows count as dependent on them.
+        backend: whose kernels compute, as in ``solve_nullspace`` (static).
     """
 
     order: Literal["forward", "reverse"] = eqx.field(default="forward", static=True, kw_only=True)
@@ -52,6 +54,7 @@ class NullSpace(Scheme):
     potential_gain: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("potential_gain"))
     margin: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("margin"))
     rank_tolerance: Float[Array, ""] = eqx.field(default=1e-5, converter=as_leaf("rank_tolerance"))
+    backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
     def __check_init__(self):
         if self.order not in ("forward", "reverse"):
@@ -75,6 +78,7 @@ class NullSpace(Scheme):
             secondary=descent,
             damping=self._damping(problem, constraints),
             rank_tolerance=self.rank_tolerance,
+            backend=self.backend,
         )
         status = answer.status
         if constraints is not None:

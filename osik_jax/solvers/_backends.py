@@ -1,13 +1,16 @@
 """Which candidate runs: the one table of backends.
 
 A solver takes a candidate for the answer, certifies it in plain JAX, and searches where that fails. Candidates come
-from kernels; the search needs none and is the definition. ``backend``, a static option of solvers and schemes, chooses:
+from kernels; the search needs none and is the definition. ``backend``, a static option of solvers and schemes, chooses.
+A projection on null spaces searches nothing, but for bounds: its kernels compute what plain JAX would, and with bounds
+or in reverse order the factors of its levels.
 
     backend   weighted QP                          hierarchy                           null space
     "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    none
               hard rows, n <= 64, <= 32 soft rows  fit into shared memory
-    "numba"   CPUs: any precision, least squares   CPUs: any precision, any shape      none
-    "jax"     none: the search alone, on any platform
+    "numba"   CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
+                                                                                       any shape
+    "jax"     none: plain JAX alone, on any platform
 
 "auto" takes what is installed and fits, and the search elsewhere. Which platform a program runs on is decided when it
 is lowered, not when it is traced (``on_platforms``).

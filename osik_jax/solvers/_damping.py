@@ -22,7 +22,7 @@ from ._level import positive_root
 
 PASSES = 3
 """Steps towards the fixed point; each makes what is damped too much smaller by the factor unmet / s^2."""
-_RIDGE = 1e-13
+RIDGE = 1e-13
 """Of the rows' squares, or ten roundings of them: keeps dependent rows from breaking the factorisation."""
 LEAST = 1e-13
 """Of the square of the level's longest row: a damping under this has slopes under those that rounding has."""
@@ -112,7 +112,7 @@ def effective(
     rows = jnp.where(counts[:, None], product(level.matrix, projector), 0.0)
     gram = product(rows, rows.T)
     eye = jnp.eye(len(goal), dtype=gram.dtype)
-    ridge = max(_RIDGE, 10.0 * float(jnp.finfo(gram.dtype).eps)) * jnp.trace(gram)
+    ridge = max(RIDGE, 10.0 * float(jnp.finfo(gram.dtype).eps)) * jnp.trace(gram)
     demand = jnp.where(damping.demand > 0.0, damping.demand, 1.0)
     share = jnp.ones_like(damping.unmet)
     for _ in range(PASSES):

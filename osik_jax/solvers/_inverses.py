@@ -10,21 +10,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._rules import custom_jvp
+from ._backends import Backend
 from ._dense import apply, product
 from ._row_factors import RowFactors, row_factors
 
 
 @custom_jvp
 def row_space_and_motion(
-    matrix: Float[Array, "m n"], wanted: Float[Array, " m"], cutoff: Float[Array, ""], damping: Float[Array, ""]
+    matrix: Float[Array, "m n"],
+    wanted: Float[Array, " m"],
+    cutoff: Float[Array, ""],
+    damping: Float[Array, ""],
+    *,
+    backend: Backend = "jax",
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """Orthogonal projector onto what the rows span, and the damped motion that they ask for.
 
     Rows that stand out of the span of those before them by no more than the cutoff are left out, the longest first. The
     projector comes from an orthonormal basis and not from an inverse, so that it is one to the last digit however
-    dependent the rows are. Derivatives are those at constant rank.
+    dependent the rows are. Derivatives are those at constant rank. ``backend`` is that of the factors (static).
     """
-    factors = row_factors(matrix, cutoff, damping)
+    factors = row_factors(matrix, cutoff, damping, backend)
     motion = apply(factors.basis.T, _solved(factors, wanted))
     return product(factors.basis.T, factors.basis), motion
 
@@ -36,27 +42,29 @@ def _solved(factors: RowFactors, wanted: Float[Array, "m ..."]) -> Float[Array, 
 
 
 @custom_jvp
-def _by_row_factors(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
+def _by_row_factors(matrix: Array, cutoff: Array, damping: Array, *, backend: Backend) -> tuple[Array, Array, Array]:
     """Row space, Moore-Penrose inverse and damped inverse."""
-    both = [row_factors(matrix, cutoff, each) for each in (jnp.zeros_like(damping), damping)]
+    both = [row_factors(matrix, cutoff, each, backend) for each in (jnp.zeros_like(damping), damping)]
     eye = jnp.eye(len(matrix), dtype=matrix.dtype)
     plain, damped = (product(factors.basis.T, _solved(factors, eye)) for factors in both)
     return product(both[0].basis.T, both[0].basis), plain, damped
 
 
 @_by_row_factors.defjvp
-def _by_row_factors_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+def _by_row_factors_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend) -> tuple[Any, Any]:
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
-    space, X, D = _by_row_factors(a, cutoff, damping)
+    space, X, D = _by_row_factors(a, cutoff, damping, backend=backend)
     dX = _columns(lambda w: _inverse_rate(a, X, da, w), a)
     dD = _columns(lambda w: _damped_rate(a, X, D, damping, da, d_damping, w), a)
     return (space, X, D), (_space_rate(space, X, da), dX, dD)
 
 
 @row_space_and_motion.defjvp
-def _row_space_and_motion_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+def _row_space_and_motion_jvp(
+    primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend = "jax"
+) -> tuple[Any, Any]:
     (a, wanted, cutoff, damping), (da, d_wanted, _, d_damping) = primals, tangents
-    space, X, D = _by_row_factors(a, cutoff, damping)
+    space, X, D = _by_row_factors(a, cutoff, damping, backend=backend)
     rate = _damped_rate(a, X, D, damping, da, d_damping, wanted) + apply(D, d_wanted)
     return (space, apply(D, wanted)), (_space_rate(space, X, da), rate)
 

@@ -4,20 +4,25 @@ Modified Gram-Schmidt with the longest row that is left as the pivot (A. Bjorck,
 orthogonalization", Linear Algebra and its Applications 197, 1994); each new direction is orthogonalised twice, after
 which it is orthogonal to rounding. On the way the columns of the rows on the new basis are orthogonalised as well, with
 the root of the damping below them. A batch goes through together, and a pass is a few products with a vector a row: a
-GPU, for which LAPACK's factorisations are many calls, computes hundreds of them in the time of one of those.
+GPU, for which LAPACK's factorisations are many calls, computes hundreds of them in the time of one of those. On a CPU
+a kernel does the same a lane at a time (``kernels/numba/_row_factors.py``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ._backends import Backend, on_platforms, takes
 from ._dense import apply
 from ._double import first_smallest
 from ._lanes import in_lanes
+from .kernels.numba import _target
 
 
 class RowFactors(NamedTuple):
@@ -37,15 +42,35 @@ class _State(NamedTuple):
     goes_on: Bool[Array, ""]
 
 
-def row_factors(matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]) -> RowFactors:
+def row_factors(
+    matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""], backend: Backend = "jax"
+) -> RowFactors:
     """Factors of [matrix on its basis; sqrt(damping) I]; rows that stand out by no more than the cutoff do not count.
 
-    Not differentiable.
+    Not differentiable. ``backend`` as ``here`` says it (``_backends.py``).
     """
-    return _factors(matrix, cutoff, damping)
+    return _factored(backend)(matrix, cutoff, damping)
 
 
-@in_lanes
+@cache
+def _factored(backend: Backend) -> Callable[[Array, Array, Array], RowFactors]:
+    """The function of one problem."""
+    return in_lanes(partial(_factors_anywhere, backend))
+
+
+def _factors_anywhere(backend: Backend, matrix: Array, cutoff: Array, damping: Array) -> RowFactors:
+    fits = matrix.shape[1] > 0
+    kernels = {"numba": _by_numba} if fits and takes(backend, "numba", fits=True) else {}
+    return on_platforms(kernels, _factors, matrix, cutoff, damping)
+
+
+def _by_numba(matrix: Float[Array, "B m n"], cutoff: Float[Array, " B"], damping: Float[Array, " B"]) -> RowFactors:
+    lanes, m, n = matrix.shape
+    shapes = (lanes, m, n), (lanes, 2 * m, m), (lanes, m, m), (m * (n + 2 * m),)
+    outputs = [(shape, float) for shape in shapes]
+    return RowFactors(*_target.call("_row_factors", outputs, matrix, cutoff, damping)[:3])
+
+
 def _factors(matrix: Float[Array, "B m n"], cutoff: Float[Array, " B"], damping: Float[Array, " B"]) -> RowFactors:
     count, m, _ = matrix.shape
     nothing = jnp.zeros((count, 2 * m, m), matrix.dtype)

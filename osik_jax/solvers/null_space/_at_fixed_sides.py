@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._rules import custom_jvp
+from .._backends import Backend
 from .._damping import room_below
 from .._dense import apply, product
 from ._padded import Problem, first_room
@@ -37,28 +38,30 @@ Answer = tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, " L"]]
 """x, the projector, and the scales."""
 
 
-def with_derivative(answer: Answer, decisions: Decision, problem: Problem) -> Answer:
+def with_derivative(answer: Answer, decisions: Decision, problem: Problem, backend: Backend = "jax") -> Answer:
     """The answer as it is, with the derivatives of the linear equations that hold at these decisions."""
-    return _attach(jax.lax.stop_gradient(answer), decisions, problem)
+    return _attach(jax.lax.stop_gradient(answer), decisions, problem, backend=backend)
 
 
 @custom_jvp
-def _attach(answer: Answer, decisions: Decision, problem: Problem) -> Answer:
+def _attach(answer: Answer, decisions: Decision, problem: Problem, *, backend: Backend) -> Answer:
     return answer
 
 
 @_attach.defjvp
-def _attach_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Answer, Answer]:
+def _attach_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend) -> tuple[Answer, Answer]:
     answer, decisions, problem = primals
-    _, rates = jax.jvp(lambda p: _descend(decisions, p), (problem,), (tangents[-1],))
-    return _attach(answer, decisions, problem), rates  # not the answer alone: the next derivative needs this rule
+    _, rates = jax.jvp(lambda p: _descend(decisions, p, backend), (problem,), (tangents[-1],))
+    return _attach(
+        answer, decisions, problem, backend=backend
+    ), rates  # not the answer alone: the next derivative needs this rule
 
 
-def _descend(decisions: Decision, problem: Problem) -> Answer:
+def _descend(decisions: Decision, problem: Problem, backend: Backend) -> Answer:
     def level(state: tuple[Array, ...], each: tuple[Any, ...]) -> tuple[tuple[Array, ...], Array]:
         decision, rows, damping, target = each
         start, projector, lower, upper, bent = state
-        motion, projector, strength = level_motion(rows, start, projector, damping, problem.rank)
+        motion, projector, strength = level_motion(rows, start, projector, damping, problem.rank, backend)
         x, projector, scale = _level(decision, Room(start, motion, target, projector, lower, upper))
         part = damped_part(rows, start, x, strength, problem.rank)
         x, scale = start + part * (x - start), part * scale

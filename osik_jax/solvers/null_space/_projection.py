@@ -19,6 +19,7 @@ from typing import cast
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._backends import Backend
 from .._damping import Damping, effective, room_below
 from .._dense import apply, product
 from .._inverses import row_space_and_motion
@@ -31,14 +32,18 @@ _WHOLE = 1.0 - 1e-9
 
 
 def solve_forward(
-    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Sequence[Damping], rank: Array | float
+    levels: Sequence[Level],
+    secondary: Float[Array, " n"],
+    damping: Sequence[Damping],
+    rank: Array | float,
+    backend: Backend = "jax",
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The answer, and the projector onto what no level asks for."""
     x, projector = jnp.zeros_like(secondary), jnp.eye(len(secondary), dtype=secondary.dtype)
     bent = jnp.zeros_like(x)
     lower, upper = jnp.full_like(x, -jnp.inf), jnp.full_like(x, jnp.inf)
     for level, own in zip(levels, damping, strict=True):
-        motion, projector, _ = level_motion(level, x, projector, own, rank)
+        motion, projector, _ = level_motion(level, x, projector, own, rank, backend)
         x = x + _scale(x, motion, lower, upper) * motion
         lower, upper, bent = room_below(own, level, bent, x, lower, upper)
     motion = apply(projector, secondary)
@@ -57,7 +62,12 @@ def _scale(
 
 
 def level_motion(
-    level: Level | Rows, x: Float[Array, " n"], projector: Float[Array, "n n"], damping: Damping, rank: Array | float
+    level: Level | Rows,
+    x: Float[Array, " n"],
+    projector: Float[Array, "n n"],
+    damping: Damping,
+    rank: Array | float,
+    backend: Backend = "jax",
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
     """What one level adds to x, the projector for the next, and the damping that it had."""
     if not level.matrix.shape[0]:
@@ -65,7 +75,8 @@ def level_motion(
     demand = Demand.of(level, x, rank)
     unbounded = jnp.full_like(x, jnp.inf)
     strength = effective(damping, cast(Level, level), x, projector, -unbounded, unbounded)
-    space, motion = row_space_and_motion(product(demand.rows, projector), demand.wanted, demand.cutoff, strength)
+    restricted = product(demand.rows, projector)
+    space, motion = row_space_and_motion(restricted, demand.wanted, demand.cutoff, strength, backend=backend)
     # what rounding adds outside the projector's range, as much more as singular values are small, is taken off again
     return apply(projector, motion), projector - product(projector, product(space, projector)), strength
 

@@ -30,6 +30,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._backends import Backend
 from .._damping import Damping
 from .._dense import apply, product
 from .._inverses import regularised_inverse, row_space_and_motion
@@ -38,7 +39,11 @@ from ._problem import Demand
 
 
 def solve_reverse(
-    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Sequence[Damping], rank: Array | float
+    levels: Sequence[Level],
+    secondary: Float[Array, " n"],
+    damping: Sequence[Damping],
+    rank: Array | float,
+    backend: Backend = "jax",
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The answer, and the projector onto what no level asks for. The secondary motion comes first of all."""
     x, eye = secondary, jnp.eye(len(secondary), dtype=secondary.dtype)
@@ -47,15 +52,16 @@ def solve_reverse(
         if not level.matrix.shape[0]:
             continue
         demand = Demand.of(level, x, rank)
-        space, motion = row_space_and_motion(demand.rows, demand.wanted, demand.cutoff, own.constant + own.unmet)
+        strength = own.constant + own.unmet
+        space, motion = row_space_and_motion(demand.rows, demand.wanted, demand.cutoff, strength, backend=backend)
         x = x + _least_disturbing(motion, eye - space, below, rank)
         below.append((demand.rows, own))
     if not below:
         return x, eye
     rows = jnp.concatenate([rows for rows, _ in below])
-    return x, eye - row_space_and_motion(
-        rows, jnp.zeros(len(rows), x.dtype), _cutoff(rows, rank), damping[-1].constant
-    )[0]
+    nothing = jnp.zeros(len(rows), x.dtype)
+    space, _ = row_space_and_motion(rows, nothing, _cutoff(rows, rank), damping[-1].constant, backend=backend)
+    return x, eye - space
 
 
 def _least_disturbing(

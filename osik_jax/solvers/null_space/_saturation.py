@@ -29,6 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._rules import found as kept
+from .._backends import Backend
 from .._damping import Damping, room_below
 from .._double import in_double
 from .._inverses import row_space_and_motion
@@ -64,6 +65,7 @@ def solve_saturated(
     damping: Sequence[Damping],
     rank: Array | float,
     max_iterations: int,
+    backend: Backend = "jax",
 ) -> Saturated:
     """Level after level; then as near to the secondary motion as they leave room.
 
@@ -71,9 +73,9 @@ def solve_saturated(
     decided is then differentiated in the precision of the data.
     """
     problem = padded(levels, lower, upper, secondary, damping, rank)
-    descend = in_lanes(in_double(partial(_descend, max_iterations)))
+    descend = in_lanes(in_double(partial(_descend, max_iterations, backend)))
     end = kept(descend(jax.lax.stop_gradient(problem)))
-    x, projector, scales = with_derivative((end.x, end.projector, end.scales), end.decisions, problem)
+    x, projector, scales = with_derivative((end.x, end.projector, end.scales), end.decisions, problem, backend)
     return Saturated(x, projector, scales[: len(levels)], end.active, end.iterations, end.done)
 
 
@@ -103,17 +105,17 @@ class _State(NamedTuple):
     done: Bool[Array, ""]
 
 
-def _descend(max_iterations: int, problem: Problem) -> _End:
+def _descend(max_iterations: int, backend: Backend, problem: Problem) -> _End:
     """All levels of a batch; every array has a leading axis, the batch, and then perhaps one of levels."""
     x, projector = jax.vmap(first_room)(problem)
     fixed = jnp.where(problem.lower == problem.upper, 2, 0)
     none = jnp.zeros(len(x), jnp.int32)
 
     def level(state: _State, each: tuple[Rows, Damping, Array]) -> tuple[_State, tuple[Array, Decision]]:
-        room, strength = jax.vmap(_room)(problem, state, *each)
+        room, strength = jax.vmap(partial(_room, backend))(problem, state, *each)
         found = search(room, max_iterations)
         part = jax.vmap(damped_part)(each[0], state.x, found.x, strength, problem.rank)
-        after, decision = jax.vmap(_after)(state, room, found, part, *each[:2])
+        after, decision = jax.vmap(partial(_after, backend))(state, room, found, part, *each[:2])
         return after, (jnp.where(found.done, part * found.scale, 0.0), decision)
 
     start = _State(x, problem.lower, problem.upper, jnp.zeros_like(x), projector, fixed, fixed, none, none == 0)
@@ -126,20 +128,22 @@ def _descend(max_iterations: int, problem: Problem) -> _End:
     return _End(end.x, end.projector, scales, decisions, active, end.iterations, end.done)
 
 
-def _room(problem: Problem, state: _State, rows: Rows, damping: Damping, target: Array) -> tuple[Room, Array]:
+def _room(
+    backend: Backend, problem: Problem, state: _State, rows: Rows, damping: Damping, target: Array
+) -> tuple[Room, Array]:
     """Where the next x may be, and the damping of the level."""
-    motion, projector, strength = level_motion(rows, state.x, state.projector, damping, problem.rank)
+    motion, projector, strength = level_motion(rows, state.x, state.projector, damping, problem.rank, backend)
     return Room(state.x, motion, target, projector, state.lower, state.upper), strength
 
 
 def _after(
-    state: _State, room: Room, found: Found, part: Array, rows: Rows, damping: Damping
+    backend: Backend, state: _State, room: Room, found: Found, part: Array, rows: Rows, damping: Damping
 ) -> tuple[_State, Decision]:
     """The start again where the search failed."""
     side, stops = (jnp.where(found.done, sides, 0) for sides in (found.side, found.blocking))
     stopped = jnp.where((stops != 0)[:, None], room.projector, 0.0)
     none = jnp.zeros((), stopped.dtype)
-    space, _ = row_space_and_motion(stopped, stopped[:, 0], none + _INDEPENDENT, none)
+    space, _ = row_space_and_motion(stopped, stopped[:, 0], none + _INDEPENDENT, none, backend=backend)
     keep = (stops == 0)[:, None] & (stops == 0)[None, :]
     fixed = jnp.where(state.fixed == 0, stops, state.fixed)
     x = jnp.where(

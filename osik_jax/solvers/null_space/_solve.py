@@ -11,19 +11,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._errors import OsikValueError
+from .._backends import Backend, check_backend, here, takes
 from .._box import clip_to_box, uncrossed
 from .._damping import Damping, one_each
 from .._status import Status
 from ..hqp import Level
+from ._fused import project
 from ._problem import RANK, NullSpaceSolution, sane
-from ._projection import solve_forward
 from ._reverse import solve_reverse
 from ._saturation import Saturated, solve_saturated
 
 ORDERS = ("forward", "reverse")
 
 
-@partial(jax.jit, static_argnames=("order", "max_iterations"))
+@partial(jax.jit, static_argnames=("order", "max_iterations", "backend"))
 def solve_nullspace(
     levels: Sequence[Level],
     lower: Float[ArrayLike, " n"] | None = None,
@@ -34,6 +35,7 @@ def solve_nullspace(
     damping: Float[Array, ""] | float | Damping | Sequence[Float[Array, ""] | Damping] = 0.0,
     rank_tolerance: Float[Array, ""] | float | None = None,
     max_iterations: int | None = None,
+    backend: Backend = "auto",
 ) -> NullSpaceSolution:
     """Each level as nearly as the null space of the levels above it allows.
 
@@ -64,10 +66,15 @@ def solve_nullspace(
             default 1e-10 (1e-5 in float32). Against A and not A P, so that a level which repeats one above it has
             rank 0, not the rank of its rounding.
         max_iterations: cap on the search for the saturated joints, for each level (static); default 10 (n + 2).
+        backend: whose kernels compute (static): "auto" for those that are there for the platform, "jax" for none,
+            "numba" (CPUs) for those or an error. It changes the time, not the answer.
 
     Raises:
-        ValueError: an order that does not exist, bounds in reverse order, or a damping too many or few.
+        ValueError: an order that does not exist, bounds in reverse order, a damping too many or few, or a backend that
+            has no kernels for this.
     """
+    backend = here(check_backend(backend))
+    takes(backend, "warp", fits=False)
     n = levels[0].matrix.shape[1]
     dtype = jnp.result_type(*(level.matrix for level in levels))
     box = _bounds(lower, upper, n, dtype)
@@ -80,18 +87,20 @@ def solve_nullspace(
     possible = ~jnp.stack(crossed).any()
     given = one_each(damping, len(levels), n, dtype)
     good = sane(levels, pull, *given) & (True if box is None else _exists(*box))
-    clean, pull, damped = _where(good, (list(levels), pull, given))
-    damped = [Damping(*parts) for parts in zip(*damped, strict=True)]
+    clean, pull, given = _where(good, (list(levels), pull, given))
+    damped = [Damping(*parts) for parts in zip(*given, strict=True)]
     scaled = [level.scaled() for level in clean]
     rank = RANK[dtype] if rank_tolerance is None else rank_tolerance
     if box is None:
-        method = solve_forward if order == "forward" else solve_reverse
-        answer = _free(*method(scaled, pull, damped, rank), count=len(levels))
+        if order == "forward":
+            answer = _free(*project(scaled, pull, given, rank, backend), count=len(levels))
+        else:
+            answer = _free(*solve_reverse(scaled, pull, damped, rank, backend), count=len(levels))
         return _solution(clean, answer, good, possible, jnp.zeros(n, dtype))
     cap = 10 * (n + 2) if max_iterations is None else max_iterations
     low, high, empty = uncrossed(*box)
     safe = jnp.where(good, low, -1.0), jnp.where(good, high, 1.0)
-    answer = solve_saturated(scaled, *safe, None if secondary is None else pull, damped, rank, cap)
+    answer = solve_saturated(scaled, *safe, None if secondary is None else pull, damped, rank, cap, backend)
     return _solution(clean, answer, good, possible & ~empty, clip_to_box(jnp.zeros(n, dtype), *box))
 
 

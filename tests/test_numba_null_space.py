@@ -1,0 +1,345 @@
+"""Numba's kernels of the null space on a CPU: beside the plain method and NumPy, and the derivatives of both."""
+
+import os
+import subprocess
+import sys
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.solvers import Backend, Damping, Level, Status, _backends, solve_nullspace
+from osik_jax.solvers._row_factors import row_factors
+
+pytest.importorskip("numba")
+LANES = 12
+METHODS = {"forward": {}, "reverse": dict(order="reverse"), "saturated": dict(lower=-0.4, upper=0.4)}
+
+
+class Problems(NamedTuple):
+    """Levels as matrix, lower, upper, weight; a damping each, as its fields; a leading axis, the lanes."""
+
+    levels: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
+    damping: list[tuple[np.ndarray, ...]]
+    secondary: np.ndarray
+
+
+def random_problems(seed, n, rows, *, scale=1.0, inequalities=False, damped=False, lanes=LANES) -> Problems:
+    """With independent rows; dampings none, some, and for what cannot be met."""
+    rng = np.random.default_rng(seed)
+    levels, damping = [], []
+    for m in rows:
+        A, wanted = rng.normal(size=(lanes, m, n)), rng.normal(size=(lanes, m))
+        above = wanted + np.where(rng.random((lanes, m)) < 0.5, 1.0, 0.0) if inequalities else wanted
+        weight = rng.uniform(0.1, 2.0, (lanes, m))
+        weight[rng.random((lanes, m)) < 0.05] = 0.0
+        levels.append((scale * A, scale * wanted, scale * above, weight))
+        constant = 10.0 ** rng.uniform(-8.0, 0.0, lanes) * (rng.random(lanes) < 0.7) * damped
+        unmet = rng.uniform(0.0, 30.0, lanes) * (rng.random(lanes) < 0.7) * damped
+        demand = rng.uniform(0.0, 3.0, lanes)
+        damping.append(
+            (scale**2 * constant, scale**2 * unmet, scale * demand, rng.uniform(0.0, 2.0 * scale, (lanes, n)))
+        )
+    return Problems(levels, damping, rng.normal(size=(lanes, n)))
+
+
+def repeated(p: Problems) -> Problems:
+    """The last level once more, after the first: in its null space there is less left of it, or nothing."""
+    return p._replace(levels=[p.levels[0], p.levels[-1], *p.levels[1:]], damping=[p.damping[0], *p.damping])
+
+
+def dependent(p: Problems) -> Problems:
+    """The second half of every level's rows is the first, mixed."""
+
+    def mixed(level):
+        A, lower, upper, weight = level
+        half = A.shape[1] // 2
+        mix = np.random.default_rng(1).normal(size=(A.shape[1] - half, half))
+        return np.concatenate([A[:, :half], mix @ A[:, :half]], 1), lower, upper, weight
+
+    return p._replace(levels=[mixed(level) if level[0].shape[1] > 1 else level for level in p.levels])
+
+
+@partial(jax.jit, static_argnames=("backend", "method"))
+def solved(p: Problems, *, backend: Backend = "numba", method="forward"):
+    """A batch, by one backend."""
+
+    def one(p: Problems):
+        levels, damping = [Level(*level) for level in p.levels], [Damping(*d) for d in p.damping]
+        options = METHODS[method]
+        bounds = {name: jnp.full_like(p.secondary, b) for name, b in options.items() if name != "order"}
+        order = options.get("order", "forward")
+        return solve_nullspace(levels, **bounds, order=order, secondary=p.secondary, damping=damping, backend=backend)
+
+    return jax.vmap(one)(p)
+
+
+FAMILIES = {
+    "independent": random_problems(0, 8, (3, 2, 2)),
+    "damped": random_problems(1, 8, (3, 2, 2), damped=True),
+    "inequalities": random_problems(2, 8, (3, 4, 2), inequalities=True),
+    "damped inequalities": random_problems(3, 8, (3, 4, 5), inequalities=True, damped=True),
+    "more rows than variables": random_problems(4, 4, (7, 3)),
+    "damped, more rows": random_problems(5, 6, (2, 9, 7), damped=True),
+    "nothing left": random_problems(6, 5, (3, 2, 4), damped=True),
+    "a humanoid's": random_problems(7, 35, (12, 3, 3, 29), damped=True),
+    "one variable": random_problems(8, 1, (1, 1)),
+    "level without rows": random_problems(9, 6, (0, 2, 0), damped=True),
+    "dependent": dependent(random_problems(10, 8, (4, 3, 4))),
+    "dependent and damped": dependent(random_problems(11, 8, (4, 3, 4), damped=True)),
+    "repeated": repeated(random_problems(12, 8, (3, 2, 2))),
+    "repeated and damped": repeated(random_problems(13, 8, (3, 2, 2), damped=True)),
+    "tiny": random_problems(14, 8, (3, 2, 4), scale=1e-9, inequalities=True, damped=True),
+    "huge": random_problems(15, 8, (3, 2, 4), scale=1e9, inequalities=True, damped=True),
+    "zeros": random_problems(16, 6, (2, 3), scale=0.0),
+}
+every_family = pytest.mark.parametrize("p", FAMILIES.values(), ids=FAMILIES)
+
+
+@every_family
+def test_lane_by_lane_as_the_plain_method(p):
+    found, expected = solved(p), solved(p, backend="jax")
+    np.testing.assert_array_equal(found.status, Status.SOLVED)
+    np.testing.assert_array_equal(expected.status, Status.SOLVED)
+    assert np.abs(found.projector - expected.projector).max() < 1e-11
+    assert np.abs(found.x - expected.x).max() < 1e-10 * (1.0 + np.abs(expected.x).max())
+
+
+@every_family
+def test_the_projector_is_one(p):
+    P = np.asarray(solved(p).projector)
+    np.testing.assert_allclose(P @ P, P, rtol=0, atol=1e-14 * len(P[0]))
+    np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
+
+
+def recursion(p: Problems, lane: int) -> np.ndarray:
+    """Eq. 7 as printed, of equalities with constant dampings, by NumPy's SVD."""
+    x, projector = np.zeros_like(p.secondary[lane]), np.eye(p.secondary.shape[1])
+    for (A, wanted, _, weight), (constant, *_) in zip(p.levels, p.damping, strict=True):
+        root = np.sqrt(weight[lane])
+        rows = root[:, None] * A[lane]
+        restricted = rows @ projector
+        u, s, vt = np.linalg.svd(restricted, full_matrices=False)
+        real = s > 1e-9 * np.linalg.norm(rows)
+        damped = (vt.T * np.where(real, s / np.where(real, s**2 + constant[lane], 1.0), 0.0)) @ u.T
+        x = x + damped @ (root * wanted[lane] - rows @ x)
+        projector = projector - vt[real].T @ vt[real]
+    return x + projector @ p.secondary[lane]
+
+
+@pytest.mark.parametrize(
+    "name", ["independent", "damped", "dependent", "repeated", "damped, more rows", "a humanoid's"]
+)
+def test_as_numpy(name):
+    p = FAMILIES[name]
+    p = p._replace(damping=[(constant, 0.0 * unmet, demand, bends) for constant, unmet, demand, bends in p.damping])
+    found = np.asarray(solved(p).x)
+    for lane in range(LANES):
+        expected = recursion(p, lane)
+        np.testing.assert_allclose(found[lane], expected, rtol=0, atol=1e-9 * (1.0 + np.abs(expected).max()))
+
+
+@pytest.mark.parametrize("name", ["damped inequalities", "a humanoid's", "level without rows"])
+def test_single_precision_is_double_inside(name):
+    """As near to the answer in double precision as rounded data can be, and nearer than single arithmetic."""
+    p = FAMILIES[name]
+    with jax.enable_x64(False):
+        single = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), p)
+        if jax.__version_info__ >= _backends._LOWERS_NO_DOUBLE:
+            with pytest.raises(RuntimeError, match="jax_enable_x64"):
+                solved(single)
+            return
+        found = solved(single)
+    assert found.x.dtype == found.projector.dtype == jnp.float32
+    rounded = jax.tree.map(lambda a: np.asarray(a, np.float64), single)
+    expected = solved(rounded, backend="jax")
+    assert np.abs(found.x - expected.x).max() < 1e-5 * (1.0 + np.abs(expected.x).max())
+
+
+@pytest.mark.parametrize("method", ["reverse", "saturated"])
+@pytest.mark.parametrize("name", ["damped", "damped inequalities", "dependent and damped", "repeated"])
+def test_the_other_methods_with_the_factors_of_the_kernel(name, method):
+    p = FAMILIES[name]
+    found, expected = solved(p, method=method), solved(p, backend="jax", method=method)
+    np.testing.assert_array_equal(found.status, expected.status)
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-8 * (1.0 + np.abs(expected.x).max()))
+    np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-4, 1.0])
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+@pytest.mark.parametrize(("m", "n", "rank"), [(5, 9, 5), (5, 9, 2), (9, 5, 5), (4, 4, 0), (1, 1, 1)])
+def test_factors_of_rows(rng, m, n, rank, scale, damping):
+    A = scale * rng.normal(size=(LANES, m, rank)) @ rng.normal(size=(LANES, rank, n))
+
+    def factored(a):
+        return row_factors(a, jnp.asarray(1e-10 * scale), jnp.asarray(damping * scale**2), "numba")
+
+    basis, outer, triangle = map(np.asarray, jax.jit(jax.vmap(factored))(A))
+    some, none = np.eye(m) * (np.arange(m) < rank), np.arange(m) >= rank
+    np.testing.assert_allclose(basis @ np.swapaxes(basis, 1, 2), np.broadcast_to(some, (LANES, m, m)), atol=1e-13)
+    np.testing.assert_allclose(np.swapaxes(outer, 1, 2) @ outer, np.broadcast_to(some, (LANES, m, m)), atol=1e-13)
+    np.testing.assert_allclose(outer[:, :m] @ triangle @ basis, A, rtol=0, atol=1e-13 * scale * n)
+    damped = np.sqrt(damping) * scale * some
+    np.testing.assert_allclose(
+        outer[:, m:] @ triangle * some, np.broadcast_to(damped, (LANES, m, m)), atol=1e-13 * scale
+    )
+    np.testing.assert_array_equal(triangle[:, none], np.broadcast_to(np.eye(m)[none], (LANES, none.sum(), m)))
+    np.testing.assert_array_equal(np.tril(triangle, -1), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *(("independent", "forward"), ("nothing left", "forward"), ("damped inequalities", "forward")),
+        *(("damped", "reverse"), ("damped inequalities", "saturated")),
+    ],
+)
+def test_derivatives_in_both_modes_are_those_of_the_plain_method_and_of_differences(name, method):
+    """Where the answer is smooth: along a curve, central differences of two widths that agree."""
+    p = FAMILIES[name]
+    rng = np.random.default_rng(5)
+    way = jax.tree.map(lambda a: rng.normal(size=a.shape) * np.abs(a), p)
+    cotangent = rng.normal(size=p.secondary.shape)
+
+    def at(backend, t):
+        moved = jax.tree.map(lambda a, d: a + t * d, p, way)
+        levels = [
+            (A, lower, jnp.where(same[1] == same[2], lower, upper), weight)
+            for (A, lower, upper, weight), same in zip(moved.levels, p.levels, strict=True)
+        ]
+        return solved(moved._replace(levels=levels), backend=backend, method=method).x
+
+    rates = {}
+    for backend in ("numba", "jax"):
+        rates[backend] = np.asarray(jax.jvp(partial(at, backend), (0.0,), (1.0,))[1])
+        (pulled,) = jax.vjp(partial(at, backend), 0.0)[1](jnp.asarray(cotangent))
+        assert pulled == pytest.approx(np.sum(cotangent * rates[backend]), rel=1e-8, abs=1e-8)
+    size = 1.0 + np.abs(rates["jax"]).max(1)
+    assert (np.abs(rates["numba"] - rates["jax"]).max(1) < 1e-6 * size).all()
+    wide, narrow = (np.asarray(at("numba", h) - at("numba", -h)) / (2.0 * h) for h in (2e-6, 1e-6))
+    smooth = np.abs(wide - narrow).max(1) < 1e-5 * size
+    assert smooth.mean() > 0.6
+    assert (np.abs(rates["numba"] - narrow).max(1) < 1e-4 * size)[smooth].all()
+
+
+def test_second_derivatives_and_loops():
+    """Through a scan, whose body is linearised apart from it."""
+    A = np.random.default_rng(3).normal(size=(7, 5))
+
+    def last(t, backend):
+        def step(x, _):
+            levels = [Level(A[:2], jnp.array([0.3, -0.2]) + t), Level(A[2:] + x, A[2:, 0] * t + 0.5)]
+            return jnp.sin(solve_nullspace(levels, damping=0.1, backend=backend).x), None
+
+        return jnp.sum(jax.lax.scan(step, jnp.zeros(5) + t, length=3)[0] ** 2)
+
+    by_kernel, step = partial(last, backend="numba"), 1e-5
+    value, first, second = (jax.jit(f) for f in (by_kernel, jax.grad(by_kernel), jax.grad(jax.grad(by_kernel))))
+    np.testing.assert_allclose(value(0.2), jax.jit(partial(last, backend="jax"))(0.2), rtol=1e-10)
+    np.testing.assert_allclose(first(0.2), (value(0.2 + step) - value(0.2 - step)) / (2.0 * step), rtol=1e-6)
+    np.testing.assert_allclose(second(0.2), (first(0.2 + step) - first(0.2 - step)) / (2.0 * step), rtol=1e-5)
+
+
+def test_vmap_is_a_loop_however_it_is_nested(rng):
+    p = random_problems(20, 8, (3, 4, 2), inequalities=True, damped=True, lanes=40)
+    together = solved(p)
+    nested = jax.vmap(solved)(jax.tree.map(lambda a: a.reshape(5, 8, *a.shape[1:]), p))
+    np.testing.assert_array_equal(nested.x.reshape(40, -1), together.x)
+    for lane in (0, 17, 39):
+        alone = solved(jax.tree.map(lambda a, lane=lane: a[lane : lane + 1], p))
+        np.testing.assert_array_equal(alone.x[0], together.x[lane])
+    levels = [Level(*(a[3] for a in level)) for level in p.levels]
+    damping = [Damping(*(a[3] for a in each)) for each in p.damping]
+    without_batch = solve_nullspace(levels, secondary=p.secondary[3], damping=damping, backend="numba")
+    np.testing.assert_allclose(without_batch.x, together.x[3], rtol=0, atol=1e-13)
+    shared = jax.vmap(lambda s: solve_nullspace(levels, secondary=s, damping=damping, backend="numba").x)(p.secondary)
+    np.testing.assert_allclose(shared[3], together.x[3], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_bad_lane_harms_none(method):
+    p = jax.tree.map(np.copy, FAMILIES["damped inequalities"])
+    right = solved(p, method=method)
+    p.levels[1][0][3, 0, 0] = np.nan
+    p.levels[0][0][5, 0, 0] = np.inf
+    found = solved(p, method=method)
+    good = ~np.isin(np.arange(LANES), (3, 5))
+    assert (np.asarray(found.status)[~good] == Status.NUMERICAL_ERROR).all()
+    assert np.isfinite(found.x).all() and np.isfinite(found.projector).all()
+    # of saturation, loops go on for a whole block: a lane may be corrected once more beside another one
+    atol = 1e-15 if method == "saturated" else 0.0
+    np.testing.assert_allclose(np.asarray(found.x)[good], np.asarray(right.x)[good], rtol=0, atol=atol)
+    rate = jax.jvp(lambda s: solved(p._replace(secondary=s), method=method).x, (p.secondary,), (p.secondary,))[1]
+    assert np.isfinite(rate).all()
+
+
+def test_numbers_that_overflow_are_an_error_of_their_lane():
+    p = jax.tree.map(np.copy, FAMILIES["independent"])
+    p.levels[0][0][2] *= 1e200
+    for backend in ("numba", "jax"):
+        found = solved(p, backend=backend)
+        assert np.isfinite(found.x).all()
+        assert (np.delete(np.asarray(found.status), 2) == Status.SOLVED).all()
+
+
+def test_programs_for_other_machines():
+    """Which platform a program is for is decided when it is lowered; with "jax" there is no kernel at all."""
+
+    def solve(target, backend):
+        return solve_nullspace([Level(np.ones((1, 3)), target)], backend=backend).x
+
+    traced = jax.jit(partial(solve, backend="numba")).trace(np.ones(1))
+    assert "osik_jax_projection" in traced.lower(lowering_platforms=("cpu",)).as_text()
+    assert "osik_jax" not in traced.lower(lowering_platforms=("cuda",)).as_text().replace("osik_jax/", "")
+    assert "osik_jax_" not in jax.jit(partial(solve, backend="jax")).trace(np.ones(1)).lower().as_text()
+
+
+def test_a_backend_that_is_not_there(monkeypatch):
+    level = [Level(np.ones((1, 3)), np.ones(1))]
+    with pytest.raises(ValueError, match="backend is 'cuda'; backends: auto, jax, numba, warp"):
+        osik.NullSpace(backend="cuda")  # pyright: ignore[reportArgumentType]
+    with pytest.raises((ModuleNotFoundError, RuntimeError, ValueError)):  # no Warp, no GPU, or no kernel of it
+        solve_nullspace(level, backend="warp")
+    monkeypatch.setattr(_backends, "installed", lambda package: False)
+    with pytest.raises(ModuleNotFoundError, match=r"backend='numba' needs Numba: pip install 'osik-jax\[numba\]'"):
+        osik.NullSpace(backend="numba")
+
+
+def test_the_scheme():
+    """A tick of an arm by both backends, in each order."""
+    arm = osik.load_robot("arm7")
+    tasks = {
+        "hand": osik.FrameTask(arm, arm.frame_names[-1], rows="position", priority=1),
+        "posture": osik.PostureTask(arm, priority=2),
+    }
+    hand = tasks["hand"].target
+    null_space = osik.NullSpace
+    for scheme in (null_space, partial(null_space, order="reverse"), partial(null_space, saturate=True)):
+        found, expected = (
+            osik.solve(
+                arm,
+                arm.q0,
+                tasks,
+                scheme=scheme(backend=backend),
+                targets={"hand": (hand[0] + 0.1, hand[1])},
+                dt=0.005,
+            )
+            for backend in ("numba", "jax")
+        )
+        assert found.status == expected.status
+        np.testing.assert_allclose(found.velocity, expected.velocity, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_no_index_is_out_of_bounds():
+    """With every index checked; an exception in a kernel would print a line and leave its results as they were."""
+    code = f"import pytest; pytest.main(['-q', '-n', '0', '-k', 'lane_by_lane or factors_of', {__file__!r}])"
+    environment = os.environ | dict(NUMBA_BOUNDSCHECK="1")
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert "passed" in ran.stdout and "failed" not in ran.stdout
+    assert "IndexError" not in ran.stdout + ran.stderr
