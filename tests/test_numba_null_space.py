@@ -195,7 +195,8 @@ def test_factors_of_rows(rng, m, n, rank, scale, damping):
 @pytest.mark.parametrize(
     ("name", "method"),
     [
-        *(("independent", "forward"), ("nothing left", "forward"), ("damped inequalities", "forward")),
+        ("damped inequalities", "forward"),
+        *(pytest.param(name, "forward", marks=pytest.mark.slow) for name in ("independent", "nothing left")),
         *(("damped", "reverse"), ("damped inequalities", "saturated")),
     ],
 )
