@@ -58,12 +58,15 @@ def _projected(backend: Backend) -> Callable[[list[Level], Array, Damping, Array
     return in_lanes(partial(on_platforms, dict(numba=_by_numba), plain))
 
 
-def _by_numba(levels: list[Level], secondary: Float[Array, "B n"], damping: Damping, rank: Float[Array, " B"]) -> End:
+def _by_numba(
+    levels: list[Level], secondary: Float[Array, "B n"], damping: Damping, rank: Float[Array, " B"]
+) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
     lanes, n = secondary.shape
     most = max(level.lower.shape[1] for level in levels)
     r = min(most, n)
     space = (n + 11) * (n + most) + 2 * most**2 + r * (most + 2 * r)  # as Work has it
-    rows = [a for level in levels for a in (level.matrix, level.lower, level.upper, level.equal)]
+    equal = [jax.vmap(lambda one: one.equal)(level) for level in levels]
+    rows = [a for level, e in zip(levels, equal, strict=True) for a in (level.matrix, level.lower, level.upper, e)]
     shapes = (lanes, n), (lanes, n, n), (space,)
     x, projector, _ = _target.call("_projection", [(s, float) for s in shapes], secondary, *damping, rank, *rows)
     return x, projector
