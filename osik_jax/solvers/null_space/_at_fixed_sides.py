@@ -52,9 +52,8 @@ def _attach(answer: Answer, decisions: Decision, problem: Problem, *, backend: B
 def _attach_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend) -> tuple[Answer, Answer]:
     answer, decisions, problem = primals
     _, rates = jax.jvp(lambda p: _descend(decisions, p, backend), (problem,), (tangents[-1],))
-    return _attach(
-        answer, decisions, problem, backend=backend
-    ), rates  # not the answer alone: the next derivative needs this rule
+    # not the answer alone: the next derivative needs this rule
+    return _attach(answer, decisions, problem, backend=backend), rates
 
 
 def _descend(decisions: Decision, problem: Problem, backend: Backend) -> Answer:
