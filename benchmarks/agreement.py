@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from osik_jax.solvers import HQPSolution, Level, NullSpaceSolution, solve_hqp, solve_nullspace
-from osik_jax.solvers.hqp import _fused
+from osik_jax.solvers.hqp import _dispatch
 from tests.hierarchy_families import SMALL
 
 BATCH = 4096
@@ -60,7 +60,7 @@ def main() -> None:
         jax.debug.callback(note, done)
         return with_the_rest(end, done, again, block)
 
-    with_the_rest, _fused.with_the_rest = _fused.with_the_rest, counted
+    with_the_rest, _dispatch.with_the_rest = _dispatch.with_the_rest, counted
     rng, so_far, verdicts, apart, worst = np.random.default_rng(asked.seed), 0, 0, 0, 0.0
     while so_far < asked.count:
         for name, draw in SMALL.items():

@@ -30,7 +30,7 @@ from . import throughput
 from .descriptions import ROBOTS
 from .throughput import DT, PRECISIONS, Setting, State, batch_of, machine, setting
 
-SCHEMES = {**throughput.SCHEMES, "saturated": lambda: osik.NullSpace(saturate=True)}
+SCHEMES = {**throughput.SCHEMES, "saturated": lambda: osik.NullSpace(method="saturated")}
 STEPS = 50
 RADIUS = {"nao": 0.25, "g1": 0.5, "arm7": 0.5}
 """Of the balls that suit a robot [m]."""

@@ -76,7 +76,7 @@ def _source(name: str) -> tuple[str, Mapping[str, float]]:
     given = ROBOTS[name]
     if given.urdf:
         return lean_urdf(given), given.posture
-    model = mujoco.MjModel.from_xml_path(str(ROOT / "osik_jax" / "robots" / f"{name}.xml"))
+    model = mujoco.MjModel.from_xml_path(str(ROOT / "osik_jax" / "robot" / "models" / f"{name}.xml"))
     links = {model.body(i).name for i in range(model.nbody)}
     return urdf(model, [frame for frame in (*given.feet, given.hand) if frame not in links]), keyframe(model)
 

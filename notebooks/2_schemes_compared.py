@@ -75,8 +75,8 @@ DAMPING = 0.1**2
 SCHEMES = {
     "weighted": partial(osik.WeightedQP, curvature_damping=0.0),
     "null space": partial(osik.NullSpace, curvature_damping=0.0),
-    "null space, saturated": partial(osik.NullSpace, saturate=True, curvature_damping=0.0),
-    "null space, reverse": partial(osik.NullSpace, order="reverse", curvature_damping=0.0),
+    "null space, saturated": partial(osik.NullSpace, method="saturated", curvature_damping=0.0),
+    "null space, reverse": partial(osik.NullSpace, method="reverse", curvature_damping=0.0),
     "hierarchical": partial(osik.HierarchicalQP, curvature_damping=0.0),
 }
 COLORS = dict(zip(SCHEMES, ("#d55e00", "#999999", "#009e73", "#cc79a7", "#0072b2"), strict=True))

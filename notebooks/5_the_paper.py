@@ -656,7 +656,7 @@ assert len(summary) == 9
 # - **Rank is decided, not hoped for**: singular values below a stated share of a level's size count as zero
 #   ([solvers](../docs/solvers.md)).
 # - **Limits are hard**: a box that always exists and is kept exactly by `WeightedQP`, `HierarchicalQP` and
-#   `NullSpace(saturate=True)` ([choosing a scheme](../docs/choosing_a_scheme.md)).
+#   `NullSpace(method="saturated")` ([choosing a scheme](../docs/choosing_a_scheme.md)).
 # - **Inequalities at any priority**, with slack and status reported for each tick
 #   ([tasks and limits](../docs/tasks_and_limits.md)).
 # - **Derivatives**: of a tick and of a whole motion, with respect to every number, so that weights and gains are tuned

@@ -1,12 +1,12 @@
 """Differentiable, batched operational-space inverse kinematics for redundant robots, in JAX."""
 
 from . import runtime as runtime
-from ._batches import batch_axes as batch_axes
-from ._batches import batched as batched
-from ._batches import stack as stack
 from ._errors import OsikError as OsikError
 from ._errors import OsikWarning as OsikWarning
 from ._version import installed_version as _installed_version
+from .batching import batch_axes as batch_axes
+from .batching import batched as batched
+from .batching import stack as stack
 from .collision import CollisionShape as CollisionShape
 from .control import Solution as Solution
 from .control import Trajectory as Trajectory

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
 import warnings
 from pathlib import Path
@@ -44,3 +45,11 @@ def warn(message: str) -> None:
     while frame is not None and frame.f_code.co_filename.startswith(_PACKAGE):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, OsikWarning, stacklevel=level)
+
+
+def unknown_name(kind: str, name: object, available: tuple[str, ...]) -> KeyError:
+    """The exception for a name that does not exist: the nearest one that does, and all of them."""
+    close = difflib.get_close_matches(str(name), available, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else "."
+    kinds = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
+    return OsikKeyError(f"no {kind} {name!r}{hint} {kinds}: {', '.join(available) or '(none)'}")

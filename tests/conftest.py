@@ -1,6 +1,7 @@
 """Shared by all tests: double precision, quick compilation that is not done twice, one seed, memory that stays flat."""
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -33,6 +34,8 @@ from osik_jax.runtime import configure_cpu
 
 configure_cpu()
 jax.config.update("jax_enable_x64", True)
+# Tracing makes many objects that stay; looking for garbage among them, as often as by default, is 6 % of the time.
+gc.set_threshold(50_000, 20, 20)
 
 
 MOST_MEMORY = 4 * 2**30

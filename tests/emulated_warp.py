@@ -19,7 +19,13 @@ _TYPES = {"float": np.float32, "double": np.float64, "int": np.int32}
 
 
 def emulated(
-    text: str, inputs: Mapping[str, str], outputs: Mapping[str, str], folder: Path, *, backwards: bool = False
+    text: str,
+    inputs: Mapping[str, str],
+    outputs: Mapping[str, str],
+    folder: Path,
+    *,
+    backwards: bool = False,
+    scalar: str = "max_iterations",
 ) -> Callable[..., Any]:
     """What ``_kernel`` returns, without a GPU: a function of JAX arrays and the cap on changes.
 
@@ -29,6 +35,7 @@ def emulated(
         outputs: types of its output arrays by name.
         folder: where to compile.
         backwards: whether the last lane goes first.
+        scalar: name of the whole number that is given beside the arrays.
     """
     kinds = {**inputs, **outputs}
     arrays = "\n".join(f"static Matrix<{kind}> {name};" for name, kind in kinds.items())
@@ -36,14 +43,14 @@ def emulated(
     taken = " ".join(f"{name}.data = {name}_;" for name in kinds)
     program = f"""#include "{Path(__file__).with_name("emulated_warp.h")}"
 {arrays}
-static int pid, most_changes;
+static int pid, {scalar};
 static void thread() {{
 {text}
 end_thread();
 }}
 extern "C" void solve(int problems, int cap, {arguments}) {{
   {taken}
-  most_changes = cap;
+  {scalar} = cap;
   for (pid = 0; pid < problems; ++pid) run_warp(thread, {str(backwards).lower()});
 }}
 """

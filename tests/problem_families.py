@@ -261,6 +261,19 @@ def inconsistent_rows(rng: np.random.Generator, count: int) -> QPs:
     return QPs(p.H, p.g, lower, upper, p.C, row_lower, row_upper, np.full_like(p.x, np.nan), p.unit)
 
 
+def opposite_rows(rng: np.random.Generator, count: int) -> QPs:
+    """Two rows pull at one variable from both sides; the others hold, and most variables stand in these alone."""
+    p = mixed(rng, count)
+    C, row_lower, row_upper = p.C.copy(), p.row_lower.copy(), p.row_upper.copy()
+    C[:, :2] = np.eye(C.shape[2])[0]
+    apart = p.unit[..., 0] * rng.uniform(0.1, 1.0, count)
+    row_lower[:, 0], row_upper[:, 0] = p.x[:, 0] + apart, np.inf
+    row_lower[:, 1], row_upper[:, 1] = -np.inf, p.x[:, 0] - apart
+    room = 0.1 * p.unit  # no variable is pinned: SciPy takes none
+    unknown = np.full_like(p.x, np.nan)
+    return QPs(p.H, p.g, p.lower - room, p.upper + room, C, row_lower, row_upper, unknown, p.unit)
+
+
 class LeastSquares(NamedTuple):
     """min 1/2 sum weight (A x - b)^2 + damping/2 |x|^2  over  lower <= x <= upper, batched."""
 

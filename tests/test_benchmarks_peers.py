@@ -96,7 +96,7 @@ def test_a_workload_survives_its_file(work):
 def test_urdfs_of_embedded_robots_are_those_robots(name):
     """All links, sites and the centre of mass by Pinocchio are where MuJoCo has those of the MJCF."""
     work = workload(name)
-    model = mujoco.MjModel.from_xml_path(str(ROOT / "osik_jax" / "robots" / f"{name}.xml"))
+    model = mujoco.MjModel.from_xml_path(str(ROOT / "osik_jax" / "robot" / "models" / f"{name}.xml"))
     data, theirs = mujoco.MjData(model), pinocchio_model(work.urdf, work.floating)
     pin_data, base = theirs.createData(), 7 if work.floating else 0
     moving = 1 if work.floating else 2  # Pinocchio leaves out what is fixed to the world

@@ -25,8 +25,8 @@ ORDER = ("elbow", "side", "hand", "posture")
 SCHEMES = {
     "weighted": osik.WeightedQP(damping=1e-4, curvature_damping=0.0),
     "null-space": osik.NullSpace(damping=1e-4, curvature_damping=0.0, potential_gain=0.0),
-    "saturated": osik.NullSpace(saturate=True, curvature_damping=0.0),
-    "reverse": osik.NullSpace(order="reverse", curvature_damping=0.0),
+    "saturated": osik.NullSpace(method="saturated", curvature_damping=0.0),
+    "reverse": osik.NullSpace(method="reverse", curvature_damping=0.0),
     "hierarchical": osik.HierarchicalQP(curvature_damping=0.0),
 }
 """The oracles have no curvature damping."""

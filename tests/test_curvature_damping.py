@@ -14,7 +14,7 @@ SCHEMES = {
     "weighted": osik.WeightedQP,
     "hierarchical": osik.HierarchicalQP,
     "null-space": osik.NullSpace,
-    "reverse": lambda **numbers: osik.NullSpace(order="reverse", **numbers),
+    "reverse": lambda **numbers: osik.NullSpace(method="reverse", **numbers),
 }
 
 
@@ -160,10 +160,10 @@ def test_derivatives_with_the_damping_on(scheme, arm):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", {**SCHEMES, "saturated": lambda **numbers: osik.NullSpace(saturate=True, **numbers)})
+@pytest.mark.parametrize("scheme", [*SCHEMES, "saturated"])
 def test_derivatives_where_little_room_is_left(scheme, arm):
     """On the way to a target out of reach, with a posture below: by target, gain, configuration and share."""
-    make = SCHEMES.get(scheme, lambda **numbers: osik.NullSpace(saturate=True, **numbers))
+    make = SCHEMES.get(scheme, lambda **numbers: osik.NullSpace(method="saturated", **numbers))
     q0, away = bent(arm), 1.5 * jnp.array([1.0, 0.3, 0.2]) / jnp.linalg.norm(jnp.array([1.0, 0.3, 0.2]))
     rotation = kinematics_at(arm, q0).frame_pose(arm, "hand")[1]
     hand = osik.FrameTask(arm, "hand", rows="position", target=(away, rotation), gain=10.0)

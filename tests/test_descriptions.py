@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
-from osik_jax._loading import urdf_of_description
 from osik_jax.cli import CommandError, read_robot
+from osik_jax.robot.loading import urdf_of_description
 
 MODULES = {
     "toy_mj_description": 'MJCF_PATH = os.path.join(PACKAGE_PATH, "toy.xml")',

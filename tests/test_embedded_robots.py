@@ -139,7 +139,7 @@ def test_contact_corners_go_round_each_sole_counter_clockwise(nao, nao_poses):
 
 @pytest.mark.parametrize(("name", "drift"), [("nao", 0.03), ("arm7", 0.02)])
 def test_position_actuators_hold_the_keyframe_in_simulation(name, drift):
-    text = (resources.files("osik_jax") / "robots" / f"{name}.xml").read_text(encoding="utf-8")
+    text = (resources.files("osik_jax") / "robot" / "models" / f"{name}.xml").read_text(encoding="utf-8")
     spec = mujoco.MjSpec.from_string(text)
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
     model = spec.compile()

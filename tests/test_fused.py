@@ -1,4 +1,4 @@
-"""The kernel's way into the search, without a GPU: what it proposes is taken only where it is right."""
+"""Candidates of the CUDA kernel, without a GPU: they are taken only where they are right."""
 
 import functools
 from typing import Any, NamedTuple
@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from recorded import QP_DAMPING, recorded_qps
 
-from osik_jax.solvers import Status, _backends, solve_least_squares_qp
-from osik_jax.solvers._lanes import with_the_rest
-from osik_jax.solvers.qp import _fused, _kernel, _search
+from osik_jax.execution import _backends
+from osik_jax.execution._lanes import with_the_rest
+from osik_jax.solvers import Status, solve_least_squares_qp
+from osik_jax.solvers.qp import _dispatch, _kernel, _search
 from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._kernel import Proposal, Shape
+from osik_jax.solvers.qp._kernel import Candidate, Shape
 from osik_jax.solvers.qp._problem import QP
 
 CAP = 1000
@@ -26,7 +27,7 @@ class Batch(NamedTuple):
     qp: QP
     guess: jax.Array
     tolerance: jax.Array
-    answers: _search.Found
+    answers: _search.SearchResult
 
 
 @pytest.fixture(scope="module")
@@ -49,25 +50,25 @@ def batch() -> Batch:
     return Batch(qp, guess, tolerance, answers)
 
 
-def proposal_of(found: _search.Found) -> Proposal:
+def candidate_of(found: _search.SearchResult) -> Candidate:
     yes = jnp.ones_like(found.iterations)
-    return Proposal(found.x, found.row_multipliers, found.active, yes, yes, yes)
+    return Candidate(found.x, found.row_multipliers, found.active, yes, yes, yes)
 
 
 @functools.partial(jax.jit, static_argnames="smallest")
-def searched_from(proposal: Proposal, *given: Any, smallest: int) -> _search.Found:
-    """One program for all proposals, and another where the blocks are of another size."""
-    assert smallest == _fused._SMALLEST
-    return _fused.proposed_and_searched(*given, propose=lambda *_: proposal, max_iterations=CAP)
+def searched_from(candidate: Candidate, *given: Any, smallest: int) -> _search.SearchResult:
+    """One program for all candidates, and another where the blocks are of another size."""
+    assert smallest == _dispatch._MIN_BLOCK
+    return _dispatch.warp_candidates(lambda *_: candidate, CAP).answers(*given)
 
 
-def completed(batch: Batch, proposal: Proposal) -> tuple[_search.Found, np.ndarray]:
-    """The end, and the lanes in which the proposal was taken; in NumPy."""
-    end, p = jax.device_get((searched_from(proposal, *batch[:3], smallest=_fused._SMALLEST), proposal))
+def completed(batch: Batch, candidate: Candidate) -> tuple[_search.SearchResult, np.ndarray]:
+    """The end, and the lanes in which the candidate was taken; in NumPy."""
+    end, p = jax.device_get((searched_from(candidate, *batch[:3], smallest=_dispatch._MIN_BLOCK), candidate))
     return end, np.all(end.x == p.x, 1) & (end.factorizations == p.factorizations)
 
 
-def assert_right(batch: Batch, end: _search.Found) -> None:
+def assert_right(batch: Batch, end: _search.SearchResult) -> None:
     """In the measure of the precision contract: rows of the cost, as a share of the largest that is asked for."""
     cost = batch.qp.cost
     assert isinstance(cost, LeastSquares) and end.optimal.all()
@@ -75,40 +76,40 @@ def assert_right(batch: Batch, end: _search.Found) -> None:
     assert (np.abs(off).max(1) / np.abs(np.asarray(cost.target)).max(1)).max() < 1e-5
 
 
-def test_right_proposals_are_taken(batch):
-    end, taken = completed(batch, proposal_of(batch.answers))
+def test_right_candidates_are_taken(batch):
+    end, taken = completed(batch, candidate_of(batch.answers))
     assert taken.all() and (end.factorizations == 1).all()
     np.testing.assert_array_equal(end.x, batch.answers.x)
     np.testing.assert_array_equal(end.active, batch.answers.active)
     np.testing.assert_array_equal(end.row_multipliers, batch.answers.row_multipliers)
 
 
-def unbounded_minimisers(batch: Batch) -> Proposal:
+def unbounded_minimisers(batch: Batch) -> Candidate:
     """Of the cost alone: stationary, but outside the box."""
     x = jax.vmap(lambda c: jnp.linalg.solve(c.hessian(), -c.gradient(jnp.zeros_like(c.damping))))(batch.qp.cost)
-    return proposal_of(batch.answers)._replace(
+    return candidate_of(batch.answers)._replace(
         x=x, active=jnp.zeros_like(batch.guess), row_multipliers=jnp.zeros_like(batch.answers.row_multipliers)
     )
 
 
-def held_too_much(batch: Batch) -> Proposal:
-    """The minimiser with one more variable held at its bound: everything is right but the sign of a multiplier."""
+def active_too_much(batch: Batch) -> Candidate:
+    """The minimiser with one more variable active at its bound: everything is right but the sign of a multiplier."""
     qp, n = batch.qp, batch.answers.x.shape[1]
     boxed = jnp.isfinite(qp.lower[:, :n]) & (batch.answers.active[:, :n] == 0)
     at = jnp.argmax(jnp.where(boxed, batch.answers.x - qp.lower[:, :n], -1.0), 1)
     active = batch.answers.active.at[jnp.arange(len(at)), at].set(-1)
     factor = jax.vmap(_search.factorize)(qp, jax.vmap(lambda c: c.hessian())(qp.cost), active)
-    x, y = _search.minimize_on(qp, factor, active)
-    return proposal_of(batch.answers)._replace(x=x, row_multipliers=y, active=active)
+    x, y = _search.solve_on_active_set(qp, factor, active)
+    return candidate_of(batch.answers)._replace(x=x, row_multipliers=y, active=active)
 
 
-def changed(batch: Batch, **how: Any) -> Proposal:
-    right = proposal_of(batch.answers)
+def changed(batch: Batch, **how: Any) -> Candidate:
+    right = candidate_of(batch.answers)
     return right._replace(**{name: change(getattr(right, name)) for name, change in how.items()})
 
 
 WRONG = {
-    "not settled": lambda b: changed(b, settled=jnp.zeros_like),
+    "not converged": lambda b: changed(b, converged=jnp.zeros_like),
     "NaN": lambda b: changed(b, x=lambda x: x.at[:, 3].set(jnp.nan)),
     "NaN multipliers": lambda b: changed(b, row_multipliers=lambda y: y * jnp.nan),
     "infinite": lambda b: changed(b, x=lambda x: x.at[:, 0].set(jnp.inf)),
@@ -119,34 +120,34 @@ WRONG = {
     "all equalities": lambda b: changed(b, active=lambda a: jnp.full_like(a, 2)),
     "unknown labels": lambda b: changed(b, active=lambda a: jnp.where(a == 0, 77, a)),
     "unbounded": unbounded_minimisers,
-    "held too much": held_too_much,
+    "active too much": active_too_much,
 }
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_proposals_are_not(batch, wrong):
-    proposal = jax.jit(WRONG[wrong])(batch)
-    end, taken = completed(batch, proposal)
+def test_wrong_candidates_are_not(batch, wrong):
+    candidate = jax.jit(WRONG[wrong])(batch)
+    end, taken = completed(batch, candidate)
     assert not taken.any()
     assert_right(batch, end)
 
 
 def test_what_is_left_goes_through_in_blocks(batch, monkeypatch):
-    """Wrong in 25 of 40 lanes, 4 lanes a block; the others stay as proposed."""
-    monkeypatch.setattr(_fused, "_SMALLEST", 4)
+    """Wrong in 25 of 40 lanes, 4 lanes a block; the others stay as the kernel has them."""
+    monkeypatch.setattr(_dispatch, "_MIN_BLOCK", 4)
     lanes = jnp.arange(len(batch.guess))
     spoiled = (lanes * 7) % 8 < 5
-    right = proposal_of(batch.answers)
-    proposal = right._replace(x=jnp.where(spoiled[:, None], 0.0, right.x), settled=jnp.where(spoiled, 0, 1))
-    end, taken = completed(batch, proposal)
+    right = candidate_of(batch.answers)
+    candidate = right._replace(x=jnp.where(spoiled[:, None], 0.0, right.x), converged=jnp.where(spoiled, 0, 1))
+    end, taken = completed(batch, candidate)
     np.testing.assert_array_equal(taken, ~spoiled)
     assert_right(batch, end)
     assert (end.factorizations[spoiled] == 2).all()  # the kernel's, and one from the active set that it left
 
 
 def test_too_many_changes_are_not_taken(batch):
-    proposal = proposal_of(batch.answers)._replace(iterations=jnp.full_like(batch.answers.iterations, CAP + 1))
-    end, taken = completed(batch, proposal)
+    candidate = candidate_of(batch.answers)._replace(iterations=jnp.full_like(batch.answers.iterations, CAP + 1))
+    end, taken = completed(batch, candidate)
     assert not taken.any() and (end.iterations <= CAP).all()
 
 
@@ -167,14 +168,14 @@ def beside_a_gpu(monkeypatch):
     """JAX with a CUDA device and Warp installed, as far as the choice can see; returns what the kernel is asked."""
     asked = []
 
-    def propose(qp, guess, tolerance, max_iterations):
+    def solve(qp, guess, tolerance, max_iterations):
         asked.append(qp.cost.matrix.shape[1:])
         nothing = jnp.zeros(len(guess), jnp.int32)
-        return Proposal(jnp.full_like(qp.cost.damping, jnp.nan), jnp.zeros_like(qp.compliance), guess, *[nothing] * 3)
+        return Candidate(jnp.full_like(qp.cost.damping, jnp.nan), jnp.zeros_like(qp.compliance), guess, *[nothing] * 3)
 
     monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
     monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
-    monkeypatch.setattr(_kernel, "propose", propose)
+    monkeypatch.setattr(_kernel, "solve", solve)
     jax.clear_caches()
     yield asked
     jax.clear_caches()

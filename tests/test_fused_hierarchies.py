@@ -1,6 +1,5 @@
 """The hierarchy's kernel beside XLA, without a GPU: what it answers is taken only where it passes the check."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -9,20 +8,21 @@ import numpy as np
 import pytest
 from hierarchy_families import inequality_levels
 
-from osik_jax.solvers import Level, Tolerances, _backends, solve_hqp
-from osik_jax.solvers._damping import one_each
-from osik_jax.solvers.hqp import _cascade, _fused, _kernel
+from osik_jax.execution import _backends
+from osik_jax.solvers import Level, Tolerances, solve_hqp
+from osik_jax.solvers._damping import per_level
+from osik_jax.solvers.hqp import _cascade, _dispatch, _kernel
 from osik_jax.solvers.hqp._kernel import Shape
-from osik_jax.solvers.hqp._stack import Layout, Stack, stacked
+from osik_jax.solvers.hqp._padding import Layout, PaddedHierarchy, pad_hierarchy
 
 COUNT, CAP = 12, 200
 
 
 class Batch(NamedTuple):
     layout: Layout
-    stack: Stack
+    hierarchy: PaddedHierarchy
     tolerances: Tolerances
-    answers: _cascade.Descent
+    answers: _cascade.CascadeResult
 
 
 @pytest.fixture(scope="module")
@@ -30,26 +30,26 @@ def batch() -> Batch:
     p = inequality_levels(np.random.default_rng(2), COUNT)
     layouts = []
 
-    def stack_of(levels, lower, upper):
+    def padded(levels, lower, upper):
         given = [Level(*level) for level in levels]
-        none = one_each(0.0, len(given), len(lower), lower.dtype)
-        layout, stack = stacked(given, [level.equal for level in given], lower, upper, lower >= upper, none)
+        none = per_level(0.0, len(given), len(lower), lower.dtype)
+        layout, hierarchy = pad_hierarchy(given, [level.equal for level in given], lower, upper, lower >= upper, none)
         layouts.append(layout)
-        return stack
+        return hierarchy
 
     last = (np.broadcast_to(np.eye(10), (COUNT, 10, 10)), np.zeros((COUNT, 10)))
-    stack = jax.vmap(stack_of)([*map(tuple, p.levels), last], jnp.asarray(p.lower), jnp.asarray(p.upper))
+    hierarchy = jax.vmap(padded)([*map(tuple, p.levels), last], jnp.asarray(p.lower), jnp.asarray(p.upper))
     tolerances = jax.tree.map(lambda a: jnp.full(COUNT, a), Tolerances())
     layout = layouts[0]
-    answers = jax.jit(lambda s, t: _cascade.descend_all(layout, CAP, s, t, None))(stack, tolerances)
-    assert answers.done.all() and (answers.box != 0).any(1).all()
-    return Batch(layout, stack, tolerances, answers)
+    answers = jax.jit(lambda s, t: _cascade.solve_cascade(layout, CAP, s, t, None))(hierarchy, tolerances)
+    assert answers.done.all() and (answers.active_bounds != 0).any(1).all()
+    return Batch(layout, hierarchy, tolerances, answers)
 
 
 def completed(batch, answer):
     """The end, and the lanes in which the kernel's answer was taken."""
     marked = answer._replace(factorizations=jnp.full_like(answer.factorizations, 1000))
-    check = partial(_fused.descended_and_checked, batch.layout, CAP, lambda *_: marked)
+    check = _dispatch.kernel_candidates(batch.layout, CAP, lambda *_: marked).answers
     end = jax.jit(lambda s, t: check(s, t, None))(*batch[1:3])
     return end, end.factorizations == 1000
 
@@ -60,14 +60,16 @@ def some(count=COUNT):
 
 def beside_its_box(batch):
     n = batch.answers.x.shape[1]
-    room = jnp.where(jnp.isfinite(batch.stack.hard_upper[:, :n]), batch.stack.hard_upper[:, :n], batch.answers.x)
+    room = jnp.where(
+        jnp.isfinite(batch.hierarchy.hard_upper[:, :n]), batch.hierarchy.hard_upper[:, :n], batch.answers.x
+    )
     return batch.answers._replace(x=jnp.where(some()[:, None], room + 1e-6, batch.answers.x))
 
 
 def worse_above(batch):
     """Inside the box, and a level does not keep what it had reached."""
     return batch.answers._replace(
-        reached=jnp.where(some()[:, None], 0.9 * batch.answers.reached - 1e-3, batch.answers.reached)
+        slack_norms=jnp.where(some()[:, None], 0.9 * batch.answers.slack_norms - 1e-3, batch.answers.slack_norms)
     )
 
 
@@ -103,7 +105,7 @@ def test_right_answers_are_taken(batch):
 @pytest.mark.parametrize("wrong", WRONG)
 def test_wrong_answers_are_not(batch, wrong, monkeypatch):
     """They are wrong in every third lane; blocks of 3, so that the last one is not full."""
-    monkeypatch.setattr(_fused, "_BLOCK", 3)
+    monkeypatch.setattr(_dispatch, "_BLOCK", 3)
     end, taken = completed(batch, WRONG[wrong](batch))
     np.testing.assert_array_equal(taken, ~some())
     assert end.done.all()
@@ -113,15 +115,15 @@ def test_wrong_answers_are_not(batch, wrong, monkeypatch):
 def test_when_the_kernel_is_asked(monkeypatch):
     asked = []
 
-    def solve(layout, stack, tolerances, warm, cap):
+    def solve(layout, hierarchy, tolerances, warm_start, max_iterations):
         asked.append(Shape.of(layout))
-        return _cascade.descend_all(layout, cap, stack, tolerances, warm)
+        return _cascade.solve_cascade(layout, max_iterations, hierarchy, tolerances, warm_start)
 
     monkeypatch.setattr(_kernel, "solve", solve)
     monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
 
     def trace(n=3, backend="auto"):
-        _fused.descender.cache_clear()
+        _dispatch.hierarchy_solver.cache_clear()
         jax.clear_caches()
         levels = [Level(np.ones((1, n)), [-1.0], [1.0]), Level(np.ones((2, n)), [1.0, 2.0])]
         jax.jit(lambda low: solve_hqp(levels, low, -low, backend=backend).x).lower(-np.ones(n))
@@ -137,7 +139,7 @@ def test_when_the_kernel_is_asked(monkeypatch):
     with pytest.raises(ValueError, match="backend='warp' has no kernel"):
         trace(130, backend="warp")
     assert len(asked) == count
-    _fused.descender.cache_clear()
+    _dispatch.hierarchy_solver.cache_clear()
     jax.clear_caches()
 
 

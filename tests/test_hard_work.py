@@ -8,8 +8,9 @@ import pytest
 import osik_jax as osik
 from benchmarks.hard._reach import farthest
 from benchmarks.robots import workload
+from osik_jax.numerics._constants import COST_FRACTION, MIN_RADIUS
 from osik_jax.solvers import Damping, Level, Status, solve_hqp
-from osik_jax.solvers._damping import ROOM, SPENT, effective, room_below
+from osik_jax.solvers._damping import level_damping, narrow_box
 from osik_jax.viewer import mujoco_frame_pose, mujoco_poses
 
 DT, STEPS = 0.005, 800
@@ -22,12 +23,12 @@ SCHEMES = {
     "weighted": osik.WeightedQP,
     "hierarchy": osik.HierarchicalQP,
     "null space": osik.NullSpace,
-    "saturated null space": lambda: osik.NullSpace(saturate=True),
+    "saturated null space": lambda: osik.NullSpace(method="saturated"),
 }
 QUICK_METHODS = {
     "null space": osik.NullSpace,
     "damped null space": lambda: osik.NullSpace(damping=1e-4),
-    "reverse order": lambda: osik.NullSpace(order="reverse"),
+    "reverse order": lambda: osik.NullSpace(method="reverse"),
 }
 METHODS = SCHEMES | QUICK_METHODS
 
@@ -189,7 +190,7 @@ class TestDampingInSinglePrecision:
             damping = Damping(jnp.zeros((), dtype), unmet, jnp.linalg.norm(goal))
             everywhere = jnp.full(self.N, jnp.inf, dtype)
             eye = jnp.eye(self.N, dtype=dtype)
-            return effective(damping, Level(rows, goal), jnp.zeros(self.N, dtype), eye, -everywhere, everywhere)
+            return level_damping(damping, Level(rows, goal), jnp.zeros(self.N, dtype), eye, -everywhere, everywhere)
 
         rows, goal, unmet = self.problems()
         return np.asarray(found(*(jnp.asarray(a, dtype) for a in (rows, goal, unmet)))) / unmet
@@ -232,7 +233,7 @@ class TestRoomBelow:
 
     def room(self, x, *, unmet=0.3, bends=BENDS):
         damping = Damping(0.0, unmet, 5.0, bends)
-        low, high, bent = room_below(damping, self.LEVEL, jnp.zeros(3), jnp.asarray(x), -self.FREE, self.FREE)
+        low, high, bent = narrow_box(damping, self.LEVEL, jnp.zeros(3), jnp.asarray(x), -self.FREE, self.FREE)
         np.testing.assert_allclose(bent, bends / np.linalg.norm(self.LEVEL.matrix))
         np.testing.assert_allclose(high - x, x - low, atol=1e-12)
         return np.asarray(high - x)
@@ -242,12 +243,12 @@ class TestRoomBelow:
         x = jnp.array([1.0, 0.4, 0.5])
         left = np.linalg.norm(self.LEVEL.distance(x))
         room = self.room(x)
-        cost = 0.5 * left * np.sum(np.asarray(self.BENDS)[:2] * (room[:2] - ROOM) ** 2)
-        assert cost == pytest.approx(SPENT * 0.5 * (5.0**2 - left**2), rel=1e-12)
+        cost = 0.5 * left * np.sum(np.asarray(self.BENDS)[:2] * (room[:2] - MIN_RADIUS) ** 2)
+        assert cost == pytest.approx(COST_FRACTION * 0.5 * (5.0**2 - left**2), rel=1e-12)
         assert room[2] == np.inf
 
     def test_without_progress_next_to_nothing_is_left(self):
-        np.testing.assert_allclose(self.room(jnp.zeros(3)), [ROOM, ROOM, np.inf])
+        np.testing.assert_allclose(self.room(jnp.zeros(3)), [MIN_RADIUS, MIN_RADIUS, np.inf])
 
     def test_a_level_that_is_met_narrows_nothing(self):
         assert np.isinf(self.room(jnp.array([3.0, 0.0, 2.0]))).all()
@@ -259,5 +260,7 @@ class TestRoomBelow:
         wanted = Level(jnp.eye(2), jnp.array([1.0, 1.0]))
         damping = Damping(0.0, 1e-6, 2.5, jnp.array([0.0, 0.5])), 0.0
         found = solve_hqp([first, wanted], -self.FREE[:2], self.FREE[:2], damping=damping)
-        np.testing.assert_allclose(found.x, [1.5, np.sqrt(SPENT * (2.5**2 - 2.0**2) / (2.0 * 0.5)) + ROOM], rtol=1e-5)
+        np.testing.assert_allclose(
+            found.x, [1.5, np.sqrt(COST_FRACTION * (2.5**2 - 2.0**2) / (2.0 * 0.5)) + MIN_RADIUS], rtol=1e-5
+        )
         assert found.status == Status.SOLVED and (np.asarray(found.active) == 0).all()

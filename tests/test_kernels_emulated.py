@@ -11,10 +11,11 @@ from hierarchy_families import SMALL
 from lexicographic import certificate
 from recorded import QP_DAMPING, recorded_hierarchies, recorded_qps
 
-from osik_jax.solvers import Level, Status, _backends, solve_hqp, solve_least_squares_qp
-from osik_jax.solvers.hqp import _fused as hqp_fused
+from osik_jax.execution import _backends
+from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp
+from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
 from osik_jax.solvers.hqp import _kernel as hqp_kernel
-from osik_jax.solvers.qp import _fused as qp_fused
+from osik_jax.solvers.qp import _dispatch as qp_dispatch
 from osik_jax.solvers.qp import _kernel as qp_kernel
 
 pytestmark = [needs_compiler, pytest.mark.slow]
@@ -50,14 +51,14 @@ def on_emulated_gpu(request, tmp_path_factory):
         patch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
         for module in (hqp_kernel, qp_kernel):
             patch.setattr(module, "_kernel", fake(module))
-        for module in (hqp_fused, qp_fused):
+        for module in (hqp_dispatch, qp_dispatch):
             patch.setattr(module, "with_the_rest", nothing_for_the_rest)
-        hqp_fused.descender.cache_clear()
-        qp_fused.searcher.cache_clear()
+        hqp_dispatch.hierarchy_solver.cache_clear()
+        qp_dispatch.qp_solver.cache_clear()
         jax.clear_caches()
         yield
-    hqp_fused.descender.cache_clear()
-    qp_fused.searcher.cache_clear()
+    hqp_dispatch.hierarchy_solver.cache_clear()
+    qp_dispatch.qp_solver.cache_clear()
     jax.clear_caches()
 
 

@@ -219,7 +219,7 @@ class TestGain:
 
         arm = osik.load_robot("arm7")
         own = np.asarray(arm.q0) + rng.uniform(-3.0, 3.0, 7)
-        pinocchio = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robots" / "arm7.xml"))
+        pinocchio = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robot" / "models" / "arm7.xml"))
         limit = pink.limits.ConfigurationLimit(pinocchio, config_limit_gain=gain)
         configuration = pink.Configuration(pinocchio, pinocchio.createData(), own)
         bound = limit.compute_qp_inequalities(configuration, dt)[1] / dt

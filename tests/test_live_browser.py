@@ -100,21 +100,34 @@ def pull(view: LiveView, page: Page, grip: np.ndarray, axis: np.ndarray, by: flo
     """Moves what is at a point along an axis by a length [m]."""
     start, end = pixel(view, grip), pixel(view, grip + by * axis)
     page.mouse.move(*start)
-    page.wait_for_timeout(500)
+    let_it_draw(page, 500)
     page.mouse.down()
     for part in np.linspace(0.0, 1.0, 9)[1:]:
         page.mouse.move(*(start[k] + part * (end[k] - start[k]) for k in range(2)))
-        page.wait_for_timeout(100)
+        let_it_draw(page, 100)
     page.mouse.up()
-    page.wait_for_timeout(500)
+    let_it_draw(page, 500)
+
+
+def let_it_draw(page: Page, milliseconds: float) -> None:
+    """Waits so long, and until the page has drawn a few pictures, which takes longer on a busy machine."""
+    page.wait_for_timeout(milliseconds)
+    for _ in range(3):
+        page.evaluate("() => new Promise((drawn) => requestAnimationFrame(drawn))")
+
+
+def enter(view: LiveView, page: Page) -> None:
+    """Opens the view in the page, unless it is open there."""
+    if page.url.rstrip("/") != view.url.rstrip("/"):
+        page.goto(view.url)
+        assert until(lambda: len(view._server.get_clients()) == 1)
+    page.get_by_text("running").first.wait_for()
+    let_it_draw(page, 3000)
 
 
 def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, tmp_path: Path) -> None:
     page, ahead, up = visit.page, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    page.goto(view.url)
-    assert until(lambda: len(view._server.get_clients()) == 1)
-    page.get_by_text("running").first.wait_for()
-    page.wait_for_timeout(3000)
+    enter(view, page)
     view.loop.record()
     start = target(view)
 
@@ -151,6 +164,7 @@ def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, t
 
 def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit, tmp_path: Path) -> None:
     page, left = visit.page, np.array([0.0, 1.0, 0.0])
+    enter(view, page)
     view._desk.take_scheme("Weighted QP")
     page.get_by_role("tab", name="Obstacles").click()
     page.get_by_text("ball", exact=True).click()
@@ -159,7 +173,7 @@ def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit,
     before = target(view)
     ball = before + np.array([0.0, -0.15, 0.0])
     view._desk.move_obstacle("ball 1", position=ball, size=np.array([0.04, 0.0, 0.0]))
-    page.wait_for_timeout(1500)
+    let_it_draw(page, 1500)
     handle = view._obstacles._shown["ball 1"].handle
     pull(view, page, ball + 0.75 * handle.scale * left, left, 0.14)
     moved = view._desk.obstacles["ball 1"].position
@@ -179,14 +193,14 @@ def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit,
 
 def test_a_visitor_who_leaves_in_the_middle_of_a_drag_while_another_stays(view: LiveView, visit: Visit) -> None:
     page = visit.page
-    assert until(lambda: len(view._server.get_clients()) == 1)
+    enter(view, page)
     other = page.context.new_page()
     other.goto(view.url)
     assert until(lambda: len(view._server.get_clients()) == 2)
     page.bring_to_front()
     grip = target(view) + 0.75 * view._gizmos._scale * np.array([0.0, 0.0, 1.0])
     page.mouse.move(*pixel(view, grip))
-    page.wait_for_timeout(500)
+    let_it_draw(page, 500)
     page.mouse.down()
     page.mouse.move(*pixel(view, grip + np.array([0.0, 0.0, 0.3])), steps=4)
     assert until(lambda: bool(view._gizmos.held))

@@ -17,6 +17,7 @@ from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax import cli, demo
+from osik_jax.cli._demo import read_demo_robot
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
@@ -115,9 +116,9 @@ class TestBase:
         assert "floating base" in capsys.readouterr().out
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", osik.OsikWarning)
-            assert not cli._read_demo_robot(cli.Demo(robot=arm), arm).floating_base
-        assert cli._read_demo_robot(cli.Demo(robot=arm, support=("tool",)), arm).floating_base
-        assert cli._read_demo_robot(cli.Demo(robot=biped_file), biped_file).floating_base
+            assert not read_demo_robot(cli.Demo(robot=arm), arm).floating_base
+        assert read_demo_robot(cli.Demo(robot=arm, support=("tool",)), arm).floating_base
+        assert read_demo_robot(cli.Demo(robot=biped_file), biped_file).floating_base
 
 
 class TestRangesOfOneValue:

@@ -192,8 +192,19 @@ def test_files_that_are_not_there_and_options_that_do_not_go_with_them(tmp_path)
         load_motion(tmp_path / "none.npz")
     with pytest.raises(ValueError, match=r"none of \.bvh, \.npz and \.csv"):
         load_motion(tmp_path / "clip.fbx")
+    with pytest.raises(FileNotFoundError, match="no such file: .*clips"):
+        load_motion(tmp_path / "clips")
     with pytest.raises(ValueError, match="go with BVH files"):
         load_motion(tmp_path / "clip.npz", unit="cm")
+
+
+def test_a_compressed_file_with_a_wrong_byte_is_told(tmp_path):
+    np.savez_compressed(tmp_path / "clip.npz", positions=np.random.default_rng(0).normal(size=(50, 3)))
+    content = (tmp_path / "clip.npz").read_bytes()
+    for at in range(60, len(content) - 100, 40):
+        (tmp_path / "clip.npz").write_bytes(content[:at] + bytes([content[at] ^ 255]) + content[at + 1 :])
+        with pytest.raises(ValueError, match="cannot be read as an .npz of plain arrays|has no fps, joint_names"):
+            load_motion(tmp_path / "clip.npz")
 
 
 def test_another_rate_goes_through_the_frames():

@@ -14,8 +14,9 @@ from lexicographic import certificate
 from recorded import recorded_hierarchies
 
 from osik_jax import HierarchicalQP
-from osik_jax.solvers import Damping, Level, Status, _backends, solve_hqp
-from osik_jax.solvers.hqp import _fused, _numba
+from osik_jax.execution import _backends
+from osik_jax.solvers import Damping, Level, Status, solve_hqp
+from osik_jax.solvers.hqp import _dispatch, _numba
 
 pytest.importorskip("numba")
 COUNT = 24
@@ -54,11 +55,11 @@ def nothing_is_searched(monkeypatch):
 
         return jax.tree.map(lose, end)
 
-    monkeypatch.setattr(_fused, "with_the_rest", spoiled)
-    _fused.descender.cache_clear()
+    monkeypatch.setattr(_dispatch, "with_the_rest", spoiled)
+    _dispatch.hierarchy_solver.cache_clear()
     jax.clear_caches()
     yield
-    _fused.descender.cache_clear()
+    _dispatch.hierarchy_solver.cache_clear()
     jax.clear_caches()
 
 
@@ -119,10 +120,10 @@ def test_what_the_kernel_leaves_over_is_searched(families, monkeypatch):
         return end._replace(x=jnp.where(jnp.arange(len(end.x))[:, None] % 3 == 0, jnp.nan, end.x))
 
     monkeypatch.setattr(_numba, "solve", wrong)
-    _fused.descender.cache_clear()
+    _dispatch.hierarchy_solver.cache_clear()
     jax.clear_caches()
     s = solved(*given(p))
-    _fused.descender.cache_clear()
+    _dispatch.hierarchy_solver.cache_clear()
     jax.clear_caches()
     np.testing.assert_array_equal(s.status, Status.SOLVED)
     np.testing.assert_allclose(s.x, right.x, atol=1e-9)
@@ -177,7 +178,7 @@ def test_the_second_process_does_not_compile():
     code = """
 import sys, osik_jax
 assert "numba" not in sys.modules
-from osik_jax.solvers.kernels.numba import _target
+from osik_jax.kernels.numba import _target
 _target.register("_hierarchy")
 print(_target._registered["osik_jax_hierarchy"].cache_hits)
 """
@@ -189,7 +190,7 @@ def test_rows_in_blocks_are_those_of_numpy():
     """Of every length and from every start; numbers beside the range are neither used nor changed."""
     import numba
 
-    from osik_jax.solvers.kernels.numba import _vectors
+    from osik_jax.kernels.numba import _vectors
 
     @numba.njit
     def all_three(a, b, c, d, start, stop):

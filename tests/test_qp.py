@@ -1,5 +1,6 @@
 """The array-level QP against recorded daqp answers, quadprog, daqp and KKT conditions recomputed in NumPy."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,6 +11,9 @@ import quadprog
 from recorded import QP_DAMPING, recorded_qps
 
 from osik_jax.solvers import Status, raise_if_failed, solve_least_squares_qp, solve_qp
+from osik_jax.solvers.qp._cost import LeastSquares
+from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp._solve import _with_placeholder
 
 batched_qp = jax.jit(jax.vmap(solve_qp))
 batched_rows = jax.jit(jax.vmap(lambda *a: solve_qp(*a)))
@@ -215,3 +219,37 @@ def test_damping_towards_a_centre(rng):
     np.testing.assert_allclose(x, x_of_rows, rtol=0, atol=1e-10)
     for own, other in zip(ours, expected, strict=True):
         np.testing.assert_allclose(own, other, rtol=0, atol=1e-8)
+
+
+BAD_NUMBERS = [
+    *[("matrix", value, False) for value in (np.nan, np.inf, -np.inf)],
+    *[("weight", value, False) for value in (np.nan, np.inf, -1e-300)],
+    *[("weight", 0.0, True), ("damping", -1.0, False), ("center", np.inf, False), ("target", np.nan, False)],
+    *[("rows", np.nan, False), ("compliance", np.inf, False), ("compliance", -1.0, True)],
+    *[("lower", np.nan, False), ("lower", np.inf, False), ("lower", -np.inf, True)],
+    *[("upper", -np.inf, False), ("upper", np.inf, True), ("matrix", 1e300, True)],
+]
+
+
+@pytest.mark.parametrize("name, value, fine", BAD_NUMBERS)
+def test_numbers_are_looked_at_alike_together_and_apart(monkeypatch, name, value, fine):
+    """As one array, as on CPUs, and each by itself: what cannot be computed with, and what stands in its place."""
+    rng = np.random.default_rng(0)
+    cost = LeastSquares(*(jnp.asarray(a) for a in (rng.normal(size=(3, 4)), *rng.random((2, 3)), *rng.random((2, 4)))))
+    low = jnp.array([-jnp.inf, -1.0, 0.0, -2.0, -jnp.inf, 0.5])
+    high = jnp.array([jnp.inf, 1.0, 0.0, jnp.inf, 2.0, 0.5])
+    qp = QP(cost, jnp.ones((2, 4)), jnp.ones(2), low, high, known_equalities=(False,) * 5 + (True,))
+    if hasattr(cost, name):
+        qp = replace(qp, cost=replace(cost, **{name: getattr(cost, name).at[0].set(value)}))
+    else:
+        qp = replace(qp, **{name: getattr(qp, name).at[0].set(value)})
+    together, is_valid = _with_placeholder(qp)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    apart, is_valid_apart = _with_placeholder(qp)
+    assert bool(is_valid) == bool(is_valid_apart) == fine
+    np.testing.assert_array_equal(together.packed, np.concatenate([np.ravel(a) for a in jax.tree.leaves(apart)]))
+    jax.tree.map(np.testing.assert_array_equal, replace(together, packed=None), apart)
+    assert apart.packed is None
+    if fine:
+        jax.tree.map(np.testing.assert_array_equal, apart, qp)
+    assert all(np.isfinite(a).all() for a in (*jax.tree.leaves(apart.cost), apart.rows, apart.compliance))

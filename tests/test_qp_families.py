@@ -13,6 +13,7 @@ from problem_families import (
     inconsistent_rows,
     mixed,
     nearly_dependent_rows,
+    opposite_rows,
     redundant,
     whole_body,
 )
@@ -76,7 +77,7 @@ def test_daqp_and_quadprog_agree(family, rng):
     assert claims >= 40
 
 
-@pytest.mark.parametrize("family", [inconsistent_equalities, inconsistent_rows])
+@pytest.mark.parametrize("family", [inconsistent_equalities, inconsistent_rows, opposite_rows])
 def test_contradictions_get_the_least_violating_answer(family, rng):
     """|distance of C x to its intervals| first, to nine digits; then the cost among all x as near as that, to five."""
     p = family(rng, COUNT)

@@ -9,9 +9,9 @@ from problem_families import WHOLE_BODY, WHOLE_BODY_DAMPING, whole_body
 from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp import _search
 from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._factor import factorize, minimize_on
+from osik_jax.solvers.qp._kkt_solve import factorize, solve_on_active_set
 from osik_jax.solvers.qp._problem import QP
-from osik_jax.solvers.qp._through_rows import has_few_rows, minimize_through_rows
+from osik_jax.solvers.qp._row_space import has_few_rows, solve_in_row_space
 
 COUNT = 400
 N, TASKS = WHOLE_BODY
@@ -67,7 +67,7 @@ def test_the_search_is_for_the_other_lanes(planted, monkeypatch):
     searched = solve(*data, np.zeros((COUNT, N), int))
     wrong = np.arange(COUNT) % 5 == 2
     guess = np.where(wrong[:, None], 0, searched.active)
-    monkeypatch.setattr(_search, "_search", lambda given, start, **_: start)
+    monkeypatch.setattr(_search, "_search_rounds", lambda given, start, **_: start)
 
     def lane(A, b, weight, lower, upper, damping, center, warm_start):  # a cap of its own, so compiled anew
         more = dict(damping=damping, center=center, warm_start=warm_start, max_iterations=777, backend="jax")
@@ -91,7 +91,7 @@ def test_batch_equals_one_by_one(planted, cold):
 @jax.jit
 def through_the_hessian(qp, active):
     factor = jax.vmap(lambda qp, active: factorize(qp, qp.cost.hessian(), active))(qp, active)
-    return minimize_on(qp, factor, active)
+    return solve_on_active_set(qp, factor, active)
 
 
 def extended(data, active, i):
@@ -118,7 +118,7 @@ def test_as_exact_as_through_the_hessian_or_said_not_to_be(planted, cold, heavie
     data = list(planted[1])
     data[2] = heavier * data[2]
     qp = problems(data)
-    x, _, sound = (np.asarray(a) for a in jax.jit(minimize_through_rows)(qp, cold.active))
+    x, _, sound = (np.asarray(a) for a in jax.jit(solve_in_row_space)(qp, cold.active))
     beside = np.asarray(through_the_hessian(qp, cold.active)[0])
     assert sound.all() if heavier <= 1e-2 else sound.mean() < (1.0 if heavier <= 1.0 else 0.5)
     for i in range(0, COUNT, 10):
@@ -138,7 +138,7 @@ def test_active_rows(planted, cold, hard):
     soft = problems(data)
     qp = problems(data, rows, None if hard else 1.0 / data[2][:, rows])
     active = jnp.concatenate([cold.active, jnp.full((COUNT, 4), 2)], 1)
-    x, y, sound = (np.asarray(a) for a in jax.jit(minimize_through_rows)(qp, active))
+    x, y, sound = (np.asarray(a) for a in jax.jit(solve_in_row_space)(qp, active))
     assert sound.all()
     missed = (data[1] - np.einsum("bmn,bn->bm", data[0], x))[:, rows]
     if hard:
@@ -157,7 +157,7 @@ def test_rows_that_depend_on_each_other_are_left_to_the_hessian(planted, cold):
     rows, compliance = (jnp.concatenate([a, a[:, :1]], 1) for a in (qp.rows, qp.compliance))
     twice = QP(qp.cost, rows, compliance, lower, upper)
     active = jnp.concatenate([cold.active, jnp.full((COUNT, 5), 2)], 1)
-    assert not np.asarray(jax.jit(minimize_through_rows)(twice, active)[2]).any()
+    assert not np.asarray(jax.jit(solve_in_row_space)(twice, active)[2]).any()
 
 
 @pytest.mark.parametrize("argument", range(7), ids=["A", "b", "weight", "lower", "upper", "damping", "center"])

@@ -112,7 +112,7 @@ def test_a_tick_compiles_once(arm, home, name):
 
     with Compilations() as first:
         a = tick(arm, before, *first_numbers(arm, home))
-    assert first.names.count("jit(_solve)") == 1
+    assert first.names.count("jit(step)") == 1
     stretched, numbers = longer(arm), other_numbers(arm, home)
     with Compilations() as second:
         b = tick(stretched, after, *numbers)
@@ -200,7 +200,7 @@ def test_what_is_static_compiles_again(arm):
     for tasks, other in changes:
         with Compilations() as count:
             osik.solve(arm, arm.q0, tasks, scheme=other, limits=())
-        assert count.names.count("jit(_solve)") == 1
+        assert count.names.count("jit(step)") == 1
     for steps in (2, 3):
         with Compilations() as count:
             osik.rollout(arm, arm.q0, {"posture": task}, scheme=scheme, steps=steps, limits=())

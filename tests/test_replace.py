@@ -89,8 +89,8 @@ class TestLimits:
 class TestSchemes:
     def test_new_numbers(self):
         assert osik.WeightedQP().replace(damping=1e-3).damping == 1e-3
-        scheme = osik.NullSpace(saturate=True).replace(margin=0.1, potential_gain=0.0)
-        assert scheme.saturate
+        scheme = osik.NullSpace(method="saturated").replace(margin=0.1, potential_gain=0.0)
+        assert scheme.method == "saturated"
         assert (float(scheme.margin), float(scheme.potential_gain)) == (0.1, 0.0)
 
     def test_inside_jit_and_in_batches(self, arm):
@@ -117,7 +117,7 @@ class TestSchemes:
                 TypeError,
                 "to replace; it has: damping, curvature_damping",
             ),
-            (osik.NullSpace(), dict(order="reverse"), TypeError, "structure is fixed"),
+            (osik.NullSpace(), dict(method="reverse"), TypeError, "structure is fixed"),
         ],
     )
     def test_mistakes_are_told(self, scheme, changes, error, message):

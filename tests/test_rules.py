@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from osik_jax._rules import blocked, custom_jvp
+from osik_jax.execution._rules import blocked, custom_jvp
 
 X = np.linspace(-1.0, 1.0, 23 * 3 * 2).reshape(23, 3, 2)
 

@@ -5,11 +5,12 @@ import os
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
-from osik_jax._cpu_settings import _UNTRIED_JAXLIB
+from osik_jax.execution._cpu_settings import _UNTRIED_JAXLIB
 from osik_jax.runtime import configure_cpu
 
 OURS = "PJRT_NPROC", "OPENBLAS_NUM_THREADS", "XLA_FLAGS", "JAX_CPU_ENABLE_ASYNC_DISPATCH"
@@ -69,6 +70,21 @@ def test_the_users_settings_stay():
 def test_other_flags_stay_beside_ours():
     other = "--xla_cpu_enable_fast_min_max=true"
     assert configured(XLA_FLAGS=other)[0]["XLA_FLAGS"] == f"{other} {SERIAL}"
+
+
+def test_older_fusions_are_a_flag_where_jaxlib_has_them():
+    script = (
+        STATE + "from osik_jax.runtime import configure_cpu\n"
+        "try: configure_cpu(older_fusions=True)\n"
+        "except ValueError as error: print(json.dumps(str(error))); raise SystemExit\n"
+        "import jax.numpy as jnp; jnp.zeros(3).block_until_ready()\n"  # XLA ends a process whose flags it does not know
+        "print(json.dumps(os.environ['XLA_FLAGS']))"
+    )
+    told = json.loads(in_a_process(script).stdout)
+    if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
+        assert told == f"{SERIAL} --xla_cpu_use_fusion_emitters=false"
+    else:
+        assert "before 0.11" in told
 
 
 def test_too_late_is_told_and_changes_nothing():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -14,6 +15,7 @@ from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.solvers import Level, Status, solve_nullspace
+from osik_jax.solvers.null_space._scaled_motion import ScaledMotion, solve_scaled_motion
 
 N, ROWS, LANES = 10, (3, 2, 3), 200
 FAMILIES = ("easy", "tight", "small targets", "box beside zero", "pinned", "conflicting", "near-dependent", "ties")
@@ -82,6 +84,16 @@ def solve_all(p):
 @jax.vmap
 def solve_full(p):
     return solve_nullspace(as_levels(p.levels), p.lower, p.upper, secondary=p.secondary)
+
+
+@partial(jax.jit, static_argnames="backend")
+def solve_by(p, *, backend):
+    """Everything, by one backend."""
+
+    def one(p):
+        return solve_nullspace(as_levels(p.levels), p.lower, p.upper, secondary=p.secondary, backend=backend)
+
+    return jax.vmap(one)(p)
 
 
 @pytest.fixture(scope="module")
@@ -226,6 +238,26 @@ class TestProperties:
                     assert move.status == 0
                     assert move.x[joint] == pytest.approx(x[joint], abs=1e-6)
 
+    @pytest.mark.parametrize("name", FAMILIES)
+    def test_the_kernel_and_the_plain_method_decide_alike(self, solved, name):
+        """The same answer in every lane. Joints that one of them holds at a bound are there in the other, held or not.
+
+        Where a level asks for rounding alone, as it may where joints tie, it has any scale.
+        """
+        pytest.importorskip("numba")
+        p = solved[name][0]
+        found, expected = (jax.tree.map(np.asarray, solve_by(p, backend=backend)) for backend in ("numba", "jax"))
+        np.testing.assert_array_equal(found.status, Status.SOLVED)
+        np.testing.assert_array_equal(expected.status, Status.SOLVED)
+        largest = 1.0 + np.abs(expected.x).max(1)
+        assert (np.abs(found.x - expected.x).max(1) < 1e-8 * largest).all()
+        near = np.abs(found.scales - expected.scales) < 1e-9
+        assert near.all() or (name == "ties" and near.mean() > 0.99)
+        np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-9)
+        for mine, other in ((found, expected), (expected, found)):
+            bound = np.where(mine.active > 0, p.upper, p.lower)
+            assert (np.abs(other.x - bound) < 1e-8 * largest[:, None])[mine.active != 0].all()
+
     def test_is_the_projection_where_nothing_saturates(self, solved):
         """With bounds that are far, and with bounds that are near but not reached."""
         p = solved["easy"][0]
@@ -305,6 +337,47 @@ class TestByHand:
             [Level([[1.0, 1.0, 1.0]], [0.0])], -jnp.ones(3), jnp.ones(3), secondary=jnp.array([3.0, 1.0, -1.0])
         )
         np.testing.assert_allclose(answer.x, [1.0, 0.0, -1.0], rtol=0, atol=1e-15)
+
+
+class TestSearch:
+    """Hard problems: scale, answer and the joints at their bounds against a linear program and NNLS."""
+
+    @staticmethod
+    def problems(rng, count=60, n=9, free=5, small=1e-3):
+        """Null spaces in which some joints hardly move, alone or but for others; motions far beyond the box."""
+        axes = rng.normal(size=(count, n, free))
+        axes[:, :2] *= small
+        axes[:, 2] = axes[:, 3] + small * axes[:, 2]
+        basis = np.linalg.qr(axes)[0]
+        projector = basis @ np.swapaxes(basis, 1, 2)
+        motion = 30.0 * rng.normal(size=(count, n))
+        motion -= np.einsum("imn,in->im", projector, motion)
+        lower, upper = -rng.exponential(1.0, (count, n)), rng.exponential(1.0, (count, n))
+        start = np.where(rng.random((count, n)) < 0.3, lower, 0.0)  # on bounds of its box
+        return ScaledMotion(*map(jnp.asarray, (start, motion, np.zeros((count, n)), projector, lower, upper)))
+
+    @pytest.mark.parametrize("small", [1.0, 1e-2])
+    def test_the_scale_is_a_linear_programs(self, rng, small):
+        problem = self.problems(rng, small=small)
+        found = jax.tree.map(np.asarray, jax.jit(partial(solve_scaled_motion, max_iterations=200))(problem))
+        assert found.done.all()
+        assert ((found.x >= problem.lower) & (found.x <= problem.upper)).all()
+        for i in range(len(found.x)):
+            start, motion, _, projector, lower, upper = (np.asarray(part[i]) for part in problem)
+            n, eye = len(start), np.eye(len(start))
+            left = eye - projector  # of x, what the null space does not change
+            best = scipy.optimize.linprog(
+                np.r_[np.zeros(n), -1.0],
+                A_eq=np.hstack([left, -(left @ motion)[:, None]]),
+                b_eq=left @ start,
+                bounds=[*zip(lower, upper, strict=True), (0.0, 1.0)],
+                options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+            )
+            assert best.status == 0
+            assert found.scale[i] == pytest.approx(best.x[-1], abs=1e-7)
+            np.testing.assert_allclose(left @ (found.x[i] - start - found.scale[i] * motion), 0.0, atol=1e-9)
+            at_low, at_high = found.x[i] <= lower + 1e-9, found.x[i] >= upper - 1e-9
+            assert outside_cone(found.x[i], left, eye[at_low], eye[at_high]) < 1e-6 * size(found.x[i])
 
 
 class TestBatchesAndFailures:
@@ -482,7 +555,7 @@ class TestScheme:
         return osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=limits)
 
     def test_saturation_keeps_limits_and_priorities(self, arm, tasks):
-        plain, hard = (osik.NullSpace(saturate=saturate, curvature_damping=0.0) for saturate in (False, True))
+        plain, hard = (osik.NullSpace(method=method, curvature_damping=0.0) for method in ("classical", "saturated"))
         loose, tight, far = (self.answer(arm, tasks, s, v) for s, v in ((plain, 0.1), (hard, 0.1), (hard, 1e6)))
         assert float(loose.box_violation) > 0.05
         assert float(tight.box_violation) == 0.0
@@ -496,16 +569,12 @@ class TestScheme:
 
     def test_the_reverse_order_is_the_forward_one_where_all_can_be_had(self, arm, tasks):
         forward, reverse = (
-            self.answer(arm, tasks, osik.NullSpace(damping=0.0, curvature_damping=0.0, order=order), 0.1)
-            for order in ("forward", "reverse")
+            self.answer(arm, tasks, osik.NullSpace(damping=0.0, curvature_damping=0.0, method=method), 0.1)
+            for method in ("classical", "reverse")
         )
         assert float(jnp.abs(forward.velocity).max()) > 0.1
         np.testing.assert_allclose(forward.velocity, reverse.velocity, rtol=0, atol=1e-9)
 
     def test_mistakes(self):
-        with pytest.raises(ValueError, match="order is 'sideways'; orders: forward, reverse"):
-            osik.NullSpace(order=cast(Any, "sideways"))
-        with pytest.raises(ValueError, match="saturate needs order='forward'"):
-            osik.NullSpace(order="reverse", saturate=True)
-        with pytest.raises(ValueError, match="saturate is 1; it is True or False"):
-            osik.NullSpace(saturate=cast(Any, 1))
+        with pytest.raises(ValueError, match="method is 'sideways'; methods: classical, reverse, saturated"):
+            osik.NullSpace(method=cast(Any, "sideways"))

@@ -66,7 +66,7 @@ SCHEMES = {
     "weighted": osik.WeightedQP(),
     "hierarchical": osik.HierarchicalQP(),
     "null-space": osik.NullSpace(damping=1e-3),
-    "saturated": osik.NullSpace(saturate=True),
+    "saturated": osik.NullSpace(method="saturated"),
 }
 
 

@@ -138,7 +138,7 @@ class TestRows:
 class TestAgainstPeers:
     def test_pink(self, arm, rng):
         """A weighted problem: pink's ``cost**2`` is our weight, its gain is ours times dt."""
-        model = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robots" / "arm7.xml"))
+        model = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robot" / "models" / "arm7.xml"))
         last, wanted = rng.uniform(-1.0, 1.0, (2, 7))
         q = np.asarray(arm.q0) + 0.1 * last
         coupling = {"joint2": 1.0, "joint5": -2.0}

@@ -36,7 +36,7 @@ def arm():
 
 @pytest.fixture(scope="module")
 def pinocchio_arm():
-    return pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robots" / "arm7.xml"))
+    return pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robot" / "models" / "arm7.xml"))
 
 
 @pytest.fixture

@@ -97,7 +97,7 @@ class TestAgainstPeers:
             osik.EqualityConstraintTask(loop, weight=[1.0] * 4)
 
     def test_pink(self, arm, rng):
-        model = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robots" / "arm7.xml"))
+        model = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robot" / "models" / "arm7.xml"))
         q = np.asarray(arm.q0) + rng.uniform(-0.2, 0.2, 7)
         configuration = pink.Configuration(model, model.createData(), q)
         costs = dict(com=[1.0, 0.2, 2.0], posture=rng.uniform(0.1, 1.0, 7), smooth=rng.uniform(0.1, 1.0, 7))

@@ -2,12 +2,14 @@
 
     python -m benchmarks.hard [results.json] [--all] [--only TEXT] [--python placo=PATH] [--times] [--write]
     python -m benchmarks.hard --film [film.gif]
+    python -m benchmarks.hard --settling
 
 Pinocchio judges every motion from its configurations alone; docs/hard_work.md says what is asked and what each number
 is. Without ``--all`` it is a selection that takes some minutes; ``--only`` takes those whose names, such as
 "g1, hierarchy, float64, no posture", hold a text. Rows that the file of results has already are not made again.
 ``--write`` puts the tables into the page, ``--times`` adds the time of a step (only on a machine with nothing else to
-do). ``--film`` films a G1 of ours beside mink's, with a target that is out of reach.
+do). ``--film`` films a G1 of ours beside mink's, with a target that is out of reach. ``--settling`` looks longer at
+targets out of reach, and puts into the page how the speed falls.
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ from ..robots import workload
 from ._cases import cases
 from ._film import FILM, film
 from ._motion import Entrant
-from ._page import PAGE, tables, write
+from ._page import PAGE, tables, write, write_settling
 from ._results import ROBOTS, Row, entrants, keep, read, rows
+from ._settling import settling
 
 
 def parser() -> argparse.ArgumentParser:
@@ -40,6 +43,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--times", action="store_true", help="with the time of a step")
     made.add_argument("--write", action="store_true", help=f"into {PAGE.name}")
     made.add_argument("--film", nargs="?", type=Path, const=FILM, help=f"only the film, by default {FILM.name}")
+    made.add_argument("--settling", action="store_true", help="only the table of speeds over 16 s")
     return made
 
 
@@ -74,6 +78,9 @@ def main() -> None:
     logging.disable(logging.WARNING)  # pink and mink tell of every joint at a limit
     if given.film:
         film(given.film)
+        return
+    if given.settling:
+        print(write_settling(settling()))
         return
     found = measure(given, console)
     if given.write:

@@ -56,11 +56,9 @@ def judged(work: Workload, motion: Motion) -> Numbers:
     """The numbers of one motion; infinite where a configuration is not finite."""
     if not np.isfinite(motion.path).all():
         return Numbers(**dict.fromkeys(Numbers._fields[:-2], np.inf), solved=motion.solved, seconds=motion.seconds)
-    base, first = 7 if work.floating else 0, motion.case.judged
-    joints = motion.path[:, base:]
-    speed = (np.diff(joints, axis=0) / DT)[first:]
+    first = motion.case.judged
+    speed, ends = joint_speeds(work, motion)[first:], _joints(work, motion)[first + 1 :]
     share = np.abs(speed) / work.velocity
-    ends = joints[first + 1 :]
     at_range = (ends < work.position_lower + AT_RANGE) | (ends > work.position_upper - AT_RANGE)
     feet, hand = _distances(work, motion)
     return Numbers(
@@ -76,6 +74,15 @@ def judged(work: Workload, motion: Motion) -> Numbers:
         solved=motion.solved,
         seconds=motion.seconds,
     )
+
+
+def joint_speeds(work: Workload, motion: Motion) -> np.ndarray:
+    """Of each joint in each tick [rad/s], (ticks, joints)."""
+    return np.diff(_joints(work, motion), axis=0) / DT
+
+
+def _joints(work: Workload, motion: Motion) -> np.ndarray:
+    return motion.path[:, 7 if work.floating else 0 :]
 
 
 def worst(numbers: list[Numbers]) -> Numbers:

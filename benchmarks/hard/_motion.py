@@ -59,15 +59,15 @@ OURS: Mapping[str, Ours] = {
     "weighted": Ours(osik.WeightedQP),
     "hierarchy": Ours(osik.HierarchicalQP),
     "null space": Ours(osik.NullSpace),
-    "saturated null space": Ours(lambda: osik.NullSpace(saturate=True)),
+    "saturated null space": Ours(lambda: osik.NullSpace(method="saturated")),
 }
 REMEDIES: Mapping[str, Ours] = {
     "weighted, damping 1e-2": Ours(lambda: osik.WeightedQP(damping=1e-2)),
     "hierarchy, damping 1e-2": Ours(lambda: osik.HierarchicalQP(damping=1e-2)),
     "hierarchy, posture of gain 1": Ours(osik.HierarchicalQP, _slow_posture),
     "hierarchy, posture beside the hand": Ours(osik.HierarchicalQP, _posture_beside),
-    "saturated null space, damping 1e-2": Ours(lambda: osik.NullSpace(saturate=True, damping=1e-2)),
-    "saturated null space, posture beside the hand": Ours(lambda: osik.NullSpace(saturate=True), _posture_beside),
+    "saturated null space, damping 1e-2": Ours(lambda: osik.NullSpace(method="saturated", damping=1e-2)),
+    "saturated null space, posture beside the hand": Ours(lambda: osik.NullSpace(method="saturated"), _posture_beside),
 }
 """For where the default numbers do not come to rest."""
 OF_POSTURES = frozenset(name for name, ours in REMEDIES.items() if ours.change is not _as_they_are)

@@ -66,6 +66,14 @@ def write(given: Sequence[Row], path: Path = PAGE, *, times: bool) -> None:
         write_between(text, path, start=f"<!-- table: {name} -->\n", end=f"<!-- end: {name} -->\n")
 
 
+def write_settling(rows: Iterable[Sequence[str]], path: Path = PAGE) -> str:
+    """Puts the table of ``settling`` into the page and returns it."""
+    head, *lines = map(_line, rows)
+    text = "\n".join([head, "|" + "---|" * (head.count("|") - 1), *lines]) + "\n"
+    write_between(text, path, start="<!-- table: settling -->\n", end="<!-- end: settling -->\n")
+    return text
+
+
 def _table(given: Iterable[Row], case: str, columns: Sequence[Column]) -> str:
     """A line for each entrant; a cell has a number for each gain, in bold where it is more than it should be."""
     found = by_gain(given, case)

@@ -160,8 +160,11 @@ def _segment_parameters(
 
     Where segments are parallel and lie side by side: the middle of what they have side by side.
     """
-    aa, bb, ab = _dot(a, a), _dot(b, b), _dot(a, b)
-    ao, bo = _dot(a, offset), _dot(b, offset)
+    return _parameters(_dot(a, a), _dot(b, b), _dot(a, b), _dot(a, offset), _dot(b, offset))
+
+
+def _parameters(aa: Array, bb: Array, ab: Array, ao: Array, bo: Array) -> tuple[Array, Array]:
+    """The same of any number of pairs, from the products of the two and of each with the offset."""
     square = aa * bb - ab * ab
     parallel = square <= _PARALLEL * aa * bb
     crossing = jnp.clip(_over(ab * bo - ao * bb, jnp.where(parallel, 0.0, square)), 0.0, 1.0)

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import mujoco
 
-from .._errors import OsikTypeError, OsikValueError
-from .._tree import KinematicTree, unknown_name
+from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..robot import Robot
+from ..robot._tree import KinematicTree
 from ._geometry import KINDS, Kind
 from ._shape import CollisionShape
 

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._tree import KinematicTree, cached_arrays
 from ..kinematics import Kinematics
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
 from ..robot import Robot
+from ..robot._tree import KinematicTree, cached_arrays
 from ._distance import Core, Nearest, between_polytopes, between_segments, from_plane
 from ._geometry import Kind, UnitCore, padded, unit_core, world_cores
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from .._joint_selection import concrete
+from ..numerics._arguments import concrete
 from ._geometry import Kind, UnitCore, convex_hull
 
 _ROTATION_TOLERANCE = 1e-4

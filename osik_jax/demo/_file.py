@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from .._feet import find_feet
-from .._home import compiled_kinematics
+from ..kinematics._home import compiled_kinematics
 from ..limits import ConfigurationLimit, VelocityLimit
 from ..robot import Robot
+from ..robot._feet import find_feet
 from ..tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
 from ..viewer import Look, robot_outline
 from ._motion import GAIN, Goal, Motion, Stance, along, contact_corners, tracking

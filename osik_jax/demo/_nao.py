@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._home import home_kinematics
+from ..kinematics._home import home_kinematics
 from ..limits import ConfigurationLimit, VelocityLimit
 from ..robot import Robot, load_robot
 from ..tasks import ComTask, PostureTask, Task, support_polygon

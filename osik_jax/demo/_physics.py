@@ -13,9 +13,9 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Float
 
-from .._tree import HINGE
 from ..physics import Integrated, Recording, Servo, Simulation, World, build_world, simulate
 from ..robot import Robot
+from ..robot._tree import HINGE
 from ..tasks import PostureTask, Task
 from ._measure import margins, measure
 from ._motion import Motion

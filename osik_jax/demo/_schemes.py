@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .._tree import unknown_name
+from .._errors import unknown_name
 from ..schemes import HierarchicalQP, NullSpace, WeightedQP
 
 SCHEMES = ("weighted", "null-space", "hierarchical")

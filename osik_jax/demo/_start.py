@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._home import compiled_kinematics
-from .._tree import FREE, HINGE, SLIDE
 from ..kinematics import forward_kinematics, frame_jacobian, integrate
+from ..kinematics._home import compiled_kinematics
 from ..robot import Robot
+from ..robot._tree import FREE, HINGE, SLIDE
 from ..tasks import FrameTask
 from ..viewer import Outline
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._home import compiled_kinematics
 from ..kinematics import forward_kinematics, frame_jacobian, integrate
+from ..kinematics._home import compiled_kinematics
 from ..robot import Robot
 from ._motion import Goal
 from ._references import Path, Stroke, follow

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._tree import HINGE, SLIDE, KinematicTree
 from ..kinematics._rigid import compose, cross, rotate, rotation_matrix
 from ..robot import Robot
+from ..robot._tree import HINGE, SLIDE, KinematicTree
 
 
 class Layout(NamedTuple):

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._joint_selection import dof_names, scalar_layout
-from .._tree import HINGE
 from ..robot import Robot
+from ..robot._joint_selection import dof_names, scalar_layout
+from ..robot._tree import HINGE
 from ._chain import Chain, chain_layout, make_chain, place
 from ._chain_search import ChainSearch, Goal
 from ._fixed import at_solution

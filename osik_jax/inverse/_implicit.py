@@ -7,7 +7,7 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float
 
-from .._rules import custom_jvp
+from ..execution._rules import custom_jvp
 
 
 @custom_jvp

@@ -13,12 +13,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._blocks import in_blocks
-from .._checks import check_setting, checked_configuration, checked_limits
 from .._errors import OsikTypeError, OsikValueError
-from .._joint_selection import concrete
-from .._numbers import check_count
+from ..control._checks import check_setting, checked_configuration, checked_limits
+from ..execution._blocks import in_blocks
 from ..limits import ConfigurationLimit, Limit
+from ..numerics._arguments import check_count, concrete
 from ..robot import Robot
 from ..schemes import Scheme
 from ..tasks import Task

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .._errors import OsikValueError
-from .._joint_selection import concrete
+from ..numerics._arguments import concrete
 from ..robot import Robot
 from ..tasks._targets import as_pose, pose_array
 from ._chain_search import Goal

@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._errors import OsikTypeError, OsikValueError
-from .._tree import unknown_name
+from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..limits import CollisionAvoidanceLimit, Limit, PositionBarrier
 from ..robot import Robot
 from ..schemes import Scheme, WeightedQP

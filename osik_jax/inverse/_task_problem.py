@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._checks import check_tasks
 from .._errors import OsikValueError
-from .._joint_selection import dof_names
-from .._tree import HINGE, SLIDE
+from ..control._checks import check_tasks
 from ..kinematics import forward_kinematics
 from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, PositionBarrier
 from ..robot import Robot
+from ..robot._joint_selection import dof_names
+from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
 from ..tasks import Task
 from ._chain_problem import Settings, allowed

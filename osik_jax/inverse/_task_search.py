@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
-from .._joint_selection import scalar_layout
-from ..control import _velocity_problem as velocity_problem
+from ..control._step import velocity_problem
 from ..kinematics import difference, forward_kinematics, integrate
 from ..limits import Limit, limit_rows
 from ..robot import Robot
+from ..robot._joint_selection import scalar_layout
 from ..schemes import Scheme, VelocityProblem
 from ..tasks import (
     AxisAlignTask,

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._rules import custom_jvp
-from .._tree import KinematicTree
+from ..execution._rules import custom_jvp
+from ..robot._tree import KinematicTree
 from ._rigid import compose, cross, rotate
 
 Poses = tuple[Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]
@@ -20,15 +20,13 @@ Poses = tuple[Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]
 def world_poses(tree: KinematicTree, position: Float[Array, "nbody 3"], rotation: Float[Array, "nbody 3 3"]) -> Poses:
     """Poses of all bodies in the world from their poses in their parents. Rotations have to be rotations.
 
-    The world itself does not move, whatever its row says.
+    Row 0 is the world's: 0 and the identity.
 
     All bodies at once, each with the ancestor as far above it as it has come: a tree of depth d takes log2(d) rounds.
     The derivative adds up velocities along each body's ancestors, one product with a constant matrix: as cheap in
     either mode, however deep the tree.
     """
-    moves = np.arange(len(tree.body_parents)) > 0
-    position = jnp.where(moves[:, None], position, 0.0)
-    return _composer(tree)(position, jnp.where(moves[:, None, None], rotation, np.eye(3, dtype=rotation.dtype)))
+    return _composer(tree)(position, rotation)
 
 
 @lru_cache(maxsize=64)

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from .._made_for import check_robot
-from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
+from ..execution._backends import Backend, cuda_is_default, here, takes
+from ..execution._computed import by_numba
 from ..robot import Robot
+from ..robot._made_for import check_robot
+from ..robot._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
+from . import _kernels
 from ._composition import world_poses
 from ._joints import dof_kinds, joint_transforms
 from ._rigid import compose, cross, rotate, rotation_matrix
+
+Moving = tuple[Float[Array, "k 3"], Float[Array, "k 3 3"], Float[Array, "k 6 nv"]]
 
 
 class Kinematics(eqx.Module):
@@ -28,6 +35,7 @@ class Kinematics(eqx.Module):
         dof_linear: direction in which each dof translates its body, 0 for rotations. (full nv, 3)
         dof_angular: axis about which each dof turns its body, 0 for translations. (full nv, 3)
         dof_anchor: a point on that axis [m]. (full nv, 3)
+        backend: "jax", or what made it and makes what tasks want of it: see ``WeightedQP.backend`` (static).
     """
 
     body_position: Float[Array, "nbody 3"]
@@ -35,6 +43,7 @@ class Kinematics(eqx.Module):
     dof_linear: Float[Array, "nvfull 3"]
     dof_angular: Float[Array, "nvfull 3"]
     dof_anchor: Float[Array, "nvfull 3"]
+    backend: Backend = eqx.field(default="jax", static=True)
 
     def frame_pose(self, robot: Robot, name: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         """Position [m] and rotation (frame axes to world axes) of a body, link, site or geom.
@@ -86,6 +95,18 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     return Kinematics(position, rotation, linear, angular, anchor[robot.tree.dof_joint])
 
 
+def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
+    """As ``forward_kinematics``, by a kernel where there is one; what is asked of the answer goes that way too.
+
+    Raises:
+        ModuleNotFoundError: the backend's package is not installed.
+    """
+    if not takes(here(backend), "numba", fits=True) or cuda_is_default():
+        return forward_kinematics(robot, q)
+    robot.check_configuration(q)
+    return Kinematics(*_bodies(robot, q), backend=backend)
+
+
 def frame_jacobians(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> Float[Array, "k 6 nv"]:
     """Jacobians of several frames: rows [linear; angular] in world axes, linear at each frame's origin.
 
@@ -100,6 +121,19 @@ def frame_jacobians(robot: Robot, kinematics: Kinematics, names: Sequence[str]) 
     linear = kinematics.dof_linear.T + cross(axis, points[:, :, None] - kinematics.dof_anchor.T, along=-2)
     columns = jnp.concatenate([linear, jnp.broadcast_to(axis, linear.shape)], -2)
     return independent_columns(robot.tree, jnp.where(mask, columns, 0.0))
+
+
+def moving_frames(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> Moving:
+    """Positions (k, 3), rotations (k, 3, 3) and Jacobians (k, 6, nv) of several frames.
+
+    Raises:
+        KeyError: no such frame.
+    """
+    if kinematics.backend == "jax":
+        return *kinematics.frame_poses(robot, names), frame_jacobians(robot, kinematics, names)
+    for name in names:
+        robot.tree.frame(name)
+    return _moving_frames(robot, replace(kinematics, backend="jax"), names=tuple(names))
 
 
 def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Array, "6 nv"]:
@@ -139,6 +173,20 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
     return independent_columns(robot.tree, columns / jnp.sum(mass))
 
 
+def moving_center(
+    robot: Robot, kinematics: Kinematics, subtree: str | None = None
+) -> tuple[Float[Array, "3"], Float[Array, "3 nv"]]:
+    """``center_of_mass`` and ``com_jacobian``.
+
+    Raises:
+        KeyError, ValueError: as in ``center_of_mass``.
+    """
+    if kinematics.backend == "jax":
+        return center_of_mass(robot, kinematics, subtree), com_jacobian(robot, kinematics, subtree)
+    mass = body_masses(robot, subtree)
+    return _moving_center(eqx.tree_at(lambda robot: robot.body_mass, robot, mass), replace(kinematics, backend="jax"))
+
+
 def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"]) -> Float[Array, "... nv"]:
     """From columns of all the model's dofs to columns of v: locked dofs drop out, followers join their leaders."""
     (own, _), *followers = tree.dof_columns
@@ -168,6 +216,17 @@ def _body_moments(
     robot: Robot, kinematics: Kinematics, subtree: str | None
 ) -> tuple[Float[Array, " nbody"], Float[Array, "nbody 3"]]:
     """Mass, and mass times centre of mass, of each body (0 outside the subtree)."""
+    mass = body_masses(robot, subtree)
+    centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
+    return mass, mass[:, None] * centers
+
+
+def body_masses(robot: Robot, subtree: str | None) -> Float[Array, " nbody"]:
+    """Of each body, 0 outside the subtree.
+
+    Raises:
+        KeyError, ValueError: as in ``center_of_mass``.
+    """
     mass = robot.body_mass
     if subtree is not None:
         root = robot.tree.frame_bodies[robot.tree.frame(subtree)]
@@ -175,5 +234,22 @@ def _body_moments(
         if not isinstance(mass, Tracer) and not np.asarray(mass)[below].sum() > 0.0:
             raise OsikValueError(f"the subtree of {subtree!r} has no mass, so it has no centre of mass")
         mass = jnp.where(below, mass, 0.0)
-    centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
-    return mass, mass[:, None] * centers
+    return mass
+
+
+def _fields(robot: Robot, q: Float[Array, " nq"]) -> tuple[Array, ...]:
+    """Of the kinematics, those that are arrays."""
+    return tuple(jax.tree.leaves(forward_kinematics(robot, q)))
+
+
+def _frames(robot: Robot, kinematics: Kinematics, *, names: tuple[str, ...]) -> Moving:
+    return moving_frames(robot, kinematics, names)
+
+
+def _frames_by_kernel(robot: Robot, kinematics: Kinematics, *, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
+    return _kernels.moving_frames(robot, kinematics, [robot.tree.frame(name) for name in names])
+
+
+_bodies = by_numba(_fields, _kernels.bodies)
+_moving_frames = by_numba(_frames, _frames_by_kernel)
+_moving_center = by_numba(moving_center, _kernels.center_of_mass)

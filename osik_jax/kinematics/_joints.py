@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._tree import KinematicTree
 from ..robot import Robot
+from ..robot._tree import KinematicTree
 
 with contextlib.redirect_stdout(None):  # it prints which of its optional back ends are missing
     from mujoco import mjx
@@ -26,14 +26,16 @@ with contextlib.redirect_stdout(None):  # it prints which of its optional back e
 def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
     """MJX data in which ``xpos, xquat, xanchor, xaxis`` are in the frame of each body's parent.
 
-    The quaternions are as long as the model's and the joints' axes are: 1, unless somebody changed those numbers.
+    The quaternions are as long as the model's and the joints' axes are: 1, unless somebody changed those numbers. The
+    world is where it is, whatever its row says.
     """
     model, data = _forest(
         robot.tree.joint_types, robot.tree.joint_bodies, len(robot.tree.body_names), jnp.result_type(float).name
     )
+    moves = np.arange(len(robot.tree.body_names))[:, None] > 0
     model = model.replace(
-        body_pos=robot.body_position,
-        body_quat=robot.body_quaternion,
+        body_pos=jnp.where(moves, robot.body_position, 0.0),
+        body_quat=jnp.where(moves, robot.body_quaternion, np.eye(1, 4, dtype=robot.body_quaternion.dtype)),
         jnt_pos=robot.joint_position,
         jnt_axis=robot.joint_axis,
         qpos0=robot.joint_reference,

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikValueError
-from .._made_for import check_robot
-from .._tree import BALL, FREE
 from ..robot import Robot
+from ..robot._made_for import check_robot
+from ..robot._tree import BALL, FREE
 
 
 def integrate(
@@ -29,12 +29,15 @@ def integrate(
         raise OsikValueError(f"v has shape {jnp.shape(v)}, this robot's velocities have shape ({robot.nv},)")
     step = jnp.asarray(v) * dt
     q = jnp.asarray(q, jnp.result_type(q, step))
-    scalar_q, scalar_v, quaternions = _layout(robot)
-    out = q.at[scalar_q].add(step[scalar_v]) if len(scalar_q) else q
+    scalar_q, scalar_v, quaternions = layout(robot)
+    moves = np.zeros(robot.nq, int)
+    moves[scalar_q] = scalar_v
+    added, parts, end = q + step[moves], [], 0  # put together from pieces: fewer operations than scatters
     for at, dof in quaternions:
         turned = jaxlie.SO3(q[at : at + 4]).normalize() @ jaxlie.SO3.exp(step[dof : dof + 3])
-        out = out.at[at : at + 4].set(turned.normalize().wxyz)
-    return out
+        parts += [added[end:at], turned.normalize().wxyz]
+        end = at + 4
+    return jnp.concatenate([*parts, added[end:]])
 
 
 def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"]) -> Float[Array, " nv"]:
@@ -50,7 +53,7 @@ def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"
     robot.check_configuration(qb)
     dtype = jnp.result_type(qa, qb, float)
     qa, qb = jnp.asarray(qa, dtype), jnp.asarray(qb, dtype)
-    scalar_q, scalar_v, quaternions = _layout(robot)
+    scalar_q, scalar_v, quaternions = layout(robot)
     out = jnp.zeros(robot.nv, dtype).at[scalar_v].set((qb - qa)[scalar_q])
     for at, dof in quaternions:
         a, b = (jaxlie.SO3(x[at : at + 4]).normalize() for x in (qa, qb))
@@ -58,7 +61,7 @@ def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"
     return out
 
 
-def _layout(robot: Robot) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
+def layout(robot: Robot) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
     """Entries of q and v that simply add, and (start in q, start in v) of each quaternion."""
     tree = robot.tree
     scalar_q, scalar_v, quaternions = [], [], []

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._tree import BALL, FREE, KinematicTree
 from ..robot import Robot
+from ..robot._tree import BALL, FREE, KinematicTree
 from ._forward import Kinematics, independent_columns
 from ._joints import dof_kinds
 from ._rigid import cross
@@ -23,14 +26,14 @@ def kinematics_rates(robot: Robot, kinematics: Kinematics) -> Kinematics:
     kinds, number = dof_kinds(tree)
     in_world = (kinds == FREE) & (number < 3)  # a free joint's translations are along the world's axes
     axes, anchors = _movers(tree)
-    fields = (
+    rates = Kinematics(
         _velocity(kinematics, kinematics.body_position, tree.moves),
         _turning(kinematics, kinematics.body_rotation, tree.moves),
         _turning(kinematics, kinematics.dof_linear[..., None], axes & ~in_world[:, None])[:, :, 0],
         _turning(kinematics, kinematics.dof_angular[..., None], axes)[:, :, 0],
         _velocity(kinematics, kinematics.dof_anchor, anchors),
     )
-    return Kinematics(*(independent_columns(tree, field) for field in fields))
+    return jax.tree.map(partial(independent_columns, tree), rates)
 
 
 def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Bool[np.ndarray, "nvfull nvfull"]]:

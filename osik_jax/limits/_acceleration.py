@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from .._joint_selection import concrete, dof_names, dof_values, scalar_layout
-from .._numbers import check_bounds, entries
+from ..numerics._arguments import check_bounds, concrete, entries
 from ..robot import Robot
+from ..robot._joint_selection import dof_names, dof_values, scalar_layout
 from ._box import Kind, Limit, limit_box
 from ._configuration import ConfigurationLimit
 

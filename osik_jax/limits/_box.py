@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from .._joint_selection import concrete
-from .._made_for import MadeForRobot
-from .._replace import Replaceable
 from ..kinematics import Kinematics
+from ..numerics._arguments import concrete
+from ..numerics._replace import Replaceable
 from ..robot import Robot
+from ..robot._made_for import MadeForRobot
 from ._rows import LimitRows
 
 Kind = Literal["acceleration", "velocity", "braking", "position"]

@@ -12,17 +12,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikTypeError, OsikValueError, warn
-from .._home import home_kinematics
-from .._joint_selection import concrete
-from .._numbers import as_scalar, as_vector
-from .._tree import unknown_name
+from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
 from ..collision._distance import Nearest
 from ..collision._geometry import Kind, UnitCore, geom_hull, padded
 from ..collision._pairs import Member, Patterns, candidate_pairs, exact_pairs, members
 from ..collision._scene import Placed, Scene, grouped, nearest, place, separation_jacobian
 from ..collision._shape import CollisionShape
 from ..kinematics import Kinematics
+from ..kinematics._home import home_kinematics
+from ..numerics._arguments import as_scalar, as_vector, concrete
 from ..robot import Robot
 from ._box import Limit
 from ._rows import LimitRows

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from .._joint_selection import concrete, dof_names, dof_values, scalar_layout
-from .._numbers import check_bounds
+from ..numerics._arguments import check_bounds, concrete
 from ..robot import Robot
+from ..robot._joint_selection import dof_names, dof_values, scalar_layout
 from ._box import Kind, Limit
 
 _ROUNDING = 8.0  # machine epsilons of the way to a bound that are kept clear of it, so that q + v dt stays within

@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikValueError
-from .._joint_selection import concrete
-from .._numbers import as_vector
-from .._tree import FREE, unknown_name
+from .._errors import OsikValueError, unknown_name
 from ..kinematics import Kinematics
+from ..numerics._arguments import as_vector, concrete
 from ..robot import Robot
+from ..robot._tree import FREE
 from ._box import Kind, Limit
 from ._rows import LimitRows
 

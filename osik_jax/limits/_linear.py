@@ -8,9 +8,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from .._joint_selection import concrete
-from .._numbers import as_bounds, check_bounds
 from ..kinematics import Kinematics
+from ..numerics._arguments import as_bounds, check_bounds, concrete
 from ..robot import Robot
 from ._box import Limit
 from ._rows import LimitRows

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..solvers._dense import apply
+from ..numerics._dense import apply
 
 
 class LimitRows(eqx.Module):

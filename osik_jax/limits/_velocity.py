@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from .._joint_selection import concrete, dof_names, dof_values
-from .._numbers import entries
+from ..numerics._arguments import concrete, entries
 from ..robot import Robot
+from ..robot._joint_selection import dof_names, dof_values
 from ._box import Kind, Limit
 
 

@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import check_targets
 from .._errors import OsikValueError
-from .._structure import is_number
-from ..control import Solution, Targets, Tasks, aim, remembering, solve
+from ..batching._structure import is_number
+from ..control import Solution, solve
+from ..control._checks import check_targets
+from ..control._rollout import remembering
+from ..control._step import Targets, Tasks, aim
 from ..kinematics import integrate
 from ..limits import Limit
 from ..robot import Robot

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 
 from .._errors import OsikValueError
-from .._joint_selection import select_joints
-from .._tree import BALL, FREE
 from ..robot import Robot
+from ..robot._joint_selection import select_joints
+from ..robot._tree import BALL, FREE
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._errors import OsikValueError
-from .._tree import FREE, QPOS_WIDTH, unknown_name
+from .._errors import OsikValueError, unknown_name
+from ..robot._tree import FREE, QPOS_WIDTH
 from ._world import World, frame_pose
 
 FALL_TILT, FALL_HEIGHT = math.radians(45.0), 0.6

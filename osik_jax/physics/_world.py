@@ -12,8 +12,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from .._tree import BALL, FREE
 from ..robot import Robot
+from ..robot._tree import BALL, FREE
 from ._servo import Servo as Servo
 from ._servo import add_servo, choose_servos
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikTypeError, OsikValueError
-from .._numbers import check_count
+from ..numerics._arguments import check_count
 from ..robot import Robot
 from ._frame import Frame, read_frame
 

@@ -9,10 +9,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
-from ..viewer._scene import INK
 from ._map import ReachabilityMap
 from ._slices import NOTHING, cell_edges, fullest, nearest, share_colors
 
+_INK, _GREY = "#2b2f36", "#5b636d"
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
 
@@ -29,10 +29,10 @@ def draw_slices(found: ReachabilityMap, at: tuple[float, float, float] | None = 
         _draw_slice(place, found, share, spot, plane)
     colors = ScalarMappable(Normalize(0.0, 100.0), share_colors())
     bar = figure.colorbar(colors, ax=figure.axes, shrink=0.8, pad=0.015)
-    bar.set_label(f"of {len(found.rotations)} orientations reached [%]", color=INK)
+    bar.set_label(f"of {len(found.rotations)} orientations reached [%]", color=_INK)
     note = "grey: none found; white: proven out of reach; line: the joints at home"
-    figure.text(0.012, 0.945, f"Reach of {found.frame}", fontsize=13, weight="bold", color=INK)
-    figure.text(0.012, 0.905, note, fontsize=8.5, color="#5b636d")
+    figure.text(0.012, 0.945, f"Reach of {found.frame}", fontsize=13, weight="bold", color=_INK)
+    figure.text(0.012, 0.905, note, fontsize=8.5, color=_GREY)
     return figure
 
 
@@ -49,7 +49,7 @@ def _draw_slice(
     place.plot(*found.links[:, plane].T, "-o", color="#f08c3a", linewidth=2.0, markersize=3.5, alpha=0.9)
     place.set_aspect("equal")
     names = "xyz"
-    place.set_xlabel(f"{names[plane[0]]} [m]", color=INK)
-    place.set_ylabel(f"{names[plane[1]]} [m]", color=INK)
-    place.set_title(f"{names[across]} = {axes[across][spot[across]]:.3g} m", fontsize=10, color=INK)
+    place.set_xlabel(f"{names[plane[0]]} [m]", color=_INK)
+    place.set_ylabel(f"{names[plane[1]]} [m]", color=_INK)
+    place.set_title(f"{names[across]} = {axes[across][spot[across]]:.3g} m", fontsize=10, color=_INK)
     place.tick_params(labelsize=8)

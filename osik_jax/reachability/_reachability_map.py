@@ -12,13 +12,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._checks import check_setting, checked_limits
 from .._errors import OsikValueError
-from .._numbers import check_count
+from ..control._checks import check_setting, checked_limits
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import checked_tolerance
 from ..inverse._poses import read_poses
 from ..limits import Limit
+from ..numerics._arguments import check_count
 from ..robot import Robot
 from ..scaling import run_in_chunks
 from ..scaling._progress import Progress

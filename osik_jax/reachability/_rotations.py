@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._numbers import check_count
 from ..kinematics._rigid import rotation_matrix
+from ..numerics._arguments import check_count
 
 _FIRST = np.sqrt(2.0)
 _SECOND = 1.533751168755204288118041413

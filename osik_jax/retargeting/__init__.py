@@ -1,6 +1,9 @@
 """From a person to a robot: motion retargeting."""
 
 from ._bvh import read_bvh as read_bvh
+from ._fit import Fit as Fit
+from ._fit import FitLoss as FitLoss
+from ._fit import fit as fit
 from ._goals import Weights as Weights
 from ._guess import guess_profile as guess_profile
 from ._keypoints import read_keypoints as read_keypoints

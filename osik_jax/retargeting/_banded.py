@@ -2,29 +2,63 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache, partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
+
+from ..execution._backends import on_platforms, takes
+from ..execution._lanes import in_lanes
+from ..numerics._dense import apply, product
+from . import _banded_kernel
 
 
 class BandedSystem(NamedTuple):
     """A symmetric positive definite matrix of F x F blocks, with a band of two blocks below the diagonal.
 
+    Block (t, t) is ``square[t] + diag(alone[t])``, block (t, t - 1) is
+    ``diag(first[t]) - rows[t]^T diag(weight[t]) rows[t - 1]``, and block (t, t - 2) is ``diag(second[t])``.
+
     Attributes:
-        diagonal: block (t, t). (F, n, n)
-        first: block (t, t - 1); entry 0 is not used. (F, n, n)
-        second: diagonal of block (t, t - 2), which has no other entries; entries 0 and 1 are not used. (F, n)
+        square: (F, n, n)
+        alone: (F, n)
+        rows: what couples a frame to the next. (F, m, n)
+        weight: entry 0 is not used. (F, m)
+        first: entry 0 is not used. (F, n)
+        second: entries 0 and 1 are not used. (F, n)
     """
 
-    diagonal: Float[Array, "F n n"]
-    first: Float[Array, "F n n"]
+    square: Float[Array, "F n n"]
+    alone: Float[Array, "F n"]
+    rows: Float[Array, "F m n"]
+    weight: Float[Array, "F m"]
+    first: Float[Array, "F n"]
     second: Float[Array, "F n"]
 
 
 def solve_banded(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Array, "F n"]:
-    """The solution x of ``system x = right``, by a Cholesky factorisation from the first block to the last.
+    """The solution x of ``system x = right``: on a GPU in single precision by a kernel, where Warp is installed.
+
+    It is not finite where the matrix is not positive definite in the precision of its numbers.
+    """
+    weight, first = (a.at[0].set(0.0) for a in (system.weight, system.first))
+    system = system._replace(weight=weight, first=first, second=system.second.at[:2].set(0.0))
+    if takes("auto", "warp", fits=_banded_kernel.fits(system)):
+        return _anywhere()(system, right)
+    return solve_banded_plain(system, right)
+
+
+@cache
+def _anywhere() -> Callable[[BandedSystem, Array], Array]:
+    return in_lanes(partial(on_platforms, {"warp": _banded_kernel.solve}, jax.vmap(solve_banded_plain)))
+
+
+def solve_banded_plain(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Array, "F n"]:
+    """The same in plain JAX, where what is not used is 0, by a Cholesky factorisation from first block to last.
 
     With L the factor, row t of blocks is ``L2 = S L[t-2]^-T`` (two frames back), ``L1 = (B - L2 L1[t-1]^T) L[t-1]^-T``
     and ``L L^T = A - L1 L1^T - L2 L2^T``. The blocks on the diagonal are kept as inverses: of blocks this small,
@@ -33,31 +67,31 @@ def solve_banded(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Arra
     n = right.shape[-1]
     identity, zero = jnp.eye(n, dtype=right.dtype), jnp.zeros((n, n), right.dtype)
     none = jnp.zeros(n, right.dtype)
-    first = system.first.at[0].set(0.0)
-    second = system.second.at[:2].set(0.0)
+    # of each frame the one-back block but for its diagonal: a batch of products is quicker than one in each step
+    weighted, before = system.rows * -system.weight[..., None], jnp.roll(system.rows, 1, 0)
+    coupled = product(jnp.swapaxes(weighted, 1, 2), before)
 
     def down(carry, row):
         inverse1, inverse2, below1, y1, y2 = carry
-        diagonal, one_back, two_back, b = row
+        square, alone, coupled, one_back, two_back, b = row
         far = two_back[:, None] * inverse2.T
-        near = (one_back - far @ below1.T) @ inverse1.T
+        near = product(coupled + one_back[:, None] * identity - product(far, below1.T), inverse1.T)
         both = jnp.concatenate([near, far], 1)
-        factor = lax.linalg.cholesky(diagonal - both @ both.T, symmetrize_input=False)
+        factor = lax.linalg.cholesky(square + alone[:, None] * identity - product(both, both.T), symmetrize_input=False)
         inverse = lax.linalg.triangular_solve(factor, identity, left_side=True, lower=True)
-        y = inverse @ (b - near @ y1 - far @ y2)
+        y = apply(inverse, b - apply(near, y1) - apply(far, y2))
         return (inverse, inverse1, near, y, y1), (inverse, near, y)
 
-    _, (inverse, near, y) = lax.scan(
-        down, (identity, identity, zero, none, none), (system.diagonal, first, second, right)
-    )
+    rows = (system.square, system.alone, coupled, system.first, system.second, right)
+    _, (inverse, near, y) = lax.scan(down, (identity, identity, zero, none, none), rows)
 
     def up(carry, row):
         x1, x2, near1 = carry
         inverse, near, y, two_on = row
         # row t + 2 couples to t by L2 = S L[t]^-T, so that L2^T x = L[t]^-1 S x
-        x = inverse.T @ (y - near1.T @ x1 - inverse @ (two_on * x2))
+        x = apply(inverse.T, y - apply(near1.T, x1) - apply(inverse, two_on * x2))
         return (x, x1, near), x
 
-    two_on = jnp.roll(second, -2, 0)
+    two_on = jnp.roll(system.second, -2, 0)
     _, x = lax.scan(up, (none, none, zero), (inverse, near, y, two_on), reverse=True)
     return x

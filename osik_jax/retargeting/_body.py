@@ -8,14 +8,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from .._home import home_kinematics
 from ..collision import CollisionShape
+from ..kinematics._forward import independent_columns
+from ..kinematics._home import home_kinematics
 from ..limits import CollisionAvoidanceLimit
 from ..robot import Robot
+from ..robot._joint_selection import scalar_layout
 from ._goals import Goals
 from ._person import LIMBS, SIDES, Person
 from ._profile import Profile
@@ -24,6 +27,8 @@ from ._terms import Bounds
 JOINTS_APART = 3
 _CAPSULE = "capsule "
 _INSET, _SHARE = 1e-3, 0.98
+_AT_END, _BENT = 0.01, 1.0
+"""What counts as the end of a range, as a share of it; how far from there plans begin [rad], to the middle at most."""
 
 
 def shapes_apart(robot: Robot, profile: Profile) -> CollisionAvoidanceLimit | None:
@@ -77,7 +82,7 @@ class Build:
         turn: of the root body. (3, 3)
         scale: robot over person; None: the ratio of their legs, and stretch.
         stretch: what that ratio is multiplied with.
-        q0: the home configuration. (nq,)
+        start: the home configuration, limbs bent where they are at the end of a range (``_with_bent_limbs``). (nq,)
         lower: ends of the joints' ranges [rad or m]. (nv,)
         upper: the other ends. (nv,)
         speed: limits [rad/s or m/s]. (nv,)
@@ -90,7 +95,7 @@ class Build:
     turn: Float[np.ndarray, "3 3"]
     scale: float | None
     stretch: float
-    q0: Float[np.ndarray, " nq"]
+    start: Float[np.ndarray, " nq"]
     lower: Float[np.ndarray, " nv"]
     upper: Float[np.ndarray, " nv"]
     speed: Float[np.ndarray, " nv"]
@@ -114,7 +119,7 @@ class Build:
             turn=turns[-1],
             scale=profile.scale,
             stretch=profile.stretch,
-            q0=np.asarray(robot.q0),
+            start=_with_bent_limbs(robot, profile),
             lower=np.asarray(robot.position_lower),
             upper=np.asarray(robot.position_upper),
             speed=np.asarray(robot.velocity_limit),
@@ -125,7 +130,7 @@ class Build:
         scale = self.stretch * self.leg / person.leg if self.scale is None else self.scale
         root = scale * person.root
         root[:, 2] += self.ankle - scale * person.ankle
-        dtype = self.q0.dtype
+        dtype = self.start.dtype
         parts: dict[str, Any] = {  # NumPy's arrays: each one of JAX's would cost more than its numbers
             **{name: getattr(person, name) for name in ("directions", "pelvis", "torso", "feet", "contact")},
             "root": root,
@@ -134,9 +139,9 @@ class Build:
         return Goals(**{name: part.astype(dtype) for name, part in parts.items()})
 
     def first_guess(self, goals: Goals) -> Float[np.ndarray, "F nq"]:
-        """The home posture with the pelvis where and as the person's is."""
+        """One posture throughout, with the pelvis where and as the person's is."""
         turn = np.asarray(goals.pelvis)
-        q = np.tile(self.q0, (len(turn), 1))
+        q = np.tile(self.start, (len(turn), 1))
         q[:, :3] = np.asarray(goals.root) - turn @ self.hips
         q[:, 3:7] = Rotation.from_matrix(turn @ self.turn).as_quat(scalar_first=True)
         return q
@@ -146,4 +151,26 @@ class Build:
         inset = np.minimum(_INSET, 0.01 * (self.upper - self.lower))
         step, change = _SHARE * self.speed * dt, _SHARE * np.asarray(acceleration) * dt**2
         parts: list[Any] = [self.lower + inset, self.upper - inset, step, change]
-        return Bounds(*(part.astype(self.q0.dtype) for part in parts))
+        return Bounds(*(part.astype(self.start.dtype) for part in parts))
+
+
+def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]:
+    """Home, with joints of the limbs that are at an end of their range there moved inside it.
+
+    A limb that is straight and can bend to one side alone is singular: as long as its hinge is turned the wrong way,
+    the end of the range holds it, and what would turn the hinge does not move the limb's end.
+    """
+    q = np.array(robot.q0)
+    scalar, index = scalar_layout(robot)
+    ends = [profile.keypoints[end][0] for _, end in LIMBS]
+    bodies = [robot.tree.frame_bodies[robot.tree.frame(frame)] for frame in ends]
+    moves = np.asarray(independent_columns(robot.tree, jnp.asarray(robot.tree.moves[bodies], float))).any(0)
+    lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
+    for dof in np.flatnonzero(scalar & moves & np.isfinite(upper - lower)):
+        width, home = upper[dof] - lower[dof], q[index[dof]]
+        inside = min(_BENT, 0.5 * width)
+        if home - lower[dof] < _AT_END * width:
+            q[index[dof]] = lower[dof] + inside
+        elif upper[dof] - home < _AT_END * width:
+            q[index[dof]] = upper[dof] - inside
+    return q

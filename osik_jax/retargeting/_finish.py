@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._joint_selection import scalar_layout
-from ..control import remembering
+from ..control._rollout import remembering
 from ..kinematics import difference, integrate
 from ..limits import AccelerationLimit, Limit, limit_box
 from ..limits._acceleration import stopping_speed
 from ..robot import Robot
+from ..robot._joint_selection import scalar_layout
 
 _SPARE = 0.1
 """Share of the acceleration with which the motion comes back to the plan."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -69,3 +70,16 @@ class Weights(eqx.Module):
     limit: Float[Array, ""] = eqx.field(default=1e3, converter=_number)
     speed: Float[Array, ""] = eqx.field(default=100.0, converter=_number)
     margin: Float[Array, ""] = eqx.field(default=0.005, converter=_number)
+
+    def smoother(self, time: Float[Array, ""] | float, dt: Float[Array, ""] | float) -> Weights:
+        """With accelerations of all dofs weighing ``time**4`` [s^4] more, beside 1 for the direction of a limb.
+
+        Of one dof by itself, whose path x is to be followed, the minimum of ``(y - x)^2 + time^4 y''^2`` is x through a
+        filter without delay that halves what has an angular frequency of ``1 / time``.
+
+        Args:
+            time: [s]
+            dt: from one frame to the next [s].
+        """
+        more = (time / dt) ** 4
+        return dataclasses.replace(self, smooth=self.smooth + more, smooth_base=self.smooth_base + more)

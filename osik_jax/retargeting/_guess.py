@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 
 from .._errors import OsikValueError
-from .._feet import find_feet
-from .._home import home_kinematics
 from ..kinematics import Kinematics
+from ..kinematics._home import home_kinematics
 from ..physics._world import contact_corners, sole_points
 from ..robot import Robot
+from ..robot._feet import find_feet
 from ._body import JOINTS_APART, joints_between
 from ._person import SIDES
 from ._profile import Capsule, Foot, Place, Point, Profile
@@ -23,11 +23,12 @@ from ._profile import Capsule, Foot, Place, Point, Profile
 _FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
 _LEG_RADIUS, _ARM_RADIUS, _TRUNK_RADIUS = 0.18, 0.18, 0.3
 _HAND = 0.6
-_LEAST_MASS, _THINNEST, _WIDE, _LONG = 3e-3, 0.1, 1.6, 0.9
-"""Links that count, as a share of the robot's mass; what is flatter is not trusted; a trunk that is wider gets two
-capsules; how much of an ellipsoid's length a capsule has."""
+_LEAST_MASS, _LEAST_SIZE, _THINNEST, _WIDE, _LONG, _SHELL = 3e-3, 1e-3, 0.1, 1.6, 1.15, 1.2
+"""Links that count, as a share of the robot's mass; what is smaller [m] or flatter is not trusted; a trunk that is
+wider gets two capsules; how much of an ellipsoid's length and width a capsule has."""
 _SAME, _ROOM = 1e-6, 6e-3
 _ORIGIN: Point = (0.0, 0.0, 0.0)
+_GRIPS = re.compile(r"grip|finger|thumb|hand$", re.IGNORECASE)
 
 
 class _Chain(NamedTuple):
@@ -41,9 +42,9 @@ def guess_profile(robot: Robot) -> Profile:
     """The profile of a robot with two legs and two arms, as its tree and its home configuration show it.
 
     Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as what reaches furthest to the sides. A knee
-    or an elbow is the joint that is far from both ends of its limb. Soles are the feet's corner frames
-    (``NAME_corner_0`` and so on), or their boxes or balls; a foot without is given a length that goes with its leg.
-    Look at it, and save it with ``save_profile`` to change it.
+    or an elbow is the joint that is far from both ends of its limb, a wrist the last that turns the whole hand. Soles
+    are the feet's corner frames (``NAME_corner_0`` and so on), or their boxes or balls; a foot without is given a
+    length that goes with its leg. Look at it, and save it with ``save_profile`` to change it.
 
     Raises:
         ValueError: the base does not float, or two legs and two arms are not found.
@@ -64,7 +65,7 @@ def guess_profile(robot: Robot) -> Profile:
     for side, leg, arm in zip(SIDES, legs, arms, strict=True):
         knee, elbow = _bend(leg.anchors, 0), _bend(arm.anchors, 1)
         hip, shoulder = max(knee - 2, 0), min(1, elbow - 1)
-        wrist = _last_apart(arm.anchors, elbow)
+        wrist = max(_after(arm.anchors, elbow), _hand(robot, arm, elbow))
         places = dict(hip=leg.bodies[hip], knee=leg.bodies[knee], ankle=leg.bodies[_after(leg.anchors, knee)])
         places |= dict(shoulder=arm.bodies[shoulder], elbow=arm.bodies[elbow], wrist=arm.bodies[wrist])
         keypoints |= {f"{side}_{role}": (tree.body_names[body], _ORIGIN) for role, body in places.items()}
@@ -130,19 +131,30 @@ def _after(anchors: np.ndarray, bend: int) -> int:
     return next(i for i in range(bend + 1, len(anchors)) if apart[i])
 
 
-def _last_apart(anchors: np.ndarray, bend: int) -> int:
-    """The joint of a wrist: the last of its limb."""
-    return max(_after(anchors, bend), len(anchors) - 1)
+def _hand(robot: Robot, arm: _Chain, elbow: int) -> int:
+    """The last body of an arm that is still one with the whole hand: behind it fingers part, or a gripper opens.
+
+    A gripper's joint leads or follows another, or is called so.
+    """
+    tree = robot.tree
+    coupled = {joint for follower, leader, _ in tree.followers for joint in (follower, leader)}
+    for i in range(elbow + 1, len(arm.bodies)):
+        siblings = sum(parent == tree.body_parents[arm.bodies[i]] for parent in tree.body_parents)
+        joints = [j for j, body in enumerate(tree.joint_bodies) if body == arm.bodies[i]]
+        if siblings > 1 or any(j in coupled or _GRIPS.search(tree.joint_names[j]) for j in joints):
+            return i - 1
+    return len(arm.bodies) - 1
 
 
 def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: _Chain) -> Foot:
-    """The sole's corners, or those of a foot that goes with the leg."""
+    """The sole's corners, or those of a foot that goes with the leg; at height 0 of a frame that is called a sole."""
     corners = _corners(robot, kinematics, frame)
     if len(corners) >= 4:
         ordered = corners[np.argsort(corners[:, 0])]
         return Foot(frame, *(_pair(part[np.argsort(-part[:, 1])]) for part in (ordered[:2], ordered[-2:])))
     length = float(np.linalg.norm(np.diff(leg.anchors, axis=0), axis=-1).sum())
     foot, width, height = _FOOT_LENGTH * length / 2, _FOOT_WIDTH * length / 2, _FOOT_HEIGHT * length
+    height = 0.0 if "sole" in frame.lower() else height
     rear, front = -_HEEL * foot, (1.0 - _HEEL) * foot
     return Foot(frame, *(_pair(np.array([[x, width, -height], [x, -width, -height]])) for x in (rear, front)))
 
@@ -186,11 +198,17 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
 
     plain = _plain_capsules(kinematics, profile, robot)
     missing = [capsule for capsule, end in plain if not is_seen(capsule.frame, end)]
-    return _apart_at_home(robot, kinematics, [*seen, *missing])
+    soles = [kinematics.frame_pose(robot, frame) for frame, _ in profile.corners]
+    floor = min(float((p + R @ np.array(x))[2]) for (p, R), (_, x) in zip(soles, profile.corners, strict=True))
+    return _apart_at_home(robot, kinematics, [*seen, *missing], floor)
 
 
-def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule]) -> tuple[Capsule, ...]:
-    """Capsules made thinner, by up to a half, that overlap at home: such pairs would not be kept apart."""
+def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule], floor: float) -> tuple[Capsule, ...]:
+    """Capsules made thinner, by up to a half, that overlap at home or reach below the soles.
+
+    Such pairs would not be kept apart, and what is below the soles would lift the feet; what would have to be thinner
+    than half for that is left out.
+    """
     tree, out = robot.tree, []
     bodies = [tree.frame_bodies[tree.frame(c.frame)] for c in capsules]
     poses = [kinematics.frame_pose(robot, c.frame) for c in capsules]
@@ -204,8 +222,10 @@ def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule]
         most = between / (capsules[i].radius + capsules[j].radius)
         if 0.5 < most < 1.0:
             share[[i, j]] = np.minimum(share[[i, j]], most)
-    for capsule, factor in zip(capsules, share, strict=True):
-        out.append(dataclasses.replace(capsule, radius=round(float(factor) * capsule.radius, 6)))
+    for capsule, ends, factor in zip(capsules, axes, share, strict=True):
+        above = (min(float(end[2]) for end in ends) - floor - _ROOM) / capsule.radius
+        if above > 0.5:
+            out.append(dataclasses.replace(capsule, radius=round(min(float(factor), above) * capsule.radius, 6)))
     return tuple(out)
 
 
@@ -219,6 +239,7 @@ def _between(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> floa
 def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
     """Each link as the solid ellipsoid of its inertia, and that as one capsule; a wide trunk as two side by side.
 
+    Wider than the ellipsoid, for a link's mass is inside its shell: a G1's thighs are by 11 %, its hands by 30.
     An ellipsoid of semi-axes a, b, c and mass m turns about the first with ``m (b^2 + c^2) / 5``.
     """
     model, out = robot.mj_model, []
@@ -232,13 +253,14 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
         mujoco.mju_quat2Mat(turn, model.body_iquat[body])
         axes = np.sqrt(np.maximum(2.5 / mass * (inertia.sum() - 2.0 * inertia), 0.0))
         long, wide, thin = np.argsort(-axes)
-        if not axes[thin] > _THINNEST * axes[long]:
+        if not axes[thin] > max(_LEAST_SIZE, _THINNEST * axes[long]):
             continue
         apart = name in trunk and axes[wide] > _WIDE * axes[thin]
-        radius = float(axes[thin] if apart else 0.5 * (axes[wide] + axes[thin]))
+        radius = _SHELL * float(axes[thin] if apart else 0.5 * (axes[wide] + axes[thin]))
         along, aside = turn.reshape(3, 3)[:, long], turn.reshape(3, 3)[:, wide]
         reach = max(_LONG * axes[long] - radius, 0.05 * radius)
-        for shift in (axes[wide] - radius, radius - axes[wide]) if apart else (0.0,):
+        aside_by = _SHELL * axes[wide] - radius
+        for shift in (aside_by, -aside_by) if apart else (0.0,):
             centre = model.body_ipos[body] + shift * aside
             ends = _pair(np.stack([centre - reach * along, centre + reach * along]))
             out.append(Capsule(name, *ends, round(radius, 6)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             if not hasattr(data, "files"):
                 raise OsikValueError("it holds one array and not several by name")
             return {name: data[name] for name in data.files}
-    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+    except (ValueError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise OsikValueError(f"{path} cannot be read as an .npz of plain arrays: {error}") from None
 
 

@@ -16,15 +16,13 @@ from .._errors import OsikValueError
 from ..kinematics import difference
 from ..limits import Limit
 from ..robot import Robot
-from ._body import Build, pairs_apart
 from ._finish import inside_limits, inside_ranges
 from ._goals import Goals, Weights
 from ._motion import HumanMotion
+from ._on_robot import ACCELERATION, OnRobot
 from ._person import measure, read_person
 from ._plan import make_plan, mend_plan
 from ._profile import Profile
-from ._profile_file import check_profile, find_profile
-from ._retarget import ACCELERATION, own_limits
 from ._skeletons import find_roles
 from ._terms import Body, Bounds
 
@@ -76,7 +74,7 @@ class _Plan(NamedTuple):
     off: Float[Array, ""]
 
 
-class LiveRetargeter:
+class LiveRetargeter(OnRobot):
     """Retargets a stream frame by frame, some frames behind the person: ``look_ahead`` of them are known ahead.
 
     Limits of position, speed and acceleration hold at every frame, whatever comes in. Feet stay where they stand, and
@@ -108,22 +106,15 @@ class LiveRetargeter:
         look_ahead: int = 8,
         iterations: int = 3,
     ):
-        if not robot.floating_base:
-            raise OsikValueError("retargeting moves a robot's base: load the robot with floating_base=True")
         for name, value in (("look_ahead", look_ahead), ("iterations", iterations)):
             if not value >= 1:
                 raise OsikValueError(f"{name} is {value}; it is 1 at least")
-        self.robot = robot
-        self.profile = find_profile(robot) if profile is None else profile
-        check_profile(robot, self.profile)
-        self.limits = own_limits(robot, acceleration)
+        super().__init__(robot, profile, acceleration)
         self.look_ahead, self.iterations = int(look_ahead), int(iterations)
         self._standing, self.roles = standing, find_roles(standing.joint_names, mapping)
         self._measures = measure(standing, self.roles)
-        self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile))
-        self._build = Build.of(robot, self.profile)
         self._dt = 1.0 / standing.fps
-        self._bounds = self._build.bounds(np.asarray(self.limits[2].acceleration), self._dt)
+        self._window_bounds = self._bounds(self._dt)
         self.reset()
 
     @property
@@ -214,9 +205,9 @@ class LiveRetargeter:
 
     def _advanced(self, goals: Goals) -> _Plan:
         """The window a frame further."""
-        weights, guess = self.profile.weights, self._build.first_guess(goals)
+        weights, bounds, guess = self.profile.weights, self._window_bounds, self._build.first_guess(goals)
         if self._plan is None:
-            first = make_plan(self._body, goals, weights, self._bounds, guess, _FIRST_ITERATIONS).q
+            first = make_plan(self._body, goals, weights, bounds, guess, _FIRST_ITERATIONS).q
             # at rest in the first frame, which is there _PAST times more
             q = np.concatenate([np.repeat(np.asarray(first)[:1], _PAST, 0), np.asarray(first)[_PAST:]])
             q[:_PAST] = inside_ranges(self.robot, jnp.asarray(q[0]))
@@ -226,7 +217,7 @@ class LiveRetargeter:
             q = np.concatenate([before[1:], before[-1:]])
             q[-1, :3] += guess[-1, :3] - guess[-2, :3]
             velocity = self._plan.velocity
-        return _advance(self._body, goals, weights, self._bounds, q, velocity, self.limits, self._dt, self.iterations)
+        return _advance(self._body, goals, weights, bounds, q, velocity, self.limits, self._dt, self.iterations)
 
 
 @jax.jit

@@ -10,6 +10,8 @@ from ._bvh import Up, read_bvh
 from ._keypoints import read_keypoints
 from ._motion import HumanMotion
 
+ENDINGS = (".bvh", ".npz", ".csv")
+
 
 def load_motion(path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None) -> HumanMotion:
     """Reads a person's motion: BVH, or keypoints as ``.npz`` or ``.csv``, told apart by the file's ending.
@@ -28,8 +30,28 @@ def load_motion(path: str | os.PathLike[str], *, unit: str | float | None = None
     ending = Path(path).suffix.lower()
     if ending == ".bvh":
         return read_bvh(path, unit=unit, up=up)
-    if ending not in (".npz", ".csv"):
+    if ending not in ENDINGS:
+        if not ending and not Path(path).exists():  # perhaps a folder's name with a letter wrong
+            raise FileNotFoundError(f"no such file: {path}")
         raise OsikValueError(f"{path} is none of .bvh, .npz and .csv")
     if unit is not None or up is not None:
         raise OsikValueError("unit and up go with BVH files; keypoints are metres, z up")
     return read_keypoints(path)
+
+
+def load_clip(path: Path, unit: str | float | None, up: Up | None) -> HumanMotion:
+    """A clip; unit and axis go with BVH files alone."""
+    bvh = path.suffix.lower() == ".bvh"
+    return load_motion(path, unit=unit if bvh else None, up=up if bvh else None)
+
+
+def clips_in(folder: Path) -> dict[str, Path]:
+    """The files that are read, by the names of their clips: without the ending, but where two would be called alike."""
+    inside = sorted(folder.iterdir())
+    files = [path for path in inside if path.is_file() and path.suffix.lower() in ENDINGS]
+    if not files:
+        others = [path.name for path in inside]
+        seen = ", ".join(others[:8]) + (f" and {len(others) - 8} more" if len(others) > 8 else "")
+        raise OsikValueError(f"{folder} has no clips ({', '.join(ENDINGS)}); in it: {seen or 'nothing'}")
+    stems = [path.stem for path in files]
+    return {path.stem if stems.count(path.stem) == 1 else path.name: path for path in files}

@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._errors import OsikValueError
-from .._tree import unknown_name
+from .._errors import OsikValueError, unknown_name
 from ._rotations import continuous, slerp
 
 CONTACT_POINTS = ("left_heel", "left_toe", "right_heel", "right_toe")

@@ -66,18 +66,25 @@ def unit(vector: np.ndarray) -> np.ndarray:
     return np.where(length > _SHORTEST, vector / np.maximum(length, _SHORTEST), np.eye(3)[0])
 
 
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a x b, in half the time that NumPy takes for some hundred. (..., 3)."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
+
+
 def axes_from(left: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Right-handed axes as columns, with the y axis along ``left`` and z as near ``up`` as it can be. (..., 3, 3)."""
     y = unit(left)
-    x = unit(np.cross(y, up))
-    return np.stack([x, y, np.cross(x, y)], -1)
+    x = unit(_cross(y, up))
+    return np.stack([x, y, _cross(x, y)], -1)
 
 
 def foot_axes(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Axes as columns, with x along ``forward`` and z as near ``up`` as it can be. (..., 3, 3)."""
     x = unit(forward)
-    y = unit(np.cross(up, x))
-    return np.stack([x, y, np.cross(x, y)], -1)
+    y = unit(_cross(up, x))
+    return np.stack([x, y, _cross(x, y)], -1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,7 +201,7 @@ def _toes(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
 def _toe(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
     """Before and below the ankle, at right angles to the shank, as far as feet are long for a shank."""
     shank = points[f"{side}_ankle"] - points[f"{side}_knee"]
-    forward = np.cross(points["left_hip"] - points["right_hip"], -shank)
+    forward = _cross(points["left_hip"] - points["right_hip"], -shank)
     length = np.linalg.norm(shank, axis=-1, keepdims=True)
     return points[f"{side}_ankle"] + length * (_TOE * unit(forward) + _SOLE * unit(shank))
 

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._joint_selection import scalar_layout
+from ..execution._backends import here, takes
+from ..execution._computed import by_numba
 from ..kinematics import difference, integrate
+from ..numerics._dense import product
+from ..robot._joint_selection import scalar_layout
+from . import _plan_kernel
 from ._banded import BandedSystem, solve_banded
 from ._goals import Goals, Weights
 from ._terms import Body, Bounds, frame_rows
@@ -24,8 +28,9 @@ from ._terms import Body, Bounds, frame_rows
 _LARGEST_STEP = 0.5
 """Of any dof in an iteration [rad or m]: what the linear model is good for."""
 
-_SOFTEST, _STIFFENING, _SLOWING = 1e-4, 10.0, 0.5
-"""Stiffness of the bounds at first, its growth, and the share of the cost below which a step's gain lets it grow."""
+_SOFTEST, _SOFT, _STIFFENING, _SLOWING = 1e-4, 1e-3, 10.0, 0.5
+"""Stiffness of the bounds at first, in a part of the frames and in all, its growth, and the share of the cost below
+which a step's gain lets it grow."""
 
 _FIXED = 1e15
 """Damping of frames that do not move."""
@@ -38,8 +43,17 @@ With bounds at their full stiffness, and after a step that was refused, it is ``
 stretched legs swing from one end of what the bounds leave them to the other.
 """
 
-_LITTLE, _SETTLED = 5e-3, 2
-"""A gain that is little, as a share of what the wishes cost, and how many of them in a row are the end."""
+_LITTLE, _SETTLED = 2e-3, 2
+"""A gain that is little, as a share of what the wishes cost, and what makes an end: a step that gains so little counts
+as two, a refused one as one."""
+
+_Ending = Literal["ready", "settled", "spent"]
+_START = {
+    "ready": (_SOFTEST, _FIRST_DAMPING),
+    "settled": (_SOFT, _FIRST_DAMPING),
+    "spent": (1.0, _STIFF_DAMPING),
+}
+"""What ends iterations but for their number; stiffness and damping with which they begin."""
 
 _SMOOTHNESS = ("smooth", "smooth_base")
 _STRIDE, _COARSE_ITERATIONS = 4, 8
@@ -97,9 +111,7 @@ class _State(NamedTuple):
     iterations: Int[Array, ""]
 
     @classmethod
-    def at(
-        cls, clip: _Clip, q: Float[Array, "F nq"], stiffness: float = _SOFTEST, damping: float = _FIRST_DAMPING
-    ) -> _State:
+    def at(cls, clip: _Clip, q: Float[Array, "F nq"], stiffness: float, damping: float) -> _State:
         """Before the first iteration."""
         hard, damped, growth = (jnp.asarray(x, q.dtype) for x in (stiffness, damping, _CAREFUL))
         here, none = _linearised(clip, q, hard), jnp.array(0)
@@ -119,17 +131,11 @@ def make_plan(
 
     Levenberg and Marquardt's method. Bounds that have to hold begin soft and get stiffer with each step that is
     taken, so that limbs find their way before feet and limits pin them down; they do so on a part of the frames first,
-    which is a quarter of the work. It ends when two steps in a row gained less than a small part of what the wishes
-    cost, with all bounds at their full stiffness. Refused steps count where the bounds are kept.
+    which is a quarter of the work. It ends when a step gains less than a small part of what the wishes cost, with all
+    bounds at their full stiffness, or when two are refused where the bounds are kept.
     """
     clip = _Clip(body, goals, weights, bounds, jnp.ones(len(start), start.dtype))
-
-    def goes_on(state: _State) -> Bool[Array, ""]:
-        return (state.settled < _SETTLED) & (state.iterations < max_iterations)
-
-    q = _from_a_part(clip, start)
-    last = jax.lax.while_loop(goes_on, partial(_improved, clip), _State.at(clip, q))
-    return Plan(last.q, jnp.stack(last.here.costs), last.iterations)
+    return _descended(clip, _from_a_part(clip, start), max_iterations, until="settled")
 
 
 @jax.jit
@@ -153,10 +159,22 @@ def mend_plan(
         free: 1 for frames that may move, 0 for those that are past. (F,)
         iterations: how many.
     """
-    clip = _Clip(body, goals, weights, bounds, free)
-    state = _State.at(clip, q, stiffness=1.0, damping=_STIFF_DAMPING)
-    last = jax.lax.while_loop(lambda state: state.iterations < iterations, partial(_improved, clip), state)
-    return Plan(last.q, jnp.stack(last.here.costs), last.iterations)
+    return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, until="spent")
+
+
+def at_solution(
+    body: Body, goals: Goals, weights: Weights, bounds: Bounds, q: Float[Array, "F nq"]
+) -> Float[Array, "F nq"]:
+    """A plan as a function of what it was made for: its value is q, its derivative that of the solution.
+
+    At the solution a step of Gauss and Newton is 0, and its derivative, with the system held fixed, is how the solution
+    moves, but for second derivatives of residuals that are small (implicit function theorem).
+    """
+    clip = _Clip(body, goals, weights, bounds, jnp.ones(len(q), q.dtype))
+    here = _linearised(clip, q, jnp.ones((), q.dtype))
+    system = jax.lax.stop_gradient(here.system)
+    step = -solve_banded(system._replace(alone=system.alone + _LEAST_DAMPING), here.gradient)
+    return jax.vmap(lambda a, b: integrate(body.robot, a, b))(q, step - jax.lax.stop_gradient(step))
 
 
 def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq"]:
@@ -170,11 +188,7 @@ def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq
         weights=wide,
         bounds=clip.bounds._replace(step=_STRIDE * clip.bounds.step, change=_STRIDE**2 * clip.bounds.change),
     )
-
-    def goes_on(state: _State) -> Bool[Array, ""]:
-        return ~state.ready & (state.iterations < _COARSE_ITERATIONS)
-
-    found = jax.lax.while_loop(goes_on, partial(_improved, less), _State.at(less, start[part])).q
+    found = _descended(less, start[part], _COARSE_ITERATIONS, until="ready").q
     move = jax.vmap(lambda a, b: difference(robot, a, b))(start[part], found)
     at = np.arange(frames) / _STRIDE
     before = np.minimum(at.astype(int), len(move) - 1)
@@ -183,12 +197,49 @@ def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq
     return jax.vmap(lambda a, b: integrate(robot, a, b))(start, move)
 
 
+def _descended(clip: _Clip, q: Float[Array, "F nq"], most: Int[Array, ""] | int, *, until: _Ending) -> Plan:
+    """Iterations from some configurations on: on CPUs by a kernel, where Numba is installed.
+
+    Args:
+        clip: what for.
+        q: where they begin; with soft bounds and little damping, or stiff and damped for those that are ``spent``.
+        most: iterations, at most.
+        until: what ends them before: bounds that are ready to get stiffer, steps that gain little, or nothing (static).
+    """
+    descended = _by_kernel if takes(here("auto"), "numba", fits=True) else _descended_plain
+    return descended(clip, q, jnp.asarray(most), until=until)
+
+
+def _descended_plain(clip: _Clip, q: Float[Array, "F nq"], most: Int[Array, ""], *, until: _Ending) -> Plan:
+    """The same in plain JAX."""
+
+    def goes_on(state: _State) -> Bool[Array, ""]:
+        over = {"ready": state.ready, "settled": state.settled >= _SETTLED, "spent": jnp.array(False)}[until]
+        return ~over & (state.iterations < most)
+
+    last = jax.lax.while_loop(goes_on, partial(_improved, clip), _State.at(clip, q, *_START[until]))
+    return Plan(last.q, jnp.stack(last.here.costs), last.iterations)
+
+
+def _descended_by_numba(
+    clip: _Clip, q: Float[Array, "lanes F nq"], most: Int[Array, " lanes"], *, until: _Ending
+) -> Plan:
+    """The same of a batch, on a CPU and in double precision; what all lanes share has an axis of length 1."""
+    endings = float(until == "ready"), float(until == "settled")
+    rules = (_LARGEST_STEP, _STIFFENING, _SLOWING, _FIXED, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING, _CALMER)
+    rules += (_CAREFUL, _LITTLE, float(_SETTLED), *_START[until])
+    return Plan(*_plan_kernel.descended(*clip, q, rules, most, endings))
+
+
+_by_kernel = by_numba(_descended_plain, _descended_by_numba)
+
+
 def _improved(clip: _Clip, state: _State) -> _State:
     """One system solved, and its step taken if it makes things better."""
     robot, here = clip.body.robot, state.here
-    identity, free = jnp.eye(robot.nv, dtype=state.q.dtype), clip.free[:, None]
+    free = clip.free[:, None]
     held = jnp.where(free == 1.0, state.damping, _FIXED)
-    damped = here.system._replace(diagonal=here.system.diagonal + held[..., None] * identity)
+    damped = here.system._replace(alone=here.system.alone + held)
     move = -free * solve_banded(damped, free * here.gradient)
     longest = jnp.abs(move).max(-1, keepdims=True)
     move = move * jnp.minimum(1.0, _LARGEST_STEP / jnp.maximum(longest, _LARGEST_STEP))
@@ -202,7 +253,7 @@ def _improved(clip: _Clip, state: _State) -> _State:
     damping = jnp.clip(state.damping * jnp.where(better, _CALMER, state.growth), least, _MOST_DAMPING)
     growth = jnp.where(better, _CAREFUL, 2.0 * state.growth)
     little = (state.stiffness >= 1.0) & (before - after < _LITTLE * soft) & (better | (stiff < _LITTLE * soft))
-    settled = jnp.where(little, state.settled + 1, jnp.where(better, 0, state.settled))
+    settled = jnp.where(little, state.settled + jnp.where(better, 2, 1), jnp.where(better, 0, state.settled))
     settled = jnp.where(~better & (state.damping >= _MOST_DAMPING), _SETTLED, settled)
     ready = jnp.where(better, before - after < _SLOWING * before, state.ready)
     old, new = (state.q, here, state.stiffness), (candidate, there, stiffer)
@@ -273,34 +324,31 @@ def _linearised(clip: _Clip, q: Float[Array, "F nq"], stiffness: Float[Array, ""
     jacobian = jnp.concatenate([rows.jacobian, moving], 1)
     square = jnp.concatenate([weight, held + jnp.roll(held, -1, 0)], 1)
     pull = jnp.concatenate([weight * rows.residual, held * move - jnp.roll(held * move, -1, 0)], 1)
-    diagonal = jnp.matmul(jnp.swapaxes(jacobian * square[..., None], 1, 2), jacobian)
-    first = -jnp.matmul(jnp.swapaxes(moving * held[..., None], 1, 2), jnp.roll(moving, 1, 0))
-    gradient = jnp.sum(jacobian * pull[..., None], 1)
+    # one product for both: on a GPU, sums over rows take as long as all of it
+    weighted = jnp.concatenate([jacobian * square[..., None], pull[..., None]], -1)
+    both = product(jnp.swapaxes(jacobian, 1, 2), weighted)
+    blocks, gradient = both[..., :-1], both[..., -1]
     gradient += there * (own.soft_weight * own.soft + stiffness * own.stiff_weight * own.stiff)
     alone = there * (own.soft_weight + stiffness * own.stiff_weight)
-    system = BandedSystem(diagonal, first, jnp.zeros_like(gradient))
-    here = _Linearised(system, gradient, soft, stiff)
-    return _with_steps(here, alone, *_between(body, q, goals, weights, bounds, stiffness))
+    none = jnp.zeros_like(gradient)
+    here = _Linearised(BandedSystem(blocks, alone, moving, held, none, none), gradient, soft, stiff)
+    return _with_steps(here, *_between(body, q, goals, weights, bounds, stiffness))
 
 
-def _with_steps(here: _Linearised, alone: Float[Array, "F nv"], steps: _Hinge, changes: _Hinge) -> _Linearised:
-    """What dofs cost by themselves, with their speeds and accelerations.
+def _with_steps(here: _Linearised, steps: _Hinge, changes: _Hinge) -> _Linearised:
+    """With what the dofs' speeds and accelerations cost.
 
     ``step_t = q_t+1 - q_t`` has derivatives (-1, 1), ``change_t = q_t+2 - 2 q_t+1 + q_t`` has (1, -2, 1).
     """
-    n = here.gradient.shape[-1]
     w, c = steps.weight, changes.weight
-    main = alone.at[:-1].add(w).at[1:].add(w)
+    main = here.system.alone.at[:-1].add(w).at[1:].add(w)
     main = main.at[:-2].add(c).at[1:-1].add(4.0 * c).at[2:].add(c)
     near = jnp.zeros_like(main).at[1:].add(-w).at[1:-1].add(-2.0 * c).at[2:].add(-2.0 * c)
     far = here.system.second.at[2:].add(c)
     g, a = steps.gradient, changes.gradient
     gradient = here.gradient.at[:-1].add(-g).at[1:].add(g)
     gradient = gradient.at[:-2].add(a).at[1:-1].add(-2.0 * a).at[2:].add(a)
-    spread = jnp.eye(n, dtype=main.dtype)
-    system = BandedSystem(
-        here.system.diagonal + main[:, :, None] * spread, here.system.first + near[:, :, None] * spread, far
-    )
+    system = here.system._replace(alone=main, first=near, second=far)
     soft, stiff = (
         own.at[1:].add(step).at[2:].add(change)
         for own, step, change in ((here.soft, steps.soft, changes.soft), (here.stiff, steps.stiff, changes.stiff))

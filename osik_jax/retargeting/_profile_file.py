@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .._errors import OsikValueError
-from .._tree import unknown_name
+from .._errors import OsikValueError, unknown_name
 from ..robot import Robot
 from ._goals import Weights
 from ._guess import guess_profile

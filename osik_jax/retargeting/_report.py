@@ -27,9 +27,10 @@ _CHAINS = {
 def report(result: Retargeted) -> dict[str, Any]:
     """Figures of a retargeted motion: lengths in mm, angles in rad but for ``segment_angle_deg``.
 
-    ``joints``: how far joints are beyond their ranges, speed over its limit, accelerations, and frames with a jump of
-    more than 15 rad/s. ``feet``: how far points that stand move from where they landed (``slip``), how high they are
-    (``float``), and how deep soles are below the floor. ``shapes``: how deep the profile's capsules are in each other.
+    ``joints``: how far joints are beyond their ranges, speed over its limit, accelerations and jerks (``rms``: root of
+    the mean square over joints and frames), and frames with a jump of more than 15 rad/s. ``feet``: how far points that
+    stand move from where they landed (``slip``), how high they are (``float``), and how deep soles are below the floor.
+    ``shapes``: how deep the profile's capsules are in each other.
     ``tracking``: keypoints against the person's, limb by limb, with the scale that fits each limb best; and the angle
     between the person's segments and the robot's.
     """
@@ -82,8 +83,15 @@ def _joints(result: Retargeted) -> dict[str, Any]:
         "speed_over_limit_max": float((np.abs(speed) / fast).max()),
         "acceleration_max": float(change.max() * fps),
         "acceleration_max_joint": names[worst],
+        "acceleration_rms": _rms(change) * fps,
+        "jerk_rms": _rms(np.diff(speed, 2, axis=0)) * fps**2,
         "jump_frames": int((change > JUMP).any(1).sum()),
     }
+
+
+def _rms(values: np.ndarray) -> float:
+    """The root of the mean square; 0 of none."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
 def _feet(corners: Float[np.ndarray, "F 8 3"], contact: Bool[np.ndarray, "F 4"], fps: float) -> dict[str, Any]:

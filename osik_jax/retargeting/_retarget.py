@@ -4,34 +4,36 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikValueError
-from .._joint_selection import scalar_layout
-from .._tree import FREE
-from ..limits import AccelerationLimit, ConfigurationLimit, Limit, VelocityLimit
+from ..execution._workers import cores
+from ..limits import Limit
 from ..robot import Robot
 from ..scaling import Saved, run_in_chunks
-from ._body import Build, pairs_apart
+from ..scaling._progress import reported
 from ._finish import follow
 from ._goals import Goals, Weights
 from ._motion import HumanMotion
+from ._on_robot import ACCELERATION, OnRobot
 from ._person import Person, read_person
 from ._plan import make_plan
 from ._profile import Profile
-from ._profile_file import check_profile, find_profile
-from ._robot_motion import RobotMotion
+from ._robot_motion import RobotMotion, in_mujoco_order
 from ._skeletons import find_roles
 from ._terms import Body, Bounds
 
-ACCELERATION = 240.0
 _LENGTHS = 16
+_Checked = tuple[HumanMotion, Mapping[str, str]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,13 +78,15 @@ class Retargeted:
         )
 
 
-class Retargeter:
+class Retargeter(OnRobot):
     """Retargets any number of clips to one robot; what does not depend on the clip is computed once.
 
     Args:
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
         profile: how the robot is seen. None: the package's own for NAO and G1, or a guess (``find_profile``).
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+        smoothness: what is faster than about this time is smoothed out [s]: accelerations weigh, beside directions of
+            limbs, with its fourth power. 0: nothing but what the profile's weights say. Changing it compiles nothing.
         max_iterations: of the plan.
 
     Raises:
@@ -96,25 +100,22 @@ class Retargeter:
         *,
         profile: Profile | None = None,
         acceleration: float | Mapping[str, float] = ACCELERATION,
+        smoothness: float = 0.0,
         max_iterations: int = 100,
     ):
-        if not robot.floating_base:
-            raise OsikValueError("retargeting moves a robot's base: load the robot with floating_base=True")
-        self.robot = robot
-        self.profile = find_profile(robot) if profile is None else profile
-        check_profile(robot, self.profile)
-        self.limits = own_limits(robot, acceleration)
+        super().__init__(robot, profile, acceleration)
+        if not (np.isfinite(smoothness) and smoothness >= 0.0):
+            raise OsikValueError(f"smoothness is {smoothness}; it is a time in seconds, 0 or more")
+        self.smoothness = smoothness
         self.max_iterations = max_iterations
-        self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile))
-        self._build = Build.of(robot, self.profile)
-        self._acceleration = np.asarray(self.limits[2].acceleration)
 
     def retarget(
         self, motion: HumanMotion, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
     ) -> Retargeted:
         """The robot does what a person did; see ``retarget``."""
         clip = self._prepared(motion, mapping, fps)
-        plan = make_plan(self._body, clip.goals, self.profile.weights, clip.bounds, clip.start, self.max_iterations)
+        weights = self.profile.weights.smoother(self.smoothness, clip.dt)
+        plan = make_plan(self._body, clip.goals, weights, clip.bounds, clip.start, self.max_iterations)
         q, off = follow(self.robot, plan.q, self.limits, clip.dt)
         return self._finished(clip, Solved(q, off, plan.iterations, plan.cost))
 
@@ -134,7 +135,8 @@ class Retargeter:
             motions: the clips.
             mapping: as of ``retarget``, the same for all.
             fps: as of ``retarget``.
-            chunk: how many are worked on at once; about 100 kB of memory a frame of each.
+            chunk: how many are worked on at once, and saved in ``out``; about 100 kB of memory a frame of each. On a
+                CPU without ``out`` as many are as there are cores.
             out: a folder for what is finished, so that a job that was killed goes on where it was
                 (``osik_jax.scaling.run_in_chunks``). None: none.
             progress: whether to show a bar.
@@ -145,19 +147,26 @@ class Retargeter:
         Raises:
             ValueError, KeyError: as of ``retarget``; the message starts with the clip's name.
         """
-        clips = [self._prepared_by_name(motion, mapping, fps) for motion in motions]
+        checked = [checked_by_name(motion, mapping, fps) for motion in motions]
+        if out is None and one_a_core():
+            with ThreadPoolExecutor(cores()) as pool, reported(len(checked), 0, progress, "clips") as advance:
+                made = []
+                for one in pool.map(self._made_by_a_core, checked):
+                    made.append(one)
+                    advance(1)
+            return made
+        clips = [self._read(*motion) for motion in checked]
         groups: dict[int, list[int]] = {}
         for i, clip in enumerate(clips):
-            groups.setdefault(_rounded_up(clip.frames), []).append(i)
+            groups.setdefault(shared_length(clip), []).append(i)
         found: dict[int, Retargeted] = {}
-        shared = (self._body, self.profile.weights, self.limits, np.asarray(self.max_iterations))
         for length, members in sorted(groups.items()):
             lanes = [_lane(clips[i], length) for i in members]
             solved = run_in_chunks(
-                _solve_lanes,
+                _solve_side_by_side,
                 jax.tree.map(lambda *leaves: np.stack(leaves), *lanes),
-                chunk=min(chunk, len(members)),
-                shared=shared,
+                chunk=_even(len(members), chunk),
+                shared=self._shared,
                 out=None if out is None else Path(out) / f"frames_{length}",
                 progress=progress,
                 unit="clips",
@@ -167,28 +176,68 @@ class Retargeter:
                 found[i] = self._finished(clips[i], jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
         return [found[i] for i in range(len(clips))]
 
-    def _prepared(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Clip:
-        """What a clip asks for."""
-        motion = motion if fps is None else motion.resampled(fps)
-        if motion.frames < 3:
-            raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
-        person = read_person(motion, find_roles(motion.joint_names, mapping))
+    def _prepared(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
+        """What a clip asks for, in the form that is computed with."""
+        return self._read(*_checked(motion, mapping, fps))
+
+    def _read(self, motion: HumanMotion, roles: Mapping[str, str]) -> Clip:
+        """The same of a clip that can be read, whose joints have these names."""
+        person = read_person(motion, roles)
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % _LENGTHS)
         dt = 1.0 / motion.fps
-        return _Clip(person, motion.frames, goals, start, self._build.bounds(self._acceleration, dt), dt)
+        return Clip(person, motion.frames, goals, start, self._bounds(dt), dt)
 
-    def _prepared_by_name(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Clip:
-        try:
-            return self._prepared(motion, mapping, fps)
-        except (ValueError, KeyError) as error:
-            raise type(error)(f"{motion.name}: {error.args[0]}") from error
+    def _solved(self, clips: Sequence[Clip], length: int, lanes: int) -> list[Callable[[], Retargeted]]:
+        """Clips of at most so many frames (``shared_length`` or more).
 
-    def _finished(self, clip: _Clip, solved: Solved) -> Retargeted:
+        ``lanes`` is of how many clips the program is that works on all at once, where there is one: at least these.
+
+        Returns:
+            for each clip a function that makes its record; it raises ValueError where the motion is not finite.
+        """
+        batch = [_lane(clip, length) for clip in clips]
+        if not one_a_core():
+            batch += batch[-1:] * (lanes - len(batch))
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *batch)
+        results = jax.tree.map(np.asarray, _solve_side_by_side(stacked, *self._shared))
+        return [
+            partial(self._finished, clip, jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
+            for lane, clip in enumerate(clips)
+        ]
+
+    @property
+    def _shared(self) -> tuple[Any, ...]:
+        """What all lanes have in common, as ``_solve_lanes`` takes it."""
+        smoothness = np.asarray(self.smoothness, self._build.start.dtype)
+        return self._body, self.profile.weights, self.limits, np.asarray(self.max_iterations), smoothness
+
+    def _made_by_a_core(self, checked: _Checked) -> Retargeted:
+        """A clip from reading to its record: while one thread holds Python's lock for that, others compute."""
+        clip = self._read(*checked)
+        solved = _solve_lane(_lane(clip, shared_length(clip)), *self._shared)
+        return self._finished(clip, jax.tree.map(np.asarray, solved))
+
+    def _finished(self, clip: Clip, solved: Solved) -> Retargeted:
         q, off = (np.asarray(part)[: clip.frames] for part in (solved.q, solved.off_plan))
         cost = float(solved.cost[0]), float(solved.cost[1])
         made = as_retargeted(self.robot, self.profile, clip.person, q, off)
         return dataclasses.replace(made, iterations=int(solved.iterations), cost=cost)
+
+
+def _checked(motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+    """A clip at the rate that is asked for, if it can be retargeted, and its joints by role."""
+    motion = motion if fps is None else motion.resampled(fps)
+    if motion.frames < 3:
+        raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
+    return motion, find_roles(motion.joint_names, mapping)
+
+
+def checked_by_name(motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+    try:
+        return _checked(motion, mapping, fps)
+    except (ValueError, KeyError) as error:
+        raise type(error)(f"{motion.name}: {error.args[0]}") from error
 
 
 def as_retargeted(
@@ -218,7 +267,7 @@ class Solved(NamedTuple):
     cost: Array
 
 
-class _Clip(NamedTuple):
+class Clip(NamedTuple):
     """A clip in the form that is computed with."""
 
     person: Person
@@ -229,33 +278,71 @@ class _Clip(NamedTuple):
     dt: float
 
 
-def _lane(clip: _Clip, length: int) -> tuple[Goals, Array, Bounds, np.ndarray]:
+def _lane(clip: Clip, length: int) -> _Lane:
     """A clip as one of a batch whose clips have this many frames, padding included."""
     frames = len(clip.start)
     goals, start = (clip.goals, clip.start) if frames >= length else padded(clip.goals, clip.start, length - frames)
     return jax.tree.map(np.asarray, (goals, start, clip.bounds, np.asarray(clip.dt)))
 
 
-def _rounded_up(frames: int) -> int:
+def shared_length(clip: Clip) -> int:
     """A length that clips of about as many frames share: at most a quarter more, and few different ones."""
-    step = max(_LENGTHS, (1 << (frames - 1).bit_length()) // 8)
-    return -(-frames // step) * step
+    step = max(_LENGTHS, (1 << (clip.frames - 1).bit_length()) // 8)
+    return -(-clip.frames // step) * step
+
+
+def _even(count: int, most: int) -> int:
+    """At most so many at once that every chunk has as many, but for the last, which has hardly fewer."""
+    return -(-count // -(-count // most)) if most > 0 else most
+
+
+def one_a_core() -> bool:
+    """Whether clips are worked on one at a time by each core, and not all of them in one program."""
+    return jax.default_backend() == "cpu"
+
+
+_Lane = tuple[Goals, Array, Bounds, Array]
+
+
+def _solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
+    """All lanes: on CPUs as many at a time as there are cores, in threads: a program does not hold Python's lock.
+
+    ``shared`` is what ``_solve_lane`` takes after the lane.
+    """
+    if not one_a_core() or isinstance(jax.tree.leaves(lanes)[0], Tracer):
+        return _solve_lanes(lanes, *shared)
+
+    def one(i: int) -> Solved:
+        return jax.tree.map(np.asarray, _solve_lane(jax.tree.map(lambda leaf: leaf[i], lanes), *shared))
+
+    with ThreadPoolExecutor(cores()) as pool:
+        solved = list(pool.map(one, range(len(lanes[1]))))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *solved)
 
 
 @jax.jit
-def _solve_lanes(
-    lanes: tuple[Goals, Array, Bounds, Array],
+def _solve_lane(
+    lane: _Lane,
     body: Body,
     weights: Weights,
     limits: Sequence[Limit],
     max_iterations: Array,
+    smoothness: Array | float = 0.0,
 ) -> Solved:
-    def one(lane: tuple[Goals, Array, Bounds, Array]) -> Solved:
-        goals, start, bounds, dt = lane
-        plan = make_plan(body, goals, weights, bounds, start, max_iterations)
-        q, off = follow(body.robot, plan.q, limits, dt)
-        return Solved(q, off, plan.iterations, plan.cost)
+    goals, start, bounds, dt = lane
+    plan = make_plan(body, goals, weights.smoother(smoothness, dt), bounds, start, max_iterations)
+    q, off = follow(body.robot, plan.q, limits, dt)
+    return Solved(q, off, plan.iterations, plan.cost)
 
+
+@jax.jit
+def _solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
+    def one(lane: _Lane) -> Solved:
+        return _solve_lane(lane, *shared)
+
+    if one_a_core():
+        # one after another: side by side they would wait for the slowest, and leave the cache in between
+        return jax.lax.map(one, lanes)
     return jax.vmap(one)(lanes)
 
 
@@ -267,6 +354,7 @@ def retarget(
     mapping: Mapping[str, str] | None = None,
     fps: float | None = None,
     acceleration: float | Mapping[str, float] = ACCELERATION,
+    smoothness: float = 0.0,
     max_iterations: int = 100,
 ) -> Retargeted:
     """The robot does what a person did: limbs in the same directions, feet that stay where they stand.
@@ -284,6 +372,7 @@ def retarget(
         mapping: role to the clip's name of it, see ``find_roles``. None: by the names that files use.
         fps: frames a second of the result; None: the clip's.
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+        smoothness: what is faster than about this time is smoothed out [s]; 0: nothing (see ``Retargeter``).
         max_iterations: of the plan.
 
     Raises:
@@ -291,21 +380,10 @@ def retarget(
             legs and two arms.
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
-    own = Retargeter(robot, profile=profile, acceleration=acceleration, max_iterations=max_iterations)
+    own = Retargeter(
+        robot, profile=profile, acceleration=acceleration, smoothness=smoothness, max_iterations=max_iterations
+    )
     return own.retarget(motion, mapping=mapping, fps=fps)
-
-
-def own_limits(
-    robot: Robot, acceleration: float | Mapping[str, float]
-) -> tuple[ConfigurationLimit, VelocityLimit, AccelerationLimit]:
-    """The robot's own limits, and that on accelerations of its joints."""
-    if isinstance(acceleration, Mapping):
-        most = AccelerationLimit(robot, acceleration)
-    else:
-        if not acceleration > 0.0:
-            raise OsikValueError(f"acceleration is {acceleration}; it has to be more than 0")
-        most = AccelerationLimit(robot, np.where(scalar_layout(robot)[0], acceleration, np.inf))
-    return ConfigurationLimit(robot), VelocityLimit(robot), most
 
 
 def padded(goals: Goals, start: Float[np.ndarray, "F nq"], more: int) -> tuple[Goals, Float[np.ndarray, "T nq"]]:
@@ -318,15 +396,3 @@ def padded(goals: Goals, start: Float[np.ndarray, "F nq"], more: int) -> tuple[G
     goals, start = jax.tree.map(longer, (goals, start))
     present = np.where(np.arange(frames + more) < frames, goals.present, 0.0).astype(start.dtype)
     return dataclasses.replace(goals, present=present, contact=goals.contact * present[:, None]), start
-
-
-def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
-    """A motion with all joints of the robot's model, those that are locked and those that follow others too."""
-    tree = robot.tree
-    index, coefficient = tree.qpos_source
-    qpos = q[:, index] * coefficient + np.asarray(robot.qpos_offset)
-    joints = [j for j, kind in enumerate(tree.joint_types) if kind != FREE]
-    base = next(j for j, kind in enumerate(tree.joint_types) if kind == FREE)
-    at = int(tree.full_qpos_address[base])
-    columns = [*range(at, at + 7), *(int(tree.full_qpos_address[j]) for j in joints)]
-    return RobotMotion(float(fps), tuple(tree.joint_names[j] for j in joints), qpos[:, columns])

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikValueError
+from ..robot import Robot
+from ..robot._tree import FREE
 from ._keypoints import load_arrays
 
 
@@ -46,6 +48,19 @@ class RobotMotion:
             )
         if not (np.isfinite(self.fps) and self.fps > 0.0):
             raise OsikValueError(f"fps is {self.fps}; it is frames a second, more than 0")
+
+
+def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
+    """A motion with all joints of the robot's model, those that are locked and those that follow others too."""
+    tree = robot.tree
+    index, coefficient = tree.qpos_source
+    qpos = q[:, index] * coefficient + np.asarray(robot.qpos_offset)
+    joints = [j for j, kind in enumerate(tree.joint_types) if kind != FREE]
+    base = next(j for j, kind in enumerate(tree.joint_types) if kind == FREE)
+    addresses = tree.full_qpos_address
+    at = int(addresses[base])
+    columns = [*range(at, at + 7), *(int(addresses[j]) for j in joints)]
+    return RobotMotion(float(fps), tuple(tree.joint_names[j] for j in joints), qpos[:, columns])
 
 
 def load_robot_motion(

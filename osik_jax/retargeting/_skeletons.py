@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from .._errors import OsikValueError
-from .._tree import unknown_name
+from .._errors import OsikValueError, unknown_name
 from ._person import NEEDED, OPTIONAL
 
 ROLES = (*NEEDED, *OPTIONAL)

@@ -11,21 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._home import home_kinematics
-from .._joint_selection import scalar_layout
-from ..collision._distance import Nearest, _across, _rounded, _segment_parameters
+from ..collision._distance import Nearest, _across, _parameters, _rounded, _segment_parameters
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._forward import independent_columns
+from ..kinematics._home import home_kinematics
 from ..kinematics._rigid import cross, rotate
 from ..robot import Robot
+from ..robot._joint_selection import scalar_layout
 from ..tasks._rotation import dot, rotation_log
 from ._goals import Goals, Weights
 from ._person import LIMBS
 from ._profile import Place, Profile
 
-_SHORTEST = 1e-6
-_PAIRS = 12
-_CLEARANCE, _SWINGING = 3e-3, 1e-3
+SHORTEST = 1e-6
+PAIRS = 12
+CLEARANCE, SWINGING = 3e-3, 1e-3
 """How far soles that do not stand are kept above the floor [m], and what that weighs beside standing."""
 
 
@@ -215,7 +215,7 @@ def _limbs(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights
     """Direction of each limb less the person's: ``d - u``, with ``d' = (I - d d^T) / length (J_b - J_a)``."""
     first, second = (np.array([keys.index(limb[i]) for limb in LIMBS]) for i in range(2))
     across = place.points[second] - place.points[first]
-    length = jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), _SHORTEST)
+    length = jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), SHORTEST)
     direction = across / length
     sideways = (jnp.eye(3, dtype=length.dtype) - direction[:, :, None] * direction[:, None]) / length[..., None]
     sideways = sideways.reshape(-1, 3)
@@ -257,8 +257,8 @@ def _soles(place: _Places, corners: slice, contact: Float[Array, "4"], weight: F
     """
     height, rates = _heights(place, corners)
     stands = jnp.repeat(contact, 2) > 0.5
-    gap = height - jnp.where(stands, 0.0, _CLEARANCE)
-    return _Rows(gap, rates, jnp.where(stands, weight, jnp.where(gap < 0.0, _SWINGING * weight, 0.0)))
+    gap = height - jnp.where(stands, 0.0, CLEARANCE)
+    return _Rows(gap, rates, jnp.where(stands, weight, jnp.where(gap < 0.0, SWINGING * weight, 0.0)))
 
 
 def _stance(place: _Places, corners: slice) -> tuple[Array, Array]:
@@ -273,8 +273,8 @@ def _floor(place: _Places, first: int, body: Body, weight: Float[Array, ""]) -> 
     """Ends of capsules not below the floor."""
     above = np.array(body.above)
     height, rates = _heights(place, first + np.stack([2 * above, 2 * above + 1], 1).ravel())
-    gap = height - jnp.repeat(body.radii[above], 2) - _CLEARANCE
-    return _Rows(gap, rates, jnp.where(gap < 0.0, _SWINGING * weight, 0.0))
+    gap = height - jnp.repeat(body.radii[above], 2) - CLEARANCE
+    return _Rows(gap, rates, jnp.where(gap < 0.0, SWINGING * weight, 0.0))
 
 
 def _joints(robot: Robot, q: Float[Array, " nq"], weights: Weights, bounds: Bounds) -> Joints:
@@ -295,19 +295,34 @@ def _apart(place: _Places, first: int, body: Body, weights: Weights) -> _Rows:
     pairs = np.array(body.pairs)
     axes = place.points[first:].reshape(-1, 2, 3)
     start, along = axes[:, 0], axes[:, 1] - axes[:, 0]
-    a, b = pairs.T
+    chosen = jax.lax.top_k(-_ways(start - place.motion.origin, along, body.radii, pairs), min(PAIRS, len(pairs)))[1]
+    a, b = jnp.asarray(pairs)[chosen].T
     s, t = jax.vmap(_segment_parameters)(along[a], along[b], start[a] - start[b])
     on_a, on_b = start[a] + s[:, None] * along[a], start[b] + t[:, None] * along[b]
-    apart = jnp.sqrt(jnp.sum((on_b - on_a) ** 2, -1)) - body.radii[a] - body.radii[b]
-    # single precision is enough to choose, and several times as fast
-    chosen = jax.lax.top_k(-apart.astype(jnp.float32), min(_PAIRS, len(pairs)))[1]
     middle, radii = start + 0.5 * along, jnp.stack([body.radii[a], body.radii[b]], -1)
-    found = jnp.concatenate([on_a, on_b, along[a], along[b], middle[b] - middle[a], radii], -1)[chosen]
+    found = jnp.concatenate([on_a, on_b, along[a], along[b], middle[b] - middle[a], radii], -1)
     near = jax.vmap(_nearest)(found)
     moves = jnp.asarray(place.moves[first::2][pairs])[chosen]
     rates = [place.motion.rates(moves[:, i], near.normal, p) for i, p in enumerate((near.point_a, near.point_b))]
     gap = near.distance - weights.margin
     return _Rows(gap, rates[1] - rates[0], jnp.where(gap < 0.0, weights.apart, 0.0))
+
+
+def _ways(
+    start: Float[Array, "k 3"], along: Float[Array, "k 3"], radii: Float[Array, " k"], pairs: np.ndarray
+) -> Float[Array, " pairs"]:
+    """How far capsules are from each other, in single precision: enough to choose, and several times as fast.
+
+    Out of the products of all vectors with all, for which a batch of frames takes one product of matrices.
+    """
+    vectors = jnp.concatenate([along, start]).astype(jnp.float32)
+    products, (a, b), k = dot(vectors, vectors.T), pairs.T, len(along)
+    aa, bb, ab = products[a, a], products[b, b], products[a, b]
+    ao, bo = products[a, k + a] - products[a, k + b], products[b, k + a] - products[b, k + b]
+    oo = products[k + a, k + a] + products[k + b, k + b] - 2.0 * products[k + a, k + b]
+    s, t = _parameters(aa, bb, ab, ao, bo)
+    square = oo + s * (s * aa + 2.0 * (ao - t * ab)) + t * (t * bb - 2.0 * bo)
+    return jnp.sqrt(jnp.maximum(square, 0.0)) - (radii[a] + radii[b]).astype(jnp.float32)
 
 
 def _nearest(found: Float[Array, "17"]) -> Nearest:

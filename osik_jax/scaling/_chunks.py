@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from .._errors import OsikValueError
-from .._names import leaf_names
+from ..batching._names import leaf_names
 from ._chunk_file import Block, Part, read_chunk, remove_partial_files, write_chunk
 from ._fingerprint import differences, fingerprint, identifier
 from ._folder import check_space, claim

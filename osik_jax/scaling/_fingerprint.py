@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._names import leaf_names
+from ..batching._names import leaf_names
 
 
 def fingerprint(tree: Any) -> dict[str, str]:

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from .._errors import OsikKeyError, OsikTypeError, OsikValueError
-from .._names import leaf_names
+from ..batching._names import leaf_names
 from ._chunk_file import Block, DamagedFile, Part, chunk_files, complete, opened, read_chunk, result_names, whole_file
 from ._fingerprint import identifier
 

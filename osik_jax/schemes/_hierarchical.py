@@ -5,8 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..solvers import Backend, Damping, WorkingSet, solve_hqp
-from ..solvers._backends import check_backend
+from ..execution._backends import check_backend
+from ..solvers import Backend, WorkingSet, solve_hqp
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf, status_with
 
 
@@ -25,7 +25,8 @@ class HierarchicalQP(Scheme):
     Attributes:
         damping: of the velocity at each priority, in the units of weight times J^2; >= 0.
         curvature_damping: kappa, the share of what each priority's linear model leaves out that is added to its
-            damping; 0 for none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
+            damping, twice that below others; 0 for none. What is added vanishes where the tasks are met
+            (``TaskRows.curvature``).
         max_iterations: cap on the active-set iterations of one level (static).
         backend: whose candidates for the answer are taken, as in ``solve_hqp`` (static).
     """
@@ -42,7 +43,7 @@ class HierarchicalQP(Scheme):
             problem.levels(constraints),
             problem.lower,
             problem.upper,
-            damping=self._damping(problem, hard=constraints is not None),
+            damping=problem.dampings(constraints, self.damping, self.curvature_damping),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
             backend=self.backend,
@@ -58,8 +59,3 @@ class HierarchicalQP(Scheme):
             answer.kkt_residual,
             answer.warm_start,
         )
-
-    def _damping(self, problem: VelocityProblem, *, hard: bool) -> list[Damping]:
-        """Of each level: none of the constraints, which damping would let off a part of what they ask."""
-        own = [problem.damping(names, self.damping, self.curvature_damping) for names in problem.by_priority()]
-        return [problem.constraint_damping(self.curvature_damping), *own] if hard else own

@@ -1,17 +1,20 @@
-"""Prioritised projection with a joint-limit potential in the last null space (eqs. 7 and 8); two variants of it."""
+"""Prioritised projection with a joint-limit potential in the last null space (eqs. 7 and 8); two other methods."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from ..solvers import Backend, Damping, Level, NullSpaceSolution, solve_nullspace
-from ..solvers._backends import check_backend
+from ..execution._backends import check_backend
+from ..solvers import Backend, Level, NullSpaceSolution, solve_nullspace
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
+
+NullSpaceMethod = Literal["classical", "reverse", "saturated"]
+METHODS: tuple[str, ...] = get_args(NullSpaceMethod)
 
 
 class NullSpace(Scheme):
@@ -21,11 +24,11 @@ class NullSpace(Scheme):
     their limits; the motion is -potential_gain df/dq. Limits are not hard: the answer may leave its box, and
     ``Solution.box_violation`` says by how much. Inequality rows count only while the levels above leave them violated.
 
-    ``saturate=True`` makes the limits hard (saturation in the null space): joints at their limits leave the work to
-    the others, a priority that cannot be met inside the limits is scaled down, keeping its direction, and the potential
-    is followed as nearly as the limits allow.
+    ``method="saturated"`` makes the limits hard (saturation in the null space): joints at their limits leave the work
+    to the others, a priority that cannot be met inside the limits is scaled down, keeping its direction, and the
+    potential is followed as nearly as the limits allow.
 
-    ``order="reverse"`` builds the motion from the potential and the lowest priority up: the first is exact, up to its
+    ``method="reverse"`` builds the motion from the potential and the lowest priority up: the first is exact, up to its
     damping, however the others conflict with it, and nothing jumps where a priority comes to depend on those above.
     Limits are not hard there, and inequality rows count while what comes before them, the lower priorities, leaves them
     violated.
@@ -35,11 +38,11 @@ class NullSpace(Scheme):
     the others: of limits, ``box_violation`` tells that too.
 
     Attributes:
-        order: "forward" or "reverse" (static).
-        saturate: whether the limits are hard (static); needs the forward order.
+        method: "classical", from the first priority down; "reverse"; or "saturated" (static).
         damping: of each priority's motion: s / (s^2 + damping) stands for 1 / s; 0 allowed.
         curvature_damping: kappa, the share of what each priority's linear model leaves out that is added to its
-            damping; 0 for none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
+            damping, twice that below others; 0 for none. What is added vanishes where the tasks are met
+            (``TaskRows.curvature``).
         potential_gain: alpha [rad^2/s]; 0 turns the potential off. It needs a ``ConfigurationLimit`` among the limits.
         margin: joints are taken to be at least this share of their range away from either limit.
         rank_tolerance: rows that stand out of the span of others by less than this share of the size (Frobenius norm)
@@ -47,8 +50,7 @@ class NullSpace(Scheme):
         backend: whose kernels compute, as in ``solve_nullspace`` (static).
     """
 
-    order: Literal["forward", "reverse"] = eqx.field(default="forward", static=True, kw_only=True)
-    saturate: bool = eqx.field(default=False, static=True, kw_only=True)
+    method: NullSpaceMethod = eqx.field(default="classical", static=True, kw_only=True)
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
     curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
     potential_gain: Float[Array, ""] = eqx.field(default=0.01, converter=as_leaf("potential_gain"))
@@ -57,12 +59,13 @@ class NullSpace(Scheme):
     backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
     def __check_init__(self):
-        if self.order not in ("forward", "reverse"):
-            raise OsikValueError(f"order is {self.order!r}; orders: forward, reverse")
-        if not isinstance(self.saturate, bool):
-            raise OsikValueError(f"saturate is {self.saturate!r}; it is True or False")
-        if self.saturate and self.order == "reverse":
-            raise OsikValueError("saturate needs order='forward': saturation goes from the first priority down")
+        if self.method not in METHODS:
+            raise OsikValueError(f"method is {self.method!r}; methods: {', '.join(METHODS)}")
+
+    @property
+    def saturates(self) -> bool:
+        """Whether the limits are hard."""
+        return self.method == "saturated"
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
         """The velocity of one tick."""
@@ -71,12 +74,13 @@ class NullSpace(Scheme):
         descent = -self.potential_gain * limit_potential_gradient(
             problem.position, problem.position_lower, problem.position_upper, self.margin
         )
+        damping = problem.dampings(constraints, self.damping, self.curvature_damping, held=self.method != "reverse")
         answer = solve_nullspace(
             levels,
-            *((problem.lower, problem.upper) if self.saturate else ()),
-            order=self.order,
+            *((problem.lower, problem.upper) if self.saturates else ()),
+            order="reverse" if self.method == "reverse" else "forward",
             secondary=descent,
-            damping=self._damping(problem, constraints),
+            damping=damping,
             rank_tolerance=self.rank_tolerance,
             backend=self.backend,
         )
@@ -84,21 +88,16 @@ class NullSpace(Scheme):
         if constraints is not None:
             status = status_with(constraints, status, answer.x, start=self._start(problem))
         first, count = levels[0].scaled(), jnp.asarray(len(levels))
-        if self.saturate:
+        if self.saturates:
             residual = _first_residual(first, answer, problem)
             return SchemeAnswer(answer.x, status, answer.iterations, count + answer.iterations, residual)
         gradient = first.matrix.T @ first.distance(answer.x)
         return SchemeAnswer(answer.x, status, count, count, jnp.max(jnp.abs(gradient)))
 
-    def _damping(self, problem: VelocityProblem, constraints: Level | None) -> list[Damping]:
-        """Of each level: none of the constraints, which damping would let off a part of what they ask."""
-        own = [problem.damping(names, self.damping, self.curvature_damping) for names in problem.by_priority()]
-        return own if constraints is None else [problem.constraint_damping(self.curvature_damping), *own]
-
     def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
         """Where the first level begins: an inequality row that holds there takes no part in it."""
         nowhere = jnp.zeros_like(problem.position)
-        return jnp.clip(nowhere, problem.lower, problem.upper) if self.saturate else nowhere
+        return jnp.clip(nowhere, problem.lower, problem.upper) if self.saturates else nowhere
 
 
 def _first_residual(first: Level, answer: NullSpaceSolution, problem: VelocityProblem) -> Float[Array, ""]:

@@ -12,17 +12,20 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._errors import OsikValueError
-from .._numbers import as_scalar
-from .._replace import Replaceable
 from ..limits import LimitRows
+from ..numerics._arguments import as_scalar
+from ..numerics._dense import apply
+from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
-from ..solvers._dense import apply
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
 from ..tasks._curvature import length, row_sums
 
 _HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 """A hard row that is missed by less, of what its numbers amount to, holds."""
+_HELD = 2.0
+"""Of a priority's curvature damping, where others are above it: a pull that it cannot meet is held by their rows, which
+bend too."""
 _STANDING = 1e-4
 """Speed [rad/s or m/s] that counts at least: of a robot at rest, rounding is all that there is."""
 
@@ -76,16 +79,34 @@ class VelocityProblem(eqx.Module):
         bends = [self.rows[name].curvature for name in names]  # none where all tasks are hard
         return self.dt * length(jnp.stack([jnp.zeros_like(self.dt), *bends]))
 
-    def damping(self, names: Sequence[str], constant: Float[Array, ""], curvature: Float[Array, ""] | float) -> Damping:
-        """Of a priority, from the damping that a scheme has anyway and the share of the curvature that it takes."""
-        pulls = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
-        return Damping(
-            constant, curvature * self.curvature(names), length(jnp.concatenate(pulls)), curvature * self.bends(names)
-        )
+    def dampings(
+        self,
+        constraints: Level | None,
+        constant: Float[Array, ""],
+        curvature: Float[Array, ""] | float,
+        *,
+        held: bool = True,
+    ) -> list[Damping]:
+        """Of each level of ``levels``: the constraints bend, but damping would let them off a part of what they ask.
 
-    def constraint_damping(self, curvature: Float[Array, ""] | float) -> Damping:
-        """Of the constraints: none, which would let them off a part of what they ask; but they bend."""
-        return Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping()
+        Args:
+            constraints: as ``constraints`` has them.
+            constant: damping that each priority has anyway.
+            curvature: kappa, the share that each takes of its curvature.
+            held: whether what a priority cannot meet is held by the rows of the levels above it.
+        """
+        found = []
+        if constraints is not None:
+            found.append(Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping())
+        for names in self.by_priority():
+            pulls = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
+            share = (_HELD if held and found else 1.0) * curvature
+            found.append(
+                Damping(
+                    constant, share * self.curvature(names), length(jnp.concatenate(pulls)), share * self.bends(names)
+                )
+            )
+        return found
 
     def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
         """What a motion of each dof costs these tasks at second order, along a unit pull (``row_sums``).

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._errors import OsikValueError
-from .._joint_selection import concrete
+from ..execution._backends import check_backend, takes
+from ..numerics._arguments import concrete
 from ..solvers import Backend, Level, solve_least_squares_qp
-from ..solvers._backends import check_backend, takes
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
 

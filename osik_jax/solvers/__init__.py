@@ -1,6 +1,6 @@
 """Array-level solvers, no robot inside: quadratic programs, hierarchies, null-space projection."""
 
-from ._backends import Backend as Backend
+from ..execution._backends import Backend as Backend
 from ._damping import Damping as Damping
 from ._level import Level as Level
 from ._status import Status as Status

@@ -1,64 +1,73 @@
-"""What a verdict rests on: optimality, as a share of the problem's own forces; contradictions, by what proves them."""
+"""What a status rests on: the relative KKT residual of an answer, and Farkas certificates of infeasible rows."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._dense import apply
+from ..numerics._dense import apply
 
-_FAR = 1e3
-_ROUNDING = 1e-14
-"""Share of the terms of a sum that is not told from 0."""
+_SEARCH_RADIUS = 1e3
+"""Relative to the numbers at hand: how large an x is considered along variables without a bound."""
+_ROUNDOFF = 1e-14
+"""Relative to the absolute terms of a sum: a smaller sum is 0."""
 
 
-def contradiction(
+def is_farkas_certificate(
     rows: Float[Array, "p n"],
-    proof: Float[Array, " p"],
+    certificate: Float[Array, " p"],
     gap: Float[Array, " p"],
     x: Float[Array, " n"],
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
 ) -> Bool[Array, ""]:
-    """Whether a vector of Farkas proves that nothing in the box satisfies the rows.
+    """Check that a Farkas vector z proves that no point of the box satisfies the rows C.
 
-    Weighed with it, the rows have to move by proof'gap before all of them can hold. In the box they move by the sum of
-    |C'proof| times the way to the bound that it pushes to, at most. Where there is no bound, no x counts that is more
-    than a thousand times as large as what is at hand.
+    Where all rows hold at x + d, ``-z'C d`` is at least ``z'gap``; in the box it is at most the sum of |C'z|_j times
+    the distance of x_j to its bound in the direction of -(C'z)_j. If the latter is smaller, there is no such d.
+    Where a variable has no such bound, values up to a thousand times those at hand are considered.
 
     Args:
         rows: C.
-        proof: a number for each row, of the sign of its gap; the gaps themselves at the least violation.
-        gap: C x minus the nearest points of the intervals; 0 for rows that do not count.
+        certificate: z, of the sign of the gap in each row; the gaps themselves at the least violation.
+        gap: C x minus the nearest points of the rows' intervals; 0 for rows that do not count.
         x: a point in the box.
-        lower: of the box.
-        upper: of the box.
+        lower: lower bounds of the box.
+        upper: upper bounds of the box.
     """
-    pull = apply(rows.T, proof)
-    rounding = _ROUNDING * apply(jnp.abs(rows).T, jnp.abs(proof))
-    pull = jnp.where(jnp.abs(pull) <= rounding, 0.0, pull)
+    gradient = apply(rows.T, certificate)
+    roundoff = _ROUNDOFF * apply(jnp.abs(rows).T, jnp.abs(certificate))
+    gradient = jnp.where(jnp.abs(gradient) <= roundoff, 0.0, gradient)
     sizes = [jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0) for a in (x, lower, upper)]
-    far = _FAR * jnp.max(jnp.stack(sizes), initial=0.0)
-    way = jnp.where(pull > 0.0, x - lower, upper - x)
-    reachable = jnp.sum(jnp.abs(pull) * jnp.where(jnp.isfinite(way), way, far))
-    return jnp.dot(proof, gap) > reachable
+    radius = _SEARCH_RADIUS * jnp.max(jnp.stack(sizes), initial=0.0)
+    distance = jnp.where(gradient > 0.0, x - lower, upper - x)
+    largest_change = jnp.sum(jnp.abs(gradient) * jnp.where(jnp.isfinite(distance), distance, radius))
+    return jnp.dot(certificate, gap) > largest_change
 
 
-def kkt_share(
-    left: Float[Array, " k"], forces: Float[Array, " n"], gap: Float[Array, " p"], scale: Float[Array, " p"]
+def relative_kkt_residual(
+    stationarity: Float[Array, " n"],
+    gradient_scale: Float[Array, " n"],
+    wrong_sign: Float[Array, " p"],
+    violation: Float[Array, " p"],
+    violation_scale: Float[Array, " p"],
 ) -> Float[Array, ""]:
-    """How far a point is from optimal, without units: comparable between problems, whatever their weights.
+    """Return how far a point is from optimal, without units: comparable between problems, whatever their weights.
 
     Args:
-        left: forces that nothing holds, and those that push away from their bound (not positive where they do not).
-        forces: at each variable, the sum of the absolute terms that the slope of the cost and the multipliers add.
-        gap: by how much each row is violated.
-        scale: of each row: what its terms and bounds amount to.
+        stationarity: the gradient of the Lagrangian at variables without an active bound, and multipliers of the wrong
+            sign at the others (not positive where the sign is right).
+        gradient_scale: for each variable, the sum of the absolute terms of that gradient.
+        wrong_sign: multipliers of the rows that have the wrong sign, in units of the gradient.
+        violation: by how much each row is violated.
+        violation_scale: for each row, the size of its terms and bounds.
 
     Returns:
-        The larger of two: the largest force left, as a share of the largest force, and the largest gap, of its scale.
+        The larger of two: the largest stationarity residual or wrong multiplier, relative to the largest gradient
+        scale, and the largest relative violation.
     """
-    most = jnp.max(forces, initial=0.0)
-    force = jnp.maximum(jnp.max(left, initial=0.0), 0.0) / jnp.where(most > 0.0, most, 1.0)
-    missed = jnp.where(gap > 0.0, gap / jnp.where(scale > 0.0, scale, 1.0), 0.0)
-    return jnp.maximum(force, jnp.max(missed, initial=0.0))
+    residual, scale = jnp.max(jnp.stack([stationarity, gradient_scale]), 1, initial=0.0)  # one operation for two
+    dual = jnp.maximum(residual, jnp.max(wrong_sign, initial=0.0)) / jnp.where(scale > 0.0, scale, 1.0)
+    relative = violation / jnp.where(violation_scale > 0.0, violation_scale, 1.0)
+    primal = jnp.where(violation > 0.0, relative, 0.0)
+    return jnp.maximum(dual, jnp.max(primal, initial=0.0))

@@ -1,4 +1,9 @@
-"""Inverses of projected rows, from an orthogonal factorisation each, with derivatives in both modes."""
+"""Pseudo-inverses and damped inverses of projected rows, by orthogonal factorisations, with derivatives in both modes.
+
+Derivatives of the Moore-Penrose inverse are those at constant rank: G. H. Golub, V. Pereyra, "The differentiation of
+pseudo-inverses and nonlinear least squares problems whose variables separate", SIAM Journal on Numerical Analysis 10,
+1973, referred to as GP.
+"""
 
 from __future__ import annotations
 
@@ -9,41 +14,48 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._rules import custom_jvp
-from ._backends import Backend
-from ._dense import apply, product
+from ..execution._backends import Backend
+from ..execution._rules import custom_jvp
+from ..numerics._dense import apply, product
 from ._row_factors import RowFactors, row_factors
 
 
 @custom_jvp
 def row_space_and_motion(
     matrix: Float[Array, "m n"],
-    wanted: Float[Array, " m"],
+    target: Float[Array, " m"],
     cutoff: Float[Array, ""],
     damping: Float[Array, ""],
     *,
     backend: Backend = "jax",
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Orthogonal projector onto what the rows span, and the damped motion that they ask for.
+    """Return the projector onto the row space of A, and the damped solution A'(A A' + damping I)^-1 target.
 
-    Rows that stand out of the span of those before them by no more than the cutoff are left out, the longest first. The
-    projector comes from an orthonormal basis and not from an inverse, so that it is one to the last digit however
-    dependent the rows are. Derivatives are those at constant rank. ``backend`` is that of the factors (static).
+    The rank is decided by pivots: rows that have no more than the cutoff outside the span of the longer ones count as
+    dependent. The projector comes from an orthonormal basis and not from an inverse, so it is idempotent to roundoff
+    however dependent the rows are. Derivatives are those at constant rank.
+
+    Args:
+        matrix: A.
+        target: values of the rows; the right-hand side.
+        cutoff: the smallest pivot that is not 0.
+        damping: of the solution, in squared singular values.
+        backend: of the factors (static).
     """
     factors = row_factors(matrix, cutoff, damping, backend)
-    motion = apply(factors.basis.T, _solved(factors, wanted))
+    motion = apply(factors.basis.T, _solved(factors, target))
     return product(factors.basis.T, factors.basis), motion
 
 
-def _solved(factors: RowFactors, wanted: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-    """y of least |matrix basis' y - wanted|^2 + damping |y|^2."""
-    left = factors.outer[: len(factors.basis)]
-    return jax.scipy.linalg.solve_triangular(factors.triangle, jnp.matmul(left.T, wanted, precision="highest"))
+def _solved(factors: RowFactors, target: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    """Return the minimiser y of |A basis' y - target|^2 + damping |y|^2, by the QR factors."""
+    left = factors.orthonormal[: len(factors.basis)]
+    return jax.scipy.linalg.solve_triangular(factors.triangle, jnp.matmul(left.T, target, precision="highest"))
 
 
 @custom_jvp
 def _by_row_factors(matrix: Array, cutoff: Array, damping: Array, *, backend: Backend) -> tuple[Array, Array, Array]:
-    """Row space, Moore-Penrose inverse and damped inverse."""
+    """Return the projector onto the row space, the Moore-Penrose inverse and the damped inverse."""
     both = [row_factors(matrix, cutoff, each, backend) for each in (jnp.zeros_like(damping), damping)]
     eye = jnp.eye(len(matrix), dtype=matrix.dtype)
     plain, damped = (product(factors.basis.T, _solved(factors, eye)) for factors in both)
@@ -63,24 +75,24 @@ def _by_row_factors_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, 
 def _row_space_and_motion_jvp(
     primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend = "jax"
 ) -> tuple[Any, Any]:
-    (a, wanted, cutoff, damping), (da, d_wanted, _, d_damping) = primals, tangents
+    (a, target, cutoff, damping), (da, d_target, _, d_damping) = primals, tangents
     space, X, D = _by_row_factors(a, cutoff, damping, backend=backend)
-    rate = _damped_rate(a, X, D, damping, da, d_damping, wanted) + apply(D, d_wanted)
-    return (space, apply(D, wanted)), (_space_rate(space, X, da), rate)
+    rate = _damped_rate(a, X, D, damping, da, d_damping, target) + apply(D, d_target)
+    return (space, apply(D, target)), (_space_rate(space, X, da), rate)
 
 
 @custom_jvp
 def row_space_and_motion_of_rank(
-    matrix: Float[Array, "m n"], wanted: Float[Array, " m"], rank: Int[Array, ""], cutoff: Float[Array, ""]
+    matrix: Float[Array, "m n"], target: Float[Array, " m"], rank: Int[Array, ""], cutoff: Float[Array, ""]
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """The same without damping, of as many pivots as the rank says, but for those up to the cutoff."""
+    """Return the same without damping for a given rank; pivots up to the cutoff are 0 whatever the rank says."""
     space, inverse = _by_pivots(matrix, rank, cutoff)
-    return space, apply(inverse, wanted)
+    return space, apply(inverse, target)
 
 
 @custom_jvp
 def _by_pivots(matrix: Array, rank: Array, cutoff: Array) -> tuple[Array, Array]:
-    """Row space and inverse from a complete orthogonal factorisation, matrix = permutation U S' Q'."""
+    """Return projector and inverse by a complete orthogonal factorisation, A = permutation U S' Q'."""
     m, n = matrix.shape
     Q, R, order = jax.scipy.linalg.qr(matrix.T, mode="economic", pivoting=True)
     pivots = jnp.abs(jnp.diagonal(R))
@@ -102,20 +114,21 @@ def _by_pivots_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple
 
 @row_space_and_motion_of_rank.defjvp
 def _row_space_and_motion_of_rank_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    (a, wanted, rank, cutoff), (da, d_wanted, *_) = primals, tangents
+    (a, target, rank, cutoff), (da, d_target, *_) = primals, tangents
     space, X = _by_pivots(a, rank, cutoff)
-    rate = _inverse_rate(a, X, da, wanted) + apply(X, d_wanted)
-    return (space, apply(X, wanted)), (_space_rate(space, X, da), rate)
+    rate = _inverse_rate(a, X, da, target) + apply(X, d_target)
+    return (space, apply(X, target)), (_space_rate(space, X, da), rate)
 
 
 def _space_rate(space: Float[Array, "n n"], X: Float[Array, "n m"], da: Float[Array, "m n"]) -> Float[Array, "n n"]:
-    turn = product(X, da)
-    turn = turn - product(turn, space)
-    return turn + turn.T
+    """Return the derivative of the projector P = X A onto the row space: X dA (I - P) and its transpose (GP)."""
+    half = product(X, da)
+    half = half - product(half, space)
+    return half + half.T
 
 
 def _columns(rate: Callable[[Float[Array, " m"]], Float[Array, " n"]], a: Float[Array, "m n"]) -> Float[Array, "n m"]:
-    """The matrix of a linear map, for derivatives of second order; those of first order need its value alone."""
+    """Return the matrix of a linear map, for second derivatives; first ones need its value alone."""
     return jax.vmap(rate, out_axes=1)(jnp.eye(len(a), dtype=a.dtype))
 
 
@@ -128,20 +141,21 @@ def _damped_rate(
     d_damping: Array,
     w: Float[Array, " m"],
 ) -> Float[Array, " n"]:
-    """Rate of D w; D solves (I + damping X X') D = X."""
+    """Return the derivative of D w, from that of (I + damping X X') D = X."""
     y = apply(D, w)
     z = apply(X.T, y)
-    pull = d_damping * apply(X, z) + damping * (_inverse_rate(a, X, da, z) + apply(X, _transposed_rate(a, X, da, y)))
-    moved = _inverse_rate(a, X, da, w) - pull
-    return moved - damping * apply(D, apply(X.T, moved))
+    damped = d_damping * apply(X, z) + damping * (_inverse_rate(a, X, da, z) + apply(X, _transposed_rate(a, X, da, y)))
+    right = _inverse_rate(a, X, da, w) - damped
+    # (I + damping X X')^-1 = I - damping D X'
+    return right - damping * apply(D, apply(X.T, right))
 
 
 def _inverse_rate(
     a: Float[Array, "m n"], X: Float[Array, "n m"], da: Float[Array, "m n"], w: Float[Array, " m"]
 ) -> Float[Array, " n"]:
-    """Rate of X w, X being the Moore-Penrose inverse of a, at constant rank.
+    """Return the derivative of X w, X being the Moore-Penrose inverse of A (GP).
 
-    G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973.
+    dX = -X dA X + X X' dA' (I - A X) + (I - X A) dA' X' X.
     """
     x = apply(X, w)
     wide = apply(X, apply(X.T, apply(da.T, w - apply(a, x))))
@@ -152,7 +166,7 @@ def _inverse_rate(
 def _transposed_rate(
     a: Float[Array, "m n"], X: Float[Array, "n m"], da: Float[Array, "m n"], v: Float[Array, " n"]
 ) -> Float[Array, " m"]:
-    """Rate of X' v."""
+    """Return the derivative of X' v: the transpose of the same formula."""
     y = apply(X.T, v)
     wide = apply(da, apply(X, y))
     tall = apply(X.T, apply(X, apply(da, v - apply(X, apply(a, v)))))
@@ -162,13 +176,13 @@ def _transposed_rate(
 def regularised_inverse(
     matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
 ) -> Float[Array, "n m"]:
-    """(A'A + damping I)^-1 A', nothing cut off; for a damping of 0 the Moore-Penrose inverse, with the cutoff."""
+    """Return (A'A + damping I)^-1 A'; for a damping of 0 the Moore-Penrose inverse, the only one with a cutoff."""
     return _with_gram(matrix, cutoff, damping)[0]
 
 
 @custom_jvp
 def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array]:
-    """The inverse D, and K with D = K A': (A'A + damping I)^-1, or (A'A)^+ for a damping of 0."""
+    """Return the inverse D, and K with D = K A': (A'A + damping I)^-1, or (A'A)^+ for a damping of 0."""
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
     damped = damping > 0.0
     kept = damped | (s > cutoff)
@@ -181,15 +195,15 @@ def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Arr
 
 @_with_gram.defjvp
 def _with_gram_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Of K A' and K where damped; of the Moore-Penrose inverse at constant rank (Golub, Pereyra 1973) where not."""
+    """Differentiate K A' and K where damped, and the Moore-Penrose inverse at constant rank (GP) where not."""
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
     D, K = _with_gram(a, cutoff, damping)
     damped = damping > 0.0
-    rest = da.T - product(product(da.T, a), D)  # da' (I - A D)
-    turned = product(da.T, product(D.T, D))
-    turn = jnp.where(damped, 0.0, turned - product(D, product(a, turned)))  # (I - D A) da' D' D
-    dD = product(K, rest) - product(D, product(da, D)) + turn - d_damping * product(K, D)
-    half = product(D, product(da, K))  # K A' da K
-    flat = product(dD, D.T)
-    dK = jnp.where(damped, -half - half.T - d_damping * product(K, K), flat + flat.T)
+    wide = da.T - product(product(da.T, a), D)  # da' (I - A D)
+    tall = product(da.T, product(D.T, D))
+    tall = jnp.where(damped, 0.0, tall - product(D, product(a, tall)))  # (I - D A) da' D' D
+    dD = product(K, wide) - product(D, product(da, D)) + tall - d_damping * product(K, D)
+    half = product(D, product(da, K))  # K A' dA K
+    undamped = product(dD, D.T)  # K = D D'
+    dK = jnp.where(damped, -half - half.T - d_damping * product(K, K), undamped + undamped.T)
     return (D, K), (dD, dK)

@@ -1,4 +1,4 @@
-"""One priority of a hierarchy."""
+"""One priority level of a hierarchy."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from ..numerics._dense import apply
 from ._box import uncrossed
-from ._dense import apply
 
 
 class Level(eqx.Module):
@@ -59,30 +59,31 @@ class Level(eqx.Module):
 
     @property
     def equality(self) -> bool:
-        """Whether all rows are known to be equalities."""
+        """Whether all rows are known to be equalities (static)."""
         return all(self.equalities)
 
     @property
     def equal(self) -> Bool[Array, " m"]:
-        """Rows to be treated as equalities: those known to be, and those whose bounds are equal or crossed."""
-        counts = True if self.weight is None else self.weight > 0.0
-        return jnp.array(self.equalities, bool) | ((self.lower >= self.upper) & counts)
+        """Which rows are equalities: those known to be, and those with lower >= upper, (m,)."""
+        has_weight = True if self.weight is None else self.weight > 0.0
+        return jnp.array(self.equalities, bool) | ((self.lower >= self.upper) & has_weight)
 
     @property
     def length(self) -> Float[Array, " m"]:
-        """Euclidean norm of each row."""
+        """Euclidean norm of each row, (m,)."""
         return jnp.sqrt(jnp.sum(self.matrix**2, -1))
 
     @property
     def size(self) -> Float[Array, ""]:
-        """Of the longest row."""
+        """Euclidean norm of the longest row."""
         return jnp.max(self.length, initial=0.0)
 
     def scaled(self) -> Level:
-        """The same level with the square roots of the weights multiplied in; a weight of 0 removes its row."""
+        """Return the level with the square roots of the weights multiplied in; a weight of 0 removes its row."""
         if self.weight is None:
             return self
         positive, root = self.weight > 0.0, positive_root(self.weight)
+        # sqrt(w) lower <= sqrt(w) A x <= sqrt(w) upper; rows of weight 0 lose their bounds
         matrix = root[:, None] * self.matrix
         known = np.array(self.equalities, bool)
         goal = jnp.where(positive, jnp.where(known, self.lower, 0.0) * root, 0.0)
@@ -93,24 +94,24 @@ class Level(eqx.Module):
         return Level(matrix, lower, upper, equalities=self.equalities)
 
     def uncrossed(self) -> tuple[Level, Bool[Array, ""]]:
-        """The same level with crossed bounds as equalities halfway, and whether there were any."""
+        """Return the level with lower > upper replaced by equalities halfway, and whether there were any."""
         known = np.array(self.equalities, bool)
         lower, upper, crossed = uncrossed(self.lower, jnp.where(known, self.lower, self.upper))
         return Level(self.matrix, lower, upper, self.weight, self.equalities), crossed
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """A x minus the nearest point of its interval: the slack, 0 where the row holds."""
+        """Return A x minus the nearest point of its interval: the slack, 0 where the row holds, (m,)."""
         value = apply(self.matrix, x)
         return value - jnp.clip(value, self.lower, self.upper)
 
 
 def positive_root(a: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The square root of what is positive; 0, with a derivative of 0, of what is 0, negative or no number."""
+    """Return the square root where ``a`` is positive; elsewhere (NaN too) 0, with a derivative of 0."""
     positive = a > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, a, 1.0)), 0.0)
 
 
 def _scaled_bound(bound: Float[Array, " m"], root: Float[Array, " m"], none: float) -> Float[Array, " m"]:
-    """root times bound, ``none`` where root is 0; the rate of an infinite bound with respect to its weight is 0."""
+    """Return root times bound, ``none`` where root is 0; an infinite bound has no derivative by its weight."""
     finite = jnp.where(jnp.isinf(bound), 0.0, bound)
     return jnp.where(root > 0.0, jnp.where(jnp.isinf(bound), bound, root * finite), none)

@@ -7,6 +7,7 @@ from typing import Any
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
@@ -76,10 +77,14 @@ class AxisAlignTask(PointingTask):
         )
 
     def rows_at(
-        self, positions: Float[Array, "k 3"], rotations: Float[Array, "k 3 3"], jacobians: Float[Array, "k 6 nv"]
+        self,
+        positions: Float[Array, "k 3"],
+        rotations: Float[Array, "k 3 3"],
+        jacobians: Float[Array, "k 6 nv"],
+        backend: Backend = "jax",
     ) -> TaskRows:
         """Two rows along the axes across ``axis``, or one for a cone."""
-        del positions
+        del positions, backend
         turn, spin = rotations[0].T, jacobians[0, 3:]
         direction, velocity = unit(self.target), self.target_velocity
         if self.target_frame is not None:

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..kinematics import Kinematics, center_of_mass, com_jacobian
+from ..kinematics import Kinematics, center_of_mass
+from ..kinematics._forward import moving_center
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
@@ -97,8 +98,7 @@ class ComTask(Task):
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """One row for each axis, or for each edge of the polygon."""
         del q
-        point = center_of_mass(robot, kinematics, self.subtree)
-        jacobian = com_jacobian(robot, kinematics, self.subtree)
+        point, jacobian = moving_center(robot, kinematics, self.subtree)
         bend = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
         if self.polygon is not None:
             return self._polygon_rows(self.polygon, point, jacobian, bend)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError
+from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..kinematics._rigid import cross
 from ..robot import Robot
@@ -115,9 +116,14 @@ class ContactTask(PlaneTask):
         ]
 
     def rows_at(
-        self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
+        self,
+        positions: Float[Array, "1 3"],
+        rotations: Float[Array, "1 3 3"],
+        jacobians: Float[Array, "1 6 nv"],
+        backend: Backend = "jax",
     ) -> TaskRows:
         """Positions along the plane's axes, then tilts and the turn: those that the kind of contact has."""
+        del backend
         turn, axes = rotations[0], plane_axes(self.normal)
         arm = dot(turn, self.point)
         linear = jacobians[0, :3] + cross(jacobians[0, 3:], arm[:, None], along=-2)

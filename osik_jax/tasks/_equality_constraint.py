@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikTypeError, OsikValueError
-from .._loading._mjmodel import element_names
-from .._tree import KinematicTree, unknown_name
+from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..kinematics import Kinematics, frame_jacobians
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
 from ..robot import Robot
+from ..robot._tree import KinematicTree
+from ..robot.loading._mjmodel import element_names
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_weight

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
@@ -112,10 +113,14 @@ class FrameTask(PoseTask):
         return (self.frame,)
 
     def rows_at(
-        self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
+        self,
+        positions: Float[Array, "1 3"],
+        rotations: Float[Array, "1 3 3"],
+        jacobians: Float[Array, "1 6 nv"],
+        backend: Backend = "jax",
     ) -> TaskRows:
         """Rows in the order x, y, z, rotation x, y, z, those left out skipped (m <= 6)."""
-        return self.pose_rows(positions[0], rotations[0], jacobians[0])
+        return self.pose_rows(positions[0], rotations[0], jacobians[0], backend)
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         del q

@@ -6,7 +6,9 @@ import abc
 
 from jaxtyping import Array, Float
 
-from ..kinematics import Kinematics, frame_jacobians
+from ..execution._backends import Backend
+from ..kinematics import Kinematics
+from ..kinematics._forward import moving_frames
 from ..robot import Robot
 from ._task import Task, TaskRows
 
@@ -26,12 +28,15 @@ class FramedTask(Task):
 
     @abc.abstractmethod
     def rows_at(
-        self, positions: Float[Array, "k 3"], rotations: Float[Array, "k 3 3"], jacobians: Float[Array, "k 6 nv"]
+        self,
+        positions: Float[Array, "k 3"],
+        rotations: Float[Array, "k 3 3"],
+        jacobians: Float[Array, "k 6 nv"],
+        backend: Backend = "jax",
     ) -> TaskRows:
-        """The rows, from the poses and Jacobians of the frames in the world."""
+        """The rows, from the poses and Jacobians of the frames in the world; by a kernel where there is one for it."""
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
         del q
-        poses = kinematics.frame_poses(robot, self.frames)
-        return self.rows_at(*poses, frame_jacobians(robot, kinematics, self.frames))
+        return self.rows_at(*moving_frames(robot, kinematics, self.frames), kinematics.backend)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, Self
 
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from .._structure import Static, put_together, taken_apart
+from ..batching._structure import Static, put_together, taken_apart
 from ..kinematics import Kinematics, forward_kinematics, integrate
 from ..kinematics._rates import kinematics_rates
 from ..robot import Robot
@@ -106,6 +107,7 @@ class FunctionTask(Task):
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """One row for each entry of x."""
         still = jnp.zeros(robot.nv, q.dtype)
+        kinematics = replace(kinematics, backend="jax")  # of which there are rates
         rates = kinematics_rates(robot, kinematics), jax.jacfwd(lambda v: integrate(robot, q, v))(still)
 
         def value(kinematics: Kinematics, q: Float[Array, " nq"]) -> Float[Array, " m"]:

@@ -12,9 +12,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from .._joint_selection import concrete, is_scalar, select_joints
 from ..kinematics import Kinematics
+from ..numerics._arguments import concrete
 from ..robot import Robot
+from ..robot._joint_selection import is_scalar, select_joints
 from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds

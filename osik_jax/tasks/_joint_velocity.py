@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from .._joint_selection import dofs_of, select_all
 from ..kinematics import Kinematics
 from ..robot import Robot
+from ..robot._joint_selection import dofs_of, select_all
 from ._leaves import WeightLike, as_joint_weight, as_scalar, as_vector
 from ._task import Task, TaskRows, check_priority
 

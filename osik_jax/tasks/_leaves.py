@@ -12,17 +12,17 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from .._home import home_kinematics as home_kinematics
-from .._joint_selection import as_array as as_array
-from .._joint_selection import concrete as concrete
-from .._joint_selection import dof_values
-from .._numbers import as_bounds as as_bounds
-from .._numbers import as_scalar as as_scalar
-from .._numbers import as_vector as as_vector
-from .._numbers import check_bounds as check_bounds
-from .._numbers import check_finite as check_finite
-from .._numbers import check_not_negative as check_not_negative
+from ..kinematics._home import home_kinematics as home_kinematics
+from ..numerics._arguments import as_array as as_array
+from ..numerics._arguments import as_bounds as as_bounds
+from ..numerics._arguments import as_scalar as as_scalar
+from ..numerics._arguments import as_vector as as_vector
+from ..numerics._arguments import check_bounds as check_bounds
+from ..numerics._arguments import check_finite as check_finite
+from ..numerics._arguments import check_not_negative as check_not_negative
+from ..numerics._arguments import concrete as concrete
 from ..robot import Robot
+from ..robot._joint_selection import dof_values
 
 WeightLike = ArrayLike | Array | Mapping[str, float]
 """One weight, one for each row, or weights by the names of joints."""

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from .._made_for import check_made_for
 from ..kinematics import Kinematics
 from ..limits import Limit, limit_box, limit_rows
 from ..robot import Robot
+from ..robot._made_for import check_made_for
 from ._leaves import as_scalar
 from ._task import Task, TaskRows, check_priority
 

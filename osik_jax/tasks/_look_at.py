@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
@@ -81,9 +82,14 @@ class LookAtTask(PointingTask):
         )
 
     def rows_at(
-        self, positions: Float[Array, "k 3"], rotations: Float[Array, "k 3 3"], jacobians: Float[Array, "k 6 nv"]
+        self,
+        positions: Float[Array, "k 3"],
+        rotations: Float[Array, "k 3 3"],
+        jacobians: Float[Array, "k 6 nv"],
+        backend: Backend = "jax",
     ) -> TaskRows:
         """Two rows along the axes across ``axis``, or one for a cone."""
+        del backend
         position, rotation, jacobian = positions[0], rotations[0], jacobians[0]
         point, velocity, moves = self.target, self.target_velocity, jnp.zeros_like(jacobian[:3])
         if self.target_frame is not None:

@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from .._joint_selection import select_all
-from .._tree import DOF_WIDTH, KinematicTree
 from ..kinematics import Kinematics, forward_kinematics, frame_jacobian, integrate
 from ..robot import Robot
+from ..robot._joint_selection import select_all
+from ..robot._tree import DOF_WIDTH, KinematicTree
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
 from ._pose import option, row_mask

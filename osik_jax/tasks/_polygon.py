@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from .._home import compiled_kinematics
+from ..kinematics._home import compiled_kinematics
 from ..robot import Robot
 
 _COLLINEAR = 1e-6

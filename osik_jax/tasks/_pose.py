@@ -12,8 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikValueError
-from .._tree import unknown_name
+from .._errors import OsikValueError, unknown_name
+from ..execution._backends import Backend
+from ..execution._computed import by_numba, side_by_side
+from ..kernels.numba import _target
 from ..robot import Robot
 from ._curvature import pose_curvature
 from ._framed import FramedTask
@@ -105,12 +107,24 @@ class PoseTask(FramedTask):
         return self.error == "se3"
 
     def pose_rows(
-        self, position: Float[Array, "3"], rotation: Float[Array, "3 3"], jacobian: Float[Array, "6 nv"]
+        self,
+        position: Float[Array, "3"],
+        rotation: Float[Array, "3 3"],
+        jacobian: Float[Array, "6 nv"],
+        backend: Backend = "jax",
     ) -> TaskRows:
         """Rows in the order x, y, z, rotation x, y, z, those left out skipped (m <= 6), from a pose and its Jacobian.
 
         Pose, target and Jacobian are in the outer axes: the world's, or those of the frame that the pose is in.
         """
+        if backend != "jax" and not (self.coupled or self.bounded or isinstance(self.gain, AdaptiveGain)):
+            error, rows, wanted, weight, curvature, pull, arms = _by_kernel(self, position, rotation, jacobian)
+            return TaskRows(error, rows, wanted, wanted, weight, curvature, pull, arms)
+        return self._plain_rows(position, rotation, jacobian)
+
+    def _plain_rows(
+        self, position: Float[Array, "3"], rotation: Float[Array, "3 3"], jacobian: Float[Array, "6 nv"]
+    ) -> TaskRows:
         form = self._twist_parts if self.coupled else self._decoupled_parts
         parts, wrench = form(position, rotation, jacobian)
         chosen = [_chosen(kept, arrays) for kept, arrays in parts]
@@ -197,6 +211,32 @@ class PoseTask(FramedTask):
 
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
+
+
+def _fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
+    """Of the rows of a task that asks for a pose; both bounds are one."""
+    rows = task._plain_rows(position, rotation, jacobian)
+    return rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
+
+
+def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
+    """The same of many lanes."""
+    assert not isinstance(task.gain, AdaptiveGain)
+    kept = np.flatnonzero(task.kept)
+    both = jnp.concatenate([task.position_weight, task.orientation_weight], 1) * task.weight[:, None]
+    weight = jnp.concatenate([both[:, i, None] for i in kept], 1)
+    numbers = side_by_side(*task.target, task.target_velocity, weight, task.gain)
+    given = (position, rotation, jacobian, numbers)
+    lanes, count, nv = max(len(a) for a in given), len(kept), jacobian.shape[-1]
+    options = np.array([*task.kept, task.axes == "frame", task.orientation_jacobian == "geometric"], np.int32)
+    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (7 * nv + 12,)
+    error, rows, wanted, curvature, pull, levers, _ = _target.call(
+        "_pose_rows", [(shape, float) for shape in shapes], *given, options
+    )
+    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers
+
+
+_by_kernel = by_numba(_fields, _fields_by_kernel)
 
 
 def _axes(axes: str | None, outer_axes: str, error: str) -> str:

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from .._joint_selection import dofs_of, is_scalar, select_all
-from .._tree import BALL, DOF_WIDTH, FREE
 from ..kinematics import Kinematics, difference
 from ..robot import Robot
+from ..robot._joint_selection import dofs_of, is_scalar, select_all
+from ..robot._tree import BALL, DOF_WIDTH, FREE
 from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_bounds, check_finite

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
@@ -111,14 +112,18 @@ class RelativeFrameTask(PoseTask):
         return self.frame, self.root
 
     def rows_at(
-        self, positions: Float[Array, "2 3"], rotations: Float[Array, "2 3 3"], jacobians: Float[Array, "2 6 nv"]
+        self,
+        positions: Float[Array, "2 3"],
+        rotations: Float[Array, "2 3 3"],
+        jacobians: Float[Array, "2 6 nv"],
+        backend: Backend = "jax",
     ) -> TaskRows:
         """Rows in the order x, y, z, rotation x, y, z, those left out skipped (m <= 6)."""
         turn, (frame, root) = rotations[1].T, jacobians
         apart = positions[0] - positions[1]
         linear = frame[:3] - root[:3] + dot(cross_matrix(apart), root[3:])
         jacobian = jnp.concatenate([dot(turn, linear), dot(turn, frame[3:] - root[3:])])
-        return self.pose_rows(dot(turn, apart), dot(turn, rotations[0]), jacobian)
+        return self.pose_rows(dot(turn, apart), dot(turn, rotations[0]), jacobian, backend)
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         del q

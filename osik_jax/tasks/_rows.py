@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..kinematics import Kinematics, frame_jacobians
+from ..kinematics import Kinematics
+from ..kinematics._forward import moving_frames
 from ..robot import Robot
 from ._axis_align import AxisAlignTask
 from ._contact import ContactTask
@@ -56,9 +57,13 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
     frames = [frame for task in tasks.values() for frame in task.frames]
     stacked = [jnp.stack(leaves) for leaves in zip(*map(jax.tree.leaves, tasks.values()), strict=True)]
     together = jax.tree.unflatten(jax.tree.structure(first), stacked)
-    found = *kinematics.frame_poses(robot, frames), frame_jacobians(robot, kinematics, frames)
+    found = moving_frames(robot, kinematics, frames)
     by_task = [a.reshape(len(tasks), len(first.frames), *a.shape[1:]) for a in found]
-    rows = jax.vmap(type(first).rows_at)(together, *by_task)
+
+    def rows_at(task: FramedTask, *frames: Array) -> TaskRows:
+        return task.rows_at(*frames, backend=kinematics.backend)
+
+    rows = jax.vmap(rows_at)(together, *by_task)
     apart = [jax.tree.map(lambda a, i=i: a[i], rows) for i in np.arange(len(tasks))]
     if not first.bounded:  # what makes an equality: one array for both bounds
         apart = [dataclasses.replace(one, upper=one.lower) for one in apart]

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikTypeError, OsikValueError
-from .._home import compiled_kinematics
-from .._made_for import MadeForRobot
-from .._replace import Replaceable
 from ..kinematics import Kinematics
+from ..kinematics._home import compiled_kinematics
+from ..numerics._replace import Replaceable
 from ..robot import Robot
+from ..robot._made_for import MadeForRobot
 from ._curvature import jacobian_curvature, levers, no_curvature
 from ._gain import Gain, as_gain, evaluate_gain
 from ._leaves import as_own_weight, as_weight

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from ..execution._backends import Backend
 from ..kinematics._rigid import cross
 from ..robot import Robot
 from ._curvature import pose_curvature
@@ -88,9 +89,14 @@ class WheelTask(PlaneTask):
         self.weight = as_weight(weight, self._weight_rows, dtype)
 
     def rows_at(
-        self, positions: Float[Array, "1 3"], rotations: Float[Array, "1 3 3"], jacobians: Float[Array, "1 6 nv"]
+        self,
+        positions: Float[Array, "1 3"],
+        rotations: Float[Array, "1 3 3"],
+        jacobians: Float[Array, "1 6 nv"],
+        backend: Backend = "jax",
     ) -> TaskRows:
         """No slip ahead and to the side, or along the rollers; then the height."""
+        del backend
         axle = dot(rotations[0], self.axis)
         ahead = unit(cross(axle, self.normal))
         spoke = self.radius * cross(axle, ahead)

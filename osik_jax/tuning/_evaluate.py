@@ -14,7 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikTypeError, OsikValueError
-from .._structure import Static, put_together, taken_apart
+from ..batching._structure import Static, put_together, taken_apart
 from ..scaling._sharded import moved
 from ..solvers import Status
 from ._loop import Loop

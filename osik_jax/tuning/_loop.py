@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._errors import OsikValueError
-from .._names import leaf_names, replace_named
-from .._structure import is_number
-from ..control import Targets, Tasks, Trajectory, rollout
+from ..batching._names import leaf_names, replace_named
+from ..batching._structure import is_number
+from ..control import Trajectory, rollout
+from ..control._step import Targets, Tasks
 from ..limits import ConfigurationLimit, Limit, VelocityLimit
 from ..robot import Robot
 from ..schemes import Scheme, WeightedQP

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._joint_selection import scalar_layout
-from .._tree import DOF_WIDTH, FREE, unknown_name
+from .._errors import unknown_name
 from ..control import Trajectory
 from ..kinematics import center_of_mass, forward_kinematics
+from ..robot._joint_selection import scalar_layout
+from ..robot._tree import DOF_WIDTH, FREE
 from ..tasks import ComTask, SupportPolygon, Task
 from ._loop import Loop
 

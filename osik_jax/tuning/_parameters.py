@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikTypeError, OsikValueError
-from .._names import find_leaves
-from .._structure import is_number
+from ..batching._names import find_leaves
+from ..batching._structure import is_number
 from ._loop import Loop
 
 _NEVER_NEGATIVE = {

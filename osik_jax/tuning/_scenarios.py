@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._errors import OsikKeyError, OsikTypeError, OsikValueError
-from .._names import find_leaves, replace_named
-from .._structure import is_number
+from ..batching._names import find_leaves, replace_named
+from ..batching._structure import is_number
 from ..control import Trajectory
 from ._loop import Loop
 

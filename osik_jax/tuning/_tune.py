@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from .._errors import OsikTypeError, OsikValueError
-from .._structure import Static, put_together, taken_apart
+from ..batching._structure import Static, put_together, taken_apart
 from ._evaluate import Evaluation, Problem, check_loss, check_mesh, chunk_size, replicas, replicated, shares
 from ._history import History, State, load_state, save_state
 from ._loop import Loop

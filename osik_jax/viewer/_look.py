@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from .._loading._packages import Packages
-from .._loading._source import check_root, parse_xml, read_source
-from .._loading._urdf import GEOMS, geom_size
-from .._loading._urdf_elements import Link, Shape, Urdf, read_urdf
+from ..robot.loading._packages import Packages
+from ..robot.loading._source import check_root, parse_xml, read_source
+from ..robot.loading._urdf import GEOMS, geom_size
+from ..robot.loading._urdf_elements import Link, Shape, Urdf, read_urdf
 from ._collada import Triangles
 from ._meshes import read_mesh
 

@@ -1,4 +1,8 @@
-"""Level after level, each on the minimisers of those above (eq. 9): what XLA makes of a hierarchy."""
+"""The search for hierarchies in plain JAX: level after level, each over the minimisers of those above (eq. 9).
+
+Each level solves on guessed working sets (``_working_set_solve.py``), goes on by the primal active-set method where no
+guess is right (``_primal_active_set.py``), and freezes what it determines (``_freeze.py``).
+"""
 
 from __future__ import annotations
 
@@ -9,79 +13,59 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._damping import effective, room_below
-from .._dense import apply, product
-from .._lanes import choose
+from ...execution._lanes import choose
+from .._damping import level_damping
 from .._level import Level
-from ._held import independent
-from ._landing import Landing, land, noise, nothing_landed
-from ._primal import LevelState, solve_level
+from ._active_rows import drop_dependent, factor_active_rows
+from ._freeze import CascadeState, LevelOutcome, freeze, skip
+from ._implicit_diff import ActiveSets
+from ._padding import Layout, LevelProblem, PaddedHierarchy
+from ._primal_active_set import PrimalState, primal_active_set
 from ._problem import Tolerances, WorkingSet
-from ._proposal import propose
-from ._replay import Decision
-from ._stack import Layout, Stack, Task
+from ._working_set_guess import guess_working_set
+from ._working_set_solve import WorkingSetSolution, placeholder, solve_on_working_set
 
-NOTHING = 1e-2
-"""Share of the rank tolerance up to which a pivot is none, whatever the rank that another factorisation found."""
-
-_LOST = 100.0
-"""Rank tolerances; a level whose optimum those below it have worsened by more was not kept."""
+_MAX_LOSS = 100.0
+"""In units of the rank tolerance: a level whose optimum the levels below have worsened by more is not kept."""
 
 
-class _Cascade(NamedTuple):
-    """What the levels so far have fixed."""
+class CascadeResult(NamedTuple):
+    """The answer of a hierarchy, of the search or of a kernel, and what is known of each level."""
 
     x: Float[Array, " n"]
-    lower: Float[Array, " h"]  # of the hard rows: those of levels done are widened to the values reached
-    upper: Float[Array, " h"]
-    frozen: Bool[Array, " h"]
-    side: Int[Array, " h"]  # held and not frozen
-    projector: Float[Array, "n n"]  # onto the null space of the frozen rows
-    bent: Float[Array, " n"]  # how much each variable bends the rows of the levels so far
-    box: Int[Array, " n"]  # active bounds, frozen or held
-    residual: Float[Array, ""]
-    iterations: Int[Array, ""]
-    factorizations: Int[Array, ""]
-    done: Bool[Array, ""]
-
-
-class Descent(NamedTuple):
-    """Where the last level ended, and what each level decided."""
-
-    x: Float[Array, " n"]
-    box: Int[Array, " n"]  # active bounds
-    decisions: Decision  # with a leading axis, the levels, and so the following
-    working: WorkingSet
+    active_bounds: Int[Array, " n"]
+    active_sets: ActiveSets  # with a leading axis of levels, and so the following
+    working_sets: WorkingSet
     multipliers: Float[Array, "L h"]
-    reached: Float[Array, " L"]  # the norm of each level's slack at its own optimum
+    slack_norms: Float[Array, " L"]  # of each level at its own optimum
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     factorizations: Int[Array, ""]
     done: Bool[Array, ""]
 
 
-def descent_of(
+def result_of_kernel(
     x: Array,
     multipliers: Array,
-    reached: Array,
-    strengths: Array,
+    slack_norms: Array,
+    dampings: Array,
     residual: Array,
-    box: Array,
-    sides: Array,
-    tight: Array,
-    missed: Array,
+    active_bounds: Array,
+    active: Array,
+    frozen: Array,
+    in_cost: Array,
     own: Array,
     ranks: Array,
     report: Array,
-) -> Descent:
-    """What a kernel gives for a batch; ``report`` has whether it came to an end, iterations and factorisations."""
-    return Descent(
+) -> CascadeResult:
+    """Return a kernel's answers for a batch; ``report`` (B, 3) has whether it ended, iterations and factorisations."""
+    return CascadeResult(
         x=x,
-        box=box,
-        decisions=Decision(jnp.where(strengths[:, :, None] > 0.0, sides, tight), tight, missed, ranks),
-        working=WorkingSet(sides, own),
+        active_bounds=active_bounds,
+        active_sets=ActiveSets(jnp.where(dampings[:, :, None] > 0.0, active, frozen), frozen, in_cost, ranks),
+        working_sets=WorkingSet(active, own),
         multipliers=multipliers,
-        reached=reached,
+        slack_norms=slack_norms,
         residual=residual,
         iterations=report[:, 1],
         factorizations=report[:, 2],
@@ -89,282 +73,252 @@ def descent_of(
     )
 
 
-def descend_all(layout: Layout, cap: int, stack: Stack, tolerances: Tolerances, warm: WorkingSet | None) -> Descent:
-    """All levels, all lanes: every array has a leading axis, the lanes, and then perhaps one of levels.
+def solve_cascade(
+    layout: Layout,
+    max_iterations: int,
+    hierarchy: PaddedHierarchy,
+    tolerances: Tolerances,
+    warm_start: WorkingSet | None,
+    *,
+    by_guesses: bool = True,
+) -> CascadeResult:
+    """Solve all levels of a batch of hierarchies; every array has a leading axis of problems, then perhaps of levels.
 
     Args:
-        layout: where rows stand (static).
-        cap: on the active-set iterations of one level (static).
-        stack: the numbers.
+        layout: sizes and row indices (static).
+        max_iterations: limit on the active-set iterations of one level (static).
+        hierarchy: the numbers.
         tolerances: what counts as zero.
-        warm: working sets to try first; all zeros in a lane for none.
+        warm_start: working sets to try first; all zeros in a problem for none.
+        by_guesses: whether working sets are guessed before the primal method searches for them (static). A kernel has
+            tried that by then, and it is much of what there is to compile.
     """
 
-    def descend(cascade: _Cascade, now: tuple[Array, Any, WorkingSet | None]) -> tuple[_Cascade, _Outcome]:
+    def solve_next(state: CascadeState, now: tuple[Array, Any, WorkingSet | None]) -> tuple[CascadeState, LevelOutcome]:
         k, level, guess = now
-        task = jax.vmap(partial(_task, layout, k))(stack, level, cascade)
-        free = jnp.trace(cascade.projector, axis1=1, axis2=2) > 0.5
-        as_it_is = _skip(cascade, task)
+        problem = jax.vmap(partial(_level_problem, layout, k))(hierarchy, level, state)
+        is_free = jnp.trace(state.projector, axis1=1, axis2=2) > 0.5  # the trace is the dimension that is left
+        skipped = skip(state, problem)
 
-        def solve() -> tuple[_Cascade, _Outcome]:
-            new = _descend(cascade, task, free, tolerances=tolerances, guess=guess, known=known, cap=cap)
-            return choose(free, new, as_it_is)
+        def solve() -> tuple[CascadeState, LevelOutcome]:
+            if by_guesses:
+                attempts = _solve_on_guesses(problem, is_free, tolerances, guess, known, max_iterations)
+            else:
+                attempts = jax.vmap(placeholder)(problem)._replace(optimal=~is_free), no_changes, no_changes
+            solved = _solve_level(state, problem, attempts, tolerances, max_iterations)
+            return choose(is_free, solved, skipped)
 
-        return jax.lax.cond(jnp.any(free), solve, lambda: as_it_is)
+        return jax.lax.cond(jnp.any(is_free), solve, lambda: skipped)
 
-    first = jax.vmap(_start)(stack)
-    known = None if warm is None else jnp.any(warm.own != 0, (1, 2))  # that of a solution has at least the last level's
-    levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (stack.levels, warm))
+    first = jax.vmap(_start)(hierarchy)
+    no_changes = jnp.zeros(len(first.x), jnp.int32)
+    # all zeros stand for no warm start: an equality of a solution has a 2
+    known = None if warm_start is None else jnp.any(warm_start.own != 0, (1, 2))
+    levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (hierarchy.levels, warm_start))
     numbers = jnp.arange(layout.levels)
-    cascade, outcomes = jax.lax.scan(descend, first, (numbers, levels, guesses))
-    decisions, working, multipliers, reached = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes)
+    state, outcomes = jax.lax.scan(solve_next, first, (numbers, levels, guesses))
+    active_sets, working_sets, multipliers, slack_norms = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes)
     n = layout.variables
+    # a bound that levels narrowed for those below them is none of the box
     narrowed = jnp.where(
-        cascade.box < 0, cascade.lower[:, :n] > stack.hard_lower[:, :n], cascade.upper[:, :n] < stack.hard_upper[:, :n]
+        state.active_bounds < 0,
+        state.lower[:, :n] > hierarchy.hard_lower[:, :n],
+        state.upper[:, :n] < hierarchy.hard_upper[:, :n],
     )
-    end = Descent(
-        x=cascade.x,
-        box=jnp.where(narrowed, 0, cascade.box),
-        decisions=decisions,
-        working=working,
+    result = CascadeResult(
+        x=state.x,
+        active_bounds=jnp.where(narrowed, 0, state.active_bounds),
+        active_sets=active_sets,
+        working_sets=working_sets,
         multipliers=multipliers,
-        reached=reached,
-        residual=cascade.residual,
-        iterations=cascade.iterations,
-        factorizations=cascade.factorizations,
-        done=cascade.done,
+        slack_norms=slack_norms,
+        residual=state.residual,
+        iterations=state.iterations,
+        factorizations=state.factorizations,
+        done=state.done,
     )
-    return jax.vmap(certified)(end, stack, tolerances)
+    return jax.vmap(certify_levels)(result, hierarchy, tolerances)
 
 
-def _start(stack: Stack) -> _Cascade:
-    h, n = stack.hard.shape
-    dtype = stack.hard.dtype
-    lower, upper = stack.hard_lower[:n], stack.hard_upper[:n]
-    pinned = stack.hard_equal[:n]
-    nothing = jnp.asarray(0, jnp.int32)
-    return _Cascade(
+def _start(hierarchy: PaddedHierarchy) -> CascadeState:
+    """Return the point of the box nearest to 0, with the pinned variables frozen."""
+    h, n = hierarchy.hard.shape
+    dtype = hierarchy.hard.dtype
+    lower, upper = hierarchy.hard_lower[:n], hierarchy.hard_upper[:n]
+    pinned = hierarchy.hard_is_equality[:n]
+    zero = jnp.asarray(0, jnp.int32)
+    return CascadeState(
         x=jnp.clip(jnp.zeros(n, dtype), lower, upper),
-        lower=stack.hard_lower,
-        upper=stack.hard_upper,
+        lower=hierarchy.hard_lower,
+        upper=hierarchy.hard_upper,
         frozen=jnp.pad(pinned, (0, h - n)),
-        side=jnp.zeros(h, jnp.int32),
+        active=jnp.zeros(h, jnp.int32),
         projector=jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(dtype)),
-        bent=jnp.zeros(n, dtype),
-        box=jnp.where(pinned, 2, 0).astype(jnp.int32),
+        curvature=jnp.zeros(n, dtype),
+        active_bounds=jnp.where(pinned, 2, 0).astype(jnp.int32),
         residual=jnp.zeros((), dtype),
-        iterations=nothing,
-        factorizations=nothing,
+        iterations=zero,
+        factorizations=zero,
         done=jnp.asarray(True),
     )
 
 
-_Outcome = tuple[Decision, WorkingSet, Float[Array, "*B h"], Float[Array, "*B"]]
-
-
-def _task(layout: Layout, k: Int[Array, ""], stack: Stack, level: Level, cascade: _Cascade) -> Task:
-    """Level k, and the rows that it must not touch."""
-    of = jnp.asarray(layout.level_of_hard)
-    bounded = jnp.isfinite(cascade.lower) | jnp.isfinite(cascade.upper)
-    n = len(cascade.x)
-    own = jax.tree.map(lambda a: a[k], stack.damping)
-    return Task(
+def _level_problem(
+    layout: Layout, k: Int[Array, ""], hierarchy: PaddedHierarchy, level: Level, state: CascadeState
+) -> LevelProblem:
+    """Return level k with the hard rows and the frozen rows that it has to keep."""
+    level_of_hard = jnp.asarray(layout.level_of_hard)
+    bounded = jnp.isfinite(state.lower) | jnp.isfinite(state.upper)
+    n = len(state.x)
+    terms = jax.tree.map(lambda a: a[k], hierarchy.damping)
+    return LevelProblem(
         level=level,
-        damping=effective(own, level, cascade.x, cascade.projector, cascade.lower[:n], cascade.upper[:n]),
-        given=own,
-        equal=stack.equal[k],
-        matrix=stack.hard,
-        lower=cascade.lower,
-        upper=cascade.upper,
-        free=~cascade.frozen & bounded & (of < k),
-        own=of == k,
-        soft=(of == k) & ~stack.hard_equal,
-        place=jnp.asarray(layout.place_of_row)[k],
-        projector=cascade.projector,
-        x=cascade.x,
+        damping=level_damping(terms, level, state.x, state.projector, state.lower[:n], state.upper[:n]),
+        damping_terms=terms,
+        is_equality=hierarchy.is_equality[k],
+        hard=hierarchy.hard,
+        lower=state.lower,
+        upper=state.upper,
+        may_block=~state.frozen & bounded & (level_of_hard < k),
+        is_own=level_of_hard == k,
+        is_own_inequality=(level_of_hard == k) & ~hierarchy.hard_is_equality,
+        hard_of_row=jnp.asarray(layout.hard_of_row)[k],
+        projector=state.projector,
+        x=state.x,
     )
 
 
-def _descend(
-    cascade: _Cascade,
-    task: Task,
-    wanted: Bool[Array, " B"],
-    *,
+def _solve_level(
+    state: CascadeState,
+    problem: LevelProblem,
+    attempts: tuple[WorkingSetSolution, Int[Array, " B"], Int[Array, " B"]],
     tolerances: Tolerances,
-    guess: WorkingSet | None,
-    known: Bool[Array, " B"] | None,
-    cap: int,
-) -> tuple[_Cascade, _Outcome]:
-    """Solves one more level in the lanes that want it, and freezes what it decides."""
-    best, changes, factorizations = _land(task, wanted, tolerances, guess, known, cap)
+    max_iterations: int,
+) -> tuple[CascadeState, LevelOutcome]:
+    """Solve one more level, where no attempt (``_solve_on_guesses``) is its optimum, and freeze what it determines."""
+    best, changes, factorizations = attempts
 
-    def by_hand() -> tuple[LevelState, Array]:
-        start = jax.vmap(_by_hand_from)(task, cascade.side, best, tolerances)
-        end = jax.vmap(partial(solve_level, max_iterations=cap))(task, start, tolerances)
+    def search() -> tuple[PrimalState, Array]:
+        start = jax.vmap(_primal_start)(problem, state.active, best, tolerances)
+        end = jax.vmap(partial(primal_active_set, max_iterations=max_iterations))(problem, start, tolerances)
         return end, end.iterations
 
-    end, more = jax.lax.cond(jnp.all(best.optimal), lambda: (jax.vmap(_at)(best), jnp.zeros_like(changes)), by_hand)
-    counted = cascade._replace(
-        iterations=cascade.iterations + changes + more,
-        factorizations=cascade.factorizations + factorizations + 2 * more + 1,
+    def accept() -> tuple[PrimalState, Array]:
+        return jax.vmap(_as_primal_state)(best), jnp.zeros_like(changes)
+
+    end, iterations = jax.lax.cond(jnp.all(best.optimal), accept, search)
+    # an iteration of the primal method factors active rows and least squares, and freezing factors once
+    counted = state._replace(
+        iterations=state.iterations + changes + iterations,
+        factorizations=state.factorizations + factorizations + 2 * iterations + 1,
     )
-    return jax.vmap(_freeze)(counted, task, end, tolerances)
+    return jax.vmap(freeze)(counted, problem, end, tolerances)
 
 
 class _Attempts(NamedTuple):
-    """The working set of the warm start, then the one that the dual method proposes."""
+    """Solves on the working set of the warm start, then on the one that the dual method guesses."""
 
     count: Int[Array, ""]
-    best: Landing
+    best: WorkingSetSolution
     changes: Int[Array, " B"]
     factorizations: Int[Array, " B"]
 
 
-def _land(
-    task: Task,
+def _solve_on_guesses(
+    problem: LevelProblem,
     wanted: Bool[Array, " B"],
     tolerances: Tolerances,
     guess: WorkingSet | None,
     known: Bool[Array, " B"] | None,
-    cap: int,
-) -> tuple[Landing, Int[Array, " B"], Int[Array, " B"]]:
-    """Lands where the warm start says and, in the lanes where that is not the optimum, where the dual method says."""
+    max_iterations: int,
+) -> tuple[WorkingSetSolution, Int[Array, " B"], Int[Array, " B"]]:
+    """Solve on the warm start's working sets and, where these are not optimal, on those of the dual method.
 
-    def named() -> tuple[Array, WorkingSet, Array]:
+    Args:
+        problem: the levels.
+        wanted: problems whose level is to be solved. (B,)
+        tolerances: what counts as zero.
+        guess: the warm start's working sets of this level, or None.
+        known: problems that have a warm start. (B,)
+        max_iterations: limit on the iterations of the dual method (static).
+
+    Returns:
+        The solutions, the changes of the working sets, and the factorisations.
+    """
+
+    def from_warm_start() -> tuple[Array, WorkingSet, Array]:
         assert guess is not None
-        return task.x, jax.vmap(_usable)(task, guess), none
+        return problem.x, jax.vmap(_usable_guess)(problem, guess), zeros
 
-    def go_on(s: _Attempts) -> Bool[Array, ""]:
+    def is_running(s: _Attempts) -> Bool[Array, ""]:
         return (s.count < 2) & ~jnp.all(s.best.optimal)
 
     def attempt(s: _Attempts) -> _Attempts:
-        def proposed() -> tuple[Array, WorkingSet, Array]:
-            return propose(task, ~s.best.optimal, cap)
+        def from_dual_method() -> tuple[Array, WorkingSet, Array]:
+            return guess_working_set(problem, ~s.best.optimal, max_iterations)
 
-        x, working, changes = proposed() if guess is None else jax.lax.cond(s.count == 0, named, proposed)
-        landed = jax.vmap(land)(task, x, working, tolerances)
+        if guess is None:
+            x, working_set, changes = from_dual_method()
+        else:
+            x, working_set, changes = jax.lax.cond(s.count == 0, from_warm_start, from_dual_method)
+        solved = jax.vmap(solve_on_working_set)(problem, x, working_set, tolerances)
         skipped = s.best.optimal if known is None else s.best.optimal | ((s.count == 0) & ~known)
-        spent = jnp.where(skipped, 0, 2 + s.count)  # a proposal has factored the damped level
-        best = choose(skipped, s.best, landed)
-        return _Attempts(s.count + 1, best, s.changes + changes, s.factorizations + spent)
+        # two for active rows and least squares; the dual method has factored the damped Hessian too
+        factorizations = jnp.where(skipped, 0, 2 + s.count)
+        best = choose(skipped, s.best, solved)
+        return _Attempts(s.count + 1, best, s.changes + changes, s.factorizations + factorizations)
 
-    none = jnp.zeros(len(wanted), jnp.int32)
-    nowhere = jax.vmap(nothing_landed)(task)._replace(optimal=~wanted)
+    zeros = jnp.zeros(len(wanted), jnp.int32)
+    nothing_yet = jax.vmap(placeholder)(problem)._replace(optimal=~wanted)
     first = jnp.asarray(1 if guess is None else 0, jnp.int32)
-    return jax.lax.while_loop(go_on, attempt, _Attempts(first, nowhere, none, none))[1:]
+    return jax.lax.while_loop(is_running, attempt, _Attempts(first, nothing_yet, zeros, zeros))[1:]
 
 
-def _usable(task: Task, warm: WorkingSet) -> WorkingSet:
-    """The warm start as far as its bounds exist."""
-    level = task.level
-    named = jnp.sign(warm.own)
-    named = jnp.where(jnp.isfinite(jnp.where(named < 0, level.lower, level.upper)), named, 0)
-    own = jnp.where(task.equal, 2, named)
-    side = jnp.sign(warm.hard)
-    side = jnp.where(task.free & jnp.isfinite(jnp.where(side < 0, task.lower, task.upper)), side, 0)
-    return WorkingSet(side.astype(jnp.int32), own.astype(jnp.int32))
+def _usable_guess(problem: LevelProblem, warm_start: WorkingSet) -> WorkingSet:
+    """Return the warm start without the rows whose bound is infinite or that cannot block."""
+    level = problem.level
+    own = jnp.sign(warm_start.own)
+    own = jnp.where(jnp.isfinite(jnp.where(own < 0, level.lower, level.upper)), own, 0)
+    own = jnp.where(problem.is_equality, 2, own)
+    active = jnp.sign(warm_start.hard)
+    bound = jnp.where(active < 0, problem.lower, problem.upper)
+    active = jnp.where(problem.may_block & jnp.isfinite(bound), active, 0)
+    return WorkingSet(active.astype(jnp.int32), own.astype(jnp.int32))
 
 
-def _at(landing: Landing) -> LevelState:
-    """The state of a level that ended where it landed."""
-    nothing = jnp.asarray(0, jnp.int32)
-    return LevelState(*landing[:-2], nothing, nothing, landing.optimal)
+def _as_primal_state(solution: WorkingSetSolution) -> PrimalState:
+    """Return the state of a level that ended with the solution on a working set."""
+    zero = jnp.asarray(0, jnp.int32)
+    return PrimalState(*solution[:-2], zero, zero, solution.optimal)
 
 
-def _by_hand_from(task: Task, side: Int[Array, " h"], landing: Landing, tolerances: Tolerances) -> LevelState:
-    """Where the landing is feasible, from there; else from where the level above ended."""
-    before = _at(nothing_landed(task))._replace(side=independent(task, side, tolerances.rank))
-    return jax.tree.map(lambda a, b: jnp.where(landing.feasible, a, b), _at(landing), before)
+def _primal_start(
+    problem: LevelProblem, active: Int[Array, " h"], solution: WorkingSetSolution, tolerances: Tolerances
+) -> PrimalState:
+    """Return the solution on the guessed working set where it is feasible, else the end of the level above."""
+    independent = drop_dependent(active, factor_active_rows(problem, active, tolerances.rank))
+    above = _as_primal_state(placeholder(problem))._replace(active=independent)
+    return jax.tree.map(lambda a, b: jnp.where(solution.feasible, a, b), _as_primal_state(solution), above)
 
 
-def _freeze(cascade: _Cascade, task: Task, end: LevelState, tolerances: Tolerances) -> tuple[_Cascade, _Outcome]:
-    n, level = len(task.x), task.level
-    value = apply(level.matrix, end.x)
-    slack = value - jnp.clip(value, level.lower, level.upper)
-    missing = task.missing(end.x, slack)
-    counts = task.equal | (jnp.abs(slack) > tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + missing))
-    gradient = task.gradient(end.x, jnp.where(counts, slack, 0.0))
-    pressure = jnp.abs(end.multiplier) * task.length
-    floor = tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + noise(task, end.x, slack, tolerances)
-    # a force that the damping explains leaves the levels below room on the face that the level has reached
-    tight = (end.side != 0) & (pressure > floor + task.damping * jnp.sqrt(jnp.sum(end.x**2)))
-    rows = jnp.argsort(~tight, stable=True)[:n]
-    length = jnp.where(tight, task.length, 1.0)[rows]
-    to_freeze = jnp.concatenate(
-        [
-            jnp.where(tight[rows], 1.0 / length, 0.0)[:, None] * task.matrix[rows],
-            jnp.where(counts[:, None], level.matrix, 0.0) / jnp.where(level.size > 0.0, level.size, 1.0),
-        ]
-    )
-    bounds = jnp.sum(tight, dtype=jnp.int32)
-    same = jnp.all(counts == end.counts)
-    decided = jnp.where(same & jnp.all(tight == (end.side != 0)), bounds + end.rank, -1)
-    basis, rank = _row_space(to_freeze, task.projector, decided, tolerances.rank)
-    missed = jnp.where(counts, jnp.where(slack > 0.0, 1, -1), 0).astype(jnp.int32)
-    reached = apply(task.matrix, end.x)
-    low, high, bent = room_below(task.given, level, cascade.bent, end.x, task.lower[:n], task.upper[:n])
-    after = cascade._replace(
-        x=end.x,
-        lower=jnp.where(task.own, jnp.minimum(task.lower, reached), task.lower).at[:n].set(low),
-        upper=jnp.where(task.own, jnp.maximum(task.upper, reached), task.upper).at[:n].set(high),
-        frozen=cascade.frozen | tight | task.spread(counts),
-        side=jnp.where(tight, 0, end.side),
-        projector=task.projector - product(basis, basis.T),
-        bent=bent,
-        box=jnp.where(end.side[:n] != 0, end.side[:n], jnp.where(cascade.frozen[:n], cascade.box, 0)),
-        residual=jnp.maximum(cascade.residual, end.residual),
-        done=cascade.done & end.done,
-    )
-    own = jnp.where(task.equal, 2, missed).astype(jnp.int32)
-    # rows held without a multiplier decide nothing, unless more of the level would count without them (a tie)
-    tie = same & (rank - bounds != end.rank) & (task.damping == 0.0)
-    kept = jnp.where(tight | tie, end.side, 0)
-    rank = jnp.where(tie, end.rank, rank - bounds)
-    decision = Decision(jnp.where(task.damping > 0.0, end.side, kept), kept, missed, rank)
-    return after, (decision, WorkingSet(end.side, own), end.multiplier, jnp.sqrt(jnp.sum(slack**2)))
+def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> CascadeResult:
+    """Check that no level lost its optimum to the levels below; what was lost is part of the residual.
 
-
-def _skip(cascade: _Cascade, task: Task) -> tuple[_Cascade, _Outcome]:
-    """A level that finds no freedom decides nothing."""
-    none, own = jnp.zeros_like(cascade.side), jnp.zeros(task.level.lower.shape, jnp.int32)
-    decision = Decision(none, none, own, jnp.zeros_like(cascade.iterations))
-    anything = jnp.full_like(cascade.residual, jnp.inf)  # x has stopped moving
-    return cascade, (decision, WorkingSet(none, own), jnp.zeros_like(cascade.lower), anything)
-
-
-def certified(end: Descent, stack: Stack, tolerances: Tolerances) -> Descent:
-    """With what the levels below took from each level's optimum: part of the residual, and of the verdict.
-
-    Rounding is that of the largest x on the way: levels may have been at bounds that those below them have left.
+    Roundoff is that of the largest x on the way: levels may have been at bounds that those below them have left.
     """
-    length = jnp.sqrt(jnp.sum(stack.hard**2, -1))
-    bound = jnp.where(end.working.hard < 0, stack.hard_lower, stack.hard_upper)
-    held = (end.working.hard != 0) & (length > 0.0) & jnp.isfinite(bound)  # a narrowed bound is nearer than x
-    been = jnp.max(jnp.where(held, jnp.abs(bound) / jnp.where(length > 0.0, length, 1.0), 0.0))
-    reach = jnp.maximum(jnp.max(jnp.abs(end.x)), been)
+    length = jnp.sqrt(jnp.sum(hierarchy.hard**2, -1))
+    active = result.working_sets.hard
+    bound = jnp.where(active < 0, hierarchy.hard_lower, hierarchy.hard_upper)
+    # a bound that is active only because it was narrowed may be infinite here; it was nearer than x
+    usable = (active != 0) & (length > 0.0) & jnp.isfinite(bound)
+    largest_bound = jnp.max(jnp.where(usable, jnp.abs(bound) / jnp.where(length > 0.0, length, 1.0), 0.0))
+    largest = jnp.maximum(jnp.max(jnp.abs(result.x)), largest_bound)
 
-    def lost(level: Level, reached: Array) -> tuple[Array, Array]:
-        slack = jnp.sqrt(jnp.sum(level.distance(end.x) ** 2))
-        more = jnp.maximum(slack - reached, 0.0)
-        allowed = _LOST * tolerances.rank * (level.size * reach + slack)
-        return level.size * more, more <= allowed
+    def loss(level: Level, slack_norm: Array) -> tuple[Array, Array]:
+        now = jnp.sqrt(jnp.sum(level.distance(result.x) ** 2))
+        increase = jnp.maximum(now - slack_norm, 0.0)
+        allowed = _MAX_LOSS * tolerances.rank * (level.size * largest + now)
+        return level.size * increase, increase <= allowed
 
-    residual, kept = jax.vmap(lost)(stack.levels, end.reached)
-    return end._replace(residual=jnp.maximum(end.residual, jnp.max(residual)), done=end.done & jnp.all(kept))
-
-
-def _row_space(
-    rows: Float[Array, "m n"], projector: Float[Array, "n n"], decided: Int[Array, ""], rank: Array | float
-) -> tuple[Float[Array, "n k"], Int[Array, ""]]:
-    """Orthonormal basis (0 columns beyond the rank) of what the rows span inside the projector's range, and its size.
-
-    The rank is what is decided; where that is negative, the number of pivots above the tolerance.
-    """
-    basis, triangle, _ = jax.scipy.linalg.qr(product(rows, projector).T, mode="economic", pivoting=True)
-    pivots = jnp.abs(jnp.diagonal(triangle))
-    known = (jnp.arange(len(pivots)) < decided) & (pivots > NOTHING * rank)
-    keep = jnp.where(decided < 0, pivots > rank, known)
-    basis = product(projector, jnp.where(keep, basis, 0.0))
-    for _ in range(2):  # a column from a small pivot left the range by rounding over that pivot: back, and orthonormal
-        basis = 1.5 * basis - 0.5 * product(basis, product(basis.T, basis))
-    return basis, jnp.sum(keep, dtype=jnp.int32)
+    residual, kept = jax.vmap(loss)(hierarchy.levels, result.slack_norms)
+    return result._replace(residual=jnp.maximum(result.residual, jnp.max(residual)), done=result.done & jnp.all(kept))

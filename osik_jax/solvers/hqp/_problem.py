@@ -1,4 +1,4 @@
-"""The hierarchy and its answer, as pytrees."""
+"""Tolerances, working sets and the answer of a hierarchy, as pytrees."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 
 class Tolerances(NamedTuple):
-    """What counts as zero, relative to the scale of the quantity at hand."""
+    """The tolerances below which a number counts as zero, relative to the scale of the quantity at hand."""
 
     rank: Float[Array, ""] | float = 1e-10  # part of a row outside the span of others, relative to the row
     step: Float[Array, ""] | float = 1e-13  # change of the level's rows by a step, relative to their scale
@@ -18,14 +18,14 @@ class Tolerances(NamedTuple):
 
 
 class WorkingSet(NamedTuple):
-    """What is taken for active in a level: 0 for no, -1 at the lower bound, 1 at the upper (2: an equality)."""
+    """The rows taken as active in a level: 0 for no, -1 at the lower bound, 1 at the upper (2: an equality)."""
 
-    hard: Int[Array, " h"]  # rows that the level leaves alone, held at a bound
-    own: Int[Array, " m"]  # the level's own rows that miss their interval on that side: they count in its cost
+    hard: Int[Array, " h"]  # hard rows, active at a bound
+    own: Int[Array, " m"]  # the level's own rows that are outside their interval on that side, and so in its cost
 
 
 class HQPSolution(eqx.Module):
-    """Answer of a hierarchy.
+    """The answer of a hierarchy.
 
     The hard rows are those of the box and then those of every level that may hold inequalities (not
     ``Level.equality``), h of them.
@@ -38,8 +38,8 @@ class HQPSolution(eqx.Module):
         factorizations: systems factored, all levels together.
         kkt_residual: the largest stationarity residual of a level, and what the levels below took from its optimum.
         active: of the box, -1 at the lower bound, 1 at the upper, 2 equality, 0 free. (n,)
-        active_rows: of each level, its rows that miss their interval: -1 below it, 1 above, 2 equality; 0 for those
-            that hold. ((m,), ...)
+        active_rows: of each level, its rows outside their interval: -1 below it, 1 above, 2 equality; 0 for those
+            inside. ((m,), ...)
         multipliers: of each level, the forces of the hard rows, in the units of its weighted cost: the downhill
             direction of the cost, within what the levels above leave free, is their combination with these; positive
             at an upper bound, negative at a lower. (levels, h)

@@ -1,4 +1,4 @@
-"""solve_hqp: descend level after level, differentiate nothing but the answer."""
+"""The entry point of hierarchies: check and pad the data, solve, attach the derivative, set the status."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ... import _rules
-from .._backends import Backend, check_backend, here
-from .._box import inside, uncrossed
-from .._damping import Damping, one_each
+from ...execution import _rules
+from ...execution._backends import Backend, check_backend, here
+from .._box import clip_roundoff, uncrossed
+from .._damping import Damping, per_level
 from .._level import Level
 from .._status import Status
-from ._cascade import NOTHING, Descent
-from ._fused import descender
+from ._cascade import CascadeResult
+from ._dispatch import hierarchy_solver
+from ._freeze import ZERO_PIVOT
+from ._implicit_diff import with_derivative
+from ._padding import pad_hierarchy
 from ._problem import HQPSolution, Tolerances, WorkingSet
-from ._replay import with_derivative
-from ._stack import stacked
 
-_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
-"""Rounding of the data makes rows independent that are not."""
+_RANK_TOLERANCE = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
+"""By the precision of the data, whose roundoff makes dependent rows independent."""
 
 
 @partial(jax.jit, static_argnames=("max_iterations", "backend"))
@@ -37,17 +38,17 @@ def solve_hqp(
     tolerances: Tolerances | None = None,
     backend: Backend = "auto",
 ) -> HQPSolution:
-    """Lexicographic least squares: level k minimises |w_k|^2 among the minimisers of the levels before it.
+    """Solve lexicographic least squares: level k minimises |w_k|^2 among the minimisers of the levels before it.
 
     w_k is the (weighted) distance of the level's rows A_k x to their intervals [lower_k, upper_k]; the box
     ``lower <= x <= upper`` is hard at every level. What freedom is left after the last level goes into the smallest
     |x|, so that the answer is unique. Pure, compiled on first use, and batched by ``vmap``.
 
-    Each level tries the working set of the warm start, then one that a dual method proposes, and judges the exact
-    solution on it by its multipliers; where neither is the optimum, a primal active set goes on by hand. A row
-    violated at its optimum, and every hard row with a nonzero multiplier, is tight on the whole face of minimisers: it
-    is frozen as an equality before the next level and eliminated by its null space. The search is in double precision
-    also where the data are single.
+    Each level is solved on the working set of the warm start, then on one that a dual method guesses, and the exact
+    solution is judged by its multipliers; where neither is the optimum, a primal active-set method goes on. A row
+    violated at its optimum, and every hard row with a nonzero multiplier, has one value on the whole face of
+    minimisers: it is frozen as an equality before the next level and eliminated by its null space. The search is in
+    double precision also where the data are single.
 
     Args:
         levels: highest priority first; any number, each an equality or inequality level or a mixture.
@@ -57,7 +58,7 @@ def solve_hqp(
             below it keep what its rows have reached, A_k x. >= 0. A ``Damping`` has a part that vanishes where the
             level can be met.
         warm_start: that of the solution of a problem nearby with the same levels. It changes the time, not the answer.
-        max_iterations: cap on the active-set iterations of one level (static); default 10 (n + rows of the level).
+        max_iterations: limit on the active-set iterations of one level (static); default 10 (n + rows of the level).
         tolerances: what counts as zero; the default rank tolerance depends on the precision of the data.
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
             the platform, "jax" for none, "numba" (CPUs) or "warp" (CUDA) for those or an error. It changes the time,
@@ -70,30 +71,34 @@ def solve_hqp(
     """
     lower, upper = jnp.asarray(lower), jnp.asarray(upper)
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
-    tolerances = Tolerances(rank=_RANK[dtype]) if tolerances is None else tolerances
-    damped = one_each(damping, len(levels), len(lower), dtype)
-    sane = _finite(levels, lower, upper) & jnp.stack([(jnp.isfinite(a) & (a >= 0.0)).all() for a in damped]).all()
-    equal = [level.equal | ~sane for level in levels]
+    tolerances = Tolerances(rank=_RANK_TOLERANCE[dtype]) if tolerances is None else tolerances
+    dampings = per_level(damping, len(levels), len(lower), dtype)
+    damping_is_valid = jnp.stack([(jnp.isfinite(a) & (a >= 0.0)).all() for a in dampings]).all()
+    is_finite = _is_finite(levels, lower, upper) & damping_is_valid
+    # where the data are not finite, a placeholder is solved: equalities of zeros in a box of ones
+    is_equality = [level.equal | ~is_finite for level in levels]
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True) if levels else ((), ())
-    low, high, empty = uncrossed(lower, upper)
-    possible = ~jnp.stack([empty, *crossed]).any()
-    low, high = (jnp.where(sane, b, side).astype(dtype) for b, side in ((low, -1.0), (high, 1.0)))
-    scaled = [jax.tree.map(lambda leaf: jnp.where(sane, leaf, 0.0), level.scaled()) for level in levels]
-    scaled, equal = [*scaled, _no_rows(len(low), dtype)], [*equal, jnp.ones(0, bool)]
-    # the last level has nothing but damping: the smallest norm
-    damped = Damping(
-        *(_with_last(jnp.where(sane, a, 0.0), last) for a, last in zip(damped, (1.0, 0.0, 0.0, 0.0), strict=True))
+    low, high, box_crossed = uncrossed(lower, upper)
+    bounds_are_ordered = ~jnp.stack([box_crossed, *crossed]).any()
+    low, high = (jnp.where(is_finite, b, one).astype(dtype) for b, one in ((low, -1.0), (high, 1.0)))
+    scaled = [jax.tree.map(lambda leaf: jnp.where(is_finite, leaf, 0.0), level.scaled()) for level in levels]
+    # a last level without rows and with a damping of 1 minimises |x|^2
+    scaled, is_equality = [*scaled, _no_rows(len(low), dtype)], [*is_equality, jnp.ones(0, bool)]
+    smallest_norm = (1.0, 0.0, 0.0, 0.0)
+    dampings = Damping(
+        *(_append(jnp.where(is_finite, a, 0.0), last) for a, last in zip(dampings, smallest_norm, strict=True))
     )
-    layout, stack = stacked(scaled, equal, low, high, (lower >= upper) & sane, damped)
+    layout, hierarchy = pad_hierarchy(scaled, is_equality, low, high, (lower >= upper) & is_finite, dampings)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
-    search = descender(layout, max_iterations, here(check_backend(backend)))
-    end = _rules.found(search(*jax.lax.stop_gradient((stack, traced, warm_start))))
-    nothing = jnp.maximum(NOTHING * traced.rank, 100.0 * jnp.finfo(dtype).eps)
-    x = with_derivative(end.x, end.decisions, stack, nothing)
-    return _answer(levels, end, x, sane, possible, lower, upper)
+    solve = hierarchy_solver(layout, max_iterations, here(check_backend(backend)))
+    result = _rules.found(solve(*jax.lax.stop_gradient((hierarchy, traced, warm_start))))
+    # the derivative is computed in the precision of the data: no singular value below its roundoff is inverted
+    singular_tol = jnp.maximum(ZERO_PIVOT * traced.rank, 100.0 * jnp.finfo(dtype).eps)
+    x = with_derivative(result.x, result.active_sets, hierarchy, singular_tol)
+    return _solution(levels, result, x, is_finite, bounds_are_ordered, lower, upper)
 
 
-def _with_last(a: Array, last: float) -> Array:
+def _append(a: Array, last: float) -> Array:
     return jnp.concatenate([a, jnp.full_like(a[:1], last)])
 
 
@@ -101,41 +106,50 @@ def _no_rows(n: int, dtype: jnp.dtype) -> Level:
     return Level(jnp.zeros((0, n), dtype), jnp.zeros(0, dtype))
 
 
-def _finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:
-    """Whether the numbers can be computed with: no NaN, no infinity but as no bound."""
+def _is_finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:
+    """Check that there is no NaN, and no infinity except in bounds that do not exist."""
     checks = [jnp.isfinite(level.matrix).all() for level in levels]
-    checks += [(low < jnp.inf).all() & (high > -jnp.inf).all() for low, high in _bounds(levels, lower, upper)]
+    bounds = [(lower, upper), *((level.lower, level.upper) for level in levels)]
+    checks += [(low < jnp.inf).all() & (high > -jnp.inf).all() for low, high in bounds]
     checks += [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
     return jnp.stack(checks).all()
 
 
-def _bounds(levels: Sequence[Level], lower: Array, upper: Array) -> list[tuple[Array, Array]]:
-    return [(lower, upper), *((level.lower, level.upper) for level in levels)]
-
-
-def _answer(
+def _solution(
     levels: Sequence[Level],
-    end: Descent,
-    x: Array,
-    sane: Array,
-    possible: Array,
-    lower: Array,
-    upper: Array,
+    result: CascadeResult,
+    x: Float[Array, " n"],
+    is_finite: Bool[Array, ""],
+    bounds_are_ordered: Bool[Array, ""],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
 ) -> HQPSolution:
-    at_bound = jnp.where(end.box < 0, lower, jnp.where(end.box > 0, upper, x))
-    good = sane & jnp.isfinite(x).all()
-    x = inside(jnp.where(good, at_bound, 0.0), lower, upper)
-    status = jnp.where(end.done, Status.SOLVED, Status.MAX_ITERATIONS)
-    status = jnp.where(possible, status, Status.INFEASIBLE)
+    """Return the answer with its status: x exactly inside its box, all numbers finite.
+
+    Args:
+        levels: as the caller gave them, with lower bounds not above upper ones.
+        result: of all levels, the last one that minimises |x|^2 too.
+        x: the result's x, with its derivative. (n,)
+        is_finite: whether the data can be computed with.
+        bounds_are_ordered: whether no lower bound of the data is above its upper bound.
+        lower: lower bounds of the box. (n,)
+        upper: upper bounds of the box. (n,)
+    """
+    # at an active bound x is that bound, to the last bit and with its derivative
+    at_bound = jnp.where(result.active_bounds < 0, lower, jnp.where(result.active_bounds > 0, upper, x))
+    is_valid = is_finite & jnp.isfinite(x).all()
+    x = clip_roundoff(jnp.where(is_valid, at_bound, 0.0), lower, upper)
+    status = jnp.where(result.done, Status.SOLVED, Status.MAX_ITERATIONS)
+    status = jnp.where(bounds_are_ordered, status, Status.INFEASIBLE)
     return HQPSolution(
         x=x,
-        slacks=tuple(jnp.where(good, level.distance(x), 0.0) for level in levels),
-        status=jnp.where(good, status, Status.NUMERICAL_ERROR),
-        iterations=end.iterations,
-        factorizations=end.factorizations,
-        kkt_residual=jnp.where(good, end.residual, jnp.inf),
-        active=end.box,
-        active_rows=tuple(end.working.own[k, : len(level.lower)] for k, level in enumerate(levels)),
-        multipliers=jnp.where(good, end.multipliers[:-1], 0.0),
-        warm_start=end.working,
+        slacks=tuple(jnp.where(is_valid, level.distance(x), 0.0) for level in levels),
+        status=jnp.where(is_valid, status, Status.NUMERICAL_ERROR),
+        iterations=result.iterations,
+        factorizations=result.factorizations,
+        kkt_residual=jnp.where(is_valid, result.residual, jnp.inf),
+        active=result.active_bounds,
+        active_rows=tuple(result.working_sets.own[k, : len(level.lower)] for k, level in enumerate(levels)),
+        multipliers=jnp.where(is_valid, result.multipliers[:-1], 0.0),
+        warm_start=result.working_sets,
     )

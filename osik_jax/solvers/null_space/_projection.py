@@ -1,9 +1,10 @@
-"""The classical order (eqs. 6 and 7): from the highest level to the lowest, each in the null space of those before it.
+"""The classical projection (eqs. 6 and 7): from the highest level down, each in the null space of those before it.
 
     v_k = v_{k-1} + (J_k P_{k-1})^+ (b_k - J_k v_{k-1}),    P_k = P_{k-1} - (J_k P_{k-1})^+ (J_k P_{k-1})
 
-with the Moore-Penrose inverse; rows that depend on others but for a share of the level's own size are left out.
-Damping acts on the motion term alone; in the projector it would break idempotency, and lower levels would leak into
+with the Moore-Penrose inverse (Y. Nakamura, H. Hanafusa, T. Yoshikawa, "Task-priority based redundancy control of robot
+manipulators", 1987; B. Siciliano, J.-J. Slotine, 1991); rows that depend on others up to the rank tolerance are left
+out. Damping acts on the motion alone; in the projector it would break idempotency, and lower levels would disturb
 higher ones.
 
 When not to use it: where bounds have to hold (``_saturation.py``), or inequalities (``solve_hqp``): an inequality row
@@ -19,84 +20,96 @@ from typing import cast
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._backends import Backend
-from .._damping import Damping, effective, room_below
-from .._dense import apply, product
+from ...execution._backends import Backend
+from ...numerics._constants import FULL_STEP, NEGLIGIBLE_STEP
+from ...numerics._dense import apply, product
+from .._damping import Damping, level_damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
-from ._padded import Rows
-from ._problem import Demand
-
-_WHOLE = 1.0 - 1e-9
-"""From this part of a way on it is all of it, but for rounding."""
+from ._padding import PaddedLevel
+from ._problem import ActiveTask
 
 
 def solve_forward(
     levels: Sequence[Level],
     secondary: Float[Array, " n"],
     damping: Sequence[Damping],
-    rank: Array | float,
+    rank_tol: Array | float,
     backend: Backend = "jax",
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The answer, and the projector onto what no level asks for."""
+    """Return the answer, and the projector onto the null space of all levels.
+
+    Args:
+        levels: highest priority first, weights multiplied in.
+        secondary: motion that is projected onto what all levels leave free.
+        damping: of each level.
+        rank_tol: relative length under which a row counts as dependent.
+        backend: of the factors (static).
+    """
     x, projector = jnp.zeros_like(secondary), jnp.eye(len(secondary), dtype=secondary.dtype)
-    bent = jnp.zeros_like(x)
+    curvature = jnp.zeros_like(x)
     lower, upper = jnp.full_like(x, -jnp.inf), jnp.full_like(x, jnp.inf)
-    for level, own in zip(levels, damping, strict=True):
-        motion, projector, _ = level_motion(level, x, projector, own, rank, backend)
-        x = x + _scale(x, motion, lower, upper) * motion
-        lower, upper, bent = room_below(own, level, bent, x, lower, upper)
+    for level, one in zip(levels, damping, strict=True):
+        # eq. 7: x_k = x_{k-1} + (J_k P_{k-1})^+ (b_k - J_k x_{k-1}), and P_k
+        motion, projector, _ = level_motion(level, x, projector, one, rank_tol, backend)
+        x = x + _step_length(x, motion, lower, upper) * motion
+        lower, upper, curvature = narrow_box(one, level, curvature, x, lower, upper)
+    # the secondary motion in the null space of all levels, inside the same box
     motion = apply(projector, secondary)
-    return x + _scale(x, motion, lower, upper) * motion, projector
+    return x + _step_length(x, motion, lower, upper) * motion, projector
 
 
-def _scale(
+def _step_length(
     x: Float[Array, " n"], motion: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]
 ) -> Float[Array, ""]:
-    """The largest part of a motion, 1 at most, that stays within what levels out of reach leave to those below."""
+    """Return the largest step length, 1 at most, in the box that levels out of reach leave to those below."""
     moves = motion != 0.0
     gap = jnp.where(motion > 0.0, upper - x, x - lower)
     finite = moves & jnp.isfinite(gap)
-    parts = jnp.where(finite, jnp.where(finite, gap, 1.0) / jnp.where(finite, jnp.abs(motion), 1.0), 1.0)
-    return jnp.minimum(jnp.min(parts), 1.0)
+    # the double where keeps 0 / 0 and inf / 0 out of the derivative
+    lengths = jnp.where(finite, jnp.where(finite, gap, 1.0) / jnp.where(finite, jnp.abs(motion), 1.0), 1.0)
+    return jnp.minimum(jnp.min(lengths), 1.0)
 
 
 def level_motion(
-    level: Level | Rows,
+    level: Level | PaddedLevel,
     x: Float[Array, " n"],
     projector: Float[Array, "n n"],
     damping: Damping,
-    rank: Array | float,
+    rank_tol: Array | float,
     backend: Backend = "jax",
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
-    """What one level adds to x, the projector for the next, and the damping that it had."""
+    """Return the motion of one level from x, the projector for the next level, and the level's damping."""
     if not level.matrix.shape[0]:
         return jnp.zeros_like(x), projector, jnp.zeros_like(x[0])
-    demand = Demand.of(level, x, rank)
+    task = ActiveTask.at(level, x, rank_tol)
     unbounded = jnp.full_like(x, jnp.inf)
-    strength = effective(damping, cast(Level, level), x, projector, -unbounded, unbounded)
-    restricted = product(demand.rows, projector)
-    space, motion = row_space_and_motion(restricted, demand.wanted, demand.cutoff, strength, backend=backend)
-    # what rounding adds outside the projector's range, as much more as singular values are small, is taken off again
-    return apply(projector, motion), projector - product(projector, product(space, projector)), strength
+    total = level_damping(damping, cast(Level, level), x, projector, -unbounded, unbounded)
+    # with P = P_{k-1}: the rows J_k P, and the motion P J_k' (J_k P J_k' + damping I)^-1 error
+    restricted = product(task.rows, projector)
+    space, motion = row_space_and_motion(restricted, task.error, task.cutoff, total, backend=backend)
+    # roundoff over small singular values has components outside the projector's range, so the motion is projected
+    return apply(projector, motion), projector - product(projector, product(space, projector)), total
 
 
-def damped_part(
-    level: Level | Rows,
+def damped_step_length(
+    level: Level | PaddedLevel,
     start: Float[Array, " n"],
     end: Float[Array, " n"],
     damping: Float[Array, ""],
-    rank: Array | float,
+    rank_tol: Array | float,
 ) -> Float[Array, ""]:
-    """The part of the way from start to end, 1 at most, at which the damped cost of a level is least.
+    """Return the step length from start to end, 1 at most, that minimises the damped cost of a level.
 
-    The motion of a level alone is the damped optimum; the bounds of some joints may ask far more of the others for the
-    same motion of the rows, and that is not worth its cost.
+    The motion of a level without bounds is the damped optimum; the bounds of some joints may ask far larger motions of
+    the others for the same motion of the rows, and that is not worth its cost. With ``d = end - start`` the cost
+    ``1/2 |t A d - error|^2 + 1/2 damping t^2 |d|^2`` is least at ``t = error'A d / (|A d|^2 + damping |d|^2)``.
     """
-    demand = Demand.of(level, start, rank)
-    way = end - start
-    moved = apply(demand.rows, way)
-    cost = jnp.sum(moved**2) + damping * jnp.sum(way**2)
-    damped = (damping > 0.0) & (cost > 0.0)
-    part = jnp.sum(moved * demand.wanted) / jnp.where(damped, cost, 1.0)
-    return jnp.where(damped & (part < _WHOLE), jnp.maximum(part, 0.0), 1.0)
+    task = ActiveTask.at(level, start, rank_tol)
+    step = end - start
+    change = apply(task.rows, step)
+    square = jnp.sum(step**2)
+    cost = jnp.sum(change**2) + damping * square
+    is_damped = (damping > 0.0) & (cost > 0.0) & (square > NEGLIGIBLE_STEP**2 * jnp.sum(start**2))
+    length = jnp.sum(change * task.error) / jnp.where(is_damped, cost, 1.0)
+    return jnp.where(is_damped & (length < FULL_STEP), jnp.maximum(length, 0.0), 1.0)

@@ -6,16 +6,19 @@ Transactions on Robotics 31(3), 2015. Level k asks for the motion of eq. 7,
 
     d = (J_k P_{k-1})^+ (b_k - J_k x_{k-1})
 
-and gets s d: s is the largest scale in [0, 1] for which some x in the box has the rows of the levels above where they
-are and its own at J_k (x_{k-1} + s d); x_k is the smallest such x. So a level is met exactly if the box and the levels
-above allow, and otherwise the direction of what it still lacks is kept. For the first level and a box around 0 that is
-the direction of the task. Two things differ from the papers. They scale b_k itself, also at the lower levels, which may
-have no admissible scale and then drops the task whole; what is scaled here always has one. And where a level is scaled
-down, the joints that stop it can move no more whatever comes after: they leave the null space of the levels below,
-which would otherwise be stopped by them whole.
+and gets s d: s is the largest scale in [0, 1] for which some x in the box leaves the rows of the levels above unchanged
+and has its own at J_k (x_{k-1} + s d); x_k is the smallest such x. So a level is met exactly if the box and the levels
+above allow, and otherwise the direction of its task error is kept. For the first level and a box around 0 that is the
+direction of the task. Two things differ from the papers. They scale b_k itself, also at the lower levels; that may have
+no admissible scale, and then drops the whole task. The motion d always has one. And where a level is scaled down, the
+joints that block it can move no more whatever comes after: they are removed from the null space of the levels below,
+whose scale would otherwise be 0.
 
-When not to use it: where half a task along the wrong direction is better than little along the right one, and where
-rows are inequalities. One unreachable row scales its whole level down; ``solve_hqp`` misses it by least squares.
+On a CPU a kernel takes one problem after another through all levels (``kernels/numba/_saturation.py``); problems
+without an answer of it are searched here, which is the definition, what runs elsewhere, and the derivative.
+
+When not to use it: where a large motion along a wrong direction is better than a small one along the right, and where
+rows are inequalities. One unreachable row scales its whole level down; ``solve_hqp`` fits it by least squares.
 """
 
 from __future__ import annotations
@@ -26,28 +29,28 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._rules import found as kept
-from .._backends import Backend
-from .._damping import Damping, room_below
-from .._double import in_double
+from ...execution._backends import Backend, takes
+from ...execution._blocks import BLOCK
+from ...execution._candidates import Candidates, certified_or_searched
+from ...execution._double import in_double
+from ...execution._lanes import in_lanes, with_a_few
+from ...execution._rules import found as kept
+from ...kernels.numba import _target
+from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
+from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
-from .._lanes import in_lanes
 from ..hqp import Level
-from ._at_fixed_sides import Decision, with_derivative
-from ._padded import Problem, Rows, first_room, padded
-from ._projection import damped_part, level_motion
-from ._search import Found, Room, search
-
-_INDEPENDENT = 1e-6
-"""Part of a joint's unit vector in the null space and outside the span of others that stop the level; one has less."""
-_AT_BOUND = 1e-9
-"""A joint that is off its bound by more is not on it."""
+from ._implicit_diff import ActiveJoints, with_derivative
+from ._padding import PaddedLevel, Problem, initial_point, pad_levels
+from ._projection import damped_step_length, level_motion
+from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
 
 
-class Saturated(NamedTuple):
-    """What the levels came to inside the box."""
+class BoundedAnswer(NamedTuple):
+    """The answer of all levels inside the box."""
 
     x: Float[Array, " n"]
     projector: Float[Array, "n n"]
@@ -63,102 +66,161 @@ def solve_saturated(
     upper: Float[Array, " n"],
     secondary: Float[Array, " n"] | None,
     damping: Sequence[Damping],
-    rank: Array | float,
+    rank_tol: Array | float,
     max_iterations: int,
     backend: Backend = "jax",
-) -> Saturated:
-    """Level after level; then as near to the secondary motion as they leave room.
+) -> BoundedAnswer:
+    """Solve level after level; then come as near to the secondary motion as they leave room.
 
-    The levels are solved in double precision whatever the data are, for a joint is on its bound or is not. What was
-    decided is then differentiated in the precision of the data.
+    The levels are solved in double precision whatever the data are, for a joint is at its bound or is not. At the
+    active sets that were found, the derivative is in the precision of the data.
+
+    Args:
+        levels: highest priority first, weights multiplied in.
+        lower: lower bounds of the box.
+        upper: upper bounds of the box.
+        secondary: motion for what the levels leave free, or None.
+        damping: of each level.
+        rank_tol: relative length under which a row counts as dependent.
+        max_iterations: limit on the changes of the active set, for each level (static).
+        backend: whose kernels compute (static).
     """
-    problem = padded(levels, lower, upper, secondary, damping, rank)
-    descend = in_lanes(in_double(partial(_descend, max_iterations, backend)))
-    end = kept(descend(jax.lax.stop_gradient(problem)))
-    x, projector, scales = with_derivative((end.x, end.projector, end.scales), end.decisions, problem, backend)
-    return Saturated(x, projector, scales[: len(levels)], end.active, end.iterations, end.done)
+    problem = pad_levels(levels, lower, upper, secondary, damping, rank_tol)
+    solve = in_lanes(in_double(partial(_solve_on_platform, max_iterations, backend)))
+    end = kept(solve(jax.lax.stop_gradient(problem)))
+    x, projector, scales = with_derivative((end.x, end.projector, end.scales), end.active_joints, problem, backend)
+    return BoundedAnswer(x, projector, scales[: len(levels)], end.active, end.iterations, end.done)
 
 
-class _End(NamedTuple):
-    """What all levels came to, and what each decided."""
+class _Result(NamedTuple):
+    """The answer of all levels, and the active set of each."""
 
     x: Float[Array, " n"]
     projector: Float[Array, "n n"]
     scales: Float[Array, " L"]
-    decisions: Decision  # with a leading axis, the levels
+    active_joints: ActiveJoints  # with a leading axis of levels
     active: Int[Array, " n"]
     iterations: Int[Array, ""]
     done: Bool[Array, ""]
 
 
 class _State(NamedTuple):
-    """Where the levels so far ended."""
+    """What the levels so far have determined."""
 
     x: Float[Array, " n"]
     lower: Float[Array, " n"]  # of the levels to come
     upper: Float[Array, " n"]
-    bent: Float[Array, " n"]  # how much each variable bends the rows of these levels
+    curvature: Float[Array, " n"]  # bound on the curvature of the rows so far along each variable
     projector: Float[Array, "n n"]  # without the joints that can move no more
-    fixed: Int[Array, " n"]  # those, at their side; 2 for the pinned ones
+    fixed: Int[Array, " n"]  # those, -1 at the lower bound, 1 at the upper; 2 for pinned ones
     active: Int[Array, " n"]
     iterations: Int[Array, ""]
     done: Bool[Array, ""]
 
 
-def _descend(max_iterations: int, backend: Backend, problem: Problem) -> _End:
-    """All levels of a batch; every array has a leading axis, the batch, and then perhaps one of levels."""
-    x, projector = jax.vmap(first_room)(problem)
+def _solve_on_platform(max_iterations: int, backend: Backend, problem: Problem) -> _Result:
+    search = partial(_solve_levels, max_iterations, backend)
+    if not takes(backend, "numba", fits=True):
+        return search(problem)
+
+    def certified(problem: Problem) -> tuple[_Result, Array]:
+        result = _by_numba(max_iterations, problem)
+        return result, result.done | (result.iterations >= max_iterations)
+
+    def search_rest(candidates: tuple[_Result, Array], problem: Problem) -> _Result:
+        result, is_final = candidates
+        return with_a_few(problem, result, is_final, lambda problem, _: search(problem), BLOCK)
+
+    return certified_or_searched({"numba": Candidates(certified, search_rest)}, search, problem)
+
+
+def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> _Result:
+    """Solve all levels of a batch in plain JAX; every array has a leading axis of problems, then perhaps of levels."""
+    x, projector = jax.vmap(initial_point)(problem)
     fixed = jnp.where(problem.lower == problem.upper, 2, 0)
-    none = jnp.zeros(len(x), jnp.int32)
+    zeros = jnp.zeros(len(x), jnp.int32)
 
-    def level(state: _State, each: tuple[Rows, Damping, Array]) -> tuple[_State, tuple[Array, Decision]]:
-        room, strength = jax.vmap(partial(_room, backend))(problem, state, *each)
-        found = search(room, max_iterations)
-        part = jax.vmap(damped_part)(each[0], state.x, found.x, strength, problem.rank)
-        after, decision = jax.vmap(partial(_after, backend))(state, room, found, part, *each[:2])
-        return after, (jnp.where(found.done, part * found.scale, 0.0), decision)
+    def solve_level(
+        state: _State, each: tuple[PaddedLevel, Damping, Array]
+    ) -> tuple[_State, tuple[Array, ActiveJoints]]:
+        # eq. 7 without bounds, then the largest scale of that motion in the box
+        motion, damping = jax.vmap(partial(_level_problem, backend))(problem, state, *each)
+        result = solve_scaled_motion(motion, max_iterations)
+        # bounds may make the damped motion too dear: a part of the step is then the optimum
+        length = jax.vmap(damped_step_length)(each[0], state.x, result.x, damping, problem.rank_tol)
+        after, joints = jax.vmap(partial(_after_level, backend))(state, motion, result, length, *each[:2])
+        return after, (jnp.where(result.done, length * result.scale, 0.0), joints)
 
-    start = _State(x, problem.lower, problem.upper, jnp.zeros_like(x), projector, fixed, fixed, none, none == 0)
-    across = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), (problem.rows, problem.damping, problem.targets))
-    end, (scales, decisions) = jax.lax.scan(level, start, across)
-    scales, decisions = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), (scales, decisions))
+    start = _State(x, problem.lower, problem.upper, jnp.zeros_like(x), projector, fixed, fixed, zeros, zeros == 0)
+    across = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), (problem.levels, problem.damping, problem.targets))
+    end, (scales, joints) = jax.lax.scan(solve_level, start, across)
+    scales, joints = jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), (scales, joints))
+    # a joint may have stopped at the trust region of its level, or damped on its way to the bound
     bound = jnp.where(end.active < 0, problem.lower, problem.upper)
-    away = (jnp.abs(end.active) == 1) & (jnp.abs(end.x - bound) > _AT_BOUND * (1.0 + jnp.abs(bound)))
-    active = jnp.where(away, 0, end.active)  # at the end of its room, or damped on its way to the bound
-    return _End(end.x, end.projector, scales, decisions, active, end.iterations, end.done)
+    away = (jnp.abs(end.active) == 1) & (jnp.abs(end.x - bound) > BOUND_DISTANCE * (1.0 + jnp.abs(bound)))
+    active = jnp.where(away, 0, end.active)
+    return _Result(end.x, end.projector, scales, joints, active, end.iterations, end.done)
 
 
-def _room(
-    backend: Backend, problem: Problem, state: _State, rows: Rows, damping: Damping, target: Array
-) -> tuple[Room, Array]:
-    """Where the next x may be, and the damping of the level."""
-    motion, projector, strength = level_motion(rows, state.x, state.projector, damping, problem.rank, backend)
-    return Room(state.x, motion, target, projector, state.lower, state.upper), strength
-
-
-def _after(
-    backend: Backend, state: _State, room: Room, found: Found, part: Array, rows: Rows, damping: Damping
-) -> tuple[_State, Decision]:
-    """The start again where the search failed."""
-    side, stops = (jnp.where(found.done, sides, 0) for sides in (found.side, found.blocking))
-    stopped = jnp.where((stops != 0)[:, None], room.projector, 0.0)
-    none = jnp.zeros((), stopped.dtype)
-    space, _ = row_space_and_motion(stopped, stopped[:, 0], none + _INDEPENDENT, none, backend=backend)
-    keep = (stops == 0)[:, None] & (stops == 0)[None, :]
-    fixed = jnp.where(state.fixed == 0, stops, state.fixed)
-    x = jnp.where(
-        found.done & (part < 1.0), state.x + part * (found.x - state.x), jnp.where(found.done, found.x, state.x)
+def _by_numba(max_iterations: int, problem: Problem) -> _Result:
+    """Return the kernel's answers, ``done`` where it has one."""
+    batch, count, m, n = problem.levels.matrix.shape
+    width = max(m, n)
+    # as ``Work`` and ``Search`` in the kernel; rows there are read in blocks of eight numbers
+    space = (n + 11) * (n + width) + 2 * width**2 + n * (width + 2 * n) + n * (2 * n + 9)
+    floats = (batch, n), (batch, n, n), (batch, count)
+    ints = (batch, count), (batch, count, n), (batch, count, n), (batch, count), (batch, n), (batch, 2)
+    x, projector, scales, done, at_bound, blocking, blocker, active, report, *_ = _target.call(
+        "_saturation",
+        [*((s, float) for s in floats), *((s, int) for s in ints), ((space + 8,), float), ((5 * n,), int)],
+        *(*problem.levels, *problem.damping, problem.targets, problem.lower, problem.upper, problem.rank_tol),
+        np.array([max_iterations], np.int32),
     )
-    lower, upper, bent = room_below(damping, rows, state.bent, x, state.lower, state.upper)
+    joints = ActiveJoints(done != 0, at_bound, blocking, blocker)
+    return _Result(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)
+
+
+def _level_problem(
+    backend: Backend, problem: Problem, state: _State, level: PaddedLevel, damping: Damping, target: Array
+) -> tuple[ScaledMotion, Array]:
+    """Return the motion that a level asks for and where x may be, and the damping of the level."""
+    motion, projector, total = level_motion(level, state.x, state.projector, damping, problem.rank_tol, backend)
+    return ScaledMotion(state.x, motion, target, projector, state.lower, state.upper), total
+
+
+def _after_level(
+    backend: Backend,
+    state: _State,
+    motion: ScaledMotion,
+    result: SaturationResult,
+    length: Array,
+    level: PaddedLevel,
+    damping: Damping,
+) -> tuple[_State, ActiveJoints]:
+    """Return the state for the next level; where the search failed, x stays."""
+    active, blocking = (jnp.where(result.done, joints, 0) for joints in (result.active, result.blocking))
+    # the blocking joints can move no more: their columns are removed from the projector
+    columns = jnp.where((blocking != 0)[:, None], motion.projector, 0.0)
+    zero = jnp.zeros((), columns.dtype)
+    space, _ = row_space_and_motion(columns, columns[:, 0], zero + BLOCKING_RANK, zero, backend=backend)
+    keep = (blocking == 0)[:, None] & (blocking == 0)[None, :]
+    fixed = jnp.where(state.fixed == 0, blocking, state.fixed)
+    x = jnp.where(
+        result.done & (length < 1.0),
+        state.x + length * (result.x - state.x),
+        jnp.where(result.done, result.x, state.x),
+    )
+    # what the levels below may spend of the level's progress
+    lower, upper, curvature = narrow_box(damping, level, state.curvature, x, state.lower, state.upper)
     after = _State(
         x=x,
         lower=lower,
         upper=upper,
-        bent=bent,
-        projector=jnp.where(keep, room.projector - space, 0.0),
+        curvature=curvature,
+        projector=jnp.where(keep, motion.projector - space, 0.0),
         fixed=fixed,
-        active=jnp.where(fixed != 0, fixed, side),
-        iterations=state.iterations + found.iterations,
-        done=state.done & found.done,
+        active=jnp.where(fixed != 0, fixed, active),
+        iterations=state.iterations + result.iterations,
+        done=state.done & result.done,
     )
-    return after, Decision(found.done, side, stops, found.blocker)
+    return after, ActiveJoints(result.done, active, blocking, result.blocker)

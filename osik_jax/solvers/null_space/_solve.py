@@ -1,4 +1,4 @@
-"""solve_nullspace: which method, inputs that can be computed with, and the answer."""
+"""The entry point of null-space projection: check the data, choose the method, set the status."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._errors import OsikValueError
-from .._backends import Backend, check_backend, here, takes
+from ...execution._backends import Backend, check_backend, here, takes
 from .._box import clip_to_box, uncrossed
-from .._damping import Damping, one_each
+from .._damping import Damping, per_level
 from .._status import Status
 from ..hqp import Level
-from ._fused import project
-from ._problem import RANK, NullSpaceSolution, sane
+from ._dispatch import project
+from ._problem import RANK_TOLERANCE, NullSpaceSolution, is_finite
 from ._reverse import solve_reverse
-from ._saturation import Saturated, solve_saturated
+from ._saturation import BoundedAnswer, solve_saturated
 
 ORDERS = ("forward", "reverse")
 
@@ -47,7 +47,7 @@ def solve_nullspace(
       give the same answer where all levels can be met together. Where they cannot, the highest level is as exact as if
       it were alone in both; the reverse order has no jump where a level comes to depend on those above.
     - bounds: saturation in the null space (Flacco, De Luca, Khatib 2012, 2015). Joints that would leave their bounds
-      are put on them and the others take over; a level for which that does not suffice is scaled down, by the largest
+      are saturated and the others take over; a level for which that does not suffice is scaled down, by the largest
       scale that fits.
 
     Args:
@@ -82,31 +82,34 @@ def solve_nullspace(
         raise OsikValueError(f"order is {order!r}; orders: {', '.join(ORDERS)}")
     if box is not None and order == "reverse":
         raise OsikValueError("bounds need order='forward': saturation goes from the highest level down")
-    pull = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
+    # bounds with lower > upper become equalities halfway; the status says so
+    motion = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True)
-    possible = ~jnp.stack(crossed).any()
-    given = one_each(damping, len(levels), n, dtype)
-    good = sane(levels, pull, *given) & (True if box is None else _exists(*box))
-    clean, pull, given = _where(good, (list(levels), pull, given))
-    damped = [Damping(*parts) for parts in zip(*given, strict=True)]
-    scaled = [level.scaled() for level in clean]
-    rank = RANK[dtype] if rank_tolerance is None else rank_tolerance
+    bounds_are_ordered = ~jnp.stack(crossed).any()
+    dampings = per_level(damping, len(levels), n, dtype)
+    # where the data are not finite, a placeholder of zeros is solved, in a box of ones
+    is_valid = is_finite(levels, motion, *dampings) & (True if box is None else _exist(*box))
+    valid, motion, dampings = _or_zeros(is_valid, (list(levels), motion, dampings))
+    scaled = [level.scaled() for level in valid]
+    rank_tol = RANK_TOLERANCE[dtype] if rank_tolerance is None else rank_tolerance
+    one_each = [Damping(*parts) for parts in zip(*dampings, strict=True)]
     if box is None:
         if order == "forward":
-            answer = _free(*project(scaled, pull, given, rank, backend), count=len(levels))
+            answer = _unbounded(*project(scaled, motion, dampings, rank_tol, backend), count=len(levels))
         else:
-            answer = _free(*solve_reverse(scaled, pull, damped, rank, backend), count=len(levels))
-        return _solution(clean, answer, good, possible, jnp.zeros(n, dtype))
-    cap = 10 * (n + 2) if max_iterations is None else max_iterations
+            answer = _unbounded(*solve_reverse(scaled, motion, one_each, rank_tol, backend), count=len(levels))
+        return _solution(valid, answer, is_valid, bounds_are_ordered, jnp.zeros(n, dtype))
+    limit = 10 * (n + 2) if max_iterations is None else max_iterations
     low, high, empty = uncrossed(*box)
-    safe = jnp.where(good, low, -1.0), jnp.where(good, high, 1.0)
-    answer = solve_saturated(scaled, *safe, None if secondary is None else pull, damped, rank, cap, backend)
-    return _solution(clean, answer, good, possible & ~empty, clip_to_box(jnp.zeros(n, dtype), *box))
+    safe = jnp.where(is_valid, low, -1.0), jnp.where(is_valid, high, 1.0)
+    target = None if secondary is None else motion
+    answer = solve_saturated(scaled, *safe, target, one_each, rank_tol, limit, backend)
+    return _solution(valid, answer, is_valid, bounds_are_ordered & ~empty, clip_to_box(jnp.zeros(n, dtype), *box))
 
 
-def _where(good: Array, tree: Any) -> Any:
-    """The numbers as they are, or zeros."""
-    return jax.tree.map(lambda leaf: jnp.where(good, leaf, 0.0), tree)
+def _or_zeros(is_valid: Array, tree: Any) -> Any:
+    """Return the numbers as they are, or zeros."""
+    return jax.tree.map(lambda leaf: jnp.where(is_valid, leaf, 0.0), tree)
 
 
 def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] | None:
@@ -122,27 +125,29 @@ def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] |
     return low, high
 
 
-def _exists(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Bool[Array, ""]:
+def _exist(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Bool[Array, ""]:
+    """Check that no bound is NaN, and none infinite on the wrong side."""
     return ((lower < jnp.inf) & (upper > -jnp.inf)).all()
 
 
-def _free(x: Float[Array, " n"], projector: Float[Array, "n n"], *, count: int) -> Saturated:
-    """Answer without bounds."""
-    nothing = jnp.zeros(len(x), jnp.int32)
-    return Saturated(x, projector, jnp.ones(count, x.dtype), nothing, jnp.asarray(0), jnp.asarray(True))
+def _unbounded(x: Float[Array, " n"], projector: Float[Array, "n n"], *, count: int) -> BoundedAnswer:
+    """Return an answer without bounds in the same form: every scale is 1, no joint is active."""
+    inactive = jnp.zeros(len(x), jnp.int32)
+    return BoundedAnswer(x, projector, jnp.ones(count, x.dtype), inactive, jnp.asarray(0), jnp.asarray(True))
 
 
 def _solution(
-    levels: Sequence[Level], answer: Saturated, good: Array, possible: Array, fallback: Array
+    levels: Sequence[Level], answer: BoundedAnswer, is_valid: Array, bounds_are_ordered: Array, fallback: Array
 ) -> NullSpaceSolution:
-    good &= jnp.isfinite(answer.x).all()
-    x = jnp.where(good, answer.x, fallback)
+    """Return the answer with its status, all numbers finite; ``fallback`` where the data are not valid."""
+    is_valid &= jnp.isfinite(answer.x).all()
+    x = jnp.where(is_valid, answer.x, fallback)
     status = jnp.where(answer.done, Status.SOLVED, Status.MAX_ITERATIONS)
-    status = jnp.where(possible, status, Status.INFEASIBLE)
+    status = jnp.where(bounds_are_ordered, status, Status.INFEASIBLE)
     return NullSpaceSolution(
         x=x,
-        slacks=tuple(jnp.where(good, level.distance(x), 0.0) for level in levels),
-        status=jnp.where(good, status, Status.NUMERICAL_ERROR),
+        slacks=tuple(jnp.where(is_valid, level.distance(x), 0.0) for level in levels),
+        status=jnp.where(is_valid, status, Status.NUMERICAL_ERROR),
         projector=answer.projector,
         scales=answer.scales,
         active=answer.active,

@@ -1,50 +1,53 @@
-// Body of one function: a QP in a box, with soft rows, solved by the warp that calls it. _kernel.py names the arguments.
+// Body of one function: a QP in a box, with soft rows, solved by one warp. _kernel.py names the arguments.
 //
-//     min 1/2 sum_r weight_r (A x - target)_r^2 + 1/2 sum_i damping_i (x_i - center_i)^2 + 1/2 sum_q t_q^2 / compliance_q
+//     min 1/2 sum_r weight_r (A x - target)_r^2 + 1/2 sum_i damping_i (x_i - center_i)^2
+//         + 1/2 sum_q t_q^2 / compliance_q
 //     over lower <= [x; C x + t] <= upper
 //
-// Guess an active set, factor, solve, refine, look: bounds that are crossed become active, bounds whose multiplier has
-// the wrong sign become inactive, all at once, until none is left. Where several such exchanges have not left fewer, the
-// dual method goes on from there (Goldfarb and Idnani, as in _pivots.py), which does not cycle: one constraint at a time, a
-// factorization each. A soft row that is active is a row of the cost.
+// Block pivoting: solve on the working set by a Cholesky factor and iterative refinement; violated bounds become
+// active, those whose multiplier has the wrong sign inactive, all at once, until there are none (J. J. Judice, F. M. Pires, "A
+// block principal pivoting algorithm for large-scale strictly monotone linear complementarity problems", 1994). Where
+// that has ceased to reduce their number, the dual active-set method of Goldfarb and Idnani (GI, see
+// _goldfarb_idnani.py) goes on from the working set. It cannot cycle: one constraint at a time, one factorisation each.
+// An active soft row is a row of the cost.
 //
-// Variable i belongs to lane i % 32. Constants from _kernel.py: N variables, M rows of the cost, P soft rows (at most
-// 32), WARPS a block.
+// Variable i belongs to lane i % 32, in its slot i / 32. Constants from _kernel.py: N variables, M rows of the cost,
+// P soft rows (at most 32), WARPS of a block.
 
-constexpr int H = N > 32 ? 2 : 1;             // variables a lane
+constexpr int H = N > 32 ? 2 : 1;             // variables of a lane
 constexpr int ROWS = M + P;
 constexpr int NG = (N + 3) / 4;               // groups of four variables
-constexpr int LD = 4 * (NG | 1);              // lengths of rows: an odd number of groups meets every bank
-constexpr int TALL = (ROWS + 3) / 4 * 4;
+constexpr int LD = 4 * (NG | 1);              // length of a row: an odd number of groups meets every bank
+constexpr int PADDED_ROWS = (ROWS + 3) / 4 * 4;
 constexpr int CONSTRAINTS = N + P;
 constexpr unsigned ALL = 0xffffffffu;
 constexpr int FREE = 0, AT_LOWER = -1, AT_UPPER = 1, EQUALITY = 2;
-constexpr float RIDGE = 1.1920929e-7f;        // of the diagonal: one rounding
-constexpr float LAST_CORRECTION = 1e-6f;      // as a share of x: of the one that would come next
-constexpr float NEARLY = 10.f;                // roundings; a bound crossed by less holds
-constexpr float WORTH = 0.25f;                // a correction that shrinks less than to this share was rounding
-constexpr int MOST_CORRECTIONS = 6;
-constexpr int MOST_FACTORIZATIONS = 100;
-constexpr int PATIENCE = 2;                   // exchanges that do not help, before the dual method
+constexpr float RIDGE = 1.1920929e-7f;        // relative to the diagonal: machine epsilon
+constexpr float LAST_CORRECTION = 1e-6f;      // relative to x: the correction that would come next
+constexpr float FEASIBILITY_TOL = 10.f;       // in units of roundoff: a bound that is violated by less holds
+constexpr float MIN_DECREASE = 0.25f;         // a correction that shrinks to more than this was roundoff
+constexpr int MAX_REFINEMENTS = 6;
+constexpr int MAX_FACTORIZATIONS = 100;
+constexpr int MAX_STALLED = 2;                // exchanges that leave no fewer wrong labels, before the dual method
 
-__shared__ float4 rows_of[WARPS][(ROWS + 1) * LD / 4];
-__shared__ float4 half_of[WARPS][N * LD / 4];
-__shared__ float4 vectors_of[WARPS][(5 * LD + 3 * TALL + (P + 3) / 4 * 4) / 4];
+__shared__ float4 shared_rows[WARPS][(ROWS + 1) * LD / 4];
+__shared__ float4 shared_inverse[WARPS][N * LD / 4];
+__shared__ float4 shared_vectors[WARPS][(5 * LD + 3 * PADDED_ROWS + (P + 3) / 4 * 4) / 4];
 
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
-float* const S = (float*)rows_of[warp];       // A, then C
-float* const half = (float*)half_of[warp];    // L^-1, for the free variables
-float* const columns = (float*)vectors_of[warp];
+float* const S = (float*)shared_rows[warp];       // A, then C
+float* const inverse_factor = (float*)shared_inverse[warp];    // L^-1, for the free variables
+float* const columns = (float*)shared_vectors[warp];
 float* const point = columns + 2 * LD;
-float* const right_side = point + LD;
-float* const middle = right_side + LD;
-float* const weights = middle + LD;
-float* const targets = weights + TALL;
-float* const residuals = targets + TALL;
-float* const row_values = residuals + TALL;
+float* const scaled_right = point + LD;
+float* const work = scaled_right + LD;
+float* const row_weights = work + LD;
+float* const row_targets = row_weights + PADDED_ROWS;
+float* const residuals = row_targets + PADDED_ROWS;
+float* const row_values = residuals + PADDED_ROWS;
 
-auto largest = [&](float a) {
-  for (int far = 16; far; far /= 2) a = fmaxf(a, __shfl_xor_sync(ALL, a, far));
+auto warp_max = [&](float a) {
+  for (int distance = 16; distance; distance /= 2) a = fmaxf(a, __shfl_xor_sync(ALL, a, distance));
   return a;
 };
 auto dot = [&](const float* a, const float* b, int groups) {
@@ -56,7 +59,7 @@ auto dot = [&](const float* a, const float* b, int groups) {
   }
   return (sum.x + sum.y) + (sum.z + sum.w);
 };
-auto across = [&](const float* a, const float* b, int from, int to) {  // sum of a[k * LD] * b[k]; from is 0 or 32
+auto dot_column = [&](const float* a, const float* b, int from, int to) {  // sum of a[k * LD] * b[k]; from is 0 or 32
   float4 sum = {0.f, 0.f, 0.f, 0.f};
   int k = from;
 #pragma unroll 2
@@ -73,18 +76,18 @@ auto across = [&](const float* a, const float* b, int from, int to) {  // sum of
 auto solve = [&](const float* right, const float* unit, float* step) {  // with the Hessian of the free variables
 #pragma unroll
   for (int h = 0; h < H; ++h)
-    if (lane + 32 * h < 4 * NG) right_side[lane + 32 * h] = unit[h] * right[h];
+    if (lane + 32 * h < 4 * NG) scaled_right[lane + 32 * h] = unit[h] * right[h];
   __syncwarp();
 #pragma unroll
   for (int h = 0; h < H; ++h) {
     int i = lane + 32 * h, groups = NG < 8 * (h + 1) ? NG : 8 * (h + 1);
-    if (i < N) middle[i] = dot(half + i * LD, right_side, groups);
+    if (i < N) work[i] = dot(inverse_factor + i * LD, scaled_right, groups);
   }
   __syncwarp();
 #pragma unroll
   for (int h = 0; h < H; ++h) {
     int i = lane + 32 * h;
-    step[h] = unit[h] * across(half + (i < N ? i : N - 1), middle, 32 * h, N);
+    step[h] = unit[h] * dot_column(inverse_factor + (i < N ? i : N - 1), work, 32 * h, N);
   }
 };
 auto finite = [](float a) { return fabsf(a) <= 3.4e38f; };
@@ -95,9 +98,9 @@ auto nearest_bound = [&](float low, float high) {
 
 // ---- the problem
 const size_t problem = pid;
-int index[H], state[H];
+int index[H], label[H];
 bool exists[H];
-float low[H], high[H], damp[H], rest[H], x[H];
+float low[H], high[H], damping_of[H], center_of[H], x[H];
 #pragma unroll
 for (int h = 0; h < H; ++h) {
   int i = lane + 32 * h;
@@ -105,22 +108,22 @@ for (int h = 0; h < H; ++h) {
   index[h] = exists[h] ? i : N - 1;
   low[h] = exists[h] ? lower.data[problem * CONSTRAINTS + i] : 0.f;
   high[h] = exists[h] ? upper.data[problem * CONSTRAINTS + i] : 0.f;
-  damp[h] = exists[h] ? damping.data[problem * N + i] : 0.f;
-  rest[h] = exists[h] ? center.data[problem * N + i] : 0.f;
-  state[h] = exists[h] ? guess.data[problem * CONSTRAINTS + i] : EQUALITY;
+  damping_of[h] = exists[h] ? damping.data[problem * N + i] : 0.f;
+  center_of[h] = exists[h] ? center.data[problem * N + i] : 0.f;
+  label[h] = exists[h] ? guess.data[problem * CONSTRAINTS + i] : EQUALITY;
   x[h] = 0.f;
 }
 const bool has_row = lane < P;
-float row_low = 0.f, row_high = 0.f, gives = 1.f;
-int row_state = FREE;
+float row_low = 0.f, row_high = 0.f, row_compliance = 1.f;
+int row_label = FREE;
 if (has_row) {
   row_low = lower.data[problem * CONSTRAINTS + N + lane];
   row_high = upper.data[problem * CONSTRAINTS + N + lane];
-  gives = compliance.data[problem * P + lane];
-  row_state = row_low == row_high ? EQUALITY : guess.data[problem * CONSTRAINTS + N + lane];
+  row_compliance = compliance.data[problem * P + lane];
+  row_label = row_low == row_high ? EQUALITY : guess.data[problem * CONSTRAINTS + N + lane];
 }
-const bool hard = __any_sync(ALL, has_row && gives <= 0.f && (finite(row_low) || finite(row_high)));
-const float noise = tolerance.data[problem];
+const bool hard = __any_sync(ALL, has_row && row_compliance <= 0.f && (finite(row_low) || finite(row_high)));
+const float relative_tol = tolerance.data[problem];
 
 __syncwarp();
 for (int e = lane; e < M * N; e += 32) S[e / N * LD + e % N] = matrix.data[problem * (M * N) + e];
@@ -128,39 +131,39 @@ for (int e = lane; e < P * N; e += 32) S[(M + e / N) * LD + e % N] = rows.data[p
 for (int r = lane; r < ROWS; r += 32)
   for (int k = N; k < 4 * NG; ++k) S[r * LD + k] = 0.f;
 for (int r = lane; r < M; r += 32) {
-  weights[r] = weight.data[problem * M + r];
-  targets[r] = target.data[problem * M + r];
+  row_weights[r] = weight.data[problem * M + r];
+  row_targets[r] = target.data[problem * M + r];
 }
 
-int factorizations = 0, changes = 0, best = CONSTRAINTS + 1, lives = PATIENCE;
-bool settled = false, dual = false;
-int entering = -1;                            // the constraint that the dual method is making active, -1 for none
-float pushed = 0.f;                           // its multiplier so far
-float row_push = 0.f;                         // multiplier of the lane's row
-while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes) {
+int factorizations = 0, changes = 0, fewest_wrong = CONSTRAINTS + 1, patience = MAX_STALLED;
+bool converged = false, use_dual = false;
+int entering = -1;                            // the constraint that the dual method makes active, -1 for none
+float entering_multiplier = 0.f;                           // its multiplier so far
+float row_multiplier = 0.f;                         // multiplier of the lane's soft row
+while (!hard && factorizations < MAX_FACTORIZATIONS && changes <= max_iterations) {
   if (has_row) {
-    weights[M + lane] = row_state == FREE ? 0.f : 1.f / gives;
-    targets[M + lane] = row_state == FREE ? 0.f : row_state == AT_UPPER ? row_high : row_low;
+    row_weights[M + lane] = row_label == FREE ? 0.f : 1.f / row_compliance;
+    row_targets[M + lane] = row_label == FREE ? 0.f : row_label == AT_UPPER ? row_high : row_low;
   }
   __syncwarp();
 
   // ---- the Hessian: lane i has column i, and of column i + 32 the rows from 32 on; the rest of that is in the other
   // lanes, by symmetry
-  float R[H][N], own[H];
+  float R[H][N], diagonal[H];
 #pragma unroll
   for (int h = 0; h < H; ++h) {
-    own[h] = damp[h];
+    diagonal[h] = damping_of[h];
 #pragma unroll
     for (int k = 32 * h; k < N; ++k) R[h][k] = 0.f;
   }
   for (int r = 0; r < ROWS; ++r) {
-    if (weights[r] == 0.f) continue;
+    if (row_weights[r] == 0.f) continue;
     float a[H];
 #pragma unroll
     for (int h = 0; h < H; ++h) {
       float entry = S[r * LD + index[h]];
-      a[h] = weights[r] * entry;
-      own[h] += a[h] * entry;
+      a[h] = row_weights[r] * entry;
+      diagonal[h] += a[h] * entry;
     }
 #pragma unroll
     for (int g = 0; g < NG; ++g) {
@@ -174,12 +177,12 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
     }
   }
 
-  // ---- of the free variables, in units that make its diagonal ones; the others get the identity
+  // ---- over the free variables, scaled to a diagonal of ones; the others get a row and column of the identity
   float root[H], unit[H];
 #pragma unroll
   for (int h = 0; h < H; ++h) {
-    root[h] = sqrtf(own[h] > 0.f ? own[h] : 1.f);
-    unit[h] = exists[h] && state[h] == FREE ? 1.f / root[h] : 0.f;
+    root[h] = sqrtf(diagonal[h] > 0.f ? diagonal[h] : 1.f);
+    unit[h] = exists[h] && label[h] == FREE ? 1.f / root[h] : 0.f;
     if (lane + 32 * h < 4 * NG) point[lane + 32 * h] = unit[h];
   }
   __syncwarp();
@@ -189,8 +192,8 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
     for (int h = 0; h < H; ++h)
       if (32 * h <= k) R[h][k] = lane + 32 * h == k ? 1.f + RIDGE : R[h][k] * unit[h] * point[k];
 
-  // ---- its factor's inverse, in place. Before step j lane i >= j has column i of what is left of the Hessian, lane
-  // i < j column i of the identity as far as it has been solved for
+  // ---- L^-1 of its Cholesky factor L, in place. Before step j lane i >= j has column i of the Schur complement that
+  // is left of the Hessian, lane i < j column i of the identity as far as L has been solved for
 #pragma unroll
   for (int j = 0; j < N; ++j) {
     float inverse = rsqrtf(__shfl_sync(ALL, R[j >> 5][j], j & 31));
@@ -203,7 +206,7 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
         if (exists[h]) column[index[h]] = c[h];
         bool at = lane + 32 * h == j;
         R[h][j] = at ? inverse : c[h];
-        c[h] += at ? inverse : 0.f;  // lane j: what is left of its column, and at once the first step of its identity
+        c[h] += at ? inverse : 0.f;  // lane j: its column of L, and the first step of its column of the identity
       }
     if (j < 32 && lane == j)
 #pragma unroll
@@ -229,15 +232,15 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
     for (int h = 0; h < H; ++h)
       if (lane + 32 * h < 4 * NG) {
         float entry = 32 * h <= k ? R[h][k] : 0.f;
-        half[k * LD + lane + 32 * h] = lane + 32 * h <= k ? entry : 0.f;
+        inverse_factor[k * LD + lane + 32 * h] = lane + 32 * h <= k ? entry : 0.f;
       }
   ++factorizations;
 
-  // ---- x: bounds where active, zeros to begin with, corrections against residuals of A itself
-  float slope[H], share = INFINITY, before = INFINITY;
+  // ---- x: active bounds, then iterative refinement against residuals of A itself
+  float gradient[H], relative = INFINITY, last_relative = INFINITY;
 #pragma unroll
   for (int h = 0; h < H; ++h)
-    if (state[h] != FREE) x[h] = state[h] == AT_UPPER ? high[h] : low[h];
+    if (label[h] != FREE) x[h] = label[h] == AT_UPPER ? high[h] : low[h];
   for (int round = 0;; ++round) {
 #pragma unroll
     for (int h = 0; h < H; ++h)
@@ -245,168 +248,177 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
     __syncwarp();
     for (int r = lane; r < ROWS; r += 32) {
       float value = dot(S + r * LD, point, NG);
-      residuals[r] = r >= M && r - M + N == entering ? pushed : weights[r] * (targets[r] - value);
+      residuals[r] = r >= M && r - M + N == entering ? entering_multiplier : row_weights[r] * (row_targets[r] - value);
       if (r >= M) row_values[r - M] = value;
     }
     __syncwarp();
 #pragma unroll
     for (int h = 0; h < H; ++h) {
-      slope[h] = across(S + index[h], residuals, 0, ROWS) - damp[h] * (x[h] - rest[h]);
-      if (lane + 32 * h == entering) slope[h] += pushed;
-      if (!exists[h]) slope[h] = 0.f;
+      gradient[h] = dot_column(S + index[h], residuals, 0, ROWS) - damping_of[h] * (x[h] - center_of[h]);
+      if (lane + 32 * h == entering) gradient[h] += entering_multiplier;
+      if (!exists[h]) gradient[h] = 0.f;
     }
-    bool enough = share * share <= LAST_CORRECTION * before || share > WORTH * before;
-    if (round == MOST_CORRECTIONS || (round > 1 && enough)) break;
-    before = share;
-    float step[H], moved = 0.f, far = 0.f;
-    solve(slope, unit, step);
+    bool enough = relative * relative <= LAST_CORRECTION * last_relative || relative > MIN_DECREASE * last_relative;
+    if (round == MAX_REFINEMENTS || (round > 1 && enough)) break;
+    last_relative = relative;
+    float step[H], step_size = 0.f, x_size = 0.f;
+    solve(gradient, unit, step);
 #pragma unroll
     for (int h = 0; h < H; ++h) {
       x[h] += step[h];
-      moved = fmaxf(moved, fabsf(step[h] * root[h]));
-      far = fmaxf(far, fabsf(x[h] * root[h]));
+      step_size = fmaxf(step_size, fabsf(step[h] * root[h]));
+      x_size = fmaxf(x_size, fabsf(x[h] * root[h]));
     }
-    share = largest(moved) / fmaxf(largest(far), 1e-37f);
+    relative = warp_max(step_size) / fmaxf(warp_max(x_size), 1e-37f);
   }
 
-  // ---- what has to change
-  float far = 0.f, long_ = 0.f;
+  // ---- labels that are wrong: violated constraints that are inactive, multipliers of the wrong sign
+  float x_size = 0.f, x_max = 0.f;
 #pragma unroll
   for (int h = 0; h < H; ++h) {
-    far = fmaxf(far, fabsf(x[h] * root[h]));
-    long_ = fmaxf(long_, fabsf(x[h]));
-    if (lane + 32 * h < 4 * NG) middle[lane + 32 * h] = exists[h] ? 1.f / root[h] : 0.f;
+    x_size = fmaxf(x_size, fabsf(x[h] * root[h]));
+    x_max = fmaxf(x_max, fabsf(x[h]));
+    if (lane + 32 * h < 4 * NG) work[lane + 32 * h] = exists[h] ? 1.f / root[h] : 0.f;
   }
-  far = largest(far), long_ = largest(long_);
+  x_size = warp_max(x_size), x_max = warp_max(x_max);
   __syncwarp();
-  int next[H], next_row = row_state, wrong = 0;
+  int next[H], next_row_label = row_label, wrong_count = 0;
 #pragma unroll
   for (int h = 0; h < H; ++h) {
-    float rounding = noise * (fminf(far / root[h], long_) + fabsf(x[h]) + nearest_bound(low[h], high[h]));
-    float pull = rounding * root[h] * root[h], crossed = NEARLY * rounding;
-    next[h] = state[h];
-    if (state[h] == FREE) next[h] = x[h] < low[h] - crossed ? AT_LOWER : x[h] > high[h] + crossed ? AT_UPPER : FREE;
-    if (state[h] == AT_LOWER && slope[h] > pull) next[h] = FREE;
-    if (state[h] == AT_UPPER && slope[h] < -pull) next[h] = FREE;
-    wrong += __popc(__ballot_sync(ALL, next[h] != state[h]));
+    float roundoff = relative_tol * (fminf(x_size / root[h], x_max) + fabsf(x[h]) + nearest_bound(low[h], high[h]));
+    float multiplier_tol = roundoff * root[h] * root[h], violation_tol = FEASIBILITY_TOL * roundoff;
+    next[h] = label[h];
+    if (label[h] == FREE)
+      next[h] = x[h] < low[h] - violation_tol ? AT_LOWER : x[h] > high[h] + violation_tol ? AT_UPPER : FREE;
+    if (label[h] == AT_LOWER && gradient[h] > multiplier_tol) next[h] = FREE;
+    if (label[h] == AT_UPPER && gradient[h] < -multiplier_tol) next[h] = FREE;
+    wrong_count += __popc(__ballot_sync(ALL, next[h] != label[h]));
   }
-  row_push = 0.f;
+  row_multiplier = 0.f;
   float row_gain = -1.f;
   if (has_row) {
-    float reach = 0.f, span = 0.f, value = row_values[lane];
+    float row_reach = 0.f, row_sum = 0.f, value = row_values[lane];
     for (int k = 0; k < N; ++k) {
       float a = fabsf(S[(M + lane) * LD + k]);
-      reach += a * middle[k], span += a;
+      row_reach += a * work[k], row_sum += a;
     }
-    float rounding = noise * (fminf(far * reach, long_ * span) + fabsf(value) + nearest_bound(row_low, row_high));
-    float pull = rounding / fmaxf(reach * reach, 1e-37f), crossed = NEARLY * rounding;
-    if (row_state == FREE)
-      next_row = value < row_low - crossed ? AT_LOWER : value > row_high + crossed ? AT_UPPER : FREE;
+    float scale = fminf(x_size * row_reach, x_max * row_sum) + fabsf(value) + nearest_bound(row_low, row_high);
+    float roundoff = relative_tol * scale;
+    float multiplier_tol = roundoff / fmaxf(row_reach * row_reach, 1e-37f), violation_tol = FEASIBILITY_TOL * roundoff;
+    if (row_label == FREE)
+      next_row_label = value < row_low - violation_tol ? AT_LOWER : value > row_high + violation_tol ? AT_UPPER : FREE;
     else
-      row_push = weights[M + lane] * (targets[M + lane] - value);
-    if (row_state == AT_LOWER && row_push < -pull) next_row = FREE;
-    if (row_state == AT_UPPER && row_push > pull) next_row = FREE;
+      row_multiplier = row_weights[M + lane] * (row_targets[M + lane] - value);
+    if (row_label == AT_LOWER && row_multiplier < -multiplier_tol) next_row_label = FREE;
+    if (row_label == AT_UPPER && row_multiplier > multiplier_tol) next_row_label = FREE;
     float gap = fmaxf(row_low - value, value - row_high);
-    if (row_state == FREE && next_row != FREE) row_gain = gap * gap / (gives + reach * reach);
+    if (row_label == FREE && next_row_label != FREE) row_gain = gap * gap / (row_compliance + row_reach * row_reach);
   }
-  wrong += __popc(__ballot_sync(ALL, next_row != row_state));
-  settled = wrong == 0 && entering < 0;
-  lives = wrong < best ? PATIENCE : lives - 1;
-  best = wrong < best ? wrong : best;
-  dual = dual || lives < 0;
-  if (settled) break;
-  bool frees = has_row && row_state != FREE && next_row == FREE;
+  wrong_count += __popc(__ballot_sync(ALL, next_row_label != row_label));
+  converged = wrong_count == 0 && entering < 0;
+  patience = wrong_count < fewest_wrong ? MAX_STALLED : patience - 1;
+  fewest_wrong = wrong_count < fewest_wrong ? wrong_count : fewest_wrong;
+  use_dual = use_dual || patience < 0;
+  if (converged) break;
+  bool releases = has_row && row_label != FREE && next_row_label == FREE;
 #pragma unroll
-  for (int h = 0; h < H; ++h) frees = frees || (state[h] != FREE && next[h] == FREE);
-  bool drops = entering < 0 && __any_sync(ALL, frees);
-  if (!dual || drops) {  // all at once; the dual method begins with what has to become inactive
+  for (int h = 0; h < H; ++h) releases = releases || (label[h] != FREE && next[h] == FREE);
+  bool drops = entering < 0 && __any_sync(ALL, releases);
+  if (!use_dual || drops) {  // all at once; the dual method first drops wrong multipliers, as its start requires
 #pragma unroll
     for (int h = 0; h < H; ++h) {
-      bool takes = next[h] != state[h] && (!dual || next[h] == FREE);
-      changes += __popc(__ballot_sync(ALL, takes));
-      if (takes) state[h] = next[h];
+      bool changes_label = next[h] != label[h] && (!use_dual || next[h] == FREE);
+      changes += __popc(__ballot_sync(ALL, changes_label));
+      if (changes_label) label[h] = next[h];
     }
-    bool takes = next_row != row_state && (!dual || next_row == FREE);
-    changes += __popc(__ballot_sync(ALL, takes));
-    if (takes) row_state = next_row;
+    bool changes_label = next_row_label != row_label && (!use_dual || next_row_label == FREE);
+    changes += __popc(__ballot_sync(ALL, changes_label));
+    if (changes_label) row_label = next_row_label;
     continue;
   }
 
-  // ---- one step of the dual method. Which constraint: the one whose activation would raise the dual objective most
+  // ---- a dual step (GI, step 1): the violated constraint whose activation raises the dual objective most enters
   if (entering < 0) {
     float gain = row_gain;
     int which = N + lane;
 #pragma unroll
     for (int h = 0; h < H; ++h) {
       float inverse = 0.f;
-      for (int k = 32 * h; k < N; ++k) inverse += half[k * LD + index[h]] * half[k * LD + index[h]];
+      for (int k = 32 * h; k < N; ++k) inverse += inverse_factor[k * LD + index[h]] * inverse_factor[k * LD + index[h]];
       float gap = fmaxf(low[h] - x[h], x[h] - high[h]);
       float own_gain = gap * gap / fmaxf(inverse * unit[h] * unit[h], 1e-37f);
-      if (state[h] == FREE && next[h] != FREE && own_gain > gain) gain = own_gain, which = lane + 32 * h;
+      if (label[h] == FREE && next[h] != FREE && own_gain > gain) gain = own_gain, which = lane + 32 * h;
     }
-    unsigned first = __ballot_sync(ALL, gain == largest(gain));
+    unsigned first = __ballot_sync(ALL, gain == warp_max(gain));
     entering = __shfl_sync(ALL, which, __ffs(first) - 1);
-    pushed = 0.f;
+    entering_multiplier = 0.f;
   }
-  // which way and how far: to x + length side ahead, and the multipliers of the active constraints with it
-  const int place = entering < N ? entering & 31 : entering - N, part = entering < N ? entering >> 5 : -1;
-  float along[H], ahead[H], rate[H];
+  // GI, step 2a: x moves along the primal direction H^-1 normal, the multipliers of the active constraints with it
+  const int entering_lane = entering < N ? entering & 31 : entering - N;
+  const int entering_slot = entering < N ? entering >> 5 : -1;  // -1 for a row
+  float normal[H], direction[H], rate[H];
 #pragma unroll
   for (int h = 0; h < H; ++h)
-    along[h] = !exists[h] ? 0.f : part < 0 ? S[(M + place) * LD + index[h]] : lane + 32 * h == entering ? 1.f : 0.f;
-  solve(along, unit, ahead);
+    normal[h] = !exists[h]          ? 0.f
+                : entering_slot < 0 ? S[(M + entering_lane) * LD + index[h]]
+                                    : lane + 32 * h == entering ? 1.f : 0.f;
+  solve(normal, unit, direction);
 #pragma unroll
   for (int h = 0; h < H; ++h)
-    if (lane + 32 * h < 4 * NG) point[lane + 32 * h] = ahead[h];
+    if (lane + 32 * h < 4 * NG) point[lane + 32 * h] = direction[h];
   float value = has_row ? row_values[lane] : 0.f;
   __syncwarp();
   for (int r = lane; r < ROWS; r += 32) {
     float change = dot(S + r * LD, point, NG);
-    residuals[r] = weights[r] * change;
+    residuals[r] = row_weights[r] * change;
     if (r >= M) row_values[r - M] = change;
   }
   __syncwarp();
-  float gap_low = row_low - value - gives * pushed, gap_high = value + gives * pushed - row_high;
-  float gain = gives + (has_row ? row_values[lane] : 0.f);
+  float gap_low = row_low - value - row_compliance * entering_multiplier;
+  float gap_high = value + row_compliance * entering_multiplier - row_high;
+  float gain = row_compliance + (has_row ? row_values[lane] : 0.f);
 #pragma unroll
   for (int h = 0; h < H; ++h) {
-    rate[h] = across(S + index[h], residuals, 0, ROWS) + damp[h] * ahead[h] - along[h];
-    if (part == h) gap_low = low[h] - x[h], gap_high = x[h] - high[h], gain = ahead[h];
+    rate[h] = dot_column(S + index[h], residuals, 0, ROWS) + damping_of[h] * direction[h] - normal[h];
+    if (entering_slot == h) gap_low = low[h] - x[h], gap_high = x[h] - high[h], gain = direction[h];
   }
-  gap_low = __shfl_sync(ALL, gap_low, place), gap_high = __shfl_sync(ALL, gap_high, place);
-  gain = __shfl_sync(ALL, gain, place);
-  const float side = pushed > 0.f ? 1.f : pushed < 0.f ? -1.f : gap_low > gap_high ? 1.f : -1.f;
-  const float full = fmaxf(side > 0.f ? gap_low : gap_high, 0.f) / fmaxf(gain, 1e-37f);
-  float shortest = INFINITY;
+  gap_low = __shfl_sync(ALL, gap_low, entering_lane), gap_high = __shfl_sync(ALL, gap_high, entering_lane);
+  gain = __shfl_sync(ALL, gain, entering_lane);
+  const float sign_of_bound = entering_multiplier > 0.f   ? 1.f
+                              : entering_multiplier < 0.f ? -1.f
+                                                          : gap_low > gap_high ? 1.f : -1.f;
+  // GI, step 2b: the full step makes the entering constraint hold, the partial step takes a multiplier to 0
+  const float full_step = fmaxf(sign_of_bound > 0.f ? gap_low : gap_high, 0.f) / fmaxf(gain, 1e-37f);
+  float shortest_step = INFINITY;
   int leaving = -1;
 #pragma unroll
   for (int h = 0; h < H; ++h) {
-    float sign = state[h] == AT_LOWER ? 1.f : state[h] == AT_UPPER ? -1.f : 0.f;
-    float falls = -sign * side * rate[h], length = fmaxf(-sign * slope[h], 0.f) / falls;
-    if (exists[h] && falls > 0.f && length < shortest) shortest = length, leaving = lane + 32 * h;
+    float sign = label[h] == AT_LOWER ? 1.f : label[h] == AT_UPPER ? -1.f : 0.f;
+    float decrease = -sign * sign_of_bound * rate[h], length = fmaxf(-sign * gradient[h], 0.f) / decrease;
+    if (exists[h] && decrease > 0.f && length < shortest_step) shortest_step = length, leaving = lane + 32 * h;
   }
   if (has_row) {
-    float sign = row_state == AT_LOWER ? 1.f : row_state == AT_UPPER ? -1.f : 0.f;
-    float falls = sign * side * residuals[M + lane], length = fmaxf(sign * row_push, 0.f) / falls;
-    if (falls > 0.f && length < shortest) shortest = length, leaving = N + lane;
+    float sign = row_label == AT_LOWER ? 1.f : row_label == AT_UPPER ? -1.f : 0.f;
+    float decrease = sign * sign_of_bound * residuals[M + lane], length = fmaxf(sign * row_multiplier, 0.f) / decrease;
+    if (decrease > 0.f && length < shortest_step) shortest_step = length, leaving = N + lane;
   }
-  const float length = -largest(-shortest);
+  const float length = -warp_max(-shortest_step);
   ++changes;
-  if (full <= length) {
-    int label = side > 0.f ? AT_LOWER : AT_UPPER;
+  if (full_step <= length) {  // GI, step 2c: the full step, the constraint becomes active
+    int new_label = sign_of_bound > 0.f ? AT_LOWER : AT_UPPER;
 #pragma unroll
     for (int h = 0; h < H; ++h)
-      if (lane + 32 * h == entering) state[h] = label;
-    if (has_row && N + lane == entering) row_state = label;
-    entering = -1, pushed = 0.f;
-  } else {
-    unsigned first = __ballot_sync(ALL, shortest == length);
+      if (lane + 32 * h == entering) label[h] = new_label;
+    if (has_row && N + lane == entering) row_label = new_label;
+    entering = -1, entering_multiplier = 0.f;
+  } else {                    // the partial step, the blocking constraint becomes inactive
+    unsigned first = __ballot_sync(ALL, shortest_step == length);
     leaving = __shfl_sync(ALL, leaving, __ffs(first) - 1);
 #pragma unroll
     for (int h = 0; h < H; ++h)
-      if (lane + 32 * h == leaving) state[h] = FREE;
-    if (has_row && N + lane == leaving) row_state = FREE;
-    pushed += side * length;
+      if (lane + 32 * h == leaving) label[h] = FREE;
+    if (has_row && N + lane == leaving) row_label = FREE;
+    entering_multiplier += sign_of_bound * length;
   }
 }
 
@@ -415,14 +427,14 @@ while (!hard && factorizations < MOST_FACTORIZATIONS && changes <= most_changes)
 for (int h = 0; h < H; ++h)
   if (exists[h]) {
     solution.data[problem * N + index[h]] = x[h];
-    active.data[problem * CONSTRAINTS + index[h]] = state[h];
+    active.data[problem * CONSTRAINTS + index[h]] = label[h];
   }
 if (has_row) {
-  row_multipliers.data[problem * P + lane] = row_push;
-  active.data[problem * CONSTRAINTS + N + lane] = row_state;
+  row_multipliers.data[problem * P + lane] = row_multiplier;
+  active.data[problem * CONSTRAINTS + N + lane] = row_label;
 }
 if (lane == 0) {
-  report.data[problem * 3] = settled;
+  report.data[problem * 3] = converged;
   report.data[problem * 3 + 1] = changes;
   report.data[problem * 3 + 2] = factorizations;
 }

@@ -1,13 +1,14 @@
-"""Convex quadratic costs, in the two forms that they come in."""
+"""Convex quadratic costs, by a Hessian or by a least-squares problem."""
 
 from __future__ import annotations
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._dense import apply, product
+from ...numerics._dense import apply, product
 
 
 class Quadratic(eqx.Module):
@@ -17,49 +18,50 @@ class Quadratic(eqx.Module):
     linear: Float[Array, " n"]
 
     def hessian(self) -> Float[Array, "n n"]:
-        """H."""
+        """Return H, (n, n)."""
         return self.matrix
 
     def diagonal(self) -> Float[Array, " n"]:
-        """Of H."""
+        """Return the diagonal of H, (n,)."""
         return jnp.diagonal(self.matrix)
 
     def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """H x + g."""
+        """Return H x + g, (n,)."""
         return apply(self.matrix, x) + self.linear
 
-    def curvature(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """H x."""
+    def hessian_product(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return H x, (n,)."""
         return apply(self.matrix, x)
 
-    def forces(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The terms of the gradient, none against another."""
+    def gradient_scale(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the sums of the absolute terms of the gradient, in proportion to which roundoff is, (n,)."""
         return apply(jnp.abs(self.matrix), jnp.abs(x)) + jnp.abs(self.linear)
 
-    def root(self, free: Bool[Array, " n"]) -> Float[Array, "n n"]:
-        """R with R'R = H over the free variables, ones for the others; a ridge of roundings keeps it from breaking."""
-        unit = 10.0 * float(jnp.finfo(self.matrix.dtype).eps)
+    def square_root(self, free: Bool[Array, " n"]) -> Float[Array, "n n"]:
+        """Return R with R'R = H over the free variables, ones for the others (Cholesky, with a ridge of roundoff)."""
+        eps = 10.0 * float(jnp.finfo(self.matrix.dtype).eps)
         square = jnp.where(free[:, None] & free[None, :], self.matrix, 0.0)
-        ridge = jnp.where(free, unit * jnp.max(jnp.diagonal(square), initial=unit), 1.0)
+        ridge = jnp.where(free, eps * jnp.max(jnp.diagonal(square), initial=eps), 1.0)
         return jax.lax.linalg.cholesky(square + jnp.diag(ridge), symmetrize_input=False).T
 
-    def bend(self) -> Float[Array, " n"]:
-        """A diagonal matrix that is no less than H: the sums of the absolute numbers in its rows."""
+    def curvature_bound(self) -> Float[Array, " n"]:
+        """Return the diagonal of a matrix D >= H: row sums of |H| (Gershgorin), (n,)."""
         return jnp.sum(jnp.abs(self.matrix), 1)
 
-    def bends_down(self) -> Bool[Array, ""]:
-        """Whether it is seen to have no minimum: a negative number on the diagonal of H."""
-        return (self.diagonal() < 0.0).any()
+    def lowest_valid(self, number: float) -> list[np.ndarray]:
+        """Return the lowest valid entries of each array: ``number``, and 0 on the diagonal of H."""
+        n = len(self.linear)
+        return [np.where(np.eye(n, dtype=bool), 0.0, number), np.full(n, number)]
 
-    def harmless(self) -> Quadratic:
-        """A cost of the same shape that can always be minimised."""
+    def placeholder(self) -> Quadratic:
+        """Return a cost of the same shape that has a minimiser."""
         return Quadratic(jnp.eye(len(self.linear), dtype=self.matrix.dtype), jnp.zeros_like(self.linear))
 
 
 class LeastSquares(eqx.Module):
     """1/2 sum_i weight_i (A x - b)_i^2 + 1/2 sum_j damping_j (x_j - center_j)^2.
 
-    Products go through A: what forming H = A'WA rounds away (small weights beside large ones) is kept.
+    Products go through A: what is lost to roundoff in H = A'WA (small weights beside large ones) is kept.
     """
 
     matrix: Float[Array, "m n"]
@@ -69,44 +71,45 @@ class LeastSquares(eqx.Module):
     center: Float[Array, " n"]
 
     def hessian(self) -> Float[Array, "n n"]:
-        """A'WA + D, rounded."""
+        """Return A'WA + D, (n, n)."""
         return product(self.matrix.T * self.weight, self.matrix) + jnp.diag(self.damping)
 
     def diagonal(self) -> Float[Array, " n"]:
-        """Of the Hessian."""
+        """Return the diagonal of the Hessian, (n,)."""
         return jnp.sum(self.weight[:, None] * self.matrix**2, 0) + self.damping
 
     def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """A'W(A x - b) + D (x - c)."""
+        """Return A'W(A x - b) + D (x - c), (n,)."""
         residual = self.weight * (apply(self.matrix, x) - self.target)
         return apply(self.matrix.T, residual) + self.damping * (x - self.center)
 
-    def curvature(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """A'WA x + D x."""
+    def hessian_product(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return (A'WA + D) x, (n,)."""
         return apply(self.matrix.T, self.weight * apply(self.matrix, x)) + self.damping * x
 
-    def forces(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The terms of the gradient, none against another."""
+    def gradient_scale(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the sums of the absolute terms of the gradient, in proportion to which roundoff is, (n,)."""
         size = jnp.abs(self.matrix)
-        pulls = self.weight * (apply(size, jnp.abs(x)) + jnp.abs(self.target))
-        return apply(size.T, pulls) + self.damping * (jnp.abs(x) + jnp.abs(self.center))
+        residual_scale = self.weight * (apply(size, jnp.abs(x)) + jnp.abs(self.target))
+        return apply(size.T, residual_scale) + self.damping * (jnp.abs(x) + jnp.abs(self.center))
 
-    def root(self, free: Bool[Array, " n"]) -> Float[Array, "m_and_n n"]:
-        """R with R'R = H over the free variables, ones for the others; nothing is squared."""
-        own = jnp.where(free, jnp.sqrt(self.damping), 1.0)
-        return jnp.concatenate([jnp.sqrt(self.weight)[:, None] * self.matrix * free, jnp.diag(own)])
+    def square_root(self, free: Bool[Array, " n"]) -> Float[Array, "m_and_n n"]:
+        """Return R with R'R = H over the free variables, ones for the others: [sqrt(W) A; sqrt(D)], nothing squared."""
+        diagonal = jnp.where(free, jnp.sqrt(self.damping), 1.0)
+        return jnp.concatenate([jnp.sqrt(self.weight)[:, None] * self.matrix * free, jnp.diag(diagonal)])
 
-    def bend(self) -> Float[Array, " n"]:
-        """A diagonal matrix that is no less than the Hessian."""
+    def curvature_bound(self) -> Float[Array, " n"]:
+        """Return the diagonal of a matrix that is no less than the Hessian: row sums of |A|'W|A| + D, (n,)."""
         size = jnp.abs(self.matrix)
         return apply(size.T, self.weight * jnp.sum(size, 1)) + self.damping
 
-    def bends_down(self) -> Bool[Array, ""]:
-        """Whether it is seen to have no minimum: a negative weight or damping."""
-        return (self.weight < 0.0).any() | (self.damping < 0.0).any()
+    def lowest_valid(self, number: float) -> list[np.ndarray]:
+        """Return the lowest valid entries of each array: ``number``, and 0 for weights and damping."""
+        m, n = self.matrix.shape
+        return [np.full((m, n), number), np.full(m, number), np.zeros(m), np.zeros(n), np.full(n, number)]
 
-    def harmless(self) -> LeastSquares:
-        """A cost of the same shape that can always be minimised."""
+    def placeholder(self) -> LeastSquares:
+        """Return a cost of the same shape that has a minimiser."""
         return LeastSquares(
             matrix=jnp.zeros_like(self.matrix),
             target=jnp.zeros_like(self.target),

@@ -1,24 +1,26 @@
-"""The quadratic program and its answer, as pytrees."""
+"""The quadratic program and its answer as pytrees, and its optimality (KKT) conditions."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._box import outside
-from .._certificate import kkt_share
-from .._dense import apply
-from .._pivots import AT_LOWER, AT_UPPER, INACTIVE
+from ...numerics._constants import AT_LOWER, AT_UPPER, INACTIVE
+from ...numerics._dense import apply
+from .._box import violation
+from .._certificate import relative_kkt_residual
 from ._cost import LeastSquares, Quadratic
 
-CERTIFIED = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
+KKT_TOLERANCE = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
 """The largest ``kkt_residual`` of an answer that is SOLVED, by the precision of the data."""
-_NOUGHT = 100.0
-"""Roundings of what the cost pulls at it; an answer that is no larger is 0."""
+_ZERO_TOL = 100.0
+"""In units of machine epsilon times the Newton step at x: an x that is no larger counts as 0."""
 
 
 class QP(eqx.Module):
@@ -27,10 +29,12 @@ class QP(eqx.Module):
     Attributes:
         cost: of x, strictly convex.
         rows: C; p may be 0. (p, n)
-        compliance: of the rows; 0 for a hard row (t = 0), 1 / weight for one that gives way at that price. (p,)
+        compliance: of the rows; 0 for a hard row (t = 0), 1 / weight for a soft one. (p,)
         lower: lower bounds of x, then of the rows; -inf allowed. (n + p,)
         upper: upper bounds; inf allowed, equal to the lower for an equality. (n + p,)
-        known: constraints that are equalities to the lower bound, whatever the upper is (static); None for none.
+        known_equalities: constraints that are equalities to the lower bound, whatever the upper is (static); None for
+            none.
+        packed: all of the arrays above, one after another, where these are at hand as one. (k,)
     """
 
     cost: Quadratic | LeastSquares
@@ -38,13 +42,23 @@ class QP(eqx.Module):
     compliance: Float[Array, " p"]
     lower: Float[Array, " n+p"]
     upper: Float[Array, " n+p"]
-    known: tuple[bool, ...] | None = eqx.field(default=None, static=True)
+    known_equalities: tuple[bool, ...] | None = eqx.field(default=None, static=True)
+    packed: Float[Array, " k"] | None = None
 
     @property
     def equality(self) -> Bool[Array, " n_and_p"]:
-        """Constraints that are known to be equalities, and those whose bounds are equal."""
+        """Which constraints are equalities: those known to be, and those with equal bounds, (n + p,)."""
         equal = self.lower == self.upper
-        return equal if self.known is None else equal | np.array(self.known)
+        return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
+
+
+def unpack(like: QP, packed: Float[Array, " k"]) -> QP:
+    """Return a problem of the shapes of another, from all its arrays, one after another."""
+    leaves, tree = jax.tree.flatten(replace(like, packed=None))
+    parts = jnp.split(packed, np.cumsum([a.size for a in leaves])[:-1])
+    return jax.tree.unflatten(
+        tree, [part.reshape(a.shape).astype(a.dtype) for part, a in zip(parts, leaves, strict=True)]
+    )
 
 
 class QPSolution(eqx.Module):
@@ -52,15 +66,16 @@ class QPSolution(eqx.Module):
 
     Attributes:
         x: inside its box exactly, whatever the status. SOLVED: the minimiser. INFEASIBLE: the least violation of the
-            hard rows, and of those the least cost. MAX_ITERATIONS: a careful step downhill, no worse than zero clipped
+            hard rows, and of those the least cost. MAX_ITERATIONS: projected gradient steps, no worse than zero clipped
             into the box, which NUMERICAL_ERROR has. (n,)
         status: a ``Status`` code.
         iterations: constraints added to or dropped from the active set.
         factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search. A
-            first try through the rows that comes to nothing is not counted.
-        kkt_residual: without units, at most 1e-9 (1e-5 in float32) where SOLVED. The larger of two: the largest force
-            that nothing holds, or multiplier of the wrong sign, as a share of the largest sum of absolute terms that
-            pull at a variable; the largest violation of a row, as a share of its scale.
+            first row-space solve that is not optimal is not counted.
+        kkt_residual: without units, at most 1e-9 (1e-5 in float32) where SOLVED. The larger of two: the largest
+            gradient of the Lagrangian at a variable without an active bound, or multiplier of the wrong sign, relative
+            to the largest sum of absolute terms of that gradient; the largest violation of a row, relative to its
+            scale.
         slack: of the rows, C x minus the nearest point of its interval; 0 for a row that holds. (p,)
         multipliers: of the box: gradient of the cost = multipliers + C' row_multipliers; positive at a lower bound,
             negative at an upper. (n,)
@@ -80,64 +95,81 @@ class QPSolution(eqx.Module):
     active: Int[Array, " n+p"]
 
 
-def active_targets(qp: QP, active: Int[Array, " n_and_p"]) -> Float[Array, " n_and_p"]:
-    """The bound that each active constraint sits at, 0 for the others (never infinite)."""
+def active_bounds(qp: QP, active: Int[Array, " n_and_p"]) -> Float[Array, " n_and_p"]:
+    """Return the bound of each active constraint, 0 for the others (never infinite)."""
     at_lower = (active != INACTIVE) & (active != AT_UPPER)
     return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)
 
 
-def given_way(qp: QP, stiff: float) -> Float[Array, " p"]:
-    """Compliances with which hard rows give way too: they bend the cost ``stiff`` times as much as it bends most."""
-    soft = qp.compliance > 0.0
-    price = jnp.where(soft, 1.0 / jnp.where(soft, qp.compliance, 1.0), 0.0)
-    steepest = jnp.max(qp.cost.diagonal() + apply(qp.rows.T**2, price))
-    length = jnp.sum(qp.rows**2, 1)
-    own = jnp.where(length > 0.0, length, 1.0) / (stiff * jnp.where(steepest > 0.0, steepest, 1.0))
-    return jnp.where(soft, qp.compliance, own)
+def softened_compliance(qp: QP, stiffness: float) -> Float[Array, " p"]:
+    """Return compliances in which hard rows are soft: with ``stiffness`` times the largest curvature of the cost."""
+    is_soft = qp.compliance > 0.0
+    penalty = jnp.where(is_soft, 1.0 / jnp.where(is_soft, qp.compliance, 1.0), 0.0)
+    largest_curvature = jnp.max(qp.cost.diagonal() + apply(qp.rows.T**2, penalty))
+    square = jnp.sum(qp.rows**2, 1)
+    # a row of length l and compliance c has the curvature l^2 / c along itself
+    scaled = stiffness * jnp.where(largest_curvature > 0.0, largest_curvature, 1.0)
+    return jnp.where(is_soft, qp.compliance, jnp.where(square > 0.0, square, 1.0) / scaled)
 
 
-def forces(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n"]:
-    """What cost and rows pull at each variable with, none against another: rounding is a share of it."""
-    return qp.cost.forces(x) + apply(jnp.abs(qp.rows).T, jnp.abs(y))
+def gradient_scale(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n"]:
+    """Return the sums of the absolute terms of the Lagrangian's gradient, in proportion to which its roundoff is."""
+    return qp.cost.gradient_scale(x) + apply(jnp.abs(qp.rows).T, jnp.abs(y))
 
 
 class Scales(NamedTuple):
-    """Rounding in the values and multipliers of the constraints is this large, times a tolerance."""
+    """The sizes of the terms in values and multipliers of the constraints; times a tolerance they are roundoff."""
 
     value: Float[Array, " m"]
     multiplier: Float[Array, " m"]
 
 
-def scales_of(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
-    """Invariant to the units of the variables: each is measured by the root of its curvature, from H's diagonal.
+def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
+    """Return scales that do not depend on the units of the variables: each is measured by the root of its curvature.
 
-    Where the constraints hold all of x at 0, its rounding is that of what the cost pulls at it.
+    Where the constraints hold all of x at 0, the Newton step of each variable alone takes the place of x.
+
+    Args:
+        qp: the problem.
+        diagonal: of the Hessian.
+        x: the point.
+        y: the multipliers of the rows.
     """
     root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
-    pulled = jnp.abs(qp.cost.gradient(x)) / root**2
-    nought = jnp.max(jnp.abs(x) * root) <= _NOUGHT * jnp.finfo(x.dtype).eps * jnp.max(pulled * root)
-    size = jnp.where(nought, pulled, jnp.abs(x))
+    newton = jnp.abs(qp.cost.gradient(x)) / root**2
+    sizes = jnp.stack([jnp.abs(x) * root, newton * root, jnp.abs(x), newton])
+    scaled, scaled_newton, plain, plain_newton = jnp.max(sizes, 1, initial=0.0)
+    is_zero = scaled <= _ZERO_TOL * jnp.finfo(x.dtype).eps * scaled_newton
+    # what a constraint's value may be for such an x: in curvature units and in units of the variables, the smaller
     reach = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
     span = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])
-    floor = jnp.minimum(jnp.max(size * root) * reach, jnp.max(size) * span)
+    floor = jnp.minimum(
+        jnp.where(is_zero, scaled_newton, scaled) * reach, jnp.where(is_zero, plain_newton, plain) * span
+    )
     values = jnp.concatenate([x, apply(qp.rows, x)])
     bounds = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (qp.lower, qp.upper)]
     nearest = jnp.minimum(*bounds)
     value = floor + jnp.abs(values) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
-    pull = jnp.concatenate([1e-3 * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
-    return Scales(value, value / jnp.maximum(reach, jnp.finfo(x.dtype).tiny) ** 2 + pull)
+    # the multiplier that moves the value by its scale, and a part of what the rows add to the gradient
+    row_terms = jnp.concatenate([1e-3 * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
+    return Scales(value, value / jnp.maximum(reach, jnp.finfo(x.dtype).tiny) ** 2 + row_terms)
 
 
 def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: Int[Array, " n+p"]) -> Float[Array, ""]:
-    """Largest violation of the optimality conditions, as a share: see ``QPSolution.kkt_residual``."""
+    """Return the largest violation of the optimality conditions, without units: see ``QPSolution.kkt_residual``.
+
+    The conditions are stationarity, ``grad cost(x) - C'y = multipliers of the box``; signs of the multipliers;
+    feasibility, and complementarity of the rows with a multiplier.
+    """
     n = len(x)
-    slope = qp.cost.gradient(x) - apply(qp.rows.T, y)
-    held = active[:n] != INACTIVE
-    pushed = jnp.concatenate([slope, y * jnp.max(jnp.abs(qp.rows), 1, initial=0.0)])
-    wrong_sign = jnp.where(active == AT_LOWER, -pushed, jnp.where(active == AT_UPPER, pushed, 0.0))
+    gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
+    at_bound = active[:n] != INACTIVE
+    # row multipliers in units of the gradient: times the largest entry of the row
+    multipliers = jnp.concatenate([gradient, y * jnp.max(jnp.abs(qp.rows), 1, initial=0.0)])
+    wrong_sign = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, 0.0))
     values = apply(qp.rows, x) + qp.compliance * y
-    loose = jnp.where((active[n:] != INACTIVE) & (y != 0.0), values - active_targets(qp, active)[n:], 0.0)
-    gap = jnp.maximum(jnp.abs(outside(values, qp.lower[n:], qp.upper[n:])), jnp.abs(loose))
-    scale = scales_of(qp, qp.cost.diagonal(), x, y).value[n:]
-    left = jnp.concatenate([jnp.where(held, 0.0, jnp.abs(slope)), wrong_sign])
-    return kkt_share(left, forces(qp, x, y), gap, scale)
+    off_bound = jnp.where((active[n:] != INACTIVE) & (y != 0.0), values - active_bounds(qp, active)[n:], 0.0)
+    gap = jnp.maximum(jnp.abs(violation(values, qp.lower[n:], qp.upper[n:])), jnp.abs(off_bound))
+    scale = constraint_scales(qp, qp.cost.diagonal(), x, y).value[n:]
+    stationarity = jnp.maximum(jnp.where(at_bound, 0.0, jnp.abs(gradient)), wrong_sign[:n])
+    return relative_kkt_residual(stationarity, gradient_scale(qp, x, y), wrong_sign[n:], gap, scale)

@@ -1,8 +1,8 @@
-"""Active set found and certified: guess, factor, check; where the check fails, pivot on from there, and again.
+"""The search for the active set in plain JAX: guess, factor, check; where the check fails, the dual method goes on.
 
 The guess is the warm start, or no active bound at all; where it is right, one factorisation is all there is. In a batch
-on a CPU a problem of few rows tries it through a system of their size first. The answer always comes from a fresh
-factorisation at the final active set, never from the tableau that found it.
+on a CPU a problem of few rows tries it by a row-space solve first. The answer always comes from a fresh factorisation
+at the final active set, never from the tableau that found it.
 """
 
 from __future__ import annotations
@@ -14,220 +14,276 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._dense import apply
-from .._double import in_double
-from .._lanes import choose, with_a_few
-from .._pivots import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, NO_GAP, Noise
-from ._careful import careful_step
-from ._descent import descend
-from ._factor import factorize, minimize_on
-from ._problem import CERTIFIED, QP, kkt_residual, scales_of
-from ._tableau import find
-from ._through_rows import has_few_rows, minimize_through_rows
+from ...execution._double import in_double
+from ...execution._lanes import choose, with_a_few
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ...numerics._dense import apply
+from .._goldfarb_idnani import REDUNDANCY_TOL, Roundoff
+from ._kkt_solve import factorize, solve_on_active_set
+from ._problem import KKT_TOLERANCE, QP, constraint_scales, kkt_residual
+from ._projected_gradient import projected_gradient
+from ._projected_newton import projected_newton
+from ._row_space import has_few_rows, solve_in_row_space
+from ._tableau import find_active_set
 
-_ROUNDS = 12
-_NEARLY = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
-"""Noises; an answer that the search does not change is accepted with violations up to this."""
-_PATIENCE = 2
-"""Searches that end at a contradiction before the pivots are given up; one that moves nothing is enough."""
-_SOFT = 1e-12
-"""Compliance of hard rows that contradict, of their reach: with it the least violation has a derivative."""
-_FEW, _MANY = 4, 256
-"""Lanes that are worked on together where most need no more work; many, where there is no CPU."""
+_MAX_ROUNDS = 12
+_RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
+"""In units of roundoff; an answer that the dual method does not change is accepted with violations up to this."""
+_MAX_INFEASIBLE = 2
+"""Dual methods that end as infeasible before projected Newton takes over; one that changes nothing is enough."""
+_SOFT_COMPLIANCE = 1e-12
+"""Compliance of infeasible hard rows relative to C diag(H)^-1 C': with it the least violation has a derivative."""
+_BLOCK_ON_CPU, _BLOCK = 4, 256
+"""Problems that are worked on together where most are done."""
 
 
-class Found(NamedTuple):
-    """The end of a search. As an iterate it has a leading axis, the lanes."""
+class SearchResult(NamedTuple):
+    """The end of a search. As an iterate it has a leading axis of problems."""
 
     x: Float[Array, " n"]
     row_multipliers: Float[Array, " p"]
     active: Int[Array, " m"]
-    implied: Bool[Array, " m"]  # equalities that the active constraints imply
+    redundant: Bool[Array, " m"]  # equalities that the active constraints imply
     iterations: Int[Array, ""]
     factorizations: Int[Array, ""]
     done: Bool[Array, ""]
     optimal: Bool[Array, ""]
-    contradictions: Int[Array, ""]  # searches that ended at one
-    descended: Bool[Array, ""]  # the pivots were given up
-    infeasible: Bool[Array, ""]  # it is proven that rows contradict each other or the box; x is the least violation
+    infeasible_ends: Int[Array, ""]  # of the dual method
+    used_newton: Bool[Array, ""]  # projected Newton took over from the dual method
+    infeasible: Bool[Array, ""]  # proven: no point of the box satisfies the hard rows; x is the least violation
     compliance: Float[Array, " p"]  # of the rows in the problem that ``x`` solves
     residual: Float[Array, ""]  # of the optimality conditions
 
 
-def unsearched(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> Found:
-    """Where a search begins: nothing found, at the bounds of the guess that exist."""
-    lanes, n, dtype = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1], qp.lower.dtype
-    nothing, no = jnp.zeros(lanes, jnp.int32), jnp.zeros(lanes, bool)
-    return Found(
-        x=jnp.zeros((lanes, n), dtype),
+def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
+    """Return where a search begins: nothing solved, the usable part of the guess active."""
+    batch, n, dtype = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1], qp.lower.dtype
+    zeros, no = jnp.zeros(batch, jnp.int32), jnp.zeros(batch, bool)
+    return SearchResult(
+        x=jnp.zeros((batch, n), dtype),
         row_multipliers=jnp.zeros(qp.rows.shape[:2], dtype),
-        active=jax.vmap(possible)(qp, guess),
-        implied=jnp.zeros(guess.shape, bool),
-        iterations=nothing,
-        factorizations=nothing,
+        active=jax.vmap(usable_guess)(qp, guess),
+        redundant=jnp.zeros(guess.shape, bool),
+        iterations=zeros,
+        factorizations=zeros,
         done=no,
         optimal=no,
-        contradictions=nothing,
-        descended=no,
+        infeasible_ends=zeros,
+        used_newton=no,
         infeasible=no,
         compliance=qp.compliance,
         residual=jnp.zeros_like(tolerance),
     )
 
 
-def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int) -> Found:
-    """The search for a batch: every argument has a leading axis, the lanes. A cap on the changes of the active set.
+def search(
+    qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int, by_pivots: bool = True
+) -> SearchResult:
+    """Solve a batch: every argument has a leading axis of problems.
 
-    It is in double precision whatever the data: which bounds are active is yes or no, and a weak damping beside heavy
-    rows is below the rounding of single precision.
+    The search is in double precision whatever the data: which bounds are active is yes or no, and a weak damping beside
+    heavy rows is below the roundoff of single precision.
+
+    Args:
+        qp: the problems.
+        guess: labels of the active sets to try first.
+        tolerance: violation that counts as none, relative to the scale of the constraint.
+        max_iterations: limit on the changes of the active set (static).
+        by_pivots: whether the dual method goes on from a guess that is wrong; without it projected Newton does at once
+            (static). A kernel has tried the former by then, and it is much of what there is to compile.
     """
-    whole = partial(_found, cap=max_iterations, holds=CERTIFIED[qp.lower.dtype])
-    return in_double(whole)(qp, guess, tolerance)
+    kkt_tol = KKT_TOLERANCE[qp.lower.dtype]
+    solve = partial(_solve_batch, max_iterations=max_iterations, kkt_tol=kkt_tol, by_pivots=by_pivots)
+    return in_double(solve)(qp, guess, tolerance)
 
 
-def _found(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, cap: int, holds: float) -> Found:
-    """The answers, and where there is none, a careful step."""
-    lanes, start = len(guess), unsearched(qp, guess, tolerance)
-    search_one = partial(_search, cap=cap, holds=holds)
-    if lanes == 1 or jax.default_backend() != "cpu" or not has_few_rows(qp):
-        found = search_one((qp, tolerance), start)
+def _solve_batch(
+    qp: QP,
+    guess: Int[Array, "B m"],
+    tolerance: Float[Array, " B"],
+    *,
+    max_iterations: int,
+    kkt_tol: float,
+    by_pivots: bool,
+) -> SearchResult:
+    """Return the answers, and projected gradient steps where there is none."""
+    batch, start = len(guess), initial_result(qp, guess, tolerance)
+    search_all = partial(_search_rounds, max_iterations=max_iterations, kkt_tol=kkt_tol, by_pivots=by_pivots)
+    if batch == 1 or jax.default_backend() != "cpu" or not by_pivots or not has_few_rows(qp):
+        result = search_all((qp, tolerance), start)
     else:
-        looked = _first_look(qp, start, tolerance)
-        found = with_a_few((qp, tolerance), looked, looked.done, search_one, _block())
-    residual = jax.vmap(kkt_residual)(qp, found.x, found.row_multipliers, found.active)
-    found = found._replace(residual=residual, optimal=found.optimal & (residual <= holds))
-    return with_a_few(qp, found, found.optimal | found.infeasible, _carefully, _block())
+        tried = _try_row_space(qp, start, tolerance)
+        result = with_a_few((qp, tolerance), tried, tried.done, search_all, _block())
+    # the certificate: no answer without it, however the search ended
+    residual = jax.vmap(kkt_residual)(qp, result.x, result.row_multipliers, result.active)
+    result = result._replace(residual=residual, optimal=result.optimal & (residual <= kkt_tol))
+    return with_a_few(qp, result, result.optimal | result.infeasible, _fall_back, _block())
 
 
 def _block() -> int:
-    return _FEW if jax.default_backend() == "cpu" else _MANY
+    return _BLOCK_ON_CPU if jax.default_backend() == "cpu" else _BLOCK
 
 
-def _carefully(qp: QP, found: Found) -> Found:
-    cold = jax.vmap(possible)(qp, jnp.zeros_like(found.active))
-    x, y = jax.vmap(careful_step)(qp), jnp.zeros_like(found.row_multipliers)
-    residual = jax.vmap(kkt_residual)(qp, x, y, cold)
-    return found._replace(x=x, row_multipliers=y, active=cold, residual=residual)
+def _fall_back(qp: QP, result: SearchResult) -> SearchResult:
+    inactive = jax.vmap(usable_guess)(qp, jnp.zeros_like(result.active))
+    x, y = jax.vmap(projected_gradient)(qp), jnp.zeros_like(result.row_multipliers)
+    residual = jax.vmap(kkt_residual)(qp, x, y, inactive)
+    return result._replace(x=x, row_multipliers=y, active=inactive, residual=residual)
 
 
-def _first_look(qp: QP, start: Found, tolerance: Float[Array, " B"]) -> Found:
-    """Where the guess is right, the answer, for less than a round of the search."""
-    x, y, sound = minimize_through_rows(qp, start.active)
-    scales = jax.vmap(scales_of)(qp, jax.vmap(lambda one: one.cost.diagonal())(qp), x, y)
-    noise = Noise(*(tolerance[:, None] * a for a in scales))
-    optimal = sound & jax.vmap(optimal_on)(qp, start, x, y, noise)
+def _try_row_space(qp: QP, start: SearchResult, tolerance: Float[Array, " B"]) -> SearchResult:
+    """Return the answer where the guess is right, for less than a round of the search."""
+    x, y, is_valid = solve_in_row_space(qp, start.active)
+    scales = jax.vmap(constraint_scales)(qp, jax.vmap(lambda one: one.cost.diagonal())(qp), x, y)
+    roundoff = Roundoff(*(tolerance[:, None] * a for a in scales))
+    optimal = is_valid & jax.vmap(is_optimal)(qp, start, x, y, roundoff)
     end = start._replace(x=x, row_multipliers=y, factorizations=start.factorizations + 1, done=optimal, optimal=optimal)
     return choose(optimal, end, start)
 
 
-def _search(given: tuple[QP, Float[Array, " B"]], start: Found, *, cap: int, holds: float) -> Found:
-    """Rounds of factoring, checking and pivoting, until every lane is done; what is lost on the way goes downhill.
+def _search_rounds(
+    given: tuple[QP, Float[Array, " B"]], start: SearchResult, *, max_iterations: int, kkt_tol: float, by_pivots: bool
+) -> SearchResult:
+    """Factor, check and search in rounds until every problem is done; where that fails, projected Newton takes over.
 
-    Where the descent ends there is one more round, so that its answer is the exact minimiser on its active set, if
+    After projected Newton there is one more round, so that its answer is the exact minimiser on its active set, if
     there are digits enough for that.
     """
     qp, tolerance = given
     hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
-    down = partial(_descended, holds=holds, cap=cap)
+    newton = partial(_by_newton, kkt_tol=kkt_tol, max_iterations=max_iterations, by_pivots=by_pivots)
 
-    def go_on(state: tuple[Found, Array]) -> Bool[Array, ""]:
-        found, rounds = state
-        return (rounds <= _ROUNDS) & ~jnp.all(found.done)
+    def is_running(state: tuple[SearchResult, Array]) -> Bool[Array, ""]:
+        result, rounds = state
+        return (rounds <= _MAX_ROUNDS) & ~jnp.all(result.done)
 
-    def body(state: tuple[Found, Array]) -> tuple[Found, Array]:
-        found, rounds = state
-        found = choose(~found.done, _round(qp, hessian, found, tolerance, cap), found)
-        lost = ~(found.done | found.descended) & ((found.contradictions >= _PATIENCE) | (rounds + 1 >= _ROUNDS))
-        return with_a_few(qp, found, ~lost, down, _block()), rounds + 1
+    def body(state: tuple[SearchResult, Array]) -> tuple[SearchResult, Array]:
+        result, rounds = state
+        result = choose(~result.done, _round(qp, hessian, result, tolerance, max_iterations, by_pivots), result)
+        gives_up = (result.infeasible_ends >= _MAX_INFEASIBLE) | (rounds + 1 >= _MAX_ROUNDS)
+        failed = ~(result.done | result.used_newton) & gives_up
+        return with_a_few(qp, result, ~failed, newton, _block()), rounds + 1
 
-    return jax.lax.while_loop(go_on, body, (start, jnp.asarray(0)))[0]
+    return jax.lax.while_loop(is_running, body, (start, jnp.asarray(0)))[0]
 
 
-def _descended(qp: QP, found: Found, *, holds: float, cap: int) -> Found:
-    start = jnp.where(jnp.isfinite(found.x), found.x, 0.0)
-    end = descend(qp, start, found.iterations, holds=holds, max_iterations=cap)
-    reach = jax.vmap(lambda one: jnp.max(apply(one.rows**2, 1.0 / one.cost.diagonal()), initial=0.0))(qp)
-    contradicts = end.settled & end.infeasible
-    optimal = end.settled & ~end.infeasible
-    return found._replace(
+def _by_newton(qp: QP, result: SearchResult, *, kkt_tol: float, max_iterations: int, by_pivots: bool) -> SearchResult:
+    # x on an active set that no pivots have made consistent may be anywhere
+    start = jnp.where(jnp.isfinite(result.x), result.x, 0.0) if by_pivots else jnp.zeros_like(result.x)
+    end = projected_newton(qp, start, result.iterations, feasibility_tol=kkt_tol, max_iterations=max_iterations)
+    largest = jax.vmap(lambda one: jnp.max(apply(one.rows**2, 1.0 / one.cost.diagonal()), initial=0.0))(qp)
+    # a minimiser gets one more round; the least violation of infeasible rows is final
+    infeasible = end.converged & end.infeasible
+    optimal = end.converged & ~end.infeasible
+    softened = jnp.maximum(_SOFT_COMPLIANCE * largest[:, None], qp.compliance)
+    return result._replace(
         x=end.x,
         row_multipliers=end.row_multipliers,
         active=end.active,
         iterations=end.iterations,
-        factorizations=found.factorizations + end.iterations - found.iterations,
+        factorizations=result.factorizations + end.iterations - result.iterations,
         done=~optimal,
         optimal=optimal,
-        descended=jnp.ones_like(optimal),
-        infeasible=contradicts,
-        compliance=jnp.where(contradicts[:, None], jnp.maximum(_SOFT * reach[:, None], qp.compliance), qp.compliance),
+        used_newton=jnp.ones_like(optimal),
+        infeasible=infeasible,
+        compliance=jnp.where(infeasible[:, None], softened, qp.compliance),
     )
 
 
-def _round(qp: QP, hessian: Float[Array, "B n n"], found: Found, tolerance: Float[Array, " B"], cap: int) -> Found:
-    factor = jax.vmap(factorize)(qp, hessian, found.active)
-    x, y = minimize_on(qp, factor, found.active)
-    scales = jax.vmap(scales_of)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
-    noise = Noise(*(tolerance[:, None] * a for a in scales))
-    optimal = jax.vmap(optimal_on)(qp, found, x, y, noise)
-    more = Noise(*(_NEARLY[hessian.dtype] * a for a in noise))
-    nearly = jax.vmap(optimal_on)(qp, found, x, y, more)
-    exhausted = found.iterations >= cap
-    searching = ~(found.done | optimal | exhausted | found.descended)
+def _round(
+    qp: QP,
+    hessian: Float[Array, "B n n"],
+    result: SearchResult,
+    tolerance: Float[Array, " B"],
+    max_iterations: int,
+    by_pivots: bool,
+) -> SearchResult:
+    """Solve on the active set, check, and run the dual method where the check fails, or give up without it."""
+    # the minimiser on the active set, by fresh factors
+    factor = jax.vmap(factorize)(qp, hessian, result.active)
+    x, y = solve_on_active_set(qp, factor, result.active)
+    # the optimality conditions, within roundoff and with relaxed tolerances
+    scales = jax.vmap(constraint_scales)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
+    roundoff = Roundoff(*(tolerance[:, None] * a for a in scales))
+    optimal = jax.vmap(is_optimal)(qp, result, x, y, roundoff)
+    relaxed = Roundoff(*(_RELAXED[hessian.dtype] * a for a in roundoff))
+    nearly_optimal = jax.vmap(is_optimal)(qp, result, x, y, relaxed)
+    exhausted = result.iterations >= max_iterations
+    searching = ~(result.done | optimal | exhausted | result.used_newton)
 
-    def look() -> Found:
-        end = find(
-            *(qp, hessian, factor, found.active, noise, x, y),
+    def by_dual_method() -> SearchResult:
+        end = find_active_set(
+            *(qp, hessian, factor, result.active, roundoff, x, y),
             searching=searching,
-            iterations=found.iterations,
-            max_iterations=cap,
+            iterations=result.iterations,
+            max_iterations=max_iterations,
         )
-        rests = jnp.all(end.active == found.active, 1)
-        return found._replace(
+        unchanged = jnp.all(end.active == result.active, 1)
+        return result._replace(
             active=end.active,
-            implied=end.implied,
+            redundant=end.redundant,
             iterations=end.iterations,
-            contradictions=found.contradictions
-            + jnp.where(rests & (end.contradicted | ~nearly), _PATIENCE, end.contradicted.astype(jnp.int32)),
+            infeasible_ends=result.infeasible_ends
+            + jnp.where(
+                unchanged & (end.infeasible | ~nearly_optimal), _MAX_INFEASIBLE, end.infeasible.astype(jnp.int32)
+            ),
         )
 
-    after = jax.lax.cond(jnp.any(searching), lambda: choose(searching, look(), found), lambda: found)
-    same = jnp.all(after.active == found.active, 1)
-    good = nearly & same & jax.vmap(lambda x, y: jnp.isfinite(x).all() & jnp.isfinite(y).all())(x, y)
-    lost = after.contradictions >= _PATIENCE
-    x, y = choose(good | ~found.descended, (x, y), (found.x, found.row_multipliers))
+    if by_pivots:
+        after = jax.lax.cond(jnp.any(searching), lambda: choose(searching, by_dual_method(), result), lambda: result)
+    else:
+        after = result._replace(infeasible_ends=jnp.where(searching, _MAX_INFEASIBLE, result.infeasible_ends))
+        nearly_optimal &= optimal | result.used_newton
+    # an active set that the dual method confirms is accepted with relaxed tolerances: what is left is roundoff
+    unchanged = jnp.all(after.active == result.active, 1)
+    is_finite = jax.vmap(lambda x, y: jnp.isfinite(x).all() & jnp.isfinite(y).all())(x, y)
+    accepted = nearly_optimal & unchanged & is_finite
+    failed = after.infeasible_ends >= _MAX_INFEASIBLE
+    x, y = choose(accepted | ~result.used_newton, (x, y), (result.x, result.row_multipliers))
+    no_new_end = after.infeasible_ends == result.infeasible_ends
     return after._replace(
         x=x,
         row_multipliers=y,
-        factorizations=found.factorizations + 1,
-        done=exhausted | found.descended | (good & ((after.contradictions == found.contradictions) | lost)),
-        optimal=good | found.descended,
+        factorizations=result.factorizations + 1,
+        done=exhausted | result.used_newton | (accepted & (no_new_end | failed)),
+        optimal=accepted | result.used_newton,
     )
 
 
-def possible(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
-    """The guess, where the bounds that it names exist; equal bounds of the box are active from the start."""
+def usable_guess(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
+    """Return the guess without infinite bounds; equal bounds of the box are active from the start."""
     n = qp.lower.shape[0] - qp.rows.shape[0]
-    named = jnp.where(guess == AT_UPPER, qp.upper, qp.lower)
-    one_sided = jnp.where(guess == AT_UPPER, AT_UPPER, AT_LOWER)
-    label = jnp.where((guess != INACTIVE) & jnp.isfinite(named), one_sided, INACTIVE)
+    bound = jnp.where(guess == AT_UPPER, qp.upper, qp.lower)
+    at_bound = jnp.where(guess == AT_UPPER, AT_UPPER, AT_LOWER)
+    label = jnp.where((guess != INACTIVE) & jnp.isfinite(bound), at_bound, INACTIVE)
     in_box = jnp.arange(len(guess)) < n
     pinned = qp.equality & (in_box | (guess != INACTIVE))
     return jnp.where(pinned, EQUALITY, label).astype(jnp.int32)
 
 
-def optimal_on(qp: QP, found: Found, x: Float[Array, " n"], y: Float[Array, " p"], noise: Noise) -> Bool[Array, ""]:
-    """Whether the minimiser on the active set is the minimiser: others hold, multipliers have their signs."""
-    active = found.active
-    slope = qp.cost.gradient(x) - apply(qp.rows.T, y)
-    multipliers = jnp.concatenate([slope, y])
+def is_optimal(
+    qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
+) -> Bool[Array, ""]:
+    """Check that the minimiser on the active set is the minimiser: constraints hold, multipliers have their signs."""
+    return ~jnp.any(violated_conditions(qp, result, x, y, roundoff))
+
+
+def violated_conditions(
+    qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
+) -> Bool[Array, " m"]:
+    """Return which constraints are violated, inactive equalities, or have a multiplier of the wrong sign."""
+    active = result.active
+    gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
+    multipliers = jnp.concatenate([gradient, y])
+    # primal feasibility, the equalities, and dual feasibility
     gap = _gaps(qp, x, y)
-    open_equality = qp.equality & (active == INACTIVE) & ~found.implied
-    violated = gap > jnp.where(found.implied, NO_GAP[x.dtype], 1.0) * noise.value
-    wrong = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, -jnp.inf))
-    return ~jnp.any(violated | open_equality | (wrong > noise.multiplier))
+    inactive_equality = qp.equality & (active == INACTIVE) & ~result.redundant
+    violated = gap > jnp.where(result.redundant, REDUNDANCY_TOL[x.dtype], 1.0) * roundoff.value
+    wrong_sign = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, -jnp.inf))
+    return violated | inactive_equality | (wrong_sign > roundoff.multiplier)
 
 
 def _gaps(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " m"]:
-    """How far each constraint is outside its interval; negative inside."""
+    """Return how far each constraint is outside its interval; negative inside."""
     values = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * y])
     return jnp.maximum(qp.lower - values, values - qp.upper)

@@ -1,4 +1,4 @@
-"""solve_qp and solve_least_squares_qp: find the active set, solve exactly on it, certify."""
+"""The entry points of QPs: check the data, solve, attach the derivative, set the status."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ... import _rules
 from ..._errors import OsikValueError
-from .._backends import Backend, check_backend, here
-from .._box import inside, uncrossed
-from .._dense import apply
-from .._pivots import INACTIVE
+from ...execution import _rules
+from ...execution._backends import Backend, check_backend, here
+from ...numerics._constants import INACTIVE
+from ...numerics._dense import apply
+from .._box import clip_roundoff, uncrossed
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
-from ._derivative import differentiable
-from ._fused import searcher
-from ._problem import QP, QPSolution
-from ._search import Found
+from ._dispatch import qp_solver
+from ._implicit_diff import with_derivative
+from ._problem import QP, QPSolution, unpack
+from ._search import SearchResult
 
 _TOLERANCE = 1e-12
 
@@ -122,11 +122,11 @@ def solve_least_squares_qp(
     """
     matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)
     n = matrix.shape[1]
-    pulls = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
-    cost = LeastSquares(matrix, target, weight, *pulls)
+    diagonal = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
+    cost = LeastSquares(matrix, target, weight, *diagonal)
     qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance, rows_equalities)
-    gives_way = rows is None or (rows_compliance is not None and not any(rows_equalities or ()))
-    return _solve(qp, warm_start, max_iterations, tolerance, backend, gives_way=gives_way)
+    has_soft_rows = rows is None or (rows_compliance is not None and not any(rows_equalities or ()))
+    return _solve(qp, warm_start, max_iterations, tolerance, backend, has_soft_rows=has_soft_rows)
 
 
 def _problem(
@@ -140,22 +140,22 @@ def _problem(
     compliance: ArrayLike | None,
     equalities: tuple[bool, ...] | None = None,
 ) -> QP:
-    """The problem as one stack of constraints; shapes are checked here."""
+    """Return the problem with the bounds of box and rows one after the other; shapes are checked here."""
     dtype = cost.matrix.dtype
     if rows is None:
         rows, rows_lower, rows_upper = jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
     if rows_lower is None or rows_upper is None:
         raise OsikValueError("rows need rows_lower and rows_upper; use -inf or inf for a side without bound")
-    stack = [
+    bounds = [
         jnp.concatenate([jnp.asarray(a, dtype), jnp.asarray(b, dtype)])
         for a, b in ((lower, rows_lower), (upper, rows_upper))
     ]
     rows = jnp.asarray(rows, dtype)
     p = rows.shape[0]
-    if stack[0].shape != (n + p,) or stack[1].shape != stack[0].shape:
+    if bounds[0].shape != (n + p,) or bounds[1].shape != bounds[0].shape:
         raise OsikValueError(
-            f"bounds do not fit: {n} variables, {p} rows, {stack[0].shape[0]} lower bounds "
-            f"and {stack[1].shape[0]} upper bounds"
+            f"bounds do not fit: {n} variables, {p} rows, {bounds[0].shape[0]} lower bounds "
+            f"and {bounds[1].shape[0]} upper bounds"
         )
     compliance = jnp.zeros(p, dtype) if compliance is None else jnp.asarray(compliance, dtype)
     if compliance.shape != (p,):
@@ -164,7 +164,7 @@ def _problem(
     if len(equalities) != p:
         raise OsikValueError(f"rows_equalities has {len(equalities)} flags; there are {p} rows")
     known = (False,) * n + equalities if any(equalities) else None
-    return QP(cost, rows, compliance, stack[0], stack[1], known)
+    return QP(cost, rows, compliance, bounds[0], bounds[1], known)
 
 
 def _solve(
@@ -174,64 +174,104 @@ def _solve(
     tolerance: ArrayLike | None,
     backend: Backend,
     *,
-    gives_way: bool = False,
+    has_soft_rows: bool = False,
 ) -> QPSolution:
-    """Searches, certifies, and differentiates nothing but the answer; ``gives_way`` where rows may all be soft."""
+    """Solve, certify, and differentiate nothing but the answer.
+
+    Args:
+        qp: the problem as it was given.
+        guess: labels of the active set to try first, or None.
+        max_iterations: limit on the changes of the active set, or None.
+        tolerance: violation that counts as none, or None.
+        backend: whose candidates are taken.
+        has_soft_rows: whether rows may be soft, or there are none (static).
+    """
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
-    allowed = jnp.asarray(_TOLERANCE if tolerance is None else tolerance, dtype)
-    sane = _finite(qp)
-    safe = _replace_where(~sane, qp)
-    low, high, crossed = uncrossed(safe.lower, _upper(safe))
-    safe = replace(safe, lower=low, upper=high)
-    cold = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
-    search = searcher(20 * m if max_iterations is None else max_iterations, gives_way, here(check_backend(backend)))
-    found = _rules.found(search(*jax.lax.stop_gradient((safe, cold, allowed))))
-    solved = replace(safe, compliance=jnp.where(found.infeasible, found.compliance, safe.compliance))
-    answered = found.optimal | found.infeasible
-    moving = differentiable(backend)(found.x, found.row_multipliers, found.active, solved)
-    x, y = (jnp.where(answered, a, b) for a, b in zip(moving, (found.x, found.row_multipliers), strict=True))
-    finite = sane & jnp.isfinite(x).all() & jnp.isfinite(y).all()
-    x, y = jnp.where(finite, x, 0.0), jnp.where(finite, y, 0.0)
-    x = inside(x, *(jnp.where(sane, b, raw)[:n] for b, raw in ((safe.lower, qp.lower), (safe.upper, qp.upper))))
-    slope = jnp.where(finite, safe.cost.gradient(x), 0.0) - apply(safe.rows.T, y)
-    multipliers = jnp.where(found.active[:n] != INACTIVE, slope, 0.0)
+    tolerance = jnp.asarray(_TOLERANCE if tolerance is None else tolerance, dtype)
+    # bounds with lower > upper become equalities halfway; the status says so
+    low, high, crossed = uncrossed(qp.lower, _upper(qp))
+    safe, is_valid = _with_placeholder(replace(qp, lower=low, upper=high))
+    start = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
+    limit = 20 * m if max_iterations is None else max_iterations
+    solve = qp_solver(limit, has_soft_rows, here(check_backend(backend)))
+    result = _rules.found(solve(*jax.lax.stop_gradient((safe, start, tolerance))))
+    # the derivative is that of the problem which x solves: with infeasible hard rows, the softened one
+    compliance = jnp.where(result.infeasible, result.compliance, safe.compliance)
+    solved = replace(safe, packed=None, compliance=compliance)
+    has_answer = result.optimal | result.infeasible
+    differentiable = with_derivative(backend)(result.x, result.row_multipliers, result.active, solved)
+    constant = result.x, result.row_multipliers
+    x, y = (jnp.where(has_answer, a, b) for a, b in zip(differentiable, constant, strict=True))
+    is_finite = is_valid & jnp.isfinite(x).all() & jnp.isfinite(y).all()
+    x, y = jnp.where(is_finite, x, 0.0), jnp.where(is_finite, y, 0.0)
+    # at the end x is inside the box that was given, to the last bit
+    box = (jnp.where(is_valid, b, given)[:n] for b, given in ((safe.lower, qp.lower), (safe.upper, qp.upper)))
+    x = clip_roundoff(x, *box)
+    # multipliers of the box from stationarity: grad cost - C'y at active variables, 0 at free ones
+    gradient = jnp.where(is_finite, safe.cost.gradient(x), 0.0) - apply(safe.rows.T, y)
+    multipliers = jnp.where(result.active[:n] != INACTIVE, gradient, 0.0)
     value = apply(safe.rows, x)
     return QPSolution(
         x=x,
-        status=_status(finite, crossed, found),
-        iterations=found.iterations,
-        factorizations=found.factorizations,
-        kkt_residual=found.residual,
+        status=_status(is_finite, crossed, result),
+        iterations=result.iterations,
+        factorizations=result.factorizations,
+        kkt_residual=result.residual,
         slack=value - jnp.clip(value, safe.lower[n:], safe.upper[n:]),
         multipliers=multipliers,
         row_multipliers=y,
-        active=found.active,
+        active=result.active,
     )
 
 
 def _upper(qp: QP) -> Float[Array, " n_and_p"]:
-    """Upper bounds, those of known equalities exactly the lower ones."""
-    return qp.upper if qp.known is None else jnp.where(np.array(qp.known), qp.lower, qp.upper)
+    """Return the upper bounds; those of known equalities are exactly the lower ones."""
+    if qp.known_equalities is None:
+        return qp.upper
+    return jnp.where(np.array(qp.known_equalities), qp.lower, qp.upper)
 
 
-def _status(finite: Bool[Array, ""], crossed: Bool[Array, ""], found: Found) -> Array:
-    verdict = jnp.where(found.optimal, Status.SOLVED, Status.MAX_ITERATIONS)
-    verdict = jnp.where(found.infeasible | crossed, Status.INFEASIBLE, verdict)
-    return jnp.where(finite, verdict, Status.NUMERICAL_ERROR)
+def _status(is_finite: Bool[Array, ""], crossed: Bool[Array, ""], result: SearchResult) -> Array:
+    status = jnp.where(result.optimal, Status.SOLVED, Status.MAX_ITERATIONS)
+    status = jnp.where(result.infeasible | crossed, Status.INFEASIBLE, status)
+    return jnp.where(is_finite, status, Status.NUMERICAL_ERROR)
 
 
-def _finite(qp: QP) -> Bool[Array, ""]:
-    """Whether the numbers can be computed with: no NaN anywhere, no infinity but as no bound, no negative weight."""
-    data = jax.tree.leaves((qp.cost, qp.rows, qp.compliance))
-    finite = jnp.stack([jnp.isfinite(a).all() for a in data]).all() & ~qp.cost.bends_down()
-    return finite & jnp.all(qp.lower < jnp.inf) & jnp.all(qp.upper > -jnp.inf)
+def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
+    """Return the problem, or a placeholder where its numbers are not valid, and whether they are.
+
+    Valid are numbers without NaN, infinities only as bounds that do not exist, and weights that are not negative. The
+    placeholder keeps derivatives finite too.
+    """
+    leaves, tree = jax.tree.flatten(qp)
+    unbounded = jnp.full_like(qp.upper, jnp.inf)
+    if qp.known_equalities is not None:
+        unbounded = jnp.where(np.array(qp.known_equalities), 0.0, unbounded)
+    placeholder = QP(
+        cost=qp.cost.placeholder(),
+        rows=jnp.zeros_like(qp.rows),
+        compliance=jnp.ones_like(qp.compliance),
+        lower=-unbounded,
+        upper=unbounded,
+        known_equalities=qp.known_equalities,
+    )
+    arrays = [leaves, jax.tree.leaves(placeholder), *_valid_range(qp)]
+    on_cpu = jax.default_backend() == "cpu"
+    if on_cpu:  # one operation for all arrays, where each costs as much as its numbers do
+        arrays = [[jnp.concatenate([jnp.ravel(a) for a in each])] for each in arrays]
+    in_range = [((lowest <= a) & (a <= highest)).all() for a, _, lowest, highest in zip(*arrays, strict=True)]
+    is_valid = jnp.stack(in_range).all()
+    safe = [jnp.where(is_valid, a, b) for a, b, *_ in zip(*arrays, strict=True)]
+    if on_cpu:
+        return replace(unpack(qp, safe[0]), packed=safe[0]), is_valid
+    return jax.tree.unflatten(tree, safe), is_valid
 
 
-def _replace_where(bad: Bool[Array, ""], qp: QP) -> QP:
-    """A harmless problem in the place of a bad one, so that derivatives stay finite too."""
-    free = jnp.full_like(qp.upper, jnp.inf)
-    if qp.known is not None:
-        free = jnp.where(np.array(qp.known), 0.0, free)
-    harmless = QP(qp.cost.harmless(), jnp.zeros_like(qp.rows), jnp.ones_like(qp.compliance), -free, free, qp.known)
-    return jax.tree.map(lambda a, b: jnp.where(bad, a, b), harmless, qp)
+def _valid_range(qp: QP) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the lowest and the highest valid entries of each array."""
+    largest = float(jnp.finfo(qp.lower.dtype).max)
+    finite = [np.full(a.shape, largest) for a in jax.tree.leaves(qp)]
+    infinite = np.full(qp.lower.shape, np.inf)
+    *_, rows, compliance, _, upper = finite
+    return [*qp.cost.lowest_valid(-largest), -rows, -compliance, -infinite, -upper], [*finite[:-1], infinite]

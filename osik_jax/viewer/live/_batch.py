@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._checks import check_setting, check_tasks, checked_limits
-from ..._errors import OsikValueError
-from ..._tree import unknown_name
+from ..._errors import OsikValueError, unknown_name
+from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import ConfigurationLimit, Limit, VelocityLimit
 from ...robot import Robot
 from ...schemes import Scheme, WeightedQP
@@ -219,28 +218,21 @@ def serve_batch(
     port: int = 8080,
     open_browser: bool = False,
 ) -> BatchView:
-    """Shows several robots side by side, each with its own numbers of one controller, in one vmapped step.
+    """Run several copies of a robot in one vmapped step and show them side by side.
+
+    Each has its own numbers of one controller. Arguments that are not named here are those of ``serve``, and hold for
+    all copies; so are exceptions.
 
     Args:
-        robot: the robot that all of them are.
-        tasks: of each robot by its name, such as ``{"gain 5": {"hand": ...}, "gain 50": {"hand": ...}}``. They
-            have tasks of the same names and kinds, whose numbers (targets, weights, gains) differ.
-        scheme: as in ``osik_jax.solve``, for all.
-        limits: as in ``osik_jax.solve``, for all.
-        dt: time of a step, and period of the loop [s].
-        q0: where each of them starts, or all; default: ``robot.q0``. (B, nq) or (nq,)
-        look: what the robot's URDF shows, from ``read_look``; default: the model's own shapes.
-        host: address to listen at; 127.0.0.1 is this machine alone.
-        port: 0 for any that is free.
-        open_browser: opens the page in a browser.
+        tasks: of each copy by its name, such as ``{"gain 5": {"hand": ...}, "gain 50": {"hand": ...}}``. All have tasks
+            of the same names and kinds, whose numbers (targets, weights, gains) differ.
+        q0: configurations at the start [m, rad], of each or of all; default: ``robot.q0``. (B, nq) or (nq,)
 
     Returns:
         The view.
 
     Raises:
-        ImportError: viser is not installed (the extra ``viewer``).
-        OSError: the port is in use.
-        TypeError, ValueError: as in ``osik_jax.solve``; no robots, or tasks that differ in more than numbers.
+        TypeError, ValueError: no copies, or tasks that differ in more than numbers.
     """
     if not tasks:
         raise OsikValueError("there are no robots: tasks is empty")

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._home import compiled_kinematics
+from ...kinematics._home import compiled_kinematics
 from ...limits import ConfigurationLimit, VelocityLimit
 from ...robot import Robot
 from ...schemes import WeightedQP

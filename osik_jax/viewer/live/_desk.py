@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..._errors import OsikValueError
-from ..._tree import unknown_name
+from ..._errors import OsikValueError, unknown_name
 from ...collision import CollisionShape
 from ...limits import CollisionAvoidanceLimit, VelocityLimit
 from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
@@ -33,7 +32,7 @@ _DAMPING = 1e-6
 SCHEMES: dict[str, Callable[[], Scheme]] = {
     "Weighted QP": WeightedQP,
     "Hierarchical QP": lambda: HierarchicalQP(damping=_DAMPING),
-    "Null space": lambda: NullSpace(saturate=True),
+    "Null space": lambda: NullSpace(method="saturated"),
 }
 """The schemes to choose from, all of which keep the limits."""
 

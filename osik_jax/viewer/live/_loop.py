@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._errors import OsikValueError
-from ..._tree import unknown_name
+from ..._errors import OsikValueError, unknown_name
 from ...robot import Robot
 from ...solvers import Status
 from ._compiler import Compiler

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._checks import check_setting, check_tasks, checked_limits
+from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import ConfigurationLimit, Limit, VelocityLimit
 from ...robot import Robot
 from ...schemes import Scheme, WeightedQP
@@ -164,10 +164,10 @@ def serve(
     port: int = 8080,
     open_browser: bool = False,
 ) -> LiveView:
-    """Shows a controller at work in a page, where targets can be dragged, and runs it at a fixed rate.
+    """Run a controller at a fixed rate and show it in a page, where targets can be dragged.
 
-    ``view = serve(robot, tasks)`` returns at once; the first step is compiled while the page is up already.
-    ``view.stop()`` ends it, ``view.wait()`` keeps a program going until Ctrl-C.
+    The view is returned at once; the first step is compiled while the page is up already. ``view.stop()`` ends it,
+    ``view.wait()`` keeps a program going until Ctrl-C.
 
     Args:
         robot: the robot.
@@ -175,12 +175,12 @@ def serve(
         scheme: as in ``osik_jax.solve``.
         limits: as in ``osik_jax.solve``.
         dt: time of a step, and period of the loop [s].
-        q0: where the robot starts; default: ``robot.q0``. (nq,)
-        look: what the robot's URDF shows, from ``read_look``; default: the model's own shapes.
+        q0: configuration at the start [m, rad]; default: ``robot.q0``. (nq,)
+        look: shapes of the robot, from ``read_look``; default: those of the model.
         source: name or file of the robot, which sessions then keep.
         host: address to listen at; 127.0.0.1 is this machine alone.
-        port: 0 for any that is free.
-        open_browser: opens the page in a browser.
+        port: TCP port; 0 for any that is free.
+        open_browser: whether to open the page in a browser.
 
     Returns:
         The view.
@@ -212,10 +212,13 @@ def serve_session(
     port: int = 8080,
     open_browser: bool = False,
 ) -> LiveView:
-    """Shows a session, such as one from ``load_session``; the arguments are those of ``serve``.
+    """Run and show a session; arguments that are not named here, and exceptions, are those of ``serve``.
 
-    Raises:
-        ImportError, OSError: as in ``serve``.
+    Args:
+        session: from a view or from ``load_session``.
+
+    Returns:
+        The view.
     """
     check_setting("serve(robot, tasks)", session.robot, session.scheme, session.dt)
     check_tasks(session.tasks, session.robot)

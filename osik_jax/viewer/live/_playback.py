@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError
-from ..._tree import FREE
 from ...robot import Robot
+from ...robot._tree import FREE
 from .._look import Look
 from .._mujoco import mujoco_poses
 from .._outline import floor_height

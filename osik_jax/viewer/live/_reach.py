@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ..._errors import OsikTypeError, OsikValueError
-from ..._tree import unknown_name
+from ..._errors import OsikTypeError, OsikValueError, unknown_name
 from ...reachability import ReachabilityMap
 from ...reachability._slices import NOTHING, cell_edges, nearest, share_colors, slice_colors
 from ...robot import Robot
@@ -253,27 +252,21 @@ def serve_reach(
     port: int = 8080,
     open_browser: bool = False,
 ) -> ReachView:
-    """Shows a map in a page: the robot, and a slice coloured by the share of orientations that are reached.
+    """Show a reachability map: the robot, and a slice coloured by the share of orientations that are reached.
 
     The panel has the axis and the place of the slice. A click on the slice puts the robot into the configuration that
-    the map has there.
+    the map has there. Arguments that are not named here, and exceptions, are those of ``serve``.
 
     Args:
-        robot: the robot that the map is of.
+        robot: the robot of the map.
         found: from ``reachability_map`` or ``load_map``.
-        look: what the robot's URDF shows, from ``read_look``; default: the model's own shapes.
-        host: address to listen at; 127.0.0.1 is this machine alone.
-        port: 0 for any that is free.
-        open_browser: opens the page in a browser.
 
     Returns:
         The view.
 
     Raises:
-        ImportError: viser is not installed (the extra ``viewer``).
-        OSError: the port is in use.
-        TypeError: no map.
-        ValueError: a map of another robot.
+        TypeError: ``found`` is no map.
+        ValueError: the map is of another robot.
     """
     check_map(robot, found)
     view = ReachView(robot, found, look=look, host=host, port=port, title=f"Reach of {found.frame}")

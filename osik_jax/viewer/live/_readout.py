@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from ..._joint_selection import scalar_layout
 from ...robot import Robot
+from ...robot._joint_selection import scalar_layout
 from ...solvers import Status
 from ...tasks import ComTask, FrameTask, Task
 from ._snapshot import Snapshot

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from ..._loading import ROBOTS, is_mjcf, urdf_of_description
 from ...robot import Robot, load_robot
+from ...robot.loading import ROBOTS, is_mjcf, urdf_of_description
 from .._look import Look, read_look
 
 _SUFFIX = "_description"

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._home import home_kinematics
-from ..._joint_selection import scalar_layout
-from ..._tree import FREE
 from ...kinematics import forward_kinematics, integrate
+from ...kinematics._home import home_kinematics
 from ...robot import Robot
+from ...robot._joint_selection import scalar_layout
+from ...robot._tree import FREE
 from ...tasks import FrameTask, SupportPolygon, support_polygon
 from .._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
 from .._parts import RobotParts

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._errors import OsikValueError
-from ...control import remembering, solve
+from ...control import solve
+from ...control._rollout import remembering
 from ...kinematics import integrate
 from ...limits import Limit
 from ...robot import Robot

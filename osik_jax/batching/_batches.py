@@ -1,0 +1,133 @@
+"""Batches by name: which arrays have the batch's axis, and how to make such arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._errors import OsikValueError
+from ..robot._tree import KinematicTree, ModelHolder
+from ._names import find_leaves, leaf_names, replace_named
+
+T = TypeVar("T")
+
+
+def batch_axes(tree: T, *names: str, axis: int = 0) -> T:
+    """Which arrays of a pytree are batched: what ``jax.vmap`` takes as ``in_axes`` or ``out_axes`` of that argument.
+
+    ``jax.vmap(tick, in_axes=(0, osik.batch_axes(tasks, "hand.target")))`` maps over configurations and over the hand's
+    target, while all else in ``tasks`` is shared.
+
+    Args:
+        tree: tasks, a robot, limits, a scheme, or any other pytree; its numbers do not matter.
+        names: of what is batched: ``"hand.target"``, ``"hand.gain.maximum"``, ``"[1].velocity"`` (of a tuple of
+            limits), ``"body_mass"`` (of a robot). A name stands for all arrays under it, so ``"hand"`` for the whole
+            task; ``*`` stands for any part of a name up to a dot: ``"*.weight"``.
+        axis: where the batch's axis is.
+
+    Returns:
+        A pytree of the same structure, with ``axis`` in the place of each array named and None for the others.
+
+    Raises:
+        KeyError: no such name; the message lists the arrays.
+    """
+    known = leaf_names(tree)
+    chosen = {place for name in names for place in find_leaves(known, name)}
+    return jax.tree.unflatten(
+        jax.tree.structure(tree), [axis if place in chosen else None for place in range(len(known))]
+    )
+
+
+def batched(tree: T, values: Mapping[str, Any]) -> T:
+    """The pytree with the named arrays replaced by batches of them; map over ``batch_axes(tree, *values)``.
+
+    Args:
+        tree: tasks, a robot, limits, a scheme, or any other pytree.
+        values: by name, as in ``batch_axes``: arrays with one more axis in front. Of what holds several arrays, such
+            as a pose, a pytree of them: ``{"hand.target": (positions (n, 3), rotations (n, 3, 3))}``. (n,) numbers for
+            an array of another shape: each is repeated. Signs are not checked, unlike in ``Task.replace``.
+
+    Raises:
+        KeyError: no such name; the message lists the arrays.
+        ValueError: a wrong shape, different lengths, or an array that is given twice.
+    """
+    lengths = {name: {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(value)} for name, value in values.items()}
+    if len(set().union(*lengths.values())) > 1:
+        shown = "; ".join(f"{k}: {', '.join(str(n[0]) if n else 'none' for n in v)}" for k, v in lengths.items())
+        raise OsikValueError(f"the lengths of the batch differ: {shown}")
+    return replace_named(tree, leaf_names(tree), values, batched=True)
+
+
+def stack(items: Sequence[T]) -> T:
+    """One pytree of stacked arrays from several of the same structure: robots, task sets, limits; ``vmap`` over it.
+
+    Raises:
+        ValueError: there is nothing to stack, or structure differs: the message says what, and why it cannot.
+    """
+    if not items:
+        raise OsikValueError("there is nothing to stack")
+    for place, item in enumerate(items[1:], 1):
+        reason = _difference(items[0], item, "")
+        if reason is not None:
+            raise OsikValueError(f"item {place} does not stack on item 0: {reason}")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
+
+
+_PRIORITY = "a priority is structure, for each is a level with shapes of its own; make one batch for each order"
+_STRUCTURE = "that is structure, not a number; make one batch for each"
+
+
+def _difference(a: Any, b: Any, where: str) -> str | None:
+    """What in the structure of two pytrees differs first, and why that cannot be a batch; None: nothing does."""
+    at = where.removeprefix(".") or "it"
+    if type(a) is not type(b) and not (_is_number(a) and _is_number(b)):
+        return f"{at} is a {type(a).__name__} in one and a {type(b).__name__} in the other; {_STRUCTURE}"
+    if isinstance(a, Mapping):
+        return _of_keys(a, b, where, at)
+    if isinstance(a, (tuple, list)):
+        if len(a) != len(b):
+            return f"{at} has {len(a)} parts in one and {len(b)} in the other; {_STRUCTURE}"
+        return _first(_difference(x, y, f"{where}[{i}]") for i, (x, y) in enumerate(zip(a, b, strict=True)))
+    if isinstance(a, eqx.Module):
+        fields = dataclasses.fields(a)
+        return _first(_of_field(field, a, b, f"{where}.{field.name}") for field in fields)
+    if _is_number(a) and jnp.shape(a) != jnp.shape(b):
+        return f"{at} has shape {jnp.shape(a)} in one and {jnp.shape(b)} in the other"
+    return None
+
+
+def _first(reasons: Any) -> str | None:
+    return next((reason for reason in reasons if reason is not None), None)
+
+
+def _of_keys(a: Mapping[Any, Any], b: Mapping[Any, Any], where: str, at: str) -> str | None:
+    if set(a) != set(b):
+        only = ", ".join(repr(key) for key in sorted(set(a) ^ set(b), key=str))
+        return f"{at} has other names in one than in the other ({only}); {_STRUCTURE}"
+    return _first(_difference(a[key], b[key], f"{where}.{key}") for key in a)
+
+
+def _of_field(field: Any, a: Any, b: Any, where: str) -> str | None:
+    old, new = getattr(a, field.name), getattr(b, field.name)
+    if not field.metadata.get("static"):
+        return _difference(old, new, where)
+    if isinstance(old, ModelHolder) or old == new:
+        return None
+    name = where.removeprefix(".")
+    if isinstance(old, KinematicTree):
+        return f"the robots' {_of_trees(old, new)} differ, and only lengths, masses and limits may"
+    return f"{name} is {old!r} in one and {new!r} in the other; {_PRIORITY if field.name == 'priority' else _STRUCTURE}"
+
+
+def _of_trees(a: KinematicTree, b: KinematicTree) -> str:
+    names = (field.name for field in dataclasses.fields(a))
+    return " and ".join(name.replace("_", " ") for name in names if getattr(a, name) != getattr(b, name))
+
+
+def _is_number(value: Any) -> bool:
+    return eqx.is_array_like(value)

@@ -1,0 +1,11 @@
+"""The command line."""
+
+from ._demo import Demo as Demo
+from ._ik import Ik as Ik
+from ._info import Info as Info
+from ._main import main as main
+from ._messages import CommandError as CommandError
+from ._reach import Reach as Reach
+from ._retarget import Retarget as Retarget
+from ._robots import read_robot as read_robot
+from ._view import View as View

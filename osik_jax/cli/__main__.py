@@ -1,0 +1,7 @@
+"""``python -m osik_jax.cli``."""
+
+import sys
+
+from ._main import main
+
+sys.exit(main())

@@ -1,0 +1,139 @@
+"""``osik demo``."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ._messages import CommandError, progress, told, writing
+from ._robots import read_robot
+
+if TYPE_CHECKING:
+    from ..demo import Motion
+    from ..robot import Robot
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Moves a robot with each scheme, and writes a film, a figure, the motion and a report to a folder.
+
+    NAO sways over both feet (double-support), or lifts one (single-support). With --robot, the base or the tip of your
+    own robot goes 5 cm to its left and back.
+    """
+
+    motion: Literal["double-support", "single-support"] | None = None
+    """What NAO does. Default: double-support. Any other robot sways."""
+    physics: bool = False
+    """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every tick."""
+    robot: str | None = None
+    """A URDF or MJCF file (or nao, arm7) to move instead."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """With --robot: whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has
+    feet (or --support)."""
+    frame: str | None = None
+    """With --robot: the frame that moves. Default: the floating base, or the tip of a robot that is bolted down."""
+    support: tuple[str, ...] = ()
+    """With --robot: frames that stand on the ground. Default: those that look like feet."""
+    duration: float = 8.0
+    """Length of the motion [s]."""
+    frequency: float = 200.0
+    """Control ticks a second [Hz]."""
+    schemes: tuple[Literal["weighted", "null-space", "hierarchical"], ...] = ("weighted", "null-space", "hierarchical")
+    """Which schemes to run, one after the other; the film shows the last."""
+    out: Path = Path("osik-demo")
+    """Folder to write to."""
+    animation: bool = True
+    """Write the film (motion.gif; motion.mp4 too where the program ffmpeg is installed)."""
+    picture: bool = False
+    """Write picture.png as well: three instants side by side."""
+    renderer: Literal["auto", "mujoco", "raycast"] = "auto"
+    """mujoco needs OpenGL; raycast runs anywhere; auto takes the first that works."""
+
+    def run(self) -> int:
+        """Runs the command; returns the exit code."""
+        from rich.console import Console
+        from rich.markup import escape
+
+        from .. import demo
+        from .._progress import spoken
+
+        console = Console()
+        motion, dt = _motion(self), 1.0 / self.frequency
+        with told():
+            out = demo.writable_folder(self.out, demo.needed_bytes(motion, len(self.schemes), dt))
+        for note in motion.notes:
+            console.print(f"[yellow]note:[/yellow] {escape(note)}")
+        settings: Any = dict(schemes=self.schemes, dt=dt, animation=self.animation)
+        seconds = demo.estimate_seconds(motion, physics=self.physics, **settings)
+        console.print(f"{escape(motion.title)}: this will take about {spoken(seconds)}")
+        settings["renderer"] = self.renderer
+        with writing(out), progress(console) as announce:
+            if self.physics:
+                summary, simulated = demo.run_physics_demo(motion, out, announce=announce, **settings)
+                last, table = simulated[-1].run, demo.physics_table(summary)
+            else:
+                summary, runs = demo.run_demo(motion, out, announce=announce, **settings)
+                last, table = runs[-1], demo.table(summary)
+            if self.picture:
+                announce("drawing the picture", 1.0)
+                demo.draw_picture(motion, last, out / "picture.png")
+        console.print(table)
+        console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}")
+        return 0
+
+
+def _motion(command: Demo) -> Motion:
+    """The motion that the options ask for."""
+    from .. import demo
+    from ..viewer.live._source import RobotSource, source_look
+
+    _check(command)
+    if command.robot is not None:
+        robot = read_demo_robot(command, command.robot)
+        with told():
+            return demo.file_motion(
+                robot,
+                name=Path(command.robot).stem,
+                frame=command.frame,
+                support=command.support,
+                duration=command.duration,
+                look=source_look(RobotSource(command.robot)),
+            )
+    make = demo.single_support if command.motion == "single-support" else demo.double_support
+    return make(command.duration)
+
+
+def _check(command: Demo) -> None:
+    """Options that exclude each other, and values out of range."""
+    if command.robot is None and (command.frame is not None or command.support):
+        raise CommandError("--frame and --support go with --robot FILE; NAO's motions choose their own")
+    if command.robot is not None and command.motion is not None:
+        raise CommandError(
+            f"--motion {command.motion} is NAO's, and --robot moves another: its waist or its tip sways; "
+            "--frame, --support and --duration say what, on what and how long"
+        )
+    if command.physics and command.robot is not None:
+        raise CommandError("--physics goes with NAO's motions; for a robot of yours, see osik_jax.physics")
+    if not command.frequency > 0.0:
+        raise CommandError(f"--frequency is {command.frequency:g}; it has to be positive")
+    if not command.duration * command.frequency >= 2.0:
+        raise CommandError(f"--duration is {command.duration:g} s; it has to last two control ticks at least")
+    if not command.schemes:
+        raise CommandError("--schemes is empty; name at least one of: weighted, null-space, hierarchical")
+    if command.renderer == "mujoco" and command.animation:
+        from ..viewer import check_opengl
+
+        try:
+            check_opengl()
+        except RuntimeError as error:
+            raise CommandError(f"--renderer mujoco: {' '.join(str(error).split())}; use auto or raycast") from error
+
+
+def read_demo_robot(command: Demo, source: str) -> Robot:
+    """The robot to move; a URDF that does not say whether its base moves floats if --support names what stands."""
+    from ..robot.loading import is_mjcf
+
+    stands = command.base == "auto" and command.support and Path(source).is_file() and not is_mjcf(source)
+    return read_robot(source, "floating" if stands else command.base)

@@ -1,0 +1,83 @@
+"""``osik ik``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from ._messages import told
+from ._robots import read_robot
+
+if TYPE_CHECKING:
+    from ..robot import Robot
+
+
+@dataclasses.dataclass(frozen=True)
+class Ik:
+    """Finds a configuration that brings a frame to a pose, and prints it; or says what stops the robot.
+
+    The exit code is 1 where none is found.
+    """
+
+    robot: Annotated[str, tyro.conf.Positional]
+    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    frame: str
+    """The frame: a link, body, site or geom."""
+    position: tuple[float, float, float]
+    """Where its origin should be, in world axes [m]."""
+    quaternion: tuple[float, float, float, float] | None = None
+    """How it should be turned: w x y z. Default: anyhow."""
+    hold: tuple[str, ...] = ()
+    """Frames that stay where they are at the robot's home configuration, such as feet."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+    nearest: bool = False
+    """Of the solutions that are found, the one nearest to the home configuration."""
+    all: bool = False
+    """Print all solutions that differ."""
+    seeds: int = 64
+    """Number of searches."""
+    key: int = 0
+    """Number of the sequence of their starts."""
+    position_tolerance: float = 1e-3
+    """Largest distance from the position [m]."""
+    orientation_tolerance: float = 1e-2
+    """Largest angle to the orientation [rad]."""
+
+    def run(self) -> int:
+        """Runs the command; returns the exit code."""
+        from rich.console import Console
+
+        from ..inverse import inverse_kinematics
+        from ..inverse._report import print_found
+
+        robot = read_robot(self.robot, self.base)
+        with told():
+            held = _home_poses(robot, self.hold)
+            turned = self.quaternion is not None
+            wanted = {self.frame: (self.position, self.quaternion) if turned else self.position}
+            found = inverse_kinematics(
+                robot,
+                held | wanted,
+                seeds=self.seeds,
+                key=self.key,
+                nearest=self.nearest,
+                all=self.all,
+                position_tolerance=self.position_tolerance,
+                orientation_tolerance=self.orientation_tolerance,
+            )
+        print_found(Console(), robot, found)
+        return 0 if found.converged else 1
+
+
+def _home_poses(robot: Robot, frames: Sequence[str]) -> dict[str, Any]:
+    """Where frames are at the home configuration."""
+    from ..kinematics import forward_kinematics
+
+    if not frames:
+        return {}
+    home = forward_kinematics(robot, robot.q0)
+    return {name: home.frame_pose(robot, name) for name in frames}

@@ -1,0 +1,59 @@
+"""``osik info``."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from ._robots import read_robot
+
+if TYPE_CHECKING:
+    from rich.table import Column, Table
+
+    from ..robot import Robot
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Prints a robot's joints with their limits, its frames and its mass."""
+
+    robot: Annotated[str, tyro.conf.Positional]
+    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+
+    def run(self) -> int:
+        """Runs the command; returns the exit code."""
+        from rich.console import Console
+
+        robot = read_robot(self.robot, self.base)
+        console = Console()
+        base = "floating base" if robot.floating_base else "bolted down"
+        mass = float(robot.body_mass.sum())
+        size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {mass:.3f} kg"
+        console.print(f"[bold]{self.robot}[/bold]: {size}")
+        console.print(_joint_table(robot))
+        for follower, (leader, multiplier) in robot.mimic_joints.items():
+            console.print(f"{follower} follows {leader}, times {multiplier:g}")
+        console.print(f"[bold]{len(robot.frame_names)} frames[/bold]: {', '.join(robot.frame_names)}")
+        return 0
+
+
+def _joint_table(robot: Robot) -> Table:
+    from rich.table import Table
+
+    table = Table("joint", *(_right(name) for name in ("in q", "in v", "lower", "upper", "top speed")))
+    for name in robot.joint_names:
+        dof = robot.joint_dof_index(name)
+        limits = (robot.position_lower[dof], robot.position_upper[dof], robot.velocity_limit[dof])
+        numbers = (f"{float(value):.4f}".rstrip("0").rstrip(".") for value in limits)
+        table.add_row(name, str(robot.joint_qpos_index(name)), str(dof), *numbers)
+    return table
+
+
+def _right(header: str) -> Column:
+    from rich.table import Column
+
+    return Column(header, justify="right")

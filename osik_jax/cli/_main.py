@@ -1,0 +1,70 @@
+"""The command line: ``osik demo``, ``ik``, ``reach``, ``retarget``, ``view`` and ``info``."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import sys
+from collections.abc import Sequence
+
+import tyro
+
+from ._demo import Demo
+from ._ik import Ik
+from ._info import Info
+from ._messages import CommandError, notes
+from ._reach import Reach
+from ._retarget import Retarget
+from ._view import View
+
+_DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
+_Command = Demo | Ik | Reach | Retarget | View | Info
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit code.
+
+    0, or 1 where ``osik ik`` finds nothing or a clip of a folder failed, or 2 after what the user can set right (told
+    on stderr in one line), or 130 where it was interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments == ["--version"]:
+        print(f"osik-jax {importlib.metadata.version('osik-jax')}")
+        return 0
+    command = tyro.extras.subcommand_cli_from_dict(
+        {"demo": Demo, "ik": Ik, "reach": Reach, "retarget": Retarget, "view": View, "info": Info},
+        prog="osik",
+        description=_DESCRIPTION,
+        args=arguments or ["--help"],
+    )
+    try:
+        with notes():
+            return _run(command)
+    except CommandError as error:
+        print(f"osik: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"osik: interrupted{_left_behind(command)}", file=sys.stderr)
+        return 130
+
+
+def _run(command: _Command) -> int:
+    """Runs a command in double precision; returns the exit code."""
+    import jax
+
+    from ..runtime import configure_cpu
+
+    configure_cpu()
+    jax.config.update("jax_enable_x64", True)
+    return command.run()
+
+
+def _left_behind(command: _Command) -> str:
+    """A remark where an interrupted command has written something."""
+    if isinstance(command, Reach) and command.unfinished.is_dir():
+        return f"; with --resume it goes on where it was ({command.unfinished})"
+    if isinstance(command, Retarget) and os.path.isdir(command.clip) and command.out.is_dir():
+        return f"; the same command goes on where it was ({command.out})"
+    if not isinstance(command, Demo | Retarget) or not command.out.is_dir() or not os.listdir(command.out):
+        return ""
+    return f"; what is in {command.out} may be incomplete"

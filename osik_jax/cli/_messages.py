@@ -1,0 +1,70 @@
+"""What a command says to the one who typed it: wrong input in one line, notes, progress."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+USER_ERRORS = (OSError, KeyError, ValueError, ImportError)
+
+
+class CommandError(Exception):
+    """Something that the user can set right; told in one line."""
+
+
+@contextmanager
+def notes() -> Iterator[None]:
+    """Tells this package's warnings in one line each, in the words of the command line."""
+    from .._errors import OsikWarning
+
+    told = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
+        if not issubclass(category, OsikWarning):
+            return told(message, category, *where, **options)
+        text = str(message).replace("floating_base=False", "--base fixed")
+        text = text.replace("floating_base=True", "--base floating")
+        print(f"osik: note: {text}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", OsikWarning)
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
+def told() -> Iterator[None]:
+    """Turns the exceptions of wrong input into a one-line message."""
+    try:
+        yield
+    except USER_ERRORS as error:
+        text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+        raise CommandError(" ".join(text.split())) from error
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Tells in one line that a file could not be written, as on a full disk."""
+    try:
+        yield
+    except OSError as error:
+        raise CommandError(f"cannot write to {folder}: {error.strerror or error}; it may be incomplete") from error
+
+
+@contextmanager
+def progress(console: Console) -> Iterator[Callable[[str, float], None]]:
+    """A progress bar over the stages; yields what to tell it."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (BarColumn(bar_width=30), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    with Progress(*columns, TextColumn("{task.description}"), console=console) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda stage, done: bar.update(task, description=stage, completed=done)

@@ -1,0 +1,88 @@
+"""``osik reach``."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from ._messages import CommandError, told, writing
+from ._robots import read_robot
+
+
+@dataclasses.dataclass(frozen=True)
+class Reach:
+    """Maps what a frame gets to: for each position of a grid, the share of orientations that it reaches.
+
+    Writes the map and, beside it, a picture. What is finished is kept in a folder until then: the name of the map with
+    .chunks after it.
+    """
+
+    robot: str
+    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    frame: str
+    """The frame: a link, body, site or geom, carried by hinges and slides."""
+    out: Path = Path("map.npz")
+    """File to write. The picture has the same name, and ends in .png."""
+    resume: bool = False
+    """Go on with a map that was interrupted, with the same options."""
+    positions: int = 20_000
+    """About how many positions."""
+    orientations: int = 64
+    """How many orientations at each."""
+    seeds: int = 64
+    """Number of searches for a pose, at most."""
+    key: int = 0
+    """Number of the sequence of their starts."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+    position_tolerance: float = 1e-3
+    """Largest distance from a position [m]."""
+    orientation_tolerance: float = 1e-2
+    """Largest angle to an orientation [rad]."""
+    picture: bool = True
+    """Draw the picture."""
+
+    @property
+    def unfinished(self) -> Path:
+        """Folder of what is finished."""
+        return self.out.with_name(f"{self.out.name}.chunks")
+
+    def run(self) -> int:
+        """Runs the command; returns the exit code."""
+        import shutil
+
+        from rich.console import Console
+
+        from .. import reachability
+        from ..reachability._report import summary_table
+
+        chunks = self.unfinished
+        if chunks.exists() and not self.resume:
+            raise CommandError(
+                f"{chunks} has an unfinished map: --resume goes on with it; else remove it, or change --out"
+            )
+        robot = read_robot(self.robot, self.base)
+        with told():
+            found = reachability.reachability_map(
+                robot,
+                self.frame,
+                grid=self.positions,
+                orientations=self.orientations,
+                seeds=self.seeds,
+                key=self.key,
+                position_tolerance=self.position_tolerance,
+                orientation_tolerance=self.orientation_tolerance,
+                out=chunks,
+            )
+            found.save(self.out)
+        written, picture = [str(self.out)], self.out.with_suffix(".png")
+        if self.picture:
+            with writing(picture):
+                found.figure().savefig(picture)
+            written.append(str(picture))
+        shutil.rmtree(chunks, ignore_errors=True)
+        console = Console()
+        console.print(summary_table(found))
+        console.print(f"written: {', '.join(written)}", markup=False, highlight=False)
+        return 0

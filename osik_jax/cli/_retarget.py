@@ -1,0 +1,279 @@
+"""``osik retarget``."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from .._errors import OsikValueError
+from ._messages import told
+from ._robots import EMBEDDED, read_robot
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..retargeting import Retargeter
+    from ..robot import Robot
+
+_COLUMNS = {
+    "slip\n[mm]": "slip_mm_max",
+    "float\n[mm]": "float_mm_max",
+    "below\n[mm]": "below_floor_mm_max",
+    "overlap\n[mm]": "penetration_mm_max",
+    "accel.\n[rad/s²]": "acceleration_max",
+    "off\n[deg]": "segment_angle_deg_mean",
+}
+_MOST_ROWS = 50
+
+
+@dataclasses.dataclass(frozen=True)
+class Retarget:
+    """Makes a robot do what a person did: from a motion file, or a folder of them, to a folder.
+
+    Writes motion.npz (MuJoCo's order, with the person's joints), motion.csv (position, quaternion x y z w, joints; no
+    headings), report.json (figures recomputed by MuJoCo), profile.toml (how the robot was seen) and motion.gif.
+    Of a folder, each clip gets a folder of its own in --out, and report.json has the figures of all. The same command
+    goes on where one that was interrupted has come to.
+    """
+
+    clip: Annotated[str, tyro.conf.Positional]
+    """A BVH file, or keypoints as .npz or .csv; or a folder with such files."""
+    robot: str = "nao"
+    """nao, g1 (of example-robot-data, where that is installed), or a URDF or MJCF file."""
+    out: Path = Path("osik-retarget")
+    """Folder to write to."""
+    profile: str | None = None
+    """A TOML file that says how the robot is seen. Default: the package's own for NAO and G1, else a guess."""
+    mapping: tuple[str, ...] = ()
+    """Which of the clip's joints is which, as ROLE=NAME, where names are not to be guessed; all of them then."""
+    fps: float | None = None
+    """Frames a second of the result. Default: the clip's."""
+    acceleration: float = 240.0
+    """Greatest acceleration of the joints [rad/s^2]."""
+    smooth: float = 0.0
+    """What is faster than about this time is smoothed out [s]; 0: nothing."""
+    unit: str | None = None
+    """Of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
+    up: Literal["x", "y", "z"] | None = None
+    """Of a BVH: the axis that points up. Default: found from the skeleton."""
+    animation: bool = True
+    """Write the film (motion.gif); of a folder none is written."""
+    fit: Path | None = None
+    """Of a folder: no motions, but a profile whose weights, scale and keypoints suit its clips, written to this TOML
+    file. One clip in four is held out, and says which step is taken."""
+    live: bool = False
+    """Frame by frame: CLIP is replayed at its own rate, as it would come from a person; - reads JSON lines from stdin
+    and writes JSON lines to stdout, and nothing to a folder."""
+    look_ahead: int = 8
+    """With --live: how many frames the robot is behind the person."""
+
+    def run(self) -> int:
+        """Runs the command; returns the exit code."""
+        if self.fit is not None:
+            _fit(self, self.fit)
+            return 0
+        if self.live:
+            _retarget_live(self)
+            return 0
+        if os.path.isdir(self.clip):
+            return _retarget_folder(self)
+        from rich.console import Console
+        from rich.markup import escape
+
+        from .. import retargeting
+        from ..retargeting._command import retarget_to_folder
+
+        console = Console()
+        with told():
+            unit = None if self.unit is None else _number_or_name(self.unit)
+            motion = retargeting.load_motion(self.clip, unit=unit, up=self.up)
+            retargeter = _retargeter(self)
+            mapping = _mapping(self.mapping)
+            console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
+            _, figures = retarget_to_folder(
+                retargeter, motion, self.out, mapping=mapping, fps=self.fps, animation=self.animation
+            )
+        _print_retargeted(console, figures, self.out)
+        return 0
+
+
+def _fit(command: Retarget, file: Path) -> None:
+    """Writes a profile found by a folder's clips."""
+    from rich.console import Console
+
+    from .. import retargeting
+    from ..retargeting._command import fit_to_file
+
+    with told():
+        if command.live:
+            raise OsikValueError("--fit goes with whole clips, not with --live")
+        if not os.path.isdir(command.clip):
+            raise OsikValueError(f"--fit takes a folder of clips; {command.clip} is none")
+        found, learned, held_out = fit_to_file(
+            _robot_to_retarget(command.robot),
+            Path(command.clip),
+            file,
+            profile=None if command.profile is None else retargeting.load_profile(command.profile),
+            mapping=_mapping(command.mapping),
+            acceleration=command.acceleration,
+            unit=None if command.unit is None else _number_or_name(command.unit),
+            up=command.up,
+        )
+    step, losses = found.step, found.losses
+    said = f"step {step} of {len(losses) - 1}: the loss of {learned} clips is {losses[step]:.3f} times what it was"
+    if held_out:
+        said += f", of {held_out} held out {found.held_out[step]:.3f} times"
+    Console().print(f"{said}\nwritten to {file}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _retargeter(command: Retarget) -> Retargeter:
+    """What retargets whole clips as the command says."""
+    from .. import retargeting
+
+    profile = None if command.profile is None else retargeting.load_profile(command.profile)
+    return retargeting.Retargeter(
+        _robot_to_retarget(command.robot),
+        profile=profile,
+        acceleration=command.acceleration,
+        smoothness=command.smooth,
+    )
+
+
+def _retarget_folder(command: Retarget) -> int:
+    """All clips of a folder; returns the exit code."""
+    from rich.console import Console
+
+    from ..retargeting._folder import retarget_folder
+
+    with told():
+        summary = retarget_folder(
+            _retargeter(command),
+            Path(command.clip),
+            command.out,
+            mapping=_mapping(command.mapping),
+            fps=command.fps,
+            unit=None if command.unit is None else _number_or_name(command.unit),
+            up=command.up,
+        )
+    failed: dict[str, str] = summary["failed"]
+    console = Console()
+    if summary["clips"]:
+        console.print(_table(summary))
+    console.print(
+        f"{summary['clips']} clips, {summary['frames']:,} frames, written to {command.out}; all figures are in "
+        f"{command.out / 'report.json'}",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+    for name, reason in failed.items():
+        print(f"osik: {name}: {reason}", file=sys.stderr)
+    if failed:
+        print(f"osik: {len(failed)} of {len(failed) + summary['clips']} clips failed", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _table(summary: dict[str, Any]) -> Table:
+    """A line for each clip, if they are not too many, and the worst of all."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table()
+    for title in ("clip", "frames", *_COLUMNS):
+        table.add_column(escape(title), justify="left" if title == "clip" else "right")
+    rows: dict[str, dict[str, Any]] = summary["figures"]
+    worst = {"frames": summary["frames"], **summary["worst"]}
+    for name, row in [*(rows.items() if len(rows) <= _MOST_ROWS else ()), ("worst", worst)]:
+        values = ["-" if row.get(key) is None else f"{row[key]:.2f}" for key in _COLUMNS.values()]
+        table.add_row(escape(name), f"{row['frames']:,}", *values)
+    return table
+
+
+def _retarget_live(command: Retarget) -> None:
+    """A clip at its own rate, or a stream on stdin."""
+    import numpy as np
+    from rich.console import Console
+    from rich.markup import escape
+
+    from .. import retargeting
+    from ..retargeting._command import write_folder
+    from ..retargeting._live_command import replay, stream
+
+    console = Console()
+    with told():
+        if command.smooth:
+            raise OsikValueError("--smooth goes with whole clips, not with --live")
+        if os.path.isdir(command.clip):
+            raise OsikValueError(f"--live takes one clip, and {command.clip} is a folder")
+        profile = None if command.profile is None else retargeting.load_profile(command.profile)
+        robot, mapping = _robot_to_retarget(command.robot), _mapping(command.mapping)
+
+        def make(standing: retargeting.HumanMotion) -> retargeting.LiveRetargeter:
+            return retargeting.LiveRetargeter(
+                robot,
+                standing,
+                profile=profile,
+                mapping=mapping,
+                acceleration=command.acceleration,
+                look_ahead=command.look_ahead,
+            )
+
+        if command.clip == "-":
+            stream(make, sys.stdin, sys.stdout)
+            return
+        unit = None if command.unit is None else _number_or_name(command.unit)
+        motion = retargeting.load_motion(command.clip, unit=unit, up=command.up)
+        motion = motion if command.fps is None else motion.resampled(command.fps)
+        command.out.mkdir(parents=True, exist_ok=True)
+        console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")
+        result, frames = replay(make, motion)
+        figures = write_folder(result, motion.name, command.out, animation=command.animation)
+    spent = 1e3 * np.array([frame.seconds for frame in frames])
+    waiting = 1e3 * command.look_ahead / motion.fps
+    console.print(
+        f"the robot is {waiting + np.median(spent):.0f} ms behind: {command.look_ahead} frames of look-ahead are "
+        f"{waiting:.0f} ms, and computing took {np.median(spent):.1f} ms a frame ({spent.max():.1f} at most)"
+    )
+    _print_retargeted(console, figures, command.out)
+
+
+def _print_retargeted(console: Console, figures: dict[str, Any], out: Path) -> None:
+    """What came of a clip."""
+    joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
+    console.print(
+        f"segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {feet['slip_mm_max']:.2f} mm, soles "
+        f"{feet['float_mm_max']:.2f} mm above and {feet['below_floor_mm_max']:.2f} mm below the floor at most, "
+        f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
+    )
+    console.print(f"written to {out}: {', '.join(sorted(os.listdir(out)))}")
+
+
+def _robot_to_retarget(source: str) -> Robot:
+    """A robot by name or file, its base floating; ``g1`` is that of example-robot-data."""
+    if source == "g1" and not os.path.exists(source):
+        from ..retargeting._g1 import g1_urdf
+
+        source = str(g1_urdf())
+    return read_robot(source, "auto" if source in EMBEDDED else "floating", named=("nao", "g1"))
+
+
+def _number_or_name(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:
+    """ROLE=NAME as a mapping; None where there are none."""
+    wrong = [pair for pair in pairs if "=" not in pair]
+    if wrong:
+        raise OsikValueError(f"--mapping takes ROLE=NAME; got {', '.join(wrong)}")
+    return {role: name for role, _, name in (pair.partition("=") for pair in pairs)} or None

@@ -1,0 +1,82 @@
+"""``osik view``."""
+
+from __future__ import annotations
+
+import dataclasses
+import webbrowser
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from ._messages import CommandError, told
+from ._robots import FLOATING, read_robot
+
+if TYPE_CHECKING:
+    from ..robot import Robot
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Shows a robot in the browser: drag its hands, feet and waist, and it follows. Needs the extra viewer.
+
+    With a file: plays the motion.npz that osik demo wrote, opens a session that a view has saved, or shows slices of
+    the map.npz that osik reach wrote.
+    """
+
+    file: Annotated[Path | None, tyro.conf.Positional] = None
+    """A motion.npz to play, a session.json to open, or a map.npz. Default: drag the robot."""
+    robot: str = "nao"
+    """A URDF or MJCF file, or nao, arm7, g1 (from the package example-robot-data), or a name of robot_descriptions."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+    support: tuple[str, ...] = ()
+    """Frames that stand on the ground. Default: those that look like feet."""
+    host: str = "127.0.0.1"
+    """Address to listen at; the default is this machine alone."""
+    port: int = 8080
+    """Port to listen at; 0 for any that is free."""
+    browser: bool = True
+    """Open the page in a browser."""
+    html: Path | None = None
+    """With a motion.npz: write a page that plays it without a server, instead of serving one."""
+
+    def run(self) -> int:
+        """Serves a page until Ctrl-C, which is how a view ends."""
+        from ..viewer.live import _open
+
+        with told():
+            if self.html is not None and (self.file is None or self.file.suffix == ".json" or _open.is_map(self.file)):
+                raise CommandError("--html goes with a motion.npz")
+            _open.check(self.host, 0 if self.html is not None else self.port)
+            source = _open.source_of(self.robot, FLOATING[self.base])
+            if self.file is not None and self.file.suffix == ".json":
+                view = _open.open_session(self.file, host=self.host, port=self.port)
+            else:
+                robot = read_robot(source.robot, self.base)
+                options: Any = dict(host=self.host, port=self.port)
+                if self.file is not None and self.html is not None:
+                    _open.write_motion(self.file, robot, source, self.html)
+                    print(f"written: {self.html}")
+                    return 0
+                if self.file is not None:
+                    opened = _open.open_map if _open.is_map(self.file) else _open.open_motion
+                    view = opened(self.file, robot, source, **options)
+                else:
+                    feet = self.support or _feet(robot)
+                    view = _open.open_robot(robot, source, feet, **options)
+        print(f"osik view: {view.url} (Ctrl-C ends it)", flush=True)
+        if self.browser:
+            webbrowser.open(view.url)
+        with suppress(KeyboardInterrupt):
+            view.wait()
+        view.stop()
+        return 0
+
+
+def _feet(robot: Robot) -> tuple[str, ...]:
+    """Frames on the ground, of a robot that moves freely."""
+    from ..demo import guess_feet
+
+    return guess_feet(robot) if robot.floating_base else ()

@@ -1,0 +1,7 @@
+"""The loop: one control step, and many."""
+
+from ._rollout import rollout as rollout
+from ._solution import Solution as Solution
+from ._solution import Trajectory as Trajectory
+from ._step import build_problem as build_problem
+from ._step import solve as solve

@@ -1,0 +1,208 @@
+"""What is looked at before a tick is compiled and run: wrong input is told in words, outside of any program.
+
+Nothing here runs inside a program: what is traced is looked at as far as its type and shape go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._errors import OsikKeyError, OsikTypeError, OsikValueError, warn
+from ..limits import Limit
+from ..numerics._arguments import concrete
+from ..robot import Robot
+from ..robot._made_for import check_made_for, check_robot
+from ..schemes import Scheme, SchemeAnswer, VelocityProblem
+from ..tasks import Task, TaskRows
+
+
+def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
+    """Raises TypeError or ValueError for anything that is not what it should be."""
+    check_robot(robot, where)
+    _check_precision(robot)
+    if scheme is not None and not isinstance(scheme, Scheme):
+        raise OsikTypeError(f"scheme is {scheme!r}; it is a WeightedQP(), a NullSpace() or a HierarchicalQP()")
+    check_dt(dt)
+
+
+def _check_precision(robot: Robot) -> None:
+    """In single precision all can be float64 numbers no longer; in double precision float32 is possible, and slower."""
+    own, now = robot.q0.dtype, jnp.result_type(float)
+    if own == now:
+        return
+    cure = "take robot.astype(float), or load it again, and make tasks, limits and scheme after that"
+    if own == jnp.dtype("float64"):
+        raise OsikValueError(f"the robot's numbers are float64, and jax_enable_x64 was switched off since: {cure}")
+    warn(
+        f"the robot's numbers are {own} while jax_enable_x64 is on: if it was made before that was switched on, {cure}"
+    )
+
+
+def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
+    """The limits as a tuple, None where none are given.
+
+    Raises:
+        TypeError: no sequence of limits.
+        ValueError: a limit that was made for another robot.
+    """
+    if limits is None:
+        return None
+    wanted = "it is a sequence, such as (ConfigurationLimit(robot),); None: the robot's own; (): none"
+    if isinstance(limits, Limit | Mapping | str) or not hasattr(limits, "__iter__"):
+        raise OsikTypeError(f"limits is {limits!r}; {wanted}")
+    limits = tuple(limits)
+    for place, limit in enumerate(limits):
+        if not isinstance(limit, Limit):
+            raise OsikTypeError(f"limits[{place}] is {limit!r}, which is no limit; {wanted}")
+        check_made_for(limit, robot, f"limits[{place}]")
+    return limits
+
+
+def check_dt(dt: Any) -> None:
+    """Raises TypeError where dt is no number, ValueError where it is seen not to be one, positive and finite."""
+    seen = concrete(dt)
+    if seen is not None and seen.dtype.kind not in "iuf":
+        raise OsikTypeError(f"dt is {dt!r}; it is a number, in seconds")
+    if jnp.shape(dt) != ():
+        raise OsikValueError(f"dt has shape {jnp.shape(dt)}; it is one number, in seconds. Batch with jax.vmap.")
+    if seen is None:
+        return
+    if not ((seen > 0.0) & np.isfinite(seen)).all():
+        raise OsikValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
+
+
+def check_tasks(tasks: Any, robot: Robot | None = None) -> None:
+    """Raises TypeError or ValueError where these are no tasks by name, or not this robot's."""
+    if not isinstance(tasks, Mapping):
+        raise OsikTypeError(f"tasks is a {type(tasks).__name__}; it is a dict from names to tasks")
+    if not tasks:
+        raise OsikValueError("there is no task: give at least one, such as a PostureTask")
+    for name, task in tasks.items():
+        if not isinstance(name, str):
+            raise OsikTypeError(f"{name!r} is the name of a task; names are strings: {', '.join(map(repr, tasks))}")
+        if not isinstance(task, Task):
+            shown = f"the class {task.__name__}" if isinstance(task, type) else f"a {type(task).__name__}"
+            raise OsikTypeError(f"tasks[{name!r}] is {shown}, not a Task")
+        if robot is not None:
+            check_made_for(task, robot, f"tasks[{name!r}]")
+
+
+def checked_configuration(robot: Robot, q: Any) -> Array:
+    """q, checked, as floats at least as precise as the robot's.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: a wrong length, not finite, or a quaternion of zeros.
+    """
+    try:
+        q = jnp.asarray(q)
+    except (TypeError, ValueError):
+        raise OsikTypeError(f"q is {q!r}; it is a configuration: {robot.nq} numbers") from None
+    robot.check_configuration(q)
+    return q.astype(jnp.result_type(q, robot.q0))
+
+
+def check_steps(steps: Any) -> None:
+    """Raises ValueError where the number of ticks is none."""
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 0:
+        raise OsikValueError(f"steps is {steps!r}; it is the number of ticks, an integer")
+
+
+_BY_TICK = "targets by tick"
+
+
+def check_target_names(tasks: Mapping[str, Task], targets: Any, what: str = "targets") -> None:
+    """Raises where targets are no mapping, or for a task that does not exist."""
+    if targets is not None and not isinstance(targets, Mapping):
+        raise OsikTypeError(f"targets is a {type(targets).__name__}; it is a dict from task names to {what}")
+    for name in targets or {}:
+        if name not in tasks:
+            raise OsikKeyError(f"targets are for {name!r}, which is no task; tasks: {', '.join(tasks)}")
+
+
+def check_targets(
+    tasks: Mapping[str, Task] | Callable[[Array], Mapping[str, Task]],
+    targets: Mapping[str, Any] | None,
+    steps: int,
+    robot: Robot | None = None,
+) -> None:
+    """Raises where tasks are none, or targets by tick do not fit them."""
+    if callable(tasks):
+        if targets is not None:
+            raise OsikValueError("targets go with a dict of tasks; a function of time sets them itself")
+        return
+    check_tasks(tasks, robot)
+    check_target_names(tasks, targets, _BY_TICK)
+    for name, target in (targets or {}).items():
+        for leaf in jax.tree.leaves(target):
+            if not eqx.is_array_like(leaf):
+                raise OsikTypeError(
+                    f"targets[{name!r}] holds objects of type {type(leaf).__name__}; it is made of arrays, such as "
+                    "positions (steps, 3) and rotation matrices (steps, 3, 3) or quaternions (steps, 4)"
+                )
+            if jnp.shape(leaf)[:1] != (steps,):
+                raise OsikValueError(
+                    f"targets[{name!r}] has shape {jnp.shape(leaf)}; its first axis is the ticks, {steps}"
+                )
+
+
+def check_warm_start(warm_start: Any) -> None:
+    """Raises TypeError where it is not made of integers; whether it fits is seen when the tick is compiled."""
+    for leaf in jax.tree.leaves(warm_start):
+        if not hasattr(leaf, "dtype") or not jnp.issubdtype(leaf.dtype, jnp.integer):
+            raise OsikTypeError(
+                f"warm_start is a {type(warm_start).__name__}; it is the warm_start of the tick before's Solution"
+            )
+
+
+def solved_with(scheme: Scheme, problem: VelocityProblem, warm_start: Any) -> SchemeAnswer:
+    """The scheme's answer; ValueError where the warm start is that of another problem or scheme.
+
+    What a warm start should be is that of an answer without one, which is traced only where something went wrong.
+    """
+    if warm_start is None:
+        return scheme.solve(problem)
+    try:
+        answer = scheme.solve(problem, warm_start)
+    except Exception as error:
+        expected = jax.eval_shape(lambda: scheme.solve(problem).warm_start)
+        if _shapes(expected) == _shapes(warm_start):
+            raise
+        raise _other_warm_start(scheme, warm_start, expected) from error
+    if _shapes(answer.warm_start) != _shapes(warm_start):
+        raise _other_warm_start(scheme, warm_start, answer.warm_start)
+    return answer
+
+
+def _other_warm_start(scheme: Scheme, given: Any, expected: Any) -> ValueError:
+    return OsikValueError(
+        f"warm_start is that of another problem or scheme: it has arrays of shapes {_shapes(given)[1]}, and a "
+        f"{type(scheme).__name__} with these tasks and limits takes {_shapes(expected)[1]}. Give the warm_start of a "
+        "Solution with the same tasks, limits and scheme, or None"
+    )
+
+
+def _shapes(tree: Any) -> tuple[Any, list[tuple[int, ...]]]:
+    return jax.tree.structure(tree), [jnp.shape(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def check_rows(rows: Mapping[str, Any], tasks: Mapping[str, Task], robot: Robot) -> None:
+    """Raises where the rows of a task, which somebody may have written himself, do not fit each other or the robot."""
+    for name, own in rows.items():
+        kind = type(tasks[name]).__name__
+        if not isinstance(own, TaskRows):
+            raise OsikTypeError(f"tasks[{name!r}]: {kind}.rows returned {own!r}; it returns TaskRows, see task_rows")
+        shapes = {field: jnp.shape(getattr(own, field)) for field in ("error", "lower", "upper", "weight")}
+        count, jacobian = shapes["error"], jnp.shape(own.jacobian)
+        if len(count) != 1 or any(shape != count for shape in shapes.values()) or jacobian != (*count, robot.nv):
+            raise OsikValueError(
+                f"tasks[{name!r}]: the rows of {kind} do not fit each other: jacobian has shape {jacobian}, expected "
+                f"(m, {robot.nv}), and {', '.join(f'{field} {own}' for field, own in shapes.items())}, expected (m,)"
+            )

@@ -1,0 +1,166 @@
+"""Many control steps: the closed loop in one compiled scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
+
+from .._errors import OsikValueError
+from ..batching._structure import Static, put_together, taken_apart
+from ..execution._rules import FOUND
+from ..kinematics import integrate
+from ..limits import Limit
+from ..numerics._sanity import cleaned
+from ..robot import Robot
+from ..schemes import Scheme
+from ..tasks import Task
+from ._checks import (
+    check_setting,
+    check_steps,
+    check_targets,
+    check_tasks,
+    checked_configuration,
+    checked_limits,
+)
+from ._solution import Solution, Trajectory
+from ._step import Targets, Tasks, aim, in_type_of, step
+
+Feedback = Callable[[Array, Array], Array]
+_Carry = tuple[Array, Any, Any]
+"""What a tick leaves to the next: configuration, velocity and warm start."""
+
+
+def rollout(
+    robot: Robot,
+    q0: Num[ArrayLike, " nq"] | Sequence[float],
+    tasks: Tasks | Callable[[Array], Tasks],
+    *,
+    scheme: Scheme | None = None,
+    limits: Sequence[Limit] | None = None,
+    dt: Float[Array, ""] | float = 0.005,
+    steps: int,
+    targets: Targets | None = None,
+    feedback: Feedback | Float[ArrayLike, "steps nq"] | None = None,
+) -> Trajectory:
+    """The closed loop: solve, integrate, repeat, in one compiled scan.
+
+    Differentiable in both modes. The reverse mode keeps of each tick the configuration and what the solver found, and
+    computes the rest of it again on its way back: a long path costs little memory.
+
+    Args:
+        robot: the robot.
+        q0: start. (nq,)
+        tasks: by name, or a function from time [s] to tasks (the same ones each time, with other numbers). A function
+            that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers (arrays and
+            floats; integers are static) without compiling; any other function compiles once for each object.
+        scheme: as in ``solve``.
+        limits: as in ``solve``. Limits and tasks that remember the last velocity get it at each tick; the
+            first takes them as they are.
+        dt: time of one tick [s].
+        steps: number of ticks (static).
+        targets: targets of some tasks at each tick, by task name: what ``replace(target=...)`` takes, with a leading
+            axis of length ``steps`` on every array.
+        feedback: measured configurations: an array with one for each tick (steps, nq), or a function of time [s] and of
+            the configuration that the last tick led to, which returns the one measured. Default: no feedback. The
+            trajectory holds where the ticks led, not what was measured.
+
+    Returns:
+        The trajectory. Every tick applies its velocity, whatever the status (``Solution.velocity`` says what it is);
+        one that failed on a NaN in q or dt moves nothing: look at ``solution.status``.
+
+    Raises:
+        TypeError, ValueError: as in ``solve``; ``targets``, ``feedback`` or ``steps`` do not fit.
+        KeyError: ``targets`` names a task that does not exist.
+    """
+    check_setting("rollout(robot, q0, tasks)", robot, scheme, dt)
+    limits = checked_limits(robot, limits)
+    check_steps(steps)
+    check_targets(tasks, targets, steps, robot)
+    if feedback is not None and not callable(feedback):
+        feedback = jnp.asarray(feedback)
+        if feedback.shape != (steps, robot.nq):
+            raise OsikValueError(
+                f"feedback has shape {feedback.shape}; it is one configuration a tick, {(steps, robot.nq)}"
+            )
+    numbers, static = taken_apart((tasks if callable(tasks) else dict(tasks), feedback))
+    q0 = checked_configuration(robot, q0)
+    return _rollout(
+        robot,
+        q0,
+        numbers,
+        scheme,
+        limits,
+        in_type_of(dt, q0),
+        targets,
+        static=static,
+        steps=steps,
+    )
+
+
+@partial(jax.jit, static_argnames=("static", "steps"))
+def _rollout(
+    robot: Robot,
+    q0: Array,
+    numbers: Any,
+    scheme: Scheme | None,
+    limits: tuple[Limit, ...] | None,
+    dt: Array | float,
+    targets: Targets | None,
+    *,
+    static: Static,
+    steps: int,
+) -> Trajectory:
+    tasks, feedback = put_together(numbers, static)
+    time = jnp.arange(steps) * dt
+    measured = None if callable(feedback) else feedback
+
+    def tick(state: _Carry, now: tuple[Array, Targets | None, Array | None]) -> tuple[_Carry, tuple[Array, Solution]]:
+        (q, velocity, warm_start), (t, target, sensed) = state, now
+        if callable(feedback):
+            q = checked_configuration(robot, feedback(t, q))
+        elif sensed is not None:
+            q = sensed.astype(q.dtype)
+        todo = _checked(tasks(t), robot) if callable(tasks) else aim(tasks, target)
+        todo, kept = remembering((todo, limits), velocity, t > 0.0)
+        solution = step(robot, q, todo, scheme, kept, dt, warm_start)
+        q = _move(robot, q, solution.velocity, dt)
+        return (q, solution.velocity, solution.warm_start), (q, solution)
+
+    ticks = (time, targets, measured)
+    cold = _cold_start(lambda now: tick((q0, None, None), now)[0][1:], ticks)
+    thrifty = jax.checkpoint(tick, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
+    _, (q, solution) = jax.lax.scan(thrifty, (q0, *cold), ticks, length=steps)
+    return Trajectory(time, jnp.concatenate([q0[None], q]), solution)
+
+
+def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, moved: Bool[Array, ""] | bool) -> Any:
+    """Tasks and limits ``after`` a tick's velocity; as they are where there was no tick (``moved`` is false)."""
+
+    def one(part: Task | Limit) -> Task | Limit:
+        if velocity is None or type(part).after in (Task.after, Limit.after):
+            return part
+        return jax.tree.map(lambda new, old: jnp.where(moved, new, old), part.after(velocity), part)
+
+    return jax.tree.map(one, tasks_and_limits, is_leaf=lambda part: isinstance(part, Task | Limit))
+
+
+def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
+    """Where a tick leads; nowhere if q or dt is NaN."""
+    (clean, tick), fine = cleaned((q, jnp.asarray(dt)))
+    return jnp.where(fine, integrate(robot, clean, v, tick).astype(q.dtype), q)
+
+
+def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:
+    """Zeros in the shape of what a tick leaves to the next, from one that is traced and not run."""
+    one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), jax.tree.map(jnp.asarray, ticks))
+    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, one))
+
+
+def _checked(tasks: Any, robot: Robot) -> dict[str, Task]:
+    check_tasks(tasks, robot)
+    return dict(tasks)

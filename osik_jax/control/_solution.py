@@ -1,0 +1,57 @@
+"""What a control step and a rollout return."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int
+
+
+class Solution(eqx.Module):
+    """Answer of one tick (or, with a leading axis, of many).
+
+    Attributes:
+        velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. ``WeightedQP`` returns, by
+            status: SOLVED, the best; INFEASIBLE, the one that misses what is hard least; MAX_ITERATIONS, a careful
+            step downhill, in the box and no worse than standing still; NUMERICAL_ERROR, zero, clipped into the box.
+            (nv,)
+        status: a ``Status`` code.
+        iterations: changes of the active set, all levels together.
+        factorizations: systems factored, all levels together; 1 in ``WeightedQP`` where the warm start was right.
+        kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``), of
+            ``WeightedQP`` as a share of the forces that the tasks exert: comparable between problems, at most 1e-9
+            (1e-5 in float32) where SOLVED. The largest finite number where the status is NUMERICAL_ERROR.
+        box_violation: how far v leaves its box [rad/s or m/s], 0 but for ``NullSpace``; or, where that is more, how far
+            it leaves the rows of limits that are no box, in their units: rounding, but for ``NullSpace`` and where the
+            status is INFEASIBLE.
+        slack: of each task, J v minus the nearest point of its interval: what the task did not get. {name: (m,)}
+        error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
+        warm_start: for the next tick: the active set, as a pytree of integers; None for ``NullSpace``.
+
+    All numbers are finite: what a NaN in the input spoils is 0, its derivatives too, and the status says so.
+    """
+
+    velocity: Float[Array, " nv"]
+    status: Int[Array, ""]
+    iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
+    kkt_residual: Float[Array, ""]
+    box_violation: Float[Array, ""]
+    slack: dict[str, Float[Array, " m"]]
+    error: dict[str, Float[Array, " m"]]
+    warm_start: Any
+
+
+class Trajectory(eqx.Module):
+    """What a rollout went through.
+
+    Attributes:
+        time: at the start of each tick [s]. (steps,)
+        q: configurations, the start first; ``q[k + 1]`` is where tick k led. (steps + 1, nq)
+        solution: of each tick; every leaf has a leading axis. (steps, ...)
+    """
+
+    time: Float[Array, " steps"]
+    q: Float[Array, "steps_1 nq"]
+    solution: Solution

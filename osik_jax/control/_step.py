@@ -1,0 +1,245 @@
+"""One control step: from a configuration and tasks to a velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from ..execution._blocks import BLOCK
+from ..execution._rules import blocked
+from ..kinematics import Kinematics, forward_kinematics
+from ..kinematics._forward import kinematics_by
+from ..limits import ConfigurationLimit, Limit, VelocityLimit, limit_box, limit_rows
+from ..numerics._sanity import cleaned, positive
+from ..robot import Robot
+from ..robot._joint_selection import scalar_layout
+from ..schemes import Scheme, VelocityProblem, WeightedQP
+from ..solvers import Status
+from ..tasks import Task
+from ..tasks._rows import rows_of
+from ._checks import (
+    check_rows,
+    check_setting,
+    check_target_names,
+    check_tasks,
+    check_warm_start,
+    checked_configuration,
+    checked_limits,
+    solved_with,
+)
+from ._solution import Solution
+
+Tasks = Mapping[str, Task]
+Targets = Mapping[str, Any]
+
+
+def solve(
+    robot: Robot,
+    q: Num[ArrayLike, " nq"] | Sequence[float],
+    tasks: Tasks,
+    *,
+    scheme: Scheme | None = None,
+    limits: Sequence[Limit] | None = None,
+    dt: Float[Array, ""] | float = 0.005,
+    targets: Targets | None = None,
+    warm_start: Any = None,
+) -> Solution:
+    """The velocity that serves the tasks best at configuration q.
+
+    Compiled on first use; changing any number (target, weight, gain, limit, dt, link length) compiles nothing. Pure, so
+    it can be used inside ``jit`` and batched by ``vmap`` over q and over any leaf of robot, tasks, scheme and limits.
+
+    Args:
+        robot: the robot.
+        q: configuration. (nq,)
+        tasks: by name; the names come back in ``slack`` and ``error``.
+        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``. Default: ``WeightedQP()``.
+        limits: hard bounds on the velocity. Default: the robot's own, ``(ConfigurationLimit(robot),
+            VelocityLimit(robot))``; ``()``: none. Those that remember the last tick's velocity, such as
+            ``AccelerationLimit``, need it each time: ``limit.after(solution.velocity)``.
+        dt: time until the next tick [s].
+        targets: of some tasks, by name: what ``task.replace(target=...)`` takes, such as a pose as (position, rotation
+            matrix), (position, quaternion w x y z), a 4 x 4 matrix or a ``jaxlie.SE3``. The other tasks keep theirs.
+        warm_start: that of the tick before (``Solution.warm_start``), with the same tasks, scheme and limits. It saves
+            time and does not change the answer; one with wrong numbers costs time only.
+
+    Returns:
+        The answer. What can be known of numbers only when they are there, such as a traced dt <= 0, raises nothing:
+        look at ``status``, or call ``osik_jax.solvers.raise_if_failed`` outside jit.
+
+    Raises:
+        KeyError: ``targets`` names a task that does not exist.
+        TypeError: something that is no robot, task, scheme or limit, or no number.
+        ValueError: q of the wrong length, not finite or with a quaternion of zeros; no task; dt <= 0; a task or limit
+            that was made for another robot, the warm start of another problem; a robot that is a stack, or that has
+            float64 numbers while ``jax_enable_x64`` is off.
+
+    Warns:
+        OsikWarning: a robot that has float32 numbers while ``jax_enable_x64`` is on.
+    """
+    check_setting("solve(robot, q, tasks)", robot, scheme, dt)
+    limits = checked_limits(robot, limits)
+    check_tasks(tasks, robot)
+    check_target_names(tasks, targets)
+    check_warm_start(warm_start)
+    q = checked_configuration(robot, q)
+    return step(robot, q, aim(dict(tasks), targets), scheme, limits, in_type_of(dt, q), warm_start)
+
+
+def build_problem(
+    robot: Robot,
+    q: Num[ArrayLike, " nq"] | Sequence[float],
+    tasks: Tasks,
+    *,
+    limits: Sequence[Limit] | None = None,
+    dt: Float[Array, ""] | float = 0.005,
+    targets: Targets | None = None,
+) -> VelocityProblem:
+    """What ``solve`` hands to its scheme: the rows of the tasks, the box and the rows of the limits, assembled.
+
+    For solvers of your own, and to look at the numbers: ``problem.rows["hand"].jacobian``, ``problem.lower``. A scheme
+    takes it: ``scheme.solve(problem).velocity``. Pure; it is not compiled here, so call it inside your own ``jit``,
+    together with what uses it.
+
+    Args:
+        robot: the robot.
+        q: configuration. (nq,)
+        tasks: as in ``solve``.
+        limits: as in ``solve``.
+        dt: as in ``solve``.
+        targets: as in ``solve``.
+
+    Raises:
+        KeyError, TypeError, ValueError: as in ``solve``.
+    """
+    check_setting("build_problem(robot, q, tasks)", robot, None, dt)
+    bounds = _own_limits(robot, checked_limits(robot, limits))
+    check_tasks(tasks, robot)
+    check_target_names(tasks, targets)
+    q = checked_configuration(robot, q)
+    aimed = aim(dict(tasks), targets)
+    return velocity_problem(robot, forward_kinematics(robot, q), q, aimed, bounds, in_type_of(dt, q))
+
+
+@jax.jit
+@blocked(BLOCK)
+def step(
+    robot: Robot,
+    q: Array,
+    tasks: dict[str, Task],
+    scheme: Scheme | None,
+    limits: tuple[Limit, ...] | None,
+    dt: Array | float,
+    warm_start: Any = None,
+) -> Solution:
+    chosen, bounds = _own_scheme(q, scheme), _own_limits(robot, limits)
+    dt = positive(dt)
+    raw_box = jax.lax.stop_gradient(limit_box(robot, q, bounds, dt))
+    (robot, q), posed = cleaned((robot, q))
+    (chosen, bounds, dt), set_up = cleaned((chosen, bounds, dt))
+    looked_at = {name: cleaned(task) for name, task in tasks.items()}
+    tasks, sound = (
+        {k: task for k, (task, _) in looked_at.items()},
+        {k: posed & own for k, (_, own) in looked_at.items()},
+    )
+    kinematics = kinematics_by(getattr(chosen, "backend", "jax"), robot, q)
+    problem = velocity_problem(robot, kinematics, q, tasks, bounds, dt)
+    given = _spoiled(problem, raw_box, jnp.stack([set_up, *sound.values()]).all())
+    answer = solved_with(chosen, given, warm_start)
+    v = answer.velocity
+    failed = answer.status == Status.NUMERICAL_ERROR
+    return Solution(
+        velocity=v,
+        status=answer.status,
+        iterations=answer.iterations,
+        factorizations=answer.factorizations,
+        kkt_residual=jnp.where(failed, jnp.finfo(v.dtype).max, answer.kkt_residual),
+        box_violation=jnp.max(_finite(_beyond_limits(given, v))),
+        slack={name: _finite(jnp.where(sound[name], slack, 0.0)) for name, slack in problem.slack(v).items()},
+        error={name: _finite(jnp.where(sound[name], rows.error, 0.0)) for name, rows in problem.rows.items()},
+        warm_start=answer.warm_start,
+    )
+
+
+def _spoiled(problem: VelocityProblem, raw_box: tuple[Array, Array], fine: Array) -> VelocityProblem:
+    """The problem with NaN back where its numbers are not to be had from: the solver says so, in every scheme.
+
+    It comes in through a select, so that derivatives with respect to what the problem was made of are 0 in that lane.
+    """
+    rows = {
+        name: replace(r, jacobian=jnp.where(fine, r.jacobian, jnp.nan), weight=jnp.where(fine, r.weight, jnp.nan))
+        for name, r in problem.rows.items()
+    }
+    lower, upper = (
+        jnp.where(jnp.isnan(raw), raw, b) for raw, b in zip(raw_box, (problem.lower, problem.upper), strict=True)
+    )
+    return replace(problem, rows=rows, lower=lower, upper=upper)
+
+
+def _beyond_limits(problem: VelocityProblem, v: Float[Array, " nv"]) -> Float[Array, " m"]:
+    """How far v leaves its box, then its rows."""
+    box = jnp.maximum(jnp.maximum(problem.lower - v, v - problem.upper), 0.0)
+    return box if problem.limit_rows is None else jnp.concatenate([box, problem.limit_rows.violation(v)])
+
+
+def _finite(x: Array) -> Array:
+    return jnp.where(jnp.isfinite(x), x, 0.0)
+
+
+def aim(tasks: dict[str, Task], targets: Targets | None) -> dict[str, Task]:
+    """The tasks with this tick's targets."""
+    aimed = {name: tasks[name].replace(target=target) for name, target in (targets or {}).items()}
+    return {**tasks, **aimed}
+
+
+def velocity_problem(
+    robot: Robot,
+    kinematics: Kinematics,
+    q: Array,
+    tasks: dict[str, Task],
+    limits: tuple[Limit, ...],
+    dt: Array | float,
+) -> VelocityProblem:
+    lower, upper = limit_box(robot, q, limits, dt)
+    scalar, index = scalar_layout(robot)
+    low, high = jnp.full_like(lower, -jnp.inf), jnp.full_like(upper, jnp.inf)
+    for limit in limits:
+        if isinstance(limit, ConfigurationLimit):
+            low, high = jnp.maximum(low, limit.lower), jnp.minimum(high, limit.upper)
+    rows = rows_of(robot, kinematics, q, {name: task.during(dt) for name, task in tasks.items()})
+    check_rows(rows, tasks, robot)
+    return VelocityProblem(
+        rows=rows,
+        priorities=tuple((name, task.priority) for name, task in tasks.items()),
+        lower=lower,
+        upper=upper,
+        position=jnp.where(scalar, q[index], 0.0),
+        position_lower=jnp.where(scalar, low, -jnp.inf),
+        position_upper=jnp.where(scalar, high, jnp.inf),
+        hard=tuple(name for name, task in tasks.items() if task.hard),
+        limit_rows=limit_rows(robot, kinematics, q, limits, dt),
+        dt=jnp.asarray(dt, lower.dtype),
+        turning=robot.tree.turning,
+        scalar=scalar,
+    )
+
+
+def in_type_of(dt: Any, q: Array) -> Any:
+    """The tick in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
+    return dt.astype(q.dtype) if isinstance(dt, jax.Array) else np.asarray(dt, q.dtype)
+
+
+def _own_scheme(q: Array, scheme: Scheme | None) -> Scheme:
+    """The scheme that is given, or a weighted QP in the precision of q."""
+    return jax.tree.map(lambda leaf: leaf.astype(q.dtype), WeightedQP()) if scheme is None else scheme
+
+
+def _own_limits(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Limit, ...]:
+    """The limits that are given, or the robot's own."""
+    return (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else limits

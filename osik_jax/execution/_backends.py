@@ -1,0 +1,144 @@
+"""Which candidate runs: the one table of backends.
+
+A solver takes a candidate for the answer, certifies it in plain JAX, and searches where that fails. Candidates come
+from kernels; the search needs none and is the definition. ``backend``, a static option of solvers and schemes, chooses.
+Kernels of projections on null spaces compute what plain JAX would: all of the classical order, and the factors of the
+levels in reverse order. With bounds a kernel searches, and what it cannot answer is searched again. Kernels of
+kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's backend is that of its whole step
+(``_computed.py``).
+
+    backend   weighted QP                          hierarchy                           null space
+    "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    none
+              hard rows, n <= 64, <= 32 soft rows  fit into shared memory
+    "numba"   CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
+                                                                                       any shape
+    "jax"     none: plain JAX alone, on any platform
+
+    of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks
+    "numba"   where JAX's default is a CPU: any robot, any precision
+
+    of retargeting                            iterations of a plan                a plan's banded systems
+    "warp"                                    none                                CUDA: float32, about 40 dofs at most
+    "numba"                                   CPUs: any robot, any precision      inside the former
+
+"auto" takes what is installed and fits, and the search elsewhere. Which platform a program runs on is decided when it
+is lowered, not when it is traced (``on_platforms``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+
+from .._errors import OsikValueError
+
+Backend = Literal["auto", "jax", "numba", "warp"]
+BACKENDS: tuple[str, ...] = get_args(Backend)
+
+_PLATFORM = {"numba": "cpu", "warp": "cuda"}
+_MISSING = {
+    "numba": "backend='numba' needs Numba: pip install 'osik-jax[numba]'",
+    "warp": "backend='warp' needs Warp: pip install 'osik-jax[cuda]'",
+}
+
+
+_LOWERS_NO_DOUBLE = (0, 12)
+_WITHOUT_NUMBA = "auto without numba"
+
+
+def check_backend(backend: Any) -> Backend:
+    """The backend, if it is one and what it needs is there.
+
+    Raises:
+        ValueError: it is none.
+        ModuleNotFoundError: the package of its kernels is not installed; the message says how to install it.
+        RuntimeError: "warp" without a CUDA device.
+    """
+    if backend not in BACKENDS:
+        raise OsikValueError(f"backend is {backend!r}; backends: {', '.join(BACKENDS)}")
+    if backend in _MISSING and not installed(backend):
+        raise ModuleNotFoundError(_MISSING[backend], name=backend)
+    if backend == "warp" and not cuda_is_default():
+        raise RuntimeError("backend='warp' needs a CUDA device, and JAX's default device is none (jax.devices())")
+    return backend
+
+
+def here(backend: Backend) -> Any:
+    """The backend for a program in the precision that JAX is set to: in single, JAX 0.12 lowers no kernel for CPUs.
+
+    It lowers double precision inside such a program wrongly where platforms differ, so "auto" takes the search there.
+
+    Raises:
+        RuntimeError: "numba" was asked for where that is so.
+    """
+    if jnp.result_type(float) == jnp.float64 or jax.__version_info__ < _LOWERS_NO_DOUBLE:
+        return backend
+    if backend == "numba":
+        raise RuntimeError(
+            f"backend='numba' needs jax_enable_x64 with jax {jax.__version__}, or a jax before 0.12; take 'auto'"
+        )
+    return _WITHOUT_NUMBA if backend == "auto" else backend
+
+
+def installed(package: str) -> bool:
+    """Whether a package can be imported, without doing so."""
+    return find_spec(package) is not None
+
+
+def cuda_is_default() -> bool:
+    """Whether the device that JAX computes on where it is not told otherwise is a GPU.
+
+    Beside one, under ``jax.default_device`` of a CPU, there is nothing to compile a kernel for.
+    """
+    device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
+    return getattr(device, "platform", device) in ("gpu", "cuda")
+
+
+def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
+    """Whether a solver has to make a program with the candidates of a kernel in it.
+
+    Args:
+        backend: what was asked for.
+        kernel: "numba" or "warp".
+        fits: whether the solver has such a kernel for problems of this kind, precision and shape.
+
+    Raises:
+        ValueError: this very kernel was asked for and does not fit.
+        Exception: it was asked for and is not there, as ``check_backend``.
+    """
+    if backend == kernel:
+        check_backend(backend)
+        if not fits:
+            raise OsikValueError(
+                f"backend={kernel!r} has no kernel for problems of this kind, precision or shape; take 'auto'"
+            )
+        return True
+    if not (backend == "auto" and fits and installed(kernel)):
+        return False
+    return cuda_is_default() if kernel == "warp" else _can_be_imported(kernel)
+
+
+@cache
+def _can_be_imported(package: str) -> bool:
+    """Numba refuses releases of NumPy and of Python that are newer than itself."""
+    try:
+        import_module(package)
+    except Exception:
+        return False
+    return True
+
+
+def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., Any], *args: Any) -> Any:
+    """Calls the function that takes a kernel's candidates on the kernel's platform, and the search elsewhere.
+
+    The functions are not differentiated. One program may be lowered for several platforms.
+    """
+    if not kernels:
+        return search(*args)
+    return jax.lax.platform_dependent(*args, default=search, **{_PLATFORM[name]: f for name, f in kernels.items()})

@@ -1,0 +1,113 @@
+"""Functions that a kernel computes on CPUs, where it computes what plain JAX would.
+
+Nothing is proposed and nothing certified: the kernel's answer is that of the plain function to rounding, which is what
+runs elsewhere, and the derivative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, ArrayLike, Float
+
+from ._backends import on_platforms
+from ._blocks import first_axes_as_one
+from ._rules import custom_jvp
+
+
+def by_numba(plain: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """The plain function, on CPUs by a kernel of a batch. What is given by name is static.
+
+    Args:
+        plain: of one problem: pytrees of arrays by position.
+        kernel: the same for arrays with a leading axis, of the lanes or of length 1 where all lanes share one.
+    """
+
+    @cache
+    def anywhere(**options: Any) -> Callable[..., Any]:
+        wide = over_lanes(partial(plain, **options))
+        return in_shared_lanes(partial(on_platforms, {"numba": partial(kernel, **options)}, wide))
+
+    @custom_jvp
+    def by_kernel(*args: Any, **options: Any) -> Any:
+        return anywhere(**options)(*args)
+
+    @by_kernel.defjvp
+    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...], **options: Any) -> tuple[Any, Any]:
+        return jax.jvp(partial(plain, **options), primals, tangents)
+
+    def function(*args: Any, **options: Any) -> Any:
+        kinds = {jnp.result_type(a) for a in jax.tree.leaves(args)}
+        usual = all(kind == jnp.result_type(float) for kind in kinds if jnp.issubdtype(kind, jnp.floating))
+        # how precisions mix is the definition's to say
+        return (by_kernel if usual else plain)(*args, **options)
+
+    return function
+
+
+def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
+    """As ``in_lanes``, for work that is the same in all lanes: what they share is not copied for each, nor are blocks.
+
+    Args:
+        solve: takes pytrees whose arrays have a leading axis, of the lanes or of length 1, and returns those of lanes.
+    """
+
+    @custom_vmap
+    def lanes(*args: Any) -> Any:
+        return solve(*args)
+
+    @lanes.def_vmap
+    def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
+        inner = max(a.shape[int(own)] for a, own in _pairs(args, in_batched))
+
+        def merged(a: jax.Array, batched: bool) -> jax.Array:
+            if not batched and len(a) == 1:
+                return a
+            shape = a.shape[1 + batched :]
+            wide = a if batched else a[None]
+            return first_axes_as_one(jnp.broadcast_to(wide, (axis_size, inner, *shape)))
+
+        out = lanes(*jax.tree.map(merged, args, tuple(in_batched)))
+        out = jax.tree.map(lambda a: a.reshape(axis_size, inner, *a.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    def one(*args: Any) -> Any:
+        return jax.tree.map(lambda a: a[0], lanes(*jax.tree.map(lambda a: jnp.asarray(a)[None], args)))
+
+    return one
+
+
+def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
+    """What ``in_shared_lanes`` takes, from a function of one lane."""
+
+    def wide(*args: Any) -> Any:
+        leaves, tree = jax.tree.flatten(args)
+        lanes = max(len(a) for a in leaves)
+        own = [len(a) == lanes for a in leaves]
+        rest = [a if many else a[0] for a, many in zip(leaves, own, strict=True)]
+
+        def one(*leaves: jax.Array) -> Any:
+            return function(*jax.tree.unflatten(tree, leaves))
+
+        return jax.vmap(one, in_axes=[0 if many else None for many in own])(*rest)
+
+    return wide
+
+
+def side_by_side(*arrays: ArrayLike) -> Float[Array, "lanes k"]:
+    """All numbers of each lane, one array after another, for lanes as ``in_shared_lanes`` has them.
+
+    An argument of a kernel costs time, and one that is made of constants alone is made once.
+    """
+    flat = [jnp.reshape(a, (len(a), -1)) for a in map(jnp.asarray, arrays)]
+    lanes = max(len(a) for a in flat)
+    return jnp.concatenate([jnp.broadcast_to(a, (lanes, a.shape[1])) for a in flat], 1)
+
+
+def _pairs(args: Any, flags: Any) -> list[tuple[jax.Array, bool]]:
+    return list(zip(jax.tree.leaves(args), jax.tree.leaves(flags), strict=True))

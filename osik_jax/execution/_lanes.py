@@ -1,0 +1,88 @@
+"""Batches of problems, seen as one array of lanes by code that stops early, branches or works in blocks.
+
+Under plain ``vmap`` a ``while_loop`` selects its whole carry at every iteration and a ``cond`` runs both branches. Code
+that sees the lanes decides itself: a branch that no lane needs is not run, and on a CPU a batch goes through in blocks
+that stay in the cache, each of which stops when its own slowest lane is done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool
+
+from ._blocks import BLOCK, first_axes_as_one, in_blocks
+
+
+def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
+    """One problem at a time, from a function of many.
+
+    Args:
+        solve: takes and returns pytrees whose arrays have a leading axis, the lanes.
+
+    Returns:
+        The function of pytrees without that axis. ``vmap`` of it, however deeply nested, calls ``solve`` on all lanes
+        (on a CPU: on blocks of them). It is not differentiable: stop gradients at its inputs.
+    """
+
+    @custom_vmap
+    def lanes(*args: Any) -> Any:
+        return in_blocks(solve, args, BLOCK)
+
+    @lanes.def_vmap
+    def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
+        wide = jax.tree.map(
+            lambda a, batched: a if batched else jnp.broadcast_to(a, (axis_size, *a.shape)), args, tuple(in_batched)
+        )
+        merged = jax.tree.map(first_axes_as_one, wide)
+        out = jax.tree.map(lambda a: a.reshape(axis_size, a.shape[0] // axis_size, *a.shape[1:]), lanes(*merged))
+        return out, jax.tree.map(lambda _: True, out)
+
+    def one(*args: Any) -> Any:
+        return jax.tree.map(lambda a: a[0], lanes(*jax.tree.map(lambda a: jnp.asarray(a)[None], args)))
+
+    return one
+
+
+def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, Any], Any], block: int) -> Any:
+    """The state of all lanes, of which those that are not done have been worked on again, a block of them at a time.
+
+    Args:
+        state: a pytree whose arrays have a leading axis, the lanes.
+        done: lanes that stay as they are.
+        again: from the numbers of a block's lanes and the state of all to the new state of that block.
+        block: lanes that are worked on together; a block that is not full has copies of the last lane.
+    """
+    lanes = len(done)
+    if lanes == 1:  # XLA would see that every round of the loop has the same numbers, and go through it beforehand
+        return jax.lax.cond(done[0], lambda: state, lambda: again(jnp.zeros(1, int), state))
+
+    def body(carry: tuple[Any, Array]) -> tuple[Any, Array]:
+        state, done = carry
+        (at,) = jnp.nonzero(~done, size=block, fill_value=lanes)
+        end = again(jnp.minimum(at, lanes - 1), state)
+        state = jax.tree.map(lambda all_, new: all_.at[at].set(new, mode="drop"), state, end)
+        return state, done.at[at].set(True, mode="drop")
+
+    return jax.lax.while_loop(lambda carry: ~jnp.all(carry[1]), body, (state, done))[0]
+
+
+def with_a_few(data: Any, state: Any, done: Bool[Array, " B"], again: Callable[[Any, Any], Any], block: int) -> Any:
+    """As ``with_the_rest``, by a function of the data and the state of a block's lanes; a short batch is one block."""
+    lanes = len(done)
+
+    def gathered(at: Array, state: Any) -> Any:
+        return again(*jax.tree.map(lambda a: a[at], (data, state)))
+
+    if lanes > block:
+        return with_the_rest(state, done, gathered, block)
+    return jax.lax.cond(jnp.all(done), lambda: state, lambda: choose(done, state, again(data, state)))
+
+
+def choose(where: jax.Array, new: Any, old: Any) -> Any:
+    """``new`` in the lanes where the flag (one a lane) is set, ``old`` in the others."""
+    return jax.tree.map(lambda a, b: jnp.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

@@ -1,0 +1,146 @@
+"""Kernel of ``kinematics/_forward.py``: poses of bodies and axes of dofs, one configuration after another.
+
+It goes through the bodies from the root, so that each finds its parent done. What a joint does in its body's parent is
+MJX's ``kinematics``, for quaternions of any length too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
+from ._rigid import (
+    carried,
+    composed,
+    minus,
+    multiplied,
+    normalized,
+    plus,
+    put,
+    put_turning,
+    rotation_of,
+    triple,
+    turning,
+)
+from ._rigid import turned as rotated
+
+FREE, BALL, SLIDE = 0, 1, 2  # MuJoCo's; a hinge is what is left
+
+
+@lean
+def place_bodies(parents, kinds, owners, value, reference, at, along, joint_at, joint_along, P, R, lin, ang, anchors):
+    """Poses of all bodies into P and R, axes of hinges and slides and all anchors into the arrays over dofs.
+
+    Args:
+        parents: of each body. (nbody,)
+        kinds: of each joint. (njoint,)
+        owners: body of each joint; those of a body follow each other. (njoint,)
+        value: MuJoCo's configuration. (nqfull,)
+        reference: at which bodies sit as described. (nqfull,)
+        at: of each body in its parent. (nbody, 3)
+        along: of each body in its parent, a quaternion. (nbody, 4)
+        joint_at: anchor of each joint in its body. (njoint, 3)
+        joint_along: axis of each joint in its body. (njoint, 3)
+        P: (nbody, 3)
+        R: (nbody, 9)
+        lin: (nvfull, 3)
+        ang: (nvfull, 3)
+        anchors: (nvfull, 3)
+    """
+    nothing = 0.0, 0.0, 0.0
+    put(P, 0, nothing)
+    put_turning(R, 0, (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    joint, place, dof = 0, 0, 0
+    for body in range(1, len(parents)):
+        there, frame = triple(P, parents[body]), turning(R, parents[body])
+        pos, quat = triple(at, body), (along[body, 0], along[body, 1], along[body, 2], along[body, 3])
+        while joint < len(owners) and owners[joint] == body:
+            kind, fixed = kinds[joint], triple(joint_at, joint)
+            if kind == FREE:
+                pos = value[place], value[place + 1], value[place + 2]
+                quat = normalized((value[place + 3], value[place + 4], value[place + 5], value[place + 6]))
+                for k in range(6):
+                    put(lin, dof + k, nothing)
+                    put(ang, dof + k, nothing)
+                    put(anchors, dof + k, plus(there, rotated(frame, pos)))
+                for k in range(3):
+                    lin[dof + k, k] = 1.0
+                joint, place, dof = joint + 1, place + 7, dof + 6
+                continue
+            anchor = plus(carried(quat, fixed), pos)
+            seen, axis = plus(there, rotated(frame, anchor)), carried(quat, triple(joint_along, joint))
+            if kind == BALL:
+                own = normalized((value[place], value[place + 1], value[place + 2], value[place + 3]))
+                quat = multiplied(quat, own)
+                pos = minus(anchor, carried(quat, fixed))
+                for k in range(3):
+                    put(lin, dof + k, nothing)
+                    put(anchors, dof + k, seen)
+                joint, place, dof = joint + 1, place + 4, dof + 3
+                continue
+            way = value[place] - reference[place]
+            put(anchors, dof, seen)
+            if kind == SLIDE:
+                pos = plus(pos, (way * axis[0], way * axis[1], way * axis[2]))
+                put(lin, dof, rotated(frame, axis))
+                put(ang, dof, nothing)
+            else:
+                sine, cosine = np.sin(0.5 * way), np.cos(0.5 * way)
+                x, y, z = triple(joint_along, joint)
+                quat = multiplied(quat, (cosine, sine * x, sine * y, sine * z))
+                pos = minus(anchor, carried(quat, fixed))
+                put(lin, dof, nothing)
+                put(ang, dof, rotated(frame, axis))
+            joint, place, dof = joint + 1, place + 1, dof + 1
+        put(P, body, plus(there, rotated(frame, pos)))
+        put_turning(R, body, composed(frame, rotation_of(quat)))
+
+
+@lean
+def turn_with_bodies(kinds, owners, R, ang):
+    """Axes of ball and free joints, which are those of the body."""
+    dof = 0
+    for joint in range(len(kinds)):
+        kind = kinds[joint]
+        dof += 3 if kind == FREE else 0
+        if kind in (FREE, BALL):
+            for k in range(3):
+                for i in range(3):
+                    ang[dof + k, i] = R[owners[joint], 3 * i + k]
+            dof += 3
+        else:
+            dof += 1
+
+
+def handle(frame):
+    """One call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
+    if not is_call(frame):
+        return 0
+    given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each
+    lanes, bodies, nv = dimension(found, 0), dimension(found, 8), dimension(found + 16, 8)
+    nq, full = dimension(given, 8), dimension(found + 40, 0)
+    whole, numbers = dimension(given + 8, 8), data(given + 16)
+    joints = dimension(given + 16, 0) - bodies - full >> 1
+    own, other = nq * (dimension(given, 0) > 1), whole * (dimension(given + 8, 0) > 1)  # numbers between lanes
+    parents, kinds = whole_numbers(numbers, bodies), whole_numbers(numbers + 4 * bodies, joints)
+    owners = whole_numbers(numbers + 4 * (bodies + joints), joints)
+    source = whole_numbers(numbers + 4 * (bodies + 2 * joints), full)
+    value = vector(data(found + 40), full)
+    for lane in range(lanes):
+        q, at = vector(data(given) + 8 * own * lane, nq), data(given + 8) + 8 * other * lane
+        factor, extra, reference = vector(at, full), vector(at + 8 * full, full), vector(at + 16 * full, full)
+        for i in range(full):
+            value[i] = factor[i] * q[source[i]] + extra[i]
+        at += 24 * full
+        positions, at = matrix(at, bodies, 3), at + 24 * bodies
+        quaternions, at = matrix(at, bodies, 4), at + 32 * bodies
+        fixed, axes = matrix(at, joints, 3), matrix(at + 24 * joints, joints, 3)
+        R = matrix(data(found + 8) + 72 * bodies * lane, bodies, 9)
+        angular = matrix(data(found + 24) + 24 * nv * lane, nv, 3)
+        place_bodies(
+            parents, kinds, owners, value, reference, positions, quaternions, fixed, axes,
+            matrix(data(found) + 24 * bodies * lane, bodies, 3), R, matrix(data(found + 16) + 24 * nv * lane, nv, 3),
+            angular, matrix(data(found + 32) + 24 * nv * lane, nv, 3),
+        )  # fmt: skip
+        turn_with_bodies(kinds, owners, R, angular)
+    return 0

@@ -1,0 +1,271 @@
+"""Kernel of ``solvers/null_space/_saturation.py``: all levels of one problem after another, in coordinates.
+
+The problem is the one that file states. The motion of a level is found in the coordinates of ``_projection.py``; then
+joints are put on their bounds (``_saturation_search.py``), and those that stop the level are taken off the coordinates,
+as the rows of a level are. The joints that cannot move at all are the first that are taken off.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE, FULL_STEP, NEGLIGIBLE_STEP, SATURATION_RESIDUAL
+from ._dense import fill
+from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
+from ._projection import (
+    Level,
+    counts,
+    find_motion,
+    look,
+    narrow,
+    set_beside,
+    strength_of,
+    take_row_space,
+    work_at,
+)
+from ._saturation_search import Search, bound, search, size
+from ._vectors import add, dot
+
+LEAST = 1e-9
+"""Part of a joint's unit vector in the null space and outside the span of held ones, with less of which it depends on
+them; part of the largest in a combination, with less of which a joint does not stop the motion."""
+LOOSER = 1e-6
+"""The same for a second attempt, where the answer of the first does not hold: joints nearly depended on each other."""
+
+
+@lean
+def given_rows(A, lower, upper, equal, m, n):
+    """How many rows there are before those that only fill up."""
+    while m > 0:
+        row = A[m - 1]
+        if equal[m - 1] != 0 or dot(row, row, 0, n) > 0.0 or lower[m - 1] > -np.inf or upper[m - 1] < np.inf:
+            break
+        m -= 1
+    return m
+
+
+@lean
+def damping_of(W, S, level, x, first, longest):
+    """The damping of the level, which is found at what of x the null space can not move."""
+    n = len(x)
+    if level.unmet != 0.0:
+        for i in range(n):
+            S.x[i] = x[i]
+        for j in range(first, n):
+            add(S.x, -dot(W.turned[j], x, 0, n), W.turned[j], 0, n)
+        look(W, level, S.x)
+    return strength_of(W, level, first, longest)
+
+
+@lean
+def damped_part(W, S, level, x, damping):
+    """The part of the way from x to where the search ended at which the damped cost of the level is least."""
+    m, n = level.A.shape
+    if not damping > 0.0:
+        return 1.0
+    gain, cost, size, way = 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        S.along[i] = S.x[i] - x[i]
+        way += S.along[i] * S.along[i]
+        size += x[i] * x[i]
+    if not way > NEGLIGIBLE_STEP * NEGLIGIBLE_STEP * size:
+        return 1.0
+    cost = damping * way
+    for i in range(m):
+        if counts(W, level, i):
+            moved = dot(level.A[i], S.along, 0, n)
+            gain, cost = gain + moved * W.wanted[i], cost + moved * moved
+    part = gain / (cost if cost > 0.0 else 1.0)
+    return max(part, 0.0) if cost > 0.0 and part < FULL_STEP else 1.0
+
+
+@lean
+def put_on_bounds(W, S, held, stop):
+    """Puts x where it is but for rounding; how much that is, infinite where x is no number."""
+    n, off = len(S.x), 0.0
+    for i in range(n):
+        before = S.x[i]
+        if S.side[i] != 0:
+            S.x[i] = bound(W, S, i)
+        elif i == stop:
+            S.x[i] = W.low[i] if S.passed[i] < 0 else W.high[i]
+        S.x[i] = min(max(S.x[i], W.low[i]), W.high[i])
+        moved = abs(S.x[i] - before)
+        off = max(off, moved if moved < np.inf else np.inf)
+    return off
+
+
+@lean
+def attempt(W, S, x, target, first, most, least):
+    """As ``search``, done where the answer holds; where it does not, the coordinates are as they were."""
+    n = len(x)
+    for j in range(first, n):
+        for i in range(n):
+            S.before[j, i] = W.turned[j, i]
+    scale, held, stop, changes, done = search(W, S, x, target, first, most, least)
+    done = done and put_on_bounds(W, S, held, stop) <= SATURATION_RESIDUAL * size(W, S, x, target, scale, held)
+    if not done:
+        for j in range(first, n):
+            for i in range(n):
+                W.turned[j, i] = S.before[j, i]
+    return scale, held, stop, changes, done
+
+
+@lean
+def decide(S, held, stop, side, blocking):
+    """The joints on their bounds, those that stop the motion, and which of them the others say most about."""
+    n, blocker, most = len(side), 0, 0.0
+    for i in range(n):
+        side[i], blocking[i] = S.side[i], 0
+    if stop >= 0:
+        for i in range(n):
+            if S.normal[i] != 0.0:
+                blocking[i] = S.passed[i] if i == stop else S.side[i]
+            if abs(S.normal[i]) > most:
+                blocker, most = i, abs(S.normal[i])
+        side[stop] = S.passed[stop]
+        side[blocker] = 0
+    return blocker
+
+
+@lean
+def take_off_stops(W, first, blocking):
+    """Takes the joints that stop the level off the coordinates that are left; how many coordinates go."""
+    n, count = len(blocking), 0
+    for i in range(n):
+        if blocking[i] != 0:
+            for j in range(first, n):
+                W.turned[j, n + count] = W.turned[j, i]
+            count += 1
+    if count == 0:
+        return 0
+    rank = take_row_space(W, count, n, first, BLOCKING_RANK)
+    for i in range(n):
+        if blocking[i] != 0:
+            for j in range(first + rank, n):
+                W.turned[j, i] = 0.0
+    return rank
+
+
+@lean
+def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side, blocking):
+    """Moves x as the level asks.
+
+    Returns:
+        The coordinates that it takes, its scale, the blocker, changes of the active set, whether the search ended.
+    """
+    n = len(x)
+    set_beside(W, level, first, plain)
+    longest, whole = look(W, level, x)
+    damping = damping_of(W, S, level, x, first, longest)
+    look(W, level, x)
+    rank = find_motion(W, level, first, damping, rank_tolerance)
+    scale, held, stop, changes, done = attempt(W, S, x, target, first + rank, most, LEAST)
+    if not done and changes < most:
+        scale, held, stop, more, done = attempt(W, S, x, target, first + rank, most, LOOSER)
+        changes += more
+    blocker = decide(S, held, stop, side, blocking)
+    if not done:
+        fill(side, 0)
+        fill(blocking, 0)
+        narrow(W, level, x, longest, whole)
+        return rank, 0.0, blocker, changes, False
+    part = damped_part(W, S, level, x, damping)
+    for i in range(n):
+        x[i] = S.x[i] if part == 1.0 else x[i] + part * (S.x[i] - x[i])
+    narrow(W, level, x, longest, whole)
+    return rank + take_off_stops(W, first + rank, blocking), part * scale, blocker, changes, True
+
+
+@lean
+def begin(W, x, low, high, fixed):
+    """The point of the box that is nearest to 0, and the joints that can move in coordinates of their own."""
+    n, first, last = len(x), 0, 0
+    for i in range(n):
+        W.low[i], W.high[i], W.bent[i] = low[i], high[i], 0.0
+        x[i] = min(max(0.0, low[i]), high[i])
+        fixed[i] = 2 if low[i] == high[i] else 0
+        last += low[i] == high[i]
+        fill(W.turned[i], 0.0)
+    for i in range(n):
+        if fixed[i] != 0:
+            W.turned[first, i] = 1.0
+            first += 1
+        else:
+            W.turned[last, i] = 1.0
+            last += 1
+    return first
+
+
+def handle(frame):
+    """One call of XLA: arguments as in ``null_space/_saturation.py``, a leading axis of lanes on each."""
+    if not is_call(frame):
+        return 0
+    given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each
+    lanes, levels, M, n = dimension(given, 0), dimension(given, 8), dimension(given, 16), dimension(given, 24)
+    A, below, above, equal = data(given), data(given + 8), data(given + 16), data(given + 24)
+    constant, unmet, demand = data(given + 32), data(given + 40), data(given + 48)
+    bends, targets, lower, upper = data(given + 56), data(given + 64), data(given + 72), data(given + 80)
+    rank, most = data(given + 88), whole_numbers(data(given + 96), 1)[0]
+    solution, projector, scales = data(found), data(found + 8), data(found + 16)
+    dones, sides, blockings = data(found + 24), data(found + 32), data(found + 40)
+    blockers, actives, reports = data(found + 48), data(found + 56), data(found + 64)
+    space, marks = data(found + 72), data(found + 80)
+    width = max(M, n)
+    W = work_at(space, n, width)
+    at = space + 8 * ((n + 11) * (n + width) + 2 * width * width + n * (width + 2 * n))
+    duals, before, at, line = matrix(at, n, n), matrix(at + 8 * n * n, n, n), at + 16 * n * n, 8 * n
+    S = Search(
+        duals, before, vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n),
+        vector(at + 4 * line, n), vector(at + 5 * line, n), vector(at + 6 * line, n), vector(at + 7 * line, n),
+        vector(at + 8 * line, n), whole_numbers(marks, n), whole_numbers(marks + 4 * n, n),
+        whole_numbers(marks + 8 * n, n), whole_numbers(marks + 12 * n, n),
+    )  # fmt: skip
+    fixed = whole_numbers(marks + 16 * n, n)
+    for lane in range(lanes):
+        x, low, high = (
+            vector(solution + 8 * n * lane, n), vector(lower + 8 * n * lane, n), vector(upper + 8 * n * lane, n)
+        )  # fmt: skip
+        first = begin(W, x, low, high, fixed)
+        plain, active = first == 0, whole_numbers(actives + 4 * n * lane, n)
+        for i in range(n):
+            active[i] = fixed[i]
+        report = whole_numbers(reports + 8 * lane, 2)
+        report[0], report[1] = 1, 0
+        for k in range(levels):
+            each = levels * lane + k
+            m = given_rows(
+                matrix(A + 8 * M * n * each, M, n), vector(below + 8 * M * each, M), vector(above + 8 * M * each, M),
+                whole_numbers(equal + 4 * M * each, M), M, n,
+            )  # fmt: skip
+            level = Level(
+                matrix(A + 8 * M * n * each, m, n), vector(below + 8 * M * each, m), vector(above + 8 * M * each, m),
+                whole_numbers(equal + 4 * M * each, m), vector(constant, lanes * levels)[each],
+                vector(unmet, lanes * levels)[each], vector(demand, lanes * levels)[each],
+                vector(bends + 8 * n * each, n),
+            )  # fmt: skip
+            side, blocking = whole_numbers(sides + 4 * n * each, n), whole_numbers(blockings + 4 * n * each, n)
+            target = vector(targets + 8 * n * each, n)
+            taken, scale, blocker, changes, done = solve_level(
+                W, S, level, x, target, first, plain, vector(rank, lanes)[lane], most, side, blocking
+            )
+            plain, first = plain and taken == 0 and changes == 0, first + taken
+            vector(scales, lanes * levels)[each] = scale
+            whole_numbers(dones, lanes * levels)[each] = done
+            whole_numbers(blockers, lanes * levels)[each] = blocker
+            for i in range(n):
+                fixed[i] = blocking[i] if fixed[i] == 0 else fixed[i]
+                active[i] = fixed[i] if fixed[i] != 0 else side[i]
+            report[0], report[1] = report[0] != 0 and done, report[1] + changes
+        for i in range(n):
+            at_bound = low[i] if active[i] < 0 else high[i]
+            if (active[i] == 1 or active[i] == -1) and abs(x[i] - at_bound) > BOUND_DISTANCE * (1.0 + abs(at_bound)):
+                active[i] = 0
+        own = matrix(projector + 8 * n * n * lane, n, n)
+        fill(own.reshape(-1), 0.0)
+        for j in range(first, n):
+            row = W.turned[j]
+            for i in range(n):
+                if row[i] != 0.0:
+                    add(own[i], row[i], row, 0, n)
+    return 0

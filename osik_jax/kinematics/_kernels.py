@@ -1,0 +1,89 @@
+"""Kinematics on a CPU by Numba's kernels (``kernels/numba``), called from JAX.
+
+They compute what ``_forward.py`` says, a configuration at a time and in double precision; that file is the definition,
+what runs elsewhere, and the derivative. Arguments have a leading axis of lanes, or one of length 1 where all lanes have
+the same: robots are seldom many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..execution._computed import side_by_side
+from ..kernels.numba import _target
+from ..robot import Robot
+from ..robot._tree import KinematicTree
+
+
+def bodies(robot: Robot, q: Float[Array, "lanes nq"]) -> tuple[Array, ...]:
+    """The fields of ``Kinematics``."""
+    tree = robot.tree
+    index, coefficient = tree.qpos_source
+    integers = np.concatenate([tree.body_parents, tree.joint_types, tree.joint_bodies, index])
+    numbers = side_by_side(
+        *(coefficient[None], robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion),
+        *(robot.joint_position, robot.joint_axis),
+    )
+    lanes, count, full = max(len(q), len(numbers)), len(tree.body_parents), len(tree.dof_joint)
+    shapes = (count, 3), (count, 3, 3), (full, 3), (full, 3), (full, 3)
+    *found, _ = _target.call(
+        "_kinematics",
+        [*(((lanes, *shape), float) for shape in shapes), ((len(index),), float)],
+        *(q, numbers, integers.astype(np.int32)),
+    )
+    return tuple(found)
+
+
+def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Array, Array, Array]:
+    """Positions, rotations and Jacobians of frames."""
+    tree, chosen = robot.tree, np.asarray(ids, int)
+    carriers = np.asarray(tree.frame_bodies, int)[chosen]
+    columns, factors = dof_columns(tree)
+    integers = np.concatenate([carriers, columns, tree.moves[carriers].ravel()])
+    numbers = side_by_side(factors[None], robot.frame_position[:, chosen], robot.frame_rotation[:, chosen])
+    given = _arrays(kinematics)
+    lanes, k = max(len(a) for a in (*given, numbers)), len(chosen)
+    positions, rotations, jacobians = _target.call(
+        "_moving_frames",
+        [((lanes, *shape), float) for shape in ((k, 3), (k, 3, 3), (k, 6, tree.nv))],
+        *(*given, numbers, integers.astype(np.int32)),
+    )
+    return positions, rotations, jacobians
+
+
+def center_of_mass(robot: Robot, kinematics: Any) -> tuple[Array, Array]:
+    """The centre of the masses of the bodies, and its Jacobian."""
+    tree = robot.tree
+    columns, factors = dof_columns(tree)
+    integers = np.concatenate([tree.body_parents, tree.dof_body, columns])
+    numbers, given = side_by_side(factors[None], robot.body_mass, robot.body_com), _arrays(kinematics)
+    lanes, count = max(len(a) for a in (*given, numbers)), len(tree.body_parents)
+    center, jacobian, _ = _target.call(
+        "_center_of_mass",
+        [((lanes, 3), float), ((lanes, 3, tree.nv), float), ((count, 4), float)],
+        *(*given, numbers, integers.astype(np.int32)),
+    )
+    return center, jacobian
+
+
+def _arrays(kinematics: Any) -> tuple[Array, ...]:
+    """Its fields, as the kernels take them: all of as many lanes."""
+    fields = jax.tree.leaves(kinematics)
+    lanes = max(len(a) for a in fields)
+    return tuple(jnp.broadcast_to(a, (lanes, *a.shape[1:])) for a in fields)
+
+
+def dof_columns(tree: KinematicTree) -> tuple[np.ndarray, np.ndarray]:
+    """The column of v that each full dof adds to, -1 for none, and the factor with which it does."""
+    full = len(tree.dof_joint)
+    columns, factors = np.full(full, -1), np.zeros(full)
+    for index, coefficient in tree.dof_columns:
+        for column in np.flatnonzero(coefficient):
+            columns[index[column]], factors[index[column]] = column, coefficient[column]
+    return columns, factors

@@ -1,0 +1,1 @@
+"""Arrays and what a user gives for them. Knows no robot and no solver."""

@@ -1,0 +1,114 @@
+"""From the numbers that a user gives to array leaves, checked where they can be looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from .._errors import OsikTypeError, OsikValueError
+
+
+def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
+    """A finite number that is not negative: a gain, a weight. ``dtype=None``: an array's own, else JAX's default.
+
+    Raises:
+        ValueError: it is not, or not a scalar.
+    """
+    if dtype is None:
+        own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
+        dtype = value.dtype if own else float
+    out = as_vector(value, (), what, dtype)
+    check_not_negative(out, what)
+    return out
+
+
+def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Array:
+    """An array of this shape; a scalar is repeated.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: any other shape, or NaN that can be seen.
+    """
+    out = as_array(value, what, dtype)
+    if out.shape not in ((), shape):
+        expected = "a scalar" if shape == () else f"{shape} or a scalar"
+        raise OsikValueError(f"{what} has shape {out.shape}, expected {expected}. Batch with jax.vmap.")
+    check_not_nan(out, what)
+    return jnp.broadcast_to(out, shape)
+
+
+def check_not_nan(value: Array, what: str) -> None:
+    """Raises ValueError where a value can be seen to be NaN, which no number of a problem is."""
+    seen = concrete(value)
+    if seen is not None and np.isnan(seen).any():
+        raise OsikValueError(f"{what} is {seen}; it has to be numbers, not NaN")
+
+
+def check_finite(value: Array, what: str) -> None:
+    """Raises ValueError where a value can be seen not to be finite."""
+    seen = concrete(value)
+    if seen is not None and not np.isfinite(seen).all():
+        raise OsikValueError(f"{what} is {seen}; it has to be finite")
+
+
+def check_not_negative(value: Array, what: str) -> None:
+    """Raises ValueError where a value can be seen to be negative or not finite."""
+    seen = concrete(value)
+    if seen is not None and not (np.isfinite(seen).all() and (seen >= 0.0).all()):
+        raise OsikValueError(f"{what} is {seen}; it has to be finite and not negative")
+
+
+def as_bounds(lower: Any, upper: Any, rows: int, dtype: Any) -> tuple[Array | None, Array | None]:
+    """Both bounds as arrays (rows,), a missing one infinite; (None, None) where neither is given."""
+    if lower is None and upper is None:
+        return None, None
+    low = as_vector(-jnp.inf if lower is None else lower, (rows,), "lower", dtype)
+    high = as_vector(jnp.inf if upper is None else upper, (rows,), "upper", dtype)
+    check_bounds(low, high)
+    return low, high
+
+
+def check_bounds(lower: Array | None, upper: Array | None) -> None:
+    """Raises ValueError where lower can be seen to be above upper."""
+    low, high = concrete(lower), concrete(upper)
+    if lower is None or upper is None or low is None or high is None:
+        return
+    if (low > high).any():
+        rows = np.flatnonzero(low > high)
+        raise OsikValueError(f"lower > upper in rows {rows.tolist()}: lower {low[rows]}, upper {high[rows]}")
+
+
+def entries(values: np.ndarray, which: np.ndarray, names: Sequence[str] | None = None) -> str:
+    """For messages: some entries of an array, by name where there are names."""
+    found = np.flatnonzero(which).tolist()
+    return ", ".join(f"{names[i] if names else f'entry {i}'} ({values[i]})" for i in found)
+
+
+def check_count(what: str, value: Any, *, least: int = 1) -> None:
+    """Raises ValueError for what is no integer, or less than ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise OsikValueError(f"{what} is {value!r}; it is an integer, at least {least}")
+
+
+def as_array(value: Any, what: str, dtype: Any) -> Array:
+    """The value as an array of this type.
+
+    Raises:
+        TypeError: it is made of something else than numbers.
+    """
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError):
+        shown = repr(value)
+        raise OsikTypeError(f"{what} is {shown[:80]}; it is a number, or an array of numbers") from None
+
+
+def concrete(value: Any) -> np.ndarray | None:
+    """The value as NumPy, or None where it is traced and cannot be looked at."""
+    return None if isinstance(value, Tracer) else np.asarray(value)

@@ -1,0 +1,61 @@
+"""What retargeting a clip and retargeting a stream both know of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from .._errors import OsikValueError
+from ..limits import AccelerationLimit, ConfigurationLimit, VelocityLimit
+from ..robot import Robot
+from ..robot._joint_selection import scalar_layout
+from ._body import Build, pairs_apart
+from ._profile import Profile
+from ._profile_file import check_profile, find_profile
+from ._terms import Body, Bounds
+
+ACCELERATION = 240.0
+
+
+class OnRobot:
+    """A robot, how it is seen, its limits, and what is computed of them once.
+
+    Args:
+        robot: with a free base, two legs and two arms.
+        profile: how the robot is seen. None: the package's own, or a guess (``find_profile``).
+        acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+
+    Attributes:
+        robot: the robot.
+        profile: how it is seen.
+        limits: of position, speed and acceleration, which hold exactly.
+
+    Raises:
+        ValueError: the base does not float, no two legs and two arms are found, or a number is out of range.
+        KeyError: the profile or ``acceleration`` names something that the robot does not have.
+    """
+
+    def __init__(self, robot: Robot, profile: Profile | None, acceleration: float | Mapping[str, float]):
+        if not robot.floating_base:
+            raise OsikValueError("retargeting moves a robot's base: load the robot with floating_base=True")
+        self.robot = robot
+        self.profile = find_profile(robot) if profile is None else profile
+        check_profile(robot, self.profile)
+        self.limits = ConfigurationLimit(robot), VelocityLimit(robot), _on_joints(robot, acceleration)
+        self._acceleration = np.asarray(self.limits[2].acceleration)
+        self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile))
+        self._build = Build.of(robot, self.profile)
+
+    def _bounds(self, dt: float) -> Bounds:
+        """What joints may do in a plan with a frame every ``dt`` seconds."""
+        return self._build.bounds(self._acceleration, dt)
+
+
+def _on_joints(robot: Robot, acceleration: float | Mapping[str, float]) -> AccelerationLimit:
+    """A limit on accelerations of the joints; the base is free."""
+    if isinstance(acceleration, Mapping):
+        return AccelerationLimit(robot, acceleration)
+    if not acceleration > 0.0:
+        raise OsikValueError(f"acceleration is {acceleration}; it has to be more than 0")
+    return AccelerationLimit(robot, np.where(scalar_layout(robot)[0], acceleration, np.inf))

@@ -1,0 +1,120 @@
+"""Plans on a CPU by a kernel of Numba's (``kernels/numba/_plan.py``), called from JAX.
+
+It computes what ``_plan.py`` says, in double precision; that file is the definition, and what runs elsewhere.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..execution._computed import side_by_side
+from ..kernels.numba import _target
+from ..kinematics._kernels import dof_columns
+from ..kinematics._manifold import layout
+from ..numerics._dense import product
+from ..robot._joint_selection import scalar_layout
+from ._goals import Goals, Weights
+from ._person import LIMBS
+from ._terms import CLEARANCE, PAIRS, SHORTEST, SWINGING, Body, Bounds
+
+_HIPS = ("left_hip", "right_hip")
+_ROWS, _POINTS = 60, 8
+"""As in ``kernels/numba/_clip_workspace.py``."""
+
+
+def descended(
+    body: Body,
+    goals: Goals,
+    weights: Weights,
+    bounds: Bounds,
+    free: Float[Array, "_ F"],
+    q: Float[Array, "_ F nq"],
+    rules: tuple[float, ...],
+    most: Int[Array, " _"],
+    endings: tuple[float, float],
+) -> tuple[Array, Array, Array]:
+    """Configurations, costs and iterations of a batch of clips.
+
+    Args:
+        body: the robot.
+        goals: of the frames.
+        weights: of the goals.
+        bounds: of the joints.
+        free: 1 for frames that may move.
+        q: where it begins.
+        rules: numbers of the method.
+        most: iterations, at most.
+        endings: whether it ends when bounds are ready to get stiffer, and when steps gain little.
+    """
+    frames, nq = q.shape[1:]
+    counts, integers = _structure(body)
+    wishes = goals.directions, goals.pelvis, goals.torso, goals.root, goals.feet, goals.contact, goals.present
+    method = side_by_side(np.array([rules]), most.astype(q.dtype), np.array([endings]))
+    given = [q, *wishes, free, _numbers(body, weights, bounds), method]
+    lanes = max(len(a) for a in given)
+    shapes = (lanes, frames, nq), (lanes, 2), (lanes,), (_memory(counts, frames, nq),)
+    found, cost, count, _ = _target.call(
+        "_plan", [(shape, float) for shape in shapes], *(jnp.reshape(a, (len(a), -1)) for a in given), integers
+    )
+    return found, cost, count.astype(most.dtype)
+
+
+def _structure(body: Body) -> tuple[dict[str, int], np.ndarray]:
+    """The kernel's whole numbers, and by name those that count something."""
+    tree = body.robot.tree
+    places = np.array([tree.frame_bodies[tree.frame(name)] for name in body.frames])
+    columns, _ = dof_columns(tree)
+    scalar, index = scalar_layout(body.robot)
+    scalar_q, scalar_v, quaternions = layout(body.robot)
+    limbs = [[body.keys.index(end) for end in limb] for limb in (*LIMBS, _HIPS)]
+    counts = dict(
+        bodies=len(tree.body_parents),
+        joints=len(tree.joint_types),
+        values=len(tree.qpos_source[0]),
+        full=len(columns),
+        keys=len(body.keys),
+        capsules=body.radii.shape[-1],
+        above=len(body.above),
+        pairs=len(body.pairs),
+        bends=int(body.bends),
+        most_pairs=min(PAIRS, len(body.pairs)),
+        root=tree.root,
+        places=len(places),
+        straight=int(np.array_equal(columns, np.arange(tree.nv))),
+        limbs=len(limbs),
+        scalars=len(scalar_q),
+        turns=len(quaternions),
+        dofs=tree.nv,
+    )
+    parts = [list(counts.values()), tree.body_parents, tree.joint_types, tree.joint_bodies, tree.qpos_source[0]]
+    parts += [columns, places, np.where(scalar, index, -1), limbs, body.above, body.pairs, tree.moves]
+    parts += [scalar_q, scalar_v, np.array(quaternions).T]
+    return counts, np.concatenate([np.asarray(part, np.int32).ravel() for part in parts])
+
+
+def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"]:
+    """The kernel's numbers of robot, profile and weights; the stiffness, which comes and goes, is 0."""
+    robot, ids = body.robot, np.array([body.robot.tree.frame(name) for name in body.frames])
+    turned, rotations, w = ids[len(body.keys) : len(body.keys) + 4], robot.frame_rotation, weights
+    points = robot.frame_position[:, ids] + product(rotations[:, ids], body.offsets[..., None])[..., 0]
+    return side_by_side(
+        robot.tree.qpos_source[1][None], robot.qpos_offset, robot.joint_reference, robot.body_position,
+        robot.body_quaternion, robot.joint_position, robot.joint_axis, dof_columns(robot.tree)[1][None], points,
+        rotations[:, turned], body.home, body.radii, bounds.lower, bounds.upper,
+        robot.q0[:, scalar_layout(robot)[1]], bounds.step, bounds.change, w.limb, w.pelvis, w.torso, w.root, w.foot,
+        w.posture, w.stance, w.apart, w.limit, w.margin, np.array([[0.0, CLEARANCE, SWINGING, SHORTEST]]), w.smooth,
+        w.smooth_base, w.speed,
+    )  # fmt: skip
+
+
+def _memory(counts: dict[str, int], frames: int, nq: int) -> int:
+    """How many numbers the kernel works with."""
+    bodies, full, n = counts["bodies"], counts["full"], counts["dofs"]
+    rows, wide, long = _ROWS + 2 * counts["above"] + counts["most_pairs"], n // 8 * 8 + 8, (full + 7) // 8 * 8
+    frame = counts["values"] + 12 * bodies + 9 * full + (7 + bodies) * long + 3 * counts["places"] + 36
+    frame += 2 * counts["pairs"] + 4 * counts["capsules"] + 2 * rows * wide + 8 * _POINTS + 1
+    system = frames * (wide**2 + _POINTS * wide + _POINTS + 4 * n)
+    steps = 2 * n + frames * (1 + 2 * n + 2 * wide**2) + wide * (wide + 2 * _POINTS + 2)
+    return frame + 8 + 2 * system + steps + frames * nq + 19

@@ -1,0 +1,59 @@
+"""A robot in five lines."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jax.core import Tracer
+
+if TYPE_CHECKING:
+    from ._robot import Robot
+
+_NAMES_SHOWN = 4
+
+
+def described(robot: Robot) -> str:
+    """Name, sizes and base; joints; frames; masses; limits. Numbers that are traced or batched are left out."""
+    tree = robot.tree
+    base = "floating base" if robot.floating_base else "fixed base"
+    batch = np.shape(robot.q0)[:-1]
+    many = f", a stack of {' x '.join(map(str, batch))}" if batch else ""
+    lines = [
+        f"Robot {model_name(robot)!r}: nq {robot.nq}, nv {robot.nv}, {base}{many}",
+        f"{len(robot.joint_names)} joints: {_some(robot.joint_names)}{_not_free(robot)}",
+        f"{len(tree.frame_names)} frames of {len(robot.body_names)} bodies: {_some(robot.body_names)}",
+        f"mass {_mass(robot)}",
+        f"limits: {_limited(robot)}",
+    ]
+    return "\n  ".join(lines)
+
+
+def model_name(robot: Robot) -> str:
+    """What the file calls the robot; empty where it does not."""
+    return robot.mj_model.names.split(b"\0")[0].decode(errors="replace")
+
+
+def _some(names: tuple[str, ...]) -> str:
+    return ", ".join(names[:_NAMES_SHOWN]) + (", ..." if len(names) > _NAMES_SHOWN else "")
+
+
+def _not_free(robot: Robot) -> str:
+    counts = {"mimic": len(robot.mimic_joints), "locked": len(robot.locked_joints)}
+    return "".join(f"; {count} {kind}" for kind, count in counts.items() if count)
+
+
+def _mass(robot: Robot) -> str:
+    if isinstance(robot.body_mass, Tracer) or np.ndim(robot.body_mass) > 1:
+        return "of each robot its own"
+    return f"{np.sum(np.asarray(robot.body_mass)[1:]):.4g} kg"
+
+
+def _limited(robot: Robot) -> str:
+    """Of the dofs of joints, how many have a range and how many a greatest speed."""
+    own = (robot.position_lower, robot.position_upper, robot.velocity_limit)
+    if any(isinstance(array, Tracer) or np.ndim(array) > 1 for array in own):
+        return "of each robot its own"
+    ranged = np.isfinite(own[0]) | np.isfinite(own[1])
+    total = robot.nv - (6 if robot.floating_base else 0)
+    return f"{ranged.sum()} ranges and {np.isfinite(own[2]).sum()} speeds of {total} joint coordinates"

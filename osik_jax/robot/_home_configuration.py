@@ -1,0 +1,120 @@
+"""Where a robot starts and what its tasks aim at by default: from what a user gives to a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from .._errors import OsikTypeError, OsikValueError, unknown_name
+from ._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
+
+if TYPE_CHECKING:
+    from ._robot import Robot
+
+Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
+"""A keyframe's name or number, a mapping from joint names to values, or a configuration (nq,)."""
+
+_OUTSIDE = 1e-6
+"""A value that is further out of its joint's range is refused [rad or m]; less is the rounding of a file."""
+
+
+def home_configuration(robot: Robot, home: Home) -> Float[Array, " nq"]:
+    """The configuration that is meant, checked and with unit quaternions.
+
+    Raises:
+        KeyError: no such keyframe or joint.
+        TypeError: none of the things that a home can be.
+        ValueError: a wrong length, not finite, a quaternion of zeros, or a joint outside its range.
+    """
+    if isinstance(home, str) or _is_integer(home):
+        q: Any = _keyframe(robot, home)
+    elif isinstance(home, Mapping):
+        q = _with_joints(robot, home)
+    else:
+        q = _as_array(home, robot.q0.dtype)
+    robot.check_configuration(q, "home")
+    q = _with_unit_quaternions(robot, jnp.asarray(q, robot.q0.dtype))
+    return q if isinstance(q, Tracer) else _inside(robot, np.asarray(q))
+
+
+def _is_integer(home: Any) -> bool:
+    return isinstance(home, int | np.integer) and not isinstance(home, bool)
+
+
+def _as_array(home: Any, dtype: Any) -> Array:
+    try:
+        return jnp.asarray(home, dtype)
+    except (TypeError, ValueError):
+        raise OsikTypeError(
+            f"home is {home!r}; it is a configuration (nq,), a mapping from joint names to values, or the name or "
+            "number of a keyframe"
+        ) from None
+
+
+def _keyframe(robot: Robot, home: Any) -> np.ndarray:
+    """The independent entries of a keyframe of the MuJoCo model."""
+    model = robot.mj_model
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or str(k) for k in range(model.nkey)]
+    if isinstance(home, str) and home in names:
+        number = names.index(home)
+    elif not isinstance(home, str) and 0 <= home < model.nkey:
+        number = int(home)
+    else:
+        raise unknown_name("keyframe", home, tuple(names))
+    q = np.zeros(robot.nq)
+    for joint, start in robot.tree.qpos_address.items():
+        full, width = robot.tree.full_qpos_address[joint], QPOS_WIDTH[robot.tree.joint_types[joint]]
+        q[start : start + width] = model.key_qpos[number, full : full + width]
+    return q
+
+
+def _with_joints(robot: Robot, values: Mapping[str, Any]) -> Array:
+    """``q0`` with the named joints set: a number each, or all entries of a free (7) or ball joint (4)."""
+    single: dict[str, Any] = {}
+    several: dict[str, Any] = {}
+    for name, value in values.items():
+        turning = robot.tree.joint_types[robot.tree.joint(name)] in (FREE, BALL)
+        (several if turning else single)[name] = value
+    numbers: Any = {name: _as_array(value, robot.q0.dtype) for name, value in single.items()}
+    q = robot.configuration(numbers)
+    for name, value in several.items():
+        start, width = robot.joint_qpos_index(name), QPOS_WIDTH[robot.tree.joint_types[robot.tree.joint(name)]]
+        entries = _as_array(value, q.dtype)
+        if entries.shape != (width,):
+            layout = "x, y, z, then the quaternion w, x, y, z" if width == 7 else "a quaternion w, x, y, z"
+            raise OsikValueError(f"home of joint {name!r} has shape {entries.shape}, expected ({width},): {layout}")
+        q = q.at[start : start + width].set(entries)
+    return q
+
+
+def _with_unit_quaternions(robot: Robot, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
+    for joint, start in robot.tree.qpos_address.items():
+        kind = robot.tree.joint_types[joint]
+        if kind in (FREE, BALL):
+            part = slice(start + QPOS_WIDTH[kind] - 4, start + QPOS_WIDTH[kind])
+            q = q.at[part].divide(jnp.linalg.norm(q[part]))
+    return q
+
+
+def _inside(robot: Robot, q: np.ndarray) -> Float[Array, " nq"]:
+    """The configuration with roundings beyond a range taken off; ValueError where a joint is further out."""
+    if isinstance(robot.position_lower, Tracer):
+        return jnp.asarray(q)
+    lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
+    out, inside = [], q.copy()
+    for joint, start in robot.tree.qpos_address.items():
+        if robot.tree.joint_types[joint] in (HINGE, SLIDE):
+            low, high = (bound[robot.tree.dof_address[joint]] for bound in (lower, upper))
+            inside[start] = np.clip(q[start], low, high)
+            if abs(inside[start] - q[start]) > _OUTSIDE:
+                out.append(f"{robot.tree.joint_names[joint]} is {q[start]:g}, its range is [{low:g}, {high:g}]")
+    if out:
+        raise OsikValueError(f"home is outside the joints' ranges (radians, metres): {'; '.join(out)}")
+    return jnp.asarray(inside)

@@ -1,0 +1,106 @@
+"""From the joint names and globs that a user gives to the entries of q and v."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._errors import OsikTypeError, OsikValueError, unknown_name
+from ..numerics._arguments import as_array
+from ._robot import Robot
+from ._tree import DOF_WIDTH, FREE, HINGE, SLIDE
+
+
+def select_joints(robot: Robot, pattern: str) -> list[int]:
+    """Independent joints called ``pattern``, or those but the free ones that match it as a glob.
+
+    Raises:
+        KeyError: there are none; the message lists the independent joints.
+    """
+    names = {robot.tree.joint_names[j]: j for j in robot.tree.independent}
+    if pattern in names:
+        return [names[pattern]]
+    matches = [j for name, j in names.items() if fnmatch.fnmatchcase(name, str(pattern))]
+    found = [j for j in matches if robot.tree.joint_types[j] != FREE]
+    if not found:
+        raise unknown_name("joint", pattern, tuple(names))
+    return found
+
+
+def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:
+    """Independent joints, in the order of v, that match any of the patterns; ``None``: all but the free joints.
+
+    Raises:
+        KeyError: a pattern matches no joint.
+        TypeError: one string instead of a sequence of them, or no sequence.
+        ValueError: an empty sequence.
+    """
+    if patterns is None:
+        return [j for j in robot.tree.independent if robot.tree.joint_types[j] != FREE]
+    if isinstance(patterns, str):
+        raise OsikTypeError(f"joints is a sequence of names and globs, not one string: use ({patterns!r},)")
+    if not isinstance(patterns, Iterable):
+        raise OsikTypeError(f"joints is {patterns!r}; it is a sequence of names and globs")
+    found = sorted({joint for pattern in patterns for joint in select_joints(robot, pattern)})
+    if not found:
+        raise OsikValueError(f"joints is empty; name at least one joint, or None for all of {robot.tree.dof_owners}")
+    return found
+
+
+def dofs_of(robot: Robot, joints: Sequence[int]) -> list[int]:
+    """Entries of v that belong to some independent joints, joint by joint."""
+    tree = robot.tree
+    return [tree.dof_address[j] + i for j in joints for i in range(DOF_WIDTH[tree.joint_types[j]])]
+
+
+def is_scalar(robot: Robot, joint: int) -> bool:
+    """Whether a joint is a hinge or a slide: one entry in q, one in v."""
+    return robot.tree.joint_types[joint] in (HINGE, SLIDE)
+
+
+def scalar_layout(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Which dofs are hinges or slides, and where each of those sits in q (0 for the others). (nv,) each."""
+    mask, index = np.zeros(robot.nv, bool), np.zeros(robot.nv, int)
+    for joint, dof in robot.tree.dof_address.items():
+        if is_scalar(robot, joint):
+            mask[dof], index[dof] = True, robot.tree.qpos_address[joint]
+    return mask, index
+
+
+def dof_names(robot: Robot) -> list[str]:
+    """For messages: the joint that each entry of v belongs to. (nv,)."""
+    return [
+        robot.tree.joint_names[j] for j in robot.tree.independent for _ in range(DOF_WIDTH[robot.tree.joint_types[j]])
+    ]
+
+
+def dof_values(robot: Robot, given: Any, default: Float[Array, " nv"], what: str) -> Float[Array, " nv"]:
+    """An array over v from what a user gives: nothing, an array (nv,), or a mapping from names or globs to values.
+
+    Raises:
+        KeyError: the mapping names a joint that does not exist.
+        ValueError: an array of another shape.
+    """
+    dtype = robot.q0.dtype
+    if given is None:
+        return jnp.asarray(default, dtype)
+    if isinstance(given, Mapping):
+        values = jnp.asarray(default, dtype)
+        for pattern, value in given.items():
+            for joint in select_joints(robot, pattern):
+                dof = robot.tree.dof_address[joint]
+                width = DOF_WIDTH[robot.tree.joint_types[joint]]
+                values = values.at[dof : dof + width].set(as_array(value, f"{what}[{pattern!r}]", dtype))
+        return values
+    values = as_array(given, what, dtype)
+    if values.shape != (robot.nv,):
+        raise OsikValueError(
+            f"{what} has shape {values.shape}, expected ({robot.nv},), one entry for each of "
+            f"{', '.join(dof_names(robot))}; or give a mapping from joint names to values"
+        )
+    return values

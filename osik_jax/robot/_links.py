@@ -1,0 +1,65 @@
+"""A robot with longer or heavier links."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._errors import OsikValueError, unknown_name
+from ._tree import KinematicTree
+
+if TYPE_CHECKING:
+    from ._robot import Robot
+
+Factors = Mapping[str, Float[Array, ""] | float] | Float[Array, ""] | float
+
+
+def scaled_leaves(robot: Robot, length: Factors, mass: Factors) -> dict[str, Array]:
+    """The leaves of a robot that other lengths and masses change, by field."""
+    tree, dtype = robot.tree, robot.body_position.dtype
+    longer, heavier = _factors(tree, length, "length", dtype), _factors(tree, mass, "mass", dtype)
+    parent, carrier = np.asarray(tree.body_parents, int), np.asarray(tree.frame_bodies, int)
+    owner, wearer = np.asarray(tree.joint_bodies, int), np.asarray(tree.geom_bodies, int)
+    return {
+        "body_position": robot.body_position * longer[parent, None],
+        "body_com": robot.body_com * longer[:, None],
+        "joint_position": robot.joint_position * longer[owner, None],
+        "frame_position": robot.frame_position * longer[carrier, None],
+        "geom_position": robot.geom_position * longer[wearer, None],
+        "geom_size": robot.geom_size * longer[wearer, None],
+        "body_mass": robot.body_mass * heavier,
+        "body_inertia": robot.body_inertia * (heavier * longer**2)[:, None, None],
+    }
+
+
+def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) -> Float[Array, " nbody"]:
+    """One factor for each body; the world keeps 1."""
+    factors = jnp.ones(len(tree.body_names), dtype)
+    if not isinstance(given, Mapping):
+        return factors.at[1:].set(given)
+    seen: dict[int, str] = {}
+    for pattern, factor in given.items():
+        for body in _bodies(tree, pattern):
+            if body in seen:
+                raise OsikValueError(
+                    f"{what} gives {tree.body_names[body]!r} twice, by {seen[body]!r} and by {pattern!r}"
+                )
+            seen[body] = pattern
+            factors = factors.at[body].set(factor)
+    return factors
+
+
+def _bodies(tree: KinematicTree, pattern: str) -> list[int]:
+    """Moving bodies called ``pattern``, or that match it as a glob."""
+    names = dict(zip(tree.body_names[1:], range(1, len(tree.body_names)), strict=True))
+    found = [body for name, body in names.items() if name == pattern] or [
+        body for name, body in names.items() if fnmatch.fnmatchcase(name, pattern)
+    ]
+    if not found:
+        raise unknown_name("body", pattern, tuple(names))
+    return found

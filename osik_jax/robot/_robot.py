@@ -1,0 +1,490 @@
+"""Robot: the kinematic model that everything else takes, as an immutable pytree."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, ArrayLike, DTypeLike, Float, Num
+
+from .._errors import OsikKeyError, OsikTypeError, OsikValueError
+from . import loading
+from ._describe import described
+from ._home_configuration import Home, home_configuration
+from ._links import Factors, scaled_leaves
+from ._tree import BALL, FREE, KinematicTree, ModelHolder
+
+LockedJoints = Iterable[str] | Mapping[str, float]
+PositionLimits = Mapping[str, tuple[float, float]]
+_UNIT_QUATERNION_TOLERANCE = 1e-8
+
+
+class Robot(eqx.Module):
+    """A robot's geometry, masses and limits.
+
+    Configurations ``q`` (nq,) are in MuJoCo's qpos layout (a free joint is a position in the world and a unit
+    quaternion w, x, y, z) without the entries of locked joints and mimic followers. Velocities ``v`` (nv,) live in the
+    tangent space (a free joint is a linear velocity in world axes, then an angular velocity in body axes).
+
+    All arrays are traced leaves: robots with the same tree and other link lengths, masses or limits can be stacked and
+    vmapped over (``scaled``, ``osik_jax.stack``). ``mj_model`` is carried along unchanged; it does not follow edits of
+    the leaves.
+
+    Attributes:
+        tree: names and topology (static).
+        body_position: of each body in its parent [m]. (nbody, 3)
+        body_quaternion: of each body in its parent, w x y z. (nbody, 4)
+        body_mass: [kg]; what is fixed to the world does not count. (nbody,)
+        body_com: centre of mass of each body in its own frame [m]. (nbody, 3)
+        body_inertia: rotational inertia of each body about its centre of mass, in its own axes [kg m^2]. (nbody, 3, 3)
+        joint_position: anchor of each joint in its body [m]. (njoint, 3)
+        joint_axis: axis of each joint in its body. (njoint, 3)
+        dof_armature: inertia that each dof's drive adds, MuJoCo's ``armature`` [kg m^2 or kg]. (full nv,)
+        joint_reference: MuJoCo's qpos0, the joint values at which bodies sit as described. (full nq,)
+        frame_position: of each named frame in its body [m]. (nframe, 3)
+        frame_rotation: of each named frame in its body. (nframe, 3, 3)
+        geom_position: of each of the model's geoms in its body [m]. (ngeom, 3)
+        geom_rotation: of each geom in its body. (ngeom, 3, 3)
+        geom_size: MuJoCo's sizes of each geom [m]; of a mesh, factors of its vertices. (ngeom, 3)
+        qpos_offset: values of locked joints and offsets of followers, 0 elsewhere. (full nq,)
+        position_lower: lower joint limits [rad or m], -inf where free. (nv,)
+        position_upper: upper joint limits [rad or m], inf where free. (nv,)
+        velocity_limit: greatest joint speeds [rad/s or m/s], inf where free. (nv,)
+        q0: the robot's home configuration. (nq,)
+    """
+
+    tree: KinematicTree = eqx.field(static=True)
+    body_position: Float[Array, "nbody 3"]
+    body_quaternion: Float[Array, "nbody 4"]
+    body_mass: Float[Array, " nbody"]
+    body_com: Float[Array, "nbody 3"]
+    body_inertia: Float[Array, "nbody 3 3"]
+    joint_position: Float[Array, "njoint 3"]
+    joint_axis: Float[Array, "njoint 3"]
+    dof_armature: Float[Array, " nvfull"]
+    joint_reference: Float[Array, " nqfull"]
+    frame_position: Float[Array, "nframe 3"]
+    frame_rotation: Float[Array, "nframe 3 3"]
+    geom_position: Float[Array, "ngeom 3"]
+    geom_rotation: Float[Array, "ngeom 3 3"]
+    geom_size: Float[Array, "ngeom 3"]
+    qpos_offset: Float[Array, " nqfull"]
+    position_lower: Float[Array, " nv"]
+    position_upper: Float[Array, " nv"]
+    velocity_limit: Float[Array, " nv"]
+    q0: Float[Array, " nq"]
+    holder: ModelHolder = eqx.field(static=True, repr=False)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: str | os.PathLike[str],
+        *,
+        floating_base: bool | None = None,
+        velocity_limits: Mapping[str, float] | None = None,
+        position_limits: PositionLimits | None = None,
+        locked_joints: LockedJoints = (),
+        home: Home | None = None,
+        collision_meshes: bool = False,
+        package_dirs: Iterable[str | os.PathLike[str]] = (),
+    ) -> Robot:
+        """Loads a URDF. Boxes, spheres, cylinders and capsules are kept as geoms; mesh files are not read unless asked.
+
+        Every link is a frame, with or without a joint of its own. Limits come from ``<limit>``: no ``<limit>`` means
+        none, an absent ``lower`` or ``upper`` is 0 as the format has it, and a velocity of 0 or none means unknown,
+        so unlimited. ``<safety_controller>`` is not read. A ``<mimic>`` joint is no coordinate of its own: it moves
+        with its leader, whose limits its own limits narrow. Moving links without mass get 2e-15 kg in ``mj_model``:
+        MuJoCo demands some. What is fixed to the world (the root link of an arm) does not count as the robot's mass.
+
+        Args:
+            urdf: path of the file, ``package://`` address, or the XML text itself. Lengths in metres, angles in
+                radians.
+            floating_base: ``True``: put a free joint, ``floating_base``, on the root link unless the URDF has a
+                ``floating`` joint already (below a root link called ``world``: on the one link fixed to it).
+                ``False``: the root link is fixed to the world, and ``floating`` joints are locked. ``None``: as the
+                file says, if it does: a ``floating`` joint floats, and a root link called ``world`` is the world. A
+                URDF that says neither floats if two of its outermost links are called like feet (sole, foot, ankle or
+                toe), and is fixed to the world with an ``OsikWarning`` if not.
+            velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; wins over the file's.
+            position_limits: joint name (or glob) to (lower, upper) [rad or m]; wins over the file's. Infinite: free.
+            locked_joints: names or globs of joints to freeze at 0, or a mapping from them to the values to freeze at
+                [rad or m]. A mimic joint is locked by locking its leader.
+            home: what ``q0`` is, see ``with_home``. Default: zeros, brought inside the joints' ranges.
+            collision_meshes: read the collision shapes that are meshes (STL, OBJ, MSH) too; without, no mesh file is
+                needed.
+            package_dirs: folders that are ROS packages or hold some, for ``package://`` addresses. Then
+                ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH`` are looked through, then the folders above the file.
+
+        Raises:
+            FileNotFoundError: no such file, or with ``collision_meshes`` a mesh is not found; the message says where it
+                was looked for.
+            ValueError: the XML or the model in it is broken or cannot be represented (``planar`` joints, several root
+                links), or ``home`` does not fit; the message says where.
+            KeyError: a mapping or ``locked_joints`` names a joint that does not exist.
+
+        Warns:
+            OsikWarning: the base is fixed because nothing in the file looks like feet, or a joint cannot move because
+                its range is a single value.
+        """
+        fields = loading.from_urdf(
+            urdf,
+            floating_base=floating_base,
+            velocity_limits=velocity_limits,
+            position_limits=position_limits,
+            locked_joints=locked_joints,
+            collision_meshes=collision_meshes,
+            package_dirs=package_dirs,
+        )
+        return cls._at_home(fields, home)
+
+    @classmethod
+    def from_mjcf(
+        cls,
+        mjcf: str | os.PathLike[str],
+        *,
+        floating_base: bool | None = None,
+        velocity_limits: Mapping[str, float] | None = None,
+        position_limits: PositionLimits | None = None,
+        locked_joints: LockedJoints = (),
+        home: Home | None = None,
+    ) -> Robot:
+        """Loads an MJCF file or text.
+
+        Active joint equality constraints that are linear become exact mimic joints, those without a second joint lock
+        the first; an ``EqualityConstraintTask`` keeps ``connect``, ``weld`` and the other joint constraints. Tendons
+        are not honoured. Where files of meshes, height fields or textures cannot be read, the geoms that need them are
+        left out. Where the model does not compile for want of masses, moving bodies without get 2e-15 kg.
+        ``fusestatic`` is not followed: it loses names.
+
+        Args:
+            mjcf: path of the file, or the XML text itself.
+            floating_base: ``None``: as the file says. ``True``: put a free joint on the root body unless the model has
+                one. ``False``: free joints are locked where the file has them.
+            velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; MJCF has no field for it. A custom
+                numeric ``velocity_limit/JOINT`` in the file is read too.
+            position_limits: as in ``from_urdf``.
+            locked_joints: as in ``from_urdf``.
+            home: what ``q0`` is, see ``with_home``: a keyframe's name or number, for instance. Default: the first
+                keyframe, or ``qpos0`` where there is none, brought inside the joints' ranges.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: the XML or the model in it is broken, a body takes its mass from a mesh that cannot be read, or
+                ``home`` does not fit.
+            KeyError: a mapping or ``locked_joints`` names a joint that does not exist, or ``home`` a keyframe.
+
+        Warns:
+            OsikWarning: a joint cannot move because its range is a single value. MuJoCo reads ``range="0 0"`` as no
+                limit at all, and so does this.
+        """
+        fields = loading.from_mjcf(
+            mjcf,
+            floating_base=floating_base,
+            velocity_limits=velocity_limits,
+            position_limits=position_limits,
+            locked_joints=locked_joints,
+        )
+        return cls._at_home(fields, home)
+
+    @classmethod
+    def from_mjmodel(
+        cls,
+        model: mujoco.MjModel,
+        *,
+        velocity_limits: Mapping[str, float] | None = None,
+        position_limits: PositionLimits | None = None,
+        locked_joints: LockedJoints = (),
+        home: Home | None = None,
+    ) -> Robot:
+        """Takes a compiled MuJoCo model.
+
+        Args:
+            model: the model.
+            velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; wins over custom numerics
+                ``velocity_limit/JOINT`` of the model.
+            position_limits: as in ``from_urdf``.
+            locked_joints: as in ``from_urdf``; without a value, joints freeze at ``qpos0``.
+            home: as in ``from_mjcf``.
+
+        Raises:
+            TypeError: ``model`` is no ``mujoco.MjModel``.
+            ValueError: the model has no moving joint, no moving mass, or a range with lower > upper, or ``home`` does
+                not fit.
+            KeyError: a name in a mapping or ``locked_joints`` does not exist, or ``home`` names no keyframe.
+
+        Warns:
+            OsikWarning: a joint cannot move because its range is a single value.
+        """
+        fields = loading.from_mjmodel(
+            model, velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked_joints
+        )
+        return cls._at_home(fields, home)
+
+    @classmethod
+    def _at_home(cls, fields: Mapping[str, Any], home: Home | None) -> Self:
+        """The robot with these fields, and with another ``q0`` where one is given."""
+        robot = cls(**fields)
+        return robot if home is None else robot.with_home(home)
+
+    def __repr__(self) -> str:
+        """The robot in five lines."""
+        return described(self)
+
+    @property
+    def nq(self) -> int:
+        """Length of q."""
+        return self.tree.nq
+
+    @property
+    def nv(self) -> int:
+        """Length of v."""
+        return self.tree.nv
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Independent joints in the order of v, free joints left out."""
+        return tuple(self.tree.joint_names[j] for j in self.tree.independent if self.tree.joint_types[j] != FREE)
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Moving bodies, in the order of ``body_mass`` and the other arrays over bodies, whose entry 0 is the world."""
+        return self.tree.body_names[1:]
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Every frame that can be asked for by name: bodies, URDF links (fused or not), sites, geoms."""
+        return self.tree.frame_names
+
+    @property
+    def mimic_joints(self) -> dict[str, tuple[str, float]]:
+        """Followers: name to (leader, multiplier)."""
+        names = self.tree.joint_names
+        return {names[f]: (names[leader], m) for f, leader, m in self.tree.followers}
+
+    @property
+    def locked_joints(self) -> tuple[str, ...]:
+        """Names of the joints frozen at load time."""
+        return tuple(self.tree.joint_names[j] for j in self.tree.locked)
+
+    @property
+    def floating_base(self) -> bool:
+        """Whether the robot has a free joint that is not locked."""
+        return any(self.tree.joint_types[j] == FREE for j in self.tree.independent)
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations."""
+        return self.holder.model
+
+    def joint_qpos_index(self, name: str) -> int:
+        """Where a joint's values start in q; a follower sits where its leader sits.
+
+        Raises:
+            KeyError: no such joint, or it is locked.
+        """
+        return self.tree.qpos_address[self._owner(name)]
+
+    def joint_dof_index(self, name: str) -> int:
+        """Where a joint's velocities start in v; a follower sits where its leader sits.
+
+        Raises:
+            KeyError: no such joint, or it is locked.
+        """
+        return self.tree.dof_address[self._owner(name)]
+
+    def _owner(self, name: str) -> int:
+        joint = self.tree.joint(name)
+        if joint in self.tree.locked:
+            raise OsikKeyError(
+                f"joint {name!r} is locked, so it has no place in q; joints: {', '.join(self.joint_names)}"
+            )
+        return {f: leader for f, leader, _ in self.tree.followers}.get(joint, joint)
+
+    def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
+        """The configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
+        index, coefficient = self.tree.qpos_source
+        return jnp.asarray(q)[index] * coefficient + self.qpos_offset
+
+    def configuration(self, joints: Mapping[str, float], *, base: Num[ArrayLike, " nq"] | None = None) -> Array:
+        """``q0`` (or ``base``) with the named hinge and slide joints set; setting a follower moves its leader. (nq,).
+
+        Raises:
+            KeyError: no such joint, or it is locked.
+            ValueError: a free or ball joint, which no single number sets.
+        """
+        q = jnp.asarray(self.q0 if base is None else base)
+        coefficient = self.tree.qpos_source[1]
+        for name, value in joints.items():
+            joint = self.tree.joint(name)
+            if self.tree.joint_types[joint] in (FREE, BALL):
+                raise OsikValueError(
+                    f"joint {name!r} is free or ball: set its entries of q, from joint_qpos_index({name!r})"
+                )
+            full = self.tree.full_qpos_address[joint]
+            index = self.joint_qpos_index(name)
+            q = q.at[index].set((value - self.qpos_offset[full]) / coefficient[full])
+        return q
+
+    def with_home(self, home: Home) -> Self:
+        """The same robot with another ``q0``, which is what tasks made from then on aim at by default.
+
+        Works inside ``jit``, where values are not checked; nothing is compiled again.
+
+        Args:
+            home: a configuration (nq,), whose quaternions are normalised; a mapping from joint names to values, a
+                number each [rad or m], or all entries of a free joint (7) or a ball (4), where joints that are not
+                named keep their values of ``q0``; or the name or number of a keyframe of ``mj_model``.
+
+        Raises:
+            KeyError: no such joint or keyframe; the message lists those that exist.
+            TypeError: nothing that a home can be.
+            ValueError: a wrong length, not finite, a quaternion of zeros, or a joint outside its range.
+        """
+        q0 = home_configuration(self, home)
+        return eqx.tree_at(lambda robot: robot.q0, self, q0)
+
+    def astype(self, dtype: DTypeLike) -> Self:
+        """The same robot in another precision: every number is cast, and everything else stays.
+
+        A robot has the precision that was in force when it was made. After ``jax_enable_x64`` was switched on or off,
+        ``robot.astype(float)`` is the robot in the precision now in force; tasks, limits and schemes are to be made
+        anew.
+
+        Args:
+            dtype: ``float`` (JAX's default), ``"float32"`` or ``"float64"``.
+
+        Raises:
+            TypeError: no floating-point type.
+            ValueError: float64 while ``jax_enable_x64`` is off.
+        """
+        wanted = np.dtype(jnp.result_type(float) if dtype is float else dtype)
+        if not jnp.issubdtype(wanted, np.floating):
+            raise OsikTypeError(f"dtype is {dtype!r}; a robot's numbers are floating-point: float32 or float64")
+        if wanted == np.float64 and jnp.result_type(float) != wanted:
+            raise OsikValueError("float64 needs jax.config.update('jax_enable_x64', True) first")
+        return jax.tree.map(lambda leaf: leaf.astype(wanted), self)
+
+    def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
+        """The same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
+
+        A link is made longer from its own origin: the joints of its children, its centre of mass, its frames and its
+        geoms move away by the factor, and its geoms grow by it. Masses are scaled by their own factors only, inertias
+        by mass times length squared; drives stay. Factors may be traced:
+        ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of robots.
+
+        Args:
+            length: a factor for all links, or a mapping from body names or globs to factors; the others keep theirs.
+            mass: likewise.
+
+        Raises:
+            KeyError: no such body; the message lists those that exist.
+            ValueError: a body is given twice.
+        """
+        changed = scaled_leaves(self, length, mass)
+        return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
+
+    def to_mjcf(self, path: str | os.PathLike[str] | None = None) -> str:
+        """The robot as MJCF, as its leaves have it now: scaled, edited, joints locked.
+
+        Locked joints are gone, their bodies posed at the locked values. Links that are fixed to others are one body
+        with them and stay as frames. Mimic joints are joint equality constraints, velocity limits custom numerics
+        ``velocity_limit/JOINT``, and ``q0`` is the keyframe ``home``. Frames that are no bodies are sites, or geoms
+        where they were: simple shapes are kept, meshes are not, so the file needs no other. Actuators, sensors,
+        tendons, other constraints and the masses of what is fixed to the world are left out; bodies that locked joints
+        leave fixed to the world count as such when the file is read. ``Robot.from_mjcf`` of the text is the same robot
+        in all else.
+
+        Args:
+            path: file to write the text to, if any.
+
+        Returns:
+            The text.
+
+        Raises:
+            ValueError: a stack of robots, or numbers that MJCF has no place for: a joint limited on one side alone,
+                limits that differ between the dofs of a free or ball joint, the frame of a body moved without it.
+        """
+        text = loading.to_mjcf(self)
+        if path is not None:
+            Path(path).write_text(text, encoding="utf-8")
+        return text
+
+    def check_configuration(self, q: Num[ArrayLike, " nq"], name: str = "q") -> None:
+        """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
+
+        Args:
+            q: what should be a configuration. (nq,)
+            name: what the message calls it.
+        """
+        shape = jnp.shape(q)
+        if shape != (self.nq,):
+            raise OsikValueError(
+                f"{name} has shape {shape}, this robot's configurations have shape ({self.nq},): "
+                f"{', '.join(self.tree.joint_names[j] for j in self.tree.independent)}. Batch with jax.vmap."
+            )
+        if isinstance(q, jax.core.Tracer):
+            return
+        values = np.asarray(q)
+        if not np.isfinite(values).all():
+            raise OsikValueError(f"{name} is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
+        for joint, start in self.tree.qpos_address.items():
+            kind = self.tree.joint_types[joint]
+            if kind in (FREE, BALL):
+                first = start + (3 if kind == FREE else 0)
+                if np.linalg.norm(values[first : first + 4]) < _UNIT_QUATERNION_TOLERANCE:
+                    raise OsikValueError(
+                        f"{name}[{first}:{first + 4}], the quaternion of joint {self.tree.joint_names[joint]!r}, is "
+                        "zero; the identity is (1, 0, 0, 0)"
+                    )
+
+
+def load_robot(
+    name: str,
+    *,
+    floating_base: bool | None = None,
+    velocity_limits: Mapping[str, float] | None = None,
+    position_limits: PositionLimits | None = None,
+    locked_joints: LockedJoints = (),
+    home: Home | None = None,
+) -> Robot:
+    """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
+
+    Any other name is one of the package robot_descriptions (the extra ``descriptions``): MuJoCo Menagerie as
+    ``panda_mj_description``, ``g1_mj_description`` and so on, URDFs as ``panda_description``. That package clones the
+    robot's git repository into a cache when it is asked for the first time.
+
+    Args:
+        name: of the robot.
+        floating_base: as in ``Robot.from_mjcf`` and, for URDFs, ``Robot.from_urdf``.
+        velocity_limits: likewise.
+        position_limits: likewise.
+        locked_joints: likewise.
+        home: likewise.
+
+    Raises:
+        KeyError: no such robot; the message lists those with names like it. No such joint or keyframe.
+        ImportError: the robot is one of robot_descriptions, which is not installed.
+        ValueError: the robot comes as xacro alone, its file cannot be read, or ``home`` does not fit.
+
+    Warns:
+        OsikWarning: as in ``Robot.from_mjcf`` and ``Robot.from_urdf``.
+    """
+    if not isinstance(name, str):
+        raise OsikTypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, loading.ROBOTS))}")
+    load = loading.embedded if name in loading.ROBOTS else loading.described
+    fields = load(
+        name,
+        floating_base=floating_base,
+        velocity_limits=velocity_limits,
+        position_limits=position_limits,
+        locked_joints=locked_joints,
+    )
+    return Robot._at_home(fields, home)

@@ -1,0 +1,265 @@
+"""The static half of a robot: what is hashed, compared and never traced."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, Generic, TypeVar, cast
+
+import jax
+import mujoco
+import numpy as np
+
+from .._errors import unknown_name
+
+FREE, BALL, SLIDE, HINGE = (
+    int(t)
+    for t in (
+        mujoco.mjtJoint.mjJNT_FREE,
+        mujoco.mjtJoint.mjJNT_BALL,
+        mujoco.mjtJoint.mjJNT_SLIDE,
+        mujoco.mjtJoint.mjJNT_HINGE,
+    )
+)
+QPOS_WIDTH = {FREE: 7, BALL: 4, SLIDE: 1, HINGE: 1}
+DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ModelHolder:
+    """Carries the MuJoCo model along without taking part in comparison: only the tree decides what may be stacked."""
+
+    model: mujoco.MjModel
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ModelHolder)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+_Arrays = TypeVar("_Arrays")
+
+
+class cached_arrays(Generic[_Arrays]):
+    """A ``cached_property`` for NumPy arrays: computed once, and copied at each access.
+
+    JAX remembers in which precision it has read an array object. Where ``jax_enable_x64`` changes while a robot lives,
+    an object that was read before would have the wrong one.
+    """
+
+    def __init__(self, compute: Callable[[Any], _Arrays]):
+        self.compute, self.name, self.__doc__ = compute, f"_cached_{compute.__name__}", compute.__doc__
+
+    def __get__(self, tree: Any, owner: type | None = None) -> _Arrays:
+        """A copy of the arrays; they are computed on the first access."""
+        if tree is None:
+            return cast(_Arrays, self)
+        if self.name not in tree.__dict__:
+            tree.__dict__[self.name] = self.compute(tree)
+        return jax.tree.map(np.copy, tree.__dict__[self.name])
+
+
+@dataclasses.dataclass(frozen=True)
+class KinematicTree:
+    """Names and topology of a robot. Two robots with equal trees can be stacked and vmapped over.
+
+    Joints are all of the MuJoCo model's, in its order. A joint is *independent* (it owns entries of ``q`` and ``v``),
+    a *follower* (``q_follower = multiplier * q_leader + offset``) or *locked* (its value is a constant).
+
+    Attributes:
+        body_names: name of each moving body; body 0 is the world. Links without a joint are fused into the body they
+            are fixed to and stay as frames.
+        body_parents: index of each body's parent (0 for the world itself).
+        joint_names: name of each joint.
+        joint_types: MuJoCo's joint types.
+        joint_bodies: the body that each joint moves.
+        frame_names: every name that can be asked for: bodies, URDF links, sites, geoms.
+        frame_bodies: the body that each frame is fixed to.
+        geom_names: name of each of the MuJoCo model's geoms, in its order.
+        geom_types: MuJoCo's geom types.
+        geom_bodies: the body that each geom is fixed to.
+        followers: ``(follower, leader, multiplier)`` by joint index, hinges and slides only.
+        locked: indices of locked joints.
+    """
+
+    body_names: tuple[str, ...]
+    body_parents: tuple[int, ...]
+    joint_names: tuple[str, ...]
+    joint_types: tuple[int, ...]
+    joint_bodies: tuple[int, ...]
+    frame_names: tuple[str, ...]
+    frame_bodies: tuple[int, ...]
+    geom_names: tuple[str, ...] = ()
+    geom_types: tuple[int, ...] = ()
+    geom_bodies: tuple[int, ...] = ()
+    followers: tuple[tuple[int, int, float], ...] = ()
+    locked: tuple[int, ...] = ()
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Computed once: every call of a jitted function asks for it."""
+        return hash(tuple(getattr(self, field.name) for field in dataclasses.fields(self)))
+
+    @cached_property
+    def independent(self) -> tuple[int, ...]:
+        """Joints that own entries of q and v."""
+        dependent = {f for f, _, _ in self.followers} | set(self.locked)
+        return tuple(j for j in range(len(self.joint_names)) if j not in dependent)
+
+    @cached_property
+    def dof_owners(self) -> str:
+        """Names of the joints that own entries of v, in its order: robots for which they differ do not mix."""
+        return ", ".join(self.joint_names[j] for j in self.independent)
+
+    @cached_arrays
+    def full_qpos_address(self) -> np.ndarray:
+        """Where each joint starts in the MuJoCo model's qpos; one past the end is last."""
+        return np.cumsum([0, *(QPOS_WIDTH[t] for t in self.joint_types)])
+
+    @cached_arrays
+    def full_dof_address(self) -> np.ndarray:
+        """Where each joint starts in the MuJoCo model's qvel; one past the end is last."""
+        return np.cumsum([0, *(DOF_WIDTH[t] for t in self.joint_types)])
+
+    @cached_property
+    def qpos_address(self) -> dict[int, int]:
+        """Where each independent joint starts in q."""
+        widths = [QPOS_WIDTH[self.joint_types[j]] for j in self.independent]
+        return dict(zip(self.independent, np.cumsum([0, *widths])[:-1].tolist(), strict=True))
+
+    @cached_property
+    def dof_address(self) -> dict[int, int]:
+        """Where each independent joint starts in v."""
+        widths = [DOF_WIDTH[self.joint_types[j]] for j in self.independent]
+        return dict(zip(self.independent, np.cumsum([0, *widths])[:-1].tolist(), strict=True))
+
+    @cached_property
+    def nq(self) -> int:
+        """Length of q."""
+        return sum(QPOS_WIDTH[self.joint_types[j]] for j in self.independent)
+
+    @cached_property
+    def nv(self) -> int:
+        """Length of v."""
+        return sum(DOF_WIDTH[self.joint_types[j]] for j in self.independent)
+
+    @cached_arrays
+    def turning(self) -> np.ndarray:
+        """Entries of v that turn something; slides and a base's translation bend no path. (nv,), bool."""
+        parts = {FREE: [False] * 3 + [True] * 3, BALL: [True] * 3, SLIDE: [False], HINGE: [True]}
+        return np.array([turns for j in self.independent for turns in parts[self.joint_types[j]]], bool)
+
+    @cached_arrays
+    def qpos_source(self) -> tuple[np.ndarray, np.ndarray]:
+        """``(index, coefficient)``: full qpos = coefficient * q[index] + offset (coefficient 0 where locked)."""
+        n = int(self.full_qpos_address[-1])
+        index, coefficient = np.zeros(n, int), np.zeros(n)
+        for joint, start in self.qpos_address.items():
+            full, width = self.full_qpos_address[joint], QPOS_WIDTH[self.joint_types[joint]]
+            index[full : full + width] = np.arange(start, start + width)
+            coefficient[full : full + width] = 1.0
+        for follower, leader, multiplier in self.followers:
+            index[self.full_qpos_address[follower]] = self.qpos_address[leader]
+            coefficient[self.full_qpos_address[follower]] = multiplier
+        return index, coefficient
+
+    @cached_arrays
+    def dof_columns(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """How full Jacobian columns add up to columns of v: ``sum of J_full[:, index] * coefficient``.
+
+        The first pair takes each independent joint's own columns; each further pair adds one follower to its leader.
+        """
+        own = (
+            np.concatenate(
+                [np.arange(self.full_dof_address[j], self.full_dof_address[j + 1]) for j in self.independent]
+            ).astype(int)
+            if self.independent
+            else np.zeros(0, int)
+        )
+        terms = [(own, np.ones(self.nv))]
+        for follower, leader, multiplier in self.followers:
+            dof = self.dof_address[leader]
+            free = next((term for term in terms[1:] if term[1][dof] == 0.0), None)
+            if free is None:
+                free = np.zeros(self.nv, int), np.zeros(self.nv)
+                terms.append(free)
+            free[0][dof], free[1][dof] = self.full_dof_address[follower], multiplier
+        return tuple(terms)
+
+    @cached_arrays
+    def dof_joint(self) -> np.ndarray:
+        """The joint that each full dof belongs to."""
+        return np.repeat(np.arange(len(self.joint_types)), [DOF_WIDTH[t] for t in self.joint_types])
+
+    @cached_arrays
+    def dof_body(self) -> np.ndarray:
+        """The body that each full dof moves."""
+        return np.asarray(self.joint_bodies, int)[self.dof_joint]
+
+    @cached_arrays
+    def parents(self) -> np.ndarray:
+        """``body_parents`` as an array, of JAX's integers in either precision."""
+        return np.asarray(self.body_parents, np.int32)
+
+    @cached_property
+    def root(self) -> int:
+        """The first moving body, or the world where nothing moves."""
+        return min(1, len(self.body_parents) - 1)
+
+    @cached_arrays
+    def doublings(self) -> np.ndarray:
+        """Of each body its parent, then the ancestor 2 above it, 4, ... until that is the world for all. (k, nbody)."""
+        rounds, above = [], self.parents
+        while above.any():
+            rounds.append(above)
+            above = above[above]
+        return np.array(rounds, int).reshape(-1, len(self.parents))
+
+    @cached_arrays
+    def descendants(self) -> np.ndarray:
+        """``descendants[a, b]``: body b is a or below it. (nbody, nbody), bool."""
+        n = len(self.body_parents)
+        below = np.eye(n, dtype=bool)
+        for body in range(n - 1, 0, -1):
+            below[self.body_parents[body]] |= below[body]
+        return below
+
+    @cached_arrays
+    def moves(self) -> np.ndarray:
+        """``moves[b, i]``: full dof i moves body b. (nbody, full nv), bool."""
+        return self.descendants[self.dof_body].T
+
+    def frame(self, name: str) -> int:
+        """Index of a frame.
+
+        Raises:
+            KeyError: no such frame; the message lists those that exist.
+        """
+        try:
+            return self._frame_index[name]
+        except (KeyError, TypeError):
+            raise unknown_name("frame", name, self.frame_names) from None
+
+    def joint(self, name: str) -> int:
+        """Index of a joint (independent, follower or locked).
+
+        Raises:
+            KeyError: no such joint; the message lists those that exist.
+        """
+        try:
+            return self._joint_index[name]
+        except (KeyError, TypeError):
+            raise unknown_name("joint", name, self.joint_names) from None
+
+    @cached_property
+    def _frame_index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.frame_names)}
+
+    @cached_property
+    def _joint_index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.joint_names)}

@@ -1,0 +1,77 @@
+"""Robots of the package robot_descriptions, which clones their repositories when they are first asked for."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+from collections.abc import Iterable
+from types import ModuleType
+from typing import Any
+
+from ..._errors import OsikKeyError, OsikValueError, unknown_name
+from ._embedded import ROBOTS
+from ._mjcf import from_mjcf
+from ._urdf import from_urdf
+
+SUFFIX = "_description"
+_NEAREST = 8
+
+
+def described(name: str, **options: Any) -> dict[str, Any]:
+    """The fields of a robot that ``robot_descriptions`` knows; options as of ``from_mjcf`` and ``from_urdf``.
+
+    Raises:
+        ImportError: the package is not installed.
+        KeyError: it knows no such robot; the message lists those with names like this one.
+        ValueError: the robot comes as xacro, or as no file that can be read here.
+    """
+    known = _known(name)
+    if name not in known:
+        raise _unknown(name, known)
+    module = importlib.import_module(f"robot_descriptions.{name}")
+    if hasattr(module, "MJCF_PATH"):
+        return from_mjcf(module.MJCF_PATH, **options)
+    if hasattr(module, "URDF_PATH"):
+        return from_urdf(module.URDF_PATH, package_dirs=_package_dirs(module), **options)
+    xacro = getattr(module, "XACRO_PATH", None)
+    if xacro is None:
+        raise OsikValueError(f"robot {name!r} comes neither as MJCF nor as URDF")
+    raise OsikValueError(f"robot {name!r} comes as xacro: run xacro on {xacro!r} and load what it writes")
+
+
+def urdf_of_description(name: str) -> tuple[str, list[str]] | None:
+    """The file of a robot that comes as URDF, and the folders of its packages; ``None``: it comes otherwise."""
+    module = importlib.import_module(f"robot_descriptions.{name}")
+    if hasattr(module, "MJCF_PATH") or not hasattr(module, "URDF_PATH"):
+        return None
+    return module.URDF_PATH, _package_dirs(module)
+
+
+def _known(name: str) -> tuple[str, ...]:
+    """The robots that the package lists; where it is not installed, none, unless one is asked for by its full name."""
+    try:
+        package = importlib.import_module("robot_descriptions")
+    except ImportError as missing:
+        if name.endswith(SUFFIX):
+            raise ImportError(
+                f"robot {name!r} needs robot_descriptions: pip install 'osik-jax[descriptions]'"
+            ) from missing
+        raise unknown_name("robot", name, ROBOTS) from None
+    return tuple(package.DESCRIPTIONS)
+
+
+def _unknown(name: str, known: Iterable[str]) -> KeyError:
+    """Hundreds are known: the message lists the embedded ones, and those with names like this one."""
+    available = (*ROBOTS, *known)
+    close = difflib.get_close_matches(name, available, n=_NEAREST)
+    short = name.removesuffix(SUFFIX)
+    close += [other for other in available if short and short in other and other not in close]
+    hint = f"; did you mean {', '.join(map(repr, close[:_NEAREST]))}?" if close else "."
+    return OsikKeyError(f"no robot {name!r}{hint} robots: {', '.join(ROBOTS)}, and robot_descriptions.DESCRIPTIONS")
+
+
+def _package_dirs(module: ModuleType) -> list[str]:
+    """Where the description's ``package://`` addresses may lead."""
+    roots = [getattr(module, name) for name in ("PACKAGE_PATH", "REPOSITORY_PATH") if hasattr(module, name)]
+    return [*roots, *map(os.path.dirname, roots)]

@@ -1,0 +1,16 @@
+"""Robots that come with the package: MJCF files under ``osik_jax/robot/models``."""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Any
+
+from ._mjcf import from_mjcf
+
+ROBOTS = ("nao", "arm7")
+
+
+def embedded(name: str, **options: Any) -> dict[str, Any]:
+    """The fields of an embedded robot, one of ``ROBOTS``; options as of ``from_mjcf``."""
+    text = (resources.files("osik_jax") / "robot" / "models" / f"{name}.xml").read_text(encoding="utf-8")
+    return from_mjcf(text, **options)

@@ -1,0 +1,97 @@
+"""XML given as a path or as text: found, read and parsed, with errors that say where."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import NamedTuple
+
+from ..._errors import OsikTypeError, OsikValueError
+
+_ROOTS = {"robot": "a URDF: use Robot.from_urdf", "mujoco": "an MJCF: use Robot.from_mjcf", "sdf": "an SDF"}
+
+
+def is_mjcf(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is in MuJoCo's format, told by what is in it."""
+    text = Path(path).read_text(encoding="utf-8", errors="replace")
+    return "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]
+
+
+class Source(NamedTuple):
+    """XML before it is parsed.
+
+    Attributes:
+        label: what error messages call it: the file's path, or "the XML text".
+        content: the XML.
+        path: of the file, None where the text itself was given.
+    """
+
+    label: str
+    content: str | bytes
+    path: Path | None
+
+
+def read_source(given: str | os.PathLike[str], kind: str) -> Source:
+    """Reads a file, or takes the text itself (anything that starts with ``<``).
+
+    Raises:
+        FileNotFoundError: no such file; the message lists the files of the same suffix that lie there.
+        TypeError: neither a path nor text.
+        ValueError: an empty text.
+    """
+    if not isinstance(given, str | os.PathLike):
+        raise OsikTypeError(f"{given!r} is no {kind}: give a path, or the XML text itself")
+    if not str(given).strip():
+        raise OsikValueError(f"the {kind} is an empty text: give a path, or the XML text itself")
+    if isinstance(given, str) and given.lstrip("\ufeff \t\r\n").startswith("<"):
+        return Source("the XML text", given.lstrip("\ufeff \t\r\n"), None)
+    path = Path(given)
+    if not os.path.isfile(path):
+        raise FileNotFoundError(_missing(path, kind))
+    return Source(str(path), path.read_bytes(), path)
+
+
+def parse_xml(source: Source) -> ElementTree.Element:
+    """The root element. Comments may hold ``--``, which strict XML forbids and robot files often do.
+
+    Raises:
+        ValueError: the XML is broken; the message gives line and column.
+    """
+    try:
+        return ElementTree.fromstring(_without_comments(source.content))
+    except ElementTree.ParseError as error:
+        line, column = error.position
+        reason = str(error).partition(":")[0]
+        raise OsikValueError(f"{source.label}: broken XML at line {line}, column {column + 1}: {reason}") from None
+
+
+def check_root(root: ElementTree.Element, expected: str, source: Source) -> None:
+    """Raises ValueError where the root element is not ``expected`` ("robot" or "mujoco")."""
+    if root.tag != expected:
+        what = _ROOTS.get(root.tag, "not a robot description that can be read here")
+        raise OsikValueError(f"{source.label}: the root element is <{root.tag}>, not <{expected}>: this is {what}")
+
+
+def _without_comments(content: str | bytes) -> str | bytes:
+    """Comments become the line breaks in them, so that line numbers stay."""
+    if isinstance(content, bytes):  # latin-1 maps every byte to one character and back
+        return _blank(content.decode("latin-1")).encode("latin-1")
+    return _blank(content)
+
+
+def _blank(text: str) -> str:
+    return re.sub("<!--.*?-->", lambda comment: "\n" * comment.group().count("\n"), text, flags=re.DOTALL)
+
+
+def _missing(path: Path, kind: str) -> str:
+    if not os.path.isdir(path.parent):
+        return f"no {kind} file {str(path)!r}: the folder {str(path.parent)!r} does not exist"
+    folder = path if os.path.isdir(path) else path.parent
+    suffix = path.suffix or f".{'urdf' if kind == 'URDF' else 'xml'}"
+    there = sorted(entry.name for entry in folder.iterdir() if entry.suffix == suffix)
+    close = difflib.get_close_matches(path.name, there, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else "."
+    return f"no {kind} file {str(path)!r}{hint} {suffix} files in {str(folder)!r}: {', '.join(there) or '(none)'}"

@@ -1,0 +1,246 @@
+"""URDF to the fields of a Robot, by way of a MuJoCo model that holds all that the URDF says about the kinematics."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ..._errors import OsikValueError, warn
+from .._feet import find_feet
+from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, as_mapping, from_mjmodel, quaternion
+from ._packages import Packages, is_uri
+from ._source import check_root, parse_xml, read_source
+from ._urdf_elements import IDENTITY, Joint, Link, Pose, Shape, Urdf, read_urdf
+
+WORLD = "world"
+FLOATING_BASE = "floating_base"
+
+GEOMS = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
+_VISUAL_GROUP, _COLLISION_GROUP = 2, 3
+_MESH_SUFFIXES = (".stl", ".obj", ".msh")
+
+
+def from_urdf(
+    urdf: str | os.PathLike[str],
+    *,
+    floating_base: bool | None = None,
+    velocity_limits: Mapping[str, float] | None = None,
+    position_limits: Mapping[str, tuple[float, float]] | None = None,
+    locked_joints: Iterable[str] | Mapping[str, float] = (),
+    collision_meshes: bool = False,
+    package_dirs: Iterable[str | os.PathLike[str]] = (),
+) -> dict[str, Any]:
+    """The fields of a Robot from a URDF file or text; see ``Robot.from_urdf``."""
+    packages = Packages(package_dirs)
+    source = read_source(packages.path(urdf) if is_uri(urdf) else urdf, "URDF")
+    root = parse_xml(source)
+    check_root(root, "robot", source)
+    try:
+        description = _with_base(read_urdf(root), floating_base, source.label)
+        spec = urdf_spec(description)
+        if collision_meshes:
+            _add_meshes(spec, description, packages, source.path)
+        model = spec.compile()
+    except ValueError as error:
+        raise OsikValueError(f"{source.label}: {error}") from None
+    locked = as_mapping(locked_joints)
+    if floating_base is False:
+        locked = {j.name: None for j in description.joints if j.kind == "floating"} | locked
+    return from_mjmodel(model, velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked)
+
+
+def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
+    """Adds the floating base, as a joint from the world to the root link, where there should be one."""
+    has_one = any(joint.kind == "floating" for joint in urdf.joints)
+    wanted = _guess_floats(urdf, has_one, label) if floating_base is None else floating_base
+    if urdf.root == WORLD:
+        return _freed_from_world(urdf) if wanted and not has_one else urdf
+    kind = "floating" if wanted and not has_one else "fixed"
+    base = Joint(_base_name(urdf), kind, WORLD, urdf.root, IDENTITY, np.zeros(3), -math.inf, math.inf, math.inf, None)
+    if WORLD in urdf.links:
+        raise OsikValueError(f"only the root link may be called {WORLD!r}, and the root link is {urdf.root!r}")
+    world = Link(WORLD, 0.0, IDENTITY, np.zeros((3, 3)), ())
+    return Urdf(urdf.name, {WORLD: world, **urdf.links}, (base, *urdf.joints), WORLD)
+
+
+def _guess_floats(urdf: Urdf, has_free_joint: bool, label: str) -> bool:
+    """Whether the base floats where nobody says so: with feet it does, and where it does not for want of feet warns."""
+    if urdf.root == WORLD or has_free_joint:
+        return False
+    bodies = {urdf.root: 0}
+    parents = [0]
+    for joint in urdf.joints:
+        if joint.kind == "fixed":
+            bodies[joint.child] = bodies[joint.parent]
+        else:
+            bodies[joint.child] = len(parents)
+            parents.append(bodies[joint.parent])
+    if find_feet(bodies.items(), parents):
+        return True
+    warn(
+        f"{label}: the URDF does not say whether its base moves, and no two of its outermost links are called like "
+        f"feet: the root link {urdf.root!r} is fixed to the world. Say what is meant: floating_base=False, or "
+        "floating_base=True"
+    )
+    return False
+
+
+def _freed_from_world(urdf: Urdf) -> Urdf:
+    """Turns the one fixed joint below a root link called world into the floating base."""
+    first, *others = [joint for joint in urdf.joints if joint.parent == WORLD] or [None]
+    if first is None or others or first.kind != "fixed":
+        raise OsikValueError(
+            f"floating_base=True, but the root link is {WORLD!r}: one fixed joint has to hang from it, to be freed. "
+            f"Joints there: {', '.join(j.name for j in (first, *others) if j) or '(none)'}"
+        )
+    free = dataclasses.replace(first, name=_base_name(urdf), kind="floating")
+    return dataclasses.replace(urdf, joints=tuple(free if joint is first else joint for joint in urdf.joints))
+
+
+def _base_name(urdf: Urdf) -> str:
+    name = FLOATING_BASE
+    while any(joint.name == name for joint in urdf.joints):
+        name += "_"
+    return name
+
+
+def urdf_spec(urdf: Urdf) -> mujoco.MjSpec:
+    """The MuJoCo model: a body for every link but the root, which is the world.
+
+    Mimic joints are joint equality constraints and speed limits are custom numerics, which ``from_mjmodel`` reads.
+    Moving links without mass or inertia get 2e-15 kg and kg m^2. Shapes have no mass and touch nothing.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = urdf.name
+    spec.compiler.degree = False
+    spec.compiler.balanceinertia = True
+    _add_shapes(spec.worldbody, urdf.links[urdf.root])
+    bodies = {urdf.root: spec.worldbody}
+    fixed_at = {urdf.root: IDENTITY}
+    for joint in urdf.joints:
+        parent, pose = bodies[joint.parent], joint.origin
+        if joint.kind == "fixed" and joint.parent in fixed_at:
+            fixed_at[joint.child] = fixed_at[joint.parent] @ pose
+        if joint.kind == "floating":
+            parent, pose = spec.worldbody, _free_pose(joint, fixed_at)
+        bodies[joint.child] = _add_body(parent, pose, urdf.links[joint.child], moving=joint.kind != "fixed")
+        _add_joint(spec, bodies[joint.child], joint)
+    for joint in urdf.joints:
+        _add_mimic(spec, joint)
+    return spec
+
+
+def _free_pose(joint: Joint, fixed_at: Mapping[str, Pose]) -> Pose:
+    if joint.parent not in fixed_at:
+        raise OsikValueError(
+            f"floating joint {joint.name!r} hangs from {joint.parent!r}, which moves: it has to be fixed"
+        )
+    return fixed_at[joint.parent] @ joint.origin
+
+
+def _add_body(parent: mujoco.MjsBody, pose: Pose, link: Link, *, moving: bool) -> mujoco.MjsBody:
+    moments, axes = np.linalg.eigh(link.inertia)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    least = LEAST_INERTIA if moving else 0.0
+    body = parent.add_body(
+        name=link.name,
+        pos=pose.position,
+        quat=quaternion(pose.rotation),
+        mass=max(link.mass, least),
+        ipos=link.inertial.position,
+        iquat=quaternion(link.inertial.rotation @ axes),
+        inertia=np.maximum(moments, least),
+        explicitinertial=True,
+    )
+    _add_shapes(body, link)
+    return body
+
+
+def _add_shapes(body: mujoco.MjsBody, link: Link) -> None:
+    for shape in link.shapes:
+        if shape.kind in GEOMS:
+            _add_geom(body, shape, type=GEOMS[shape.kind], size=geom_size(shape))
+
+
+def _add_geom(body: mujoco.MjsBody, shape: Shape, **form: Any) -> None:
+    color = {} if shape.color is None else {"rgba": shape.color}
+    body.add_geom(
+        pos=shape.pose.position,
+        quat=quaternion(shape.pose.rotation),
+        group=_VISUAL_GROUP if shape.visual else _COLLISION_GROUP,
+        contype=0,
+        conaffinity=0,
+        mass=0.0,
+        **form,
+        **color,
+    )
+
+
+def _add_meshes(spec: mujoco.MjSpec, urdf: Urdf, packages: Packages, beside: Path | None) -> None:
+    """Adds the collision shapes that are meshes; a file at one scale is read once."""
+    names: dict[tuple[Path, tuple[float, ...]], str] = {}
+    for link in urdf.links.values():
+        body = spec.worldbody if link.name == urdf.root else spec.body(link.name)
+        for shape in link.shapes:
+            if shape.kind != "mesh" or shape.visual:
+                continue
+            key = packages.path(shape.file, beside=beside), shape.size
+            _check_mesh(key[0], link.name)
+            if key not in names:
+                names[key] = f"{key[0].stem}_{len(names)}"
+                spec.add_mesh(name=names[key], file=str(key[0]), scale=shape.size)
+            _add_geom(body, shape, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=names[key])
+
+
+def _check_mesh(path: Path, link: str) -> None:
+    if path.suffix.lower() not in _MESH_SUFFIXES:
+        raise OsikValueError(
+            f"link {link!r}: MuJoCo cannot read the mesh {str(path)!r}; it reads {', '.join(_MESH_SUFFIXES)}"
+        )
+
+
+def geom_size(shape: Shape) -> list[float]:
+    """MuJoCo's sizes: radius first, then half lengths."""
+    if shape.kind == "box":
+        return [edge / 2.0 for edge in shape.size]
+    radius, *length = shape.size
+    return [radius, *(value / 2.0 for value in length), 0.0, 0.0][:3]
+
+
+def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, joint: Joint) -> None:
+    if joint.kind == "floating":
+        body.add_freejoint(name=joint.name)
+    elif joint.kind != "fixed":
+        slides = joint.kind == "prismatic"
+        limits = {}
+        if math.isfinite(joint.lower):
+            # MuJoCo asks for lower < upper: equal limits are one unit in the last place apart.
+            limits["range"] = [joint.lower, max(joint.upper, np.nextafter(joint.lower, math.inf))]
+        body.add_joint(
+            name=joint.name,
+            type=mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE,
+            axis=joint.axis,
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE if limits else mujoco.mjtLimited.mjLIMITED_FALSE,
+            **limits,
+        )
+        if math.isfinite(joint.speed):
+            spec.add_numeric(name=VELOCITY_LIMIT_PREFIX + joint.name, data=[joint.speed], size=1)
+
+
+def _add_mimic(spec: mujoco.MjSpec, joint: Joint) -> None:
+    if joint.mimic is not None:
+        equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint.name, name2=joint.mimic.leader)
+        equality.data[:2] = joint.mimic.offset, joint.mimic.multiplier
+        equality.data[2:5] = 0.0

@@ -1,0 +1,360 @@
+"""A URDF's links and joints as plain data, checked to form one tree."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from ..._errors import OsikValueError
+
+JOINT_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating")
+_SCALAR = ("revolute", "continuous", "prismatic")
+_Color = tuple[float, ...]
+
+
+class Pose(NamedTuple):
+    """Position (3,) [m] and rotation (3, 3) of a frame in another."""
+
+    position: np.ndarray
+    rotation: np.ndarray
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.position + self.rotation @ other.position, self.rotation @ other.rotation)
+
+
+IDENTITY = Pose(np.zeros(3), np.eye(3))
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A box (full edges), sphere (radius), cylinder or capsule (radius, length) [m], or a mesh (scale of its file)."""
+
+    kind: str
+    size: tuple[float, ...]
+    pose: Pose
+    color: _Color | None
+    visual: bool
+    file: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """A link. ``inertial`` has its origin at the centre of mass and the axes that ``inertia`` (3, 3) [kg m^2] is in."""
+
+    name: str
+    mass: float
+    inertial: Pose
+    inertia: np.ndarray
+    shapes: tuple[Shape, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Mimic:
+    """``q = multiplier * q_leader + offset``."""
+
+    leader: str
+    multiplier: float
+    offset: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """A joint; ``lower``, ``upper`` and ``speed`` are infinite where the joint is free."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Pose
+    axis: np.ndarray
+    lower: float
+    upper: float
+    speed: float
+    mimic: Mimic | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Urdf:
+    """A robot: links by name, joints with parents before children, the link that has no parent."""
+
+    name: str
+    links: Mapping[str, Link]
+    joints: tuple[Joint, ...]
+    root: str
+
+
+def read_urdf(element: ElementTree.Element) -> Urdf:
+    """Links and joints of a ``<robot>`` element; everything else in it is ignored.
+
+    Raises:
+        ValueError: an element is broken, or the links do not form one tree; the message names it.
+    """
+    _refuse_xacro(element)
+    colors = {m.get("name", ""): color for m in element.findall("material") if (color := _rgba(m))}
+    links = _by_name("link", (_link(e, colors) for e in element.findall("link")))
+    if not links:
+        raise OsikValueError("the URDF has no <link>")
+    joints = _by_name("joint", (_joint(e) for e in element.findall("joint")))
+    root = _root(links, joints)
+    _check_mimics(joints)
+    return Urdf(element.get("name", ""), links, tuple(_parents_first(root, links, joints)), root)
+
+
+def _refuse_xacro(element: ElementTree.Element) -> None:
+    for child in element.iter():
+        if isinstance(child.tag, str) and "xacro" in child.tag.rpartition("}")[0]:
+            name = child.tag.rpartition("}")[2]
+            raise OsikValueError(f"the file holds the xacro element <xacro:{name}>: run xacro and load what it writes")
+
+
+_Named = TypeVar("_Named", Link, Joint)
+
+
+def _by_name(kind: str, items: Iterable[_Named]) -> dict[str, _Named]:
+    out: dict[str, _Named] = {}
+    for item in items:
+        if item.name in out:
+            raise OsikValueError(f"two {kind}s are called {item.name!r}")
+        out[item.name] = item
+    return out
+
+
+def _attribute(element: ElementTree.Element | None, name: str, where: str) -> str:
+    value = None if element is None else element.get(name)
+    if value is None:
+        raise OsikValueError(f"{where}: the attribute {name!r} is missing")
+    return value
+
+
+def _numbers(text: str, count: int, where: str) -> np.ndarray:
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.full(0, np.nan)
+    if len(values) != count or not np.isfinite(values).all():
+        raise OsikValueError(
+            f"{where}: {text!r} is not {'a finite number' if count == 1 else f'{count} finite numbers'}"
+        )
+    return values
+
+
+def _number(element: ElementTree.Element, name: str, where: str, default: str | None = None) -> float:
+    text = _attribute(element, name, where) if default is None else element.get(name, default)
+    return float(_numbers(text, 1, f"{where}, {name}")[0])
+
+
+def _origin(element: ElementTree.Element, where: str) -> Pose:
+    origin = element.find("origin")
+    if origin is None:
+        return IDENTITY
+    position = _numbers(origin.get("xyz", "0 0 0"), 3, f"{where}, origin xyz")
+    if "quat_xyzw" in origin.attrib:
+        x, y, z, w = _numbers(origin.attrib["quat_xyzw"], 4, f"{where}, origin quat_xyzw")
+        return Pose(position, _from_quaternion(np.array([w, x, y, z]), where))
+    return Pose(position, _from_angles(*_numbers(origin.get("rpy", "0 0 0"), 3, f"{where}, origin rpy")))
+
+
+def _from_quaternion(quaternion: np.ndarray, where: str) -> np.ndarray:
+    length = np.linalg.norm(quaternion)
+    if length == 0.0:
+        raise OsikValueError(f"{where}: the quaternion is zero")
+    w, *xyz = quaternion / length
+    x, y, z = xyz
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+
+
+def _from_angles(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Rotation about the fixed axes x, then y, then z [rad]."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    return about_z @ about_y @ about_x
+
+
+def _link(element: ElementTree.Element, colors: Mapping[str, _Color]) -> Link:
+    name = _attribute(element, "name", "a <link>")
+    where = f"link {name!r}"
+    shapes = [_shape(e, colors, where) for e in element if e.tag in ("visual", "collision")]
+    mass, inertial, inertia = _inertial(element.find("inertial"), where)
+    return Link(name, mass, inertial, inertia, tuple(shape for shape in shapes if shape is not None))
+
+
+def _inertial(element: ElementTree.Element | None, where: str) -> tuple[float, Pose, np.ndarray]:
+    if element is None:
+        return 0.0, IDENTITY, np.zeros((3, 3))
+    where = f"{where}, inertial"
+    mass_element = element.find("mass")
+    mass = 0.0 if mass_element is None else _number(mass_element, "value", f"{where}, mass")
+    if mass < 0.0:
+        raise OsikValueError(f"{where}: the mass {mass} is negative")
+    moments = element.find("inertia")
+    inertia = np.zeros((3, 3))
+    for row, column in np.ndindex(3, 3):
+        key = "i" + "".join("xyz"[k] for k in sorted((row, column)))
+        inertia[row, column] = 0.0 if moments is None else _number(moments, key, f"{where}, inertia", "0")
+    return mass, _origin(element, where), inertia
+
+
+def _rgba(material: ElementTree.Element | None) -> _Color | None:
+    color = None if material is None else material.find("color")
+    if color is None:
+        return None
+    return tuple(_numbers(color.get("rgba", ""), 4, "material, color rgba"))
+
+
+def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], where: str) -> Shape | None:
+    """None for shapes without size."""
+    shapes = [e for e in element.findall("geometry/*") if e.tag in ("box", "sphere", "cylinder", "capsule", "mesh")]
+    if not shapes:
+        return None
+    (shape, *_), where = shapes, f"{where}, {element.tag}"
+    size, file = _size(shape, where), ""
+    if shape.tag == "mesh":
+        file = _attribute(shape, "filename", f"{where}, mesh")
+    elif min(size) <= 0.0:
+        return None
+    material = element.find("material")
+    color = _rgba(material) or (None if material is None else colors.get(material.get("name", "")))
+    return Shape(shape.tag, size, _origin(element, where), color, element.tag == "visual", file)
+
+
+def _size(shape: ElementTree.Element, where: str) -> tuple[float, ...]:
+    if shape.tag == "mesh":
+        return tuple(_numbers(shape.get("scale", "1 1 1"), 3, f"{where}, mesh scale"))
+    if shape.tag == "box":
+        return tuple(_numbers(_attribute(shape, "size", where), 3, f"{where}, box size"))
+    lengths = ("radius",) if shape.tag == "sphere" else ("radius", "length")
+    return tuple(_number(shape, name, f"{where}, {shape.tag}") for name in lengths)
+
+
+def _joint(element: ElementTree.Element) -> Joint:
+    name = _attribute(element, "name", "a <joint>")
+    where = f"joint {name!r}"
+    kind = _attribute(element, "type", where)
+    if kind not in JOINT_KINDS:
+        advice = "; write it as two prismatic joints and a continuous one" if kind == "planar" else ""
+        raise OsikValueError(
+            f"{where} has the type {kind!r}, which is not supported{advice}. Types: {', '.join(JOINT_KINDS)}"
+        )
+    lower, upper, speed = _joint_limits(element.find("limit"), kind, where)
+    return Joint(
+        name=name,
+        kind=kind,
+        parent=_attribute(element.find("parent"), "link", f"{where}, parent"),
+        child=_attribute(element.find("child"), "link", f"{where}, child"),
+        origin=_origin(element, where),
+        axis=_axis(element.find("axis"), where) if kind in _SCALAR else np.array([1.0, 0.0, 0.0]),
+        lower=lower,
+        upper=upper,
+        speed=speed,
+        mimic=_mimic(element.find("mimic"), where) if kind in _SCALAR else None,
+    )
+
+
+def _axis(element: ElementTree.Element | None, where: str) -> np.ndarray:
+    axis = np.array([1.0, 0.0, 0.0]) if element is None else _numbers(element.get("xyz", "1 0 0"), 3, f"{where}, axis")
+    length = np.linalg.norm(axis)
+    if length == 0.0:
+        raise OsikValueError(f"{where}: the axis is zero")
+    return axis / length
+
+
+def _joint_limits(element: ElementTree.Element | None, kind: str, where: str) -> tuple[float, float, float]:
+    """``(lower, upper, speed)``; no ``<limit>`` is no limit, and a speed of 0 is read as unknown."""
+    if element is None or kind not in _SCALAR:
+        return -math.inf, math.inf, math.inf
+    where = f"{where}, limit"
+    speed = _number(element, "velocity", where, "0")
+    if speed < 0.0:
+        raise OsikValueError(f"{where}: the velocity {speed} is negative")
+    speed = speed or math.inf
+    if kind == "continuous":
+        return -math.inf, math.inf, speed
+    lower, upper = (_number(element, name, where, "0") for name in ("lower", "upper"))
+    if lower > upper:
+        raise OsikValueError(f"{where}: lower {lower} > upper {upper}")
+    return lower, upper, speed
+
+
+def _mimic(element: ElementTree.Element | None, where: str) -> Mimic | None:
+    if element is None:
+        return None
+    where = f"{where}, mimic"
+    leader = _attribute(element, "joint", where)
+    return Mimic(leader, _number(element, "multiplier", where, "1"), _number(element, "offset", where, "0"))
+
+
+def _root(links: Mapping[str, Link], joints: Mapping[str, Joint]) -> str:
+    """The one link without a parent."""
+    parent_joint: dict[str, str] = {}
+    for joint in joints.values():
+        for role, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in links:
+                raise OsikValueError(f"joint {joint.name!r}: {_no_such('link', link, links)} (its {role})")
+        if joint.child in parent_joint:
+            raise OsikValueError(
+                f"link {joint.child!r} is the child of two joints, {parent_joint[joint.child]!r} and {joint.name!r}: "
+                "a URDF is a tree, and closed loops cannot be written in it"
+            )
+        parent_joint[joint.child] = joint.name
+    roots = [name for name in links if name not in parent_joint]
+    if not roots:
+        raise OsikValueError(
+            f"the joints form a loop: every link has a parent, so there is no root. links: {', '.join(links)}"
+        )
+    if len(roots) > 1:
+        raise OsikValueError(f"{len(roots)} links have no parent, one has to be the root: {', '.join(roots)}")
+    return roots[0]
+
+
+def _parents_first(root: str, links: Mapping[str, Link], joints: Mapping[str, Joint]) -> Iterator[Joint]:
+    """Joints from the root outwards; a ValueError names the links that cannot be reached."""
+    below: dict[str, list[Joint]] = {name: [] for name in links}
+    for joint in joints.values():
+        below[joint.parent].append(joint)
+    queue, reached = [root], {root}
+    for link in queue:
+        for joint in below[link]:
+            queue.append(joint.child)
+            reached.add(joint.child)
+            yield joint
+    if len(reached) < len(links):
+        lost = ", ".join(name for name in links if name not in reached)
+        raise OsikValueError(f"the joints form a loop that the root {root!r} does not reach: {lost}")
+
+
+def _check_mimics(joints: Mapping[str, Joint]) -> None:
+    for joint in joints.values():
+        if joint.mimic is None:
+            continue
+        leader = joints.get(joint.mimic.leader)
+        if leader is None:
+            raise OsikValueError(
+                f"joint {joint.name!r} mimics what is not there: {_no_such('joint', joint.mimic.leader, joints)}"
+            )
+        if leader.kind not in _SCALAR:
+            raise OsikValueError(f"joint {joint.name!r} mimics {leader.name!r}, which is {leader.kind}")
+        _check_chain(joint, joints)
+
+
+def _check_chain(joint: Joint, joints: Mapping[str, Joint]) -> None:
+    chain = [joint.name]
+    while (mimic := joints[chain[-1]].mimic) is not None and mimic.leader in joints:
+        if mimic.leader in chain:
+            raise OsikValueError(f"mimic joints follow each other in a circle: {' -> '.join([*chain, mimic.leader])}")
+        chain.append(mimic.leader)
+
+
+def _no_such(kind: str, name: str, available: Iterable[str]) -> str:
+    available = list(available)
+    close = difflib.get_close_matches(name, available, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else "."
+    return f"no {kind} {name!r}{hint} {kind}s: {', '.join(available) or '(none)'}"

@@ -1,0 +1,295 @@
+"""A Robot as the text of an MJCF file, from its leaves."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from typing import TYPE_CHECKING, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..._errors import OsikValueError
+from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
+from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, quaternion, rotation_matrix
+from ._urdf_elements import IDENTITY, Pose
+
+if TYPE_CHECKING:
+    from .._robot import Robot
+
+_TYPES = {FREE: "free", BALL: "ball", SLIDE: "slide", HINGE: "hinge"}
+_SHAPES = {
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")): name
+    for name in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box")
+}
+_ROUNDING = 1e-9
+"""Of its greatest moment of inertia, by which a body may break the triangle inequality for rounding alone."""
+
+_SAME = 1e-6
+"""Up to this, a frame and what it is the frame of are in one place [m, or entries of a rotation matrix]."""
+
+
+class _JointPlace(NamedTuple):
+    """A joint that stays, with its anchor and axis in its body."""
+
+    joint: int
+    anchor: np.ndarray
+    axis: np.ndarray
+
+
+def to_mjcf(robot: Robot) -> str:
+    """The robot as MJCF; see ``Robot.to_mjcf``."""
+    if np.ndim(robot.body_position) != 2:
+        raise OsikValueError(
+            f"a stack of robots, body_position {np.shape(robot.body_position)}: write them one by one, "
+            "jax.tree.map(lambda leaf: leaf[0], robots)"
+        )
+    root = ElementTree.Element("mujoco", model=_model_name(robot))
+    ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true", balanceinertia="true")
+    bodies = [ElementTree.SubElement(root, "worldbody")]
+    for body in range(1, len(robot.tree.body_names)):
+        bodies.append(_body(robot, body, bodies[robot.tree.body_parents[body]]))
+    _add_frames(robot, bodies)
+    _add_speeds(robot, ElementTree.SubElement(root, "custom"))
+    _add_followers(robot, ElementTree.SubElement(root, "equality"))
+    _add_home(robot, ElementTree.SubElement(root, "keyframe"))
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _model_name(robot: Robot) -> str:
+    """MuJoCo keeps it at the start of the model's names."""
+    return robot.mj_model.names.partition(b"\0")[0].decode() or "robot"
+
+
+def _text(values: ArrayLike) -> str:
+    """Numbers that read back as they are."""
+    return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, float)))
+
+
+def _put(parent: ElementTree.Element, tag: str, **values: str | ArrayLike) -> ElementTree.Element:
+    texts = {key: value if isinstance(value, str) else _text(value) for key, value in values.items()}
+    return ElementTree.SubElement(parent, tag, texts)
+
+
+# --- bodies and joints ---
+
+
+def _body(robot: Robot, body: int, parent: ElementTree.Element) -> ElementTree.Element:
+    pose, joints = _pose_and_joints(robot, body)
+    element = _put(parent, "body", name=robot.tree.body_names[body], pos=pose.position, quat=quaternion(pose.rotation))
+    _add_inertial(robot, body, element, moving=bool(joints))
+    for place in joints:
+        _add_joint(robot, place, element)
+    return element
+
+
+def _pose_and_joints(robot: Robot, body: int) -> tuple[Pose, list[_JointPlace]]:
+    """Where the body sits in its parent, locked joints at their values, and the joints that are left.
+
+    A locked joint moves the body's frame, so the anchors and axes of the joints before it are told from there.
+    """
+    tree = robot.tree
+    position, axes = (np.asarray(leaf[body], float) for leaf in (robot.body_position, robot.body_quaternion))
+    pose, joints = Pose(position, rotation_matrix(axes)), []
+    for joint in (j for j, owner in enumerate(tree.joint_bodies) if owner == body):
+        place = _JointPlace(
+            joint, *(np.asarray(leaf[joint], float) for leaf in (robot.joint_position, robot.joint_axis))
+        )
+        if joint not in tree.locked:
+            joints.append(place)
+        elif tree.joint_types[joint] == FREE:
+            pose = _free_pose(robot, joint)
+        else:
+            motion = _motion(robot, place)
+            pose = pose @ motion
+            joints = [_seen_from(motion, other) for other in joints]
+    return pose, joints
+
+
+def _values(robot: Robot, joint: int) -> np.ndarray:
+    """What a locked joint is locked at."""
+    start = robot.tree.full_qpos_address[joint]
+    return np.asarray(robot.qpos_offset, float)[start : start + QPOS_WIDTH[robot.tree.joint_types[joint]]]
+
+
+def _reference(robot: Robot, joint: int) -> float:
+    return float(robot.joint_reference[robot.tree.full_qpos_address[joint]])
+
+
+def _free_pose(robot: Robot, joint: int) -> Pose:
+    values = _values(robot, joint)
+    return Pose(values[:3], rotation_matrix(values[3:]))
+
+
+def _motion(robot: Robot, place: _JointPlace) -> Pose:
+    """By what a locked joint moves its body's frame, in that frame."""
+    kind, values = robot.tree.joint_types[place.joint], _values(robot, place.joint)
+    if kind == BALL:
+        return _about(place.anchor, rotation_matrix(values))
+    moved = float(values[0]) - _reference(robot, place.joint)
+    if kind == SLIDE:
+        return Pose(moved * place.axis, np.eye(3))
+    turn = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, place.axis, moved)
+    return _about(place.anchor, rotation_matrix(turn))
+
+
+def _about(anchor: np.ndarray, rotation: np.ndarray) -> Pose:
+    return Pose(anchor - rotation @ anchor, rotation)
+
+
+def _seen_from(motion: Pose, place: _JointPlace) -> _JointPlace:
+    """A joint of the same body, told in the frame that a locked joint after it has moved.
+
+    That does not change its coordinate: MuJoCo lets nothing that turns come after a ball joint.
+    """
+    back = motion.rotation.T
+    return _JointPlace(place.joint, back @ (place.anchor - motion.position), back @ place.axis)
+
+
+def _add_inertial(robot: Robot, body: int, element: ElementTree.Element, *, moving: bool) -> None:
+    """Mass and principal moments, at least what MuJoCo asks of what moves."""
+    mass, least = float(robot.body_mass[body]), LEAST_INERTIA if moving else 0.0
+    if max(mass, least) == 0.0:
+        return
+    moments, axes = np.linalg.eigh(np.asarray(robot.body_inertia[body], float))
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    excess = moments[2] - moments[0] - moments[1]
+    if 0.0 < excess <= _ROUNDING * moments[2]:
+        moments[0] += 2.0 * excess
+    _put(
+        element,
+        "inertial",
+        mass=max(mass, least),
+        pos=robot.body_com[body],
+        quat=quaternion(axes),
+        diaginertia=np.maximum(moments, least),
+    )
+
+
+def _add_joint(robot: Robot, place: _JointPlace, element: ElementTree.Element) -> None:
+    tree, joint = robot.tree, place.joint
+    kind, name = tree.joint_types[joint], tree.joint_names[joint]
+    values: dict[str, str | ArrayLike] = {}
+    if kind in (HINGE, SLIDE):
+        values |= dict(axis=place.axis, ref=_reference(robot, joint))
+    if kind != FREE:
+        values |= dict(pos=place.anchor)
+    start, end = tree.full_dof_address[joint : joint + 2]
+    armature = _one(robot.dof_armature[start:end], name, "armature")
+    if armature:
+        values |= dict(armature=armature)
+    _put(element, "joint", name=name, type=_TYPES[kind], **values, **_range(robot, joint))
+
+
+def _range(robot: Robot, joint: int) -> dict[str, ArrayLike]:
+    """Limits of an independent joint; a follower has those of its leader, which the leader keeps."""
+    tree, name = robot.tree, robot.tree.joint_names[joint]
+    if joint not in tree.dof_address:
+        return {}
+    dof = _dofs(robot, joint)
+    lower, upper = (np.asarray(leaf[dof], float) for leaf in (robot.position_lower, robot.position_upper))
+    if np.isinf(lower).all() and np.isinf(upper).all():
+        return {}
+    if tree.joint_types[joint] in (FREE, BALL):
+        raise OsikValueError(f"joint {name!r} is free or ball: MJCF has no place for its position limits")
+    low, high = float(lower[0]), float(upper[0])
+    if math.isinf(low) or math.isinf(high):
+        raise OsikValueError(f"joint {name!r} is limited on one side, [{low}, {high}]: MJCF has both limits or none")
+    # MuJoCo asks for lower < upper: equal limits are one unit in the last place apart.
+    return dict(range=(low, max(high, math.nextafter(low, math.inf))))
+
+
+def _dofs(robot: Robot, joint: int) -> slice:
+    """The entries of v that belong to an independent joint."""
+    tree = robot.tree
+    start = tree.dof_address[joint]
+    return slice(start, start + tree.full_dof_address[joint + 1] - tree.full_dof_address[joint])
+
+
+def _one(values: ArrayLike, joint: str, what: str) -> float:
+    """The one value that all dofs of a joint share."""
+    first, *others = np.asarray(values, float)
+    if any(other != first for other in others):
+        raise OsikValueError(f"the dofs of joint {joint!r} differ in {what}: MJCF has one value a joint")
+    return float(first)
+
+
+# --- frames and shapes ---
+
+
+def _add_frames(robot: Robot, bodies: list[ElementTree.Element]) -> None:
+    """Geoms of simple shapes, and as sites all frames that are neither those nor bodies."""
+    tree = robot.tree
+    done = dict.fromkeys(tree.body_names, IDENTITY) | _add_geoms(robot, bodies)
+    for k, (name, body) in enumerate(zip(tree.frame_names, tree.frame_bodies, strict=True)):
+        pose = _pose(robot.frame_position[k], robot.frame_rotation[k])
+        if name not in done:
+            _put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
+        elif not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(pose, done[name], strict=True)):
+            raise OsikValueError(
+                f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
+            )
+
+
+def _pose(position: ArrayLike, rotation: ArrayLike) -> Pose:
+    return Pose(np.asarray(position, float), np.asarray(rotation, float))
+
+
+def _add_geoms(robot: Robot, bodies: list[ElementTree.Element]) -> dict[str, Pose]:
+    """The shapes that need no file; the frames that are their names, and where they are."""
+    model, tree = robot.mj_model, robot.tree
+    done: dict[str, Pose] = {}
+    for g in (g for g, kind in enumerate(tree.geom_types) if kind in _SHAPES):
+        pose = _pose(robot.geom_position[g], robot.geom_rotation[g])
+        values, name = _appearance(model, g), mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g)
+        if name:
+            name = f"geom:{name}" if f"geom:{name}" in tree.frame_names else name
+            done[name] = pose
+            values |= dict(name=name)
+        places = dict(size=robot.geom_size[g], pos=pose.position, quat=quaternion(pose.rotation))
+        _put(bodies[tree.geom_bodies[g]], "geom", **values, **places)
+    return done
+
+
+def _appearance(model: mujoco.MjModel, geom: int) -> dict[str, str | ArrayLike]:
+    """Kind, colour and what it collides with; masses are the bodies'."""
+    material = model.geom_matid[geom]
+    return dict(
+        type=_SHAPES[int(model.geom_type[geom])],
+        rgba=model.geom_rgba[geom] if material < 0 else model.mat_rgba[material],
+        group=str(model.geom_group[geom]),
+        contype=str(model.geom_contype[geom]),
+        conaffinity=str(model.geom_conaffinity[geom]),
+        mass="0",
+    )
+
+
+# --- what is said of the whole ---
+
+
+def _add_speeds(robot: Robot, element: ElementTree.Element) -> None:
+    for joint in robot.tree.independent:
+        name = robot.tree.joint_names[joint]
+        speed = _one(robot.velocity_limit[_dofs(robot, joint)], name, "greatest speed")
+        if math.isfinite(speed):
+            _put(element, "numeric", name=VELOCITY_LIMIT_PREFIX + name, data=speed)
+
+
+def _add_followers(robot: Robot, element: ElementTree.Element) -> None:
+    """``q_follower - reference = constant + multiplier (q_leader - reference)``, as MuJoCo has it."""
+    tree = robot.tree
+    for follower, leader, multiplier in tree.followers:
+        offset = float(robot.qpos_offset[tree.full_qpos_address[follower]])
+        constant = offset - _reference(robot, follower) + multiplier * _reference(robot, leader)
+        names = dict(joint1=tree.joint_names[follower], joint2=tree.joint_names[leader])
+        _put(element, "joint", **names, polycoef=(constant, multiplier, 0.0, 0.0, 0.0))
+
+
+def _add_home(robot: Robot, element: ElementTree.Element) -> None:
+    tree, full = robot.tree, np.asarray(robot.mujoco_qpos(robot.q0), float)
+    kept = [full[start:end] for start, end in zip(tree.full_qpos_address, tree.full_qpos_address[1:], strict=False)]
+    moving = [values for joint, values in enumerate(kept) if joint not in tree.locked]
+    _put(element, "key", name="home", qpos=np.concatenate(moving))

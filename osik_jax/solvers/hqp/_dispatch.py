@@ -1,0 +1,101 @@
+"""Which backend solves a hierarchy: a kernel's candidates, certified in plain JAX, and the search for the others.
+
+A kernel judges each level as ``solve_on_working_set`` does, by feasibility and multipliers. What is certified here is
+what needs no factorisation: numbers are finite, x is in its box, and no level lost its optimum to those below. Problems
+whose candidate fails are gathered into blocks and solved level after level by the search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ...execution._backends import Backend, takes
+from ...execution._candidates import Candidates, certified_or_searched
+from ...execution._double import in_double
+from ...execution._lanes import in_lanes, with_the_rest
+from . import _kernel, _numba
+from ._cascade import CascadeResult, certify_levels, solve_cascade
+from ._padding import Layout, PaddedHierarchy
+from ._problem import Tolerances, WorkingSet
+
+_BLOCK = 256
+"""Problems that the search takes at a time: on a GPU its many small operations cost as much for one as for these."""
+
+_BOX_TOLERANCE = 1e3
+"""In units of the feasibility tolerance: how far a candidate may be outside its box (the answer is clipped into it)."""
+
+Solve = Callable[[Layout, PaddedHierarchy, Tolerances, WorkingSet | None, int], CascadeResult]
+
+
+@cache
+def hierarchy_solver(
+    layout: Layout, max_iterations: int | None, backend: Backend
+) -> Callable[[PaddedHierarchy, Tolerances, WorkingSet | None], CascadeResult]:
+    """Return the function that solves all levels of one problem, in double precision.
+
+    Args:
+        layout: sizes and row indices.
+        max_iterations: limit on the active-set iterations of one level; None for 10 (n + rows of the longest level).
+        backend: whose candidates are taken.
+    """
+    limit = 10 * (layout.variables + layout.rows) if max_iterations is None else max_iterations
+    return in_lanes(in_double(partial(_solve_on_platform, layout, limit, backend)))
+
+
+def _solve_on_platform(
+    layout: Layout,
+    max_iterations: int,
+    backend: Backend,
+    hierarchy: PaddedHierarchy,
+    tolerances: Tolerances,
+    warm_start: WorkingSet | None,
+) -> CascadeResult:
+    kernels = {}
+    if takes(backend, "warp", fits=_kernel.Shape.of(layout).warps > 0):
+        kernels["warp"] = kernel_candidates(layout, max_iterations, _kernel.solve)
+    if takes(backend, "numba", fits=True):
+        kernels["numba"] = kernel_candidates(layout, max_iterations, _numba.solve, by_guesses=False)
+    search = partial(solve_cascade, layout, max_iterations)
+    return certified_or_searched(kernels, search, hierarchy, tolerances, warm_start)
+
+
+def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve, *, by_guesses: bool = True) -> Candidates:
+    """Return how a kernel is used: its certified candidates, and the search for the rest, a block at a time.
+
+    Args:
+        layout: sizes and row indices.
+        max_iterations: limit on the active-set iterations of one level.
+        solve: calls the kernel.
+        by_guesses: whether the search has guesses of its own (``solve_cascade``).
+    """
+
+    def certified(hierarchy: PaddedHierarchy, tolerances: Tolerances, warm_start: WorkingSet | None) -> CascadeResult:
+        candidates = solve(layout, hierarchy, tolerances, warm_start, max_iterations)
+        result = jax.vmap(certify_levels)(candidates, hierarchy, tolerances)
+        return result._replace(done=result.done & jax.vmap(_is_valid)(result, hierarchy, tolerances))
+
+    def search_rest(
+        result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances, warm_start: WorkingSet | None
+    ) -> CascadeResult:
+        def search_block(at: Array, result: CascadeResult) -> CascadeResult:
+            block = jax.tree.map(lambda a: a[at], (hierarchy, tolerances, warm_start))
+            return solve_cascade(layout, max_iterations, *block, by_guesses=by_guesses)
+
+        return with_the_rest(result, result.done, search_block, min(_BLOCK, len(result.done)))
+
+    return Candidates(certified, search_rest)
+
+
+def _is_valid(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> Bool[Array, ""]:
+    """Check that the numbers are finite and that x is inside its box."""
+    n = len(result.x)
+    lower, upper = hierarchy.hard_lower[:n], hierarchy.hard_upper[:n]
+    margin = _BOX_TOLERANCE * tolerances.feasible * (jnp.max(jnp.abs(result.x)) + jnp.abs(result.x))
+    inside = (result.x >= lower - margin) & (result.x <= upper + margin)
+    valid = jnp.isfinite(result.x) & inside
+    return valid.all() & jnp.isfinite(result.residual) & jnp.isfinite(result.multipliers).all()

@@ -1,0 +1,156 @@
+"""What a level at its optimum freezes for the levels below (docs/derivations.md, "The freezing rule").
+
+Active hard rows with a nonzero multiplier and the level's own rows in its cost have the same values at all minimisers
+of the level. They become equalities, and their row space is taken out of the projector.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...numerics._dense import apply, product
+from .._damping import narrow_box
+from ._implicit_diff import ActiveSets
+from ._padding import LevelProblem
+from ._primal_active_set import PrimalState
+from ._problem import Tolerances, WorkingSet
+from ._working_set_solve import gradient_roundoff
+
+ZERO_PIVOT = 1e-2
+"""In units of the rank tolerance: a pivot up to this is 0, whatever rank another factorisation has found."""
+
+
+class CascadeState(NamedTuple):
+    """What the levels so far have fixed."""
+
+    x: Float[Array, " n"]
+    lower: Float[Array, " h"]  # of the hard rows; those of solved levels are widened to the values reached
+    upper: Float[Array, " h"]
+    frozen: Bool[Array, " h"]
+    active: Int[Array, " h"]  # active and not frozen
+    projector: Float[Array, "n n"]  # onto the null space of the frozen rows
+    curvature: Float[Array, " n"]  # bound on the curvature of the rows so far along each variable
+    active_bounds: Int[Array, " n"]  # of the box, frozen or not
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    factorizations: Int[Array, ""]
+    done: Bool[Array, ""]
+
+
+class LevelOutcome(NamedTuple):
+    """What is reported of one level."""
+
+    active_sets: ActiveSets
+    working_set: WorkingSet
+    multipliers: Float[Array, "*B h"]
+    slack_norm: Float[Array, "*B"]  # at the level's own optimum
+
+
+def freeze(
+    state: CascadeState, problem: LevelProblem, end: PrimalState, tolerances: Tolerances
+) -> tuple[CascadeState, LevelOutcome]:
+    """Freeze what a level determines, and report the level.
+
+    Args:
+        state: what the levels above have fixed.
+        problem: the level.
+        end: its optimum.
+        tolerances: what counts as zero.
+    """
+    n, level = len(problem.x), problem.level
+    value = apply(level.matrix, end.x)
+    slack = value - jnp.clip(value, level.lower, level.upper)
+    root_cost = problem.root_cost(end.x, slack)
+    slack_tol = tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + root_cost)
+    in_cost = problem.is_equality | (jnp.abs(slack) > slack_tol)
+    gradient = problem.gradient(end.x, jnp.where(in_cost, slack, 0.0))
+    force = jnp.abs(end.multiplier) * problem.length
+    roundoff = gradient_roundoff(problem, end.x, slack, tolerances)
+    force_tol = tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + roundoff
+    # a force that the damping alone explains leaves the levels below room on the face that the level has reached
+    frozen = (end.active != 0) & (force > force_tol + problem.damping * jnp.sqrt(jnp.sum(end.x**2)))
+    rows = jnp.argsort(~frozen, stable=True)[:n]
+    # rows of unit length, and own rows in units of the longest, so that one rank tolerance fits all
+    length = jnp.where(frozen, problem.length, 1.0)[rows]
+    to_freeze = jnp.concatenate(
+        [
+            jnp.where(frozen[rows], 1.0 / length, 0.0)[:, None] * problem.hard[rows],
+            jnp.where(in_cost[:, None], level.matrix, 0.0) / jnp.where(level.size > 0.0, level.size, 1.0),
+        ]
+    )
+    frozen_count = jnp.sum(frozen, dtype=jnp.int32)
+    same_cost = jnp.all(in_cost == end.in_cost)
+    # the rank is known from the level's own factors where these have all the rows that are frozen here
+    known_rank = jnp.where(same_cost & jnp.all(frozen == (end.active != 0)), frozen_count + end.rank, -1)
+    basis, rank = _row_space(to_freeze, problem.projector, known_rank, tolerances.rank)
+    own_side = jnp.where(in_cost, jnp.where(slack > 0.0, 1, -1), 0).astype(jnp.int32)
+    reached = apply(problem.hard, end.x)
+    low, high, curvature = narrow_box(
+        problem.damping_terms, level, state.curvature, end.x, problem.lower[:n], problem.upper[:n]
+    )
+    # the levels below may not make a row of this level worse: its interval is widened to the value reached, no further
+    after = state._replace(
+        x=end.x,
+        lower=jnp.where(problem.is_own, jnp.minimum(problem.lower, reached), problem.lower).at[:n].set(low),
+        upper=jnp.where(problem.is_own, jnp.maximum(problem.upper, reached), problem.upper).at[:n].set(high),
+        frozen=state.frozen | frozen | problem.scatter(in_cost),
+        active=jnp.where(frozen, 0, end.active),
+        projector=problem.projector - product(basis, basis.T),
+        curvature=curvature,
+        active_bounds=jnp.where(
+            end.active[:n] != 0, end.active[:n], jnp.where(state.frozen[:n], state.active_bounds, 0)
+        ),
+        residual=jnp.maximum(state.residual, end.residual),
+        done=state.done & end.done,
+    )
+    own = jnp.where(problem.is_equality, 2, own_side).astype(jnp.int32)
+    # active rows without a multiplier are left out of the derivative, unless the rank of the cost's rows would then
+    # be another (a tie)
+    tie = same_cost & (rank - frozen_count != end.rank) & (problem.damping == 0.0)
+    kept = jnp.where(frozen | tie, end.active, 0)
+    active_sets = ActiveSets(
+        active=jnp.where(problem.damping > 0.0, end.active, kept),
+        frozen=kept,
+        in_cost=own_side,
+        rank=jnp.where(tie, end.rank, rank - frozen_count),
+    )
+    slack_norm = jnp.sqrt(jnp.sum(slack**2))
+    return after, LevelOutcome(active_sets, WorkingSet(end.active, own), end.multiplier, slack_norm)
+
+
+def skip(state: CascadeState, problem: LevelProblem) -> tuple[CascadeState, LevelOutcome]:
+    """Report a level that finds no freedom left: it freezes nothing."""
+    inactive, own = jnp.zeros_like(state.active), jnp.zeros(problem.level.lower.shape, jnp.int32)
+    active_sets = ActiveSets(inactive, inactive, own, jnp.zeros_like(state.iterations))
+    slack_norm = jnp.full_like(state.residual, jnp.inf)  # x does not move any more, so no level below can make it worse
+    return state, LevelOutcome(active_sets, WorkingSet(inactive, own), jnp.zeros_like(state.lower), slack_norm)
+
+
+def _row_space(
+    rows: Float[Array, "m n"], projector: Float[Array, "n n"], known_rank: Int[Array, ""], rank_tol: Array | float
+) -> tuple[Float[Array, "n k"], Int[Array, ""]]:
+    """Return an orthonormal basis of the row space inside the projector's range, and its dimension.
+
+    Args:
+        rows: rows of unit length, or of the length 1 at most. (m, n)
+        projector: onto what is not frozen. (n, n)
+        known_rank: the dimension where it is known; where negative, it is the number of pivots above ``rank_tol``.
+        rank_tol: the rank tolerance.
+
+    Returns:
+        The basis, with columns of 0 beyond its dimension, and the dimension.
+    """
+    basis, triangle, _ = jax.scipy.linalg.qr(product(rows, projector).T, mode="economic", pivoting=True)
+    pivots = jnp.abs(jnp.diagonal(triangle))
+    known = (jnp.arange(len(pivots)) < known_rank) & (pivots > ZERO_PIVOT * rank_tol)
+    keep = jnp.where(known_rank < 0, pivots > rank_tol, known)
+    basis = product(projector, jnp.where(keep, basis, 0.0))
+    # a column of a small pivot is off the range by roundoff over that pivot; projected, it is orthonormalised again
+    # by the Newton-Schulz iteration B <- B (3 I - B' B) / 2, without a factorisation
+    for _ in range(2):
+        basis = 1.5 * basis - 0.5 * product(basis, product(basis.T, basis))
+    return basis, jnp.sum(keep, dtype=jnp.int32)

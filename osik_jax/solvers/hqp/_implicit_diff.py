@@ -1,0 +1,137 @@
+"""Implicit differentiation of a hierarchy at the fixed active sets of its solution.
+
+Where no active set is about to change, the solution map is that of a cascade of equality-constrained least squares: at
+each level the frozen hard rows stay at their bounds, and the rows in the cost come as near to theirs as the levels
+above allow (docs/derivations.md, "Implicit derivatives"). The cascade takes one pseudo-inverse for each block of rows,
+whose derivative at constant rank is known in closed form. The search is not differentiated, so memory does not grow
+with its iterations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ...execution._rules import custom_jvp
+from ...numerics._dense import apply, product
+from .._damping import Damping, level_damping, narrow_box
+from .._inverses import row_space_and_motion, row_space_and_motion_of_rank
+from .._level import Level
+from ._padding import PaddedHierarchy
+
+
+class ActiveSets(NamedTuple):
+    """The active sets at the optimum of one level: -1 at the lower bound, 1 at the upper, 0 inactive."""
+
+    active: Int[Array, " h"]  # hard rows that stop the level
+    frozen: Int[Array, " h"]  # those of them that are frozen for the levels below
+    in_cost: Int[Array, " m"]  # the level's own rows in its cost, and the bound that they miss
+    rank: Int[Array, ""]  # of the rows in the cost, within what the frozen rows leave free
+
+
+def with_derivative(
+    x: Float[Array, " n"], active_sets: ActiveSets, hierarchy: PaddedHierarchy, singular_tol: Float[Array, ""]
+) -> Float[Array, " n"]:
+    """Return ``x`` unchanged, with the derivatives of the cascade at fixed active sets.
+
+    Args:
+        x: the answer. (n,)
+        active_sets: those of each level, with a leading axis.
+        hierarchy: what the derivatives are with respect to.
+        singular_tol: singular values up to this part of the longest row are 0, whatever the rank of the active sets.
+    """
+    return _attach(jax.lax.stop_gradient(x), active_sets, singular_tol, hierarchy)
+
+
+@custom_jvp
+def _attach(x: Array, active_sets: ActiveSets, singular_tol: Array, hierarchy: PaddedHierarchy) -> Array:
+    return x
+
+
+@_attach.defjvp
+def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    x, active_sets, singular_tol, hierarchy = primals
+    *_, rates = tangents
+    _, dx = jax.jvp(lambda data: _solve_at_active_sets(active_sets, singular_tol, data), (hierarchy,), (rates,))
+    # not x alone: the second derivative needs this rule again
+    return _attach(x, active_sets, singular_tol, hierarchy), dx
+
+
+def _solve_at_active_sets(
+    active_sets: ActiveSets, singular_tol: Float[Array, ""], hierarchy: PaddedHierarchy
+) -> Float[Array, " n"]:
+    """Return the answer of the cascade of equality-constrained least squares that the active sets define."""
+    n = hierarchy.hard.shape[1]
+    pinned = hierarchy.hard_is_equality[:n]
+
+    def solve_level(state: tuple[Array, ...], now: tuple[ActiveSets, Level, Damping]) -> tuple[tuple[Array, ...], None]:
+        sets, level, terms = now
+        x, projector, low, high, curvature = state
+        hard = hierarchy.hard, hierarchy.hard_lower.at[:n].set(low), hierarchy.hard_upper.at[:n].set(high)
+        damping = level_damping(terms, level, x, projector, low, high)
+        # the level moves within what all active rows leave free; below it only the frozen ones are equalities
+        x, free = _fit_rows(*_active_first(*hard, sets.active), n, x, projector, singular_tol)
+        _, free_below = _fit_rows(*_active_first(*hard, sets.frozen), n, x, projector, singular_tol)
+        own = level.matrix, level.lower, level.upper, sets.in_cost, sets.rank
+        x, _ = _fit_rows(*own, x, free, singular_tol, damping)
+        _, free_below = _fit_rows(*own, x, free_below, singular_tol)
+        return (x, free_below, *narrow_box(terms, level, curvature, x, low, high)), None
+
+    box = hierarchy.hard_lower[:n], hierarchy.hard_upper[:n]
+    start = (
+        jnp.where(pinned, box[0], 0.0),
+        jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(hierarchy.hard.dtype)),
+        *box,
+        jnp.zeros_like(box[0]),
+    )
+    return jax.lax.scan(solve_level, start, (active_sets, hierarchy.levels, hierarchy.damping))[0][0]
+
+
+def _active_first(matrix: Array, lower: Array, upper: Array, active: Array) -> tuple[Array, Array, Array, Array]:
+    """Return as many hard rows as there are variables, active ones first: these are independent, so all are kept."""
+    rows = jnp.argsort(active == 0, stable=True)[: matrix.shape[1]]
+    return matrix[rows], lower[rows], upper[rows], active[rows]
+
+
+def _fit_rows(
+    matrix: Float[Array, "k n"],
+    lower: Float[Array, " k"],
+    upper: Float[Array, " k"],
+    active: Int[Array, " k"],
+    rank: Array | int,
+    x: Float[Array, " n"],
+    projector: Float[Array, "n n"],
+    singular_tol: Float[Array, ""],
+    damping: Float[Array, ""] | None = None,
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Move x in the projector's range so that the active rows come nearest to their bounds.
+
+    With C the active rows times the projector P and g what they miss, the motion is ``C^+ g``, with a pseudo-inverse of
+    the given rank at most. With damping it minimises ``|C d - g|^2 + damping |x + d|^2``.
+
+    Returns:
+        The new x, and the projector without the row space of C.
+    """
+    is_active = active != 0
+    target = jnp.where(active < 0, _masked(lower, active < 0), _masked(upper, active > 0))
+    chosen = jnp.where(is_active[:, None], matrix, 0.0)
+    # a cutoff decides on the rank alone: no derivative goes through it
+    longest = jnp.max(jnp.abs(jax.lax.stop_gradient(chosen)))
+    gap = jnp.where(is_active, target - apply(chosen, x), 0.0)
+    rows, cutoff = product(chosen, projector), singular_tol * longest
+    space, motion = row_space_and_motion_of_rank(rows, gap, rank, cutoff)
+    if damping is not None:
+        is_damped = damping > 0.0
+        _, whole = row_space_and_motion(rows, gap + apply(rows, x), cutoff, jnp.where(is_damped, damping, 1.0))
+        # the damped minimiser does not depend on x: all of x in the projector's range is replaced
+        motion = jnp.where(is_damped, whole - x, motion)
+    # rounding over small singular values has components outside the projector's range, so both are projected (eq. 7)
+    return x + apply(projector, motion), projector - product(projector, product(space, projector))
+
+
+def _masked(bound: Array, used: Array) -> Array:
+    """Return the bounds that are used and 0 for the others, which may be infinite."""
+    return jnp.where(used, bound, 0.0)

@@ -1,0 +1,162 @@
+"""A primal active-set method for one level, for working sets that no guess has found.
+
+    min 1/2 |dist(A x, [l, u])|^2 + 1/2 damping |x|^2   over   {x: frozen rows keep their values},  hard rows hold
+
+The start is feasible and all iterates stay so. Each iteration takes the least-squares step in the null space of the
+frozen and the active rows (rank-revealing QR) and follows it to the first hard row that blocks it, with an exact line
+search where a row of the level enters or leaves its interval. Where the step vanishes, the row with the most wrongly
+signed multiplier becomes inactive; without one the point is optimal. After a run of steps of zero length the choices
+follow the least index (R. G. Bland, "New finite pivoting rules for the simplex method", 1977), which cannot cycle.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...execution._double import first_smallest
+from ...numerics._dense import apply
+from ._active_rows import ActiveRows, factor_active_rows, multipliers
+from ._padding import LevelProblem
+from ._problem import Tolerances
+from ._working_set_solve import factor_least_squares, slack_roundoff, wrong_signs
+
+_MAX_STALLED = 20
+"""Steps of zero length in a row after which the least index decides."""
+
+
+class PrimalState(NamedTuple):
+    """An iterate of the primal active-set method."""
+
+    x: Float[Array, " n"]
+    active: Int[Array, " h"]  # of each hard row: -1 active at its lower bound, 1 at its upper, 0 inactive
+    multiplier: Float[Array, " h"]
+    in_cost: Bool[Array, " m"]  # the level's rows that are outside their interval, or equalities
+    rank: Int[Array, ""]  # of those, within what the active rows leave free
+    residual: Float[Array, ""]  # largest component of the projected gradient (stationarity)
+    stalled: Int[Array, ""]  # steps of zero length in a row
+    iterations: Int[Array, ""]
+    done: Bool[Array, ""]
+
+
+def primal_active_set(
+    problem: LevelProblem, start: PrimalState, tolerances: Tolerances, max_iterations: int
+) -> PrimalState:
+    """Minimise the level's cost from a feasible start.
+
+    Args:
+        problem: the level.
+        start: feasible x, and active rows that are independent of each other and of the frozen ones.
+        tolerances: what counts as zero.
+        max_iterations: limit on the iterations (static).
+
+    Returns:
+        The last iterate; ``done`` where it is the optimum.
+    """
+    level = problem.level
+
+    def iterate(s: PrimalState) -> PrimalState:
+        value = apply(level.matrix, s.x)
+        slack = value - jnp.clip(value, level.lower, level.upper)
+        in_cost = (slack != 0.0) | problem.is_equality
+        rows = jax.lax.optimization_barrier(factor_active_rows(problem, s.active, tolerances.rank))
+        least_squares_step, rank = factor_least_squares(problem, in_cost, rows, tolerances)
+        step = apply(problem.projector, least_squares_step(s.x, slack))
+        change = jnp.where(in_cost, apply(level.matrix, step), 0.0)
+        roundoff = slack_roundoff(problem, s.x, slack, tolerances)
+        gradient = problem.gradient(s.x, slack)
+        # the step vanishes where it changes the rows by no more than roundoff, or is no descent direction
+        is_zero = (problem.root_cost(step, change) <= roundoff) | ~(jnp.sum(gradient * step) < 0.0)
+        released = _release(problem, s, gradient, roundoff * problem.size, rows, tolerances)
+        moved = _advance(problem, s, step, tolerances)
+        out = jax.tree.map(lambda a, b: jnp.where(is_zero, a, b), released, moved)
+        return out._replace(in_cost=in_cost, rank=rank, iterations=s.iterations + 1)
+
+    def is_running(s: PrimalState) -> Bool[Array, ""]:
+        return ~s.done & (s.iterations < max_iterations)
+
+    return jax.lax.while_loop(is_running, iterate, start)
+
+
+def _release(
+    problem: LevelProblem,
+    s: PrimalState,
+    gradient: Float[Array, " n"],
+    roundoff: Float[Array, ""],
+    rows: ActiveRows,
+    tolerances: Tolerances,
+) -> PrimalState:
+    """Release the active row with the most wrongly signed multiplier, or declare the optimum where there is none."""
+    multiplier = multipliers(problem, rows, -apply(problem.projector, gradient))
+    wrong = wrong_signs(problem, s.active, multiplier, gradient, roundoff, tolerances)
+    force = multiplier * s.active * problem.length
+    # after a run of steps of zero length all wrong signs are alike, so that the least index is taken (Bland)
+    worst = first_smallest(jnp.where(wrong, jnp.where(s.stalled > _MAX_STALLED, 0.0, force), jnp.inf))
+    any_wrong = wrong.any()
+    return s._replace(
+        active=s.active.at[worst].set(jnp.where(any_wrong, 0, s.active[worst])),
+        multiplier=multiplier,
+        residual=jnp.max(jnp.abs(apply(rows.projector, gradient))),
+        done=~any_wrong,
+    )
+
+
+def _advance(problem: LevelProblem, s: PrimalState, step: Float[Array, " n"], tolerances: Tolerances) -> PrimalState:
+    """Follow the step as far as the hard rows and the exact line search allow."""
+    level = problem.level
+    value, rate = apply(problem.hard, s.x), apply(problem.hard, step)
+    # a row whose rate is below the rank tolerance is dependent on active rows and cannot block
+    size = jnp.sqrt(jnp.sum(step**2)) * problem.length
+    approached = problem.may_block & (s.active == 0) & (jnp.abs(rate) > tolerances.rank * size)
+    bound = jnp.where(rate > 0.0, problem.upper, problem.lower)
+    safe_rate = jnp.where(approached, rate, 1.0)
+    # ratio test: the step length at which each hard row reaches its bound
+    ratios = jnp.where(approached, jnp.maximum(jnp.where(approached, bound - value, jnp.inf) / safe_rate, 0.0), jnp.inf)
+    longest = jnp.min(ratios, initial=jnp.inf)
+    # 1/2 damping |x + t d|^2 has the derivative damping (x'd + t d'd)
+    damping_terms = problem.damping * jnp.stack([jnp.sum(s.x * step), jnp.sum(step**2)])
+    ideal = _line_search(apply(level.matrix, s.x), apply(level.matrix, step), level.lower, level.upper, damping_terms)
+    blocked = longest <= ideal
+    length = jnp.minimum(longest, ideal)
+    first = first_smallest(ratios)  # the least index among ties
+    x = s.x + length * step
+    stalled = jnp.where(length * jnp.max(jnp.abs(step)) > 0.0, 0, s.stalled + 1)
+    active = s.active.at[first].set(jnp.where(blocked, jnp.where(rate[first] > 0.0, 1, -1), s.active[first]))
+    return s._replace(x=x, active=active, stalled=stalled)
+
+
+def _line_search(
+    value: Float[Array, " m"],
+    rate: Float[Array, " m"],
+    lower: Float[Array, " m"],
+    upper: Float[Array, " m"],
+    damping_terms: Float[Array, "2"],
+) -> Float[Array, ""]:
+    """Return the exact minimiser t >= 0 of 1/2 |dist(value + t rate, [lower, upper])|^2 + c_0 t + 1/2 c_1 t^2.
+
+    The function is convex and piecewise quadratic; c are ``damping_terms``, the damping along the step.
+    """
+    moving = rate != 0.0
+    safe_rate = jnp.where(moving, rate, 1.0)
+    crossings = [
+        jnp.where(moving & jnp.isfinite(b), (jnp.where(jnp.isfinite(b), b, 0.0) - value) / safe_rate, 1.0)
+        for b in (lower, upper)
+    ]
+    knots = jnp.maximum(jnp.concatenate([*crossings, jnp.ones(1, value.dtype), jnp.zeros(1, value.dtype)]), 0.0)
+
+    def derivative(t: Array) -> Array:
+        at = value + t * rate
+        return jnp.sum(rate * (at - jnp.clip(at, lower, upper))) + damping_terms[0] + t * damping_terms[1]
+
+    derivatives = jax.vmap(derivative)(knots)
+    before = jnp.max(jnp.where(derivatives < 0.0, knots, 0.0), initial=0.0)
+    after = jnp.min(jnp.where(knots > before, knots, jnp.inf))  # the next knot, where the derivative is >= 0
+    probe = jnp.where(jnp.isinf(after), before + 1.0, 0.5 * (before + after))
+    # between two knots the derivative is a straight line, so the secant through two of its points has the root
+    first, second = derivative(before), derivative(probe)
+    rising = second > first
+    root = before - first * (probe - before) / jnp.where(rising, second - first, 1.0)
+    return jnp.where(rising, jnp.maximum(root, 0.0), before)

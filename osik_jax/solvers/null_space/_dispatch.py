@@ -1,0 +1,72 @@
+"""Which backend computes the classical projection: on a CPU, a kernel for all levels of one problem after another.
+
+It computes what ``_projection.py`` defines, in double precision; nothing is searched, so nothing is certified. That
+file is the definition, what runs elsewhere, and the derivative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ...execution._backends import Backend, on_platforms, takes
+from ...execution._lanes import in_lanes
+from ...execution._rules import custom_jvp
+from ...kernels.numba import _target
+from .._damping import Damping
+from ..hqp import Level
+from ._projection import solve_forward
+
+Answer = tuple[Float[Array, " n"], Float[Array, "n n"]]
+"""x, and the projector onto the null space of all levels."""
+
+
+def project(
+    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Damping, rank_tol: Array | float, backend: Backend
+) -> Answer:
+    """Return what ``solve_forward`` does, by the kernel where there is one; the damping has an axis of levels."""
+    rank_tol = jnp.asarray(rank_tol, secondary.dtype)
+    if takes(backend, "numba", fits=True):
+        return _by_kernel(list(levels), secondary, damping, rank_tol, backend=backend)
+    return _plain(list(levels), secondary, damping, rank_tol, backend=backend)
+
+
+def _plain(levels: list[Level], secondary: Array, damping: Damping, rank_tol: Array, *, backend: Backend) -> Answer:
+    each = [Damping(*parts) for parts in zip(*damping, strict=True)]
+    return solve_forward(levels, secondary, each, rank_tol, backend)
+
+
+@custom_jvp
+def _by_kernel(levels: list[Level], secondary: Array, damping: Damping, rank_tol: Array, *, backend: Backend) -> Answer:
+    return _on_platform(backend)(levels, secondary, damping, rank_tol)
+
+
+@_by_kernel.defjvp
+def _by_kernel_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend) -> tuple[Answer, Answer]:
+    return jax.jvp(partial(_plain, backend=backend), primals, tangents)
+
+
+@cache
+def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Array], Answer]:
+    """Return the function of one problem."""
+    plain = jax.vmap(partial(_plain, backend=backend))
+    return in_lanes(partial(on_platforms, dict(numba=_by_numba), plain))
+
+
+def _by_numba(
+    levels: list[Level], secondary: Float[Array, "B n"], damping: Damping, rank_tol: Float[Array, " B"]
+) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
+    batch, n = secondary.shape
+    m = max(level.lower.shape[1] for level in levels)
+    r = min(m, n)
+    space = (n + 11) * (n + m) + 2 * m**2 + r * (m + 2 * r)  # as ``Work`` in the kernel
+    equal = [jax.vmap(lambda one: one.equal)(level) for level in levels]
+    rows = [a for level, e in zip(levels, equal, strict=True) for a in (level.matrix, level.lower, level.upper, e)]
+    shapes = (batch, n), (batch, n, n), (space,)
+    x, projector, _ = _target.call("_projection", [(s, float) for s in shapes], secondary, *damping, rank_tol, *rows)
+    return x, projector

@@ -1,0 +1,162 @@
+"""Implicit differentiation of saturation in the null space, at the fixed active sets of its solution.
+
+Where no joint is about to saturate or to be released, x and the scale solve linear equations: the saturated joints of a
+level are at their bounds, and where the level is scaled down, the blocking joints determine by how much. Two
+factorisations a level solve them, whose derivatives are known in closed form; the search is not differentiated.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...execution._backends import Backend
+from ...execution._rules import custom_jvp
+from ...numerics._dense import apply, product
+from .._damping import narrow_box
+from ._padding import Problem, initial_point
+from ._projection import damped_step_length, level_motion
+from ._scaled_motion import ScaledMotion, blocked_scale
+
+
+class ActiveJoints(NamedTuple):
+    """The active set of one level."""
+
+    done: Bool[Array, ""]
+    active: Int[Array, " n"]  # -1 saturated at the lower bound, 1 at the upper, 0 free
+    blocking: Int[Array, " n"]  # the joints that limit the level's scale, likewise
+    blocker: Int[Array, ""]  # the one of them that the others determine
+
+
+_RANK_TOL = 1e-7
+"""A saturated joint with less of its column of the projector outside the span of the others has no derivative of its
+own."""
+
+Answer = tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, " L"]]
+"""x, the projector, and the scales."""
+
+
+def with_derivative(answer: Answer, sets: ActiveJoints, problem: Problem, backend: Backend = "jax") -> Answer:
+    """Return the answer unchanged, with the derivatives of the linear equations at these active sets.
+
+    Args:
+        answer: x, the projector and the scales.
+        sets: active sets of each level, with a leading axis.
+        problem: what the derivatives are with respect to.
+        backend: of the factors (static).
+    """
+    return _attach(jax.lax.stop_gradient(answer), sets, problem, backend=backend)
+
+
+@custom_jvp
+def _attach(answer: Answer, sets: ActiveJoints, problem: Problem, *, backend: Backend) -> Answer:
+    return answer
+
+
+@_attach.defjvp
+def _attach_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend) -> tuple[Answer, Answer]:
+    answer, sets, problem = primals
+    _, rates = jax.jvp(lambda p: _solve_at_active_sets(sets, p, backend), (problem,), (tangents[-1],))
+    # not the answer alone: the next derivative needs this rule
+    return _attach(answer, sets, problem, backend=backend), rates
+
+
+def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend) -> Answer:
+    """Return the answer that the active sets of all levels determine."""
+
+    def solve_level(state: tuple[Array, ...], each: tuple[Any, ...]) -> tuple[tuple[Array, ...], Array]:
+        joints, level, damping, target = each
+        start, projector, lower, upper, curvature = state
+        motion, projector, total = level_motion(level, start, projector, damping, problem.rank_tol, backend)
+        x, projector, scale = _level(joints, ScaledMotion(start, motion, target, projector, lower, upper))
+        length = damped_step_length(level, start, x, total, problem.rank_tol)
+        x, scale = start + length * (x - start), length * scale
+        return (x, projector, *narrow_box(damping, level, curvature, x, lower, upper)), scale
+
+    across = sets, problem.levels, problem.damping, problem.targets
+    start = *initial_point(problem), problem.lower, problem.upper, jnp.zeros_like(problem.lower)
+    (x, projector, *_), scales = jax.lax.scan(solve_level, start, across)
+    return x, projector, scales
+
+
+def _level(
+    joints: ActiveJoints, problem: ScaledMotion
+) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
+    """Return x, the projector, and the scale of one level."""
+    scale, projector = _scale_and_projector(problem, joints)
+    # one factorisation after another: see osik_jax/runtime.py
+    scale, active = jax.lax.optimization_barrier((scale, joints.active))
+    dual = _dual_basis(problem.projector, active)
+    x = jnp.where(active != 0, problem.bound(active), _at_bounds(problem, scale, active, dual))
+    return jnp.where(joints.done, x, problem.start), projector, jnp.where(joints.done, scale, 0.0)
+
+
+def _scale_and_projector(problem: ScaledMotion, joints: ActiveJoints) -> tuple[Float[Array, ""], Float[Array, "n n"]]:
+    """Return the scale, and the projector without the joints that block the motion.
+
+    The blocker's column of the projector is a combination of the others' columns; the same combination of x does not
+    depend on what the null space does.
+    """
+    blocking, blocker = joints.blocking, joints.blocker
+    # normal: the combination of the blocking joints that the null space does not change
+    others = blocking.at[blocker].set(0)
+    dual = _dual_basis(problem.projector, others)
+    coefficients = apply(dual, problem.projector[:, blocker])
+    normal = (-coefficients).at[blocker].set(1.0)
+    is_blocked = (blocking != 0).any()
+    scale = jnp.where(is_blocked, blocked_scale(problem, blocking, normal), 1.0)
+    # the projector without the span of the blocking joints' columns, purified of roundoff
+    columns = jnp.where(others != 0, problem.projector, 0.0)
+    reduced = problem.projector - product(problem.projector, product(product(columns, dual), problem.projector))
+    keep = (blocking == 0)[:, None] & (blocking == 0)[None, :]
+    return scale, jnp.where(keep, _purified(reduced), 0.0)
+
+
+@custom_jvp
+def _dual_basis(projector: Float[Array, "n n"], active: Int[Array, " n"]) -> Float[Array, "n n"]:
+    """Return C, the pseudo-inverse of the projector's columns of the active joints, with rows of 0 for the others.
+
+    C' (bound - x) brings the active joints to their bounds, by the smallest step in the projector's range.
+    """
+    # QR of the columns of the active joints, these first; dependent ones are left out
+    order = jnp.argsort(active == 0, stable=True)
+    valid = active[order] != 0
+    basis, triangle = jnp.linalg.qr(jnp.where(valid, projector[:, order], 0.0))
+    eye = jnp.eye(len(active), dtype=projector.dtype)
+    valid = valid & (jnp.abs(jnp.diagonal(triangle)) > _RANK_TOL)
+    both = valid[:, None] & valid[None, :]
+    inverse = jax.scipy.linalg.solve_triangular(jnp.where(both, triangle, eye), eye)
+    # C = R^-1 Q'
+    dual = product(jnp.where(both, inverse, 0.0), jnp.where(valid, basis, 0.0).T)
+    return jnp.zeros_like(dual).at[order].set(dual)
+
+
+@_dual_basis.defjvp
+def _dual_basis_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
+    """Golub and Pereyra's derivative (``solvers/_inverses.py``), of a matrix of full column rank."""
+    projector, active = primals
+    dual = _dual_basis(projector, active)
+    columns, moved = (jnp.where(active != 0, matrix, 0.0) for matrix in (projector, tangents[0]))
+    rest = moved.T - product(product(moved.T, columns), dual)
+    return dual, product(dual, product(dual.T, rest)) - product(dual, product(moved, dual))
+
+
+def _at_bounds(
+    problem: ScaledMotion, scale: Array, active: Int[Array, " n"], dual: Float[Array, "n n"]
+) -> Float[Array, " n"]:
+    """Return x with the active joints at their bounds, refined once."""
+    x = problem.unbounded(scale)
+    for _ in range(2):
+        step = apply(dual.T, jnp.where(active != 0, problem.bound(active) - x, 0.0))
+        x = x + apply(problem.projector, step)
+    return x
+
+
+def _purified(projector: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return 3 P^2 - 2 P^3 (McWeeny's purification): eigenvalues at a distance e from 0 or 1 come as near as 3 e^2."""
+    projector = 0.5 * (projector + projector.T)
+    square = product(projector, projector)
+    return 3.0 * square - 2.0 * product(square, projector)

@@ -1,0 +1,97 @@
+"""The levels of a projection padded to one shape, so that one ``scan`` goes through them all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...numerics._dense import apply
+from .._damping import Damping
+from ..hqp import Level
+
+
+class PaddedLevel(NamedTuple):
+    """A level padded with rows of zeros without bounds; it answers what a ``Level`` does.
+
+    Which rows are equalities is decided once, and not by comparing bounds again: XLA may compute those twice, with
+    different roundoff.
+    """
+
+    matrix: Float[Array, "m n"]
+    lower: Float[Array, " m"]
+    upper: Float[Array, " m"]
+    equal: Bool[Array, " m"]
+
+    def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """Return A x minus the nearest point of its interval; a clip would halve the derivative at equalities."""
+        value = apply(self.matrix, x)
+        return value - jnp.where(self.equal, self.lower, jnp.clip(value, self.lower, self.upper))
+
+
+class Problem(NamedTuple):
+    """The levels, weights multiplied in, and the box."""
+
+    levels: PaddedLevel  # with a leading axis; the last has no rows where there is a secondary motion
+    damping: Damping  # with a leading axis too
+    targets: Float[Array, "L n"]  # the nearest x is taken: the secondary motion in the last level, 0 before
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    rank_tol: Float[Array, ""]
+
+
+def pad_levels(
+    levels: Sequence[Level],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    secondary: Float[Array, " n"] | None,
+    damping: Sequence[Damping],
+    rank_tol: Array | float,
+) -> Problem:
+    """Return the padded problem; a secondary motion is one more level without rows.
+
+    Args:
+        levels: highest priority first, weights multiplied in.
+        lower: lower bounds of the box.
+        upper: upper bounds of the box.
+        secondary: what x comes as near to as levels and box allow, or None.
+        damping: of each level.
+        rank_tol: relative length under which a row counts as dependent.
+    """
+    n, dtype = len(lower), lower.dtype
+    targets = [jnp.zeros(n, dtype)] * len(levels)
+    if secondary is not None:
+        no_bounds = jnp.zeros(0, dtype)
+        levels = [*levels, Level(jnp.zeros((0, n), dtype), no_bounds, no_bounds)]
+        targets, damping = [*targets, secondary], [*damping, jax.tree.map(jnp.zeros_like, damping[0])]
+    count = max(1, *(len(level.lower) for level in levels))
+    stacked = jax.tree.map(lambda *a: jnp.stack(a), *(_pad(level, count) for level in levels))
+    return Problem(
+        stacked,
+        jax.tree.map(lambda *a: jnp.stack(a), *damping),
+        jnp.stack(targets),
+        lower,
+        upper,
+        jnp.asarray(rank_tol, dtype),
+    )
+
+
+def _pad(level: Level, count: int) -> PaddedLevel:
+    more = count - len(level.lower)
+    return PaddedLevel(
+        jnp.pad(level.matrix, ((0, more), (0, 0))),
+        jnp.pad(level.lower, (0, more), constant_values=-jnp.inf),
+        jnp.pad(level.upper, (0, more), constant_values=jnp.inf),
+        jnp.pad(level.equal, (0, more)),
+    )
+
+
+def initial_point(problem: Problem) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Return the point of the box nearest to 0, and the projector onto the joints that are not pinned."""
+    lower, upper = problem.lower, problem.upper
+    pinned = lower == upper
+    x = jnp.where(lower > 0.0, lower, jnp.where(upper < 0.0, upper, jnp.where(pinned, lower, 0.0)))
+    return x, jnp.diag(jnp.where(pinned, 0.0, 1.0).astype(x.dtype))

@@ -1,0 +1,237 @@
+"""Which backend solves a QP: a kernel's candidates, certified in plain JAX, and the search for the others.
+
+The certificate is that of the search itself (``violated_conditions``, ``kkt_residual``), on the data as they were
+given, so that answers do not rest on the kernel. It costs two products with the rows. Problems whose candidate fails
+are gathered into blocks, and the search goes on from the candidate's active set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...execution._backends import Backend, on_platforms, takes
+from ...execution._candidates import Candidates, certified_or_searched
+from ...execution._double import in_double
+from ...execution._lanes import in_lanes, with_a_few, with_the_rest
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ...numerics._dense import apply
+from .._goldfarb_idnani import Roundoff
+from . import _kernel, _numba
+from ._cost import LeastSquares
+from ._kernel import Candidate
+from ._kkt_solve import kkt_inverse
+from ._problem import KKT_TOLERANCE, QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, unpack
+from ._search import SearchResult, initial_result, search, usable_guess, violated_conditions
+
+_BLOCKS, _MIN_BLOCK = 16, 1024
+"""On a GPU, problems that are left are searched in blocks of a 16th of the batch, of 1,024 problems at least."""
+_BLOCK_ON_CPU = 4
+
+_SINGLE_TOL = 1e-7
+"""Smallest tolerance of a kernel in single precision, and of its certificate; the search has the one asked for."""
+
+_VALUE_TOL, _SIGN_TOL = 30.0, 2.0
+"""In units of the tolerance: how far a certified value may be off its bound, or a gradient from 0; and how large a
+multiplier of the wrong sign may be.
+
+The latter is smaller: such a multiplier says that the active set is not right, and what that costs is more the weaker
+the curvature is that the rows leave."""
+
+_GRADIENT_TOL = 4.0
+"""In units of machine epsilon times the gradient's terms: how large a certified gradient of a free variable may be."""
+
+Solve = Callable[[QP, Array, Array, int], Candidate]
+
+
+@cache
+def qp_solver(max_iterations: int, has_soft_rows: bool, backend: Backend) -> Callable[[QP, Array, Array], SearchResult]:
+    """Return the function that solves one problem, from its data, a guess of the active set and the tolerance.
+
+    Args:
+        max_iterations: limit on the changes of the active set.
+        has_soft_rows: whether rows may be soft; where all are hard, Warp's kernel is not asked.
+        backend: whose candidates are taken.
+    """
+    return in_lanes(partial(_solve_on_platform, max_iterations, has_soft_rows, backend))
+
+
+def _solve_on_platform(
+    max_iterations: int, has_soft_rows: bool, backend: Backend, qp: QP, guess: Array, tolerance: Array
+) -> SearchResult:
+    kernels = {}
+    if takes(backend, "warp", fits=has_soft_rows and _fits_warp(qp)):
+        kernels["warp"] = warp_candidates(_kernel.solve, max_iterations)
+    if takes(backend, "numba", fits=isinstance(qp.cost, LeastSquares)):
+        kernels["numba"] = _numba_candidates(KKT_TOLERANCE[tolerance.dtype], max_iterations)
+    search_all = partial(search, max_iterations=max_iterations)
+    return certified_or_searched(kernels, search_all, qp, guess, tolerance, no_candidates=initial_result)
+
+
+def warp_candidates(solve: Solve, max_iterations: int) -> Candidates:
+    """Return how the CUDA kernel in single precision is used.
+
+    Args:
+        solve: calls the kernel.
+        max_iterations: limit on the changes of the active set.
+    """
+
+    def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
+        start, single = jax.vmap(usable_guess)(qp, guess), jnp.maximum(tolerance, _SINGLE_TOL)
+        candidate = solve(qp, start, single, max_iterations)
+        result = _as_result(qp, candidate)
+        is_certified = (candidate.converged != 0) & (candidate.iterations <= max_iterations)
+        is_certified &= jax.vmap(_is_certified)(qp, result, single).all(1)
+        is_certified &= result.residual <= KKT_TOLERANCE[single.dtype]
+        return result._replace(done=is_certified, optimal=is_certified)
+
+    def search_rest(result: SearchResult, qp: QP, guess: Array, tolerance: Float[Array, " B"]) -> SearchResult:
+        def search_block(at: Array, result: SearchResult) -> SearchResult:
+            block = jax.tree.map(lambda a: a[at], (qp, result.active, tolerance))
+            end = search(*block, max_iterations=max_iterations)
+            return end._replace(factorizations=end.factorizations + result.factorizations[at])
+
+        return with_the_rest(result, result.done, search_block, _block(len(tolerance)))
+
+    return Candidates(certified, search_rest)
+
+
+def _numba_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
+    """Return how the CPU kernel is used; ``kkt_tol`` is the largest residual that is certified."""
+
+    def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
+        start = jax.vmap(usable_guess)(qp, guess)
+        candidate = _numba.solve(qp, start, tolerance, max_iterations)
+        result, within_limit = _as_result(qp, candidate), candidate.iterations <= max_iterations
+        is_certified = (candidate.converged != 0) & within_limit
+        conditions = [jax.vmap(_is_certified)(qp, result, tolerance), jax.vmap(_is_stationary)(qp, result)]
+        is_certified &= jnp.concatenate(conditions, 1).all(1)
+        is_certified &= result.residual <= kkt_tol
+        # the search has the limit too: it may not begin where more changes than that have led
+        active = jnp.where(within_limit[:, None], result.active, start)
+        return result._replace(done=is_certified, optimal=is_certified, active=active)
+
+    def search_rest(result: SearchResult, qp: QP, guess: Array, tolerance: Float[Array, " B"]) -> SearchResult:
+        def search_block(given: tuple[QP | Array, Array], result: SearchResult) -> SearchResult:
+            data, tolerance = given
+            block = data if isinstance(data, QP) else jax.vmap(partial(unpack, jax.tree.map(lambda a: a[0], qp)))(data)
+            end = search(block, result.active, tolerance, max_iterations=max_iterations, by_pivots=False)
+            return end._replace(factorizations=end.factorizations + result.factorizations)
+
+        data = qp if qp.packed is None else qp.packed  # as few arrays as can be: most problems are done
+        return with_a_few((data, tolerance), result, result.done, search_block, _BLOCK_ON_CPU)
+
+    return Candidates(in_double(certified), search_rest)
+
+
+def _block(batch: int) -> int:
+    return min(batch, max(_MIN_BLOCK, -(-batch // _BLOCKS)))
+
+
+def _as_result(qp: QP, candidate: Candidate) -> SearchResult:
+    """Return a candidate as the end of a search, not yet certified."""
+    zeros = jnp.zeros_like(candidate.iterations)
+    return SearchResult(
+        x=candidate.x,
+        row_multipliers=candidate.row_multipliers,
+        active=candidate.active,
+        redundant=jnp.zeros(candidate.active.shape, bool),
+        iterations=candidate.iterations,
+        factorizations=candidate.factorizations,
+        done=zeros.astype(bool),
+        optimal=zeros.astype(bool),
+        infeasible_ends=zeros,
+        used_newton=zeros.astype(bool),
+        infeasible=zeros.astype(bool),
+        compliance=qp.compliance,
+        residual=jax.vmap(kkt_residual)(qp, candidate.x, candidate.row_multipliers, candidate.active),
+    )
+
+
+def _is_certified(qp: QP, result: SearchResult, tolerance: Float[Array, ""]) -> Bool[Array, " m"]:
+    """Check the optimality conditions of x and y, constraint by constraint.
+
+    Active constraints are at their bounds, the gradient is 0 elsewhere, multipliers have their signs, and inactive
+    constraints hold.
+    """
+    x, y, active = result.x, result.row_multipliers, result.active
+    n = len(x)
+    is_active = active != INACTIVE
+    scales = constraint_scales(qp, qp.cost.diagonal(), x, y)
+    roundoff = Roundoff(_VALUE_TOL * tolerance * scales.value, _SIGN_TOL * tolerance * scales.multiplier)
+    gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
+    off = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * y]) - active_bounds(qp, active)
+    # labels that exist, and "equality" where there is one
+    valid_label = (jnp.abs(active) == 1) | ~is_active | ((active == EQUALITY) & qp.equality)
+    at_bound = jnp.where(is_active, jnp.abs(off) <= roundoff.value, valid_label)
+    gradient_is_zero = jnp.abs(gradient) <= _VALUE_TOL * tolerance * scales.multiplier[:n]
+    stationary = jnp.where(is_active, valid_label, jnp.concatenate([gradient_is_zero, y == 0.0]))
+    valid = jnp.isfinite(jnp.concatenate([x, y])) & at_bound & stationary
+    return valid & ~violated_conditions(qp, result, x, y, roundoff)
+
+
+def _is_stationary(qp: QP, result: SearchResult) -> Bool[Array, " n"]:
+    """Check that the gradient at each variable is roundoff, or points out of the active bound."""
+    downhill = apply(qp.rows.T, result.row_multipliers) - qp.cost.gradient(result.x)
+    active = result.active[: len(downhill)]
+    may_rise, may_fall = (active == INACTIVE) | (active == AT_LOWER), (active == INACTIVE) | (active == AT_UPPER)
+    eps = float(jnp.finfo(downhill.dtype).eps)
+    roundoff = _GRADIENT_TOL * eps * gradient_scale(qp, result.x, result.row_multipliers)
+    return (~may_rise | (downhill <= roundoff)) & (~may_fall | (-downhill <= roundoff))
+
+
+def kkt_solver(qp: QP, active: Int[Array, " m"], backend: Backend) -> Callable[[Array], Array]:
+    """Return ``kkt_inverse`` at an active set, computed by Warp's kernel where that fits."""
+    batch = jax.tree.map(lambda a: jax.ShapeDtypeStruct((1, *a.shape), a.dtype), qp)
+    if not takes(backend, "warp", fits=_fits_warp(batch)):
+        return kkt_inverse(qp, active)
+    return lambda right: _solve_kkt_on_platform()(qp, active, right)
+
+
+@cache
+def _solve_kkt_on_platform() -> Callable[[QP, Array, Array], Array]:
+    def plain(qp: QP, active: Array, right: Array) -> Array:
+        return kkt_inverse(qp, active)(right)
+
+    return in_lanes(partial(on_platforms, {"warp": _solve_kkt_by_warp}, jax.vmap(plain)))
+
+
+def _solve_kkt_by_warp(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
+    """Solve the KKT system as a QP on one active set: its constraints are equalities, the others have no bounds."""
+    cost = qp.cost
+    assert isinstance(cost, LeastSquares)
+    n = cost.damping.shape[1]
+    free, active_rows = active[:, :n] == INACTIVE, active[:, n:] != INACTIVE
+    # the right side of stationarity is the gradient of the damping at x = 0
+    center = jnp.where(free, right[:, :n], 0.0) / cost.damping
+    bound = jnp.concatenate([jnp.zeros_like(center), -right[:, n:]], 1)
+    is_equality = jnp.concatenate([~free, active_rows], 1)
+    system = replace(
+        qp,
+        cost=replace(cost, target=jnp.zeros_like(cost.target), center=center),
+        lower=jnp.where(is_equality, bound, -jnp.inf),
+        upper=jnp.where(is_equality, bound, jnp.inf),
+    )
+    tolerance = jnp.full(len(active), _SINGLE_TOL, center.dtype)
+    candidate = _kernel.solve(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
+    point = jnp.concatenate([candidate.x, jnp.where(active_rows, candidate.row_multipliers, 0.0)], 1)
+    done = (candidate.converged != 0) & jnp.isfinite(point).all(1)
+
+    def solve_block(at: Array, point: Array) -> Array:
+        block = jax.tree.map(lambda a: a[at], (qp, active, right))
+        return jax.vmap(lambda qp, active, right: kkt_inverse(qp, active)(right))(*block)
+
+    return with_the_rest(point, done, solve_block, _block(len(active)))
+
+
+def _fits_warp(qp: QP) -> bool:
+    """Whether Warp's kernel takes such problems: least squares in single precision, of a size that fits."""
+    if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float32:
+        return False
+    _, m, n = qp.cost.matrix.shape
+    return _kernel.Shape(n, m, qp.rows.shape[1]).warps > 0

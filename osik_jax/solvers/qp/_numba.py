@@ -1,0 +1,38 @@
+"""Candidates for weighted QPs from the kernel for CPUs (``kernels/numba/_weighted_qp.py``)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ...execution._computed import side_by_side
+from ...kernels.numba import _target
+from ._cost import LeastSquares
+from ._kernel import Candidate
+from ._problem import QP
+
+
+def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
+    """Return candidates for a batch; each problem takes as long as it needs.
+
+    Args:
+        qp: the problems, with a leading axis.
+        guess: labels of the active sets to try first.
+        tolerance: violation that counts as none, relative to the scale of the constraint.
+        max_iterations: limit on the changes of the active set (static).
+    """
+    cost = qp.cost
+    assert isinstance(cost, LeastSquares)
+    batch, m, n = cost.matrix.shape
+    p = qp.rows.shape[1]
+    k, constraints = m + p, n + p
+    largest = max(n, k)
+    workspace = 2 * k * n + largest**2 + p * (n + p) + 2 * constraints**2 + 18 * (largest + constraints)  # as ``Work``
+    packed = side_by_side(*jax.tree.leaves(qp)) if qp.packed is None else qp.packed  # in the order of the fields
+    x, y, active, report, _ = _target.call(
+        "_weighted_qp",
+        [((batch, n), float), ((batch, p), float), ((batch, n + p), int), ((batch, 3), int), ((workspace,), float)],
+        *(packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
+    )
+    return Candidate(x, y, active, *(report[:, i] for i in range(3)))

@@ -1,0 +1,123 @@
+"""The minimiser for a given active set, by a linear system of the size of the rows of the cost, not of the variables.
+
+Whole-body tasks have fewer rows than the robot has dofs: 18 for two feet, the centre of mass and a hand, 35 dofs of a
+G1. With B the rows of A times the roots of their weights, and the active rows of C, each column over the root of its
+damping (Sherman, Morrison and Woodbury; docs/derivations.md, "The row-space solve"),
+
+    S z = [W^(1/2) (b - A c); d - C c],    x = c + D^(-1/2) B'z,    S = B B' + diag(1, compliance),
+
+where x is free; the Hessian is never formed, nor factored.
+
+What is lost: the correction of a refinement cancels down to weight / damping in units of machine epsilon, and S is
+singular where rows depend on each other. Where the first is too much, or a pivot too small, the problem is left to the
+factor of the Hessian (``_kkt_solve.py``).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...numerics._constants import INACTIVE
+from ...numerics._dense import apply, product
+from ._cost import LeastSquares
+from ._kkt_solve import backward, cholesky, forward, refine
+from ._problem import QP, active_bounds
+
+_MAX_ROW_RATIO = 0.9
+"""Rows per variable, beyond which the factor of the Hessian is as quick."""
+_SMALLEST_PIVOT = 1e4
+"""In units of machine epsilon times the diagonal element: a smaller pivot says that rows depend on each other."""
+_MAX_CONTRACTION = 1e-4
+_LAST_CORRECTION, _ACCURACY = 1e-6, 1e-13
+"""The last correction is smaller than the first relative to x, and the next one would be smaller than the second."""
+
+
+class RowFactor(NamedTuple):
+    """Factors of the KKT system at an active set, in the space of the rows."""
+
+    free: Bool[Array, " n"]
+    active_rows: Bool[Array, " p"]
+    root: Float[Array, " n"]  # of the inverse damping, 0 where not free
+    scaled: Float[Array, "m_and_p n"]  # B
+    cholesky: Float[Array, "m_and_p m_and_p"]  # L of S = L L'
+    contraction: Float[Array, ""]  # the size of a correction relative to the one before it
+    is_valid: Bool[Array, ""]
+
+
+def has_few_rows(qp: QP) -> bool:
+    """Whether the system of the rows is the smaller one (static); ``qp`` has a leading axis of problems."""
+    if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float64:
+        return False
+    _, m, n = qp.cost.matrix.shape
+    return m + qp.rows.shape[1] <= _MAX_ROW_RATIO * n
+
+
+def solve_in_row_space(
+    qp: QP, active: Int[Array, "B n_and_p"]
+) -> tuple[Float[Array, "B n"], Float[Array, "B p"], Bool[Array, " B"]]:
+    """Return what ``solve_on_active_set`` does, and whether it is accurate; all arguments have a leading axis."""
+    factor = jax.vmap(_factorize)(qp, active)
+    target = jax.vmap(active_bounds)(qp, active)
+    x, y = jax.vmap(_first_solve)(qp, factor, target)
+    root = jnp.sqrt(jax.vmap(lambda one: one.cost.diagonal())(qp))
+    limit = jnp.minimum(_ACCURACY / factor.contraction, _LAST_CORRECTION)
+    x, y, converged = refine(lambda x, y: jax.vmap(_correction)(qp, factor, target, x, y), x, y, root=root, limit=limit)
+    return x, y, factor.is_valid & converged
+
+
+def _factorize(qp: QP, active: Int[Array, " n_and_p"]) -> RowFactor:
+    cost, n = qp.cost, active.shape[0] - qp.rows.shape[0]
+    assert isinstance(cost, LeastSquares)
+    free, active_rows = active[:n] == INACTIVE, active[n:] != INACTIVE
+    root = jnp.where(free, 1.0 / jnp.sqrt(cost.damping), 0.0)
+    active_part = jnp.where(active_rows[:, None], qp.rows, 0.0)
+    rows = jnp.concatenate([jnp.sqrt(cost.weight)[:, None] * cost.matrix, active_part])
+    scaled = rows * root
+    ones = jnp.concatenate([jnp.ones_like(cost.weight), jnp.where(active_rows, qp.compliance, 1.0)])
+    schur = product(scaled, scaled.T) + jnp.diag(ones)
+    lower = cholesky(schur)
+    eps = float(jnp.finfo(schur.dtype).eps)
+    diagonal, m = jnp.diagonal(schur), len(cost.weight)
+    # the largest diagonal element is weight / damping of a row, whose roundoff each correction leaves
+    contraction = eps * jnp.max(diagonal[:m], initial=1.0)
+    pivots_are_large = jnp.all(jnp.diagonal(lower) ** 2 >= _SMALLEST_PIVOT * eps * diagonal)
+    is_valid = pivots_are_large & (contraction <= _MAX_CONTRACTION)
+    return RowFactor(free, active_rows, root, scaled, lower, contraction, is_valid)
+
+
+def _solve(
+    factor: RowFactor, right: Float[Array, " m_and_p"], downhill: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, " m_and_p"]]:
+    """Return dx, z with D dx - B'z = downhill and B dx + diag(1, compliance) z = right, B in the units of ``right``."""
+    scaled_step = factor.root * downhill
+    z = backward(factor.cholesky, forward(factor.cholesky, right - apply(factor.scaled, scaled_step)))
+    return factor.root * (scaled_step + apply(factor.scaled.T, z)), z
+
+
+def _first_solve(
+    qp: QP, factor: RowFactor, target: Float[Array, " n_and_p"]
+) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
+    """Return x and y, solved for the step from the damping's center, where nothing large has to cancel."""
+    cost = qp.cost
+    assert isinstance(cost, LeastSquares)
+    n, m = len(factor.free), len(cost.weight)
+    x = jnp.where(factor.free, cost.center, target[:n])
+    residual = jnp.sqrt(cost.weight) * (cost.target - apply(cost.matrix, x))
+    gap = jnp.where(factor.active_rows, target[n:] - apply(qp.rows, x), 0.0)
+    dx, z = _solve(factor, jnp.concatenate([residual, gap]), jnp.zeros_like(x))
+    return x + dx, z[m:]
+
+
+def _correction(
+    qp: QP, factor: RowFactor, target: Float[Array, " n_and_p"], x: Float[Array, " n"], y: Float[Array, " p"]
+) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
+    """Return the corrections of x and y, from the residuals of the KKT conditions themselves."""
+    n, m = len(x), len(factor.cholesky) - len(y)
+    downhill = apply(qp.rows.T, y) - qp.cost.gradient(x)
+    gap = jnp.where(factor.active_rows, target[n:] - apply(qp.rows, x) - qp.compliance * y, 0.0)
+    dx, z = _solve(factor, jnp.concatenate([jnp.zeros(m, x.dtype), gap]), downhill)
+    return dx, z[m:]

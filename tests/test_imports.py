@@ -1,0 +1,76 @@
+"""Folders of the library import one way: no two know each other, and kernels know no solver."""
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "osik_jax"
+
+
+def imported(source: str, place: tuple[str, ...]) -> set[str]:
+    """Folders and modules right under the package that a module imports, lazily or for types too.
+
+    Args:
+        source: text of the module.
+        place: folders of the module under the package.
+    """
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom):
+            base = ("osik_jax", *place)
+            names = (base[: len(base) - node.level + 1] if node.level else ()) + tuple((node.module or "").split("."))
+            names = tuple(name for name in names if name)
+            paths = [names] if len(names) > 1 else [(*names, alias.name) for alias in node.names]
+        elif isinstance(node, ast.Import):
+            paths = [tuple(alias.name.split(".")) for alias in node.names]
+        else:
+            continue
+        found |= {path[1] for path in paths if path[0] == "osik_jax" and len(path) > 1}
+    return found
+
+
+def graph() -> dict[str, set[str]]:
+    """Of each folder or module right under the package, those that it imports."""
+    edges: dict[str, set[str]] = {}
+    for path in PACKAGE.rglob("*.py"):
+        place = path.relative_to(PACKAGE).parts
+        if place != ("__init__.py",):
+            name = place[0].removesuffix(".py")
+            edges.setdefault(name, set()).update(imported(path.read_text(), place[:-1]) - {name})
+    return edges
+
+
+def test_no_two_folders_know_each_other() -> None:
+    order = list(TopologicalSorter(graph()).static_order())
+    assert order.index("kernels") < order.index("solvers") < order.index("control")
+
+
+def test_kernels_know_constants_alone() -> None:
+    assert graph()["kernels"] == {"numerics"}
+
+
+def test_the_viewer_knows_maps_and_maps_no_viewer() -> None:
+    edges = graph()
+    assert "reachability" in edges["viewer"] and "viewer" not in edges["reachability"]
+
+
+def test_every_form_of_import_is_seen() -> None:
+    source = """
+from ..solvers.qp._problem import QP
+from .. import viewer
+from ...tasks import Task
+import osik_jax.control
+def later():
+    from osik_jax.physics import simulate
+    from . import _own
+    import numpy
+"""
+    assert imported(source, ("kernels",)) >= {"solvers", "viewer", "control", "physics", "kernels"}
+    assert imported(source, ("viewer", "live")) >= {"tasks", "control", "physics", "viewer"}
+
+
+def test_a_circle_is_seen() -> None:
+    with pytest.raises(CycleError):
+        list(TopologicalSorter({"robot": {"kinematics"}, "kinematics": {"robot"}}).static_order())

@@ -1,0 +1,94 @@
+"""Numba's kernel of retargeting's plans on a CPU: beside the plain method, which it follows iteration by iteration."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from motion_files import dancer, write_bvh
+
+import osik_jax as osik
+from osik_jax.retargeting import Retargeter, load_motion
+from osik_jax.retargeting._plan import _Clip, _descended, _descended_plain
+
+pytest.importorskip("numba")
+FRAMES = 9
+LOCKED = ("HeadYaw", "HeadPitch", "LWristYaw", "LHand", "RWristYaw", "RHand", "LElbowYaw")
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory):
+    return load_motion(write_bvh(tmp_path_factory.mktemp("clips") / "dance.bvh", dancer(FRAMES), 0.01))
+
+
+def clip_of(robot, motion):
+    """What a plan is made for, with frames behind the end, and where it begins: anywhere, with shapes that overlap."""
+    own = Retargeter(robot)
+    clip = own._prepared(motion, None, None)
+    frames, rng = len(clip.start), np.random.default_rng(0)
+    assert frames > clip.frames == FRAMES
+    free = jnp.where(jnp.arange(frames) < 3, 0.0, 1.0)
+    lane = _Clip(own._body, clip.goals, own.profile.weights, clip.bounds, free)
+    q = clip.start + 0.3 * rng.normal(size=clip.start.shape)
+    return jax.tree.map(jnp.asarray, lane), jnp.asarray(q)
+
+
+def compiled(until):
+    return [jax.jit(partial(function, until=until)) for function in (_descended, _descended_plain)]
+
+
+def agree(kernel, plain):
+    np.testing.assert_array_equal(kernel.iterations, plain.iterations)
+    np.testing.assert_allclose(kernel.cost, plain.cost, rtol=1e-7)
+    np.testing.assert_allclose(kernel.q, plain.q, rtol=1e-7, atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def nao():
+    return osik.load_robot("nao")
+
+
+@pytest.mark.parametrize("until", ["ready", "settled", "spent"])
+def test_a_plan_is_improved_as_by_the_plain_method(until, nao, motion):
+    clip, q = clip_of(nao, motion)
+    by_kernel, plainly = compiled(until)
+    for most in (0, 1, 6):
+        found = by_kernel(clip, q, jnp.array(most))
+        agree(found, plainly(clip, q, jnp.array(most)))
+        assert int(found.iterations) == most or until == "ready"
+        np.testing.assert_allclose(found.q[:3, 7:], q[:3, 7:], rtol=0.0, atol=1e-14)  # what is past
+    assert np.abs(found.q - q)[3:FRAMES, 7:].max() > 0.1
+
+
+def test_locked_joints_and_rows_of_whole_blocks(motion):
+    robot = osik.load_robot("nao", locked_joints=dict.fromkeys(LOCKED, 0.1))
+    assert robot.nv % 8 == 0
+    clip, q = clip_of(robot, motion)
+    by_kernel, plainly = compiled("spent")
+    agree(by_kernel(clip, q, jnp.array(2)), plainly(clip, q, jnp.array(2)))
+
+
+def test_a_batch_is_what_each_clip_is_alone(nao, motion):
+    clip, q = clip_of(nao, motion)
+    starts, stiffer = jnp.stack([q, q[::-1]]), jnp.array([1.0, 2.0])
+    by_kernel, _ = compiled("spent")
+
+    def one(start, factor):
+        bounds = clip.bounds._replace(step=factor * clip.bounds.step)
+        return by_kernel(clip._replace(bounds=bounds), start, jnp.array(2))
+
+    together = jax.vmap(one)(starts, stiffer)
+    for i in range(2):
+        alone = one(starts[i], stiffer[i])
+        np.testing.assert_array_equal(together.q[i], alone.q)
+        np.testing.assert_array_equal(together.cost[i], alone.cost)
+
+
+def test_what_cannot_be_solved_moves_nothing(nao, motion):
+    clip, q = clip_of(nao, motion)
+    wrong = clip._replace(bounds=clip.bounds._replace(lower=jnp.full_like(clip.bounds.lower, jnp.nan)))
+    for function in compiled("spent"):
+        found = function(wrong, q, jnp.array(2))
+        np.testing.assert_array_equal(found.q, q)
+        assert int(found.iterations) == 2
