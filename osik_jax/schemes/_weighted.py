@@ -20,6 +20,11 @@ from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
 _ROUNDINGS = 4.0
 """Of the largest weight times row norm squared; a weaker damping is lost in single arithmetic."""
 
+_SHARE = 1.25
+"""Of the curvature damping, what is taken for ``curvature_damping=1``."""
+_SPARED = 30.0
+"""Times what holds a dof anyway: curvature damping that is small beside this is spared."""
+
 
 class WeightedQP(Scheme):
     """min 1/2 sum_i weight_i |J_i v - wanted_i|^2 + 1/2 damping |v|^2  subject to the box.
@@ -57,13 +62,13 @@ class WeightedQP(Scheme):
         """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
-        damping = self.damping + self.curvature_damping * problem.curvature(problem.soft())
+        bend = _SHARE * self.curvature_damping * problem.curvature(problem.soft())
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
             problem.upper,
             **_rows(intervals, problem.constraints()),
-            **_pulls([rows for rows in equalities if rows.dofs is not None], problem, damping, self.backend),
+            **_pulls([rows for rows in equalities if rows.dofs is not None], problem, self.damping, bend, self.backend),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
             backend=self.backend,
@@ -84,9 +89,17 @@ def _least(problem: VelocityProblem, backend: Backend) -> Float[Array, ""]:
 
 
 def _pulls(
-    singles: list[TaskRows], problem: VelocityProblem, damping: Float[Array, ""], backend: Backend
+    singles: list[TaskRows],
+    problem: VelocityProblem,
+    damping: Float[Array, ""],
+    bend: Float[Array, ""],
+    backend: Backend,
 ) -> dict[str, Array]:
-    """Rows that each ask for one dof's velocity, with the damping: a strength and a centre for each dof."""
+    """Rows that each ask for one dof's velocity, with the damping: a strength and a centre for each dof.
+
+    Of the curvature damping, ``bend``, a dof takes what its other strength s does not make up for, ``bend^2 / (bend + m
+    s)``: all of it where that is far above s, and little where a posture holds the dof well enough.
+    """
     n = problem.lower.shape[0]
     strength, pull = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)
     for rows in singles:
@@ -95,6 +108,7 @@ def _pulls(
         usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of nought is NaN
         weight, wanted = (jnp.append(a, 0.0)[place] for a in (usable, usable * rows.lower))
         strength, pull = strength + weight, pull + wanted
+    strength = strength + bend * (bend / (bend + _SPARED * strength))
     least = _least(problem, backend)
     strength = jnp.where(strength < least, least, strength)
     center = pull / strength
