@@ -25,9 +25,8 @@ def handle(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each
     lanes, n, p = dimension(found, 0), dimension(found, 8), dimension(found + 8, 8)
-    whole = dimension(given, 8)  # numbers of a problem: (m + 2) rows of n and 2 m, p rows of n and p, 2 (n + p)
-    m = (whole - 4 * n - p * n - 3 * p) // (n + 2)
-    guess, tolerance, most = data(given + 8), data(given + 16), data(given + 24)
+    m, rest = dimension(given, 8), dimension(given + 8, 8)  # rows of the matrix, numbers of a problem beside it
+    guess, tolerance, most = data(given + 16), data(given + 24), data(given + 32)
     solution, multipliers, active = data(found), data(found + 8), data(found + 16)
     report, space = data(found + 24), data(found + 32)
     k, N, q = m + p, n + p, max(n, m + p)
@@ -48,8 +47,8 @@ def handle(frame):
     at += 14 * line
     targets, compliances, root, z = vector(at, m), vector(at + line, k), vector(at + 2 * line, n), vector(at + 3 * line, k)
     for lane in range(lanes):
-        first, last, A = 8 * n * lane, 8 * N * lane, data(given) + 8 * whole * lane
-        target = A + 8 * m * n
+        first, last, A = 8 * n * lane, 8 * N * lane, data(given) + 8 * m * n * lane
+        target = data(given + 8) + 8 * rest * lane
         damping = target + 16 * m
         C = damping + 16 * n
         lower = C + 8 * (p * n + p)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -16,6 +15,7 @@ from ...execution import _rules
 from ...execution._backends import Backend, check_backend, here
 from ...numerics._constants import INACTIVE
 from ...numerics._dense import apply
+from ...numerics._folded import all_of
 from .._box import clip_roundoff, uncrossed
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
@@ -259,20 +259,14 @@ def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
     )
     arrays = [leaves, jax.tree.leaves(placeholder), *_valid_range(qp)]
     on_cpu = jax.default_backend() == "cpu"
-    if on_cpu:  # one operation for all arrays, where each costs as much as its numbers do
-        arrays = [[_in_a_row(each)] for each in arrays]
-    in_range = [((lowest <= a) & (a <= highest)).all() for a, _, lowest, highest in zip(*arrays, strict=True)]
+    if on_cpu:  # one operation for all arrays but the matrix, where each costs as much as its numbers do
+        arrays = [[first, jnp.concatenate([jnp.ravel(a) for a in rest])] for first, *rest in arrays]
+    in_range = [all_of((lowest <= a) & (a <= highest)) for a, _, lowest, highest in zip(*arrays, strict=True)]
     is_valid = jnp.stack(in_range).all()
     safe = [jnp.where(is_valid, a, b) for a, b, *_ in zip(*arrays, strict=True)]
     if on_cpu:
-        return replace(unpack(qp, safe[0]), packed=safe[0]), is_valid
+        return replace(unpack(qp, *safe), packed=safe[1]), is_valid
     return jax.tree.unflatten(tree, safe), is_valid
-
-
-def _in_a_row(arrays: Sequence[Array | np.ndarray]) -> Array:
-    """All numbers of a problem. The matrix is copied as it is; what makes the others is not fused with the copy."""
-    first, *rest = [jnp.ravel(a) for a in arrays]
-    return jnp.concatenate([first, jax.lax.optimization_barrier(jnp.concatenate(rest))])
 
 
 def _valid_range(qp: QP) -> tuple[list[np.ndarray], list[np.ndarray]]:
