@@ -105,13 +105,13 @@ def _pulls(
 
 def _stack(equalities: list[TaskRows], problem: VelocityProblem) -> tuple[Array, Array, Array]:
     """Matrix, target and weight of equality rows."""
-    n, none = problem.lower.shape[0], jnp.zeros(0, problem.lower.dtype)
-    # the numbers of the matrices in a row, as the solver puts them: nothing is copied twice
-    matrix, target, weight = (
-        jnp.concatenate([none, *(jnp.ravel(getattr(r, field)) for r in equalities)])
-        for field in ("jacobian", "lower", "weight")
+    nothing = jnp.zeros((0, problem.lower.shape[0]), problem.lower.dtype)
+    none = nothing[:, 0]
+    return (
+        jnp.concatenate([nothing, *(r.jacobian for r in equalities)]),
+        jnp.concatenate([none, *(r.lower for r in equalities)]),
+        jnp.concatenate([none, *(r.weight for r in equalities)]),
     )
-    return matrix.reshape(-1, n), target, weight
 
 
 def _rows(intervals: list[TaskRows], constraints: Level | None) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Hashable, Mapping
 from functools import partial
 
@@ -73,6 +72,5 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
 
 
 def _of_task(i: int, a: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Task i's part of an array of all: a slice of all numbers in a row, since XLA joins those again without a copy."""
-    size = math.prod(a.shape[1:])
-    return jnp.ravel(a)[i * size : (i + 1) * size].reshape(a.shape[1:])
+    """Task i's part of an array of all. Rows are slices of all rows, since XLA joins those again without a copy."""
+    return a[i] if a.ndim == 1 else a.reshape(-1, *a.shape[2:])[i * a.shape[1] : (i + 1) * a.shape[1]]

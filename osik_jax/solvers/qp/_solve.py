@@ -15,7 +15,6 @@ from ...execution import _rules
 from ...execution._backends import Backend, check_backend, here
 from ...numerics._constants import INACTIVE
 from ...numerics._dense import apply
-from ...numerics._folded import all_of
 from .._box import clip_roundoff, uncrossed
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
@@ -261,7 +260,7 @@ def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
     on_cpu = jax.default_backend() == "cpu"
     if on_cpu:  # one operation for all arrays but the matrix, where each costs as much as its numbers do
         arrays = [[first, jnp.concatenate([jnp.ravel(a) for a in rest])] for first, *rest in arrays]
-    in_range = [all_of((lowest <= a) & (a <= highest)) for a, _, lowest, highest in zip(*arrays, strict=True)]
+    in_range = [((lowest <= a) & (a <= highest)).all() for a, _, lowest, highest in zip(*arrays, strict=True)]
     is_valid = jnp.stack(in_range).all()
     safe = [jnp.where(is_valid, a, b) for a, b, *_ in zip(*arrays, strict=True)]
     if on_cpu:
