@@ -74,24 +74,6 @@ def test_met_and_linear_tasks_bend_nothing(arm):
     assert curvatures(bent(arm)) == [0.0, 0.0]
 
 
-def test_small_errors_count_with_their_square_in_a_scheme_that_cannot_know_what_it_leaves(arm):
-    @jax.jit
-    def rows(distance):
-        q = bent(arm)
-        kinematics = osik.forward_kinematics(arm, q)
-        p, rotation = kinematics.frame_pose(arm, "hand")
-        target = (p + distance * jnp.array([0.6, 0.0, 0.8]), rotation)
-        task = osik.FrameTask(arm, "hand", rows="position", target=target, weight=3.0)
-        found = task.rows(arm, kinematics, q)
-        return found.onset, found.jacobian
-
-    share, jacobian = jax.vmap(rows)(jnp.array([0.0, 1e-6, 2e-6, 0.01, 10.0]))
-    arm_length = np.linalg.norm(jacobian[0])
-    np.testing.assert_allclose(share[2] / share[1], 2.0, rtol=1e-3)
-    np.testing.assert_allclose(share[3], 0.01 / (0.01 + 0.005 * arm_length), rtol=1e-9)  # whatever the weight
-    assert share[0] == 0.0 and 0.99 < share[4] < 1.0
-
-
 @pytest.fixture(scope="module")
 def beyond(arm):
     """Of each scheme: three seconds towards a point that is half a metre out of reach, damped and not."""
@@ -141,7 +123,7 @@ def test_inside_it_is_as_exact_as_without(scheme, arm):
         return jnp.linalg.norm(ends - path, axis=1)
 
     damped, plain = np.asarray(errors(jnp.array([1.0, 0.0])))
-    if scheme != "reverse":  # what can be met is not damped, or next to not
+    if scheme in ("hierarchical", "null-space"):  # what a level can meet is not damped
         assert damped.max() < 1.2 * plain.max()
     assert damped.max() < 1e-3
 

@@ -19,10 +19,6 @@ MIN_RADIUS = 1e-6
 NEGLIGIBLE_CURVATURE = 1e-6
 """Relative to the largest curvature cost of a variable: a smaller one may be roundoff and restricts nothing."""
 
-ONSET_ANGLE = 0.005
-"""An error as an angle [rad]: its length over the Frobenius norm of its Jacobian, both weighted. Here half of a task's
-curvature counts in a scheme that cannot know which error a step will leave."""
-
 NEGLIGIBLE_STEP = 1e-11
 """Relative to the norm of the point where it begins: a shorter step counts as none."""
 FULL_STEP = 1.0 - 1e-9

@@ -70,19 +70,13 @@ class VelocityProblem(eqx.Module):
         ranked = [(name, rank) for name, rank in self.priorities if name not in self.hard]
         return [[name for name, own in ranked if own == rank] for rank in sorted({rank for _, rank in ranked})]
 
-    def curvature(self, names: Iterable[str], *, eased: bool = False) -> Float[Array, ""]:
+    def curvature(self, names: Iterable[str]) -> Float[Array, ""]:
         """Damping of the velocity that makes up for what the linear model of these tasks leaves out.
 
         A tick leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
         different chains, so their parts add up like the sides of a right angle.
-
-        Args:
-            names: of the tasks.
-            eased: whether small errors count less than in proportion (``TaskRows.onset``): what a step will leave of
-                them is not known.
         """
-        rows = [self.rows[name] for name in names]
-        bends = [own.onset * own.curvature if eased else own.curvature for own in rows]  # none where all tasks are hard
+        bends = [self.rows[name].curvature for name in names]  # none where all tasks are hard
         return self.dt * length(jnp.stack([jnp.zeros_like(self.dt), *bends]))
 
     def dampings(

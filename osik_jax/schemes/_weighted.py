@@ -35,14 +35,13 @@ class WeightedQP(Scheme):
             dof, its damping and its posture together, is at least a few roundings of the largest weight times row norm
             squared.
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
-            none. What is added vanishes where the tasks are met, with the square of small errors
-            (``TaskRows.curvature``, ``TaskRows.onset``).
+            none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
         max_iterations: cap on changes of the active set (static).
         backend: whose candidates for the answer are taken, as in ``solve_least_squares_qp`` (static).
     """
 
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
-    curvature_damping: Float[Array, ""] = eqx.field(default=1.5, converter=as_leaf("curvature_damping"), kw_only=True)
+    curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
     max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
     backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
@@ -58,7 +57,7 @@ class WeightedQP(Scheme):
         """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
-        damping = self.damping + self.curvature_damping * problem.curvature(problem.soft(), eased=True)
+        damping = self.damping + self.curvature_damping * problem.curvature(problem.soft())
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,

@@ -27,7 +27,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..kinematics._rigid import cross
-from ..numerics._constants import ONSET_ANGLE
 from ._gain import safe_norm
 from ._rotation import dot
 
@@ -86,23 +85,6 @@ def levers(weight: Float[Array, " m"], jacobian: Float[Array, "m nv"]) -> Float[
     squared = jnp.sum(weight[:, None] * jacobian**2, axis=0)
     positive = squared > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
-
-
-def onset(error: Float[Array, " m"], weight: Float[Array, " m"], levers: Float[Array, " nv"]) -> Float[Array, ""]:
-    """The share of a task's curvature that counts where nobody knows what a step will leave, 0 to 1.
-
-    ``angle / (angle + ONSET_ANGLE)``, with the error as an angle, its length over that of the levers. So the damping
-    grows with the square of a small error, and with the first power of a large one; between these two powers lies what
-    keeps Levenberg's and Marquardt's convergence quadratic (Fan and Yuan, above). 0 for rows that are linear.
-
-    Args:
-        error: of the task; what an inequality is outside by.
-        weight: of the square of each row.
-        levers: of the task.
-    """
-    size = length(jnp.sqrt(jnp.where(weight > 0.0, weight, 0.0)) * error)
-    whole = size + ONSET_ANGLE * length(levers)
-    return size / jnp.where(whole > 0.0, whole, 1.0)
 
 
 def row_sums(levers: Float[Array, " nv"]) -> Float[Array, " nv"]:

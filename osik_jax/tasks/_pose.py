@@ -118,8 +118,8 @@ class PoseTask(FramedTask):
         Pose, target and Jacobian are in the outer axes: the world's, or those of the frame that the pose is in.
         """
         if backend != "jax" and not (self.coupled or self.bounded or isinstance(self.gain, AdaptiveGain)):
-            error, rows, wanted, *rest = _by_kernel(self, position, rotation, jacobian)
-            return TaskRows(error, rows, wanted, wanted, *rest)
+            error, rows, wanted, weight, curvature, pull, arms = _by_kernel(self, position, rotation, jacobian)
+            return TaskRows(error, rows, wanted, wanted, weight, curvature, pull, arms)
         return self._plain_rows(position, rotation, jacobian)
 
     def _plain_rows(
@@ -216,7 +216,7 @@ class PoseTask(FramedTask):
 def _fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
     """Of the rows of a task that asks for a pose; both bounds are one."""
     rows = task._plain_rows(position, rotation, jacobian)
-    return rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.onset, rows.pull, rows.levers
+    return rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
 
 
 def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
@@ -229,14 +229,11 @@ def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian
     given = (position, rotation, jacobian, numbers)
     lanes, count, nv = max(len(a) for a in given), len(kept), jacobian.shape[-1]
     options = np.array([*task.kept, task.axes == "frame", task.orientation_jacobian == "geometric"], np.int32)
-    shapes = (
-        *((lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes,), (lanes, count), (lanes, nv)),
-        (7 * nv + 12,),
-    )
-    error, rows, wanted, curvature, onset, pull, levers, _ = _target.call(
+    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (7 * nv + 12,)
+    error, rows, wanted, curvature, pull, levers, _ = _target.call(
         "_pose_rows", [(shape, float) for shape in shapes], *given, options
     )
-    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, onset, pull, levers
+    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers
 
 
 _by_kernel = by_numba(_fields, _fields_by_kernel)

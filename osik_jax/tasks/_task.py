@@ -18,7 +18,7 @@ from ..kinematics._home import compiled_kinematics
 from ..numerics._replace import Replaceable
 from ..robot import Robot
 from ..robot._made_for import MadeForRobot
-from ._curvature import jacobian_curvature, levers, no_curvature, onset
+from ._curvature import jacobian_curvature, levers, no_curvature
 from ._gain import Gain, as_gain, evaluate_gain
 from ._leaves import as_own_weight, as_weight
 from ._repr import short_repr
@@ -39,8 +39,6 @@ class TaskRows(eqx.Module):
         curvature: bound on the second derivative of the task's error along its own pull, ``|sum_i weight_i gain e_i
             grad^2 e_i|``: times dt, the damping that the schemes add for it (``_curvature.py``). 0 where the task is
             met, or linear in the joints. ()
-        onset: the share of the curvature that a scheme adds which cannot know what a step will leave of the error: near
-            0 for a small error, near 1 for a large one (``_curvature.py``). ()
         pull: ``gain e`` of each row, without the target's own velocity; of an inequality, what it is outside by. (m,)
         levers: how far each dof moves the rows, their weights' roots multiplied in; 0 for a dof that they are linear
             in. (nv,)
@@ -54,7 +52,6 @@ class TaskRows(eqx.Module):
     upper: Float[Array, " m"]
     weight: Float[Array, " m"]
     curvature: Float[Array, ""] = eqx.field(default=0.0, converter=jnp.asarray)
-    onset: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
     pull: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     levers: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
@@ -178,14 +175,12 @@ def task_rows(
     if lower is None or upper is None:
         pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
         wanted = shift - pull
-        share = onset(error, weight, arms)
-        return TaskRows(error, jacobian, wanted, wanted, weight, bend(weight * pull), share, pull, arms, dofs)
+        return TaskRows(error, jacobian, wanted, wanted, weight, bend(weight * pull), pull, arms, dofs)
     outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
     rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
     low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
     pull = rate * outside
-    share = onset(outside, weight, arms)
-    return TaskRows(error, jacobian, low, high, weight, bend(weight * pull), share, pull, arms, dofs)
+    return TaskRows(error, jacobian, low, high, weight, bend(weight * pull), pull, arms, dofs)
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:

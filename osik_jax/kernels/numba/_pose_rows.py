@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import ONSET_ANGLE
 from ._dense import fill
 from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
 from ._rigid import composed, cross, minus, transposed
@@ -209,14 +208,6 @@ def pose_curvature(R, J, weight, pull, kept, in_frame, bends):
     return (paired(force, J, 0, bends) + 0.5 * paired(torque, J, 3, bends)) / np.sqrt(2.0)
 
 
-@lean
-def onset(error_squared, levers_squared):
-    """``tasks/_curvature.py: onset`` of the squares of both lengths."""
-    size = np.sqrt(error_squared)
-    whole = size + ONSET_ANGLE * np.sqrt(levers_squared)
-    return size / whole if whole > 0.0 else 0.0
-
-
 def handle(frame):
     """One call of XLA: arguments as in ``tasks/_pose.py``, each with a leading axis of lanes, or of 1."""
     if not is_call(frame):
@@ -224,7 +215,7 @@ def handle(frame):
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each
     lanes, m, nv = dimension(found, 0), dimension(found, 8), dimension(found + 8, 16)
     options = whole_numbers(data(given + 32), 8)
-    in_frame, geometric, space = options[6] != 0, options[7] != 0, data(found + 56)
+    in_frame, geometric, space = options[6] != 0, options[7] != 0, data(found + 48)
     whole, bends = matrix(space, 6, nv), vector(space + 48 * nv, nv)
     wrong, forward = vector(space + 56 * nv, 6), vector(space + 56 * nv + 48, 6)
     # bytes between the lanes of each argument, 0 where all have the same
@@ -239,23 +230,20 @@ def handle(frame):
             forward,
         )  # fmt: skip
         error, rows = vector(data(found) + 8 * m * lane, m), matrix(data(found + 8) + 8 * m * nv * lane, m, nv)
-        wanted, pull = vector(data(found + 16) + 8 * m * lane, m), vector(data(found + 40) + 8 * m * lane, m)
-        levers = vector(data(found + 48) + 8 * nv * lane, nv)
+        wanted, pull = vector(data(found + 16) + 8 * m * lane, m), vector(data(found + 32) + 8 * m * lane, m)
+        levers = vector(data(found + 40) + 8 * nv * lane, nv)
         fill(levers, 0.0)
-        row, off, arm = 0, 0.0, 0.0
+        row = 0
         for i in range(6):
             if options[i] == 0:
                 continue
             error[row], pull[row] = wrong[i], gain * wrong[i]
             wanted[row] = forward[i] - pull[row]
-            off += weight[row] * wrong[i] * wrong[i]
             for j in range(nv):
                 rows[row, j] = whole[i, j]
                 levers[j] += weight[row] * whole[i, j] * whole[i, j]
             row += 1
         for j in range(nv):
-            arm += levers[j]
             levers[j] = np.sqrt(levers[j])
         vector(data(found + 24) + 8 * lane, 1)[0] = pose_curvature(R, J, weight, pull, options, in_frame, bends)
-        vector(data(found + 32) + 8 * lane, 1)[0] = onset(off, arm)
     return 0
