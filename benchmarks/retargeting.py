@@ -39,7 +39,7 @@ from osik_jax.retargeting import (
     load_profile,
     report,
 )
-from osik_jax.retargeting._g1 import g1_urdf
+from osik_jax.retargeting._described import g1_urdf
 from osik_jax.retargeting._live_command import replay
 from osik_jax.retargeting._retarget import _lane, _solve_lanes
 from osik_jax.runtime import configure_cpu

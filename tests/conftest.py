@@ -48,6 +48,15 @@ if not (shutil.which("chromium") and find_spec("playwright")):
 collect_ignore = list(NOT_INSTALLED)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks single variants of a test as slow or for releases: ``@pytest.mark.variants(slow=[...], release=[...])``."""
+    for item in items:
+        for tier, ids in ((t, i) for m in item.iter_markers("variants") for t, i in m.kwargs.items()):
+            if item.name.partition("[")[2].removesuffix("]") in ids:
+                item.add_marker(tier)
+
+
 def pytest_report_header() -> list[str]:
     """Says with which JAX, and what is left out where an oracle or a browser is not installed."""
     without = [f"NOT RUN, for {missing} is not installed: {name}" for name, missing in NOT_INSTALLED.items()]

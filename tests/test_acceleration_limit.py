@@ -135,6 +135,7 @@ def boxes(robot, states):
 
 
 class TestClosedLoop:
+    @pytest.mark.variants(release=["1000000"])
     @pytest.mark.parametrize("count", [5_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
     def test_never_breaks_a_limit(self, rail, count):
         """Extreme choices from viable states: box, speed, acceleration and range hold to rounding, at the end too."""
@@ -184,6 +185,7 @@ class TestClosedLoop:
 
 
 class TestInTheLoop:
+    @pytest.mark.slow
     def test_rollout_hands_the_velocity_on(self, arm):
         """The first tick starts from the velocity that the limit was given; the loop by hand gives the same path."""
         tasks = {"posture": osik.PostureTask(arm, target=arm.q0 + 0.3, weight=1.0)}

@@ -42,6 +42,7 @@ def test_frame_pose_is_that_of_mujoco(arm):
 
 
 class TestTargetsOfSolve:
+    @pytest.mark.release
     def test_are_as_replaced(self, arm, tasks, pose):
         wanted = osik.solve(arm, arm.q0, tasks | {"hand": tasks["hand"].replace(target=pose)}).velocity
         rotation = jaxlie.SO3.from_matrix(pose[1])

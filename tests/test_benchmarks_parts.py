@@ -12,7 +12,7 @@ from benchmarks import job, parts, rollouts
 from osik_jax import scaling
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_rows_of_all_parts(tmp_path, monkeypatch, capsys):
     path = tmp_path / "parts.json"
     monkeypatch.setattr(parts, "SECONDS", 0.0)
@@ -38,7 +38,7 @@ def test_an_operation_is_found_where_it_is():
     assert seconds > 2.0 * sum(others for _, others in rest)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
     path = tmp_path / "rollouts.json"
     monkeypatch.setattr(sys, "argv", ["rollouts", str(path), "--robot", "arm7", "--robots", "2", "--ticks", "3"])

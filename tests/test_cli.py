@@ -195,6 +195,7 @@ def test_info_lists_joints_limits_frames_and_mass(capsys):
     assert numbers[4] == pytest.approx(float(robot.velocity_limit[dof]), abs=5e-5)
 
 
+@pytest.mark.slow
 def test_demo_of_a_file_writes_its_folder(capsys, tmp_path, arm_file):
     out = tmp_path / "out"
     arguments = [

@@ -241,6 +241,7 @@ def test_points_are_as_far_apart_as_the_distance(zoo):
     np.testing.assert_allclose((ours.point_b - ours.point_a)[:, exact], expected[:, exact], atol=1e-8)
 
 
+@pytest.mark.release
 def test_distances_in_single_precision(zoo):
     """To 1e-6 m where shapes are apart, to 1e-5 m where they overlap, half a metre from the origin."""
     _, limit, q, ours = zoo
@@ -263,6 +264,7 @@ def _soonest(distances, slopes):
     return np.argsort((distances - 0.02) / (np.abs(slopes).sum(-1) + 1e-3), axis=1)
 
 
+@pytest.mark.slow
 def test_rows_are_those_of_the_pairs_that_could_meet_soonest(arm, avoidance):
     """Jacobians against central differences of the distances; bounds against the formula."""
     q = np.random.default_rng(2).uniform(-2.0, 2.0, (40, 3))
@@ -340,7 +342,7 @@ def _coincident():
     return osik.Robot.from_mjcf(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_everything_is_finite_where_centres_coincide():
     """And where boxes touch face to face, edge to edge, and capsules lie side by side."""
     robot = _coincident()
@@ -478,6 +480,7 @@ def _tips(arm, q):
     return jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "tip")[0])(q)
 
 
+@pytest.mark.slow
 def test_no_tick_of_a_closed_loop_penetrates(arm, among):
     """Forty targets that the arm can reach: with the limit 15 mm are kept, without it more than half hit something."""
     reachable = np.random.default_rng(6).uniform(-2.0, 2.0, (40, 3))

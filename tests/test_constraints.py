@@ -148,6 +148,7 @@ def weighted_answer(p: Problem, damping: float) -> np.ndarray:
 class TestAgainstOthers:
     """In each lane some rows of the limit bind."""
 
+    @pytest.mark.variants(slow=["inequality"])
     @pytest.mark.parametrize("hard", [("elbow",), ("elbow", "side")], ids=["equality", "inequality"])
     def test_weighted(self, arm, lanes, hard):
         some = cases(arm, lanes, hard=hard)
@@ -198,6 +199,7 @@ class TestAgainstOthers:
             box = np.maximum(np.maximum(p.box[0] - x, x - p.box[1]), 0.0).max()
             np.testing.assert_allclose(ours.box_violation[i], max(np.abs(broken).max(), box), atol=1e-12)
 
+    @pytest.mark.variants(release=["saturated"])
     @pytest.mark.parametrize("name", ["saturated", "reverse"])
     def test_other_projections(self, arm, lanes, name):
         some = cases(arm, lanes, hard=("elbow",))
@@ -313,6 +315,7 @@ def test_mistakes(arm):
 
 @pytest.mark.slow
 class TestDerivatives:
+    @pytest.mark.variants(release=["hierarchical", "null-space"])
     @pytest.mark.parametrize("name", ["weighted", "null-space", "hierarchical"])
     def test_against_differences(self, arm, lanes, name):
         """With respect to the configuration, a target, and the rows and bounds of the limit."""

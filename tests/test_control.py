@@ -74,6 +74,7 @@ def assert_same(ours, theirs, atol):
 
 
 class TestRollout:
+    @pytest.mark.variants(slow=["hierarchical"])
     @all_schemes
     def test_equals_a_python_loop(self, arm, home, tasks, limits, name):
         """Every number of the solution but the warm start, with a target that moves."""
@@ -282,6 +283,7 @@ class TestBatches:
             expected[0] = -0.4
         np.testing.assert_array_equal(out.velocity[4], expected)
 
+    @pytest.mark.release
     def test_rollouts_in_a_batch(self, arm, tasks, limits, rng):
         """vmap of the whole loop over starts and targets."""
         starts = np.asarray(arm.q0) + 0.2 * rng.normal(size=(3, arm.nq))
@@ -342,6 +344,7 @@ class TestDerivatives:
         }
         return f, x
 
+    @pytest.mark.variants(slow=["null-space"])
     @pytest.mark.parametrize("name", ["weighted", "null-space"])
     def test_one_tick_in_both_modes(self, arm, home, limits, name):
         f, x = self.cost(arm, home, limits, name)

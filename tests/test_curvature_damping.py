@@ -128,6 +128,7 @@ def test_inside_it_is_as_exact_as_without(scheme, arm):
     assert damped.max() < 1e-3
 
 
+@pytest.mark.variants(release=["null-space", "reverse"])
 @pytest.mark.parametrize(
     "scheme", ["weighted", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SCHEMES)[1:])]
 )
@@ -159,6 +160,7 @@ def test_derivatives_with_the_damping_on(scheme, arm):
     np.testing.assert_allclose(reverse, slope, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.variants(release=["hierarchical", "weighted", "null-space"])
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", [*SCHEMES, "saturated"])
 def test_derivatives_where_little_room_is_left(scheme, arm):

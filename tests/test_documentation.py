@@ -84,7 +84,19 @@ def heading_anchors(page: Path) -> set[str]:
 
 
 LONG = {
-    f"docs/{name}.md" for name in ("batches", "porting", "scaling", "solvers", "tasks_and_limits", "tuning", "viewer")
+    f"docs/{name}.md"
+    for name in (
+        "batches",
+        "inverse_kinematics",
+        "porting",
+        "retargeting",
+        "scaling",
+        "solvers",
+        "tasks_and_limits",
+        "the_loop",
+        "tuning",
+        "viewer",
+    )
 }
 
 

@@ -143,7 +143,7 @@ class TestMistakes:
             osik.EqualityConstraintTask(tied, constraints=("rope",))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_number_counts_and_gradients_are_finite(robot, configurations):
     task = {"task": osik.EqualityConstraintTask(robot, constraints=("loop", "cam", "glue"))}
     assert_every_number_counts(robot, task, configurations[0])

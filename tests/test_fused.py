@@ -181,6 +181,7 @@ def beside_a_gpu(monkeypatch):
     jax.clear_caches()
 
 
+@pytest.mark.release
 def test_a_cpu_beside_a_gpu_keeps_to_xla(batch, beside_a_gpu):
     """Where a program runs decides, not what the machine has."""
     answer = solved(batch)

@@ -83,6 +83,8 @@ class TestOutOfReach:
         places = middle + away * units
         return np.repeat(places, len(self.GAINS), 0), np.tile(self.GAINS, len(places))
 
+    @pytest.mark.variants(release=["saturated null space-True", "hierarchy-False"])
+    @pytest.mark.variants(release=["hierarchy-True"])
     @pytest.mark.parametrize(
         ("scheme", "posture"),
         [
@@ -111,6 +113,7 @@ class TestOutOfReach:
             left = np.linalg.norm(places_of(arm, path[lane, -1:], "hand")[0] - place)
             assert left == pytest.approx(np.linalg.norm(nearest - place), rel=0.01)
 
+    @pytest.mark.variants(release=["hierarchy-600"])
     @pytest.mark.parametrize(("scheme", "rest"), [("weighted", 400), ("hierarchy", 600)])
     @pytest.mark.slow
     def test_a_nao_comes_to_rest_on_its_feet(self, nao, scheme, rest):
@@ -130,6 +133,8 @@ class TestOutOfReach:
 class TestAtTheStart:
     """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives."""
 
+    @pytest.mark.variants(release=["saturated null space", "hierarchy"])
+    @pytest.mark.variants(slow=["null space"], release=["damped null space", "reverse order"])
     @pytest.mark.parametrize(
         "method", [name if name in QUICK_METHODS else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]
     )

@@ -229,6 +229,7 @@ def test_shapes_that_do_not_fit_are_named():
         Level(jnp.ones((2, 4)), jnp.zeros(2), jnp.zeros(2), equalities=[True])
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_solution_map(rng, recorded):
     """Along a random change of all data (zeros by structure kept): forward, reverse, central differences."""
     r, _ = recorded

@@ -235,6 +235,7 @@ def test_changing_numbers_compiles_nothing(arm, rng):
     assert program._cache_size() == before
 
 
+@pytest.mark.slow
 def test_tasks_on_an_arm_with_a_wall_and_preferences(arm):
     """Steps of the scheme: a barrier that a frame does not pass, a posture that fades out."""
     start = np.asarray(arm.q0)
@@ -253,6 +254,7 @@ def test_tasks_on_an_arm_with_a_wall_and_preferences(arm):
     assert_within_limits(arm, found.q)
 
 
+@pytest.mark.variants(release=["False"])
 @pytest.mark.slow
 @pytest.mark.parametrize("hard", [False, True])
 def test_floating_base_with_feet_held_and_balance(rng, hard):

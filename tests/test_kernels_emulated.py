@@ -80,6 +80,7 @@ def test_every_level_of_a_hierarchy_is_certified(family, on_emulated_gpu):
         assert max(certificate(p, i, x[i]).max() for i in range(COUNT)) < 1e-10
 
 
+@pytest.mark.variants(release=["backwards-float32", "forwards-float64"])
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_recorded_hierarchies(precision, on_emulated_gpu):
     """Level norms within the precision contract, cold and warm; the near-singular ones are among them."""
@@ -115,6 +116,7 @@ def test_recorded_qps(robot, on_emulated_gpu):
         start = s.active
 
 
+@pytest.mark.variants(release=["forwards-3", "forwards-0", "backwards-3"])
 @pytest.mark.parametrize("soft", [0, 3])
 def test_derivatives_of_recorded_qps(soft, on_emulated_gpu, rng):
     """Those of single precision by the kernel, beside those of double precision by XLA, where the kernel answers.

@@ -162,6 +162,7 @@ def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, t
     visit.check()
 
 
+@pytest.mark.release
 def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit, tmp_path: Path) -> None:
     page, left = visit.page, np.array([0.0, 1.0, 0.0])
     enter(view, page)
@@ -229,6 +230,7 @@ def test_an_exported_page_plays_without_a_server(visit: Visit, tmp_path: Path) -
     visit.check()
 
 
+@pytest.mark.release
 def test_a_click_on_a_slice_and_a_drag_past_it(visit: Visit, tmp_path: Path) -> None:
     """A click brings the robot there; a drag turns the camera and nothing else."""
     arm, page = osik.load_robot("arm7"), visit.page

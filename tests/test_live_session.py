@@ -83,6 +83,7 @@ def test_its_lines_of_python_make_the_same_controller() -> None:
     np.testing.assert_array_equal(names["solution"].velocity, expected.velocity)
 
 
+@pytest.mark.release
 def test_what_is_switched_off_is_as_if_it_were_not_there() -> None:
     arm = osik.load_robot("arm7")
     home = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")

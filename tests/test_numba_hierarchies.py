@@ -72,6 +72,7 @@ def test_every_level_is_certified_and_nothing_is_left_to_the_search(families, no
         assert max(certificate(families, i, x[i]).max() for i in range(0, len(x), 3)) < 1e-10
 
 
+@pytest.mark.variants(slow=["False"])
 @pytest.mark.parametrize("damped", [False, True])
 def test_answers_are_those_of_the_search(families, damped):
     mine, search = (solved(*given(families), backend=b, damped=damped) for b in ("numba", "jax"))
@@ -110,6 +111,7 @@ def test_vmap_is_a_loop_and_a_bad_lane_leaves_its_neighbours_alone(families):
         np.testing.assert_array_equal(alone.x[0], s.x[i])
 
 
+@pytest.mark.slow
 def test_what_the_kernel_leaves_over_is_searched(families, monkeypatch):
     """A kernel that gives wrong answers in every third lane."""
     p = jax.tree.map(lambda a: a[:6], families)
@@ -129,6 +131,7 @@ def test_what_the_kernel_leaves_over_is_searched(families, monkeypatch):
     np.testing.assert_allclose(s.x, right.x, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     A = np.random.default_rng(3).normal(size=(7, 5))
     box = np.full(5, 0.4)
@@ -172,6 +175,7 @@ def test_programs_for_other_machines():
     assert "osik_jax_hierarchy" not in traced.lower(lowering_platforms=("cuda",)).as_text()
 
 
+@pytest.mark.slow
 def test_the_second_process_does_not_compile():
     """Nor does importing the package import Numba."""
     solved(*given(jax.tree.map(lambda a: a[:1], SMALL["conflicting"](np.random.default_rng(0), 1))))
@@ -211,7 +215,7 @@ def test_rows_in_blocks_are_those_of_numpy():
         assert np.isnan(np.delete([c, d], np.s_[start : max(start, stop)], axis=1)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_index_is_out_of_bounds():
     """With every index checked: an exception would leave its lanes to the search, and print a line."""
     code = f"import pytest; pytest.main(['-q', '-n', '0', '-k', 'certified or recorded', {__file__!r}])"
@@ -220,7 +224,7 @@ def test_no_index_is_out_of_bounds():
     assert "3 passed" in ran.stdout and "IndexError" not in ran.stdout + ran.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_ten_thousand_problems(rng):
     """Lane by lane, level by level; ``python -m benchmarks.agreement`` goes on."""
     p = stretched(rng, 2048)

@@ -88,6 +88,7 @@ def assert_near(ours, theirs, atol=ROUNDING):
     jax.tree.map(partial(np.testing.assert_allclose, rtol=0.0, atol=atol), ours, theirs)
 
 
+@pytest.mark.variants(slow=["coupled"], release=["toy"])
 @pytest.mark.parametrize("name", NAMES)
 def test_beside_the_plain_method(robots, name):
     """Alone, in a batch that shares the robot, and in one of robots with other links, masses and axes."""
@@ -132,6 +133,8 @@ def test_beside_mujoco(robots, name):
             np.testing.assert_allclose(jacobian, np.concatenate([linear, angular]) @ to_mujoco, atol=ROUNDING)
 
 
+@pytest.mark.variants(release=["toy"])
+@pytest.mark.variants(slow=["coupled"])
 @pytest.mark.parametrize("name", (pytest.param("toy", marks=pytest.mark.slow), "coupled"))
 def test_derivatives(robots, name):
     """Both modes, with respect to the configuration and to the robot's own numbers, and the second along a line."""
@@ -193,6 +196,9 @@ def pose_tasks(robot: osik.Robot, **options) -> dict[str, osik.Task]:
     return tasks | {"relative": osik.RelativeFrameTask(robot, one, other, **given)}
 
 
+@pytest.mark.variants(
+    slow=["pose"], release=["twist", "adaptive", "geometric", "frame's axes", "some", "geometric, frame's"]
+)
 @pytest.mark.parametrize("case", OPTIONS)
 def test_rows_of_poses(robots, case):
     """All that the rows hold, beside the plain method; some errors are 0, one is nearly half a turn."""
@@ -212,6 +218,7 @@ def test_rows_of_poses(robots, case):
     assert_near(ours, theirs, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_derivatives_of_rows(robots):
     robot = robots["toy"]
     tasks = pose_tasks(robot)
@@ -227,6 +234,7 @@ def test_derivatives_of_rows(robots):
     assert_near(*map(jax.tree.leaves, (ours, theirs)), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_step_that_says_jax_has_no_kernel(robots):
     """``jax.export`` takes no calls of kernels: a step of ``backend="jax"`` is exported, and gives the same."""
     robot = robots["arm7"]

@@ -170,6 +170,7 @@ def test_the_reverse_order_with_the_factors_of_the_kernel(name):
     np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-8)
 
 
+@pytest.mark.variants(release=["level without rows", "repeated and damped"])
 @pytest.mark.parametrize(
     "name",
     [
@@ -212,6 +213,8 @@ def test_factors_of_rows(rng, m, n, rank, scale, damping):
     np.testing.assert_array_equal(np.tril(triangle, -1), 0.0)
 
 
+@pytest.mark.variants(release=["nothing left-forward", "independent-forward"])
+@pytest.mark.variants(slow=["damped-reverse"], release=["damped inequalities-saturated", "damped inequalities-forward"])
 @pytest.mark.parametrize(
     ("name", "method"),
     [
@@ -248,6 +251,7 @@ def test_derivatives_in_both_modes_are_those_of_the_plain_method_and_of_differen
     assert (np.abs(rates["numba"] - narrow).max(1) < 1e-4 * size)[smooth].all()
 
 
+@pytest.mark.release
 def test_second_derivatives_and_loops():
     """Through a scan, whose body is linearised apart from it."""
     A = np.random.default_rng(3).normal(size=(7, 5))
@@ -282,6 +286,7 @@ def test_vmap_is_a_loop_however_it_is_nested(rng):
     np.testing.assert_allclose(shared[3], together.x[3], rtol=0, atol=1e-13)
 
 
+@pytest.mark.variants(release=["saturated", "forward"])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_bad_lane_harms_none(method):
     p = jax.tree.map(np.copy, FAMILIES["damped inequalities"])
@@ -331,6 +336,7 @@ def test_a_backend_that_is_not_there(monkeypatch):
         osik.NullSpace(backend="numba")
 
 
+@pytest.mark.release
 def test_the_scheme():
     """A tick of an arm by both backends, in each order."""
     arm = osik.load_robot("arm7")
@@ -356,7 +362,7 @@ def test_the_scheme():
         np.testing.assert_allclose(found.velocity, expected.velocity, rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_index_is_out_of_bounds():
     """With every index checked; an exception in a kernel would print a line and leave its results as they were."""
     code = f"import pytest; pytest.main(['-q', '-n', '0', '-k', 'lane_by_lane or factors_of', {__file__!r}])"

@@ -49,6 +49,7 @@ def nao():
     return osik.load_robot("nao")
 
 
+@pytest.mark.variants(slow=["settled"], release=["spent"])
 @pytest.mark.parametrize("until", ["ready", "settled", "spent"])
 def test_a_plan_is_improved_as_by_the_plain_method(until, nao, motion):
     clip, q = clip_of(nao, motion)
@@ -61,6 +62,7 @@ def test_a_plan_is_improved_as_by_the_plain_method(until, nao, motion):
     assert np.abs(found.q - q)[3:FRAMES, 7:].max() > 0.1
 
 
+@pytest.mark.slow
 def test_locked_joints_and_rows_of_whole_blocks(motion):
     robot = osik.load_robot("nao", locked_joints=dict.fromkeys(LOCKED, 0.1))
     assert robot.nv % 8 == 0

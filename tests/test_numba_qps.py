@@ -89,6 +89,7 @@ def assert_same(p: Problems, found, expected) -> None:
     assert np.asarray(found.active == expected.active)[good].all(1).mean() > 0.99
 
 
+@pytest.mark.variants(release=["7"])
 @pytest.mark.parametrize("m", [M, MANY])
 def test_lane_by_lane_as_the_plain_method(m):
     p = problems(m=m)
@@ -101,6 +102,7 @@ def test_lane_by_lane_as_the_plain_method(m):
     assert found.factorizations.max() > 3 and found.iterations.max() > 5
 
 
+@pytest.mark.variants(release=["16", "7"])
 @pytest.mark.slow
 @pytest.mark.parametrize("m", [M, MANY])
 def test_many_lanes_as_the_plain_method(m):

@@ -153,6 +153,7 @@ def reach(robot, name):
     return tasks | {"balance": osik.ComTask(robot, polygon=polygon, priority=2)}
 
 
+@pytest.mark.variants(slow=["hard_contacts_and_balance", "hard_feet_and_posture"])
 @pytest.mark.parametrize("name", REACHES)
 def test_a_reach_is_solved_at_either_precision(name):
     """A NAO at default settings, hard feet beside a weak posture or none at all: float32 does what float64 does."""

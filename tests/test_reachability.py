@@ -116,7 +116,7 @@ def test_configurations_are_where_the_map_says():
         assert ((q >= arm.position_lower) & (q <= arm.position_upper)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_an_obstacle_keeps_poses_from_being_reached(planar, planar_map):
     """A ball at the tip keeps clear of another, in the plane: what is nearer to that is not reached, what is far is."""
     ball, apart = np.array([0.43, 0.6, 0.0]), 0.2 + 0.05

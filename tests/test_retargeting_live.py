@@ -53,6 +53,7 @@ def assert_limits_hold(robot, frames, fps, acceleration=240.0):
     assert np.abs(np.diff(speed, axis=0)).max() * fps <= acceleration * (1.0 + 1e-9)
 
 
+@pytest.mark.slow
 def test_frame_by_frame_is_near_the_whole_clip(nao, motion, live):
     whole = retarget(nao, motion)
     result, frames = replay(lambda _: live, motion, paced=False)

@@ -145,6 +145,7 @@ print(alone, [str(w.message) for w in seen if "configure_cpu" in str(w.message)]
 """
 
 
+@pytest.mark.slow
 def test_batches_on_few_cores_that_are_not_configured_are_warned_of_once():
     assert in_a_process(WARNED).stdout.strip() == "0 1"
     assert in_a_process(WARNED, PJRT_NPROC="8").stdout.strip() == "0 0"

@@ -146,6 +146,7 @@ def largest_scale(above, A, x, d, lower, upper, unit):
 
 
 class TestProperties:
+    @pytest.mark.variants(slow=["easy"])
     @every_family
     def test_every_answer_is_in_its_box_to_the_last_bit(self, solved, name):
         p, answers = solved[name]
@@ -238,6 +239,7 @@ class TestProperties:
                     assert move.status == 0
                     assert move.x[joint] == pytest.approx(x[joint], abs=1e-6)
 
+    @pytest.mark.variants(release=["easy"])
     @pytest.mark.parametrize("name", FAMILIES)
     def test_the_kernel_and_the_plain_method_decide_alike(self, solved, name):
         """The same answer in every lane. Joints that one of them holds at a bound are there in the other, held or not.
@@ -485,6 +487,7 @@ class TestDerivatives:
     def gradient(cls):
         return jax.jit(jax.vmap(jax.grad(cls.cost, has_aux=True)))
 
+    @pytest.mark.release
     def test_in_both_modes_they_are_central_differences(self, data, gradient):
         """In matrices, targets, weights, bounds, secondary motion and damping; to fourth order."""
         data, along = data

@@ -66,6 +66,7 @@ def eight():
     return finish(start(EIGHT, devices=8))
 
 
+@pytest.mark.variants(release=["WeightedQP"])
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["WeightedQP", "NullSpace", "HierarchicalQP"])
 def test_eight_devices_give_what_vmap_gives(eight, scheme):

@@ -189,6 +189,7 @@ def certify(problem: Numbers, damping: float, v: np.ndarray) -> None:
 
 
 class TestWeightedQP:
+    @pytest.mark.variants(release=["g1"])
     @pytest.mark.parametrize("name", ["nao", pytest.param("g1", marks=pytest.mark.slow)])
     def test_agrees_with_the_textbook_qp(self, name, request, rng):
         case = request.getfixturevalue(name)
@@ -433,6 +434,7 @@ class TestHierarchicalQP:
             expected = projected(levels(case, q[k]), case.robot.nv, np.zeros(case.robot.nv))
             np.testing.assert_allclose(ours.velocity[k], expected, rtol=0, atol=1e-8)
 
+    @pytest.mark.release
     def test_one_level_equals_the_weighted_qp(self, arm, rng):
         q, weights = configurations(arm, rng), (5.0, 2.0, 0.1)
         schemes = osik.HierarchicalQP(curvature_damping=0.0), osik.WeightedQP(damping=1e-11, curvature_damping=0.0)
@@ -462,6 +464,7 @@ class TestHierarchicalQP:
 
 
 class TestCentreOfMass:
+    @pytest.mark.slow
     def test_is_kept_over_the_feet_while_the_waist_pulls(self, nao):
         """MuJoCo C says where the centre of mass and the feet are. Without the task it would leave the polygon."""
         robot, feet = nao.robot, ("l_sole", "r_sole")

@@ -70,6 +70,7 @@ SCHEMES = {
 }
 
 
+@pytest.mark.variants(release=["saturated", "hierarchical"])
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_where_the_world_is(rng, scheme):

@@ -66,6 +66,7 @@ class TestWays:
         for k in range(3):
             assert_the_pose(jax.tree.map(lambda part, k=k: part[k], targets))
 
+    @pytest.mark.variants(release=["rotation matrix"])
     @pytest.mark.parametrize("way", TRACED)
     def test_at_every_tick_of_a_rollout(self, arm, way):
         task, steps = osik.FrameTask(arm, "hand"), 3
@@ -212,6 +213,7 @@ def tasks(nao):
 class TestAt:
     """mink's and pink's ``set_target_from_configuration``."""
 
+    @pytest.mark.release
     def test_the_error_is_nought_there_and_was_not_before(self, nao, tasks, rng):
         q = jnp.asarray(anywhere(nao, rng))
         before = rows_of_each(nao, tasks, q)

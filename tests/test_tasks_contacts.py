@@ -151,7 +151,7 @@ class TestContacts:
         expected = target[0] - (n @ (target[0] - p0)) * n
         np.testing.assert_allclose(p, expected, atol=1e-4)
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_every_number_counts_and_gradients_are_finite(self, walker, contacts, configurations):
         assert_every_number_counts(walker, contacts, configurations[0])
         assert_finite_gradients(rows_of_each, *alone(walker, {"plane": contacts["plane"]}, walker.q0))
@@ -294,7 +294,7 @@ class TestWheels:
         np.testing.assert_allclose(answer.velocity[:4], [x, y, 0.0, turn], atol=1e-6)
         np.testing.assert_allclose(answer.velocity[4:], (hub[:, 0] + signs * hub[:, 1]) / 0.1, atol=1e-4)
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_every_number_counts_and_gradients_are_finite(self, walker, cart, configurations):
         """Also of a wheel that lies flat."""
         tasks = {

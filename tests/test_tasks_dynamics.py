@@ -223,7 +223,7 @@ class TestKineticEnergy:
             expected = weighted @ np.linalg.solve(linear @ full @ weighted, rate[:3])
             np.testing.assert_allclose(v, expected, atol=1e-9)
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_finite_where_a_motion_moves_no_mass(self):
         """Two hinges about one axis, and one about the line on which all the mass is: M has rank 1."""
         robot = osik.Robot.from_mjcf(
@@ -288,6 +288,7 @@ class TestManipulability:
         slope = [(index(q[:7] + step) - index(q[:7] - step)) / 2e-6 for step in steps]
         np.testing.assert_allclose(own.jacobian[0], [*slope, 0.0], atol=1e-8)
 
+    @pytest.mark.release
     def test_forms_against_singular_values(self, arm):
         """Chosen rows and joints in the frame's axes, the logarithm; slopes by differences. A row a dof to climb."""
         q = arm.configuration({name: 0.3 + 0.2 * i for i, name in enumerate(arm.joint_names)})
@@ -332,6 +333,7 @@ class TestManipulability:
         names = [robot.tree.joint_names[j] for j, dof in robot.tree.dof_address.items() if dof in climbs.dofs]
         assert names == ["elbow", "lift"]  # the wrist follows the elbow
 
+    @pytest.mark.release
     def test_climbing_reaches_a_greatest_index(self, planar):
         """Of the elbow of a planar arm: at a right angle between its two equal links."""
         task = osik.ManipulabilityTask(planar, "tip", rows=FLAT, gain=20.0)
@@ -341,6 +343,7 @@ class TestManipulability:
         )
         np.testing.assert_allclose(path.q[-1], [0.2, np.pi / 2], atol=1e-6)
 
+    @pytest.mark.release
     def test_a_lower_bound_keeps_away_from_singularities(self, planar):
         """A tip pulled out of reach: its index is sin(elbow) / 4, and the elbow stays bent by as much as is asked."""
         far = np.array([1.5, 0.0, 0.0]), np.eye(3)
@@ -355,7 +358,7 @@ class TestManipulability:
         assert index.min() > 0.05 - 1e-3
         assert index[-1] == pytest.approx(0.05, abs=1e-5)
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_finite_where_it_is_singular(self, planar):
         """Stretched out; and close to it, where nothing but the size of the index changes."""
         tasks = {

@@ -126,6 +126,7 @@ class TestJacobians:
                 np.testing.assert_allclose(row.jacobian[..., :6], 0.0, atol=1e-13, err_msg=name)
                 assert np.abs(row.jacobian[..., 6:]).max() > 0.1
 
+    @pytest.mark.slow
     def test_rows_of_all_tasks_together_are_those_of_each(self, robot, tasks, q):
         """Two of each kind, so that each is worked on with another of its manner."""
         others = {k: task.replace(weight=2.0, target_velocity=0.1) for k, task in tasks.items()}
@@ -279,6 +280,7 @@ def test_feed_forward_is_the_rate_of_the_target(robot, tasks, q, rng):
 
 
 class TestGradients:
+    @pytest.mark.variants(release=["True"])
     @pytest.mark.parametrize("x64", [True, False])
     def test_finite_wherever_an_angle_has_none(self, x64):
         """On the axis, opposite to it, next to both, too near, and where the basis across the axis jumps."""
@@ -336,6 +338,7 @@ class TestClosedLoop:
         task = osik.AxisAlignTask(robot, "hand", axis=(1.0, 0.0, 0.0), gain=5.0)
         np.testing.assert_allclose(_turned(task, jnp.array(direction)), angle * 0.9 ** np.arange(100), atol=1e-9)
 
+    @pytest.mark.variants(release=["scheme1"])
     @pytest.mark.parametrize("scheme", [osik.WeightedQP(), pytest.param(osik.HierarchicalQP(), marks=pytest.mark.slow)])
     def test_the_visual_field_is_kept(self, head, scheme):
         """The posture turns the head away by 1.5 and 0.7 rad; the point stays within 0.4 rad of its axis."""

@@ -204,6 +204,7 @@ class TestFeedForward:
 
 
 class TestGradients:
+    @pytest.mark.variants(release=["True"])
     @pytest.mark.parametrize("x64", [True, False])
     def test_finite_at_zero_error_and_near_pi(self, x64):
         with jax.enable_x64(x64):

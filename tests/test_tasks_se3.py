@@ -180,6 +180,7 @@ class TestClosedLoop:
 
 
 class TestGradients:
+    @pytest.mark.variants(release=["True"])
     @pytest.mark.parametrize("x64", [True, False])
     def test_finite_at_zero_error_and_near_pi_in_both_modes(self, x64):
         with jax.enable_x64(x64):
@@ -195,6 +196,7 @@ class TestGradients:
 
             assert_finite_gradients(rows, batch, jnp.tile(arm.q0, (len(angles), 1)))
 
+    @pytest.mark.release
     def test_through_a_solve_at_the_target(self, arm):
         task = osik.FrameTask(arm, "hand", error="se3")
 

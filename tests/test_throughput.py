@@ -28,7 +28,7 @@ def run(patch, path, batches):
     throughput.main()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_row_is_right(path):
     result = json.loads(path.read_text())
     assert result["jax"] == jax.__version__ and result["platform"] == "cpu"

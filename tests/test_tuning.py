@@ -327,6 +327,7 @@ class TestTune:
         assert tuned.parameters["hand.gain.decay"] == pytest.approx(float(best.tasks["hand"].gain.decay))
         assert float(best.tasks["hand"].weight) == 1.0
 
+    @pytest.mark.release
     def test_chunks_change_nothing(self, loop, scenarios):
         whole, parts = run(loop, scenarios), run(loop, scenarios, chunk=3)
         np.testing.assert_allclose(parts.history.loss, whole.history.loss, rtol=1e-12)
@@ -334,6 +335,7 @@ class TestTune:
         with pytest.raises(ValueError, match="chunk is 0"):
             run(loop, scenarios, chunk=0)
 
+    @pytest.mark.release
     def test_a_nan_scenario_is_dropped(self, loop, scenarios):
         """Starts, targets, and a gradient that is not finite: as if those scenarios were not there."""
         steep = tuning.Tracking("hand") + _steep
@@ -383,7 +385,7 @@ class TestTune:
         with pytest.raises(FileNotFoundError):
             run(loop, scenarios, resume=tmp_path / "no.npz")
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_a_line_search(self, loop, scenarios):
         """An optimiser that asks for values along the way."""
         search = optax.chain(optax.sgd(1.0), optax.scale_by_backtracking_linesearch(max_backtracking_steps=5))

@@ -9,6 +9,7 @@ from benchmarks.tuning import arm_reaching, compare
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.release
 def test_the_arm_beats_cma():
     """Held-out loss at least five times lower, and lower than CMA-ES's at the same number of rollouts."""
     result = compare(arm_reaching(), 60, seeds=3, costs=(1,), progress=False)

@@ -76,6 +76,7 @@ def test_the_base_of_nao_is_its_waist(loop):
     np.testing.assert_allclose(loop.tasks["waist"].target[0], loop.robot.q0[:3], atol=1e-12)
 
 
+@pytest.mark.release
 def test_tuned_gains_stand(tuned):
     assert tuned.loss < 0.2 * tuned.history.loss[0]
     gains = {name: value for name, value in tuned.parameters.items() if name.endswith("gain")}

@@ -74,7 +74,7 @@ def assert_same(found: dict[str, Any], wanted: dict[str, Any]) -> None:
     assert np.ptp(wanted["vectors"], axis=0).min() > 1e-3  # every parameter has moved
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_eight_devices_tune_as_one(eight):
     """With a line search, some scenarios at a time, one left out, and a number of them that does not divide."""
     assert eight["devices"] == 8
@@ -88,7 +88,7 @@ def test_eight_devices_evaluate_as_one(eight):
     np.testing.assert_allclose(eight["eight"]["losses"], eight["one"]["losses"], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_two_processes_tune_as_one(eight):
     port = free_port()
     first, second = map(finish, [start(TWO_HOSTS, port, i, devices=2) for i in range(2)])

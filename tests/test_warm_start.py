@@ -44,6 +44,7 @@ def test_a_random_active_set_costs_time_only(qps, rng):
     np.testing.assert_array_equal(warm.active, cold.active)
 
 
+@pytest.mark.variants(release=["mixed"])
 @pytest.mark.parametrize("family", ["mixed", "duplicated_rows", "pinned", "scaled_altogether"])
 def test_random_active_sets_with_rows(family, rng):
     p = PLANTED[family](rng, 500)
@@ -64,7 +65,7 @@ def norms(s):
     return np.stack([np.linalg.norm(w, axis=1) for w in s.slacks], 1)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_hierarchies(rng):
     r = recorded_hierarchies(unit_rows=False)
     longest = max(level[0].shape[1] for level in r.levels)
@@ -113,6 +114,7 @@ def reaching():
     return arm, tasks, limits
 
 
+@pytest.mark.variants(release=["weighted"])
 @pytest.mark.parametrize(
     "scheme",
     [osik.WeightedQP(), pytest.param(osik.HierarchicalQP(), marks=pytest.mark.slow)],

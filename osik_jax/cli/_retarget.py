@@ -258,7 +258,7 @@ def _print_retargeted(console: Console, figures: dict[str, Any], out: Path) -> N
 def _robot_to_retarget(source: str) -> Robot:
     """A robot by name or file, its base floating; ``g1`` is that of example-robot-data."""
     if source == "g1" and not os.path.exists(source):
-        from ..retargeting._g1 import g1_urdf
+        from ..retargeting._described import g1_urdf
 
         source = str(g1_urdf())
     return read_robot(source, "auto" if source in EMBEDDED else "floating", named=("nao", "g1"))
