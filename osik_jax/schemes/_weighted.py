@@ -20,10 +20,8 @@ from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
 _ROUNDINGS = 4.0
 """Of the largest weight times row norm squared; a weaker damping is lost in single arithmetic."""
 
-_SHARE = 1.25
-"""Of the curvature damping, what is taken for ``curvature_damping=1``."""
 _SPARED = 30.0
-"""Times what holds a dof anyway: curvature damping that is small beside this is spared."""
+"""Curvature damping is spared where it is below this many times what holds a dof anyway."""
 
 
 class WeightedQP(Scheme):
@@ -40,13 +38,14 @@ class WeightedQP(Scheme):
             dof, its damping and its posture together, is at least a few roundings of the largest weight times row norm
             squared.
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
-            none. What is added vanishes where the tasks are met (``TaskRows.curvature``).
+            none. What is added vanishes where the tasks are met (``TaskRows.curvature``), with the square of their
+            error where a posture or the damping holds a dof anyway.
         max_iterations: cap on changes of the active set (static).
         backend: whose candidates for the answer are taken, as in ``solve_least_squares_qp`` (static).
     """
 
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
-    curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
+    curvature_damping: Float[Array, ""] = eqx.field(default=1.25, converter=as_leaf("curvature_damping"), kw_only=True)
     max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
     backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
@@ -62,7 +61,7 @@ class WeightedQP(Scheme):
         """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
-        bend = _SHARE * self.curvature_damping * problem.curvature(problem.soft())
+        bend = self.curvature_damping * problem.curvature(problem.soft())
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
@@ -97,8 +96,9 @@ def _pulls(
 ) -> dict[str, Array]:
     """Rows that each ask for one dof's velocity, with the damping: a strength and a centre for each dof.
 
-    Of the curvature damping, ``bend``, a dof takes what its other strength s does not make up for, ``bend^2 / (bend + m
-    s)``: all of it where that is far above s, and little where a posture holds the dof well enough.
+    Of the curvature damping ``bend`` a dof that is held with strength s anyway takes ``bend^2 / (bend + 30 s)``: all of
+    it out of reach, and next to none beside a posture that is strong enough to calm what is left of an error
+    (docs/paper.md, "Curvature damping").
     """
     n = problem.lower.shape[0]
     strength, pull = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)
@@ -108,7 +108,8 @@ def _pulls(
         usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of nought is NaN
         weight, wanted = (jnp.append(a, 0.0)[place] for a in (usable, usable * rows.lower))
         strength, pull = strength + weight, pull + wanted
-    strength = strength + bend * (bend / (bend + _SPARED * strength))
+    whole = bend + _SPARED * strength
+    strength = strength + bend * bend / jnp.where(whole > 0.0, whole, 1.0)
     least = _least(problem, backend)
     strength = jnp.where(strength < least, least, strength)
     center = pull / strength
