@@ -171,11 +171,21 @@ def _spoiled(problem: VelocityProblem, raw_box: tuple[Array, Array], fine: Array
     """The problem with NaN back where its numbers are not to be had from: the solver says so, in every scheme.
 
     It comes in through a select, so that derivatives with respect to what the problem was made of are 0 in that lane.
+    Of equalities what they want and their weights say it, all in one operation: matrices are large.
     """
+    small = [name for name, r in problem.rows.items() if r.is_equality and r.dofs is None and name not in problem.hard]
     rows = {
         name: replace(r, jacobian=jnp.where(fine, r.jacobian, jnp.nan), weight=jnp.where(fine, r.weight, jnp.nan))
         for name, r in problem.rows.items()
+        if name not in small
     }
+    if small:
+        numbers = [getattr(problem.rows[name], field) for field in ("lower", "weight") for name in small]
+        ends = np.cumsum([len(a) for a in numbers])[:-1]
+        spoiled = jnp.split(jnp.where(fine, jnp.concatenate(numbers), jnp.nan), ends)
+        for name, wanted, weight in zip(small, spoiled, spoiled[len(small) :], strict=False):
+            rows[name] = replace(problem.rows[name], lower=wanted, upper=wanted, weight=weight)
+        rows = {name: rows[name] for name in problem.rows}
     lower, upper = (
         jnp.where(jnp.isnan(raw), raw, b) for raw, b in zip(raw_box, (problem.lower, problem.upper), strict=True)
     )

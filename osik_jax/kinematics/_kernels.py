@@ -59,17 +59,23 @@ def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Ar
 
 def center_of_mass(robot: Robot, kinematics: Any) -> tuple[Array, Array]:
     """The centre of the masses of the bodies, and its Jacobian."""
-    tree = robot.tree
-    columns, factors = dof_columns(tree)
-    integers = np.concatenate([tree.body_parents, tree.dof_body, columns])
-    numbers, given = side_by_side(factors[None], robot.body_mass, robot.body_com), _arrays(kinematics)
-    lanes, count = max(len(a) for a in (*given, numbers)), len(tree.body_parents)
+    given, integers, lanes = center_arguments(robot, kinematics)
+    count = len(robot.tree.body_parents)
     center, jacobian, _ = _target.call(
         "_center_of_mass",
-        [((lanes, 3), float), ((lanes, 3, tree.nv), float), ((count, 4), float)],
-        *(*given, numbers, integers.astype(np.int32)),
+        [((lanes, 3), float), ((lanes, 3, robot.tree.nv), float), ((count, 4), float)],
+        *(*given, integers),
     )
     return center, jacobian
+
+
+def center_arguments(robot: Robot, kinematics: Any) -> tuple[tuple[Array, ...], np.ndarray, int]:
+    """What kernels of the centre of mass take: the robot's and its bodies' numbers, integers; and how many lanes."""
+    tree = robot.tree
+    columns, factors = dof_columns(tree)
+    integers = np.concatenate([tree.body_parents, tree.dof_body, columns]).astype(np.int32)
+    given = *_arrays(kinematics), side_by_side(factors[None], robot.body_mass, robot.body_com)
+    return given, integers, max(len(a) for a in given)
 
 
 def _arrays(kinematics: Any) -> tuple[Array, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,8 +15,11 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
+from ..execution._computed import by_numba, side_by_side
+from ..kernels.numba import _target
 from ..kinematics import Kinematics, center_of_mass
-from ..kinematics._forward import moving_center
+from ..kinematics._forward import body_masses, moving_center
+from ..kinematics._kernels import center_arguments
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
@@ -98,11 +102,19 @@ class ComTask(Task):
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """One row for each axis, or for each edge of the polygon."""
         del q
+        if kinematics.backend != "jax" and self.target is not None and not isinstance(self.gain, AdaptiveGain):
+            mass = body_masses(robot, self.subtree)
+            alike = eqx.tree_at(lambda robot: robot.body_mass, robot, mass), replace(kinematics, backend="jax")
+            error, rows, wanted, weight, bend, pull, arms = _by_kernel(self, *alike)
+            return TaskRows(error, rows, wanted, wanted, weight, bend, pull, arms)
+        return self._plain_rows(robot, kinematics)
+
+    def _plain_rows(self, robot: Robot, kinematics: Kinematics) -> TaskRows:
         point, jacobian = moving_center(robot, kinematics, self.subtree)
         bend = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
         if self.polygon is not None:
             return self._polygon_rows(self.polygon, point, jacobian, bend)
-        axes = np.array(["xyz".index(axis) for axis in self.axes])
+        axes = axis_numbers(self.axes)
         value = point[axes] if self.target is None else point[axes] - self.target
         return task_rows(
             value,
@@ -143,7 +155,7 @@ class ComTask(Task):
         value = as_array(value, what, self.weight.dtype)
         check_finite(value, what)
         if value.shape == (3,) and len(self.axes) < 3:
-            value = value[np.array(["xyz".index(axis) for axis in self.axes])]
+            value = value[axis_numbers(self.axes)]
         return as_vector(value, (len(self.axes),), what, self.weight.dtype)
 
     def _convert(self, name: str, value: Any) -> Any:
@@ -159,8 +171,39 @@ class ComTask(Task):
         check_bounds(self.lower, self.upper)
 
 
+def _fields(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
+    """Of the rows of a task with a target; both bounds are one."""
+    rows = task._plain_rows(robot, kinematics)
+    return rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
+
+
+def _fields_by_kernel(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
+    """The same of many lanes."""
+    assert task.target is not None and task.target_velocity is not None and not isinstance(task.gain, AdaptiveGain)
+    given, integers, lanes = center_arguments(robot, kinematics)
+    m, nv, count = len(task.axes), robot.tree.nv, len(robot.tree.body_parents)
+    weight = task.weight if task.weight.ndim == 2 else task.weight[:, None]
+    weight = jnp.broadcast_to(weight, (len(weight), m))
+    numbers = side_by_side(task.target, task.target_velocity, weight, task.gain)
+    lanes = max(lanes, len(numbers))
+    options = np.concatenate([integers, axis_numbers(task.axes), robot.tree.turning]).astype(np.int32)
+    shapes = (lanes, m), (lanes, m, nv), (lanes, m), (lanes,), (lanes, m), (lanes, nv), (4 * count + 3 + 3 * nv,)
+    error, rows, wanted, curvature, pull, levers, _ = _target.call(
+        "_center_rows", [(shape, float) for shape in shapes], *given, options, numbers
+    )
+    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers
+
+
+_by_kernel = by_numba(_fields, _fields_by_kernel)
+
+
 def _cast(polygon: SupportPolygon, dtype: Any) -> SupportPolygon:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), polygon)
+
+
+def axis_numbers(axes: str) -> np.ndarray:
+    """0 for x, 1 for y, 2 for z. (m,)"""
+    return np.array(["xyz".index(axis) for axis in axes])
 
 
 def check_axes(axes: str) -> str:

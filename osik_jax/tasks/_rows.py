@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Hashable, Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,12 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
         return task.rows_at(*frames, backend=kinematics.backend)
 
     rows = jax.vmap(rows_at)(together, *by_task)
-    apart = [jax.tree.map(lambda a, i=i: a[i], rows) for i in np.arange(len(tasks))]
+    apart = [jax.tree.map(partial(_of_task, i), rows) for i in np.arange(len(tasks))]
     if not first.bounded:  # what makes an equality: one array for both bounds
         apart = [dataclasses.replace(one, upper=one.lower) for one in apart]
     return dict(zip(tasks, apart, strict=True))
+
+
+def _of_task(i: int, a: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Task i's part of an array of all. Rows are slices of all rows, since XLA joins those again without a copy."""
+    return a[i] if a.ndim == 1 else a.reshape(-1, *a.shape[2:])[i * a.shape[1] : (i + 1) * a.shape[1]]

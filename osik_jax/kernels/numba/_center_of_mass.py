@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ._dense import fill
-from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
+from ._frame import arguments, compiled, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
 from ._rigid import cross, minus, plus, triple, turning
 from ._rigid import turned as rotated
 
@@ -39,31 +39,42 @@ def move_center(J, below, owners, columns, factors, lin, ang, anchors):
             J[i, column] += share * (mass * along[i] + speed[i])
 
 
-def handle(frame):
-    """One call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
-    if not is_call(frame):
-        return 0
-    given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each
+@compiled
+def center_of_lane(given, lane, below, point, J):
+    """Of one lane, the centre into ``point`` (3,) and its Jacobian into J (3, nv).
+
+    Args:
+        given: the arguments of ``handle``.
+        lane: its number.
+        below: space, as in ``add_up``.
+        point: the centre.
+        J: the Jacobian.
+    """
     bodies, full, whole = dimension(given, 8), dimension(given + 16, 8), dimension(given + 40, 8)
-    lanes, nv = dimension(found, 0), dimension(found + 8, 16)
     # numbers between the lanes of each argument, 0 where all have the same
     body, dof = bodies * (dimension(given, 0) > 1), full * (dimension(given + 16, 0) > 1)
     other, numbers = whole * (dimension(given + 40, 0) > 1), data(given + 48)
     parents, owners = whole_numbers(numbers, bodies), whole_numbers(numbers + 4 * bodies, full)
     columns = whole_numbers(numbers + 4 * (bodies + full), full)
-    below = matrix(data(found + 16), bodies, 4)
+    first, shift = data(given + 40) + 8 * other * lane, 24 * dof * lane
+    factors, masses, at = vector(first, full), vector(first + 8 * full, bodies), first + 8 * (full + bodies)
+    P, R = matrix(data(given) + 24 * body * lane, bodies, 3), matrix(data(given + 8) + 72 * body * lane, bodies, 9)
+    add_up(parents, masses, matrix(at, bodies, 3), P, R, below)
+    for i in range(3):
+        point[i] = below[0, 1 + i] / below[0, 0]
+    for i in range(3):
+        fill(J[i], 0.0)
+    lin, ang = matrix(data(given + 16) + shift, full, 3), matrix(data(given + 24) + shift, full, 3)
+    move_center(J, below, owners, columns, factors, lin, ang, matrix(data(given + 32) + shift, full, 3))
+
+
+def handle(frame):
+    """One call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
+    if not is_call(frame):
+        return 0
+    given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each
+    lanes, nv, below = dimension(found, 0), dimension(found + 8, 16), matrix(data(found + 16), dimension(given, 8), 4)
     for lane in range(lanes):
-        first, shift = data(given + 40) + 8 * other * lane, 24 * dof * lane
-        factors, masses, at = vector(first, full), vector(first + 8 * full, bodies), first + 8 * (full + bodies)
-        P, R = matrix(data(given) + 24 * body * lane, bodies, 3), matrix(data(given + 8) + 72 * body * lane, bodies, 9)
-        add_up(parents, masses, matrix(at, bodies, 3), P, R, below)
-        point = vector(data(found) + 24 * lane, 3)
-        for i in range(3):
-            point[i] = below[0, 1 + i] / below[0, 0]
-        start = data(found + 8) + 24 * nv * lane
-        fill(vector(start, 3 * nv), 0.0)
-        move_center(
-            matrix(start, 3, nv), below, owners, columns, factors, matrix(data(given + 16) + shift, full, 3),
-            matrix(data(given + 24) + shift, full, 3), matrix(data(given + 32) + shift, full, 3),
-        )  # fmt: skip
+        J = matrix(data(found + 8) + 24 * nv * lane, 3, nv)
+        center_of_lane(given, lane, below, vector(data(found) + 24 * lane, 3), J)
     return 0

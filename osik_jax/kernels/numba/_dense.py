@@ -45,17 +45,59 @@ def any_number(a):
     return found
 
 
+@lean(fastmath=reordered)
+def add_multiple_absolute(y, factor, x, n):
+    """y += factor |x|, over the first n."""
+    for i in range(n):
+        y[i] += factor * abs(x[i])
+
+
+@lean(fastmath=reordered)
+def dot_absolute(a, b, n):
+    """sum_i |a_i b_i| over the first n."""
+    total = 0.0
+    for i in range(n):
+        total += abs(a[i] * b[i])
+    return total
+
+
+@lean(fastmath=reordered)
+def four_dots(a, b, c, d, n):
+    """a'c, a'd, b'c and b'd over the first n: each number is read once for two products."""
+    ac, ad, bc, bd = 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        ac += a[i] * c[i]
+        ad += a[i] * d[i]
+        bc += b[i] * c[i]
+        bd += b[i] * d[i]
+    return ac, ad, bc, bd
+
+
+@lean
+def gram(B, S, k, n):
+    """S = B B' on and below the diagonal, of the first k rows and n columns of B; S above it is used up."""
+    even = k - k % 2
+    for a in range(0, even, 2):
+        for b in range(0, a + 1, 2):
+            S[a, b], S[a, b + 1], S[a + 1, b], S[a + 1, b + 1] = four_dots(B[a], B[a + 1], B[b], B[b + 1], n)
+    for b in range(k if even < k else 0):
+        S[even, b] = dot(B[even], B[b], 0, n)
+
+
 @lean
 def cholesky(S, n, smallest):
-    """L with L L' = S in the lower triangle of S; whether every pivot L_ii^2 is at least ``smallest`` of its S_ii."""
-    for i in range(n):
-        least = smallest * S[i, i]
-        for j in range(i):
-            S[i, j] = (S[i, j] - dot(S[i], S[j], 0, j)) / S[j, j]
-        pivot = S[i, i] - dot(S[i], S[i], 0, i)
-        if not (pivot > 0.0 and pivot >= least):
+    """L with L L' = S in the lower triangle of S; whether every pivot L_jj^2 is at least ``smallest`` of its S_jj.
+
+    Column by column: the sums of a column need none of its own numbers, so that none waits for the one before.
+    """
+    for j in range(n):
+        pivot = S[j, j] - dot(S[j], S[j], 0, j)
+        if not (pivot > 0.0 and pivot >= smallest * S[j, j]):
             return False
-        S[i, i] = np.sqrt(pivot)
+        S[j, j] = np.sqrt(pivot)
+        inverse = 1.0 / S[j, j]
+        for i in range(j + 1, n):
+            S[i, j] = (S[i, j] - dot(S[i], S[j], 0, j)) * inverse
     return True
 
 

@@ -1,4 +1,4 @@
-"""The dual active set from a cold start, with factors that are updated.
+"""The dual active-set method from a cold start, with factors that are updated.
 
 D. Goldfarb, A. Idnani, "A numerically stable dual method for solving strictly convex quadratic programs", Mathematical
 Programming 27, 1983. Rows of C may give way, so the unknowns are v = (x, s) with t = sqrt(E) s and E their
@@ -37,7 +37,7 @@ def factor_cost(P, R, J, n):
     for j in range(n):
         R[j, j] = np.sqrt(P.damping[j]) if P.lower[j] < P.upper[j] else 1.0
     v = J[N - 1]
-    for i in range(len(P.wanted)):
+    for i in range(len(P.target)):
         for j in range(n):
             v[j] = P.rows[i, j] if P.lower[j] < P.upper[j] else 0.0
         add_row(R, v, n)
@@ -53,12 +53,12 @@ def factor_cost(P, R, J, n):
 @lean
 def along_normal(P, J, i, n, d):
     """d = J'n_i; the rows of ``J`` are the columns of J."""
-    N, m = len(P.lower), len(P.wanted)
+    N, m = len(P.lower), len(P.target)
     for k in range(N):
         if i < n:
             d[k] = J[k, i]
         else:
-            d[k] = dot(J[k], P.rows[m + i - n], 0, n) + J[k, i] * np.sqrt(P.give[m + i - n])
+            d[k] = dot(J[k], P.rows[m + i - n], 0, n) + J[k, i] * np.sqrt(P.compliance[m + i - n])
 
 
 @lean
@@ -66,8 +66,8 @@ def value_of(P, v, i, n):
     """n_i'v: a variable, or C_q x + t_q."""
     if i < n:
         return v[i]
-    row = len(P.wanted) + i - n
-    return dot(P.rows[row], v, 0, n) + np.sqrt(P.give[row]) * v[i]
+    row = len(P.target) + i - n
+    return dot(P.rows[row], v, 0, n) + np.sqrt(P.compliance[row]) * v[i]
 
 
 @lean
@@ -84,7 +84,7 @@ def most_violated(P, W, labels, v, d, n, count):
         gap = max(P.lower[i] - value, value - P.upper[i])
         if P.lower[i] == P.upper[i]:
             return i
-        if gap > W.value_noise[i]:
+        if gap > W.value_roundoff[i]:
             along_normal(P, W.J, i, n, d)
             gain = gap * gap / max(dot(d, d, count, len(d)), 1e-300)
             if gain > best:
@@ -143,7 +143,7 @@ def dual_active_set(P, W, labels, x, most_changes):
 
     Args:
         P: the problem.
-        W: space, and the noise of values.
+        W: space, and the roundoff of values.
         labels: no constraint active but pinned variables. (N,)
         x: the minimiser for those. (n,)
         most_changes: cap on changes of the active set.

@@ -76,7 +76,7 @@ class LeastSquares(eqx.Module):
 
     def diagonal(self) -> Float[Array, " n"]:
         """Return the diagonal of the Hessian, (n,)."""
-        return jnp.sum(self.weight[:, None] * self.matrix**2, 0) + self.damping
+        return apply(self.matrix.T**2, self.weight) + self.damping
 
     def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """Return A'W(A x - b) + D (x - c), (n,)."""

@@ -117,13 +117,15 @@ def _numba_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
         return result._replace(done=is_certified, optimal=is_certified, active=active)
 
     def search_rest(result: SearchResult, qp: QP, guess: Array, tolerance: Float[Array, " B"]) -> SearchResult:
-        def search_block(given: tuple[QP | Array, Array], result: SearchResult) -> SearchResult:
+        def search_block(given: tuple[QP | tuple[Array, Array], Array], result: SearchResult) -> SearchResult:
             data, tolerance = given
-            block = data if isinstance(data, QP) else jax.vmap(partial(unpack, jax.tree.map(lambda a: a[0], qp)))(data)
+            like = jax.tree.map(lambda a: a[0], qp)
+            block = data if isinstance(data, QP) else jax.vmap(partial(unpack, like))(*data)
             end = search(block, result.active, tolerance, max_iterations=max_iterations, by_pivots=False)
             return end._replace(factorizations=end.factorizations + result.factorizations)
 
-        data = qp if qp.packed is None else qp.packed  # as few arrays as can be: most problems are done
+        # as few arrays as can be: most problems are done
+        data = qp if qp.packed is None else (qp.cost.matrix, qp.packed)
         return with_a_few((data, tolerance), result, result.done, search_block, _BLOCK_ON_CPU)
 
     return Candidates(in_double(certified), search_rest)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -29,10 +31,11 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     k, constraints = m + p, n + p
     largest = max(n, k)
     workspace = 2 * k * n + largest**2 + p * (n + p) + 2 * constraints**2 + 18 * (largest + constraints)  # as ``Work``
-    packed = side_by_side(*jax.tree.leaves(qp)) if qp.packed is None else qp.packed  # in the order of the fields
+    matrix, *others = jax.tree.leaves(replace(qp, packed=None))
+    packed = side_by_side(*others) if qp.packed is None else qp.packed  # in the order of the fields
     x, y, active, report, _ = _target.call(
         "_weighted_qp",
         [((batch, n), float), ((batch, p), float), ((batch, n + p), int), ((batch, 3), int), ((workspace,), float)],
-        *(packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
+        *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
     return Candidate(x, y, active, *(report[:, i] for i in range(3)))

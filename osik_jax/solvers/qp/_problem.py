@@ -34,7 +34,7 @@ class QP(eqx.Module):
         upper: upper bounds; inf allowed, equal to the lower for an equality. (n + p,)
         known_equalities: constraints that are equalities to the lower bound, whatever the upper is (static); None for
             none.
-        packed: all of the arrays above, one after another, where these are at hand as one. (k,)
+        packed: all of the arrays above but the cost's matrix, one after another, where these are at hand as one. (k,)
     """
 
     cost: Quadratic | LeastSquares
@@ -52,13 +52,13 @@ class QP(eqx.Module):
         return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
 
 
-def unpack(like: QP, packed: Float[Array, " k"]) -> QP:
-    """Return a problem of the shapes of another, from all its arrays, one after another."""
+def unpack(like: QP, matrix: Float[Array, "..."], packed: Float[Array, " k"]) -> QP:
+    """Return a problem of the shapes of another, from its matrix and all its other arrays, one after another."""
     leaves, tree = jax.tree.flatten(replace(like, packed=None))
-    parts = jnp.split(packed, np.cumsum([a.size for a in leaves])[:-1])
-    return jax.tree.unflatten(
-        tree, [part.reshape(a.shape).astype(a.dtype) for part, a in zip(parts, leaves, strict=True)]
-    )
+    rest = leaves[1:]
+    parts = jnp.split(packed, np.cumsum([a.size for a in rest])[:-1])
+    others = [part.reshape(a.shape).astype(a.dtype) for part, a in zip(parts, rest, strict=True)]
+    return jax.tree.unflatten(tree, [matrix.reshape(leaves[0].shape).astype(leaves[0].dtype), *others])
 
 
 class QPSolution(eqx.Module):

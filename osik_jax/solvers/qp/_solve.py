@@ -258,13 +258,13 @@ def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
     )
     arrays = [leaves, jax.tree.leaves(placeholder), *_valid_range(qp)]
     on_cpu = jax.default_backend() == "cpu"
-    if on_cpu:  # one operation for all arrays, where each costs as much as its numbers do
-        arrays = [[jnp.concatenate([jnp.ravel(a) for a in each])] for each in arrays]
+    if on_cpu:  # one operation for all arrays but the matrix, where each costs as much as its numbers do
+        arrays = [[first, jnp.concatenate([jnp.ravel(a) for a in rest])] for first, *rest in arrays]
     in_range = [((lowest <= a) & (a <= highest)).all() for a, _, lowest, highest in zip(*arrays, strict=True)]
     is_valid = jnp.stack(in_range).all()
     safe = [jnp.where(is_valid, a, b) for a, b, *_ in zip(*arrays, strict=True)]
     if on_cpu:
-        return replace(unpack(qp, safe[0]), packed=safe[0]), is_valid
+        return replace(unpack(qp, *safe), packed=safe[1]), is_valid
     return jax.tree.unflatten(tree, safe), is_valid
 
 

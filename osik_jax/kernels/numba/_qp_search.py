@@ -1,0 +1,76 @@
+"""The search for the active set of one weighted QP: block pivoting from a guess, then the dual active-set method."""
+
+from __future__ import annotations
+
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ._dense import dot
+from ._frame import lean
+from ._goldfarb_idnani import dual_active_set
+from ._qp_active_set_solve import solve_on_active_set
+from ._qp_roundoff import find_roundoff
+
+_PATIENCE = 2
+"""Exchanges that leave no fewer wrong signs, before the dual active-set method."""
+
+
+@lean(inline="always")
+def search(P, W, labels, tolerance, most_changes, x, z, report):
+    """Active set and minimiser of one problem.
+
+    Args:
+        P: the problem.
+        W: space.
+        labels: the guess; the active set at the end. (n + p,)
+        tolerance: violation that counts as none, relative to the scale of the constraint.
+        most_changes: cap on changes of the active set.
+        x: the minimiser. (n,)
+        z: multipliers of the rows. (m + p,)
+        report: whether there is a candidate, changes, systems factored. (3,)
+    """
+    best, lives, cold, found = len(labels) + 1, _PATIENCE, False, False
+    while True:
+        report[2] += 1
+        sound = solve_on_active_set(P, W, labels, x, z)
+        if found or (cold and not sound):
+            report[0] = sound and found
+            return
+        if sound:
+            find_roundoff(P, W, tolerance, x, z)
+        if cold:
+            steps = dual_active_set(P, W, labels, x, most_changes - report[1])
+            if steps < 0:
+                return
+            report[1] += steps
+            found = True
+            continue
+        wrong = 0
+        for i in range(len(labels)):
+            W.next[i] = right_label(P, W, labels, i, x, z)
+            wrong += W.next[i] != labels[i]
+        if sound and wrong == 0:
+            report[0] = 1
+            return
+        lives = _PATIENCE if wrong < best else lives - 1
+        best = min(best, wrong)
+        cold = not sound or lives < 0
+        for i in range(len(labels)):
+            pinned = i < len(x) and P.lower[i] == P.upper[i]
+            labels[i] = W.next[i] if not cold else EQUALITY if pinned else INACTIVE
+        report[1] += 0 if cold else wrong
+
+
+@lean
+def right_label(P, W, labels, i, x, z):
+    """What constraint i should be: active where it is violated, inactive where its multiplier has the wrong sign."""
+    m, n = len(P.target), len(x)
+    if labels[i] == EQUALITY:
+        return EQUALITY
+    if labels[i] == INACTIVE:
+        if P.lower[i] == P.upper[i]:
+            return EQUALITY
+        value = x[i] if i < n else dot(P.rows[m + i - n], x, 0, n)
+        if value < P.lower[i] - W.value_roundoff[i]:
+            return AT_LOWER
+        return AT_UPPER if value > P.upper[i] + W.value_roundoff[i] else INACTIVE
+    multiplier = W.gradient[i] if i < n else z[m + i - n]
+    return INACTIVE if -labels[i] * multiplier < -W.multiplier_roundoff[i] else labels[i]
