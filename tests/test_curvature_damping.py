@@ -187,6 +187,30 @@ def test_derivatives_where_little_room_is_left(scheme, arm):
     np.testing.assert_allclose(jax.jacrev(velocity)(0.0), found, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("error", [0.0, 0.02, 0.8])
+@pytest.mark.parametrize("posture", [0.0, 3e-4, 0.1])
+def test_a_posture_makes_up_for_it_in_a_weighted_program(arm, posture, error):
+    """Without limits the answer is a linear system; the damping that the page on the paper states is put into it here."""
+    kappa, damping = 1.25, 1e-8
+    q = bent(arm)
+    kinematics = kinematics_at(arm, q)
+    p, rotation = kinematics.frame_pose(arm, "hand")
+    hand = osik.FrameTask(
+        arm, "hand", rows="position", target=(p + error * jnp.array([0.6, 0.0, 0.8]), rotation), weight=4.0, gain=10.0
+    )
+    still = osik.PostureTask(arm, target=q + 0.1, weight=posture, gain=1.0)
+    found = osik.solve(arm, q, {"hand": hand, "posture": still}, scheme=osik.WeightedQP(damping), limits=(), dt=DT)
+
+    rows, ask = hand.rows(arm, kinematics, q), still.rows(arm, kinematics, q)
+    bend = kappa * DT * float(rows.curvature)
+    held = damping + posture
+    held += bend**2 / (bend + 30.0 * held)
+    J, n = np.asarray(rows.jacobian), arm.nv
+    right = 4.0 * J.T @ np.asarray(rows.lower) + posture * np.asarray(ask.lower)
+    expected = np.linalg.solve(4.0 * J.T @ J + held * np.eye(n), right)
+    np.testing.assert_allclose(found.velocity, expected, rtol=0, atol=1e-9 * np.abs(expected).max() + 1e-12)
+
+
 def test_its_share_is_traced(arm):
     with pytest.raises(ValueError, match="curvature_damping"):
         osik.HierarchicalQP(curvature_damping=-1.0)

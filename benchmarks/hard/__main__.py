@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def measure(given: argparse.Namespace, console: Console) -> list[Row]:
-    """The rows of the file and those that it lacks, which go into the file as they come."""
+    """The rows of the file and those that it lacks, which go into the file as they come; by entrant."""
     found = read(given.results)
     done: set[Entrant] = {row.entrant for row in found}
     missing: set[str] = set()
@@ -69,7 +69,8 @@ def measure(given: argparse.Namespace, console: Console) -> list[Row]:
             console.print(str(one))
             keep(given.results, found)
         jax.clear_caches()
-    return found
+    order = entrants(everything=True)
+    return sorted(found, key=lambda row: order.index(row.entrant))
 
 
 def main() -> None:

@@ -130,7 +130,8 @@ def level_damping(
         total = damping.constant + damping.unmet * ratio + ridge
         factor = jnp.linalg.cholesky(gram + jnp.where(total > 0.0, total, 1.0) * eye)
         end = jnp.clip(base + apply(rows.T, cho_solve((factor, True), goal)), lower, upper)
-        ratio = jnp.minimum(jnp.sum((level.distance(end) / demand) ** 2), 1.0)
+        residual = positive_root(jnp.sum(level.distance(end) ** 2))
+        ratio = jnp.minimum(residual / demand, 1.0)
     total = damping.constant + damping.unmet * ratio
     longest_square = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
     return jnp.where(total > NEGLIGIBLE_DAMPING * longest_square, total, 0.0)

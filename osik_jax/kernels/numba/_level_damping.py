@@ -65,7 +65,7 @@ def level_damping(F, J, s, constant):
             for a in range(m):
                 value = dot(A[a], end, 0, n)
                 square += (value - target(F, J, a, value)) ** 2
-            ratio = min(square / (s.demand * s.demand if s.demand > 0.0 else 1.0), 1.0)
+            ratio = min(sqrt(square) / (s.demand if s.demand > 0.0 else 1.0), 1.0)
         damping = constant + s.unmet * ratio
     return damping if damping > least else 0.0
 

@@ -130,8 +130,7 @@ def strength_of(W, level, first, longest):
         share = 1.0
         for _ in range(DAMPING_ITERATIONS):
             strength = level.constant + level.unmet * share + DAMPING_RIDGE * trace
-            missed = missed_with(W, level, strength) / (level.demand if level.demand > 0.0 else 1.0)
-            share = min(missed * missed, 1.0)
+            share = min(missed_with(W, level, strength) / (level.demand if level.demand > 0.0 else 1.0), 1.0)
         whole += level.unmet * share
     return whole if whole > NEGLIGIBLE_DAMPING * longest else 0.0
 

@@ -668,7 +668,7 @@ for (level = 0; level < LEVELS; ++level) {
         const double off = in_level[g] ? distance(g) : 0.0;
         residual_norm += off * off;
       }
-      ratio = fmin(warp_sum(residual_norm) / (demand > 0.0 ? demand * demand : 1.0), 1.0);
+      ratio = fmin(sqrt(warp_sum(residual_norm)) / (demand > 0.0 ? demand : 1.0), 1.0);
     }
     damping = constant + unmet * ratio;
   }
