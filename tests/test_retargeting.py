@@ -36,9 +36,9 @@ from osik_jax.retargeting import (
 from osik_jax.retargeting._banded import BandedSystem, solve_banded
 from osik_jax.retargeting._body import Build, pairs_apart
 from osik_jax.retargeting._contact import find_contact, find_ground
+from osik_jax.retargeting._described import g1_urdf
 from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._folder import _Lengths, retarget_folder
-from osik_jax.retargeting._described import g1_urdf
 from osik_jax.retargeting._person import NEEDED, read_person
 from osik_jax.retargeting._plan import make_plan
 from osik_jax.retargeting._terms import Body, frame_rows

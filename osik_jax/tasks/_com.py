@@ -202,7 +202,7 @@ def _cast(polygon: SupportPolygon, dtype: Any) -> SupportPolygon:
 
 
 def axis_numbers(axes: str) -> np.ndarray:
-    """0 for x, 1 for y, 2 for z. (m,)"""
+    """Return 0 for x, 1 for y, 2 for z. (m,)."""
     return np.array(["xyz".index(axis) for axis in axes])
 
 

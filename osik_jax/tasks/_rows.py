@@ -71,6 +71,6 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
     return dict(zip(tasks, apart, strict=True))
 
 
-def _of_task(i: int, a: Float[Array, "..."]) -> Float[Array, "..."]:
+def _of_task(i: np.integer, a: Float[Array, "..."]) -> Float[Array, "..."]:
     """Task i's part of an array of all. Rows are slices of all rows, since XLA joins those again without a copy."""
     return a[i] if a.ndim == 1 else a.reshape(-1, *a.shape[2:])[i * a.shape[1] : (i + 1) * a.shape[1]]

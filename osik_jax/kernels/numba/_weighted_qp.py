@@ -3,11 +3,11 @@
     min 1/2 sum_i weight_i (A x - target)_i^2 + 1/2 sum_j damping_j (x_j - center_j)^2 + 1/2 sum_q t_q^2 / compliance_q
     over lower <= [x; C x + t] <= upper
 
-A lane solves on its active set (``_qp_active_set_solve``) and looks at the signs: bounds that are crossed become active,
-those whose multiplier has the wrong sign become inactive, all at once (block pivoting, ``_qp_search``). Where that stops
-helping, the dual active-set method begins anew (``_goldfarb_idnani``), which cannot cycle. Whatever comes of it is a
-candidate, which JAX certifies. No candidate comes of rows that cannot hold together, rows that depend on each other,
-and numbers that are none.
+A lane solves on its active set (``_qp_active_set_solve``) and looks at the signs: bounds that are crossed become
+active, those whose multiplier has the wrong sign become inactive, all at once (block pivoting, ``_qp_search``). Where
+that stops helping, the dual active-set method begins anew (``_goldfarb_idnani``), which cannot cycle. Whatever comes of
+it is a candidate, which JAX certifies. No candidate comes of rows that cannot hold together, rows that depend
+on each other, and numbers that are none.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ def handle(frame):
         whole_numbers(at + 11 * line, k), whole_numbers(at + 12 * line, N), whole_numbers(at + 13 * line, N),
     )  # fmt: skip
     at += 14 * line
-    targets, compliances, root, z = vector(at, m), vector(at + line, k), vector(at + 2 * line, n), vector(at + 3 * line, k)
+    targets, compliances = vector(at, m), vector(at + line, k)
+    root, z = vector(at + 2 * line, n), vector(at + 3 * line, k)
     for lane in range(lanes):
         first, last, A = 8 * n * lane, 8 * N * lane, data(given) + 8 * m * n * lane
         target = data(given + 8) + 8 * rest * lane
