@@ -109,7 +109,7 @@ def _pulls(
         weight, wanted = (jnp.append(a, 0.0)[place] for a in (usable, usable * rows.lower))
         strength, pull = strength + weight, pull + wanted
     whole = bend + _SPARED * strength
-    strength = strength + bend * bend / jnp.where(whole > 0.0, whole, 1.0)
+    strength = strength + bend * (bend / jnp.where(whole > 0.0, whole, 1.0))  # bend^2 of a far target overflows
     least = _least(problem, backend)
     strength = jnp.where(strength < least, least, strength)
     center = pull / strength

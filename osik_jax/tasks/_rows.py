@@ -66,7 +66,7 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
 
     rows = jax.vmap(rows_at)(together, *by_task)
     apart = [jax.tree.map(partial(_of_task, i), rows) for i in np.arange(len(tasks))]
-    if not first.bounded:  # what makes an equality: one array for both bounds
+    if not first.bounded:  # one array for both bounds
         apart = [dataclasses.replace(one, upper=one.lower) for one in apart]
     return dict(zip(tasks, apart, strict=True))
 

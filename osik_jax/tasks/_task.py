@@ -44,6 +44,8 @@ class TaskRows(eqx.Module):
             in. (nv,)
         dofs: where each row asks for one dof's velocity as it is, those dofs (static): ``jacobian`` is then those rows
             of the identity, which a scheme may use to save work. None elsewhere.
+        is_equality: whether all rows are equalities, for which only ``lower`` counts (static). Default: whether both
+            bounds are one and the same array.
     """
 
     error: Float[Array, " m"]
@@ -55,11 +57,11 @@ class TaskRows(eqx.Module):
     pull: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     levers: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
+    is_equality: bool = eqx.field(default=None, static=True)  # pyright: ignore[reportAssignmentType]  # set below
 
-    @property
-    def is_equality(self) -> bool:
-        """Whether the two bounds are one array (known while tracing): all rows are equalities."""
-        return self.lower is self.upper
+    def __post_init__(self) -> None:
+        if self.is_equality is None:
+            self.is_equality = self.lower is self.upper
 
 
 class Task(MadeForRobot, Replaceable):
