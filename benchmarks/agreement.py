@@ -1,84 +1,168 @@
-"""Kernels beside the search, problem by problem: random hierarchies solved with both backends.
+"""Kernels beside plain JAX, problem by problem: random problems solved by both.
 
-    python -m benchmarks.agreement [--count 1000000] [--backend numba] [--solver hqp] [--seed 0]
+    python -m benchmarks.agreement --solver qp|hqp|nullspace|reverse|saturated [--count 1000000]
+        [--backend numba] [--seed 0] [--batch 4096]
 
-Of each family of ``tests/hierarchy_families.py`` as many as of the others. Each line gives the problems so far, those
-whose verdicts differ, those in which a level's residual norm differs by more than 1e-7 of the level's size, the largest
-such difference, and those that the kernel left over for the search. With ``--solver nullspace`` the same levels are
-projected, without their box: there an inequality counts where the levels above leave it violated, and some of the
-degenerate ones are on their bound but for a rounding.
+Each family is drawn as often as the others: for weighted QPs those of ``tests/weighted_families.py`` and the planted
+ones of ``tests/problem_families.py`` as least squares, for the others those of ``tests/hierarchy_families.py``. Each
+line gives the problems so far; those whose status differs; those in which the rows of a QP's cost, or the norm of what
+a level misses, differ by more than 1e-7 of their size; the largest such difference; and those that the kernel left to
+the search.
+
+Null spaces without bounds (``nullspace``, ``reverse``) are given the same levels without their box. There an inequality
+counts where the levels above leave it violated, so where these put it on its bound, roundoff decides whether it counts:
+some problems of the degenerate families differ for that reason alone.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from osik_jax.solvers import HQPSolution, Level, NullSpaceSolution, solve_hqp, solve_nullspace
-from osik_jax.solvers.hqp import _dispatch
-from tests.hierarchy_families import SMALL
+from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp, solve_nullspace
+from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
+from osik_jax.solvers.null_space import _saturation
+from osik_jax.solvers.qp import _dispatch as qp_dispatch
+from tests.hierarchy_families import SMALL, Hierarchies
+from tests.problem_families import PLANTED, QPs
+from tests.weighted_families import MANY, M, Problems, problems
 
-BATCH = 4096
-"""Problems of one call."""
 APART = 1e-7
-"""Of a level's size, a difference that counts."""
+"""Of a problem's size, a difference that counts."""
+_SEARCHES = (
+    (qp_dispatch, "with_a_few", 2),
+    (hqp_dispatch, "with_the_rest", 1),
+    (_saturation, "with_a_few", 2),
+)
+"""Where a solver searches for what a kernel left over: module, function, and which argument says what is done."""
 
 
-@partial(jax.jit, static_argnames=("solver", "backend"))
-def solved(levels: Any, lower: Any, upper: Any, solver: str, backend: Any) -> HQPSolution | NullSpaceSolution:
-    """A batch, by one backend."""
+class Comparison(NamedTuple):
+    """What is compared: problems by family, how one is solved, and by how much the answers to a batch differ."""
 
-    def one(levels: Any, lower: Any, upper: Any) -> HQPSolution | NullSpaceSolution:
-        given = [Level(*level) for level in levels]
-        if solver == "nullspace":
-            return solve_nullspace(given, backend=backend)
-        return solve_hqp(given, lower, upper, backend=backend)
+    families: dict[str, Callable[[np.random.Generator, int], Any]]
+    solve: Callable[..., Any]
+    difference: Callable[[Any, Any, Any], np.ndarray]
 
-    return jax.vmap(one)(levels, lower, upper)
+
+def weighted(rng: np.random.Generator, count: int, *, m: int) -> Problems:
+    """Weights over five decades, rows hard and soft; ``m`` rows of the cost."""
+    return problems(count, m, seed=int(rng.integers(2**32)))
+
+
+def planted(rng: np.random.Generator, count: int, *, draw: Callable[[np.random.Generator, int], QPs]) -> Problems:
+    """A family of QPs with a Hessian, as least squares: half of what its diagonal can spare is damping."""
+    p = draw(rng, count)
+    diagonal = np.einsum("bii->bi", p.H)
+    root = np.sqrt(diagonal)
+    spare = np.linalg.eigvalsh(p.H / root[:, :, None] / root[:, None, :])[:, :1]
+    damping = 0.5 * np.maximum(spare, 0.0) * diagonal
+    factor = np.linalg.cholesky(p.H - damping[:, :, None] * np.eye(damping.shape[1]))
+    target = -np.linalg.solve(factor, p.g[..., None])[..., 0]
+    rows = p.C, p.row_lower, p.row_upper, np.zeros_like(p.row_lower)
+    return Problems(np.swapaxes(factor, 1, 2), target, np.ones_like(target), p.lower, p.upper, *rows, damping)
+
+
+def solve_qp(p: Problems, backend: Any) -> Any:
+    """One weighted QP."""
+    *given, compliance, damping = p
+    return solve_least_squares_qp(*given, rows_compliance=compliance, damping=damping, backend=backend)
+
+
+def qp_difference(p: Problems, mine: Any, plain: Any) -> np.ndarray:
+    """The weighted rows of the cost and the damped variables: how far those of both answers are apart."""
+
+    def rows(x: np.ndarray) -> np.ndarray:
+        values = np.einsum("bmn,bn->bm", p.matrix, x)
+        return np.concatenate([np.sqrt(p.weight) * values, np.sqrt(p.damping) * x], 1)
+
+    size = np.linalg.norm(rows(np.asarray(plain.x)), axis=1)
+    size = size + np.linalg.norm(np.sqrt(p.weight) * p.target, axis=1)
+    return np.linalg.norm(rows(np.asarray(mine.x - plain.x)), axis=1) / np.where(size > 0.0, size, 1.0)
+
+
+def solve_levels(p: Hierarchies, backend: Any, *, solver: str) -> Any:
+    """One hierarchy, or the projection of its levels."""
+    levels = [Level(*level) for level in p.levels]
+    if solver == "hqp":
+        return solve_hqp(levels, p.lower, p.upper, backend=backend)
+    if solver == "saturated":
+        return solve_nullspace(levels, p.lower, p.upper, backend=backend)
+    return solve_nullspace(levels, order="reverse" if solver == "reverse" else "forward", backend=backend)
+
+
+def levels_difference(p: Hierarchies, mine: Any, plain: Any) -> np.ndarray:
+    """The largest difference between the norms of what a level misses, of the size of the level."""
+    off = np.zeros(len(p.lower))
+    for a, b, level in zip(mine.slacks, plain.slacks, p.levels, strict=True):
+        rows = np.sqrt(level.weight)[..., None] * level.A
+        size = np.linalg.norm(rows, axis=2).max(1) * (1.0 + np.abs(plain.x).max(1))
+        norms = [np.linalg.norm(np.sqrt(level.weight) * np.asarray(w), axis=1) for w in (a, b)]
+        off = np.maximum(off, np.abs(norms[0] - norms[1]) / np.where(size > 0.0, size, 1.0))
+    return off
+
+
+def comparison(solver: str) -> Comparison:
+    """What is compared of a solver."""
+    if solver != "qp":
+        return Comparison(SMALL, partial(solve_levels, solver=solver), levels_difference)
+    few_and_many = {"few_rows": partial(weighted, m=M), "many_rows": partial(weighted, m=MANY)}
+    return Comparison(
+        few_and_many | {name: partial(planted, draw=draw) for name, draw in PLANTED.items()}, solve_qp, qp_difference
+    )
+
+
+def count_left_over() -> list[int]:
+    """Have the solvers count, in the list's one entry, the problems that are not done after a kernel."""
+    total = [0]
+
+    def note(done: np.ndarray) -> None:
+        total[0] += int((~done).sum())
+
+    def counting(search: Callable[..., Any], at: int) -> Callable[..., Any]:
+        def counted(*args: Any) -> Any:
+            jax.debug.callback(note, args[at])
+            return search(*args)
+
+        return counted
+
+    for module, name, at in _SEARCHES:
+        setattr(module, name, counting(getattr(module, name), at))
+    return total
 
 
 def main() -> None:
-    """Prints a line a batch."""
+    """Print a line for each batch."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.agreement", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--solver", default="hqp", choices=("qp", "hqp", "nullspace", "reverse", "saturated"))
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--backend", default="numba")
-    parser.add_argument("--solver", default="hqp", choices=("hqp", "nullspace"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--batch", type=int, default=4096, help="problems of one call")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    over = 0
+    families, solve, difference = comparison(asked.solver)
+    left_over = count_left_over()
 
-    def counted(end: Any, done: Any, again: Any, block: int) -> Any:
-        def note(done: np.ndarray) -> None:
-            nonlocal over
-            over += int((~done).sum())
+    @partial(jax.jit, static_argnums=1)
+    def solved(p: Any, backend: Any) -> Any:
+        return jax.vmap(partial(solve, backend=backend))(p)
 
-        jax.debug.callback(note, done)
-        return with_the_rest(end, done, again, block)
-
-    with_the_rest, _dispatch.with_the_rest = _dispatch.with_the_rest, counted
-    rng, so_far, verdicts, apart, worst = np.random.default_rng(asked.seed), 0, 0, 0, 0.0
+    rng, so_far, statuses, apart, worst = np.random.default_rng(asked.seed), 0, 0, 0, 0.0
     while so_far < asked.count:
-        for name, draw in SMALL.items():
-            p = draw(rng, BATCH)
-            data = [tuple(level) for level in p.levels], p.lower, p.upper
-            mine, search = (solved(*data, solver=asked.solver, backend=backend) for backend in (asked.backend, "jax"))
-            off = np.zeros(BATCH)
-            for a, b, level in zip(mine.slacks, search.slacks, p.levels, strict=True):
-                rows = np.sqrt(level.weight)[..., None] * level.A
-                size = np.linalg.norm(rows, axis=2).max(1) * (1.0 + np.abs(search.x).max(1))
-                norms = [np.linalg.norm(np.sqrt(level.weight) * np.asarray(w), axis=1) for w in (a, b)]
-                off = np.maximum(off, np.abs(norms[0] - norms[1]) / np.where(size > 0.0, size, 1.0))
-            so_far, verdicts = so_far + BATCH, verdicts + int((mine.status != search.status).sum())
+        for name, draw in families.items():
+            p = draw(rng, asked.batch)
+            mine, plain = solved(p, asked.backend), solved(p, "jax")
+            off = difference(p, mine, plain)
+            so_far, statuses = so_far + asked.batch, statuses + int((mine.status != plain.status).sum())
             apart, worst = apart + int((off > APART).sum()), max(worst, float(off.max()))
-            print(
-                f"{name}: {so_far} problems, {verdicts} verdicts, {apart} apart, {worst:.1e}; {over} left over",
-                flush=True,
-            )
+            found = f"{so_far} problems, {statuses} statuses, {apart} apart, {worst:.1e}"
+            print(f"{name}: {found}; {left_over[0]} left over", flush=True)
 
 
 if __name__ == "__main__":

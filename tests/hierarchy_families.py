@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from recorded import recorded_hierarchies
 
 VARIABLES = 10
 FOUR_LEVELS = (5, 5, 5, 5)
@@ -224,15 +223,3 @@ def many_levels(rng: np.random.Generator, count: int) -> Hierarchies:
         low, high = (np.where(whole[:, None], np.round(b), b) for b in (r.lower, r.upper))
         levels[k] = r._replace(A=A, lower=low, upper=high)
     return p._replace(levels=levels)
-
-
-def stretched(rng: np.random.Generator, count: int) -> Hierarchies:
-    """The robot's Jacobians near singularity, and targets far out of reach, other than the recorded ones."""
-    r = recorded_hierarchies(unit_rows=False)
-    lanes = rng.choice(np.flatnonzero(r.kind >= 2), count)
-    levels = []
-    for k, (A, low, high) in enumerate(r.levels):
-        A, low, high = A[lanes], low[lanes], high[lanes]
-        far = 10.0 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(size=low.shape) * (k < 3)
-        levels.append(Rows(A, low + far, high + far, np.ones_like(low)))
-    return Hierarchies(levels, r.lower[lanes], r.upper[lanes])

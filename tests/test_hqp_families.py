@@ -11,10 +11,10 @@ from hierarchy_families import (
     rescaled,
     scaled_between,
     scaled_within_reach,
-    stretched,
     weighted,
 )
 from lexicographic import certificate, norms, reference
+from stretched_hierarchies import stretched
 
 from osik_jax.solvers import Level, Status, solve_hqp
 

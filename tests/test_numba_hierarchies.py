@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hierarchy_families import SMALL, Hierarchies, Rows, stretched
+from hierarchy_families import SMALL, Hierarchies, Rows
 from lexicographic import certificate
 from recorded import recorded_hierarchies
+from stretched_hierarchies import stretched
 
 from osik_jax import HierarchicalQP
 from osik_jax.execution import _backends

@@ -1,0 +1,39 @@
+"""Kernels for CPUs beside plain JAX on random problems, as ``python -m benchmarks.agreement`` counts them."""
+
+import re
+import sys
+
+import pytest
+
+from benchmarks import agreement
+
+pytest.importorskip("numba")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def said(monkeypatch, capsys):
+    """What the command prints for a few problems of each family, and its solvers as they were afterwards."""
+
+    def run(solver):
+        for module, name, _ in agreement._SEARCHES:
+            monkeypatch.setattr(module, name, getattr(module, name))
+        monkeypatch.setattr(sys, "argv", ["agreement", "--solver", solver, "--count", "1", "--batch", "32"])
+        agreement.main()
+        return capsys.readouterr().out.splitlines()
+
+    return run
+
+
+@pytest.mark.variants(release=["hqp", "reverse"])
+@pytest.mark.parametrize("solver", ["qp", "hqp", "nullspace", "reverse", "saturated"])
+def test_every_family_agrees(solver, said):
+    """But for null spaces of the degenerate one, where roundoff decides which rows and bounds count."""
+    lines, before = said(solver), (0, 0)
+    assert [line.split(":")[0] for line in lines] == list(agreement.comparison(solver).families)
+    for i, line in enumerate(lines):
+        problems, statuses, apart = map(int, re.findall(r" (\d+) ", line)[:3])
+        assert problems == 32 * (i + 1)
+        if not line.startswith("degenerate") or solver in ("qp", "hqp"):
+            assert (statuses, apart) == before, line
+        before = statuses, apart
