@@ -5,9 +5,9 @@
 
 Each family is drawn as often as the others: for weighted QPs those of ``tests/weighted_families.py`` and the planted
 ones of ``tests/problem_families.py`` as least squares, for the others those of ``tests/hierarchy_families.py``. Each
-line gives the problems so far; those whose status differs; those in which the rows of a QP's cost, or the norm of what
-a level misses, differ by more than 1e-7 of their size; the largest such difference; and those that the kernel left to
-the search.
+line of the result is that of a family: its problems; by status, the kernel's first, those whose status differs; those
+of the others in which the rows of a QP's cost, or the norm of what a level misses, differ by more than 1e-7 of their
+size, and the largest such difference; and those that the kernel left to the search.
 
 Null spaces without bounds (``nullspace``, ``reverse``) are given the same levels without their box. There an inequality
 counts where the levels above leave it violated, so where these put it on its bound, roundoff decides whether it counts:
@@ -17,6 +17,8 @@ some problems of the degenerate families differ for that reason alone.
 from __future__ import annotations
 
 import argparse
+import dataclasses
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,7 +26,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp, solve_nullspace
+from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace
 from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
 from osik_jax.solvers.null_space import _saturation
 from osik_jax.solvers.qp import _dispatch as qp_dispatch
@@ -48,6 +50,33 @@ class Comparison(NamedTuple):
     families: dict[str, Callable[[np.random.Generator, int], Any]]
     solve: Callable[..., Any]
     difference: Callable[[Any, Any, Any], np.ndarray]
+
+
+@dataclasses.dataclass
+class Tally:
+    """What is found of a family."""
+
+    problems: int = 0
+    statuses: Counter[str] = dataclasses.field(default_factory=Counter)
+    apart: int = 0
+    worst: float = 0.0
+    left_over: int = 0
+
+    def add(self, mine: Any, plain: Any, off: np.ndarray, left_over: int) -> None:
+        """Count a batch: the kernel's answers, those of plain JAX, and how far they are apart."""
+        pairs = np.stack([mine.status, plain.status], 1)
+        same = pairs[:, 0] == pairs[:, 1]
+        self.problems += len(off)
+        self.statuses.update("/".join(Status(code).name for code in pair) for pair in pairs[~same])
+        self.apart += int((off[same] > APART).sum())
+        self.worst = max(self.worst, float(off[same].max(initial=0.0)))
+        self.left_over += left_over
+
+    def __str__(self) -> str:
+        """All of it."""
+        statuses = ", ".join(f"{name} {count}" for name, count in self.statuses.items()) or "none"
+        found = f"{self.problems} problems; statuses: {statuses}; apart: {self.apart}, {self.worst:.1e} at most"
+        return f"{found}; left over: {self.left_over}"
 
 
 def weighted(rng: np.random.Generator, count: int, *, m: int) -> Problems:
@@ -137,7 +166,7 @@ def count_left_over() -> list[int]:
 
 
 def main() -> None:
-    """Print a line for each batch."""
+    """Print a line for each family."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.agreement", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--solver", default="hqp", choices=("qp", "hqp", "nullspace", "reverse", "saturated"))
     parser.add_argument("--count", type=int, default=100_000)
@@ -153,16 +182,15 @@ def main() -> None:
     def solved(p: Any, backend: Any) -> Any:
         return jax.vmap(partial(solve, backend=backend))(p)
 
-    rng, so_far, statuses, apart, worst = np.random.default_rng(asked.seed), 0, 0, 0, 0.0
-    while so_far < asked.count:
+    rng, tallies = np.random.default_rng(asked.seed), {name: Tally() for name in families}
+    while sum(tally.problems for tally in tallies.values()) < asked.count:
         for name, draw in families.items():
-            p = draw(rng, asked.batch)
-            mine, plain = solved(p, asked.backend), solved(p, "jax")
-            off = difference(p, mine, plain)
-            so_far, statuses = so_far + asked.batch, statuses + int((mine.status != plain.status).sum())
-            apart, worst = apart + int((off > APART).sum()), max(worst, float(off.max()))
-            found = f"{so_far} problems, {statuses} statuses, {apart} apart, {worst:.1e}"
-            print(f"{name}: {found}; {left_over[0]} left over", flush=True)
+            p, before = draw(rng, asked.batch), left_over[0]
+            mine, plain = jax.block_until_ready((solved(p, asked.backend), solved(p, "jax")))
+            jax.effects_barrier()
+            tallies[name].add(mine, plain, difference(p, mine, plain), left_over[0] - before)
+    for name, tally in tallies.items():
+        print(f"{name}: {tally}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Kernels for CPUs beside plain JAX on random problems, as ``python -m benchmarks.agreement`` counts them."""
 
-import re
 import sys
 
 import pytest
@@ -29,11 +28,9 @@ def said(monkeypatch, capsys):
 @pytest.mark.parametrize("solver", ["qp", "hqp", "nullspace", "reverse", "saturated"])
 def test_every_family_agrees(solver, said):
     """But for null spaces of the degenerate one, where roundoff decides which rows and bounds count."""
-    lines, before = said(solver), (0, 0)
+    lines = said(solver)
     assert [line.split(":")[0] for line in lines] == list(agreement.comparison(solver).families)
-    for i, line in enumerate(lines):
-        problems, statuses, apart = map(int, re.findall(r" (\d+) ", line)[:3])
-        assert problems == 32 * (i + 1)
+    for line in lines:
+        assert ": 32 problems; " in line
         if not line.startswith("degenerate") or solver in ("qp", "hqp"):
-            assert (statuses, apart) == before, line
-        before = statuses, apart
+            assert "statuses: none; apart: 0, " in line, line

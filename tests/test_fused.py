@@ -12,10 +12,11 @@ from recorded import QP_DAMPING, recorded_qps
 from osik_jax.execution import _backends
 from osik_jax.execution._lanes import with_the_rest
 from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp import _dispatch, _kernel, _search
+from osik_jax.solvers.qp import _dispatch, _search, _warp
+from osik_jax.solvers.qp._candidate import Candidate
 from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._kernel import Candidate, Shape
 from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp._warp import Shape
 
 CAP = 1000
 SOFT = 3
@@ -175,7 +176,7 @@ def beside_a_gpu(monkeypatch):
 
     monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
     monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
-    monkeypatch.setattr(_kernel, "solve", solve)
+    monkeypatch.setattr(_warp, "solve", solve)
     jax.clear_caches()
     yield asked
     jax.clear_caches()
@@ -232,7 +233,7 @@ def test_no_gpu_no_kernel():
 @pytest.mark.parametrize("shape", [Shape(35, 50, 0), Shape(32, 47, 32), Shape(64, 90, 8), Shape(1, 1, 0)])
 def test_what_the_text_is_compiled_for(shape):
     assert 1 <= shape.warps <= 4
-    first = _kernel.source(shape).splitlines()[0]
+    first = _warp.source(shape).splitlines()[0]
     n, m, p = shape
     assert first == f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};"
     assert Shape(65, 10, 0).warps == Shape(64, 1000, 0).warps == Shape(10, 10, 33).warps == 0

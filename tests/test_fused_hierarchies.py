@@ -11,9 +11,9 @@ from hierarchy_families import inequality_levels
 from osik_jax.execution import _backends
 from osik_jax.solvers import Level, Tolerances, solve_hqp
 from osik_jax.solvers._damping import per_level
-from osik_jax.solvers.hqp import _cascade, _dispatch, _kernel
-from osik_jax.solvers.hqp._kernel import Shape
+from osik_jax.solvers.hqp import _cascade, _dispatch, _warp
 from osik_jax.solvers.hqp._padding import Layout, PaddedHierarchy, pad_hierarchy
+from osik_jax.solvers.hqp._warp import Shape
 
 COUNT, CAP = 12, 200
 
@@ -120,7 +120,7 @@ def test_when_the_kernel_is_asked(monkeypatch):
         asked.append(Shape.of(layout))
         return _cascade.solve_cascade(layout, max_iterations, hierarchy, tolerances, warm_start)
 
-    monkeypatch.setattr(_kernel, "solve", solve)
+    monkeypatch.setattr(_warp, "solve", solve)
     monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
 
     def trace(n=3, backend="auto"):
@@ -158,5 +158,5 @@ def test_when_the_kernel_is_asked(monkeypatch):
 def test_what_the_text_is_compiled_for(shape, warps):
     assert shape.warps == warps
     if warps:
-        head = _kernel.source(shape).splitlines()[:6]
+        head = _warp.source(shape).splitlines()[:6]
         assert head[0] == f"constexpr int N = {shape.variables};" and head[5] == f"constexpr int WARPS = {warps};"

@@ -12,7 +12,7 @@ from recorded import QP_DAMPING, recorded_qps
 
 from osik_jax.execution import _backends
 from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp import _kernel
+from osik_jax.solvers.qp import _warp
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
 
@@ -158,7 +158,7 @@ def test_the_kernel_settles_alone(rng):
         upper,
     )
     guess, tolerance = jnp.asarray(at, jnp.int32), jnp.full(count, 1e-7, jnp.float32)
-    kernel = jax.jit(lambda *a: _kernel.solve(a[0], a[1], a[2], 1000))
+    kernel = jax.jit(lambda *a: _warp.solve(a[0], a[1], a[2], 1000))
     found = kernel(qp, guess, tolerance)
     assert found.converged.all() and (found.factorizations == 1).all() and (found.iterations == 0).all()
     np.testing.assert_array_equal(found.active, guess)

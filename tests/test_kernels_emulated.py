@@ -14,9 +14,9 @@ from recorded import QP_DAMPING, recorded_hierarchies, recorded_qps
 from osik_jax.execution import _backends
 from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp
 from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
-from osik_jax.solvers.hqp import _kernel as hqp_kernel
+from osik_jax.solvers.hqp import _warp as hqp_kernel
 from osik_jax.solvers.qp import _dispatch as qp_dispatch
-from osik_jax.solvers.qp import _kernel as qp_kernel
+from osik_jax.solvers.qp import _warp as qp_kernel
 
 pytestmark = [needs_compiler, pytest.mark.slow]
 COUNT = 16

@@ -18,7 +18,7 @@ from ...execution._backends import Backend, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_the_rest
-from . import _kernel, _numba
+from . import _numba, _warp
 from ._cascade import CascadeResult, certify_levels, solve_cascade
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
@@ -56,8 +56,8 @@ def _solve_on_platform(
     warm_start: WorkingSet | None,
 ) -> CascadeResult:
     kernels = {}
-    if takes(backend, "warp", fits=_kernel.Shape.of(layout).warps > 0):
-        kernels["warp"] = kernel_candidates(layout, max_iterations, _kernel.solve)
+    if takes(backend, "warp", fits=_warp.Shape.of(layout).warps > 0):
+        kernels["warp"] = kernel_candidates(layout, max_iterations, _warp.solve)
     if takes(backend, "numba", fits=True):
         kernels["numba"] = kernel_candidates(layout, max_iterations, _numba.solve, by_guesses=False)
     search = partial(solve_cascade, layout, max_iterations)

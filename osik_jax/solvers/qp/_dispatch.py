@@ -22,9 +22,9 @@ from ...execution._lanes import in_lanes, with_a_few, with_the_rest
 from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
-from . import _kernel, _numba
+from . import _numba, _warp
+from ._candidate import Candidate
 from ._cost import LeastSquares
-from ._kernel import Candidate
 from ._kkt_solve import kkt_inverse
 from ._problem import KKT_TOLERANCE, QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, unpack
 from ._search import SearchResult, initial_result, search, usable_guess, violated_conditions
@@ -66,7 +66,7 @@ def _solve_on_platform(
 ) -> SearchResult:
     kernels = {}
     if takes(backend, "warp", fits=has_soft_rows and _fits_warp(qp)):
-        kernels["warp"] = warp_candidates(_kernel.solve, max_iterations)
+        kernels["warp"] = warp_candidates(_warp.solve, max_iterations)
     if takes(backend, "numba", fits=isinstance(qp.cost, LeastSquares)):
         kernels["numba"] = _numba_candidates(KKT_TOLERANCE[tolerance.dtype], max_iterations)
     search_all = partial(search, max_iterations=max_iterations)
@@ -220,7 +220,7 @@ def _solve_kkt_by_warp(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B
         upper=jnp.where(is_equality, bound, jnp.inf),
     )
     tolerance = jnp.full(len(active), _SINGLE_TOL, center.dtype)
-    candidate = _kernel.solve(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
+    candidate = _warp.solve(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
     point = jnp.concatenate([candidate.x, jnp.where(active_rows, candidate.row_multipliers, 0.0)], 1)
     done = (candidate.converged != 0) & jnp.isfinite(point).all(1)
 
@@ -236,4 +236,4 @@ def _fits_warp(qp: QP) -> bool:
     if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float32:
         return False
     _, m, n = qp.cost.matrix.shape
-    return _kernel.Shape(n, m, qp.rows.shape[1]).warps > 0
+    return _warp.Shape(n, m, qp.rows.shape[1]).warps > 0

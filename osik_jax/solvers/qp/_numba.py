@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from ...execution._computed import side_by_side
 from ...kernels.numba import _target
+from ._candidate import Candidate
 from ._cost import LeastSquares
-from ._kernel import Candidate
 from ._problem import QP
 
 

@@ -1,7 +1,8 @@
 """The CUDA kernel of the weighted QP: a Warp native function, called from JAX through Warp's FFI.
 
-One warp of 32 threads solves one problem and stops when that one is done. ``_active_set.cu`` is compiled for the number
-of variables, of rows of the cost and of soft rows, once a process (and once for all in Warp's cache on disk).
+One warp of 32 threads solves one problem and stops when that one is done. The text in ``kernels/warp/qp`` is compiled
+for the number of variables, of rows of the cost and of soft rows, once a process (and once for all in Warp's cache on
+disk).
 """
 
 from __future__ import annotations
@@ -9,15 +10,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from importlib.resources import files
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ...kernels.warp import text
+from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._problem import QP
 
+PARTS = ("workspace", "vectors", "problem", "factor", "refine", "labels", "dual_step", "active_set")
+"""The files of the kernel, in their order: each uses what those before it define."""
 MAX_VARIABLES, MAX_SOFT_ROWS = 64, 32
 _SHARED_BYTES = 48 * 1024
 """Shared memory that any CUDA device gives a block without being asked for more."""
@@ -26,17 +30,6 @@ _INPUTS = dict(
     matrix="float", target="float", weight="float", damping="float", center="float", lower="float", upper="float"
 ) | dict(rows="float", compliance="float", guess="int", tolerance="float")
 _OUTPUTS = dict(solution="float", row_multipliers="float", active="int", report="int")
-
-
-class Candidate(NamedTuple):
-    """A kernel's answers for a batch, which are yet to be certified."""
-
-    x: Float[Array, "B n"]
-    row_multipliers: Float[Array, "B p"]
-    active: Int[Array, "B n+p"]
-    converged: Int[Array, " B"]  # whether the kernel has nothing left to change
-    iterations: Int[Array, " B"]
-    factorizations: Int[Array, " B"]
 
 
 class Shape(NamedTuple):
@@ -124,8 +117,7 @@ def _kernel(shape: Shape) -> Callable[..., Any]:
     return warp.jax_kernel(kernel, num_outputs=len(outputs), block_dim=block)
 
 
-def source(shape: Shape) -> str:
-    """Return the CUDA text for a shape: its numbers as constants, then the body of the kernel."""
+def source(shape: Shape, parts: tuple[str, ...] = PARTS) -> str:
+    """Return the CUDA text for a shape: its numbers as constants, then the body of the kernel, or some of its parts."""
     n, m, p = shape
-    body = files("osik_jax.solvers.qp").joinpath("_active_set.cu").read_text()
-    return f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};\n{body}"
+    return f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};\n{text('qp', parts)}"

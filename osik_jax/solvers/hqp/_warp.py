@@ -1,7 +1,7 @@
 """The CUDA kernel of the hierarchy: a Warp native function, called from JAX through Warp's FFI.
 
-One warp of 32 threads goes through all levels of one problem, in double precision. ``_cascade.cu`` is compiled for the
-layout of the hierarchy, once a process (and once for all in Warp's cache on disk).
+One warp of 32 threads goes through all levels of one problem, in double precision. The text in ``kernels/warp/hqp`` is
+compiled for the layout of the hierarchy, once a process (and once for all in Warp's cache on disk).
 """
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ import re
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from importlib.resources import files
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ...kernels.warp import text
 from ...numerics._constants import (
     COST_FRACTION,
     DAMPING_ITERATIONS,
+    DAMPING_RIDGE,
     MIN_RADIUS,
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
@@ -27,6 +28,11 @@ from ._cascade import CascadeResult, result_of_kernel
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
+PARTS = (
+    *("workspace", "reductions", "problem", "level", "basis", "cholesky", "active_rows", "least_squares"),
+    *("multipliers", "evaluate", "damping", "warm_start", "primal_active_set", "freeze", "cascade"),
+)
+"""The files of the kernel, in their order: each uses what those before it define."""
 _MAX_ROWS, _MAX_HARD_ROWS = 64, 32
 _SHARED_BYTES = 48 * 1024
 """Shared memory that any CUDA device gives a block without being asked for more."""
@@ -198,20 +204,19 @@ def _kernel(shape: Shape) -> Callable[..., Any]:
     return warp.jax_kernel(kernel, num_outputs=len(outputs), block_dim=block)
 
 
-def source(shape: Shape) -> str:
-    """Return the CUDA text for a shape: its numbers as constants, then the body of the kernel."""
+def source(shape: Shape, parts: tuple[str, ...] = PARTS) -> str:
+    """Return the CUDA text for a shape: its numbers as constants, then the body of the kernel, or some of its parts."""
     offsets = [sum(shape.row_counts[:k]) for k in range(len(shape.row_counts))]
     numbers = dict(N=shape.variables, LEVELS=len(shape.row_counts), M=shape.rows, ROWS=shape.all_rows)
     numbers |= dict(P=len(shape.row_of_hard), WARPS=shape.warps, DAMPING_ITERATIONS=DAMPING_ITERATIONS)
     lists = dict(COUNT=shape.row_counts, OFFSET=offsets, HAS_INEQUALITIES=[int(a) for a in shape.has_inequalities])
     lists |= dict(ROW=shape.row_of_hard or (0,), LEVEL=shape.level_of_hard or (0,))
     head = [f"constexpr int {name} = {value};" for name, value in numbers.items()]
-    constants = dict(NEGLIGIBLE_DAMPING=NEGLIGIBLE_DAMPING, COST_FRACTION=COST_FRACTION)
+    constants = dict(NEGLIGIBLE_DAMPING=NEGLIGIBLE_DAMPING, COST_FRACTION=COST_FRACTION, DAMPING_RIDGE=DAMPING_RIDGE)
     constants |= dict(MIN_RADIUS=MIN_RADIUS, NEGLIGIBLE_CURVATURE=NEGLIGIBLE_CURVATURE)
     head += [f"constexpr double {name} = {value!r};" for name, value in constants.items()]
     head += [f"const int {name}[] = {{{', '.join(map(str, values))}}};" for name, values in lists.items()]
-    body = files("osik_jax.solvers.hqp").joinpath("_cascade.cu").read_text()
-    return "\n".join(head) + "\n" + rolled(body)
+    return "\n".join(head) + "\n" + rolled(text("hqp", parts))
 
 
 def rolled(text: str) -> str:

@@ -1,0 +1,18 @@
+"""What a kernel answers to a batch of QPs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Float, Int
+
+
+class Candidate(NamedTuple):
+    """A kernel's answers for a batch, which are yet to be certified."""
+
+    x: Float[Array, "B n"]
+    row_multipliers: Float[Array, "B p"]
+    active: Int[Array, "B n+p"]
+    converged: Int[Array, " B"]  # whether the kernel has nothing left to change
+    iterations: Int[Array, " B"]
+    factorizations: Int[Array, " B"]
