@@ -129,6 +129,52 @@ def test_batches_of_factorisations_side_by_side_come_to_an_end():
     assert done.stdout == "done\n", done.stderr
 
 
+BY_KERNELS = """
+import os
+os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from osik_jax.solvers import Level, solve_nullspace
+def solve(A, b):
+    return solve_nullspace([Level(A[:24], b[:24]), Level(A[24:], b[24:])], backend="auto").x
+def again(_, state):
+    A, u, v = state
+    x, y = jax.vmap(solve)(A, u), jax.vmap(solve)(2.0 * A, v)
+    return A, u + 0.0 * x, v + 0.0 * y
+A, b = np.random.default_rng(0).normal(size=(64, 48, 48)), np.ones((64, 48))
+jax.block_until_ready(jax.jit(lambda *s: jax.lax.fori_loop(0, 20, again, s))(A, b, 2.0 * b))
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_kernels_wait_for_no_workers():
+    """Two batches side by side on two cores, nothing configured: with ``backend="jax"`` they wait for ever."""
+    pytest.importorskip("numba")
+    assert in_a_process(BY_KERNELS).stdout == "done\n"
+
+
+WITHOUT_WARNINGS = """
+import jax
+jax.config.update("jax_enable_x64", True)
+import osik_jax as osik
+osik.runtime.configure_cpu()
+robot = osik.load_robot("arm7")
+tasks = {"hand": osik.FrameTask(robot, "hand", priority=1), "posture": osik.PostureTask(robot, priority=2)}
+for scheme in (osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace(method="saturated")):
+    osik.raise_if_failed(osik.solve(robot, robot.q0, tasks, scheme=scheme))
+osik.rollout(robot, robot.q0, tasks, steps=3)
+jax.grad(lambda q: osik.solve(robot, q, tasks).velocity.sum())(robot.q0)
+"""
+
+
+@pytest.mark.slow
+def test_a_program_warns_of_nothing():
+    """As ``python -W error`` runs it: a step of each scheme, a rollout, a derivative."""
+    done = in_a_process(WITHOUT_WARNINGS, PYTHONWARNINGS="error")
+    assert done.stdout + done.stderr == ""
+
+
 WARNED = """
 import os, warnings
 os.sched_getaffinity = lambda _: {0, 1}
