@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def batch_axes(tree: T, *names: str, axis: int = 0) -> T:
-    """Which arrays of a pytree are batched: what ``jax.vmap`` takes as ``in_axes`` or ``out_axes`` of that argument.
+    """Return which arrays of a pytree are batched, as ``jax.vmap`` takes it for ``in_axes`` or ``out_axes``.
 
     ``jax.vmap(tick, in_axes=(0, osik.batch_axes(tasks, "hand.target")))`` maps over configurations and over the hand's
     target, while all else in ``tasks`` is shared.
@@ -44,7 +44,7 @@ def batch_axes(tree: T, *names: str, axis: int = 0) -> T:
 
 
 def batched(tree: T, values: Mapping[str, Any]) -> T:
-    """The pytree with the named arrays replaced by batches of them; map over ``batch_axes(tree, *values)``.
+    """Return the pytree with the named arrays replaced by batches of them; map over ``batch_axes(tree, *values)``.
 
     Args:
         tree: tasks, a robot, limits, a scheme, or any other pytree.
@@ -64,7 +64,7 @@ def batched(tree: T, values: Mapping[str, Any]) -> T:
 
 
 def stack(items: Sequence[T]) -> T:
-    """One pytree of stacked arrays from several of the same structure: robots, task sets, limits; ``vmap`` over it.
+    """Return one pytree of stacked arrays from several of the same structure: robots, tasks, limits; ``vmap`` over it.
 
     Raises:
         ValueError: there is nothing to stack, or structure differs: the message says what, and why it cannot.
@@ -83,7 +83,7 @@ _STRUCTURE = "that is structure, not a number; make one batch for each"
 
 
 def _difference(a: Any, b: Any, where: str) -> str | None:
-    """What in the structure of two pytrees differs first, and why that cannot be a batch; None: nothing does."""
+    """Return what in the structure of two pytrees differs first, and why that cannot be a batch; None: nothing does."""
     at = where.removeprefix(".") or "it"
     if type(a) is not type(b) and not (_is_number(a) and _is_number(b)):
         return f"{at} is a {type(a).__name__} in one and a {type(b).__name__} in the other; {_STRUCTURE}"

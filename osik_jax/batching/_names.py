@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def leaf_names(tree: Any) -> tuple[str, ...]:
-    """A name for each leaf, in JAX's order: attributes and dict keys after a dot, places in a sequence in brackets."""
+    """Return each leaf's name, in JAX's order: attributes and keys after a dot, places in a sequence in brackets."""
     return tuple(_name(path) for path, _ in jax.tree_util.tree_leaves_with_path(tree))
 
 
@@ -30,7 +30,7 @@ def _label(key: Any) -> Any:
 
 
 def find_leaves(names: Sequence[str], wanted: str) -> tuple[int, ...]:
-    """Places among the names of the leaf called ``wanted``, or of all leaves under it.
+    """Return the places among the names of the leaf called ``wanted``, or of all leaves under it.
 
     A ``*`` stands for any part of a name up to the next dot: ``*.weight``, ``*_foot.gain``, ``limits[*].velocity``.
 
@@ -46,7 +46,7 @@ def find_leaves(names: Sequence[str], wanted: str) -> tuple[int, ...]:
 
 
 def replace_named(tree: T, names: Sequence[str], values: Mapping[str, Any], *, batched: bool = False) -> T:
-    """The tree with other numbers in its named leaves.
+    """Return the tree with other numbers in its named leaves.
 
     Args:
         tree: any pytree.
@@ -70,7 +70,7 @@ def replace_named(tree: T, names: Sequence[str], values: Mapping[str, Any], *, b
 
 
 def _paired(names: Sequence[str], name: str, value: Any) -> list[tuple[int, Any]]:
-    """The leaves that a name finds, each with its value."""
+    """Return the leaves that a name finds, each with its value."""
     places, new = find_leaves(names, name), jax.tree.leaves(value)
     if len(new) not in (1, len(places)):
         found = ", ".join(names[place] for place in places)
@@ -79,7 +79,7 @@ def _paired(names: Sequence[str], name: str, value: Any) -> list[tuple[int, Any]
 
 
 def _fitting(value: Any, leaf: Any, name: str, batched: bool) -> Array:
-    """A value in the precision of the leaf that it replaces; a scalar is repeated."""
+    """Return a value in the precision of the leaf that it replaces; a scalar is repeated."""
     new, shape = jnp.asarray(value, jnp.result_type(leaf)), jnp.shape(leaf)
     lanes = new.shape[:1] if batched else ()
     if batched and new.ndim == 0:

@@ -13,17 +13,17 @@ Static = tuple[tuple[Any, ...], Any]
 
 
 def is_number(leaf: Any) -> bool:
-    """Whether a leaf is traced: arrays, tracers among them, and Python floats; all else is structure."""
+    """Return whether a leaf is traced: arrays, tracers among them, and Python floats; all else is structure."""
     return eqx.is_array(leaf) or isinstance(leaf, float | np.ndarray | np.generic)
 
 
 def taken_apart(tree: Any) -> tuple[Any, Static]:
-    """The numbers, as a pytree with None in the place of all else; and all else, to be a static argument of ``jit``."""
+    """Return the numbers, a pytree with None in place of all else; and all else, to be a static argument of ``jit``."""
     numbers, structure = eqx.partition(tree, is_number)
     leaves, treedef = jax.tree.flatten(structure)
     return numbers, (tuple(leaves), treedef)
 
 
 def put_together(numbers: Any, static: Static) -> Any:
-    """The pytree that ``taken_apart`` took apart."""
+    """Return the pytree that ``taken_apart`` took apart."""
     return eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))

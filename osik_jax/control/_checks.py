@@ -24,7 +24,7 @@ from ..tasks import Task, TaskRows
 
 
 def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
-    """Raises TypeError or ValueError for anything that is not what it should be."""
+    """Raise TypeError or ValueError for anything that is not what it should be."""
     check_robot(robot, where)
     _check_precision(robot)
     if scheme is not None and not isinstance(scheme, Scheme):
@@ -33,7 +33,7 @@ def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
 
 
 def _check_precision(robot: Robot) -> None:
-    """In single precision all can be float64 numbers no longer; in double precision float32 is possible, and slower."""
+    """Raise where the robot has another precision than JAX is set to, but for float32 in double precision."""
     own, now = robot.q0.dtype, jnp.result_type(float)
     if own == now:
         return
@@ -46,7 +46,7 @@ def _check_precision(robot: Robot) -> None:
 
 
 def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
-    """The limits as a tuple, None where none are given.
+    """Return the limits as a tuple, None where none are given.
 
     Raises:
         TypeError: no sequence of limits.
@@ -66,7 +66,7 @@ def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
 
 
 def check_dt(dt: Any) -> None:
-    """Raises TypeError where dt is no number, ValueError where it is seen not to be one, positive and finite."""
+    """Raise TypeError where dt is no number, ValueError where it is seen not to be one, positive and finite."""
     seen = concrete(dt)
     if seen is not None and seen.dtype.kind not in "iuf":
         raise OsikTypeError(f"dt is {dt!r}; it is a number, in seconds")
@@ -79,7 +79,7 @@ def check_dt(dt: Any) -> None:
 
 
 def check_tasks(tasks: Any, robot: Robot | None = None) -> None:
-    """Raises TypeError or ValueError where these are no tasks by name, or not this robot's."""
+    """Raise TypeError or ValueError where these are no tasks by name, or not this robot's."""
     if not isinstance(tasks, Mapping):
         raise OsikTypeError(f"tasks is a {type(tasks).__name__}; it is a dict from names to tasks")
     if not tasks:
@@ -95,7 +95,7 @@ def check_tasks(tasks: Any, robot: Robot | None = None) -> None:
 
 
 def checked_configuration(robot: Robot, q: Any) -> Array:
-    """q, checked, as floats at least as precise as the robot's.
+    """Return q, checked, as floats at least as precise as the robot's.
 
     Raises:
         TypeError: no numbers.
@@ -110,7 +110,7 @@ def checked_configuration(robot: Robot, q: Any) -> Array:
 
 
 def check_steps(steps: Any) -> None:
-    """Raises ValueError where the number of ticks is none."""
+    """Raise ValueError where the number of ticks is none."""
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 0:
         raise OsikValueError(f"steps is {steps!r}; it is the number of ticks, an integer")
 
@@ -119,7 +119,7 @@ _BY_TICK = "targets by tick"
 
 
 def check_target_names(tasks: Mapping[str, Task], targets: Any, what: str = "targets") -> None:
-    """Raises where targets are no mapping, or for a task that does not exist."""
+    """Raise where targets are no mapping, or for a task that does not exist."""
     if targets is not None and not isinstance(targets, Mapping):
         raise OsikTypeError(f"targets is a {type(targets).__name__}; it is a dict from task names to {what}")
     for name in targets or {}:
@@ -133,7 +133,7 @@ def check_targets(
     steps: int,
     robot: Robot | None = None,
 ) -> None:
-    """Raises where tasks are none, or targets by tick do not fit them."""
+    """Raise where tasks are none, or targets by tick do not fit them."""
     if callable(tasks):
         if targets is not None:
             raise OsikValueError("targets go with a dict of tasks; a function of time sets them itself")
@@ -154,7 +154,7 @@ def check_targets(
 
 
 def check_warm_start(warm_start: Any) -> None:
-    """Raises TypeError where it is not made of integers; whether it fits is seen when the tick is compiled."""
+    """Raise TypeError where it is not made of integers; whether it fits is seen when the tick is compiled."""
     for leaf in jax.tree.leaves(warm_start):
         if not hasattr(leaf, "dtype") or not jnp.issubdtype(leaf.dtype, jnp.integer):
             raise OsikTypeError(
@@ -163,7 +163,7 @@ def check_warm_start(warm_start: Any) -> None:
 
 
 def solved_with(scheme: Scheme, problem: VelocityProblem, warm_start: Any) -> SchemeAnswer:
-    """The scheme's answer; ValueError where the warm start is that of another problem or scheme.
+    """Return the scheme's answer; ValueError where the warm start is that of another problem or scheme.
 
     What a warm start should be is that of an answer without one, which is traced only where something went wrong.
     """
@@ -194,7 +194,7 @@ def _shapes(tree: Any) -> tuple[Any, list[tuple[int, ...]]]:
 
 
 def check_rows(rows: Mapping[str, Any], tasks: Mapping[str, Task], robot: Robot) -> None:
-    """Raises where the rows of a task, which somebody may have written himself, do not fit each other or the robot."""
+    """Raise where the rows of a task, which somebody may have written himself, do not fit each other or the robot."""
     for name, own in rows.items():
         kind = type(tasks[name]).__name__
         if not isinstance(own, TaskRows):

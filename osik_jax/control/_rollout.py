@@ -15,7 +15,7 @@ from ..batching._structure import Static, put_together, taken_apart
 from ..execution._rules import FOUND
 from ..kinematics import integrate
 from ..limits import Limit
-from ..numerics._sanity import cleaned
+from ..numerics._placeholder import with_placeholder
 from ..robot import Robot
 from ..schemes import Scheme
 from ..tasks import Task
@@ -47,7 +47,7 @@ def rollout(
     targets: Targets | None = None,
     feedback: Feedback | Float[ArrayLike, "steps nq"] | None = None,
 ) -> Trajectory:
-    """The closed loop: solve, integrate, repeat, in one compiled scan.
+    """Return the closed loop: solve, integrate, repeat, in one compiled scan.
 
     Differentiable in both modes. The reverse mode keeps of each tick the configuration and what the solver found, and
     computes the rest of it again on its way back: a long path costs little memory.
@@ -139,7 +139,7 @@ def _rollout(
 
 
 def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, moved: Bool[Array, ""] | bool) -> Any:
-    """Tasks and limits ``after`` a tick's velocity; as they are where there was no tick (``moved`` is false)."""
+    """Return tasks and limits ``after`` a tick's velocity, or as they are where there was none (``moved`` false)."""
 
     def one(part: Task | Limit) -> Task | Limit:
         if velocity is None or type(part).after in (Task.after, Limit.after):
@@ -150,13 +150,13 @@ def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, mov
 
 
 def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
-    """Where a tick leads; nowhere if q or dt is NaN."""
-    (clean, tick), fine = cleaned((q, jnp.asarray(dt)))
-    return jnp.where(fine, integrate(robot, clean, v, tick).astype(q.dtype), q)
+    """Return where a tick leads; nowhere if q or dt is NaN."""
+    (usable, tick), is_valid = with_placeholder((q, jnp.asarray(dt)))
+    return jnp.where(is_valid, integrate(robot, usable, v, tick).astype(q.dtype), q)
 
 
 def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:
-    """Zeros in the shape of what a tick leaves to the next, from one that is traced and not run."""
+    """Return zeros in the shape of what a tick leaves to the next, from one that is traced and not run."""
     one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), jax.tree.map(jnp.asarray, ticks))
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, one))
 

@@ -16,7 +16,7 @@ from ..execution._rules import blocked
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._forward import kinematics_by
 from ..limits import ConfigurationLimit, Limit, VelocityLimit, limit_box, limit_rows
-from ..numerics._sanity import cleaned, positive
+from ..numerics._placeholder import positive, with_placeholder
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ..schemes import Scheme, VelocityProblem, WeightedQP
@@ -50,7 +50,7 @@ def solve(
     targets: Targets | None = None,
     warm_start: Any = None,
 ) -> Solution:
-    """The velocity that serves the tasks best at configuration q.
+    """Return the velocity that serves the tasks best at configuration q.
 
     Compiled on first use; changing any number (target, weight, gain, limit, dt, link length) compiles nothing. Pure, so
     it can be used inside ``jit`` and batched by ``vmap`` over q and over any leaf of robot, tasks, scheme and limits.
@@ -101,7 +101,7 @@ def build_problem(
     dt: Float[Array, ""] | float = 0.005,
     targets: Targets | None = None,
 ) -> VelocityProblem:
-    """What ``solve`` hands to its scheme: the rows of the tasks, the box and the rows of the limits, assembled.
+    """Return what ``solve`` hands to its scheme: the rows of the tasks, the box and the rows of the limits, assembled.
 
     For solvers of your own, and to look at the numbers: ``problem.rows["hand"].jacobian``, ``problem.lower``. A scheme
     takes it: ``scheme.solve(problem).velocity``. Pure; it is not compiled here, so call it inside your own ``jit``,
@@ -141,16 +141,16 @@ def step(
     chosen, bounds = _own_scheme(q, scheme), _own_limits(robot, limits)
     dt = positive(dt)
     raw_box = jax.lax.stop_gradient(limit_box(robot, q, bounds, dt))
-    (robot, q), posed = cleaned((robot, q))
-    (chosen, bounds, dt), set_up = cleaned((chosen, bounds, dt))
-    looked_at = {name: cleaned(task) for name, task in tasks.items()}
-    tasks, sound = (
+    (robot, q), is_valid_pose = with_placeholder((robot, q))
+    (chosen, bounds, dt), set_up = with_placeholder((chosen, bounds, dt))
+    looked_at = {name: with_placeholder(task) for name, task in tasks.items()}
+    tasks, is_valid = (
         {k: task for k, (task, _) in looked_at.items()},
-        {k: posed & own for k, (_, own) in looked_at.items()},
+        {k: is_valid_pose & own for k, (_, own) in looked_at.items()},
     )
     kinematics = kinematics_by(getattr(chosen, "backend", "jax"), robot, q)
     problem = velocity_problem(robot, kinematics, q, tasks, bounds, dt)
-    given = _spoiled(problem, raw_box, jnp.stack([set_up, *sound.values()]).all())
+    given = _with_nan(problem, raw_box, jnp.stack([set_up, *is_valid.values()]).all())
     answer = solved_with(chosen, given, warm_start)
     v = answer.velocity
     failed = answer.status == Status.NUMERICAL_ERROR
@@ -161,29 +161,31 @@ def step(
         factorizations=answer.factorizations,
         kkt_residual=jnp.where(failed, jnp.finfo(v.dtype).max, answer.kkt_residual),
         box_violation=jnp.max(_finite(_beyond_limits(given, v))),
-        slack={name: _finite(jnp.where(sound[name], slack, 0.0)) for name, slack in problem.slack(v).items()},
-        error={name: _finite(jnp.where(sound[name], rows.error, 0.0)) for name, rows in problem.rows.items()},
+        slack={name: _finite(jnp.where(is_valid[name], slack, 0.0)) for name, slack in problem.slack(v).items()},
+        error={name: _finite(jnp.where(is_valid[name], rows.error, 0.0)) for name, rows in problem.rows.items()},
         warm_start=answer.warm_start,
     )
 
 
-def _spoiled(problem: VelocityProblem, raw_box: tuple[Array, Array], fine: Array) -> VelocityProblem:
-    """The problem with NaN back where its numbers are not to be had from: the solver says so, in every scheme.
+def _with_nan(problem: VelocityProblem, raw_box: tuple[Array, Array], is_valid: Array) -> VelocityProblem:
+    """Re-insert NaN where inputs were not valid, so that every solver reports NUMERICAL_ERROR.
 
     It comes in through a select, so that derivatives with respect to what the problem was made of are 0 in that lane.
     Of equalities what they want and their weights say it, all in one operation: matrices are large.
     """
     small = [name for name, r in problem.rows.items() if r.is_equality and r.dofs is None and name not in problem.hard]
     rows = {
-        name: replace(r, jacobian=jnp.where(fine, r.jacobian, jnp.nan), weight=jnp.where(fine, r.weight, jnp.nan))
+        name: replace(
+            r, jacobian=jnp.where(is_valid, r.jacobian, jnp.nan), weight=jnp.where(is_valid, r.weight, jnp.nan)
+        )
         for name, r in problem.rows.items()
         if name not in small
     }
     if small:
         numbers = [getattr(problem.rows[name], field) for field in ("lower", "weight") for name in small]
         ends = np.cumsum([len(a) for a in numbers])[:-1]
-        spoiled = jnp.split(jnp.where(fine, jnp.concatenate(numbers), jnp.nan), ends)
-        for name, wanted, weight in zip(small, spoiled, spoiled[len(small) :], strict=False):
+        with_nan = jnp.split(jnp.where(is_valid, jnp.concatenate(numbers), jnp.nan), ends)
+        for name, wanted, weight in zip(small, with_nan, with_nan[len(small) :], strict=False):
             rows[name] = replace(problem.rows[name], lower=wanted, upper=wanted, weight=weight)
         rows = {name: rows[name] for name in problem.rows}
     lower, upper = (
@@ -193,7 +195,7 @@ def _spoiled(problem: VelocityProblem, raw_box: tuple[Array, Array], fine: Array
 
 
 def _beyond_limits(problem: VelocityProblem, v: Float[Array, " nv"]) -> Float[Array, " m"]:
-    """How far v leaves its box, then its rows."""
+    """Return how far v leaves its box, then its rows."""
     box = jnp.maximum(jnp.maximum(problem.lower - v, v - problem.upper), 0.0)
     return box if problem.limit_rows is None else jnp.concatenate([box, problem.limit_rows.violation(v)])
 
@@ -203,7 +205,7 @@ def _finite(x: Array) -> Array:
 
 
 def aim(tasks: dict[str, Task], targets: Targets | None) -> dict[str, Task]:
-    """The tasks with this tick's targets."""
+    """Return the tasks with this tick's targets."""
     aimed = {name: tasks[name].replace(target=target) for name, target in (targets or {}).items()}
     return {**tasks, **aimed}
 
@@ -241,15 +243,15 @@ def velocity_problem(
 
 
 def in_type_of(dt: Any, q: Array) -> Any:
-    """The tick in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
+    """Return the tick in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
     return dt.astype(q.dtype) if isinstance(dt, jax.Array) else np.asarray(dt, q.dtype)
 
 
 def _own_scheme(q: Array, scheme: Scheme | None) -> Scheme:
-    """The scheme that is given, or a weighted QP in the precision of q."""
+    """Return the scheme that is given, or a weighted QP in the precision of q."""
     return jax.tree.map(lambda leaf: leaf.astype(q.dtype), WeightedQP()) if scheme is None else scheme
 
 
 def _own_limits(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Limit, ...]:
-    """The limits that are given, or the robot's own."""
+    """Return the limits that are given, or the robot's own."""
     return (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else limits

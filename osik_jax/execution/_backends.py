@@ -53,7 +53,7 @@ _WITHOUT_NUMBA = "auto without numba"
 
 
 def check_backend(backend: Any) -> Backend:
-    """The backend, if it is one and what it needs is there.
+    """Return the backend, if it is one and what it needs is there.
 
     Raises:
         ValueError: it is none.
@@ -70,7 +70,7 @@ def check_backend(backend: Any) -> Backend:
 
 
 def here(backend: Backend) -> Any:
-    """The backend for a program in the precision that JAX is set to: in single, JAX 0.12 lowers no kernel for CPUs.
+    """Return the backend for the precision that JAX is set to: in single, JAX 0.12 lowers no kernel for CPUs.
 
     It lowers double precision inside such a program wrongly where platforms differ, so "auto" takes the search there.
 
@@ -87,12 +87,12 @@ def here(backend: Backend) -> Any:
 
 
 def installed(package: str) -> bool:
-    """Whether a package can be imported, without doing so."""
+    """Return whether a package can be imported, without doing so."""
     return find_spec(package) is not None
 
 
 def cuda_is_default() -> bool:
-    """Whether the device that JAX computes on where it is not told otherwise is a GPU.
+    """Return whether the device that JAX computes on where it is not told otherwise is a GPU.
 
     Beside one, under ``jax.default_device`` of a CPU, there is nothing to compile a kernel for.
     """
@@ -101,7 +101,7 @@ def cuda_is_default() -> bool:
 
 
 def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
-    """Whether a solver has to make a program with the candidates of a kernel in it.
+    """Return whether a solver has to make a program with the candidates of a kernel in it.
 
     Args:
         backend: what was asked for.
@@ -126,7 +126,7 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
 
 @cache
 def _can_be_imported(package: str) -> bool:
-    """Numba refuses releases of NumPy and of Python that are newer than itself."""
+    """Check that a package can be imported: Numba refuses releases of NumPy and Python newer than itself."""
     try:
         import_module(package)
     except Exception:
@@ -135,7 +135,7 @@ def _can_be_imported(package: str) -> bool:
 
 
 def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., Any], *args: Any) -> Any:
-    """Calls the function that takes a kernel's candidates on the kernel's platform, and the search elsewhere.
+    """Call the function that takes a kernel's candidates on the kernel's platform, and the search elsewhere.
 
     The functions are not differentiated. One program may be lowered for several platforms.
     """

@@ -18,7 +18,7 @@ The solvers have the same, so that a block of a tick is one of theirs.
 
 
 def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> Any:
-    """``function(*args)``, on a CPU some lanes at a time, one block after another.
+    """Return ``function(*args)``, computed on a CPU some lanes at a time, one block after another.
 
     Args:
         function: takes and returns pytrees whose arrays have a leading axis, the lanes.
@@ -42,5 +42,5 @@ def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) ->
 
 
 def first_axes_as_one(a: jax.Array) -> jax.Array:
-    """The first two axes as one."""
+    """Return the first two axes as one."""
     return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])

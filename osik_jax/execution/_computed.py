@@ -21,7 +21,7 @@ from ._rules import custom_jvp
 
 
 def by_numba(plain: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """The plain function, on CPUs by a kernel of a batch. What is given by name is static.
+    """Return the plain function, on CPUs by a kernel of a batch. What is given by name is static.
 
     Args:
         plain: of one problem: pytrees of arrays by position.
@@ -51,7 +51,7 @@ def by_numba(plain: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[
 
 
 def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
-    """As ``in_lanes``, for work that is the same in all lanes: what they share is not copied for each, nor are blocks.
+    """Return what ``in_lanes`` does, without copies of what all lanes share and without blocks.
 
     Args:
         solve: takes pytrees whose arrays have a leading axis, of the lanes or of length 1, and returns those of lanes.
@@ -83,7 +83,7 @@ def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
-    """What ``in_shared_lanes`` takes, from a function of one lane."""
+    """Return what ``in_shared_lanes`` takes, from a function of one lane."""
 
     def wide(*args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
@@ -100,7 +100,7 @@ def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def side_by_side(*arrays: ArrayLike) -> Float[Array, "lanes k"]:
-    """All numbers of each lane, one array after another, for lanes as ``in_shared_lanes`` has them.
+    """Return all numbers of each lane, one array after another, for lanes as ``in_shared_lanes`` has them.
 
     An argument of a kernel costs time, and one that is made of constants alone is made once.
     """

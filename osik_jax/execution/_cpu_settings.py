@@ -27,7 +27,7 @@ def configure_cpu(
     asynchronous: bool = False,
     older_fusions: bool = False,
 ) -> None:
-    """Sets XLA's CPU runtime up for small problems, in the process as a whole; before the first JAX computation.
+    """Set XLA's CPU runtime up for small problems, in the process as a whole, before the first JAX computation.
 
     Call it once, in a program and not in a library. What you have set already stays: ``PJRT_NPROC``, these flags
     in ``XLA_FLAGS``, ``OPENBLAS_NUM_THREADS``, ``JAX_CPU_ENABLE_ASYNC_DISPATCH``. Calling it again with the same
@@ -73,7 +73,7 @@ def configure_cpu(
 
 
 def _environment(workers: int, side_by_side: bool, older_fusions: bool) -> dict[str, str]:
-    """What the environment lacks."""
+    """Return what the environment lacks."""
     changes = {}
     if "PJRT_NPROC" not in os.environ and workers > cores():
         changes["PJRT_NPROC"] = str(workers)
@@ -87,17 +87,17 @@ def _environment(workers: int, side_by_side: bool, older_fusions: bool) -> dict[
 
 
 def _jaxlib() -> tuple[int, ...]:
-    """Its version, without the last part."""
+    """Return jaxlib's version, without the last part."""
     return tuple(map(int, version("jaxlib").split(".")[:2]))
 
 
 def _dispatch(asynchronous: bool) -> bool:
-    """Whether the way in which programs are run has to be changed."""
+    """Return whether the way in which programs are run has to be changed."""
     return _ASYNCHRONOUS.upper() not in os.environ and jax.config.values[_ASYNCHRONOUS] != asynchronous
 
 
 def _client_exists() -> bool:
-    """Whether JAX has made its devices: after that it refuses to be told their number."""
+    """Return whether JAX has made its devices: after that it refuses to be told their number."""
     name = "jax_num_cpu_devices"
     now = jax.config.values[name]
     try:
@@ -109,7 +109,7 @@ def _client_exists() -> bool:
 
 
 def _limit_lapack(threads: int) -> None:
-    """Keeps SciPy's OpenBLAS to so many threads a call."""
+    """Limit SciPy's OpenBLAS to so many threads a call."""
     if "OPENBLAS_NUM_THREADS" in os.environ:
         return
     threadpoolctl = import_module("threadpoolctl")

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 
 def in_double(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function of pytrees, computed in double precision; floats come back in the precision of the first one."""
+    """Return the function, computed in double precision; floats come back in the precision of the first one."""
 
     def wide(*args: Any) -> Any:
         given = next(a.dtype for a in jax.tree.leaves(args) if _is_float(a))
@@ -35,7 +35,7 @@ def _is_float(a: Array) -> bool:
 
 
 def first_smallest(a: Float[Array, " m"]) -> Int[Array, ""]:
-    """Index of the smallest number, the first of equals.
+    """Return the index of the smallest number, the first of equals.
 
     ``jnp.argmin`` does not compile for doubles in a program whose default is single.
     """

@@ -19,7 +19,7 @@ from ._blocks import BLOCK, first_axes_as_one, in_blocks
 
 
 def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
-    """One problem at a time, from a function of many.
+    """Return a function of one problem, from a function of many.
 
     Args:
         solve: takes and returns pytrees whose arrays have a leading axis, the lanes.
@@ -49,7 +49,7 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, Any], Any], block: int) -> Any:
-    """The state of all lanes, of which those that are not done have been worked on again, a block of them at a time.
+    """Return the state of all lanes after those that are not done were worked on again, a block at a time.
 
     Args:
         state: a pytree whose arrays have a leading axis, the lanes.
@@ -72,7 +72,7 @@ def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, A
 
 
 def with_a_few(data: Any, state: Any, done: Bool[Array, " B"], again: Callable[[Any, Any], Any], block: int) -> Any:
-    """As ``with_the_rest``, by a function of the data and the state of a block's lanes; a short batch is one block."""
+    """Return what ``with_the_rest`` does, by a function of a block's data and state; a short batch is one block."""
     lanes = len(done)
 
     def gathered(at: Array, state: Any) -> Any:
@@ -84,5 +84,5 @@ def with_a_few(data: Any, state: Any, done: Bool[Array, " B"], again: Callable[[
 
 
 def choose(where: jax.Array, new: Any, old: Any) -> Any:
-    """``new`` in the lanes where the flag (one a lane) is set, ``old`` in the others."""
+    """Return ``new`` in the lanes where the flag (one a lane) is set, ``old`` in the others."""
     return jax.tree.map(lambda a, b: jnp.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

@@ -34,12 +34,12 @@ FOUND = "found by a search"
 
 
 def found(tree: Any) -> Any:
-    """The arrays as they are, under the name ``FOUND``."""
+    """Return the arrays as they are, under the name ``FOUND``."""
     return jax.tree.map(lambda a: checkpoint_name(a, FOUND), tree)
 
 
 def custom_jvp(function: Callable[..., Any]) -> Ruled:
-    """As ``jax.custom_jvp``, for functions of pytrees of arrays by position, with inexact arrays as results.
+    """Decorate as ``jax.custom_jvp`` does, functions of pytrees by position with inexact arrays as results.
 
     What is given by keyword is static; the rule is given it too.
     """
@@ -47,7 +47,7 @@ def custom_jvp(function: Callable[..., Any]) -> Ruled:
 
 
 def blocked(size: int) -> Callable[[Callable[..., Any]], Ruled]:
-    """The function as it is, which on a CPU takes this many lanes of a ``vmap`` at a time.
+    """Return the function as it is, which on a CPU takes this many lanes of a ``vmap`` at a time.
 
     Its derivatives run on all lanes at once: in blocks, those of a tick of G1 would be a fifth faster in a batch of
     1,024 and take half as long again to compile.
@@ -69,7 +69,7 @@ class Ruled:
         update_wrapper(self, function)
 
     def defjvp(self, rule: Callable[..., tuple[Any, Any]]) -> Callable[..., tuple[Any, Any]]:
-        """Sets the rule: from primals and tangents, both tuples, to results and their tangents."""
+        """Set the rule: from primals and tangents, both tuples, to results and their tangents."""
         self.rule = rule
         return rule
 
@@ -135,7 +135,7 @@ def _batch(
 
 
 def _in_blocks(wide: Callable[..., Any], axes: tuple[int | None, ...], size: int) -> Callable[..., Any]:
-    """A function of many lanes, some lanes at a time; arrays that all lanes share stay shared."""
+    """Return a function of many lanes, some lanes at a time; arrays that all lanes share stay shared."""
 
     def function(*leaves: ArrayLike) -> Any:
         own = {i: jnp.moveaxis(leaves[i], axis, 0) for i, axis in enumerate(axes) if axis is not None}

@@ -20,12 +20,12 @@ ENOUGH = 8
 
 
 def cores() -> int:
-    """Cores that this process may use, as many as XLA takes workers unless it is told otherwise."""
+    """Return the number of cores that this process may use: XLA takes as many workers unless it is told otherwise."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def warn_of_few_workers() -> None:
-    """Warns, once, where a batch is about to be solved by a pool whose size nobody has thought of."""
+    """Warn, once, where a batch is about to be solved by a pool whose size nobody has chosen."""
     global _warned
     if _warned or "PJRT_NPROC" in os.environ or not 1 < cores() < ENOUGH or jax.default_backend() != "cpu":
         return

@@ -15,7 +15,7 @@ from .._errors import OsikTypeError, OsikValueError
 
 
 def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
-    """A finite number that is not negative: a gain, a weight. ``dtype=None``: an array's own, else JAX's default.
+    """Return a finite number that is not negative. ``dtype=None`` stands for an array's own, else JAX's default.
 
     Raises:
         ValueError: it is not, or not a scalar.
@@ -29,7 +29,7 @@ def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
 
 
 def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Array:
-    """An array of this shape; a scalar is repeated.
+    """Return an array of this shape; a scalar is repeated.
 
     Raises:
         TypeError: no numbers.
@@ -44,28 +44,28 @@ def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Arra
 
 
 def check_not_nan(value: Array, what: str) -> None:
-    """Raises ValueError where a value can be seen to be NaN, which no number of a problem is."""
+    """Raise ValueError where a value can be seen to be NaN, which no number of a problem is."""
     seen = concrete(value)
     if seen is not None and np.isnan(seen).any():
         raise OsikValueError(f"{what} is {seen}; it has to be numbers, not NaN")
 
 
 def check_finite(value: Array, what: str) -> None:
-    """Raises ValueError where a value can be seen not to be finite."""
+    """Raise ValueError where a value can be seen not to be finite."""
     seen = concrete(value)
     if seen is not None and not np.isfinite(seen).all():
         raise OsikValueError(f"{what} is {seen}; it has to be finite")
 
 
 def check_not_negative(value: Array, what: str) -> None:
-    """Raises ValueError where a value can be seen to be negative or not finite."""
+    """Raise ValueError where a value can be seen to be negative or not finite."""
     seen = concrete(value)
     if seen is not None and not (np.isfinite(seen).all() and (seen >= 0.0).all()):
         raise OsikValueError(f"{what} is {seen}; it has to be finite and not negative")
 
 
 def as_bounds(lower: Any, upper: Any, rows: int, dtype: Any) -> tuple[Array | None, Array | None]:
-    """Both bounds as arrays (rows,), a missing one infinite; (None, None) where neither is given."""
+    """Return both bounds as arrays (rows,), a missing one infinite; (None, None) where neither is given."""
     if lower is None and upper is None:
         return None, None
     low = as_vector(-jnp.inf if lower is None else lower, (rows,), "lower", dtype)
@@ -75,7 +75,7 @@ def as_bounds(lower: Any, upper: Any, rows: int, dtype: Any) -> tuple[Array | No
 
 
 def check_bounds(lower: Array | None, upper: Array | None) -> None:
-    """Raises ValueError where lower can be seen to be above upper."""
+    """Raise ValueError where lower can be seen to be above upper."""
     low, high = concrete(lower), concrete(upper)
     if lower is None or upper is None or low is None or high is None:
         return
@@ -85,19 +85,19 @@ def check_bounds(lower: Array | None, upper: Array | None) -> None:
 
 
 def entries(values: np.ndarray, which: np.ndarray, names: Sequence[str] | None = None) -> str:
-    """For messages: some entries of an array, by name where there are names."""
+    """Return some entries of an array as text for messages, by name where there are names."""
     found = np.flatnonzero(which).tolist()
     return ", ".join(f"{names[i] if names else f'entry {i}'} ({values[i]})" for i in found)
 
 
 def check_count(what: str, value: Any, *, least: int = 1) -> None:
-    """Raises ValueError for what is no integer, or less than ``least``."""
+    """Raise ValueError for what is no integer, or less than ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise OsikValueError(f"{what} is {value!r}; it is an integer, at least {least}")
 
 
 def as_array(value: Any, what: str, dtype: Any) -> Array:
-    """The value as an array of this type.
+    """Return the value as an array of this type.
 
     Raises:
         TypeError: it is made of something else than numbers.
@@ -110,5 +110,5 @@ def as_array(value: Any, what: str, dtype: Any) -> Array:
 
 
 def concrete(value: Any) -> np.ndarray | None:
-    """The value as NumPy, or None where it is traced and cannot be looked at."""
+    """Return the value as NumPy, or None where it is traced and cannot be looked at."""
     return None if isinstance(value, Tracer) else np.asarray(value)

@@ -7,10 +7,10 @@ from jaxtyping import Array, Float
 
 
 def product(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
-    """The matrix a b."""
+    """Return the matrix a b."""
     return jnp.matmul(a, b, precision="highest")
 
 
 def apply(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """The vector a x."""
+    """Return the vector a x."""
     return jnp.matmul(a, x, precision="highest")

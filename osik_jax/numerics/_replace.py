@@ -16,7 +16,7 @@ class Replaceable(eqx.Module):
     """Base of what is made of numbers, which may be replaced, and of structure, which may not."""
 
     def replace(self, **changes: Any) -> Self:
-        """The same object with other numbers, checked and converted as on construction.
+        """Return the same object with other numbers, checked and converted as on construction.
 
         Works inside ``jit`` and changes no structure, so nothing is compiled again:
         ``task.replace(target=(p, R), gain=5.0)``, ``limit.replace(gain=0.5)``, ``scheme.replace(damping=1e-4)``. A
@@ -47,9 +47,9 @@ class Replaceable(eqx.Module):
         return tuple(f.name for f in fields if not f.metadata.get("static") and getattr(self, f.name) is not None)
 
     def _convert(self, name: str, value: Any) -> Any:
-        """A new value for a field, in the precision of the one that it replaces."""
+        """Return a new value for a field, in the precision of the one that it replaces."""
         old = getattr(self, name)
         return as_vector(value, jnp.shape(old), name, jnp.result_type(old, float))
 
     def _check(self) -> None:
-        """Raises ValueError where a number is not what it may be, or fields do not fit each other."""
+        """Raise ValueError where a number is not what it may be, or fields do not fit each other."""

@@ -27,7 +27,7 @@ class HierarchicalQP(Scheme):
         curvature_damping: kappa, the share of what each priority's linear model leaves out that is added to its
             damping, twice that below others; 0 for none. What is added vanishes where the tasks are met
             (``TaskRows.curvature``).
-        max_iterations: cap on the active-set iterations of one level (static).
+        max_iterations: limit on the active-set iterations of one level (static).
         backend: whose candidates for the answer are taken, as in ``solve_hqp`` (static).
     """
 
@@ -37,7 +37,7 @@ class HierarchicalQP(Scheme):
     backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
     def solve(self, problem: VelocityProblem, warm_start: WorkingSet | None = None) -> SchemeAnswer:
-        """The velocity of one tick; the warm start is the working set of every level."""
+        """Return the velocity of one tick; the warm start is the working set of every level."""
         constraints = problem.constraints()
         answer = solve_hqp(
             problem.levels(constraints),

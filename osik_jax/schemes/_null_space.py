@@ -68,7 +68,7 @@ class NullSpace(Scheme):
         return self.method == "saturated"
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
-        """The velocity of one tick."""
+        """Return the velocity of one tick."""
         constraints = problem.constraints()
         levels = problem.levels(constraints)
         descent = -self.potential_gain * limit_potential_gradient(
@@ -95,13 +95,13 @@ class NullSpace(Scheme):
         return SchemeAnswer(answer.x, status, count, count, jnp.max(jnp.abs(gradient)))
 
     def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
-        """Where the first level begins: an inequality row that holds there takes no part in it."""
+        """Return where the first level begins: an inequality row that holds there takes no part in it."""
         nowhere = jnp.zeros_like(problem.position)
         return jnp.clip(nowhere, problem.lower, problem.upper) if self.saturates else nowhere
 
 
 def _first_residual(first: Level, answer: NullSpaceSolution, problem: VelocityProblem) -> Float[Array, ""]:
-    """What the first priority misses of its scaled motion, as a gradient over the joints that can move."""
+    """Return what the first priority misses of its scaled motion, as a gradient over the joints that can move."""
     start = jnp.clip(jnp.zeros_like(answer.x), problem.lower, problem.upper)
     left = first.matrix @ (answer.x - start) + answer.scales[0] * first.distance(start)
     return jnp.max(jnp.abs(jnp.where(problem.lower == problem.upper, 0.0, first.matrix.T @ left)))
@@ -113,7 +113,7 @@ def limit_potential_gradient(
     upper: Float[Array, " nv"],
     margin: Float[Array, ""] | float = 0.01,
 ) -> Float[Array, " nv"]:
-    """df/dq of the joint-limit potential (eq. 8), 0 for joints without two finite limits.
+    """Return df/dq of the joint-limit potential (eq. 8), 0 for joints without two finite limits.
 
     r_i (2 q_i - u_i - l_i) / (2 n (u_i - q_i)^2 (q_i - l_i)^2): negative near the lower limit, positive near the upper,
     so that descending it leads away from both. q is clamped ``margin`` of the range inside the limits, where the
@@ -124,5 +124,5 @@ def limit_potential_gradient(
     span = high - low
     q = jnp.clip(position, low + margin * span, high - margin * span)
     count = jnp.maximum(jnp.sum(limited), 1)
-    slope = span * (2.0 * q - high - low) / (2.0 * count * (high - q) ** 2 * (q - low) ** 2)
-    return jnp.where(limited, slope, 0.0)
+    gradient = span * (2.0 * q - high - low) / (2.0 * count * (high - q) ** 2 * (q - low) ** 2)
+    return jnp.where(limited, gradient, 0.0)

@@ -26,7 +26,7 @@ _ADVICE = {
 
 
 def raise_if_failed(solution: Any) -> None:
-    """Raises on the host if any lane of a solution is not SOLVED.
+    """Raise on the host if any lane of a solution is not SOLVED.
 
     Args:
         solution: anything with a ``status`` array, of any batch shape. Do not call it inside ``jit``.

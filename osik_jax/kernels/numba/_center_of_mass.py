@@ -10,7 +10,7 @@ from ._rigid import turned as rotated
 
 @lean
 def add_up(parents, masses, centers, P, R, below):
-    """Mass, and mass times centre, of each body with all below it, into ``below`` (nbody, 4)."""
+    """Sum mass, and mass times centre, of each body with all below it, into ``below`` (nbody, 4)."""
     for body in range(len(parents)):
         at = plus(triple(P, body), rotated(turning(R, body), triple(centers, body)))
         below[body, 0] = masses[body]
@@ -23,7 +23,7 @@ def add_up(parents, masses, centers, P, R, below):
 
 @lean
 def move_center(J, below, owners, columns, factors, lin, ang, anchors):
-    """The Jacobian: what each dof moves, at its centre, as a share of the whole mass, into J (3, nv)."""
+    """Write the Jacobian into J (3, nv): the mass that each dof moves, at its centre, over the whole mass."""
     whole = below[0, 0]
     for dof in range(len(columns)):
         column = columns[dof]
@@ -41,7 +41,7 @@ def move_center(J, below, owners, columns, factors, lin, ang, anchors):
 
 @compiled
 def center_of_lane(given, lane, below, point, J):
-    """Of one lane, the centre into ``point`` (3,) and its Jacobian into J (3, nv).
+    """Write the centre of one lane into ``point`` (3,) and its Jacobian into J (3, nv).
 
     Args:
         given: the arguments of ``handle``.
@@ -69,7 +69,7 @@ def center_of_lane(given, lane, below, point, J):
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
+    """Answer a call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

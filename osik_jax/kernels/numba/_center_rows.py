@@ -10,7 +10,7 @@ from ._frame import arguments, data, dimension, is_call, lean, matrix, results, 
 
 @lean
 def length(a, weight):
-    """Euclidean norm of the numbers ``weight_i a_i``, of whatever size."""
+    """Return the Euclidean norm of the numbers ``weight_i a_i``, of whatever size."""
     size, total = 0.0, 0.0
     for i in range(len(a)):
         size = max(size, abs(weight[i] * a[i]))
@@ -24,7 +24,7 @@ def length(a, weight):
 
 @lean
 def size_of_turning(J, turning):
-    """Frobenius norm of the columns of dofs that turn something."""
+    """Return the Frobenius norm of the columns of dofs that turn something."""
     total = 0.0
     for i in range(3):
         for j in range(len(turning)):
@@ -34,7 +34,7 @@ def size_of_turning(J, turning):
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``tasks/_com.py``, each with a leading axis of lanes, or of 1."""
+    """Answer a call of XLA: arguments as in ``tasks/_com.py``, each with a leading axis of lanes, or of 1."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

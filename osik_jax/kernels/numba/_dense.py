@@ -15,7 +15,7 @@ reordered = {"reassoc", "contract"}
 
 @lean(fastmath=reordered)
 def dot(a, b, start, stop):
-    """sum_i a_i b_i over start <= i < stop."""
+    """Return sum_i a_i b_i over start <= i < stop."""
     total = 0.0
     for i in range(start, stop):
         total += a[i] * b[i]
@@ -24,21 +24,21 @@ def dot(a, b, start, stop):
 
 @lean(fastmath=reordered)
 def add_multiple(y, factor, x, n):
-    """y += factor x, over the first n."""
+    """Add factor x to y, over the first n."""
     for i in range(n):
         y[i] += factor * x[i]
 
 
 @lean
 def fill(a, value):
-    """a = value, everywhere."""
+    """Set all of a to the value."""
     for i in range(len(a)):
         a[i] = value
 
 
 @lean
 def any_number(a):
-    """Whether one of them is not 0."""
+    """Return whether one of them is not 0."""
     found = False
     for x in a:
         found = found or x != 0.0
@@ -47,14 +47,14 @@ def any_number(a):
 
 @lean(fastmath=reordered)
 def add_multiple_absolute(y, factor, x, n):
-    """y += factor |x|, over the first n."""
+    """Add factor |x| to y, over the first n."""
     for i in range(n):
         y[i] += factor * abs(x[i])
 
 
 @lean(fastmath=reordered)
 def dot_absolute(a, b, n):
-    """sum_i |a_i b_i| over the first n."""
+    """Return sum_i |a_i b_i| over the first n."""
     total = 0.0
     for i in range(n):
         total += abs(a[i] * b[i])
@@ -63,7 +63,7 @@ def dot_absolute(a, b, n):
 
 @lean(fastmath=reordered)
 def four_dots(a, b, c, d, n):
-    """a'c, a'd, b'c and b'd over the first n: each number is read once for two products."""
+    """Return a'c, a'd, b'c and b'd over the first n: each number is read once for two products."""
     ac, ad, bc, bd = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         ac += a[i] * c[i]
@@ -75,7 +75,7 @@ def four_dots(a, b, c, d, n):
 
 @lean
 def gram(B, S, k, n):
-    """S = B B' on and below the diagonal, of the first k rows and n columns of B; S above it is used up."""
+    """Write B B' of the first k rows and n columns of B to S, on and below the diagonal; S above it is used up."""
     even = k - k % 2
     for a in range(0, even, 2):
         for b in range(0, a + 1, 2):
@@ -86,7 +86,7 @@ def gram(B, S, k, n):
 
 @lean
 def cholesky(S, n, smallest):
-    """L with L L' = S in the lower triangle of S; whether every pivot L_jj^2 is at least ``smallest`` of its S_jj.
+    """Write L with L L' = S into S; return whether every pivot L_jj^2 is at least ``smallest`` of its S_jj.
 
     Column by column: the sums of a column need none of its own numbers, so that none waits for the one before.
     """
@@ -103,14 +103,14 @@ def cholesky(S, n, smallest):
 
 @lean
 def forward(L, b, n):
-    """b becomes L^-1 b."""
+    """Overwrite b with L^-1 b."""
     for i in range(n):
         b[i] = (b[i] - dot(L[i], b, 0, i)) / L[i, i]
 
 
 @lean
 def backward(L, b, n):
-    """b becomes L'^-1 b."""
+    """Overwrite b with L'^-1 b."""
     for i in range(n - 1, -1, -1):
         b[i] /= L[i, i]
         add_multiple(b, -b[i], L[i], i)
@@ -118,7 +118,7 @@ def backward(L, b, n):
 
 @lean
 def rotate(a, b, cosine, sine, start, n):
-    """(a, b) become (cosine a + sine b, cosine b - sine a), from ``start`` to n: a Givens rotation."""
+    """Rotate a and b by Givens, from ``start`` to n: to cosine a + sine b and cosine b - sine a."""
     for i in range(start, n):
         first = a[i]
         a[i] = cosine * first + sine * b[i]
@@ -127,7 +127,7 @@ def rotate(a, b, cosine, sine, start, n):
 
 @lean
 def add_row(R, v, n):
-    """R becomes upper triangular R+ with R+'R+ = R'R + v v', by Givens rotations; v is used up."""
+    """Overwrite R with the upper triangular R+ of R+'R+ = R'R + v v', by Givens rotations; v is used up."""
     for k in range(n):
         if v[k] != 0.0:
             length = np.hypot(R[k, k], v[k])
@@ -136,7 +136,7 @@ def add_row(R, v, n):
 
 @lean
 def invert_upper(R, columns, n):
-    """Row k of ``columns`` becomes column k of R^-1."""
+    """Write column k of R^-1 to row k of ``columns``."""
     for k in range(n):
         column = columns[k]
         column[k] = 1.0 / R[k, k]

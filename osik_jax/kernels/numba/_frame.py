@@ -27,7 +27,7 @@ Function = Callable[..., Any]
 
 
 def compiled(function: Function | None = None, **options: Any) -> Any:
-    """Decorator of a kernel's functions, which only other such functions can call; ``py_func`` is the one as written.
+    """Compile a kernel's function, which only other such functions can call; ``py_func`` is the one as written.
 
     Divisions by 0 are those of NumPy: nothing is raised. Without what Python would need to call them, they take a third
     less time to compile. What an import hook puts around them, as one that checks types does, is taken off.
@@ -47,7 +47,7 @@ _OLDEST = 1  # minor version of an XLA that does not say which one it is: 0.1
 
 
 def _pointer(typing_context, address, dtype):
-    """A pointer to numbers of a type at an integer address."""
+    """Return a pointer to numbers of a type at an integer address."""
     pointer = types.CPointer(dtype.dtype)
 
     def generate(context, builder, signature, arguments):
@@ -66,7 +66,7 @@ def _word(address):
 
 @compiled
 def is_call(frame):
-    """Whether XLA wants the kernel to run; its question which version of the interface this is is answered here.
+    """Return whether XLA wants the kernel to run; its question which version of the interface this is is answered here.
 
     The answer is the version that XLA itself has: what is read here is the same in all of them.
     """
@@ -82,19 +82,19 @@ def is_call(frame):
 
 @compiled
 def arguments(frame):
-    """Address of the list of a call's arguments."""
+    """Return the address of the list of a call's arguments."""
     return _word(frame + 72)
 
 
 @compiled
 def results(frame):
-    """Address of the list of a call's results."""
+    """Return the address of the list of a call's results."""
     return _word(frame + 112)
 
 
 @compiled
 def size(buffers, k, axis):
-    """Length of an axis of the k-th buffer; axes count from the end where negative."""
+    """Return the length of an axis of the k-th buffer; axes count from the end where negative."""
     buffer = _word(buffers + 8 * k)
     rank = _word(buffer + 32)
     return _word(_word(buffer + 40) + 8 * (axis if axis >= 0 else rank + axis))
@@ -110,43 +110,43 @@ def _count(buffer):
 
 @compiled
 def doubles(buffers, k, rows):
-    """The k-th buffer as an array of float64 with so many rows, without a copy."""
+    """Return the k-th buffer as an array of float64 with so many rows, without a copy."""
     buffer = _word(buffers + 8 * k)
     return carray(_at(_word(buffer + 24), types.float64), (rows, _count(buffer) // max(rows, 1)))
 
 
 @compiled
 def integers(buffers, k, rows):
-    """The k-th buffer as an array of int32 with so many rows, without a copy."""
+    """Return the k-th buffer as an array of int32 with so many rows, without a copy."""
     buffer = _word(buffers + 8 * k)
     return carray(_at(_word(buffer + 24), types.int32), (rows, _count(buffer) // max(rows, 1)))
 
 
 @compiled
 def dimension(pointer, axis):
-    """Length of an axis of the buffer at a pointer; ``axis`` in bytes, eight each."""
+    """Return the length of an axis of the buffer at a pointer; ``axis`` in bytes, eight each."""
     return _word(_word(_word(pointer) + 40) + axis)
 
 
 @compiled
 def data(pointer):
-    """Address of the numbers of the buffer at a pointer."""
+    """Return the address of the numbers of the buffer at a pointer."""
     return _word(_word(pointer) + 24)
 
 
 @compiled
 def vector(address, n):
-    """n float64 at an address."""
+    """Return n float64 at an address."""
     return carray(_at(address, types.float64), (n,))
 
 
 @compiled
 def matrix(address, m, n):
-    """m rows of n float64 at an address."""
+    """Return m rows of n float64 at an address."""
     return carray(_at(address, types.float64), (m, n))
 
 
 @compiled
 def whole_numbers(address, n):
-    """n int32 at an address."""
+    """Return n int32 at an address."""
     return carray(_at(address, types.int32), (n,))

@@ -26,7 +26,7 @@ _DEPENDENT = 1e-14
 
 @lean
 def factor_cost(P, R, J, n):
-    """J = U^-1, U'U the Hessian: rows of J are columns of the inverse. Nothing is squared (Givens rotations).
+    """Write J = U^-1, with U'U the Hessian, by Givens rotations, which square nothing; its rows are U^-1's columns.
 
     A pinned variable has a 1 in U and nothing in J, so that no step moves it.
     """
@@ -52,7 +52,7 @@ def factor_cost(P, R, J, n):
 
 @lean
 def along_normal(P, J, i, n, d):
-    """d = J'n_i; the rows of ``J`` are the columns of J."""
+    """Compute d = J'n_i; the rows of ``J`` are the columns of J."""
     N, m = len(P.lower), len(P.target)
     for k in range(N):
         if i < n:
@@ -63,7 +63,7 @@ def along_normal(P, J, i, n, d):
 
 @lean
 def value_of(P, v, i, n):
-    """n_i'v: a variable, or C_q x + t_q."""
+    """Return n_i'v: a variable, or C_q x + t_q."""
     if i < n:
         return v[i]
     row = len(P.target) + i - n
@@ -72,7 +72,7 @@ def value_of(P, v, i, n):
 
 @lean
 def most_violated(P, W, labels, v, d, n, count):
-    """The constraint whose activation raises the dual objective most, -1 for none; equalities first.
+    """Return the constraint whose activation raises the dual objective most, -1 for none; equalities first.
 
     By a full step it rises by half of gap^2 / |J2'n|^2.
     """
@@ -94,7 +94,7 @@ def most_violated(P, W, labels, v, d, n, count):
 
 @lean
 def add_constraint(R, J, d, w, count):
-    """T and J with one more active constraint: a Householder reflection turns d2 into one number."""
+    """Add an active constraint to T and J: a Householder reflection turns d2 into one number."""
     N = len(d)
     length = np.sqrt(dot(d, d, count, N))
     turned = -length if d[count] > 0.0 else length
@@ -112,7 +112,7 @@ def add_constraint(R, J, d, w, count):
 
 @lean
 def drop_constraint(R, J, place, count):
-    """T and J without the active constraint at a place: its column goes, Givens rotations make T triangular again."""
+    """Remove an active constraint from T and J: its column goes, Givens rotations make T triangular again."""
     for k in range(place, count - 1):
         for i in range(k + 2):
             R[i, k] = R[i, k + 1]
@@ -129,7 +129,7 @@ def drop_constraint(R, J, place, count):
 
 @lean
 def ratio_test(labels, order, u, r, count):
-    """The active inequality whose multiplier reaches 0 first, and after how much; -1 and infinity for none."""
+    """Return the active inequality whose multiplier reaches 0 first, and after how much; -1 and infinity for none."""
     shortest, leaving = np.inf, -1
     for i in range(count):
         if labels[order[i]] != EQUALITY and r[i] > 0.0 and u[i] / r[i] < shortest:
@@ -139,7 +139,7 @@ def ratio_test(labels, order, u, r, count):
 
 @lean
 def dual_active_set(P, W, labels, x, most_changes):
-    """Active constraints of the problem, from none but pinned variables, into ``labels``.
+    """Find the active constraints, from none but pinned variables, and write them to ``labels``.
 
     Args:
         P: the problem.

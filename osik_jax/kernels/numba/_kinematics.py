@@ -29,7 +29,7 @@ FREE, BALL, SLIDE = 0, 1, 2  # MuJoCo's; a hinge is what is left
 
 @lean
 def place_bodies(parents, kinds, owners, value, reference, at, along, joint_at, joint_along, P, R, lin, ang, anchors):
-    """Poses of all bodies into P and R, axes of hinges and slides and all anchors into the arrays over dofs.
+    """Write poses of all bodies to P and R, axes of hinges and slides and all anchors to the arrays over dofs.
 
     Args:
         parents: of each body. (nbody,)
@@ -98,7 +98,7 @@ def place_bodies(parents, kinds, owners, value, reference, at, along, joint_at, 
 
 @lean
 def turn_with_bodies(kinds, owners, R, ang):
-    """Axes of ball and free joints, which are those of the body."""
+    """Write the axes of ball and free joints, which are those of the body."""
     dof = 0
     for joint in range(len(kinds)):
         kind = kinds[joint]
@@ -113,7 +113,7 @@ def turn_with_bodies(kinds, owners, R, ang):
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
+    """Answer a call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

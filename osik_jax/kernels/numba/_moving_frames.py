@@ -10,7 +10,7 @@ from ._rigid import turned as rotated
 
 @lean
 def move_frame(J, at, moved, columns, factors, lin, ang, anchors):
-    """The Jacobian of a point that goes along with a body: [linear; angular] rows.
+    """Write the Jacobian of a point that goes along with a body: [linear; angular] rows.
 
     Args:
         J: (6, nv)
@@ -34,7 +34,7 @@ def move_frame(J, at, moved, columns, factors, lin, ang, anchors):
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
+    """Answer a call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

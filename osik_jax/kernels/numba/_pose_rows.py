@@ -21,25 +21,25 @@ _SMALL_ANGLE_SQUARED = 1e-2
 
 @lean
 def nine(a):
-    """A rotation from an array of its numbers."""
+    """Return a rotation from an array of its numbers."""
     return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]
 
 
 @lean
 def three(a, first):
-    """A vector from three numbers of an array."""
+    """Return a vector from three numbers of an array."""
     return a[first], a[first + 1], a[first + 2]
 
 
 @lean
 def scaled(by, a):
-    """A vector times a number."""
+    """Return a vector times a number."""
     return by * a[0], by * a[1], by * a[2]
 
 
 @lean
 def quaternion_of(m):
-    """Of a rotation, by the largest number of four; w is not negative.
+    """Return the quaternion of a rotation, by the largest number of four; w is not negative.
 
     M. Day, "Converting a rotation matrix to a quaternion", 2015.
     """
@@ -63,7 +63,7 @@ def quaternion_of(m):
 
 @lean
 def logarithm(m):
-    """The rotation vector of a rotation, its angle in [0, pi]."""
+    """Return the rotation vector of a rotation, its angle in [0, pi]."""
     w, x, y, z = quaternion_of(m)
     sine_squared = x * x + y * y + z * z
     if sine_squared < _SMALL_SINE_SQUARED:
@@ -77,7 +77,7 @@ def logarithm(m):
 
 @lean
 def inverse_left_jacobian(e):
-    """I - [e]/2 + c [e]^2 with ``c = (1 - (angle/2) cot(angle/2)) / angle^2``."""
+    """Return I - [e]/2 + c [e]^2 with ``c = (1 - (angle/2) cot(angle/2)) / angle^2``."""
     x, y, z = e
     s = x * x + y * y + z * z
     if s < _SMALL_ANGLE_SQUARED:
@@ -101,7 +101,7 @@ def inverse_left_jacobian(e):
 
 @lean
 def write_rows(whole, J, A, first, turning):
-    """Three rows of the whole six from ``first`` on: A J for the linear or, with ``turning``, the angular half of J."""
+    """Write three of the six rows, from ``first`` on: A J for the linear or, with ``turning``, angular half of J."""
     for j in range(J.shape[1]):
         v = rotated(A, (J[turning, j], J[turning + 1, j], J[turning + 2, j]))
         for i in range(3):
@@ -110,7 +110,7 @@ def write_rows(whole, J, A, first, turning):
 
 @lean
 def pose_rows(p, R, J, p_wanted, R_wanted, rates, in_frame, geometric, whole, error, forward):
-    """All six rows, their errors and what the target's own velocity adds.
+    """Write all six rows, their errors and what the target's own velocity adds.
 
     Args:
         p: position of the frame.
@@ -153,7 +153,7 @@ def pose_rows(p, R, J, p_wanted, R_wanted, rates, in_frame, geometric, whole, er
 
 @lean
 def paired(pull, J, first, bends):
-    """Frobenius norm of the matrix with the entries ``pull . (axis_i x arm_j)``; arms are rows of J from ``first`` on.
+    """Return the Frobenius norm of the entries ``pull . (axis_i x arm_j)``; arms are rows of J from ``first`` on.
 
     Args:
         pull: a vector.
@@ -180,7 +180,7 @@ def paired(pull, J, first, bends):
 
 @lean
 def pose_curvature(R, J, weight, pull, kept, in_frame, bends):
-    """``tasks/_curvature.py: pose_curvature`` of the weighted pull of the rows that are kept."""
+    """Return ``tasks/_curvature.py: pose_curvature`` of the weighted pull of the rows that are kept."""
     fx, fy, fz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     row = 0
     for i in range(6):
@@ -209,7 +209,7 @@ def pose_curvature(R, J, weight, pull, kept, in_frame, bends):
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``tasks/_pose.py``, each with a leading axis of lanes, or of 1."""
+    """Answer a call of XLA: arguments as in ``tasks/_pose.py``, each with a leading axis of lanes, or of 1."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

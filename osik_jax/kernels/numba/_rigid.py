@@ -9,50 +9,50 @@ from ._frame import lean
 
 @lean
 def triple(a, i):
-    """Row i of an array of threes."""
+    """Return row i of an array of threes."""
     return a[i, 0], a[i, 1], a[i, 2]
 
 
 @lean
 def put(a, i, v):
-    """Writes row i of an array of threes."""
+    """Write row i of an array of threes."""
     a[i, 0], a[i, 1], a[i, 2] = v
 
 
 @lean
 def plus(a, b):
-    """a + b."""
+    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @lean
 def minus(a, b):
-    """a - b."""
+    """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @lean
 def cross(a, b):
-    """a x b."""
+    """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @lean
 def turning(R, i):
-    """Row i of an array of rotations."""
+    """Return row i of an array of rotations."""
     return R[i, 0], R[i, 1], R[i, 2], R[i, 3], R[i, 4], R[i, 5], R[i, 6], R[i, 7], R[i, 8]
 
 
 @lean
 def put_turning(R, i, A):
-    """Writes row i of an array of rotations."""
+    """Write row i of an array of rotations."""
     for k in range(9):
         R[i, k] = A[k]
 
 
 @lean
 def turned(R, v):
-    """R v."""
+    """Return R v."""
     return (
         R[0] * v[0] + R[1] * v[1] + R[2] * v[2],
         R[3] * v[0] + R[4] * v[1] + R[5] * v[2],
@@ -62,13 +62,13 @@ def turned(R, v):
 
 @lean
 def transposed(R):
-    """R'."""
+    """Return R'."""
     return R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]
 
 
 @lean
 def composed(A, B):
-    """A B."""
+    """Return A B."""
     return (
         A[0] * B[0] + A[1] * B[3] + A[2] * B[6],
         A[0] * B[1] + A[1] * B[4] + A[2] * B[7],
@@ -84,7 +84,7 @@ def composed(A, B):
 
 @lean
 def multiplied(p, q):
-    """The quaternion p q."""
+    """Return the quaternion p q."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -95,7 +95,7 @@ def multiplied(p, q):
 
 @lean
 def carried(q, v):
-    """q v q*: a vector turned, and stretched by the square of the quaternion's length."""
+    """Return q v q*: the vector turned, and stretched by the square of the quaternion's length."""
     u = q[1], q[2], q[3]
     along = 2.0 * (u[0] * v[0] + u[1] * v[1] + u[2] * v[2])
     own = q[0] * q[0] - (u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
@@ -109,7 +109,7 @@ def carried(q, v):
 
 @lean
 def rotation_of(q):
-    """The rotation of a quaternion of any length but 0."""
+    """Return the rotation of a quaternion of any length but 0."""
     share = 2.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     x, y, z = share * q[1], share * q[2], share * q[3]
     wx, wy, wz = q[0] * x, q[0] * y, q[0] * z
@@ -120,7 +120,7 @@ def rotation_of(q):
 
 @lean
 def normalized(q):
-    """The quaternion over its length; one of zeros as MJX has it, finite and of no use."""
+    """Return the quaternion over its length; one of zeros as MJX has it, finite and of no use."""
     if max(abs(q[0]), abs(q[1]), abs(q[2]), abs(q[3])) <= 1e-8:
         return 1e6, 1e6, 1e6, 1e6
     length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])

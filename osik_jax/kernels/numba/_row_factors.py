@@ -13,7 +13,7 @@ from ._frame import arguments, data, dimension, is_call, lean, matrix, results, 
 
 @lean
 def longest(rest, n):
-    """Number of the longest row, the first of equals."""
+    """Return the number of the longest row, the first of equals."""
     most, which = -1.0, 0
     for i in range(len(rest)):
         square = dot(rest[i], rest[i], 0, n)
@@ -24,7 +24,7 @@ def longest(rest, n):
 
 @lean
 def next_direction(rest, basis, k, cutoff):
-    """Makes the longest row that is left, orthogonalised again, the k-th of the basis; whether it counts."""
+    """Make the longest row that is left, orthogonalised again, the k-th of the basis; return whether it counts."""
     n = rest.shape[1]
     row, direction = rest[longest(rest, n)], basis[k]
     for j in range(n):
@@ -42,7 +42,7 @@ def next_direction(rest, basis, k, cutoff):
 
 @lean
 def next_column(columns, triangle, k, m, root):
-    """Makes the k-th column, of m rows and the root of the damping, orthogonal to those before it; twice."""
+    """Make the k-th column, of m rows and the root of the damping, orthogonal to those before it; twice."""
     column, stop = columns[k], m + k + 1
     column[m + k] = root
     for _ in range(2):
@@ -58,7 +58,7 @@ def next_column(columns, triangle, k, m, root):
 
 @lean
 def factor(rest, cutoff, root, basis, columns, triangle):
-    """Factors of one problem; ``rest`` is used up, and ``columns`` has those of ``outer`` in its rows."""
+    """Factor the rows of one problem; ``rest`` is used up, and ``columns`` has those of ``outer`` in its rows."""
     m, n = rest.shape
     fill(basis.reshape(-1), 0.0)
     fill(columns.reshape(-1), 0.0)
@@ -76,7 +76,7 @@ def factor(rest, cutoff, root, basis, columns, triangle):
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``solvers/_row_factors.py``, a leading axis of lanes on each."""
+    """Answer a call of XLA: arguments as in ``solvers/_row_factors.py``, a leading axis of lanes on each."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

@@ -35,7 +35,7 @@ LOOSER = 1e-6
 
 @lean
 def given_rows(A, lower, upper, equal, m, n):
-    """How many rows there are before those that only fill up."""
+    """Return how many rows there are before those that only fill up."""
     while m > 0:
         row = A[m - 1]
         if equal[m - 1] != 0 or dot(row, row, 0, n) > 0.0 or lower[m - 1] > -np.inf or upper[m - 1] < np.inf:
@@ -46,7 +46,7 @@ def given_rows(A, lower, upper, equal, m, n):
 
 @lean
 def damping_of(W, S, level, x, first, longest):
-    """The damping of the level, which is found at what of x the null space can not move."""
+    """Return the damping of the level, which is found at what of x the null space can not move."""
     n = len(x)
     if level.unmet != 0.0:
         for i in range(n):
@@ -59,7 +59,7 @@ def damping_of(W, S, level, x, first, longest):
 
 @lean
 def damped_part(W, S, level, x, damping):
-    """The part of the way from x to where the search ended at which the damped cost of the level is least."""
+    """Return the part of the way from x to where the search ended at which the damped cost of the level is least."""
     m, n = level.A.shape
     if not damping > 0.0:
         return 1.0
@@ -81,7 +81,7 @@ def damped_part(W, S, level, x, damping):
 
 @lean
 def put_on_bounds(W, S, held, stop):
-    """Puts x where it is but for rounding; how much that is, infinite where x is no number."""
+    """Put joints on their bounds, where they are up to roundoff; return that roundoff, infinite where x is NaN."""
     n, off = len(S.x), 0.0
     for i in range(n):
         before = S.x[i]
@@ -97,7 +97,7 @@ def put_on_bounds(W, S, held, stop):
 
 @lean
 def attempt(W, S, x, target, first, most, least):
-    """As ``search``, done where the answer holds; where it does not, the coordinates are as they were."""
+    """Search, and accept where the answer holds; where it does not, put the coordinates back."""
     n = len(x)
     for j in range(first, n):
         for i in range(n):
@@ -113,7 +113,7 @@ def attempt(W, S, x, target, first, most, least):
 
 @lean
 def decide(S, held, stop, side, blocking):
-    """The joints on their bounds, those that stop the motion, and which of them the others say most about."""
+    """Return the joints on their bounds, those that stop the motion, and which of them the others say most about."""
     n, blocker, most = len(side), 0, 0.0
     for i in range(n):
         side[i], blocking[i] = S.side[i], 0
@@ -130,7 +130,7 @@ def decide(S, held, stop, side, blocking):
 
 @lean
 def take_off_stops(W, first, blocking):
-    """Takes the joints that stop the level off the coordinates that are left; how many coordinates go."""
+    """Take the joints that stop the level off the coordinates that are left; return how many coordinates go."""
     n, count = len(blocking), 0
     for i in range(n):
         if blocking[i] != 0:
@@ -149,7 +149,7 @@ def take_off_stops(W, first, blocking):
 
 @lean
 def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side, blocking):
-    """Moves x as the level asks.
+    """Move x as the level asks.
 
     Returns:
         The coordinates that it takes, its scale, the blocker, changes of the active set, whether the search ended.
@@ -179,7 +179,7 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side
 
 @lean
 def begin(W, x, low, high, fixed):
-    """The point of the box that is nearest to 0, and the joints that can move in coordinates of their own."""
+    """Return the point of the box that is nearest to 0, and the joints that can move in coordinates of their own."""
     n, first, last = len(x), 0, 0
     for i in range(n):
         W.low[i], W.high[i], W.bent[i] = low[i], high[i], 0.0
@@ -198,7 +198,7 @@ def begin(W, x, low, high, fixed):
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``null_space/_saturation.py``, a leading axis of lanes on each."""
+    """Answer a call of XLA: arguments as in ``null_space/_saturation.py``, a leading axis of lanes on each."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

@@ -71,13 +71,13 @@ class Search(NamedTuple):
 
 @lean
 def bound(W, S, i):
-    """Where joint i is held."""
+    """Return where joint i is held."""
     return W.high[i] if S.side[i] > 0 else W.low[i]
 
 
 @lean
 def settle(W, S, start, scale, first, held):
-    """x at a scale with the held joints on their bounds, and their multipliers; refined once."""
+    """Compute x at a scale with the held joints on their bounds, and their multipliers; refined once."""
     n, stop = len(start), first + held
     for i in range(n):
         S.x[i] = start[i] + scale * W.motion[i] + S.pull[i]
@@ -96,7 +96,7 @@ def settle(W, S, start, scale, first, held):
 
 @lean
 def settle_stopped(W, S, start, scale, first, held, stop, rate):
-    """Likewise, at the scale near this one that puts the joint that stops the motion on its bound: the scale."""
+    """Compute the same at the scale near this one that puts the stopping joint on its bound; return the scale."""
     settle(W, S, start, scale, first, held)
     for _ in range(2 if stop >= 0 else 0):
         off = (W.low[stop] if S.passed[stop] < 0 else W.high[stop]) - S.x[stop]
@@ -109,7 +109,7 @@ def settle_stopped(W, S, start, scale, first, held, stop, rate):
 
 @lean
 def size(W, S, start, target, scale, held):
-    """Of the numbers that x is made of."""
+    """Return the size of the numbers that x is made of."""
     most = 0.0
     for i in range(len(start)):
         most = max(most, abs(start[i]) + scale * abs(W.motion[i]) + abs(target[i]))
@@ -120,7 +120,7 @@ def size(W, S, start, target, scale, held):
 
 @lean
 def most_wrong(S, held, noise):
-    """The held joint that pulls most, where it should push; -1 for none."""
+    """Return the held joint that pulls most, where it should push; -1 for none."""
     worst, which = -noise, -1
     for a in range(held):
         push = -S.side[S.who[a]] * S.y[a]
@@ -131,7 +131,7 @@ def most_wrong(S, held, noise):
 
 @lean
 def most_violated(W, S, n, noise, least):
-    """The free joint beyond its bound whose saturation costs most; -1 for none."""
+    """Return the free joint beyond its bound whose saturation costs most; -1 for none."""
     most, which = 0.0, -1
     for i in range(n):
         if S.side[i] == 0 and S.passed[i] == 0:
@@ -144,7 +144,7 @@ def most_violated(W, S, n, noise, least):
 
 @lean
 def sum_along(W, S, vector, start, stop):
-    """``along``: what a vector of coordinates is in joints."""
+    """Write to ``along`` what a vector of coordinates is in joints."""
     fill(S.along, 0.0)
     for j in range(start, stop):
         add(S.along, vector[j], W.turned[j], 0, len(S.x))
@@ -152,7 +152,7 @@ def sum_along(W, S, vector, start, stop):
 
 @lean
 def look_along(W, S, first, held, k):
-    """What of column k the held ones make up, and the way of all joints along what is left, its squared length."""
+    """Compute what of column k the held ones make up, and how all joints move along the rest; its squared length."""
     n, stop = len(S.x), first + held
     for j in range(first, n):
         S.turn[j] = W.turned[j, k]
@@ -164,7 +164,7 @@ def look_along(W, S, first, held, k):
 
 @lean
 def reflect(W, S, turn, head, norm, start, stop):
-    """Turns rows of coordinates so that a vector of this norm is along ``head`` alone; ``along`` is their sum by it.
+    """Reflect rows of coordinates so that a vector of this norm is along ``head`` alone; ``along`` is their sum by it.
 
     The scale of the reflection, whose vector ``turn`` becomes.
     """
@@ -179,7 +179,7 @@ def reflect(W, S, turn, head, norm, start, stop):
 
 @lean
 def hold(W, S, first, held, k, square):
-    """Makes joint k the last of the held ones, after ``look_along``."""
+    """Make joint k the last of the held ones, after ``look_along``."""
     n, head = len(S.x), first + held
     reflect(W, S, S.turn, head, np.sqrt(square), head, n)
     for j in range(head + 1, n):
@@ -196,7 +196,7 @@ def hold(W, S, first, held, k, square):
 
 @lean
 def release(W, S, first, held, a):
-    """Lets a held joint go, to where it has no multiplier."""
+    """Release a held joint to where it has no multiplier."""
     n, stop, last = len(S.x), first + held, first + held - 1
     own = S.duals[a]
     sum_along(W, S, own, first, stop)
@@ -230,7 +230,7 @@ def release(W, S, first, held, a):
 
 @lean
 def scale_of(W, S, start, first, held, k, side, least):
-    """The scale at which joint k, whose column the held ones make up, is on its bound with them; its rate by that."""
+    """Return the scale at which joint k, whose column the held ones make up, is on its bound with them; its rate."""
     stop, largest = first + held, 1.0
     for a in range(held):  # the rates once more, for rounding
         for j in range(first, stop):
@@ -251,7 +251,7 @@ def scale_of(W, S, start, first, held, k, side, least):
 
 @lean
 def stop_by(S, held, k, side):
-    """Joint k and those that its column is made of stop the motion: no other is beside its bounds, or is let go."""
+    """Let joint k, and those that its column is made of, stop the motion: no other is beside its bounds or let go."""
     fill(S.normal, 0.0)
     fill(S.passed, 0)
     S.normal[k], S.passed[k] = 1.0, side
@@ -262,7 +262,7 @@ def stop_by(S, held, k, side):
 
 @lean
 def exchange(W, S, first, held, a, stop):
-    """Holds the joint that stops the motion beside the held ones in place of one of these."""
+    """Hold the joint that stops the motion beside the held ones in place of one of these."""
     other, side = S.who[a], S.side[S.who[a]]
     S.y[a] = 0.0
     release(W, S, first, held, a)
@@ -275,7 +275,7 @@ def exchange(W, S, first, held, a, stop):
 
 @lean
 def first_to_leave(S, held, sign, nothing):
-    """The length of the dual step at which a held joint pushes no longer, and which; infinite and -1 for none."""
+    """Return the length of the dual step at which a held joint pushes no longer, and which; infinite, -1 for none."""
     length, leaving = np.inf, -1
     for a in range(held):
         side = S.side[S.who[a]]
@@ -289,7 +289,7 @@ def first_to_leave(S, held, sign, nothing):
 
 @lean
 def first_to_cross(S, held, sign, nothing):
-    """Of the held joints that stop the motion, the one that a further combination has let go; -1 for none."""
+    """Return the held joint among those that stop the motion which a further combination releases; -1 for none."""
     out, most = -1, 0.0
     for a in range(held):
         i = S.who[a]
@@ -301,7 +301,7 @@ def first_to_cross(S, held, sign, nothing):
 
 @lean
 def begin_search(W, S, start, target, first):
-    """Nothing is held; what the null space makes of the target."""
+    """Begin with no joint held, and with what the null space makes of the target."""
     n = len(start)
     fill(S.pull, 0.0)
     fill(S.free, 0.0)
@@ -316,7 +316,7 @@ def begin_search(W, S, start, target, first):
 
 @lean
 def search(W, S, start, target, first, most, least):
-    """The scale, how many joints are held, the one beside them that stops the motion, changes, and whether it is done.
+    """Return the scale, how many joints are held, the one that stops the motion, changes, and whether it is done.
 
     ``S.x`` is the answer, inside its box.
     """

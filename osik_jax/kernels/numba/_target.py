@@ -24,7 +24,7 @@ _lock = threading.Lock()
 
 
 def call(module: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any) -> list[Array]:
-    """Calls a kernel on a batch of problems.
+    """Call a kernel on a batch of problems.
 
     A kernel has no rule for ``vmap``: call it in a function under ``in_lanes``, which hands it a whole batch at once.
 
@@ -50,7 +50,7 @@ def _kind(dtype: Any) -> Any:
 
 
 def register(module: str) -> str:
-    """Compiles a kernel, or loads it from disk, and makes it known to XLA under the name that is returned; once."""
+    """Compile a kernel, or load it from disk, and make it known to XLA under the name that is returned; once."""
     name = f"osik_jax{module}"
     with _lock:
         if name not in _registered:
@@ -63,7 +63,7 @@ def register(module: str) -> str:
 
 
 def _load(handle: Any) -> Any:
-    """The function as compiled code, from disk where it has been compiled before (``cache_folder``).
+    """Return the function as compiled code, from disk where it has been compiled before (``cache_folder``).
 
     Where that folder cannot be written, Numba takes the one beside the source; where no folder can be, or what is in it
     cannot be read, the process compiles for itself.
@@ -82,7 +82,7 @@ def _load(handle: Any) -> Any:
 
 
 def cache_folder() -> str:
-    """The folder for compiled kernels: one for each state of the kernels' sources and of Numba's switches.
+    """Return the folder for compiled kernels: one for each state of the kernels' sources and of Numba's switches.
 
     It is in ``NUMBA_CACHE_DIR`` or, without that, in the user's folder for caches. Numba itself looks at nothing but
     the time of the file that has ``handle``, and at its own version and the processor.

@@ -28,7 +28,7 @@ _INDICES = ir.VectorType(_INDEX, WIDTH)
 
 
 def _in_blocks(builder: Any, start: Any, stop: Any, body: Any) -> None:
-    """``body(j, None)`` for blocks from j on, and ``body(j, mask)`` for the numbers that are left."""
+    """Call ``body(j, None)`` for blocks from j on, and ``body(j, mask)`` for the numbers that are left."""
     stop = builder.select(builder.icmp_signed("<", start, stop), stop, start)
     whole = builder.add(start, builder.and_(builder.sub(stop, start), _INDEX(-WIDTH)))
     with cgutils.for_range_slice(builder, start, whole, _INDEX(WIDTH), inc=True) as (j, _):
@@ -39,20 +39,20 @@ def _in_blocks(builder: Any, start: Any, stop: Any, body: Any) -> None:
 
 
 def _splat(builder: Any, number: Any, kind: Any) -> Any:
-    """A block of the same number."""
+    """Return a block of the same number."""
     nothing = ir.Constant(kind, ir.Undefined)
     one = builder.insert_element(nothing, number, _LANE(0))
     return builder.shuffle_vector(one, nothing, ir.VectorType(_LANE, WIDTH)([0] * WIDTH))
 
 
 def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
-    """``a b + c``."""
+    """Return ``a b + c``."""
     kind = ir.FunctionType(_BLOCK, [_BLOCK] * 3)
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{WIDTH}f64"), (a, b, c))
 
 
 def _sum(builder: Any, block: Any) -> Any:
-    """The sum of a block, by halves."""
+    """Return the sum of a block, by halves."""
     width = WIDTH
     while width > 1:
         nothing, half = ir.Constant(ir.VectorType(_DOUBLE, width), ir.Undefined), width // 2
@@ -63,7 +63,7 @@ def _sum(builder: Any, block: Any) -> Any:
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, j: Any) -> Any:
-    """To the block from number j of an array on."""
+    """Return a pointer to the block from number j of an array on."""
     assert kind.layout == "C" and kind.dtype == types.float64, kind
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [j]), _BLOCK.as_pointer())
@@ -107,7 +107,7 @@ def _add_squares(typing_context, a, b, start, stop):
 
 
 def _update(context: Any, builder: Any, signature: Any, arguments: Any, factor: Any) -> None:
-    """``a += factor(b) b`` for the first array among the arguments and the last one."""
+    """Add ``factor(b) b`` to a, the first array among the arguments; b is the last one."""
     ends, (start, stop) = (0, len(arguments) - 3), arguments[-2:]
 
     def body(j, mask):
@@ -124,7 +124,7 @@ _dot_in_blocks, _add_in_blocks, _add_squares_in_blocks = map(cast(Any, intrinsic
 
 @lean
 def dot(a, b, start, stop):
-    """``sum_j a_j b_j`` over some columns."""
+    """Return ``sum_j a_j b_j`` over some columns."""
     if _CHECKED:
         total = 0.0
         for j in range(start, stop):
@@ -135,7 +135,7 @@ def dot(a, b, start, stop):
 
 @lean
 def add(a, by, b, start, stop):
-    """``a += by b`` in some columns."""
+    """Add ``by b`` to a in some columns."""
     if _CHECKED:
         for j in range(start, stop):
             a[j] += by * b[j]
@@ -145,7 +145,7 @@ def add(a, by, b, start, stop):
 
 @lean
 def add_squares(a, b, start, stop):
-    """``a_j += b_j^2`` in some columns."""
+    """Add ``b_j^2`` to ``a_j`` in some columns."""
     if _CHECKED:
         for j in range(start, stop):
             a[j] += b[j] * b[j]

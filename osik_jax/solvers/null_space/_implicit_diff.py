@@ -136,7 +136,7 @@ def _dual_basis(projector: Float[Array, "n n"], active: Int[Array, " n"]) -> Flo
 
 @_dual_basis.defjvp
 def _dual_basis_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
-    """Golub and Pereyra's derivative (``solvers/_inverses.py``), of a matrix of full column rank."""
+    """Differentiate as Golub and Pereyra (``solvers/_inverses.py``), a matrix of full column rank."""
     projector, active = primals
     dual = _dual_basis(projector, active)
     columns, moved = (jnp.where(active != 0, matrix, 0.0) for matrix in (projector, tangents[0]))

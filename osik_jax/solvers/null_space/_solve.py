@@ -37,7 +37,7 @@ def solve_nullspace(
     max_iterations: int | None = None,
     backend: Backend = "auto",
 ) -> NullSpaceSolution:
-    """Each level as nearly as the null space of the levels above it allows.
+    """Solve each level as nearly as the null space of the levels above it allows.
 
     Pure, compiled on first use, batched by ``vmap``, differentiable in both modes: at constant rank, and with bounds at
     the saturated joints. Three methods:
@@ -65,7 +65,7 @@ def solve_nullspace(
             Frobenius norm of A count as dependent on them (P projects onto what the levels before leave free);
             default 1e-10 (1e-5 in float32). Against A and not A P, so that a level which repeats one above it has
             rank 0, not the rank of its rounding.
-        max_iterations: cap on the search for the saturated joints, for each level (static); default 10 (n + 2).
+        max_iterations: limit on the search for the saturated joints, for each level (static); default 10 (n + 2).
         backend: whose kernels compute (static): "auto" for those that are there for the platform, "jax" for none,
             "numba" (CPUs) for those or an error. It changes the time, not the answer.
 

@@ -232,7 +232,7 @@ def _solve_kkt_by_warp(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B
 
 
 def _fits_warp(qp: QP) -> bool:
-    """Whether Warp's kernel takes such problems: least squares in single precision, of a size that fits."""
+    """Return whether Warp's kernel takes such problems: least squares in single precision, of a size that fits."""
     if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float32:
         return False
     _, m, n = qp.cost.matrix.shape

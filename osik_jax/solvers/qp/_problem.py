@@ -101,14 +101,14 @@ def active_bounds(qp: QP, active: Int[Array, " n_and_p"]) -> Float[Array, " n_an
     return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)
 
 
-def softened_compliance(qp: QP, stiffness: float) -> Float[Array, " p"]:
-    """Return compliances in which hard rows are soft: with ``stiffness`` times the largest curvature of the cost."""
+def softened_compliance(qp: QP, penalty_ratio: float) -> Float[Array, " p"]:
+    """Return compliances in which hard rows are soft: by ``penalty_ratio`` times the largest curvature of the cost."""
     is_soft = qp.compliance > 0.0
     penalty = jnp.where(is_soft, 1.0 / jnp.where(is_soft, qp.compliance, 1.0), 0.0)
     largest_curvature = jnp.max(qp.cost.diagonal() + apply(qp.rows.T**2, penalty))
     square = jnp.sum(qp.rows**2, 1)
     # a row of length l and compliance c has the curvature l^2 / c along itself
-    scaled = stiffness * jnp.where(largest_curvature > 0.0, largest_curvature, 1.0)
+    scaled = penalty_ratio * jnp.where(largest_curvature > 0.0, largest_curvature, 1.0)
     return jnp.where(is_soft, qp.compliance, jnp.where(square > 0.0, square, 1.0) / scaled)
 
 
@@ -141,10 +141,10 @@ def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"
     scaled, scaled_newton, plain, plain_newton = jnp.max(sizes, 1, initial=0.0)
     is_zero = scaled <= _ZERO_TOL * jnp.finfo(x.dtype).eps * scaled_newton
     # what a constraint's value may be for such an x: in curvature units and in units of the variables, the smaller
-    reach = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
-    span = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])
+    per_curvature = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
+    per_unit = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])
     floor = jnp.minimum(
-        jnp.where(is_zero, scaled_newton, scaled) * reach, jnp.where(is_zero, plain_newton, plain) * span
+        jnp.where(is_zero, scaled_newton, scaled) * per_curvature, jnp.where(is_zero, plain_newton, plain) * per_unit
     )
     values = jnp.concatenate([x, apply(qp.rows, x)])
     bounds = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (qp.lower, qp.upper)]
@@ -152,7 +152,7 @@ def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"
     value = floor + jnp.abs(values) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
     # the multiplier that moves the value by its scale, and a part of what the rows add to the gradient
     row_terms = jnp.concatenate([1e-3 * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
-    return Scales(value, value / jnp.maximum(reach, jnp.finfo(x.dtype).tiny) ** 2 + row_terms)
+    return Scales(value, value / jnp.maximum(per_curvature, jnp.finfo(x.dtype).tiny) ** 2 + row_terms)
 
 
 def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: Int[Array, " n+p"]) -> Float[Array, ""]:

@@ -39,7 +39,7 @@ _SMALL_STEP = 1e-13
 _MAX_JOINT_RELEASES = 10
 """Iterations in which all bounds that the gradient points away from are released at once; then one at a time."""
 _MAX_UPDATES = 40
-_STIFFENING = 0.1
+_COMPLIANCE_DECREASE = 0.1
 """Factor of the compliance of infeasible hard rows, where a bound keeps x from the least violation."""
 _ZERO_GRADIENT = 1e-9
 """Cosine of the angle between the violation and a column of C; a smaller one is 0."""
@@ -261,7 +261,7 @@ def _cost_change(qp: QP, s: NewtonState, at: Linearisation, step: Float[Array, "
 
 
 def _update_multipliers(feasibility_tol: float, qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
-    """At a minimiser of the augmented Lagrangian: end if its hard rows hold, else take their multipliers over."""
+    """End at a minimiser of the augmented Lagrangian whose hard rows hold; elsewhere take their multipliers over."""
     n = len(s.x)
     hard = qp.compliance == 0.0
     # how far hard rows are off, and off the points that their multipliers stand for
@@ -281,11 +281,11 @@ def _update_multipliers(feasibility_tol: float, qp: QP, s: NewtonState, at: Line
     converged = jnp.where(s.infeasible, certified & ((unchanged & is_least) | is_last), feasible & ~turns_infeasible)
     # once infeasible, all hard rows get one compliance: x then goes to the least violation in the Euclidean norm
     equal = jnp.max(jnp.where(hard, s.compliance, 0.0), initial=0.0)
-    stiffened = jnp.where(s.infeasible & unchanged & ~is_least, _STIFFENING, 1.0) * s.compliance
+    reduced = jnp.where(s.infeasible & unchanged & ~is_least, _COMPLIANCE_DECREASE, 1.0) * s.compliance
     multiplier = jnp.where(converged, s.multiplier, 0.0)
     return s._replace(
         multiplier=jnp.where(hard & ~turns_infeasible & ~converged, at.multipliers, multiplier),
-        compliance=jnp.where(hard, jnp.where(turns_infeasible, equal, stiffened), s.compliance),
+        compliance=jnp.where(hard, jnp.where(turns_infeasible, equal, reduced), s.compliance),
         last_x=s.x,
         updates=s.updates + 1,
         steps=jnp.zeros_like(s.steps),

@@ -49,7 +49,7 @@ class RowFactor(NamedTuple):
 
 
 def has_few_rows(qp: QP) -> bool:
-    """Whether the system of the rows is the smaller one (static); ``qp`` has a leading axis of problems."""
+    """Return whether the system of the rows is the smaller one (static); ``qp`` has a leading axis of problems."""
     if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float64:
         return False
     _, m, n = qp.cost.matrix.shape

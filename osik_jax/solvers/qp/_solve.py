@@ -42,7 +42,7 @@ def solve_qp(
     tolerance: Float[ArrayLike, ""] | None = None,
     backend: Backend = "auto",
 ) -> QPSolution:
-    """Minimises 1/2 x'Hx + g'x  subject to  lower <= x <= upper,  rows_lower <= rows x <= rows_upper.
+    """Minimise 1/2 x'Hx + g'x  subject to  lower <= x <= upper,  rows_lower <= rows x <= rows_upper.
 
     Pure, compiled on first use, and batched by ``vmap``. Derivatives with respect to every array, in both modes and to
     any order, are those of the solution map at its active set.
@@ -55,10 +55,10 @@ def solve_qp(
         rows: general constraints. (p, n)
         rows_lower: lower bounds of the rows; equal bounds make an equality. (p,)
         rows_upper: upper bounds of the rows. (p,)
-        rows_compliance: 0 (the default) for a hard row; a row of compliance c > 0 gives way by t at a cost of
+        rows_compliance: 0 (the default) for a hard row; a row of compliance c > 0 may be missed by t at a cost of
             t^2 / (2 c). (p,)
         warm_start: ``active`` of the solution of a problem nearby. It changes the time, not the answer. (n + p,)
-        max_iterations: cap on changes of the active set (static); default 20 (n + p).
+        max_iterations: limit on the changes of the active set (static); default 20 (n + p).
         tolerance: violation that counts as none, relative to the scale of the constraint; default 1e-12.
         backend: "auto" or "jax" (static): there is no kernel for this form.
 
@@ -93,7 +93,7 @@ def solve_least_squares_qp(
     tolerance: Float[ArrayLike, ""] | None = None,
     backend: Backend = "auto",
 ) -> QPSolution:
-    """Minimises 1/2 sum_i weight_i (matrix_i x - target_i)^2 + 1/2 damping |x - center|^2, constrained as ``solve_qp``.
+    """Minimise 1/2 sum_i weight_i (matrix_i x - target_i)^2 + 1/2 damping |x - center|^2, constrained as ``solve_qp``.
 
     The factored form: the answer is refined against residuals of the matrix itself, so that small weights survive
     beside large ones.
@@ -114,7 +114,7 @@ def solve_least_squares_qp(
             Name them where bounds are computed under ``jit``: XLA may compute an expression twice, in two roundings,
             and what was one number is then two. (p,)
         warm_start: ``active`` of the solution of a problem nearby. (n + p,)
-        max_iterations: cap on changes of the active set (static).
+        max_iterations: limit on the changes of the active set (static).
         tolerance: relative violation that counts as none.
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
             the platform, "jax" for none, "numba" (CPUs) or "warp" (CUDA) for that or an error. It changes the time,

@@ -1,4 +1,4 @@
-"""Numbers that can be computed with: what is NaN is taken out before the first operation and remembered.
+"""Placeholders: what is NaN is replaced before the first operation, and that it was there is remembered.
 
 A select after the fact keeps a NaN out of an answer, and not out of a derivative: reverse mode multiplies the zero that
 the select sends back by coefficients that are NaN, and the sum over lanes carries that into every number they share.
@@ -18,34 +18,34 @@ _NEVER_INFINITE = _WEIGHTS | {"target", "target_velocity", "axis", "ratios"}
 """Fields of a task that bound nothing."""
 
 
-def cleaned(tree: Any) -> tuple[Any, Bool[Array, ""]]:
-    """The tree with 1 in the place of what cannot be computed with, and whether there was nothing of it.
+def with_placeholder(tree: Any) -> tuple[Any, Bool[Array, ""]]:
+    """Return the tree with 1 in place of numbers that are not valid, and whether all were valid.
 
     Each array is selected from by itself, so that one which the lanes of a batch share stays shared. NaN is never
     right; an infinity is, where it can mean no bound: not in a bare array, nor in the weights, gain and target of a
     task.
     """
     numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
-    clean = jax.tree_util.tree_map_with_path(lambda path, a: jnp.where(_unusable(path, a), 1.0, a), numbers)
+    valid = jax.tree_util.tree_map_with_path(lambda path, a: jnp.where(_is_invalid(path, a), 1.0, a), numbers)
     kinds: dict[bool, list[Array]] = {True: [], False: []}
     for path, leaf in jax.tree_util.tree_leaves_with_path(numbers):
         kinds[_never_infinite(path)].append(jnp.ravel(jax.lax.stop_gradient(leaf)))
     flags = [~jnp.isnan(_joined(kinds[False])).any(), jnp.isfinite(_joined(kinds[True])).all()]
-    return eqx.combine(clean, rest), flags[0] & flags[1]
+    return eqx.combine(valid, rest), flags[0] & flags[1]
 
 
 def positive(dt: Any) -> Array:
-    """dt, or NaN where it is not positive: nothing can be computed with that either."""
+    """Return dt, or NaN where it is not positive: that is no step either."""
     dt = jnp.asarray(dt)
     return jnp.where(dt > 0.0, dt, jnp.nan)
 
 
 def _joined(arrays: list[Array]) -> Array:
-    """One array, to be looked at by one operation."""
+    """Return all numbers as one array, which one operation checks."""
     return jnp.concatenate(arrays) if arrays else jnp.zeros(0)
 
 
-def _unusable(path: tuple[Any, ...], leaf: Array) -> Bool[Array, "..."]:
+def _is_invalid(path: tuple[Any, ...], leaf: Array) -> Bool[Array, "..."]:
     return ~jnp.isfinite(leaf) if _never_infinite(path) else jnp.isnan(leaf)
 
 
