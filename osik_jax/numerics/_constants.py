@@ -1,10 +1,18 @@
-"""Constants that a method in plain JAX shares with its kernels, so that both decide alike.
+"""The one table of tolerances and other numbers that the solvers are tuned by, each with its reason.
 
-Solvers and kernels import them from here; neither imports the other's.
+Where data in single precision take another number, there is one for each precision. Most are relative: to machine
+epsilon, to roundoff (a tolerance times the scale of a constraint, ``constraint_scales``), or to what their line says.
+Those that a method in plain JAX shares with its kernels are here so that both decide alike: neither imports the other.
+Sizes of blocks and of shared memory, which change the time and not the answer, are where they are used; so are the
+numbers of a kernel's own method, whose answers are certified.
 """
+
+import jax.numpy as jnp
 
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 """Labels of a constraint in an active set."""
+
+# ---- damping of levels, shared with kernels
 
 DAMPING_ITERATIONS = 3
 """Steps towards the fixed point of a level's damping; each shrinks an excess by the factor unmet / s^2."""
@@ -19,6 +27,8 @@ MIN_RADIUS = 1e-6
 NEGLIGIBLE_CURVATURE = 1e-6
 """Relative to the largest curvature cost of a variable: a smaller one may be roundoff and restricts nothing."""
 
+# ---- saturation, shared with kernels
+
 NEGLIGIBLE_STEP = 1e-11
 """Relative to the norm of the point where it begins: a shorter step counts as none."""
 FULL_STEP = 1.0 - 1e-9
@@ -30,3 +40,130 @@ BOUND_DISTANCE = 1e-9
 """Relative to the bound: a joint at a larger distance is not at its bound."""
 SATURATION_RESIDUAL = 2e-9
 """Relative to the terms that x is made of: the largest residual of the active bounds with which an answer is taken."""
+
+# ---- answers and certificates
+
+KKT_TOLERANCE = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
+"""The largest ``kkt_residual`` of an answer that is SOLVED, by the precision of the data."""
+FEASIBILITY = 1e-12
+"""Relative to the scale of a constraint: a smaller violation, or multiplier of the wrong sign, counts as none."""
+FARKAS_RADIUS = 1e3
+"""Relative to the numbers at hand: how large an x is considered along variables without a bound."""
+FARKAS_ROUNDOFF = 1e-14
+"""Relative to the absolute terms of a sum: a smaller sum is 0."""
+SINGLE_TOL = 1e-7
+"""Smallest tolerance of a kernel in single precision, and of its certificate; the search has the one asked for."""
+VALUE_TOL, SIGN_TOL = 30.0, 2.0
+"""In units of the tolerance: how far a certified value may be off its bound, or a gradient from 0; and how large a
+multiplier of the wrong sign may be.
+
+The latter is smaller: such a multiplier says that the active set is not right, and what that costs is more the weaker
+the curvature is that the rows leave."""
+GRADIENT_TOL = 4.0
+"""In units of machine epsilon times the gradient's terms: how large a certified gradient of a free variable may be."""
+BOX_TOLERANCE = 1e3
+"""In units of the feasibility tolerance: how far a candidate may be outside its box (the answer is clipped into it)."""
+MAX_LOSS = 100.0
+"""In units of the rank tolerance: a level whose optimum the levels below have worsened by more is not kept."""
+
+# ---- the dual active-set method
+
+DEPENDENCE_TOL = 100.0
+"""In units of machine epsilon: a constraint of whose diagonal the active ones leave less depends on them."""
+REDUNDANCY_TOL = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
+"""In units of roundoff: a dependent constraint that is violated by less is redundant, by more infeasible."""
+
+# ---- weighted QPs
+
+ZERO_TOL = 100.0
+"""In units of machine epsilon times the Newton step at x: an x that is no larger counts as 0."""
+MAX_ROUNDS = 12
+"""Rounds of factor, check and search; where that many end without an answer, projected Newton takes over."""
+RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
+"""In units of roundoff; an answer that the dual method does not change is accepted with violations up to this."""
+MAX_INFEASIBLE = 2
+"""Dual methods that end as infeasible before projected Newton takes over; one that changes nothing is enough."""
+SOFT_COMPLIANCE = 1e-12
+"""Compliance of infeasible hard rows relative to C diag(H)^-1 C': with it the least violation has a derivative."""
+KKT_RIDGE = {jnp.dtype("float64"): 10.0, jnp.dtype("float32"): 1.0}
+"""In units of machine epsilon times the diagonal: keeps the factor of a semidefinite Hessian from breaking."""
+LAST_CORRECTION = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}
+"""Relative to the answer: a smaller correction is the last; the next would be its square, or roundoff."""
+MAX_REFINEMENTS = 5
+"""Steps of iterative refinement at most; two are the rule."""
+MAX_ROW_RATIO = 0.9
+"""Rows per variable, beyond which the factor of the Hessian is as quick."""
+ROW_SPACE_PIVOT = 1e4
+"""In units of machine epsilon times the diagonal element: a smaller pivot says that rows depend on each other."""
+MAX_CONTRACTION = 1e-4
+"""The largest ratio of two corrections with which refinement is trusted to converge."""
+ROW_SPACE_CORRECTION, ROW_SPACE_ACCURACY = 1e-6, 1e-13
+"""The last correction is smaller than the first relative to x, and the next one would be smaller than the second."""
+GRADIENT_STEPS = 100
+"""Steps of the projected gradient behind an answer that is MAX_ITERATIONS."""
+
+# ---- projected Newton
+
+PENALTY = 1e5
+"""Curvature of a hard row relative to the largest of the cost: an update reduces its violation to about 1e-5 of it."""
+SHORTEST_STEP, STEP_LENGTHS = 1e-9, 31
+"""The shortest step of the line search, and how many lengths from 1 down to it are tried."""
+NEWTON_ROUNDOFF = 4e-15
+"""Relative to the terms of the gradient; a variable with a smaller gradient is stationary."""
+SMALL_STEP = 1e-13
+"""Relative to x; a Newton step that is shorter is the last on its face."""
+MAX_JOINT_RELEASES = 10
+"""Iterations in which all bounds that the gradient points away from are released at once; then one at a time."""
+MAX_UPDATES = 40
+"""Updates of the multipliers of hard rows at most."""
+COMPLIANCE_DECREASE = 0.1
+"""Factor of the compliance of infeasible hard rows, where a bound keeps x from the least violation."""
+ZERO_GRADIENT = 1e-9
+"""Cosine of the angle between the violation and a column of C; a smaller one is 0."""
+UNCHANGED = 1e-9
+"""Relative to x; the least violation has been found where an update moves x by less."""
+
+# ---- hierarchies
+
+HIERARCHY_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
+"""The part of a row outside the span of others with less than which it depends on them; data in single precision have
+more roundoff, which makes dependent rows independent."""
+ZERO_PIVOT = 1e-2
+"""In units of the rank tolerance: a pivot up to this is 0, whatever rank another factorisation has found."""
+EXTRA_DAMPING = 1e-9
+"""In units of the level's longest row, squared; whatever the level's own damping: the Hessian has to be regular. A
+kernel takes one step so damped along directions that the rank tolerance left out."""
+GUESS_ROUNDOFF = 1e-10
+"""The roundoff tolerance of a row's value, in units of the terms that add up to it."""
+WORKING_SET_SOLVES = 2
+"""Solves with one factorisation, each against exact residuals: the first one, and one step of refinement."""
+MAX_STALLED = 20
+"""Steps of zero length in a row after which the least index decides; shared with kernels, and so are the next two."""
+MAX_ATTEMPTS = 4
+"""A kernel's solves on a guessed working set and its corrections, before the primal active-set method."""
+FACTOR_RIDGE = 1e-14
+"""Relative to the square of the longest row: keeps a kernel's factor of a damped level positive."""
+
+# ---- null spaces
+
+NULL_SPACE_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
+"""Of a level's Frobenius norm: a row with less outside the span of others depends on them; data in single precision
+have more roundoff, which makes dependent rows independent."""
+MISSING_COMPLIANCE = 1e-7
+"""Of the missing part of the motion: the squared length of x that it outweighs."""
+SATURATION_ROUNDOFF = 1e-11
+"""Relative to the terms that x is made of: a smaller violation of a bound counts as none."""
+INDEPENDENCE_TOL = 1e-5
+"""Relative to a combination of joints: where the null space changes it by less, it does not change it."""
+NEGLIGIBLE_ENTRY = 1e-7
+"""Joints with a smaller entry in the combination do not block the motion."""
+SATURATION_ATTEMPTS = 6
+"""Where an answer is not accepted, the next attempt has a lower compliance, and only the part of the motion near the
+scale that was found: motions that are too large for their box by orders of magnitude lose digits."""
+SATURATION_ACCURACY = 1e-15
+"""Relative to the terms that x is made of: an answer with a smaller residual is not refined."""
+MAX_SATURATION_REFINEMENTS = 5
+"""Refinements of the answer at most; one is the rule."""
+DERIVATIVE_RANK = 1e-7
+"""A saturated joint with less of its column of the projector outside the span of the others has no derivative of its
+own."""

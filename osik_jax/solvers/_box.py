@@ -13,6 +13,7 @@ def uncrossed(
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, ""]]:
     """Return bounds in which lower > upper is an equality halfway between the two, and whether there were any."""
     crossed = lower > upper
+    # 0 where nothing is crossed: lower + upper may be inf - inf there, and its derivative NaN
     middle = 0.5 * jnp.where(crossed, lower + upper, 0.0)
     return jnp.where(crossed, middle, lower), jnp.where(crossed, middle, upper), crossed.any()
 

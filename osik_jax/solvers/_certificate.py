@@ -5,12 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..numerics._constants import FARKAS_RADIUS, FARKAS_ROUNDOFF
 from ..numerics._dense import apply
-
-_SEARCH_RADIUS = 1e3
-"""Relative to the numbers at hand: how large an x is considered along variables without a bound."""
-_ROUNDOFF = 1e-14
-"""Relative to the absolute terms of a sum: a smaller sum is 0."""
 
 
 def is_farkas_certificate(
@@ -35,11 +31,13 @@ def is_farkas_certificate(
         lower: lower bounds of the box.
         upper: upper bounds of the box.
     """
+    # -z'C d as a linear function of d, whose coefficients below roundoff are 0
     gradient = apply(rows.T, certificate)
-    roundoff = _ROUNDOFF * apply(jnp.abs(rows).T, jnp.abs(certificate))
+    roundoff = FARKAS_ROUNDOFF * apply(jnp.abs(rows).T, jnp.abs(certificate))
     gradient = jnp.where(jnp.abs(gradient) <= roundoff, 0.0, gradient)
     sizes = [jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0) for a in (x, lower, upper)]
-    radius = _SEARCH_RADIUS * jnp.max(jnp.stack(sizes), initial=0.0)
+    radius = FARKAS_RADIUS * jnp.max(jnp.stack(sizes), initial=0.0)
+    # the most that this function reaches in the box: each variable at the bound that raises it
     distance = jnp.where(gradient > 0.0, x - lower, upper - x)
     largest_change = jnp.sum(jnp.abs(gradient) * jnp.where(jnp.isfinite(distance), distance, radius))
     return jnp.dot(certificate, gap) > largest_change
@@ -67,6 +65,7 @@ def relative_kkt_residual(
         scale, and the largest relative violation.
     """
     residual, scale = jnp.max(jnp.stack([stationarity, gradient_scale]), 1, initial=0.0)  # one operation for two
+    # stationarity and signs in units of the forces; feasibility in those of the rows' own terms
     dual = jnp.maximum(residual, jnp.max(wrong_sign, initial=0.0)) / jnp.where(scale > 0.0, scale, 1.0)
     relative = violation / jnp.where(violation_scale > 0.0, violation_scale, 1.0)
     primal = jnp.where(violation > 0.0, relative, 0.0)

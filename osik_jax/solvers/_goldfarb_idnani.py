@@ -28,13 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..execution._double import first_smallest
-from ..numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
-
-DEPENDENCE_TOL = 100.0
-"""In units of machine epsilon: a constraint of whose diagonal the active ones leave less depends on them."""
-
-REDUNDANCY_TOL = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
-"""In units of roundoff: a dependent constraint that is violated by less is redundant, by more infeasible."""
+from ..numerics._constants import AT_LOWER, AT_UPPER, DEPENDENCE_TOL, EQUALITY, INACTIVE, REDUNDANCY_TOL
 
 
 class Roundoff(NamedTuple):

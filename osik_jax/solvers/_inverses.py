@@ -49,6 +49,7 @@ def row_space_and_motion(
 
 def _solved(factors: RowFactors, target: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
     """Return the minimiser y of |A basis' y - target|^2 + damping |y|^2, by the QR factors."""
+    # [A basis'; sqrt(damping) I] = Q R, and the right side is 0 below: R y = (upper half of Q)' target
     left = factors.orthonormal[: len(factors.basis)]
     return jax.scipy.linalg.solve_triangular(factors.triangle, jnp.matmul(left.T, target, precision="highest"))
 
@@ -97,6 +98,7 @@ def _by_pivots(matrix: Array, rank: Array, cutoff: Array) -> tuple[Array, Array]
     Q, R, order = jax.scipy.linalg.qr(matrix.T, mode="economic", pivoting=True)
     pivots = jnp.abs(jnp.diagonal(R))
     keep = (jnp.arange(min(m, n)) < rank) & (pivots > cutoff)
+    # A' permuted is Q R; of the rank's rows of R a second QR makes R' = U S, so that A^+ = Q S^-1 U'
     Q = jnp.where(keep, Q, 0.0)
     U, S = jnp.linalg.qr(jnp.where(keep[:, None], R, 0.0).T)
     S = jnp.where(keep[:, None] & keep[None, :], S, jnp.eye(len(keep), dtype=S.dtype))
@@ -142,10 +144,12 @@ def _damped_rate(
     w: Float[Array, " m"],
 ) -> Float[Array, " n"]:
     """Return the derivative of D w, from that of (I + damping X X') D = X."""
+    # with M = X X': dD w = (I + damping M)^-1 (dX w - d_damping M D w - damping dM D w)
     y = apply(D, w)
     z = apply(X.T, y)
     damped = d_damping * apply(X, z) + damping * (_inverse_rate(a, X, da, z) + apply(X, _transposed_rate(a, X, da, y)))
     right = _inverse_rate(a, X, da, w) - damped
+    # D = (I + damping X X')^-1 X, so
     # (I + damping X X')^-1 = I - damping D X'
     return right - damping * apply(D, apply(X.T, right))
 
@@ -183,6 +187,7 @@ def regularised_inverse(
 @custom_jvp
 def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array]:
     """Return the inverse D, and K with D = K A': (A'A + damping I)^-1, or (A'A)^+ for a damping of 0."""
+    # D = V diag(s / (s^2 + damping)) U'; K = V diag(1 / (s^2 + damping)) V', and 1 / damping outside the row space
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
     damped = damping > 0.0
     kept = damped | (s > cutoff)

@@ -104,9 +104,11 @@ def _next_direction(cutoff: Float[Array, ""], root: Float[Array, ""], s: _State)
         jnp.concatenate([along, jnp.where(at_rank & is_independent, root, 0.0)]),
         jnp.zeros_like(along),
     )
+    # Gram-Schmidt, twice: what one pass leaves of the columns before is roundoff after the second
     for _ in range(2):
         correction = apply(s.orthonormal.T, column)
         column, coefficients = column - apply(s.orthonormal, correction), coefficients + correction
+    # column = orthonormal coefficients + norm direction: the next column of the triangle
     norm = jnp.where(is_independent, jnp.sqrt(jnp.sum(column**2)), 1.0)
     at_rank &= is_independent
     return _State(

@@ -7,6 +7,7 @@ from math import sqrt
 from ...numerics._constants import (
     COST_FRACTION,
     DAMPING_ITERATIONS,
+    DAMPING_RIDGE,
     MIN_RADIUS,
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
@@ -16,8 +17,6 @@ from ._frame import lean
 from ._level_factors import cholesky, cholesky_solve, from_basis, gram, rows_in_basis, to_basis
 from ._level_workspace import clear, clip, copy, target
 from ._vectors import add, dot
-
-_RIDGE = 1e-13  # of the rows' squares: keeps dependent rows from breaking the factor
 
 
 @lean
@@ -51,7 +50,7 @@ def level_damping(F, J, s, constant):
                 break
             before = ratio
             # the damped step d = R' (R R' + damping I)^-1 goal, clipped into the box
-            ridge = constant + s.unmet * ratio + _RIDGE * trace
+            ridge = constant + s.unmet * ratio + DAMPING_RIDGE * trace
             cholesky(F, J, s, m, ridge if ridge > 0.0 else 1.0)
             copy(goal, F[ws.RIGHT], m)
             cholesky_solve(F, J, s, m, F[ws.RIGHT])

@@ -11,12 +11,11 @@ from math import sqrt
 
 from numba import int64
 
+from ...numerics._constants import FACTOR_RIDGE
 from . import _level_workspace as ws
 from ._frame import lean
 from ._level_workspace import clear
 from ._vectors import add, add_squares, dot
-
-_RIDGE = 1e-14  # of the longest row, squared: keeps the damped factor positive
 
 
 @lean
@@ -199,7 +198,7 @@ def factor_level_rows(F, J, s):
         s.rank += 1
     if s.damping > 0.0:
         gram(F, J, s, s.rank, s.first_free)
-        cholesky(F, J, s, s.rank, s.damping + _RIDGE * s.size**2)
+        cholesky(F, J, s, s.rank, s.damping + FACTOR_RIDGE * s.size**2)
 
 
 @lean

@@ -6,6 +6,7 @@ from math import inf, isfinite, sqrt
 
 from numba import int64
 
+from ...numerics._constants import EXTRA_DAMPING, MAX_ATTEMPTS, MAX_STALLED
 from . import _level_workspace as ws
 from ._frame import lean
 from ._level_factors import factor_active_rows, factor_level_rows, from_basis
@@ -19,10 +20,6 @@ from ._level_solve import (
 )
 from ._level_workspace import copy, hard_value, target
 from ._vectors import dot
-
-_ATTEMPTS = 4  # solves on a guessed working set and its improvements, before the primal active-set method
-_MAX_STALLED = 20  # steps of zero length in a row after which the least index decides
-_WEAK_DAMPING = 1e-9  # of the longest row, squared: the damping of a step along directions that the factor left out
 
 
 @lean
@@ -90,7 +87,7 @@ def try_guess(F, J, s, guess_hard, guess_own):
         side = usable_side(guess_own[a], F[ws.LOWER, a], F[ws.UPPER, a])
         J[ws.OWN, a] = 2 if J[ws.EQUALITY, a] != 0 else side
     feasible = False
-    for attempt in range(_ATTEMPTS):
+    for attempt in range(MAX_ATTEMPTS):
         solve_on_working_set(F, J, s)
         if not isfinite(s.x_max):
             feasible = False
@@ -101,7 +98,7 @@ def try_guess(F, J, s, guess_hard, guess_own):
         if feasible and consistent and signs and is_stationary(s):
             return True, True
         # the factors are of the working set before the last improvement
-        if changes == 0 or attempt + 1 == _ATTEMPTS:
+        if changes == 0 or attempt + 1 == MAX_ATTEMPTS:
             copy(J[ws.PENDING], J[ws.ACTIVE], h)
             break
         s.changes += changes
@@ -215,7 +212,7 @@ def primal_active_set(F, J, s, max_iterations, factored):
             multipliers(F, J, s)
             weak = not weak_tried and not is_stationary(s)
             if not weak:
-                which = most_wrong_sign(F, J, s, stalled > _MAX_STALLED)
+                which = most_wrong_sign(F, J, s, stalled > MAX_STALLED)
                 if which < 0:
                     return True
                 J[ws.ACTIVE, which] = 0
@@ -224,7 +221,7 @@ def primal_active_set(F, J, s, max_iterations, factored):
                 continue
             weak_tried = True
             for j in range(s.first_free, n):
-                F[ws.WORK, j] = F[ws.DOWNHILL, j] / (_WEAK_DAMPING * s.size**2 + s.damping)
+                F[ws.WORK, j] = F[ws.DOWNHILL, j] / (EXTRA_DAMPING * s.size**2 + s.damping)
             from_basis(F, J, s, s.first_free, n, F[ws.STEP])
         longest, which, side = ratio_test(F, J, s)
         ideal = line_search(F, J, s, damping_x, damping_d) if s.has_inequalities != 0 and not weak else 1.0

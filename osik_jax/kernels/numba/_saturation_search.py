@@ -31,12 +31,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...numerics._constants import SATURATION_ROUNDOFF
 from ._dense import fill
 from ._frame import lean
 from ._vectors import add, add_squares, dot
 
-NOISE = 1e-11
-"""Relative to the numbers that x is made of, less than this beyond a bound is none."""
 UNEVEN = 10.0
 """Of a combination, so many times what the entering joint has: a joint with more is what the others say most about."""
 
@@ -328,14 +327,14 @@ def search(W, S, start, target, first, most, least):
     dropping, going = False, True
     while going and changes < most:
         if dropping:
-            wrong = most_wrong(S, held, NOISE * whole)
+            wrong = most_wrong(S, held, SATURATION_ROUNDOFF * whole)
             dropping = wrong >= 0
             if dropping:
                 release(W, S, first, held, wrong)
                 held, changes = held - 1, changes + 1
                 continue
         if entering < 0:
-            entering = most_violated(W, S, n, NOISE * whole, least)
+            entering = most_violated(W, S, n, SATURATION_ROUNDOFF * whole, least)
             if entering < 0:
                 going = False
                 break
@@ -348,7 +347,7 @@ def search(W, S, start, target, first, most, least):
             full = max(W.low[k] - S.x[k] if sign > 0.0 else S.x[k] - W.high[k], 0.0) / square
         for a in range(held):
             largest = max(largest, abs(S.rate[a]))
-        length, leaving = first_to_leave(S, held, sign, (NOISE if full < np.inf else least) * largest)
+        length, leaving = first_to_leave(S, held, sign, (SATURATION_ROUNDOFF if full < np.inf else least) * largest)
         if leaving < 0 and full == np.inf:
             out = first_to_cross(S, held, sign, least * largest)
             if out >= 0:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._lanes import choose
+from ...numerics._constants import MAX_LOSS
 from .._damping import level_damping
 from .._level import Level
 from ._active_rows import drop_dependent, factor_active_rows
@@ -24,9 +25,6 @@ from ._primal_active_set import PrimalState, primal_active_set
 from ._problem import Tolerances, WorkingSet
 from ._working_set_guess import guess_working_set
 from ._working_set_solve import WorkingSetSolution, placeholder, solve_on_working_set
-
-_MAX_LOSS = 100.0
-"""In units of the rank tolerance: a level whose optimum the levels below have worsened by more is not kept."""
 
 
 class CascadeResult(NamedTuple):
@@ -277,6 +275,7 @@ def _solve_on_guesses(
 def _usable_guess(problem: LevelProblem, warm_start: WorkingSet) -> WorkingSet:
     """Return the warm start without the rows whose bound is infinite or that cannot block."""
     level = problem.level
+    # an inequality may have become an equality since, or the other way round
     own = jnp.sign(warm_start.own)
     own = jnp.where(jnp.isfinite(jnp.where(own < 0, level.lower, level.upper)), own, 0)
     own = jnp.where(problem.is_equality, 2, own)
@@ -296,6 +295,7 @@ def _primal_start(
     problem: LevelProblem, active: Int[Array, " h"], solution: WorkingSetSolution, tolerances: Tolerances
 ) -> PrimalState:
     """Return the solution on the guessed working set where it is feasible, else the end of the level above."""
+    # the end of the level above is feasible; what it had active may depend on rows that were frozen since
     independent = drop_dependent(active, factor_active_rows(problem, active, tolerances.rank))
     above = _as_primal_state(placeholder(problem))._replace(active=independent)
     return jax.tree.map(lambda a, b: jnp.where(solution.feasible, a, b), _as_primal_state(solution), above)
@@ -308,6 +308,7 @@ def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances
     """
     length = jnp.sqrt(jnp.sum(hierarchy.hard**2, -1))
     active = result.working_sets.hard
+    # how large x was on the way: at least as far as the bounds that were active
     bound = jnp.where(active < 0, hierarchy.hard_lower, hierarchy.hard_upper)
     # a bound that is active only because it was narrowed may be infinite here; it was nearer than x
     usable = (active != 0) & (length > 0.0) & jnp.isfinite(bound)
@@ -315,9 +316,10 @@ def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances
     largest = jnp.maximum(jnp.max(jnp.abs(result.x)), largest_bound)
 
     def loss(level: Level, slack_norm: Array) -> tuple[Array, Array]:
+        # a level's norm at the end, beside that at its own optimum; what it lost is a force by the longest row
         now = jnp.sqrt(jnp.sum(level.distance(result.x) ** 2))
         increase = jnp.maximum(now - slack_norm, 0.0)
-        allowed = _MAX_LOSS * tolerances.rank * (level.size * largest + now)
+        allowed = MAX_LOSS * tolerances.rank * (level.size * largest + now)
         return level.size * increase, increase <= allowed
 
     residual, kept = jax.vmap(loss)(hierarchy.levels, result.slack_norms)

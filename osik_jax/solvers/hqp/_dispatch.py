@@ -18,6 +18,7 @@ from ...execution._backends import Backend, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_the_rest
+from ...numerics._constants import BOX_TOLERANCE
 from . import _numba, _warp
 from ._cascade import CascadeResult, certify_levels, solve_cascade
 from ._padding import Layout, PaddedHierarchy
@@ -26,8 +27,6 @@ from ._problem import Tolerances, WorkingSet
 _BLOCK = 256
 """Problems that the search takes at a time: on a GPU its many small operations cost as much for one as for these."""
 
-_BOX_TOLERANCE = 1e3
-"""In units of the feasibility tolerance: how far a candidate may be outside its box (the answer is clipped into it)."""
 
 Solve = Callable[[Layout, PaddedHierarchy, Tolerances, WorkingSet | None, int], CascadeResult]
 
@@ -95,7 +94,8 @@ def _is_valid(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tol
     """Check that the numbers are finite and that x is inside its box."""
     n = len(result.x)
     lower, upper = hierarchy.hard_lower[:n], hierarchy.hard_upper[:n]
-    margin = _BOX_TOLERANCE * tolerances.feasible * (jnp.max(jnp.abs(result.x)) + jnp.abs(result.x))
+    # the answer is clipped into its box, so that roundoff of x may pass here
+    margin = BOX_TOLERANCE * tolerances.feasible * (jnp.max(jnp.abs(result.x)) + jnp.abs(result.x))
     inside = (result.x >= lower - margin) & (result.x <= upper + margin)
     valid = jnp.isfinite(result.x) & inside
     return valid.all() & jnp.isfinite(result.residual) & jnp.isfinite(result.multipliers).all()

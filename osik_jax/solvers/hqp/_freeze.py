@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ...numerics._constants import ZERO_PIVOT
 from ...numerics._dense import apply, product
 from .._damping import narrow_box
 from ._implicit_diff import ActiveSets
@@ -19,9 +20,6 @@ from ._padding import LevelProblem
 from ._primal_active_set import PrimalState
 from ._problem import Tolerances, WorkingSet
 from ._working_set_solve import gradient_roundoff
-
-ZERO_PIVOT = 1e-2
-"""In units of the rank tolerance: a pivot up to this is 0, whatever rank another factorisation has found."""
 
 
 class CascadeState(NamedTuple):

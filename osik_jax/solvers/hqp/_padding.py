@@ -108,6 +108,7 @@ def pad_hierarchy(
         The static layout and the numbers.
     """
     n, m = lower.shape[0], max(level.matrix.shape[0] for level in levels)
+    # levels of equalities alone bound nothing below them: they are frozen, so they add no hard rows
     mixed = [level for level in levels if not level.equality]
     first, level_of_hard, hard_of_row = n, [-1] * n, []
     h = n + sum(level.matrix.shape[0] for level in mixed)

@@ -18,14 +18,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._double import first_smallest
+from ...numerics._constants import MAX_STALLED
 from ...numerics._dense import apply
 from ._active_rows import ActiveRows, factor_active_rows, multipliers
 from ._padding import LevelProblem
 from ._problem import Tolerances
 from ._working_set_solve import factor_least_squares, slack_roundoff, wrong_signs
-
-_MAX_STALLED = 20
-"""Steps of zero length in a row after which the least index decides."""
 
 
 class PrimalState(NamedTuple):
@@ -94,7 +92,7 @@ def _release(
     wrong = wrong_signs(problem, s.active, multiplier, gradient, roundoff, tolerances)
     force = multiplier * s.active * problem.length
     # after a run of steps of zero length all wrong signs are alike, so that the least index is taken (Bland)
-    worst = first_smallest(jnp.where(wrong, jnp.where(s.stalled > _MAX_STALLED, 0.0, force), jnp.inf))
+    worst = first_smallest(jnp.where(wrong, jnp.where(s.stalled > MAX_STALLED, 0.0, force), jnp.inf))
     any_wrong = wrong.any()
     return s._replace(
         active=s.active.at[worst].set(jnp.where(any_wrong, 0, s.active[worst])),

@@ -11,19 +11,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ...execution import _rules
 from ...execution._backends import Backend, check_backend, here
+from ...numerics._constants import HIERARCHY_RANK, ZERO_PIVOT
 from .._box import clip_roundoff, uncrossed
 from .._damping import Damping, per_level
 from .._level import Level
 from .._status import Status
 from ._cascade import CascadeResult
 from ._dispatch import hierarchy_solver
-from ._freeze import ZERO_PIVOT
 from ._implicit_diff import with_derivative
 from ._padding import pad_hierarchy
 from ._problem import HQPSolution, Tolerances, WorkingSet
-
-_RANK_TOLERANCE = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
-"""By the precision of the data, whose roundoff makes dependent rows independent."""
 
 
 @partial(jax.jit, static_argnames=("max_iterations", "backend"))
@@ -71,7 +68,7 @@ def solve_hqp(
     """
     lower, upper = jnp.asarray(lower), jnp.asarray(upper)
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
-    tolerances = Tolerances(rank=_RANK_TOLERANCE[dtype]) if tolerances is None else tolerances
+    tolerances = Tolerances(rank=HIERARCHY_RANK[dtype]) if tolerances is None else tolerances
     dampings = per_level(damping, len(levels), len(lower), dtype)
     damping_is_valid = jnp.stack([(jnp.isfinite(a) & (a >= 0.0)).all() for a in dampings]).all()
     is_finite = _is_finite(levels, lower, upper) & damping_is_valid

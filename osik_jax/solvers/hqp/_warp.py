@@ -20,6 +20,10 @@ from ...numerics._constants import (
     COST_FRACTION,
     DAMPING_ITERATIONS,
     DAMPING_RIDGE,
+    EXTRA_DAMPING,
+    FACTOR_RIDGE,
+    MAX_ATTEMPTS,
+    MAX_STALLED,
     MIN_RADIUS,
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
@@ -209,11 +213,13 @@ def source(shape: Shape, parts: tuple[str, ...] = PARTS) -> str:
     offsets = [sum(shape.row_counts[:k]) for k in range(len(shape.row_counts))]
     numbers = dict(N=shape.variables, LEVELS=len(shape.row_counts), M=shape.rows, ROWS=shape.all_rows)
     numbers |= dict(P=len(shape.row_of_hard), WARPS=shape.warps, DAMPING_ITERATIONS=DAMPING_ITERATIONS)
+    numbers |= dict(MAX_ATTEMPTS=MAX_ATTEMPTS, MAX_STALLED=MAX_STALLED)
     lists = dict(COUNT=shape.row_counts, OFFSET=offsets, HAS_INEQUALITIES=[int(a) for a in shape.has_inequalities])
     lists |= dict(ROW=shape.row_of_hard or (0,), LEVEL=shape.level_of_hard or (0,))
     head = [f"constexpr int {name} = {value};" for name, value in numbers.items()]
     constants = dict(NEGLIGIBLE_DAMPING=NEGLIGIBLE_DAMPING, COST_FRACTION=COST_FRACTION, DAMPING_RIDGE=DAMPING_RIDGE)
     constants |= dict(MIN_RADIUS=MIN_RADIUS, NEGLIGIBLE_CURVATURE=NEGLIGIBLE_CURVATURE)
+    constants |= dict(EXTRA_DAMPING=EXTRA_DAMPING, FACTOR_RIDGE=FACTOR_RIDGE)
     head += [f"constexpr double {name} = {value!r};" for name, value in constants.items()]
     head += [f"const int {name}[] = {{{', '.join(map(str, values))}}};" for name, values in lists.items()]
     return "\n".join(head) + "\n" + rolled(text("hqp", parts))

@@ -14,16 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import AT_UPPER, INACTIVE
+from ...numerics._constants import AT_UPPER, EXTRA_DAMPING, GUESS_ROUNDOFF, INACTIVE
 from ...numerics._dense import apply, product
 from .._goldfarb_idnani import Constraints, DualState, Roundoff, dual_active_set, initial_state
 from ._padding import LevelProblem
 from ._problem import WorkingSet
-
-_EXTRA_DAMPING = 1e-9
-"""In units of the level's longest row, squared; whatever the level's own damping: the Hessian has to be regular."""
-_ROUNDOFF = 1e-10
-"""The roundoff tolerance of a row's value, in units of the terms that add up to it."""
 
 
 def guess_working_set(
@@ -54,7 +49,7 @@ def _tableau(problem: LevelProblem) -> tuple[Constraints, Float[Array, " h"], Du
     cost = jnp.where(is_equality[:, None], product(level.matrix * scale, problem.projector), 0.0)
     residual = scale * jnp.where(is_equality, apply(level.matrix, x) - jnp.where(is_equality, level.lower, 0.0), 0.0)
     # equality rows are the cost, H = A_e' A_e + (damping + extra) I; inequality rows are constraints with a slack t
-    hessian = product(cost.T, cost) + (damping + _EXTRA_DAMPING) * jnp.eye(len(x), dtype=dtype)
+    hessian = product(cost.T, cost) + (damping + EXTRA_DAMPING) * jnp.eye(len(x), dtype=dtype)
     factor = jax.lax.linalg.cholesky(hessian, symmetrize_input=False)
     unit = jnp.where(problem.is_own, scale, 1.0)  # the rows of the level in the units of its cost
     rows = product(problem.hard * unit[:, None], problem.projector)
@@ -77,7 +72,7 @@ def _tableau(problem: LevelProblem) -> tuple[Constraints, Float[Array, " h"], Du
     ]
     nearest = jnp.minimum(*(jnp.where(jnp.isfinite(bound), jnp.abs(bound), jnp.inf) for bound in bounds))
     terms = unit * problem.length * jnp.max(jnp.abs(x)) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
-    roundoff = root * _ROUNDOFF * (terms + jnp.abs(value))
+    roundoff = root * GUESS_ROUNDOFF * (terms + jnp.abs(value))
     constraints = Constraints(
         lower=bounds[0] * root,
         upper=bounds[1] * root,

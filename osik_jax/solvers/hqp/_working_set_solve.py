@@ -9,14 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ...numerics._constants import WORKING_SET_SOLVES
 from ...numerics._dense import apply, product
 from .._level import Level
 from ._active_rows import ActiveRows, drop_dependent, factor_active_rows, multipliers, restoring_step
 from ._padding import LevelProblem
 from ._problem import Tolerances, WorkingSet
-
-_REFINEMENTS = 2
-"""Solves with one factorisation, each against exact residuals: the first one, and one step of refinement."""
 
 
 class WorkingSetSolution(NamedTuple):
@@ -46,13 +44,13 @@ def solve_on_working_set(
     """
     level = problem.level
     rows = factor_active_rows(problem, working_set.hard, tolerances.rank)
-    rows = jax.lax.optimization_barrier(rows)  # one LAPACK call after another: see osik_jax/runtime.py
+    rows = jax.lax.optimization_barrier(rows)  # one LAPACK call after another: see docs/installation.md
     active = drop_dependent(working_set.hard, rows)
     in_cost = working_set.own != 0
     target = jnp.where(in_cost, jnp.where(working_set.own == 1, level.upper, level.lower), 0.0)
     least_squares_step, rank = factor_least_squares(problem, in_cost, rows, tolerances)
     # rounding over small pivots has components outside the frozen rows' null space, so each step is projected
-    for _ in range(_REFINEMENTS):
+    for _ in range(WORKING_SET_SOLVES):
         x = x + apply(problem.projector, restoring_step(problem, rows, active, x))
         slack = jnp.where(in_cost, apply(level.matrix, x) - target, 0.0)
         x = x + apply(problem.projector, least_squares_step(x, slack))
@@ -120,6 +118,7 @@ def factor_least_squares(
     left = left[: kept.shape[0]]
 
     def step(x: Float[Array, " n"], slack: Float[Array, " m"]) -> Float[Array, " n"]:
+        # damping pulls on the whole of x in the space that is free, not on the step alone
         present = jnp.where(damping > 0.0, apply(active_rows.projector, x), 0.0)
         right = apply(rows, present) - slack
         y = jax.scipy.linalg.solve_triangular(square, apply(left.T, right[order]))
@@ -140,6 +139,7 @@ def wrong_signs(
 
     Forces multiplier * row length are compared with the multiplier tolerance of the gradient's norm, plus ``roundoff``.
     """
+    # a force is positive where it holds x back: at an upper bound (1) downhill points up, at a lower (-1) down
     force = multiplier * active * problem.length
     return (active != 0) & (force < -tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) - roundoff)
 
@@ -162,6 +162,7 @@ def _is_feasible(
     problem: LevelProblem, active: Int[Array, " h"], x: Float[Array, " n"], tolerances: Tolerances
 ) -> Bool[Array, ""]:
     """Check that no inactive hard row is violated by more than roundoff."""
+    # roundoff of a product: the length of the row times that of x
     value = apply(problem.hard, x)
     violation = jnp.maximum(problem.lower - value, value - problem.upper)
     tolerance = tolerances.feasible * (problem.length * jnp.max(jnp.abs(x)) + jnp.abs(value))
@@ -174,6 +175,7 @@ def _is_consistent(
     """Check that the rows in the cost are those outside their interval, on the side that was assumed."""
     value = apply(level.matrix, x)
     tolerance = tolerances.feasible * (level.length * jnp.max(jnp.abs(x)) + jnp.abs(value))
+    # a row in the cost is outside on its side; one that is not is inside; an equality is always in it
     below, above = level.lower - value, value - level.upper
     inside = (own == 0) & (jnp.maximum(below, above) <= tolerance)
     outside = ((own == -1) & (below >= -tolerance)) | ((own == 1) & (above >= -tolerance))

@@ -63,6 +63,7 @@ def _by_numba(
 ) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
     batch, n = secondary.shape
     m = max(level.lower.shape[1] for level in levels)
+    # memory of one problem; XLA allocates it as one more result
     r = min(m, n)
     space = (n + 11) * (n + m) + 2 * m**2 + r * (m + 2 * r)  # as ``Work`` in the kernel
     equal = [jax.vmap(lambda one: one.equal)(level) for level in levels]

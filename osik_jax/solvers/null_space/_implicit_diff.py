@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._backends import Backend
 from ...execution._rules import custom_jvp
+from ...numerics._constants import DERIVATIVE_RANK
 from ...numerics._dense import apply, product
 from .._damping import narrow_box
 from ._padding import Problem, initial_point
@@ -30,10 +31,6 @@ class ActiveJoints(NamedTuple):
     blocking: Int[Array, " n"]  # the joints that limit the level's scale, likewise
     blocker: Int[Array, ""]  # the one of them that the others determine
 
-
-_RANK_TOL = 1e-7
-"""A saturated joint with less of its column of the projector outside the span of the others has no derivative of its
-own."""
 
 Answer = tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, " L"]]
 """x, the projector, and the scales."""
@@ -87,7 +84,7 @@ def _level(
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
     """Return x, the projector, and the scale of one level."""
     scale, projector = _scale_and_projector(problem, joints)
-    # one factorisation after another: see osik_jax/runtime.py
+    # one factorisation after another: see docs/installation.md
     scale, active = jax.lax.optimization_barrier((scale, joints.active))
     dual = _dual_basis(problem.projector, active)
     x = jnp.where(active != 0, problem.bound(active), _at_bounds(problem, scale, active, dual))
@@ -126,7 +123,7 @@ def _dual_basis(projector: Float[Array, "n n"], active: Int[Array, " n"]) -> Flo
     valid = active[order] != 0
     basis, triangle = jnp.linalg.qr(jnp.where(valid, projector[:, order], 0.0))
     eye = jnp.eye(len(active), dtype=projector.dtype)
-    valid = valid & (jnp.abs(jnp.diagonal(triangle)) > _RANK_TOL)
+    valid = valid & (jnp.abs(jnp.diagonal(triangle)) > DERIVATIVE_RANK)
     both = valid[:, None] & valid[None, :]
     inverse = jax.scipy.linalg.solve_triangular(jnp.where(both, triangle, eye), eye)
     # C = R^-1 Q'

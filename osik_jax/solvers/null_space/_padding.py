@@ -64,6 +64,7 @@ def pad_levels(
     n, dtype = len(lower), lower.dtype
     targets = [jnp.zeros(n, dtype)] * len(levels)
     if secondary is not None:
+        # a level without rows keeps nothing and asks for the motion towards its target
         no_bounds = jnp.zeros(0, dtype)
         levels = [*levels, Level(jnp.zeros((0, n), dtype), no_bounds, no_bounds)]
         targets, damping = [*targets, secondary], [*damping, jax.tree.map(jnp.zeros_like, damping[0])]
@@ -83,6 +84,7 @@ def _pad(level: Level, count: int) -> PaddedLevel:
     more = count - len(level.lower)
     return PaddedLevel(
         jnp.pad(level.matrix, ((0, more), (0, 0))),
+        # rows that pad are unbounded: they are met everywhere
         jnp.pad(level.lower, (0, more), constant_values=-jnp.inf),
         jnp.pad(level.upper, (0, more), constant_values=jnp.inf),
         jnp.pad(level.equal, (0, more)),

@@ -14,9 +14,6 @@ from ...numerics._dense import apply
 from ..hqp import Level
 from ._padding import PaddedLevel
 
-RANK_TOLERANCE = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
-"""By the precision of the data, whose roundoff makes dependent rows independent."""
-
 
 class NullSpaceSolution(eqx.Module):
     """Answer of the projection.

@@ -38,26 +38,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._double import first_smallest
 from ...execution._lanes import choose
-from ...numerics._constants import AT_UPPER, INACTIVE, SATURATION_RESIDUAL
+from ...numerics._constants import (
+    AT_UPPER,
+    INACTIVE,
+    INDEPENDENCE_TOL,
+    MAX_SATURATION_REFINEMENTS,
+    MISSING_COMPLIANCE,
+    NEGLIGIBLE_ENTRY,
+    SATURATION_ACCURACY,
+    SATURATION_ATTEMPTS,
+    SATURATION_RESIDUAL,
+    SATURATION_ROUNDOFF,
+)
 from ...numerics._dense import apply
 from .._box import clip_to_box
 from .._goldfarb_idnani import Constraints, DualState, Roundoff, dual_active_set, initial_state
-
-_COMPLIANCE = 1e-7
-"""Of the missing part of the motion: the squared length of x that it outweighs."""
-_ROUNDOFF = 1e-11
-"""Relative to the terms that x is made of: a smaller violation of a bound counts as none."""
-_INDEPENDENCE_TOL = 1e-5
-"""Relative to a combination of joints: where the null space changes it by less, it does not change it."""
-_NEGLIGIBLE_ENTRY = 1e-7
-"""Joints with a smaller entry in the combination do not block the motion."""
-_MAX_ATTEMPTS = 6
-"""Where an answer is not accepted, the next attempt has a lower compliance, and only the part of the motion near the
-scale that was found: motions that are too large for their box by orders of magnitude lose digits."""
-_ACCURACY = 1e-15
-"""Relative to the terms that x is made of: an answer with a smaller residual is not refined."""
-_MAX_REFINEMENTS = 5
-"""Of the answer; one is the rule."""
 
 
 class ScaledMotion(NamedTuple):
@@ -111,7 +106,7 @@ def solve_scaled_motion(problem: ScaledMotion, max_iterations: int) -> Saturatio
         # ``part``: of the motion that this attempt considers
         number, part, before = carry
         # a lower compliance in every other attempt: a stiffer penalty on the missing part
-        compliance = _COMPLIANCE * jnp.where(number % 2 == 1, 0.1, 1.0).astype(part.dtype)
+        compliance = MISSING_COMPLIANCE * jnp.where(number % 2 == 1, 0.1, 1.0).astype(part.dtype)
         partial_motion = problem._replace(motion=part[:, None] * problem.motion)
         result = _attempt(partial_motion, compliance, ~before.done, max_iterations)
         is_blocked = (result.blocking != 0).any(-1)
@@ -124,7 +119,7 @@ def solve_scaled_motion(problem: ScaledMotion, max_iterations: int) -> Saturatio
 
     def is_running(carry: tuple[Array, Array, SaturationResult]) -> Array:
         number, _, result = carry
-        return (number < _MAX_ATTEMPTS) & ~jnp.all(result.done) & jnp.any(result.iterations < max_iterations)
+        return (number < SATURATION_ATTEMPTS) & ~jnp.all(result.done) & jnp.any(result.iterations < max_iterations)
 
     return jax.lax.while_loop(is_running, attempt, (zeros[0], ones, start))[2]
 
@@ -148,7 +143,7 @@ def _tableau(problem: ScaledMotion, compliance: Float[Array, ""]) -> tuple[Const
     diagonal = jnp.diagonal(tableau)
     root = 1.0 / jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
     value = problem.unbounded(jnp.ones((), unit.dtype))
-    roundoff = root * _ROUNDOFF * problem.size(jnp.ones((), unit.dtype))
+    roundoff = root * SATURATION_ROUNDOFF * problem.size(jnp.ones((), unit.dtype))
     constraints = Constraints(
         lower=problem.lower * root,
         upper=problem.upper * root,
@@ -191,8 +186,8 @@ def _active_set(problem: ScaledMotion, root: Float[Array, " n"], end: DualState)
     normal = -apply(inverse, _motion_direction(problem))
     largest = jnp.max(jnp.abs(normal))
     normal = normal / jnp.where(largest > 0.0, largest, 1.0)
-    normal = jnp.where(jnp.abs(normal) > _NEGLIGIBLE_ENTRY, normal, 0.0)
-    blocks = (largest > 0.0) & (jnp.max(jnp.abs(apply(problem.projector, normal))) <= _INDEPENDENCE_TOL)
+    normal = jnp.where(jnp.abs(normal) > NEGLIGIBLE_ENTRY, normal, 0.0)
+    blocks = (largest > 0.0) & (jnp.max(jnp.abs(apply(problem.projector, normal))) <= INDEPENDENCE_TOL)
     blocker = first_smallest(-jnp.abs(normal))
     removed = blocks & (jnp.arange(len(normal)) == blocker)
     # the inverse of the block without the blocker, and multipliers without the part of the penalty's order
@@ -230,7 +225,7 @@ def _refined(problem: ScaledMotion, active_set: _ActiveSet) -> _Iterate:
 
     def is_running(carry: tuple[Array, _Iterate]) -> Array:
         residual = jnp.maximum(carry[1].bound_residual, carry[1].normal_residual)
-        return (carry[0] < _MAX_REFINEMENTS) & jnp.any(residual > _ACCURACY)
+        return (carry[0] < MAX_SATURATION_REFINEMENTS) & jnp.any(residual > SATURATION_ACCURACY)
 
     first = jax.vmap(_evaluate)(problem, active_set, active_set.normal, active_set.y)
     return jax.lax.while_loop(is_running, body, (jnp.zeros((), jnp.int32), first))[1]

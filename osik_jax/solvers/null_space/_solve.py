@@ -12,12 +12,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._errors import OsikValueError
 from ...execution._backends import Backend, check_backend, here, takes
+from ...numerics._constants import NULL_SPACE_RANK
 from .._box import clip_to_box, uncrossed
 from .._damping import Damping, per_level
 from .._status import Status
 from ..hqp import Level
 from ._dispatch import project
-from ._problem import RANK_TOLERANCE, NullSpaceSolution, is_finite
+from ._problem import NullSpaceSolution, is_finite
 from ._reverse import solve_reverse
 from ._saturation import BoundedAnswer, solve_saturated
 
@@ -83,6 +84,7 @@ def solve_nullspace(
     if box is not None and order == "reverse":
         raise OsikValueError("bounds need order='forward': saturation goes from the highest level down")
     # bounds with lower > upper become equalities halfway; the status says so
+    # without a secondary motion x is the smallest: the motion towards 0
     motion = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
     levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True)
     bounds_are_ordered = ~jnp.stack(crossed).any()
@@ -91,7 +93,7 @@ def solve_nullspace(
     is_valid = is_finite(levels, motion, *dampings) & (True if box is None else _exist(*box))
     valid, motion, dampings = _or_zeros(is_valid, (list(levels), motion, dampings))
     scaled = [level.scaled() for level in valid]
-    rank_tol = RANK_TOLERANCE[dtype] if rank_tolerance is None else rank_tolerance
+    rank_tol = NULL_SPACE_RANK[dtype] if rank_tolerance is None else rank_tolerance
     one_each = [Damping(*parts) for parts in zip(*dampings, strict=True)]
     if box is None:
         if order == "forward":

@@ -41,6 +41,7 @@ class Quadratic(eqx.Module):
         """Return R with R'R = H over the free variables, ones for the others (Cholesky, with a ridge of roundoff)."""
         eps = 10.0 * float(jnp.finfo(self.matrix.dtype).eps)
         square = jnp.where(free[:, None] & free[None, :], self.matrix, 0.0)
+        # relative to the largest diagonal element, so that a semidefinite H has a factor too
         ridge = jnp.where(free, eps * jnp.max(jnp.diagonal(square), initial=eps), 1.0)
         return jax.lax.linalg.cholesky(square + jnp.diag(ridge), symmetrize_input=False).T
 
@@ -90,6 +91,7 @@ class LeastSquares(eqx.Module):
     def gradient_scale(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """Return the sums of the absolute terms of the gradient, in proportion to which roundoff is, (n,)."""
         size = jnp.abs(self.matrix)
+        # the terms that cancel in A x - b count one by one, and so do those of the damping
         residual_scale = self.weight * (apply(size, jnp.abs(x)) + jnp.abs(self.target))
         return apply(size.T, residual_scale) + self.damping * (jnp.abs(x) + jnp.abs(self.center))
 
@@ -100,6 +102,7 @@ class LeastSquares(eqx.Module):
 
     def curvature_bound(self) -> Float[Array, " n"]:
         """Return the diagonal of a matrix that is no less than the Hessian: row sums of |A|'W|A| + D, (n,)."""
+        # |x'A'WA x| <= sum_ij |x_i| (|A|'W|A|)_ij |x_j| <= sum_i (row sum)_i x_i^2
         size = jnp.abs(self.matrix)
         return apply(size.T, self.weight * jnp.sum(size, 1)) + self.damping
 

@@ -19,32 +19,30 @@ from ...execution._backends import Backend, on_platforms, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_a_few, with_the_rest
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ...numerics._constants import (
+    AT_LOWER,
+    AT_UPPER,
+    EQUALITY,
+    GRADIENT_TOL,
+    INACTIVE,
+    KKT_TOLERANCE,
+    SIGN_TOL,
+    SINGLE_TOL,
+    VALUE_TOL,
+)
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
 from . import _numba, _warp
 from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
-from ._problem import KKT_TOLERANCE, QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, unpack
+from ._problem import QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, unpack
 from ._search import SearchResult, initial_result, search, usable_guess, violated_conditions
 
 _BLOCKS, _MIN_BLOCK = 16, 1024
 """On a GPU, problems that are left are searched in blocks of a 16th of the batch, of 1,024 problems at least."""
 _BLOCK_ON_CPU = 4
 
-_SINGLE_TOL = 1e-7
-"""Smallest tolerance of a kernel in single precision, and of its certificate; the search has the one asked for."""
-
-_VALUE_TOL, _SIGN_TOL = 30.0, 2.0
-"""In units of the tolerance: how far a certified value may be off its bound, or a gradient from 0; and how large a
-multiplier of the wrong sign may be.
-
-The latter is smaller: such a multiplier says that the active set is not right, and what that costs is more the weaker
-the curvature is that the rows leave."""
-
-_GRADIENT_TOL = 4.0
-"""In units of machine epsilon times the gradient's terms: how large a certified gradient of a free variable may be."""
 
 Solve = Callable[[QP, Array, Array, int], Candidate]
 
@@ -82,7 +80,7 @@ def warp_candidates(solve: Solve, max_iterations: int) -> Candidates:
     """
 
     def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
-        start, single = jax.vmap(usable_guess)(qp, guess), jnp.maximum(tolerance, _SINGLE_TOL)
+        start, single = jax.vmap(usable_guess)(qp, guess), jnp.maximum(tolerance, SINGLE_TOL)
         candidate = solve(qp, start, single, max_iterations)
         result = _as_result(qp, candidate)
         is_certified = (candidate.converged != 0) & (candidate.iterations <= max_iterations)
@@ -165,13 +163,14 @@ def _is_certified(qp: QP, result: SearchResult, tolerance: Float[Array, ""]) -> 
     n = len(x)
     is_active = active != INACTIVE
     scales = constraint_scales(qp, qp.cost.diagonal(), x, y)
-    roundoff = Roundoff(_VALUE_TOL * tolerance * scales.value, _SIGN_TOL * tolerance * scales.multiplier)
+    roundoff = Roundoff(VALUE_TOL * tolerance * scales.value, SIGN_TOL * tolerance * scales.multiplier)
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
+    # an active constraint: x_i = bound, or c'x + compliance y = bound (a soft row is missed by -compliance y)
     off = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * y]) - active_bounds(qp, active)
     # labels that exist, and "equality" where there is one
     valid_label = (jnp.abs(active) == 1) | ~is_active | ((active == EQUALITY) & qp.equality)
     at_bound = jnp.where(is_active, jnp.abs(off) <= roundoff.value, valid_label)
-    gradient_is_zero = jnp.abs(gradient) <= _VALUE_TOL * tolerance * scales.multiplier[:n]
+    gradient_is_zero = jnp.abs(gradient) <= VALUE_TOL * tolerance * scales.multiplier[:n]
     stationary = jnp.where(is_active, valid_label, jnp.concatenate([gradient_is_zero, y == 0.0]))
     valid = jnp.isfinite(jnp.concatenate([x, y])) & at_bound & stationary
     return valid & ~violated_conditions(qp, result, x, y, roundoff)
@@ -181,9 +180,10 @@ def _is_stationary(qp: QP, result: SearchResult) -> Bool[Array, " n"]:
     """Check that the gradient at each variable is roundoff, or points out of the active bound."""
     downhill = apply(qp.rows.T, result.row_multipliers) - qp.cost.gradient(result.x)
     active = result.active[: len(downhill)]
+    # a variable at its lower bound may be pulled down but not up, and the other way round
     may_rise, may_fall = (active == INACTIVE) | (active == AT_LOWER), (active == INACTIVE) | (active == AT_UPPER)
     eps = float(jnp.finfo(downhill.dtype).eps)
-    roundoff = _GRADIENT_TOL * eps * gradient_scale(qp, result.x, result.row_multipliers)
+    roundoff = GRADIENT_TOL * eps * gradient_scale(qp, result.x, result.row_multipliers)
     return (~may_rise | (downhill <= roundoff)) & (~may_fall | (-downhill <= roundoff))
 
 
@@ -219,7 +219,7 @@ def _solve_kkt_by_warp(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B
         lower=jnp.where(is_equality, bound, -jnp.inf),
         upper=jnp.where(is_equality, bound, jnp.inf),
     )
-    tolerance = jnp.full(len(active), _SINGLE_TOL, center.dtype)
+    tolerance = jnp.full(len(active), SINGLE_TOL, center.dtype)
     candidate = _warp.solve(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
     point = jnp.concatenate([candidate.x, jnp.where(active_rows, candidate.row_multipliers, 0.0)], 1)
     done = (candidate.converged != 0) & jnp.isfinite(point).all(1)

@@ -18,15 +18,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import INACTIVE
+from ...numerics._constants import INACTIVE, KKT_RIDGE, LAST_CORRECTION, MAX_REFINEMENTS
 from ...numerics._dense import apply, product
 from ._problem import QP, active_bounds
-
-_LAST_CORRECTION = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}
-"""Relative to the answer: a smaller correction is the last; the next would be its square, or roundoff."""
-_MAX_REFINEMENTS = 5
-_RIDGE = {jnp.dtype("float64"): 10.0, jnp.dtype("float32"): 1.0}
-"""In units of machine epsilon times the diagonal: keeps the factor of a semidefinite Hessian from breaking."""
 
 
 class KKTFactor(NamedTuple):
@@ -52,7 +46,7 @@ def factorize(qp: QP, hessian: Float[Array, "n n"], active: Int[Array, " n_and_p
     free, active_rows = active[:n] == INACTIVE, active[n:] != INACTIVE
     # H_F = L L', with a row and a column of the identity for each variable that is not free
     diagonal = jnp.diagonal(hessian)
-    ridge = _RIDGE[hessian.dtype] * eps * jnp.where(diagonal > 0.0, diagonal, jnp.maximum(jnp.max(diagonal), eps))
+    ridge = KKT_RIDGE[hessian.dtype] * eps * jnp.where(diagonal > 0.0, diagonal, jnp.maximum(jnp.max(diagonal), eps))
     square = jnp.where(free[:, None] & free[None, :], hessian, 0.0)
     lower = cholesky(square + jnp.diag(jnp.where(free, ridge, 1.0)))
     rows = jnp.where(active_rows[:, None] & free[None, :], qp.rows, 0.0)
@@ -79,10 +73,11 @@ def solve_on_active_set(
     def correction(x: Array, y: Array) -> tuple[Array, Array]:
         return jax.vmap(_correction)(qp, factor, target, x, y)
 
+    # variables that are not free are at their bounds from the start, and the corrections leave them there
     x, y = jnp.where(factor.free, 0.0, target[:, :n]), jnp.zeros_like(target[:, n:])
     dx, dy = correction(x, y)
     root = jnp.abs(jnp.diagonal(factor.cholesky, axis1=1, axis2=2))
-    limit = jnp.asarray(_LAST_CORRECTION[x.dtype], x.dtype)
+    limit = jnp.asarray(LAST_CORRECTION[x.dtype], x.dtype)
     return refine(correction, x + dx, y + dy, root=root, limit=limit)[:2]
 
 
@@ -106,7 +101,7 @@ def refine(
 
     def is_running(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         *_, relative, count = state
-        return jnp.any(relative > limit) & (count < _MAX_REFINEMENTS)
+        return jnp.any(relative > limit) & (count < MAX_REFINEMENTS)
 
     def again(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         x, y, _, count = state
@@ -119,6 +114,7 @@ def refine(
 
 
 def _relative_size(dx: Float[Array, " n"], x: Float[Array, " n"]) -> Float[Array, ""]:
+    # tiny stands for 0: nothing that moves is infinitely large beside an x of 0
     return jnp.max(jnp.abs(dx)) / jnp.maximum(jnp.max(jnp.abs(x)), jnp.finfo(x.dtype).tiny)
 
 
@@ -135,6 +131,7 @@ def solve_kkt(
     factor: KKTFactor, downhill: Float[Array, " n"], gap: Float[Array, " p"]
 ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
     """Return dx, dy with H dx - C'dy = downhill over the free variables and C dx + E dy = gap over the active rows."""
+    # block elimination: dy = S^-1 (gap - C_F H_F^-1 r), dx = H_F^-1 (r + C_F' dy)
     step = backward(factor.cholesky, forward(factor.cholesky, jnp.where(factor.free, downhill, 0.0)))
     if not len(gap):
         return step, gap
@@ -156,6 +153,7 @@ def kkt_inverse(
 
     def solve(right: Array) -> Array:
         x, y = jnp.zeros_like(right[:n]), jnp.zeros_like(right[n:])
+        # the second pass solves for the residual of the first
         for _ in range(2):
             downhill = right[:n] - qp.cost.hessian_product(x) + apply(qp.rows.T, y)
             gap = -right[n:] - apply(qp.rows, x) - qp.compliance * y

@@ -11,16 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, INACTIVE
+from ...numerics._constants import AT_LOWER, AT_UPPER, INACTIVE, ZERO_TOL
 from ...numerics._dense import apply
 from .._box import violation
 from .._certificate import relative_kkt_residual
 from ._cost import LeastSquares, Quadratic
-
-KKT_TOLERANCE = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
-"""The largest ``kkt_residual`` of an answer that is SOLVED, by the precision of the data."""
-_ZERO_TOL = 100.0
-"""In units of machine epsilon times the Newton step at x: an x that is no larger counts as 0."""
 
 
 class QP(eqx.Module):
@@ -139,7 +134,7 @@ def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"
     newton = jnp.abs(qp.cost.gradient(x)) / root**2
     sizes = jnp.stack([jnp.abs(x) * root, newton * root, jnp.abs(x), newton])
     scaled, scaled_newton, plain, plain_newton = jnp.max(sizes, 1, initial=0.0)
-    is_zero = scaled <= _ZERO_TOL * jnp.finfo(x.dtype).eps * scaled_newton
+    is_zero = scaled <= ZERO_TOL * jnp.finfo(x.dtype).eps * scaled_newton
     # what a constraint's value may be for such an x: in curvature units and in units of the variables, the smaller
     per_curvature = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
     per_unit = jnp.concatenate([jnp.ones_like(x), jnp.sum(jnp.abs(qp.rows), 1)])

@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ...numerics._constants import GRADIENT_STEPS
 from ...numerics._dense import apply
 from .._box import clip_to_box, violation
 from ._problem import QP, softened_compliance
-
-_ITERATIONS = 100
 
 
 def projected_gradient(qp: QP) -> Float[Array, " n"]:
@@ -32,4 +31,4 @@ def projected_gradient(qp: QP) -> Float[Array, " n"]:
         gradient = qp.cost.gradient(x) + apply(qp.rows.T, penalty * violation(apply(qp.rows, x), *intervals))
         return clip_to_box(x - gradient / jnp.where(bound > 0.0, bound, 1.0), *box)
 
-    return jax.lax.fori_loop(0, _ITERATIONS, step, clip_to_box(jnp.zeros_like(bound), *box))
+    return jax.lax.fori_loop(0, GRADIENT_STEPS, step, clip_to_box(jnp.zeros_like(bound), *box))

@@ -23,28 +23,26 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._double import first_smallest
 from ...execution._lanes import choose
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ...numerics._constants import (
+    AT_LOWER,
+    AT_UPPER,
+    COMPLIANCE_DECREASE,
+    EQUALITY,
+    INACTIVE,
+    MAX_JOINT_RELEASES,
+    MAX_UPDATES,
+    NEWTON_ROUNDOFF,
+    PENALTY,
+    SHORTEST_STEP,
+    SMALL_STEP,
+    STEP_LENGTHS,
+    UNCHANGED,
+    ZERO_GRADIENT,
+)
 from ...numerics._dense import apply
 from .._box import violation
 from .._certificate import is_farkas_certificate
 from ._problem import QP, constraint_scales, gradient_scale, softened_compliance
-
-_STIFFNESS = 1e5
-"""Curvature of a hard row relative to the largest of the cost: an update reduces its violation to about 1e-5 of it."""
-_SHORTEST_STEP, _STEP_LENGTHS = 1e-9, 31
-_ROUNDOFF = 4e-15
-"""Relative to the terms of the gradient; a variable with a smaller gradient is stationary."""
-_SMALL_STEP = 1e-13
-"""Relative to x; a Newton step that is shorter is the last on its face."""
-_MAX_JOINT_RELEASES = 10
-"""Iterations in which all bounds that the gradient points away from are released at once; then one at a time."""
-_MAX_UPDATES = 40
-_COMPLIANCE_DECREASE = 0.1
-"""Factor of the compliance of infeasible hard rows, where a bound keeps x from the least violation."""
-_ZERO_GRADIENT = 1e-9
-"""Cosine of the angle between the violation and a column of C; a smaller one is 0."""
-_UNCHANGED = 1e-9
-"""Relative to x; the least violation has been found where an update moves x by less."""
 
 
 class NewtonState(NamedTuple):
@@ -124,7 +122,7 @@ def _initial_state(qp: QP, start: Float[Array, " n"], iterations: Int[Array, ""]
     return NewtonState(
         x=x,
         multiplier=jnp.zeros_like(qp.compliance),
-        compliance=softened_compliance(qp, _STIFFNESS),
+        compliance=softened_compliance(qp, PENALTY),
         last_x=x,
         updates=zero,
         iterations=iterations,
@@ -166,8 +164,8 @@ def _iterate(feasibility_tol: float, qp: QP, s: NewtonState) -> NewtonState:
 def _newton_iteration(qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
     newton = _newton_step(qp, s, at)
     root = jnp.sqrt(qp.cost.diagonal())
-    is_small = jnp.max(jnp.abs(newton) * root) <= _SMALL_STEP * jnp.max(jnp.abs(s.x) * root)
-    roundoff = _ROUNDOFF * gradient_scale(qp, s.x, at.multipliers)
+    is_small = jnp.max(jnp.abs(newton) * root) <= SMALL_STEP * jnp.max(jnp.abs(s.x) * root)
+    roundoff = NEWTON_ROUNDOFF * gradient_scale(qp, s.x, at.multipliers)
     is_stationary = jnp.all(~at.free | (jnp.abs(at.gradient) <= roundoff))
     # three ways to stop: a Newton step of roundoff, a gradient of roundoff, a line search without descent
     step, descends, is_full, is_inside = _line_search(qp, s, at, newton)
@@ -179,7 +177,7 @@ def _newton_iteration(qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
         x=_add_step(qp, s.x, step),
         iterations=s.iterations + 1,
         steps=s.steps + 1,
-        single_release=s.single_release | (stops & ~is_last) | (s.steps >= _MAX_JOINT_RELEASES),
+        single_release=s.single_release | (stops & ~is_last) | (s.steps >= MAX_JOINT_RELEASES),
         on_face=jnp.where(s.single_release, stops | is_full, is_small | is_stationary),
         at_minimiser=is_last,
     )
@@ -190,7 +188,7 @@ def _add_step(qp: QP, x: Float[Array, " n"], step: Float[Array, " n"]) -> Float[
     lower, upper = _box(qp)
     new = jnp.clip(x + step, lower, upper)
     bound = jnp.where(step > 0.0, upper, lower)
-    distance, roundoff = jnp.abs(new - bound), _ROUNDOFF * (jnp.abs(bound) + jnp.abs(x))
+    distance, roundoff = jnp.abs(new - bound), NEWTON_ROUNDOFF * (jnp.abs(bound) + jnp.abs(x))
     return jnp.where((step != 0.0) & jnp.isfinite(bound) & (distance <= roundoff), bound, new)
 
 
@@ -231,7 +229,7 @@ def _line_search(
     ahead = jnp.where(newton > 0.0, upper - s.x, lower - s.x)
     to_bound = jnp.min(jnp.where(newton != 0.0, ahead / jnp.where(newton != 0.0, newton, 1.0), jnp.inf))
     # geometrically decreasing step lengths, and the one to the first bound
-    lengths = _SHORTEST_STEP ** jnp.linspace(0.0, 1.0, _STEP_LENGTHS)
+    lengths = SHORTEST_STEP ** jnp.linspace(0.0, 1.0, STEP_LENGTHS)
     lengths = jnp.concatenate(
         [
             jnp.where(s.single_release, jnp.clip(to_bound, 0.0, 1.0), 1.0) * lengths,
@@ -275,13 +273,13 @@ def _update_multipliers(feasibility_tol: float, qp: QP, s: NewtonState, at: Line
     feasible = (infeasibility <= 1e-3) | ((infeasibility <= 1.0) & (infeasibility > 0.1 * s.infeasibility))
     turns_infeasible = certified & ~s.infeasible
     root = jnp.sqrt(qp.cost.diagonal())
-    unchanged = jnp.max(jnp.abs(s.x - s.last_x) * root) <= _UNCHANGED * jnp.max(jnp.abs(s.x) * root)
+    unchanged = jnp.max(jnp.abs(s.x - s.last_x) * root) <= UNCHANGED * jnp.max(jnp.abs(s.x) * root)
     is_least = _is_least_violation(qp, s.x, gap)
-    is_last = s.updates + 1 >= _MAX_UPDATES
+    is_last = s.updates + 1 >= MAX_UPDATES
     converged = jnp.where(s.infeasible, certified & ((unchanged & is_least) | is_last), feasible & ~turns_infeasible)
     # once infeasible, all hard rows get one compliance: x then goes to the least violation in the Euclidean norm
     equal = jnp.max(jnp.where(hard, s.compliance, 0.0), initial=0.0)
-    reduced = jnp.where(s.infeasible & unchanged & ~is_least, _COMPLIANCE_DECREASE, 1.0) * s.compliance
+    reduced = jnp.where(s.infeasible & unchanged & ~is_least, COMPLIANCE_DECREASE, 1.0) * s.compliance
     multiplier = jnp.where(converged, s.multiplier, 0.0)
     return s._replace(
         multiplier=jnp.where(hard & ~turns_infeasible & ~converged, at.multipliers, multiplier),
@@ -309,7 +307,7 @@ def _is_least_violation(qp: QP, x: Float[Array, " n"], gap: Float[Array, " p"]) 
     gradient = apply(qp.rows.T, gap)
     inward = jnp.where(x <= lower, -gradient, jnp.where(x >= upper, gradient, jnp.abs(gradient)))
     inward = jnp.where(lower == upper, 0.0, inward)
-    return jnp.all(inward <= _ZERO_GRADIENT * jnp.linalg.norm(qp.rows, axis=0) * jnp.linalg.norm(gap))
+    return jnp.all(inward <= ZERO_GRADIENT * jnp.linalg.norm(qp.rows, axis=0) * jnp.linalg.norm(gap))
 
 
 def _result(qp: QP, s: NewtonState) -> NewtonResult:

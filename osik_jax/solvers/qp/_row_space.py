@@ -21,19 +21,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import INACTIVE
+from ...numerics._constants import (
+    INACTIVE,
+    MAX_CONTRACTION,
+    MAX_ROW_RATIO,
+    ROW_SPACE_ACCURACY,
+    ROW_SPACE_CORRECTION,
+    ROW_SPACE_PIVOT,
+)
 from ...numerics._dense import apply, product
 from ._cost import LeastSquares
 from ._kkt_solve import backward, cholesky, forward, refine
 from ._problem import QP, active_bounds
-
-_MAX_ROW_RATIO = 0.9
-"""Rows per variable, beyond which the factor of the Hessian is as quick."""
-_SMALLEST_PIVOT = 1e4
-"""In units of machine epsilon times the diagonal element: a smaller pivot says that rows depend on each other."""
-_MAX_CONTRACTION = 1e-4
-_LAST_CORRECTION, _ACCURACY = 1e-6, 1e-13
-"""The last correction is smaller than the first relative to x, and the next one would be smaller than the second."""
 
 
 class RowFactor(NamedTuple):
@@ -53,7 +52,7 @@ def has_few_rows(qp: QP) -> bool:
     if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float64:
         return False
     _, m, n = qp.cost.matrix.shape
-    return m + qp.rows.shape[1] <= _MAX_ROW_RATIO * n
+    return m + qp.rows.shape[1] <= MAX_ROW_RATIO * n
 
 
 def solve_in_row_space(
@@ -64,7 +63,7 @@ def solve_in_row_space(
     target = jax.vmap(active_bounds)(qp, active)
     x, y = jax.vmap(_first_solve)(qp, factor, target)
     root = jnp.sqrt(jax.vmap(lambda one: one.cost.diagonal())(qp))
-    limit = jnp.minimum(_ACCURACY / factor.contraction, _LAST_CORRECTION)
+    limit = jnp.minimum(ROW_SPACE_ACCURACY / factor.contraction, ROW_SPACE_CORRECTION)
     x, y, converged = refine(lambda x, y: jax.vmap(_correction)(qp, factor, target, x, y), x, y, root=root, limit=limit)
     return x, y, factor.is_valid & converged
 
@@ -73,10 +72,12 @@ def _factorize(qp: QP, active: Int[Array, " n_and_p"]) -> RowFactor:
     cost, n = qp.cost, active.shape[0] - qp.rows.shape[0]
     assert isinstance(cost, LeastSquares)
     free, active_rows = active[:n] == INACTIVE, active[n:] != INACTIVE
+    # with B = [sqrt(W) A; C] D_F^(-1/2): (D + A'WA)^-1 by Woodbury is D^-1/2 (I - B'(B B' + E)^-1 B) D^-1/2
     root = jnp.where(free, 1.0 / jnp.sqrt(cost.damping), 0.0)
     active_part = jnp.where(active_rows[:, None], qp.rows, 0.0)
     rows = jnp.concatenate([jnp.sqrt(cost.weight)[:, None] * cost.matrix, active_part])
     scaled = rows * root
+    # E: 1 for rows of the cost, the compliance for active rows; inactive rows are 0 in B and get a 1
     ones = jnp.concatenate([jnp.ones_like(cost.weight), jnp.where(active_rows, qp.compliance, 1.0)])
     schur = product(scaled, scaled.T) + jnp.diag(ones)
     lower = cholesky(schur)
@@ -84,8 +85,8 @@ def _factorize(qp: QP, active: Int[Array, " n_and_p"]) -> RowFactor:
     diagonal, m = jnp.diagonal(schur), len(cost.weight)
     # the largest diagonal element is weight / damping of a row, whose roundoff each correction leaves
     contraction = eps * jnp.max(diagonal[:m], initial=1.0)
-    pivots_are_large = jnp.all(jnp.diagonal(lower) ** 2 >= _SMALLEST_PIVOT * eps * diagonal)
-    is_valid = pivots_are_large & (contraction <= _MAX_CONTRACTION)
+    pivots_are_large = jnp.all(jnp.diagonal(lower) ** 2 >= ROW_SPACE_PIVOT * eps * diagonal)
+    is_valid = pivots_are_large & (contraction <= MAX_CONTRACTION)
     return RowFactor(free, active_rows, root, scaled, lower, contraction, is_valid)
 
 
@@ -93,6 +94,7 @@ def _solve(
     factor: RowFactor, right: Float[Array, " m_and_p"], downhill: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " m_and_p"]]:
     """Return dx, z with D dx - B'z = downhill and B dx + diag(1, compliance) z = right, B in the units of ``right``."""
+    # the damping's own step, then what the rows add to it: z = S^-1 (right - B D^-1/2 downhill)
     scaled_step = factor.root * downhill
     z = backward(factor.cholesky, forward(factor.cholesky, right - apply(factor.scaled, scaled_step)))
     return factor.root * (scaled_step + apply(factor.scaled.T, z)), z
@@ -108,6 +110,7 @@ def _first_solve(
     x = jnp.where(factor.free, cost.center, target[:n])
     residual = jnp.sqrt(cost.weight) * (cost.target - apply(cost.matrix, x))
     gap = jnp.where(factor.active_rows, target[n:] - apply(qp.rows, x), 0.0)
+    # at the center the gradient of the damping is 0, so that the rows' residual is the whole right side
     dx, z = _solve(factor, jnp.concatenate([residual, gap]), jnp.zeros_like(x))
     return x + dx, z[m:]
 

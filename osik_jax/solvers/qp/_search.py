@@ -16,23 +16,27 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._double import in_double
 from ...execution._lanes import choose, with_a_few
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ...numerics._constants import (
+    AT_LOWER,
+    AT_UPPER,
+    EQUALITY,
+    INACTIVE,
+    KKT_TOLERANCE,
+    MAX_INFEASIBLE,
+    MAX_ROUNDS,
+    REDUNDANCY_TOL,
+    RELAXED,
+    SOFT_COMPLIANCE,
+)
 from ...numerics._dense import apply
-from .._goldfarb_idnani import REDUNDANCY_TOL, Roundoff
+from .._goldfarb_idnani import Roundoff
 from ._kkt_solve import factorize, solve_on_active_set
-from ._problem import KKT_TOLERANCE, QP, constraint_scales, kkt_residual
+from ._problem import QP, constraint_scales, kkt_residual
 from ._projected_gradient import projected_gradient
 from ._projected_newton import projected_newton
 from ._row_space import has_few_rows, solve_in_row_space
 from ._tableau import find_active_set
 
-_MAX_ROUNDS = 12
-_RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
-"""In units of roundoff; an answer that the dual method does not change is accepted with violations up to this."""
-_MAX_INFEASIBLE = 2
-"""Dual methods that end as infeasible before projected Newton takes over; one that changes nothing is enough."""
-_SOFT_COMPLIANCE = 1e-12
-"""Compliance of infeasible hard rows relative to C diag(H)^-1 C': with it the least violation has a derivative."""
 _BLOCK_ON_CPU, _BLOCK = 4, 256
 """Problems that are worked on together where most are done."""
 
@@ -155,12 +159,12 @@ def _search_rounds(
 
     def is_running(state: tuple[SearchResult, Array]) -> Bool[Array, ""]:
         result, rounds = state
-        return (rounds <= _MAX_ROUNDS) & ~jnp.all(result.done)
+        return (rounds <= MAX_ROUNDS) & ~jnp.all(result.done)
 
     def body(state: tuple[SearchResult, Array]) -> tuple[SearchResult, Array]:
         result, rounds = state
         result = choose(~result.done, _round(qp, hessian, result, tolerance, max_iterations, by_pivots), result)
-        gives_up = (result.infeasible_ends >= _MAX_INFEASIBLE) | (rounds + 1 >= _MAX_ROUNDS)
+        gives_up = (result.infeasible_ends >= MAX_INFEASIBLE) | (rounds + 1 >= MAX_ROUNDS)
         failed = ~(result.done | result.used_newton) & gives_up
         return with_a_few(qp, result, ~failed, newton, _block()), rounds + 1
 
@@ -175,7 +179,7 @@ def _by_newton(qp: QP, result: SearchResult, *, kkt_tol: float, max_iterations: 
     # a minimiser gets one more round; the least violation of infeasible rows is final
     infeasible = end.converged & end.infeasible
     optimal = end.converged & ~end.infeasible
-    softened = jnp.maximum(_SOFT_COMPLIANCE * largest[:, None], qp.compliance)
+    softened = jnp.maximum(SOFT_COMPLIANCE * largest[:, None], qp.compliance)
     return result._replace(
         x=end.x,
         row_multipliers=end.row_multipliers,
@@ -206,7 +210,7 @@ def _round(
     scales = jax.vmap(constraint_scales)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
     roundoff = Roundoff(*(tolerance[:, None] * a for a in scales))
     optimal = jax.vmap(is_optimal)(qp, result, x, y, roundoff)
-    relaxed = Roundoff(*(_RELAXED[hessian.dtype] * a for a in roundoff))
+    relaxed = Roundoff(*(RELAXED[hessian.dtype] * a for a in roundoff))
     nearly_optimal = jax.vmap(is_optimal)(qp, result, x, y, relaxed)
     exhausted = result.iterations >= max_iterations
     searching = ~(result.done | optimal | exhausted | result.used_newton)
@@ -225,20 +229,20 @@ def _round(
             iterations=end.iterations,
             infeasible_ends=result.infeasible_ends
             + jnp.where(
-                unchanged & (end.infeasible | ~nearly_optimal), _MAX_INFEASIBLE, end.infeasible.astype(jnp.int32)
+                unchanged & (end.infeasible | ~nearly_optimal), MAX_INFEASIBLE, end.infeasible.astype(jnp.int32)
             ),
         )
 
     if by_pivots:
         after = jax.lax.cond(jnp.any(searching), lambda: choose(searching, by_dual_method(), result), lambda: result)
     else:
-        after = result._replace(infeasible_ends=jnp.where(searching, _MAX_INFEASIBLE, result.infeasible_ends))
+        after = result._replace(infeasible_ends=jnp.where(searching, MAX_INFEASIBLE, result.infeasible_ends))
         nearly_optimal &= optimal | result.used_newton
     # an active set that the dual method confirms is accepted with relaxed tolerances: what is left is roundoff
     unchanged = jnp.all(after.active == result.active, 1)
     is_finite = jax.vmap(lambda x, y: jnp.isfinite(x).all() & jnp.isfinite(y).all())(x, y)
     accepted = nearly_optimal & unchanged & is_finite
-    failed = after.infeasible_ends >= _MAX_INFEASIBLE
+    failed = after.infeasible_ends >= MAX_INFEASIBLE
     x, y = choose(accepted | ~result.used_newton, (x, y), (result.x, result.row_multipliers))
     no_new_end = after.infeasible_ends == result.infeasible_ends
     return after._replace(

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from ..._errors import OsikValueError
 from ...execution import _rules
 from ...execution._backends import Backend, check_backend, here
-from ...numerics._constants import INACTIVE
+from ...numerics._constants import FEASIBILITY, INACTIVE
 from ...numerics._dense import apply
 from .._box import clip_roundoff, uncrossed
 from .._status import Status
@@ -22,8 +22,6 @@ from ._dispatch import qp_solver
 from ._implicit_diff import with_derivative
 from ._problem import QP, QPSolution, unpack
 from ._search import SearchResult
-
-_TOLERANCE = 1e-12
 
 
 @partial(jax.jit, static_argnames=("max_iterations", "backend"))
@@ -188,13 +186,15 @@ def _solve(
     """
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
-    tolerance = jnp.asarray(_TOLERANCE if tolerance is None else tolerance, dtype)
+    tolerance = jnp.asarray(FEASIBILITY if tolerance is None else tolerance, dtype)
     # bounds with lower > upper become equalities halfway; the status says so
     low, high, crossed = uncrossed(qp.lower, _upper(qp))
+    # NaN and negative weights are replaced before the first operation, so that derivatives stay finite
     safe, is_valid = _with_placeholder(replace(qp, lower=low, upper=high))
     start = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
     limit = 20 * m if max_iterations is None else max_iterations
     solve = qp_solver(limit, has_soft_rows, here(check_backend(backend)))
+    # the search is not differentiated: its answer is, at the active set that was found
     result = _rules.found(solve(*jax.lax.stop_gradient((safe, start, tolerance))))
     # the derivative is that of the problem which x solves: with infeasible hard rows, the softened one
     compliance = jnp.where(result.infeasible, result.compliance, safe.compliance)

@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import INACTIVE
+from ...numerics._constants import DEPENDENCE_TOL, INACTIVE
 from ...numerics._dense import apply, product
 from .._goldfarb_idnani import (
-    DEPENDENCE_TOL,
     Constraints,
     DualState,
     Roundoff,
@@ -60,6 +59,7 @@ def find_active_set(
 
 def _tableau(qp: QP, hessian: Float[Array, "B n n"], factor: KKTFactor) -> Float[Array, "B m m"]:
     """Return the tableau at the active bounds of the box, with no row active."""
+    # pivoting on all free variables at once is what their inverse block is for
     inverse = jax.vmap(_inverse)(factor)
     if qp.rows.shape[1]:
         return jax.vmap(_sweep_with_rows)(qp, hessian, inverse, factor.free)
@@ -77,6 +77,7 @@ def _sweep(matrix: Float[Array, "m m"], inverse: Float[Array, "m m"], free: Bool
 
     M_FF becomes M_FF^-1, M_FG -M_FF^-1 M_FG, M_GF M_GF M_FF^-1, and M_GG its Schur complement M_GG - M_GF M_FF^-1 M_FG.
     """
+    # the inverse block is 0 outside of F, so that products with it are those with the block
     forth, back = product(matrix, inverse), product(inverse, matrix)
     down, across = free[:, None], free[None, :]
     complement = matrix - product(forth, matrix)

@@ -41,7 +41,7 @@ auto factor_damped = [&]() {                          // Cholesky factor of R R'
     gram[k * VD + l] = total;
   }
   __syncwarp();
-  cholesky(rank, damping + 1e-14 * size * size);
+  cholesky(rank, damping + FACTOR_RIDGE * size * size);
 };
 
 auto factor_least_squares = [&]() {                   // pivoted QR of the rows in the cost, in the columns left

@@ -4,7 +4,7 @@
 auto weak_step = [&](double* d) {
 #pragma unroll
   for (int h = 0; h < H; ++h)
-    if (exists[h]) reflector[lane + 32 * h] = downhill[h] / (WEAK_DAMPING * size * size + damping);
+    if (exists[h]) reflector[lane + 32 * h] = downhill[h] / (EXTRA_DAMPING * size * size + damping);
   __syncwarp();
   from_basis(active_count, width, d);
 };

@@ -10,9 +10,6 @@ constexpr int MAX_RANK = N < M ? N : M;
 constexpr int MAX_LENGTH = (N > M ? N : M) > P ? (N > M ? N : M) : P;
 constexpr int HARD = N + P;
 constexpr int FACTORS = N * VD + M * ZD;              // the level's rows, then their reflectors; the triangle
-constexpr int MAX_ATTEMPTS = 4;                       // solves on a guessed working set and its corrections
-constexpr int MAX_STALLED = 20;                       // steps of zero length, before the least index decides
-constexpr double WEAK_DAMPING = 1e-9;                 // of the longest row, squared, as in _working_set_guess.py
 constexpr unsigned ALL = 0xffffffffu;
 
 __shared__ double shared_doubles[WARPS][N * ZD + FACTORS + (P ? P : 1) * ZD + 4 * MAX_LENGTH + MAX_RANK + M * VD + M];
