@@ -174,6 +174,18 @@ def test_files_that_derivations_and_architecture_name_are_there() -> None:
         assert [path for path in named if not (ROOT / path).exists()] == []
 
 
+def test_the_walk_from_solve_to_the_optimality_conditions_is_true() -> None:
+    """At most eight files, and what the page says of each is in it."""
+    text = (ROOT / "docs/dev/architecture.md").read_text()
+    walk = text.split("## One solve, from the call to the optimality conditions")[1].split("\n\n")[2]
+    steps = re.findall(r"^\d\. `(osik_jax/[\w/.]+)`: (.*(?:\n   .*)*)", walk, re.MULTILINE)
+    assert len(steps) == len(walk.split("\n")) - walk.count("\n   ") <= 8
+    for path, said in steps:
+        code = (ROOT / path).read_text()
+        names = [name for names in re.findall(r"`([\w.]+)`", said) for name in names.split(".")]
+        assert [name for name in names if not re.search(rf"\b{name}\b", code)] == [], path
+
+
 def test_readme_is_a_page_of_a_package_index_too() -> None:
     """Which knows nothing of the files beside it: every address is whole, and pictures are the files themselves."""
     text = README.read_text()
