@@ -134,9 +134,12 @@ import os
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
-from osik_jax.solvers import Level, solve_nullspace
+from osik_jax.solvers import Level, solve_hqp, solve_nullspace
 def solve(A, b):
-    return solve_nullspace([Level(A[:24], b[:24]), Level(A[24:], b[24:])], backend="auto").x
+    levels = [Level(A[:24], b[:24]), Level(A[24:], b[24:])]
+    if SOLVER == "hqp":
+        return solve_hqp(levels, -np.ones(48), np.ones(48), backend="auto").x
+    return solve_nullspace(levels, backend="auto").x
 def again(_, state):
     A, u, v = state
     x, y = jax.vmap(solve)(A, u), jax.vmap(solve)(2.0 * A, v)
@@ -148,10 +151,12 @@ print("done")
 
 
 @pytest.mark.slow
-def test_kernels_wait_for_no_workers():
+@pytest.mark.variants(release=["hqp"])
+@pytest.mark.parametrize("solver", ["nullspace", "hqp"])
+def test_kernels_wait_for_no_workers(solver):
     """Two batches side by side on two cores, nothing configured: with ``backend="jax"`` they wait for ever."""
     pytest.importorskip("numba")
-    assert in_a_process(BY_KERNELS).stdout == "done\n"
+    assert in_a_process(f"SOLVER = {solver!r}\n{BY_KERNELS}").stdout == "done\n"
 
 
 WITHOUT_WARNINGS = """
