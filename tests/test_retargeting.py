@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from emulated_warp import emulated, needs_compiler
 from motion_files import dancer, write_bvh
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
@@ -33,6 +34,7 @@ from osik_jax.retargeting import (
     retarget,
     save_profile,
 )
+from osik_jax.retargeting._balance import overhang
 from osik_jax.retargeting._banded import BandedSystem, solve_banded
 from osik_jax.retargeting._body import Build, pairs_apart
 from osik_jax.retargeting._contact import find_contact, find_ground
@@ -147,7 +149,8 @@ def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
     person = read_person(load_motion(dance), find_roles(load_motion(dance).joint_names))
     build = Build.of(nao, profile)
     goals = jax.tree.map(lambda leaf: leaf[7], build.goals(person))
-    body, bounds = Body.of(nao, profile, pairs_apart(nao, profile)[:1]), build.bounds(np.full(nao.nv, 240.0), 1.0 / FPS)
+    body = Body.of(nao, profile, pairs_apart(nao, profile)[:1], 0.01)
+    bounds = build.bounds(np.full(nao.nv, 240.0), 1.0 / FPS)
     rng = np.random.default_rng(1)
     q = osik.integrate(nao, nao.q0, jnp.asarray(rng.normal(scale=0.1, size=nao.nv)))
     # where a turn's goal is met the rotation vector's derivative is the angular velocity itself
@@ -186,6 +189,80 @@ def test_nao_dances_with_its_feet_where_they_are(nao, danced):
     drift = np.ptp(np.array(corners), axis=0)
     assert np.abs(np.array(corners)[..., 2]).max() < 1e-5 and drift.max() < 1e-5
     assert np.ptp(danced.q[:, 2]) > 0.005  # and the waist goes down and up
+
+
+def edge_distance(point, corners):
+    """From a convex hull's edge, positive outside: SciPy's facets inside, the nearest point of its edges outside."""
+    hull = ConvexHull(corners)
+    inside = (hull.equations[:, :2] @ point + hull.equations[:, 2]).max()
+    if inside <= 0.0:
+        return inside
+    start, end = corners[hull.simplices[:, 0]], corners[hull.simplices[:, 1]]
+    along = np.sum((point - start) * (end - start), -1) / np.sum((end - start) ** 2, -1)
+    return np.linalg.norm(start + np.clip(along, 0.0, 1.0)[:, None] * (end - start) - point, axis=-1).min()
+
+
+def test_the_distance_from_the_edge_of_the_feet_and_its_derivative():
+    rng, step = np.random.default_rng(6), 1e-7
+    for _ in range(20):
+        corners, stands = rng.normal(size=(8, 2)), rng.permutation([1.0] * 5 + [0.0] * 3)
+        center, moves = rng.normal(size=2), rng.normal(size=(9, 2))
+        found = overhang(jnp.asarray(center), jnp.asarray(corners), jnp.asarray(stands))
+        assert found.distance == pytest.approx(edge_distance(center, corners[stands > 0]), abs=1e-12)
+        ends = [edge_distance(center + s * moves[8], (corners + s * moves[:8])[stands > 0]) for s in (step, -step)]
+        slope = found.direction @ (moves[8] - found.shares @ moves[:8])
+        assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), abs=1e-6)
+        turns = np.linspace(0.0, np.pi, 20_000)
+        across = corners[stands > 0] @ np.stack([np.cos(turns), np.sin(turns)])
+        assert found.width == pytest.approx(np.ptp(across, axis=0).min(), abs=1e-3)
+    for same in (corners[:1] + np.zeros((8, 2)), np.zeros((8, 2))):  # no edge, and nothing but the point itself
+        found = overhang(jnp.zeros(2), jnp.asarray(same), jnp.ones(8))
+        assert not any(np.isnan(part).any() for part in found)
+
+
+@pytest.fixture(scope="module")
+def leaning(dance):
+    """The figure bends forward from the hips, by 70 degrees, while it dances."""
+    motion = load_motion(dance)
+    names, positions = motion.joint_names, motion.positions.copy()
+    upper = [i for i, name in enumerate(names) if not any(leg in name for leg in ("Leg", "Foot", "Toe", "Hips"))]
+    hips = positions[:, [names.index("Hips")]]
+    angles = 35.0 * (1.0 - np.cos(np.linspace(0.0, 2.0 * np.pi, len(positions))))
+    left = np.diff(positions[:, [names.index("RightUpLeg"), names.index("LeftUpLeg")]], axis=1)[:, 0]
+    turns = Rotation.from_rotvec(np.radians(angles)[:, None] * left / np.linalg.norm(left, axis=1, keepdims=True))
+    bent = np.einsum("fij,fkj->fki", turns.as_matrix(), positions[:, upper] - hips)
+    positions[:, upper] = hips + bent
+    return dataclasses.replace(motion, positions=positions, rotations=None)
+
+
+def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, leaning, dance, tmp_path, capsys):
+    free, kept = retarget(nao, leaning), retarget(nao, leaning, balance=0.01)
+    assert kept.contact.all()
+    margins = []
+    for result in (free, kept):
+        margins.append([])
+        for qpos in result.motion.qpos:
+            data = mujoco.MjData(nao.mj_model)
+            data.qpos[:] = qpos
+            mujoco.mj_forward(nao.mj_model, data)
+            corners = [data.site(f"{side}_sole_corner_{k}").xpos[:2] for side in "lr" for k in range(4)]
+            margins[-1].append(-edge_distance(data.subtree_com[0, :2], np.array(corners)))
+    without, within = map(min, margins)
+    assert without < -0.01 and within > 0.01 - 5e-5
+    figures = report(kept)
+    assert figures["balance"]["double_support_frames"] == 30 and figures["balance"]["com_inside_share"] == 1.0
+    assert figures["balance"]["com_margin_mm_min"] == pytest.approx(1e3 * within, abs=1e-6)
+    assert report(free)["balance"]["com_inside_share"] == pytest.approx(np.mean(np.array(margins[0]) >= 0.0))
+    assert figures["feet"]["slip_mm_max"] < 0.05 and figures["feet"]["below_floor_mm_max"] < 0.05
+    assert figures["joints"]["jump_frames"] == 0 and figures["joints"]["beyond_range_max"] == 0.0
+    # on one foot it is where it was
+    one_foot = np.tile([True, True, False, False], (30, 1))
+    alone = [retarget(nao, dataclasses.replace(leaning, contact=one_foot), balance=b).q for b in (None, 0.01)]
+    np.testing.assert_allclose(alone[0], alone[1], atol=1e-9)
+    out = tmp_path / "out"
+    assert cli.main(["retarget", str(dance), "--out", str(out), "--balance", "0.02", "--no-animation"]) == 0
+    assert json.loads((out / "report.json").read_text())["balance"]["com_margin_mm_min"] > 20.0 - 0.05
+    capsys.readouterr()
 
 
 def test_limits_hold_exactly(nao, dance, danced):
@@ -359,6 +436,7 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
         (["none"], "no such file: none"),
         (["DANCE", "--robot", "g2"], "no such file: g2 (robots by name: nao, g1; names of robot_descriptions end in"),
         (["DANCE", "--smooth", "-1"], "smoothness is -1.0; it is a time in seconds, 0 or more"),
+        (["DANCE", "--balance", "-0.01"], "balance is -0.01; it is a length in metres, 0 or more"),
         (["DANCE", "--smooth", "0.1", "--live"], "--smooth goes with whole clips, not with --live"),
         (["DANCE", "--robot", "none.urdf"], "no such file: none.urdf"),
         (["DANCE", "--robot", "arm7"], "floating_base=True"),

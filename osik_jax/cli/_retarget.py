@@ -59,6 +59,8 @@ class Retarget:
     """Greatest acceleration of the joints [rad/s^2]."""
     smooth: float = 0.0
     """What is faster than about this time is smoothed out [s]; 0: nothing."""
+    balance: float | None = None
+    """Where both feet stand, keep the centre of mass this far inside their edge [m]. Default: it is where it falls."""
     unit: str | None = None
     """Of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
     up: Literal["x", "y", "z"] | None = None
@@ -143,6 +145,7 @@ def _retargeter(command: Retarget) -> Retargeter:
         profile=profile,
         acceleration=command.acceleration,
         smoothness=command.smooth,
+        balance=command.balance,
     )
 
 
@@ -222,6 +225,7 @@ def _retarget_live(command: Retarget) -> None:
                 profile=profile,
                 mapping=mapping,
                 acceleration=command.acceleration,
+                balance=command.balance,
                 look_ahead=command.look_ahead,
             )
 

@@ -87,6 +87,8 @@ class Retargeter(OnRobot):
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         smoothness: what is faster than about this time is smoothed out [s]: accelerations weigh, beside directions of
             limbs, with its fourth power. 0: nothing but what the profile's weights say. Changing it compiles nothing.
+        balance: how far inside the edge of what stands the centre of mass is kept where both feet stand [m], and at
+            most a third of that polygon's width; a bound of the plan. None: it is where it falls.
         max_iterations: of the plan.
 
     Raises:
@@ -101,9 +103,10 @@ class Retargeter(OnRobot):
         profile: Profile | None = None,
         acceleration: float | Mapping[str, float] = ACCELERATION,
         smoothness: float = 0.0,
+        balance: float | None = None,
         max_iterations: int = 100,
     ):
-        super().__init__(robot, profile, acceleration)
+        super().__init__(robot, profile, acceleration, balance)
         if not (np.isfinite(smoothness) and smoothness >= 0.0):
             raise OsikValueError(f"smoothness is {smoothness}; it is a time in seconds, 0 or more")
         self.smoothness = smoothness
@@ -355,6 +358,7 @@ def retarget(
     fps: float | None = None,
     acceleration: float | Mapping[str, float] = ACCELERATION,
     smoothness: float = 0.0,
+    balance: float | None = None,
     max_iterations: int = 100,
 ) -> Retargeted:
     """The robot does what a person did: limbs in the same directions, feet that stay where they stand.
@@ -373,6 +377,8 @@ def retarget(
         fps: frames a second of the result; None: the clip's.
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         smoothness: what is faster than about this time is smoothed out [s]; 0: nothing (see ``Retargeter``).
+        balance: how far inside the edge of what stands the centre of mass is kept where both feet stand [m]; None: it
+            is where it falls (see ``Retargeter``).
         max_iterations: of the plan.
 
     Raises:
@@ -381,7 +387,12 @@ def retarget(
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
     own = Retargeter(
-        robot, profile=profile, acceleration=acceleration, smoothness=smoothness, max_iterations=max_iterations
+        robot,
+        profile=profile,
+        acceleration=acceleration,
+        smoothness=smoothness,
+        balance=balance,
+        max_iterations=max_iterations,
     )
     return own.retarget(motion, mapping=mapping, fps=fps)
 
