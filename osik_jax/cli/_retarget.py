@@ -46,11 +46,11 @@ class Retarget:
     clip: Annotated[str, tyro.conf.Positional]
     """A BVH file, or keypoints as .npz or .csv; or a folder with such files."""
     robot: str = "nao"
-    """nao, g1 (of example-robot-data, where that is installed), or a URDF or MJCF file."""
+    """nao; g1 or talos (of example-robot-data, where that is installed); or a URDF or MJCF file."""
     out: Path = Path("osik-retarget")
     """Folder to write to."""
     profile: str | None = None
-    """A TOML file that says how the robot is seen. Default: the package's own for NAO and G1, else a guess."""
+    """A TOML file that says how the robot is seen. Default: the package's own for NAO, G1 and Talos, else a guess."""
     mapping: tuple[str, ...] = ()
     """Which of the clip's joints is which, as ROLE=NAME, where names are not to be guessed; all of them then."""
     fps: float | None = None
@@ -260,12 +260,12 @@ def _print_retargeted(console: Console, figures: dict[str, Any], out: Path) -> N
 
 
 def _robot_to_retarget(source: str) -> Robot:
-    """A robot by name or file, its base floating; ``g1`` is that of example-robot-data."""
-    if source == "g1" and not os.path.exists(source):
-        from ..retargeting._described import g1_urdf
+    """A robot by name or file, its base floating; some names are of example-robot-data's."""
+    from ..retargeting._described import DESCRIBED, described_urdf
 
-        source = str(g1_urdf())
-    return read_robot(source, "auto" if source in EMBEDDED else "floating", named=("nao", "g1"))
+    if source in DESCRIBED and not os.path.exists(source):
+        source = str(described_urdf(source))
+    return read_robot(source, "auto" if source in EMBEDDED else "floating", named=("nao", *DESCRIBED))
 
 
 def _number_or_name(text: str) -> str | float:

@@ -49,8 +49,8 @@ class Weights(eqx.Module):
         posture: of the joints' distance from home [1/rad^2].
         smooth: of a joint's change of step from one frame to the next [1/rad^2].
         smooth_base: the same of the base's position [1/m^2] and turn [1/rad^2].
-        stance: of what a standing point moves, and of its height [1/m^2]; a thousandth of it, of what is nearer to the
-            floor than 3 mm and does not stand.
+        stance: of what a standing point moves, and of its height [1/m^2]; two thousandths of it, of what is nearer to
+            the floor than 3 mm and does not stand.
         apart: of the depth of shapes that are nearer than ``margin`` [1/m^2].
         balance: of what the centre of mass is beyond its bound, where one is asked for [1/m^2].
         limit: of what joints are beyond their ranges [1/rad^2].

@@ -84,7 +84,7 @@ class LiveRetargeter(OnRobot):
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
         standing: some frames of the person standing, with the joints and the rate of the stream: it is measured there
             how long legs are, how high ankles, and where the floor is.
-        profile: how the robot is seen. None: the package's own for NAO and G1, or a guess (``find_profile``).
+        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
         mapping: role to the stream's name of it, see ``find_roles``. None: by the names that files use.
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         balance: as of ``Retargeter``.

@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from .._errors import OsikValueError
 from ..execution._workers import cores
 from ..limits import Limit
 from ..robot import Robot
-from ..scaling import Saved, run_in_chunks
+from ..scaling import Saved, ShardedFunction, run_in_chunks, sharded
 from ..scaling._progress import reported
 from ._finish import follow
 from ._goals import Goals, Weights
@@ -83,7 +83,7 @@ class Retargeter(OnRobot):
 
     Args:
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
-        profile: how the robot is seen. None: the package's own for NAO and G1, or a guess (``find_profile``).
+        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         smoothness: what is faster than about this time is smoothed out [s]: accelerations weigh, beside directions of
             limbs, with its fourth power. 0: nothing but what the profile's weights say. Changing it compiles nothing.
@@ -310,8 +310,10 @@ _Lane = tuple[Goals, Array, Bounds, Array]
 def _solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
     """All lanes: on CPUs as many at a time as there are cores, in threads: a program does not hold Python's lock.
 
-    ``shared`` is what ``_solve_lane`` takes after the lane.
+    Elsewhere in one program, split over all devices. ``shared`` is what ``_solve_lane`` takes after the lane.
     """
+    if not one_a_core() and len(jax.devices()) > 1:
+        return _over_devices(len(shared))(lanes, *shared)
     if not one_a_core() or isinstance(jax.tree.leaves(lanes)[0], Tracer):
         return _solve_lanes(lanes, *shared)
 
@@ -349,6 +351,12 @@ def _solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
     return jax.vmap(one)(lanes)
 
 
+@cache
+def _over_devices(shared: int) -> ShardedFunction:
+    """``_solve_lanes`` with so many arguments that all lanes share, each device with its own part of the lanes."""
+    return sharded(_solve_lane, (0, *[None] * shared))
+
+
 def retarget(
     robot: Robot,
     motion: HumanMotion,
@@ -372,7 +380,7 @@ def retarget(
     Args:
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
         motion: the clip.
-        profile: how the robot is seen. None: the package's own for NAO and G1, or a guess (``find_profile``).
+        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
         mapping: role to the clip's name of it, see ``find_roles``. None: by the names that files use.
         fps: frames a second of the result; None: the clip's.
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].

@@ -26,7 +26,7 @@ from ._profile import Place, Profile
 
 SHORTEST = 1e-6
 PAIRS = 12
-CLEARANCE, SWINGING = 3e-3, 1e-3
+CLEARANCE, SWINGING = 3e-3, 2e-3
 """How far soles that do not stand are kept above the floor [m], and what that weighs beside standing."""
 
 
