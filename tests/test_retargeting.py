@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from emulated_warp import emulated, needs_compiler
-from motion_files import dancer, write_bvh
+from motion_files import bent_forward, dancer, write_bvh
 from other_processes import finish, start
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -224,17 +224,8 @@ def test_the_distance_from_the_edge_of_the_feet_and_its_derivative():
 
 @pytest.fixture(scope="module")
 def leaning(dance):
-    """The figure bends forward from the hips, by 70 degrees, while it dances."""
-    motion = load_motion(dance)
-    names, positions = motion.joint_names, motion.positions.copy()
-    upper = [i for i, name in enumerate(names) if not any(leg in name for leg in ("Leg", "Foot", "Toe", "Hips"))]
-    hips = positions[:, [names.index("Hips")]]
-    angles = 35.0 * (1.0 - np.cos(np.linspace(0.0, 2.0 * np.pi, len(positions))))
-    left = np.diff(positions[:, [names.index("RightUpLeg"), names.index("LeftUpLeg")]], axis=1)[:, 0]
-    turns = Rotation.from_rotvec(np.radians(angles)[:, None] * left / np.linalg.norm(left, axis=1, keepdims=True))
-    bent = np.einsum("fij,fkj->fki", turns.as_matrix(), positions[:, upper] - hips)
-    positions[:, upper] = hips + bent
-    return dataclasses.replace(motion, positions=positions, rotations=None)
+    """The figure bends forward while it dances."""
+    return bent_forward(load_motion(dance))
 
 
 def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, leaning, dance, tmp_path, capsys):
