@@ -39,7 +39,7 @@ from osik_jax.retargeting import (
     load_profile,
     report,
 )
-from osik_jax.retargeting._described import g1_urdf
+from osik_jax.retargeting._described import DESCRIBED, described_urdf
 from osik_jax.retargeting._live_command import replay
 from osik_jax.retargeting._retarget import _lane, _solve_lanes
 from osik_jax.runtime import configure_cpu
@@ -248,7 +248,7 @@ def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", nargs="+", help="motion files")
-    parser.add_argument("--robot", default="g1", help="nao, g1 or a URDF")
+    parser.add_argument("--robot", default="g1", help="nao, g1, talos or a URDF")
     parser.add_argument("--profile", help="a profile's TOML")
     parser.add_argument("--repeats", type=int, default=5, help="runs of each clip that are timed")
     parser.add_argument("--single", action="store_true", help="in single precision")
@@ -265,7 +265,7 @@ def main() -> None:
     options = parser.parse_args()
     configure_cpu()
     jax.config.update("jax_enable_x64", not options.single)
-    path = g1_urdf() if options.robot == "g1" else Path(options.robot)
+    path = described_urdf(options.robot) if options.robot in DESCRIBED else Path(options.robot)
     robot = load_robot("nao") if options.robot == "nao" else Robot.from_urdf(path, floating_base=True)
     profile = load_profile(options.profile) if options.profile else None
     judge = Judge(*options.judge) if options.judge else own_figures

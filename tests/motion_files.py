@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from osik_jax.retargeting import HumanMotion
+
 FIGURE = (
     ("Hips", -1, (0.0, 0.0, 0.0)),
     ("Spine", 0, (0.0, 0.25, 0.0)),
@@ -81,6 +83,18 @@ def dancer(frames: int = 24, fps: float = 30.0) -> Figure:
     root = np.zeros((frames, 3))
     root[:, 1] = 0.08 + 0.02 + thigh * np.cos(np.radians(bend)) + shank * np.cos(np.radians(lean))
     return Figure(FIGURE, root, angles, ("ZXY",) * len(FIGURE), fps)
+
+
+def bent_forward(motion: HumanMotion, most: float = 70.0) -> HumanMotion:
+    """The same, with all above the hips turned forward about them, by so many degrees in the middle of the clip."""
+    names, positions = motion.joint_names, motion.positions.copy()
+    upper = [i for i, name in enumerate(names) if not any(leg in name for leg in ("Leg", "Foot", "Toe", "Hips"))]
+    hips, ends = positions[:, [names.index("Hips")]], [names.index(f"{side}UpLeg") for side in ("Right", "Left")]
+    angles = np.radians(0.5 * most) * (1.0 - np.cos(np.linspace(0.0, 2.0 * np.pi, len(positions))))
+    left = positions[:, ends[1]] - positions[:, ends[0]]
+    turns = Rotation.from_rotvec(angles[:, None] * left / np.linalg.norm(left, axis=1, keepdims=True)).as_matrix()
+    positions[:, upper] = hips + np.einsum("fij,fkj->fki", turns, positions[:, upper] - hips)
+    return dataclasses.replace(motion, positions=positions, rotations=None)
 
 
 def write_bvh(path: Path, figure: Figure, unit: float = 1.0) -> Path:

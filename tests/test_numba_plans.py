@@ -1,5 +1,6 @@
 """Numba's kernel of retargeting's plans on a CPU: beside the plain method, which it follows iteration by iteration."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -22,9 +23,9 @@ def motion(tmp_path_factory):
     return load_motion(write_bvh(tmp_path_factory.mktemp("clips") / "dance.bvh", dancer(FRAMES), 0.01))
 
 
-def clip_of(robot, motion):
+def clip_of(robot, motion, balance=None):
     """What a plan is made for, with frames behind the end, and where it begins: anywhere, with shapes that overlap."""
-    own = Retargeter(robot)
+    own = Retargeter(robot, balance=balance)
     clip = own._prepared(motion, None, None)
     frames, rng = len(clip.start), np.random.default_rng(0)
     assert frames > clip.frames == FRAMES
@@ -60,6 +61,18 @@ def test_a_plan_is_improved_as_by_the_plain_method(until, nao, motion):
         assert int(found.iterations) == most or until == "ready"
         np.testing.assert_allclose(found.q[:3, 7:], q[:3, 7:], rtol=0.0, atol=1e-14)  # what is past
     assert np.abs(found.q - q)[3:FRAMES, 7:].max() > 0.1
+
+
+def test_the_centre_of_mass_is_kept_as_by_the_plain_method(nao, motion):
+    clip, q = clip_of(nao, motion, 0.02)
+    by_kernel, plainly = compiled("spent")
+    for contact in ([1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.0]):
+        goals = dataclasses.replace(clip.goals, contact=clip.goals.present[:, None] * jnp.array(contact))
+        given = clip._replace(goals=goals), q, jnp.array(2)
+        agree(by_kernel(*given), plainly(*given))
+        left_alone = dataclasses.replace(clip.body, inside=None)
+        without = by_kernel(given[0]._replace(body=left_alone), *given[1:])
+        assert (np.abs(without.q - by_kernel(*given).q).max() > 1e-3) == (contact[0] > 0.0)
 
 
 @pytest.mark.slow

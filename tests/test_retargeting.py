@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from xml.etree import ElementTree
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 from emulated_warp import emulated, needs_compiler
-from motion_files import dancer, write_bvh
+from motion_files import bent_forward, dancer, write_bvh
+from other_processes import finish, start
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
@@ -33,13 +36,14 @@ from osik_jax.retargeting import (
     retarget,
     save_profile,
 )
+from osik_jax.retargeting._balance import overhang
 from osik_jax.retargeting._banded import BandedSystem, solve_banded
 from osik_jax.retargeting._body import Build, pairs_apart
 from osik_jax.retargeting._contact import find_contact, find_ground
-from osik_jax.retargeting._described import g1_urdf
+from osik_jax.retargeting._described import described_urdf
 from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._folder import _Lengths, retarget_folder
-from osik_jax.retargeting._person import NEEDED, read_person
+from osik_jax.retargeting._person import NEEDED, SIDES, read_person
 from osik_jax.retargeting._plan import make_plan
 from osik_jax.retargeting._terms import Body, frame_rows
 
@@ -147,7 +151,8 @@ def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
     person = read_person(load_motion(dance), find_roles(load_motion(dance).joint_names))
     build = Build.of(nao, profile)
     goals = jax.tree.map(lambda leaf: leaf[7], build.goals(person))
-    body, bounds = Body.of(nao, profile, pairs_apart(nao, profile)[:1]), build.bounds(np.full(nao.nv, 240.0), 1.0 / FPS)
+    body = Body.of(nao, profile, pairs_apart(nao, profile)[:1], 0.01)
+    bounds = build.bounds(np.full(nao.nv, 240.0), 1.0 / FPS)
     rng = np.random.default_rng(1)
     q = osik.integrate(nao, nao.q0, jnp.asarray(rng.normal(scale=0.1, size=nao.nv)))
     # where a turn's goal is met the rotation vector's derivative is the angular velocity itself
@@ -188,6 +193,71 @@ def test_nao_dances_with_its_feet_where_they_are(nao, danced):
     assert np.ptp(danced.q[:, 2]) > 0.005  # and the waist goes down and up
 
 
+def edge_distance(point, corners):
+    """From a convex hull's edge, positive outside: SciPy's facets inside, the nearest point of its edges outside."""
+    hull = ConvexHull(corners)
+    inside = (hull.equations[:, :2] @ point + hull.equations[:, 2]).max()
+    if inside <= 0.0:
+        return inside
+    start, end = corners[hull.simplices[:, 0]], corners[hull.simplices[:, 1]]
+    along = np.sum((point - start) * (end - start), -1) / np.sum((end - start) ** 2, -1)
+    return np.linalg.norm(start + np.clip(along, 0.0, 1.0)[:, None] * (end - start) - point, axis=-1).min()
+
+
+def test_the_distance_from_the_edge_of_the_feet_and_its_derivative():
+    rng, step = np.random.default_rng(6), 1e-7
+    for _ in range(20):
+        corners, stands = rng.normal(size=(8, 2)), rng.permutation([1.0] * 5 + [0.0] * 3)
+        center, moves = rng.normal(size=2), rng.normal(size=(9, 2))
+        found = overhang(jnp.asarray(center), jnp.asarray(corners), jnp.asarray(stands))
+        assert found.distance == pytest.approx(edge_distance(center, corners[stands > 0]), abs=1e-12)
+        ends = [edge_distance(center + s * moves[8], (corners + s * moves[:8])[stands > 0]) for s in (step, -step)]
+        slope = found.direction @ (moves[8] - found.shares @ moves[:8])
+        assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), abs=1e-6)
+        turns = np.linspace(0.0, np.pi, 20_000)
+        across = corners[stands > 0] @ np.stack([np.cos(turns), np.sin(turns)])
+        assert found.width == pytest.approx(np.ptp(across, axis=0).min(), abs=1e-3)
+    for same in (corners[:1] + np.zeros((8, 2)), np.zeros((8, 2))):  # no edge, and nothing but the point itself
+        found = overhang(jnp.zeros(2), jnp.asarray(same), jnp.ones(8))
+        assert not any(np.isnan(part).any() for part in found)
+
+
+@pytest.fixture(scope="module")
+def leaning(dance):
+    """The figure bends forward while it dances."""
+    return bent_forward(load_motion(dance))
+
+
+def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, leaning, dance, tmp_path, capsys):
+    free, kept = retarget(nao, leaning), retarget(nao, leaning, balance=0.01)
+    assert kept.contact.all()
+    margins = []
+    for result in (free, kept):
+        margins.append([])
+        for qpos in result.motion.qpos:
+            data = mujoco.MjData(nao.mj_model)
+            data.qpos[:] = qpos
+            mujoco.mj_forward(nao.mj_model, data)
+            corners = [data.site(f"{side}_sole_corner_{k}").xpos[:2] for side in "lr" for k in range(4)]
+            margins[-1].append(-edge_distance(data.subtree_com[0, :2], np.array(corners)))
+    without, within = map(min, margins)
+    assert without < -0.01 and within > 0.01 - 5e-5
+    figures = report(kept)
+    assert figures["balance"]["double_support_frames"] == 30 and figures["balance"]["com_inside_share"] == 1.0
+    assert figures["balance"]["com_margin_mm_min"] == pytest.approx(1e3 * within, abs=1e-6)
+    assert report(free)["balance"]["com_inside_share"] == pytest.approx(np.mean(np.array(margins[0]) >= 0.0))
+    assert figures["feet"]["slip_mm_max"] < 0.05 and figures["feet"]["below_floor_mm_max"] < 0.05
+    assert figures["joints"]["jump_frames"] == 0 and figures["joints"]["beyond_range_max"] == 0.0
+    # on one foot it is where it was
+    one_foot = np.tile([True, True, False, False], (30, 1))
+    alone = [retarget(nao, dataclasses.replace(leaning, contact=one_foot), balance=b).q for b in (None, 0.01)]
+    np.testing.assert_allclose(alone[0], alone[1], atol=1e-9)
+    out = tmp_path / "out"
+    assert cli.main(["retarget", str(dance), "--out", str(out), "--balance", "0.02", "--no-animation"]) == 0
+    assert json.loads((out / "report.json").read_text())["balance"]["com_margin_mm_min"] > 20.0 - 0.05
+    capsys.readouterr()
+
+
 def test_limits_hold_exactly(nao, dance, danced):
     tight = Retargeter(nao, acceleration=12.0).retarget(load_motion(dance))
     speed, acceleration = steps_of(tight)
@@ -222,6 +292,33 @@ def test_many_clips_give_what_each_gives_alone(nao, dance, danced, tmp_path):
     np.testing.assert_allclose(filled_up.q, together[1].q, atol=1e-12)
     with pytest.raises(ValueError, match="short: .*it takes three"):
         own.retarget_all([motion, dataclasses.replace(short, positions=short.positions[:2])], progress=False)
+
+
+SPLIT = """
+import dataclasses, json, sys
+import jax, numpy as np
+import osik_jax as osik
+from osik_jax.retargeting import Retargeter, _retarget, load_motion
+
+motion, own = load_motion(sys.argv[1]), Retargeter(osik.load_robot("nao"), max_iterations=3)
+motions = [motion, dataclasses.replace(motion, positions=motion.positions[::-1], rotations=None), motion]
+alone = [own.retarget(clip) for clip in motions]
+_retarget.one_a_core = lambda: False  # as where there are GPUs
+over = []
+solve = _retarget._over_devices(5)
+_retarget._over_devices = lambda shared: lambda *args: over.append(solve(*args)) or over[-1]
+together = own.retarget_all(motions, chunk=2, progress=False)
+print(json.dumps({
+    "devices": [len(found.q.sharding.device_set) for found in over if hasattr(found.q, "sharding")],
+    "off": max(float(np.abs(a.q - b.q).max()) for a, b in zip(alone, together)),
+}))
+"""
+
+
+@pytest.mark.slow
+def test_a_batch_is_split_over_devices(dance):
+    found = finish(start(SPLIT, dance, devices=2))
+    assert 2 in found["devices"] and found["off"] < 1e-6
 
 
 def test_more_smoothness_is_less_acceleration_and_feet_stay(nao, dance, danced, monkeypatch):
@@ -357,12 +454,16 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     [
         (["none.bvh"], "No such file"),
         (["none"], "no such file: none"),
-        (["DANCE", "--robot", "g2"], "no such file: g2 (robots by name: nao, g1; names of robot_descriptions end in"),
+        (
+            ["DANCE", "--robot", "g2"],
+            "no such file: g2 (robots by name: nao, g1, talos; names of robot_descriptions",
+        ),
         (["DANCE", "--smooth", "-1"], "smoothness is -1.0; it is a time in seconds, 0 or more"),
+        (["DANCE", "--balance", "-0.01"], "balance is -0.01; it is a length in metres, 0 or more"),
         (["DANCE", "--smooth", "0.1", "--live"], "--smooth goes with whole clips, not with --live"),
         (["DANCE", "--robot", "none.urdf"], "no such file: none.urdf"),
         (["DANCE", "--robot", "arm7"], "floating_base=True"),
-        (["DANCE", "--profile", "none.toml"], "profiles that come with the package: nao, g1"),
+        (["DANCE", "--profile", "none.toml"], "profiles that come with the package: nao, g1, talos"),
         (["DANCE", "--acceleration", "0"], "acceleration is 0.0; it has to be more than 0"),
         (["DANCE", "--mapping", "left_hip"], "--mapping takes ROLE=NAME; got left_hip"),
         (["DANCE", "--mapping", "left_hip=Hip"], "no joint of the clip 'Hip'"),
@@ -444,7 +545,7 @@ def test_a_guess_sees_the_same_robot(nao):
 
 
 def test_a_g1_is_guessed_from_its_urdf():
-    g1 = osik.Robot.from_urdf(g1_urdf(), floating_base=True)
+    g1 = osik.Robot.from_urdf(described_urdf("g1"), floating_base=True)
     guess, own = guess_profile(g1), load_profile("g1")
     assert find_profile(g1) == own
     for side in ("left", "right"):
@@ -465,12 +566,40 @@ def test_a_g1_is_guessed_from_its_urdf():
     ],
 )
 def test_a_wrist_is_not_what_grips(urdf, wrist):
-    robot = osik.Robot.from_urdf(g1_urdf().parents[2] / urdf, floating_base=True)
+    robot = osik.Robot.from_urdf(described_urdf("g1").parents[2] / urdf, floating_base=True)
     assert guess_profile(robot).keypoints["left_wrist"][0] == wrist
 
 
+def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
+    path = described_urdf("talos")
+    talos, own = osik.Robot.from_urdf(path, floating_base=True), load_profile("talos")
+    assert find_profile(talos) == own
+    boxes = ElementTree.parse(path.with_name("talos_full_v2_box.urdf")).getroot()
+    for side in SIDES:
+        (size,) = boxes.iterfind(f"./link[@name='leg_{side}_6_link']/collision/geometry/box")
+        length, width = (float(number) for number in size.attrib["size"].split()[:2])
+        corners = np.array([*own.feet[side].heel, *own.feet[side].toe])
+        signs = np.array([[-1, 1, 0], [-1, -1, 0], [1, 1, 0], [1, -1, 0]])
+        np.testing.assert_allclose(corners, 0.5 * signs * [length, width, 0.0])
+    made, guessed = (Build.of(talos, profile).points for profile in (own, guess_profile(talos)))
+    for role in NEEDED:
+        np.testing.assert_allclose(made[role], guessed[role], atol=0.02 * np.sqrt(3.0))  # what a fit may move it by
+
+
+@pytest.mark.slow
+def test_talos_dances_with_its_feet_where_they_are(dance):
+    talos = osik.Robot.from_urdf(described_urdf("talos"), floating_base=True)
+    figures = report(retarget(talos, load_motion(dance)))
+    assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.05
+    assert figures["feet"]["float_mm_max"] < 0.05 and figures["feet"]["below_floor_mm_max"] < 0.05
+    assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["speed_over_limit_max"] <= 1.0 + 1e-9
+    assert figures["joints"]["jump_frames"] == 0 and figures["shapes"]["penetration_mm_max"] < 1.0
+    assert figures["tracking"]["segment_angle_deg_mean"] < 2.0
+
+
 def test_links_without_a_size_get_no_capsule():
-    icub = osik.Robot.from_urdf(g1_urdf().parents[2] / "icub_description/robots/icub_reduced.urdf", floating_base=True)
+    path = described_urdf("g1").parents[2] / "icub_description/robots/icub_reduced.urdf"
+    icub = osik.Robot.from_urdf(path, floating_base=True)
     capsules = {capsule.frame: capsule.radius for capsule in guess_profile(icub).capsules}
     assert "l_ankle_2" not in capsules and min(capsules.values()) > 1e-3
 

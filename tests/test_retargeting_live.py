@@ -3,10 +3,11 @@
 import dataclasses
 import io
 import json
+from functools import partial
 
 import numpy as np
 import pytest
-from motion_files import dancer, write_bvh
+from motion_files import bent_forward, dancer, write_bvh
 
 import osik_jax as osik
 from osik_jax import cli
@@ -54,6 +55,15 @@ def assert_limits_hold(robot, frames, fps, acceleration=240.0):
 
 
 @pytest.mark.slow
+def test_the_centre_of_mass_stays_over_the_feet_frame_by_frame(nao, motion):
+    margins = []
+    for balance in (None, 0.01):
+        make = partial(LiveRetargeter, nao, look_ahead=LOOK_AHEAD, balance=balance)
+        margins.append(report(replay(make, bent_forward(motion), paced=False)[0])["balance"]["com_margin_mm_min"])
+    assert margins[0] < -5.0 and margins[1] > 10.0 - 0.5
+
+
+@pytest.mark.slow
 def test_frame_by_frame_is_near_the_whole_clip(nao, motion, live):
     whole = retarget(nao, motion)
     result, frames = replay(lambda _: live, motion, paced=False)
@@ -94,7 +104,7 @@ def test_a_person_who_is_lost_leaves_the_robot_at_rest(nao, motion, live):
     assert_limits_hold(nao, frames, motion.fps)
 
 
-def test_short_streams_and_wrong_frames(motion, live):
+def test_short_streams_and_wrong_frames(nao, motion, live):
     live.reset()
     assert live.finish() == []
     assert live.step(motion.positions[0]) is None and len(live.finish()) == 1
@@ -104,6 +114,8 @@ def test_short_streams_and_wrong_frames(motion, live):
     live.step(motion.positions[0], [True] * 4)
     with pytest.raises(ValueError, match="in some frames and not in others"):
         live.step(motion.positions[1])
+    with pytest.raises(ValueError, match="balance is nan"):
+        LiveRetargeter(nao, motion, balance=np.nan)
     with pytest.raises(ValueError, match="look_ahead is 0"):
         LiveRetargeter(live.robot, motion, look_ahead=0)
 

@@ -46,11 +46,11 @@ class Retarget:
     clip: Annotated[str, tyro.conf.Positional]
     """A BVH file, or keypoints as .npz or .csv; or a folder with such files."""
     robot: str = "nao"
-    """nao, g1 (of example-robot-data, where that is installed), or a URDF or MJCF file."""
+    """nao; g1 or talos (of example-robot-data, where that is installed); or a URDF or MJCF file."""
     out: Path = Path("osik-retarget")
     """Folder to write to."""
     profile: str | None = None
-    """A TOML file that says how the robot is seen. Default: the package's own for NAO and G1, else a guess."""
+    """A TOML file that says how the robot is seen. Default: the package's own for NAO, G1 and Talos, else a guess."""
     mapping: tuple[str, ...] = ()
     """Which of the clip's joints is which, as ROLE=NAME, where names are not to be guessed; all of them then."""
     fps: float | None = None
@@ -59,6 +59,8 @@ class Retarget:
     """Greatest acceleration of the joints [rad/s^2]."""
     smooth: float = 0.0
     """What is faster than about this time is smoothed out [s]; 0: nothing."""
+    balance: float | None = None
+    """Where both feet stand, keep the centre of mass this far inside their edge [m]. Default: it is where it falls."""
     unit: str | None = None
     """Of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
     up: Literal["x", "y", "z"] | None = None
@@ -143,6 +145,7 @@ def _retargeter(command: Retarget) -> Retargeter:
         profile=profile,
         acceleration=command.acceleration,
         smoothness=command.smooth,
+        balance=command.balance,
     )
 
 
@@ -222,6 +225,7 @@ def _retarget_live(command: Retarget) -> None:
                 profile=profile,
                 mapping=mapping,
                 acceleration=command.acceleration,
+                balance=command.balance,
                 look_ahead=command.look_ahead,
             )
 
@@ -256,12 +260,12 @@ def _print_retargeted(console: Console, figures: dict[str, Any], out: Path) -> N
 
 
 def _robot_to_retarget(source: str) -> Robot:
-    """A robot by name or file, its base floating; ``g1`` is that of example-robot-data."""
-    if source == "g1" and not os.path.exists(source):
-        from ..retargeting._described import g1_urdf
+    """A robot by name or file, its base floating; some names are of example-robot-data's."""
+    from ..retargeting._described import DESCRIBED, described_urdf
 
-        source = str(g1_urdf())
-    return read_robot(source, "auto" if source in EMBEDDED else "floating", named=("nao", "g1"))
+    if source in DESCRIBED and not os.path.exists(source):
+        source = str(described_urdf(source))
+    return read_robot(source, "auto" if source in EMBEDDED else "floating", named=("nao", *DESCRIBED))
 
 
 def _number_or_name(text: str) -> str | float:

@@ -183,6 +183,7 @@ def _job(retargeter: Retargeter, options: Mapping[str, Any]) -> dict[str, Any]:
         "profile": identifier({"text": profile_text(retargeter.profile)}),
         "acceleration": finite[0].item() if len(finite) == 1 else identifier(fingerprint(most)),
         "smoothness": float(retargeter.smoothness),
+        "balance": retargeter.balance,
         "max_iterations": int(retargeter.max_iterations),
         **options,
     }

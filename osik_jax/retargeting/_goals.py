@@ -49,9 +49,10 @@ class Weights(eqx.Module):
         posture: of the joints' distance from home [1/rad^2].
         smooth: of a joint's change of step from one frame to the next [1/rad^2].
         smooth_base: the same of the base's position [1/m^2] and turn [1/rad^2].
-        stance: of what a standing point moves, and of its height [1/m^2]; a thousandth of it, of what is nearer to the
-            floor than 3 mm and does not stand.
+        stance: of what a standing point moves, and of its height [1/m^2]; two thousandths of it, of what is nearer to
+            the floor than 3 mm and does not stand.
         apart: of the depth of shapes that are nearer than ``margin`` [1/m^2].
+        balance: of what the centre of mass is beyond its bound, where one is asked for [1/m^2].
         limit: of what joints are beyond their ranges [1/rad^2].
         speed: of what speeds and accelerations are beyond their limits, as shares of those [1].
         margin: least distance of shapes [m].
@@ -67,6 +68,7 @@ class Weights(eqx.Module):
     smooth_base: Float[Array, ""] = eqx.field(default=0.02, converter=_number)
     stance: Float[Array, ""] = eqx.field(default=1e6, converter=_number)
     apart: Float[Array, ""] = eqx.field(default=1e4, converter=_number)
+    balance: Float[Array, ""] = eqx.field(default=1e5, converter=_number)
     limit: Float[Array, ""] = eqx.field(default=1e3, converter=_number)
     speed: Float[Array, ""] = eqx.field(default=100.0, converter=_number)
     margin: Float[Array, ""] = eqx.field(default=0.005, converter=_number)

@@ -84,9 +84,10 @@ class LiveRetargeter(OnRobot):
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
         standing: some frames of the person standing, with the joints and the rate of the stream: it is measured there
             how long legs are, how high ankles, and where the floor is.
-        profile: how the robot is seen. None: the package's own for NAO and G1, or a guess (``find_profile``).
+        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
         mapping: role to the stream's name of it, see ``find_roles``. None: by the names that files use.
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+        balance: as of ``Retargeter``.
         look_ahead: frames that the robot is behind the person, at least 1.
         iterations: of the plan at each frame, at least 1.
 
@@ -103,13 +104,14 @@ class LiveRetargeter(OnRobot):
         profile: Profile | None = None,
         mapping: Mapping[str, str] | None = None,
         acceleration: float | Mapping[str, float] = ACCELERATION,
+        balance: float | None = None,
         look_ahead: int = 8,
         iterations: int = 3,
     ):
         for name, value in (("look_ahead", look_ahead), ("iterations", iterations)):
             if not value >= 1:
                 raise OsikValueError(f"{name} is {value}; it is 1 at least")
-        super().__init__(robot, profile, acceleration)
+        super().__init__(robot, profile, acceleration, balance)
         self.look_ahead, self.iterations = int(look_ahead), int(iterations)
         self._standing, self.roles = standing, find_roles(standing.joint_names, mapping)
         self._measures = measure(standing, self.roles)

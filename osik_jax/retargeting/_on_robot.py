@@ -25,10 +25,12 @@ class OnRobot:
         robot: with a free base, two legs and two arms.
         profile: how the robot is seen. None: the package's own, or a guess (``find_profile``).
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+        balance: as of ``Retargeter``.
 
     Attributes:
         robot: the robot.
         profile: how it is seen.
+        balance: as given.
         limits: of position, speed and acceleration, which hold exactly.
 
     Raises:
@@ -36,15 +38,24 @@ class OnRobot:
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
 
-    def __init__(self, robot: Robot, profile: Profile | None, acceleration: float | Mapping[str, float]):
+    def __init__(
+        self,
+        robot: Robot,
+        profile: Profile | None,
+        acceleration: float | Mapping[str, float],
+        balance: float | None,
+    ):
         if not robot.floating_base:
             raise OsikValueError("retargeting moves a robot's base: load the robot with floating_base=True")
+        if balance is not None and not (np.isfinite(balance) and balance >= 0.0):
+            raise OsikValueError(f"balance is {balance}; it is a length in metres, 0 or more")
         self.robot = robot
+        self.balance = balance
         self.profile = find_profile(robot) if profile is None else profile
         check_profile(robot, self.profile)
         self.limits = ConfigurationLimit(robot), VelocityLimit(robot), _on_joints(robot, acceleration)
         self._acceleration = np.asarray(self.limits[2].acceleration)
-        self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile))
+        self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile), balance)
         self._build = Build.of(robot, self.profile)
 
     def _bounds(self, dt: float) -> Bounds:

@@ -15,12 +15,13 @@ from ..kinematics._kernels import dof_columns
 from ..kinematics._manifold import layout
 from ..numerics._dense import product
 from ..robot._joint_selection import scalar_layout
+from ._balance import mass_shares
 from ._goals import Goals, Weights
 from ._person import LIMBS
 from ._terms import CLEARANCE, PAIRS, SHORTEST, SWINGING, Body, Bounds
 
 _HIPS = ("left_hip", "right_hip")
-_ROWS, _POINTS = 60, 8
+_ROWS, _POINTS = 61, 8
 """As in ``kernels/numba/_clip_workspace.py``."""
 
 
@@ -96,6 +97,8 @@ def _structure(body: Body) -> tuple[dict[str, int], np.ndarray]:
 
 def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"]:
     """The kernel's numbers of robot, profile and weights; the stiffness, which comes and goes, is 0."""
+    none = np.zeros(1)
+    balance = (none, none) if body.inside is None else (weights.balance, body.inside)
     robot, ids = body.robot, np.array([body.robot.tree.frame(name) for name in body.frames])
     turned, rotations, w = ids[len(body.keys) : len(body.keys) + 4], robot.frame_rotation, weights
     points = robot.frame_position[:, ids] + product(rotations[:, ids], body.offsets[..., None])[..., 0]
@@ -103,9 +106,10 @@ def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"
         robot.tree.qpos_source[1][None], robot.qpos_offset, robot.joint_reference, robot.body_position,
         robot.body_quaternion, robot.joint_position, robot.joint_axis, dof_columns(robot.tree)[1][None], points,
         rotations[:, turned], body.home, body.radii, bounds.lower, bounds.upper,
-        robot.q0[:, scalar_layout(robot)[1]], bounds.step, bounds.change, w.limb, w.pelvis, w.torso, w.root, w.foot,
+        robot.q0[:, scalar_layout(robot)[1]], bounds.step, bounds.change, mass_shares(robot),
+        robot.body_com, w.limb, w.pelvis, w.torso, w.root, w.foot,
         w.posture, w.stance, w.apart, w.limit, w.margin, np.array([[0.0, CLEARANCE, SWINGING, SHORTEST]]), w.smooth,
-        w.smooth_base, w.speed,
+        w.smooth_base, w.speed, *balance,
     )  # fmt: skip
 
 

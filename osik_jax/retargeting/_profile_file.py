@@ -19,11 +19,11 @@ from ._guess import guess_profile
 from ._person import SIDES
 from ._profile import Capsule, Foot, Place, Point, Profile
 
-BUNDLED = ("nao", "g1")
+BUNDLED = ("nao", "g1", "talos")
 
 
 def load_profile(path: str | os.PathLike[str]) -> Profile:
-    """Reads a profile from a TOML file, or one that comes with the package: ``"nao"``, ``"g1"``.
+    """Reads a profile from a TOML file, or one that comes with the package: ``"nao"``, ``"g1"``, ``"talos"``.
 
     Raises:
         FileNotFoundError: no such file.

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..physics._world import frame_pose
+from ..tasks._polygon import hull
 from ._body import JOINTS_APART, joints_between
 from ._person import LIMBS, SIDES
 from ._profile import Profile
@@ -30,6 +31,8 @@ def report(result: Retargeted) -> dict[str, Any]:
     ``joints``: how far joints are beyond their ranges, speed over its limit, accelerations and jerks (``rms``: root of
     the mean square over joints and frames), and frames with a jump of more than 15 rad/s. ``feet``: how far points that
     stand move from where they landed (``slip``), how high they are (``float``), and how deep soles are below the floor.
+    ``balance``: in frames in which both feet stand, how often the centre of mass is over the hull of what stands of
+    them, and how far inside its edge it is at least (outside: minus how far it is beyond an edge's line).
     ``shapes``: how deep the profile's capsules are in each other.
     ``tracking``: keypoints against the person's, limb by limb, with the scale that fits each limb best; and the angle
     between the person's segments and the robot's.
@@ -42,29 +45,34 @@ def report(result: Retargeted) -> dict[str, Any]:
         "off_plan_rad": float(result.off_plan.max()),
         "joints": _joints(result),
         "feet": _feet(places["soles"], result.contact, result.motion.fps),
+        "balance": _balance(places["soles"], places["center"], result.contact),
         "shapes": {"penetration_mm_max": _penetration(result, places["capsules"])},
         "tracking": _tracking(result, places["keypoints"]),
     }
 
 
 def _places(result: Retargeted) -> dict[str, Any]:
-    """Keypoints by role, soles' corners (F, 8, 3) and capsules' ends (F, k, 2, 3), as MuJoCo has them."""
+    """Keypoints by role, soles' corners (F, 8, 3), capsules' ends (F, k, 2, 3), centre of mass (F, 3): MuJoCo's."""
     robot, profile = result.robot, result.profile
     data = mujoco.MjData(robot.mj_model)
     index, coefficient = robot.tree.qpos_source
     wanted = [*profile.keypoints.values(), *profile.corners]
     wanted += [(c.frame, point) for c in profile.capsules for point in (c.start, c.end)]
-    points = np.zeros((len(result.q), len(wanted), 3))
+    points, center = np.zeros((len(result.q), len(wanted), 3)), np.zeros((len(result.q), 3))
+    root = robot.mj_model.body(robot.tree.body_names[robot.tree.root]).id
     frames = tuple(dict.fromkeys(frame for frame, _ in wanted))
     for f, q in enumerate(result.q):
         data.qpos[:] = q[index] * coefficient + np.asarray(robot.qpos_offset)
         mujoco.mj_kinematics(robot.mj_model, data)
         poses = {frame: frame_pose(robot, data, frame) for frame in frames}
+        mujoco.mj_comPos(robot.mj_model, data)
+        center[f] = data.subtree_com[root]
         points[f] = [poses[frame][0] + poses[frame][1] @ np.array(point) for frame, point in wanted]
     keys = len(profile.keypoints)
     return {
         "keypoints": dict(zip(profile.keypoints, np.moveaxis(points[:, :keys], 1, 0), strict=True)),
         "soles": points[:, keys : keys + 8],
+        "center": center,
         "capsules": points[:, keys + 8 :].reshape(len(points), -1, 2, 3),
     }
 
@@ -108,6 +116,23 @@ def _feet(corners: Float[np.ndarray, "F 8 3"], contact: Bool[np.ndarray, "F 4"],
         "slip_mm_max": 1e3 * max(slip),
         "float_mm_max": 1e3 * float(max(0.0, heights.max(initial=0.0))),
         "below_floor_mm_max": 1e3 * float(max(0.0, -corners[..., 2].min())),
+    }
+
+
+def _balance(
+    corners: Float[np.ndarray, "F 8 3"], center: Float[np.ndarray, "F 3"], contact: Bool[np.ndarray, "F 4"]
+) -> dict[str, Any]:
+    margins = []
+    both = contact[:, :2].any(1) & contact[:, 2:].any(1)
+    for f in np.flatnonzero(both):
+        polygon = hull(corners[f, np.repeat(contact[f], 2), :2])
+        if polygon is not None:
+            normals, offsets, _ = polygon
+            margins.append(float((offsets - normals @ center[f, :2]).min()))
+    return {
+        "double_support_frames": int(both.sum()),
+        "com_inside_share": float(np.mean(np.array(margins) >= 0.0)) if margins else None,
+        "com_margin_mm_min": 1e3 * min(margins) if margins else None,
     }
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from .._errors import OsikValueError
 from ..execution._workers import cores
 from ..limits import Limit
 from ..robot import Robot
-from ..scaling import Saved, run_in_chunks
+from ..scaling import Saved, ShardedFunction, run_in_chunks, sharded
 from ..scaling._progress import reported
 from ._finish import follow
 from ._goals import Goals, Weights
@@ -83,10 +83,12 @@ class Retargeter(OnRobot):
 
     Args:
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
-        profile: how the robot is seen. None: the package's own for NAO and G1, or a guess (``find_profile``).
+        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         smoothness: what is faster than about this time is smoothed out [s]: accelerations weigh, beside directions of
             limbs, with its fourth power. 0: nothing but what the profile's weights say. Changing it compiles nothing.
+        balance: how far inside the edge of what stands the centre of mass is kept where both feet stand [m], and at
+            most a third of that polygon's width; a bound of the plan. None: it is where it falls.
         max_iterations: of the plan.
 
     Raises:
@@ -101,9 +103,10 @@ class Retargeter(OnRobot):
         profile: Profile | None = None,
         acceleration: float | Mapping[str, float] = ACCELERATION,
         smoothness: float = 0.0,
+        balance: float | None = None,
         max_iterations: int = 100,
     ):
-        super().__init__(robot, profile, acceleration)
+        super().__init__(robot, profile, acceleration, balance)
         if not (np.isfinite(smoothness) and smoothness >= 0.0):
             raise OsikValueError(f"smoothness is {smoothness}; it is a time in seconds, 0 or more")
         self.smoothness = smoothness
@@ -307,8 +310,10 @@ _Lane = tuple[Goals, Array, Bounds, Array]
 def _solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
     """All lanes: on CPUs as many at a time as there are cores, in threads: a program does not hold Python's lock.
 
-    ``shared`` is what ``_solve_lane`` takes after the lane.
+    Elsewhere in one program, split over all devices. ``shared`` is what ``_solve_lane`` takes after the lane.
     """
+    if not one_a_core() and len(jax.devices()) > 1:
+        return _over_devices(len(shared))(lanes, *shared)
     if not one_a_core() or isinstance(jax.tree.leaves(lanes)[0], Tracer):
         return _solve_lanes(lanes, *shared)
 
@@ -346,6 +351,12 @@ def _solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
     return jax.vmap(one)(lanes)
 
 
+@cache
+def _over_devices(shared: int) -> ShardedFunction:
+    """``_solve_lanes`` with so many arguments that all lanes share, each device with its own part of the lanes."""
+    return sharded(_solve_lane, (0, *[None] * shared))
+
+
 def retarget(
     robot: Robot,
     motion: HumanMotion,
@@ -355,6 +366,7 @@ def retarget(
     fps: float | None = None,
     acceleration: float | Mapping[str, float] = ACCELERATION,
     smoothness: float = 0.0,
+    balance: float | None = None,
     max_iterations: int = 100,
 ) -> Retargeted:
     """The robot does what a person did: limbs in the same directions, feet that stay where they stand.
@@ -368,11 +380,13 @@ def retarget(
     Args:
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
         motion: the clip.
-        profile: how the robot is seen. None: the package's own for NAO and G1, or a guess (``find_profile``).
+        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
         mapping: role to the clip's name of it, see ``find_roles``. None: by the names that files use.
         fps: frames a second of the result; None: the clip's.
         acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         smoothness: what is faster than about this time is smoothed out [s]; 0: nothing (see ``Retargeter``).
+        balance: how far inside the edge of what stands the centre of mass is kept where both feet stand [m]; None: it
+            is where it falls (see ``Retargeter``).
         max_iterations: of the plan.
 
     Raises:
@@ -381,7 +395,12 @@ def retarget(
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
     own = Retargeter(
-        robot, profile=profile, acceleration=acceleration, smoothness=smoothness, max_iterations=max_iterations
+        robot,
+        profile=profile,
+        acceleration=acceleration,
+        smoothness=smoothness,
+        balance=balance,
+        max_iterations=max_iterations,
     )
     return own.retarget(motion, mapping=mapping, fps=fps)
 

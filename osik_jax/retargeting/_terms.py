@@ -19,13 +19,14 @@ from ..kinematics._rigid import cross, rotate
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ..tasks._rotation import dot, rotation_log
+from ._balance import mass_shares, overhang
 from ._goals import Goals, Weights
 from ._person import LIMBS
 from ._profile import Place, Profile
 
 SHORTEST = 1e-6
 PAIRS = 12
-CLEARANCE, SWINGING = 3e-3, 1e-3
+CLEARANCE, SWINGING = 3e-3, 2e-3
 """How far soles that do not stand are kept above the floor [m], and what that weighs beside standing."""
 
 
@@ -37,6 +38,7 @@ class Body(eqx.Module):
         offsets: of each place in its frame [m]. (places, 3)
         radii: of the capsules [m]. (capsules,)
         home: how pelvis, chest and feet are turned at home, where the person's axes are the world's. (4, 3, 3)
+        inside: how far inside the edge of the feet the centre of mass is kept [m]; None: it is not.
         frames: of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static).
         keys: the role of each keypoint (static).
         bends: whether the trunk bends (static).
@@ -48,6 +50,7 @@ class Body(eqx.Module):
     offsets: Float[Array, "places 3"]
     radii: Float[Array, " capsules"]
     home: Float[Array, "4 3 3"]
+    inside: Float[Array, ""] | None
     frames: tuple[str, ...] = eqx.field(static=True)
     keys: tuple[str, ...] = eqx.field(static=True)
     bends: bool = eqx.field(static=True)
@@ -55,7 +58,7 @@ class Body(eqx.Module):
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, robot: Robot, profile: Profile, pairs: Sequence[tuple[int, int]]) -> Body:
+    def of(cls, robot: Robot, profile: Profile, pairs: Sequence[tuple[int, int]], inside: float | None = None) -> Body:
         """The robot with this profile, whose capsules are kept apart in these pairs."""
         origin = (0.0, 0.0, 0.0)
         places: list[Place] = list(profile.keypoints.values())
@@ -72,6 +75,7 @@ class Body(eqx.Module):
             offsets=jnp.array([point for _, point in places], robot.q0.dtype),
             radii=jnp.array([capsule.radius for capsule in profile.capsules], robot.q0.dtype),
             home=home_kinematics(robot).frame_poses(robot, turned)[1],
+            inside=None if inside is None else jnp.asarray(inside, robot.q0.dtype),
             frames=tuple(frame for frame, _ in places),
             keys=tuple(profile.keypoints),
             bends=profile.torso is not None,
@@ -188,6 +192,8 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
         stiff.append(_floor(place, k + 12, body, weights.stance))
     if body.pairs:
         stiff.append(_apart(place, k + 12, body, weights))
+    if body.inside is not None:
+        stiff.append(_balanced(place, corners, kinematics, robot, goals.contact, body.inside, weights.balance))
     wishes, needs = (_Rows(*(jnp.concatenate(column) for column in zip(*part, strict=True))) for part in (soft, stiff))
     stance, along = _stance(place, corners)
     rates = independent_columns(robot.tree, jnp.concatenate([wishes.rates, needs.rates, along]))
@@ -275,6 +281,33 @@ def _floor(place: _Places, first: int, body: Body, weight: Float[Array, ""]) -> 
     height, rates = _heights(place, first + np.stack([2 * above, 2 * above + 1], 1).ravel())
     gap = height - jnp.repeat(body.radii[above], 2) - CLEARANCE
     return _Rows(gap, rates, jnp.where(gap < 0.0, SWINGING * weight, 0.0))
+
+
+def _balanced(
+    place: _Places,
+    corners: slice,
+    kinematics: Kinematics,
+    robot: Robot,
+    contact: Float[Array, "4"],
+    inside: Float[Array, ""],
+    weight: Float[Array, ""],
+) -> _Rows:
+    """Where both feet stand, the centre of mass inside what stands of them; none elsewhere.
+
+    The direction changes too, but the distance does not by that: along any other it is less.
+    """
+    share = mass_shares(robot)[:, None]
+    centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
+    at, both = jnp.sum(share * centers, 0), jnp.max(contact[:2]) * jnp.max(contact[2:]) > 0.5
+    # beside a row that does not count, a polygon that is one: its numbers are finite
+    stands = jnp.where(both, jnp.repeat(contact, 2), 1.0)
+    found = overhang(at[:2], place.points[corners][:, :2], stands)
+    direction = jnp.append(found.direction, 0.0)
+    pulls = [place.motion.rates(robot.tree.moves, share * direction, centers)]
+    pulls.append(place.motion.rates(place.moves[corners], -found.shares[:, None] * direction, place.points[corners]))
+    gap = found.distance + jnp.minimum(inside, found.width / 3.0)
+    rates = jnp.concatenate(pulls).sum(0, keepdims=True)
+    return _Rows(gap[None], rates, jnp.where(both & (gap > 0.0), weight, 0.0)[None])
 
 
 def _joints(robot: Robot, q: Float[Array, " nq"], weights: Weights, bounds: Bounds) -> Joints:

@@ -73,7 +73,7 @@ def support_polygon(
     if not margin >= 0.0:
         raise OsikValueError(f"margin is {margin}; it has to be 0 or more, in metres")
     points = np.concatenate([_ground_points(robot, q, name, given.get(name)) for name in frames] or [np.zeros((0, 2))])
-    polygon = _hull(points)
+    polygon = hull(points)
     if polygon is None:
         raise OsikValueError(f"the contact corners of {', '.join(frames)} span no area on the ground:\n{points}")
     drawn_in = _draw_in(polygon, margin) if margin else polygon
@@ -118,7 +118,7 @@ def _corner_names(robot: Robot, frame: str) -> list[str]:
     return names
 
 
-def _hull(points: np.ndarray) -> _Polygon | None:
+def hull(points: np.ndarray) -> _Polygon | None:
     """Normals, offsets and vertices of the convex hull; None where it has no area."""
     if len(points) < 3:
         return None
@@ -154,4 +154,4 @@ def _draw_in(polygon: _Polygon, margin: float) -> _Polygon | None:
     crossing = np.abs(np.linalg.det(pairs)) > 1e-9
     points = np.linalg.solve(pairs[crossing], np.stack([offsets[i], offsets[j]], 1)[crossing][..., None])[..., 0]
     inside = (points @ normals.T <= offsets + 1e-9).all(1)
-    return _hull(points[inside])
+    return hull(points[inside])

@@ -12,8 +12,9 @@ import numpy as np
 from ._frame import compiled, matrix, vector, whole_numbers
 from ._tiles import padded
 
-ROWS = 60
-"""Rows of a frame but for those of capsules and the floor: at most 16 of limbs, 3 and 12 of turns, 8 and 8 of soles."""
+ROWS = 61
+"""Rows of a frame but for those of capsules and the floor: at most 16 of limbs, 3 and 12 of turns, 8 and 8 of soles, 1
+of balance."""
 POINTS = 8
 """Rows of standing points."""
 
@@ -57,6 +58,8 @@ class Numbers(NamedTuple):
     rest: np.ndarray
     step: np.ndarray
     change: np.ndarray
+    shares: np.ndarray  # of each body in the robot's mass
+    centers: np.ndarray  # where that is in the body
     wishes: np.ndarray
 
 
@@ -109,11 +112,11 @@ class Goal(NamedTuple):
     TURNS,
     DOFS,
 ) = range(17)
-COUNTS, WISHES = 17, 19
+COUNTS, WISHES = 17, 21
 LIMB, PELVIS, TORSO, ROOT_X, ROOT_Y, ROOT_Z, FOOT, POSTURE, STANCE, APART, LIMIT, MARGIN, STIFFNESS, CLEARANCE = range(
     14
 )
-SWINGING, SHORTEST, SMOOTH, SMOOTH_BASE, SPEED = range(14, 19)
+SWINGING, SHORTEST, SMOOTH, SMOOTH_BASE, SPEED, BALANCE, INSIDE = range(14, 21)
 
 
 class Kept(NamedTuple):
@@ -184,11 +187,13 @@ def numbers(c, at, wishes):
     rest, at = vector(at, n), at + 8 * n
     step, at = vector(at, n), at + 8 * n
     change, at = vector(at, n), at + 8 * n
+    shares, at = vector(at, c[BODIES]), at + 8 * c[BODIES]
+    centers, at = matrix(at, c[BODIES], 3), at + 24 * c[BODIES]
     for i in range(WISHES):
         wishes[i] = vector(at, WISHES)[i]
     return Numbers(
         coefficient, offset, reference, body_at, body_along, joint_at, joint_along, factors, points, turns, home,
-        radii, lower, upper, rest, step, change, wishes,
+        radii, lower, upper, rest, step, change, shares, centers, wishes,
     )  # fmt: skip
 
 
