@@ -69,3 +69,9 @@ static void end_thread() {
   ended[lane_now] = true;
   swapcontext(&fibers[lane_now], &outside);
 }
+
+// Warp has these two macros before a kernel's text: a declarator such as "float (&a)[2]" becomes a call
+template <class T> static float cast_float(T a) { return static_cast<float>(a); }
+template <class T> static int cast_int(T a) { return static_cast<int>(a); }
+#define float(x) cast_float(x)
+#define int(x) cast_int(x)

@@ -1,7 +1,10 @@
 // The Hessian of the working set, and the inverse of its Cholesky factor.
 
+// named, since Warp makes a macro of what stands before a parenthesis in "float (&R)"
+using Entries = float[H][N];
+
 // lane i has column i, and of column i + 32 the rows from 32 on; the rest of that is in the other lanes, by symmetry
-auto form_hessian = [&](float (&R)[H][N], float* diagonal) {
+auto form_hessian = [&](Entries& R, float* diagonal) {
 #pragma unroll
   for (int h = 0; h < H; ++h) {
     diagonal[h] = damping_of[h];
@@ -30,7 +33,7 @@ auto form_hessian = [&](float (&R)[H][N], float* diagonal) {
   }
 };
 // over the free variables, scaled to a diagonal of ones; the others get a row and column of the identity
-auto scale_hessian = [&](float (&R)[H][N], const float* diagonal) {
+auto scale_hessian = [&](Entries& R, const float* diagonal) {
 #pragma unroll
   for (int h = 0; h < H; ++h) {
     root[h] = sqrtf(diagonal[h] > 0.f ? diagonal[h] : 1.f);
@@ -46,7 +49,7 @@ auto scale_hessian = [&](float (&R)[H][N], const float* diagonal) {
 };
 // L^-1 of its Cholesky factor L, in place. Before step j lane i >= j has column i of the Schur complement that is left of
 // the Hessian, lane i < j column i of the identity as far as L has been solved for
-auto invert_factor = [&](float (&R)[H][N]) {
+auto invert_factor = [&](Entries& R) {
 #pragma unroll
   for (int j = 0; j < N; ++j) {
     float inverse = rsqrtf(__shfl_sync(ALL, R[j >> 5][j], j & 31));
@@ -80,7 +83,7 @@ auto invert_factor = [&](float (&R)[H][N]) {
   }
   __syncwarp();
 };
-auto store_factor = [&](const float (&R)[H][N]) {     // to `inverse_factor`, from the registers
+auto store_factor = [&](const Entries& R) {     // to `inverse_factor`, from the registers
 #pragma unroll
   for (int k = 0; k < N; ++k)
 #pragma unroll
