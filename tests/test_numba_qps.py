@@ -269,7 +269,7 @@ def test_sums_and_factors_in_blocks_are_those_of_numpy():
     )
     before = B.copy()
     assert others(T, B, u, v, c) == np.max(v**2)
-    np.testing.assert_array_equal(T, before.T)
+    np.testing.assert_array_equal(T[:35, :13], before.T[:35, :13])
     before[2:7, 8:] += u[2:7, None] * v[None, 8:]
     np.testing.assert_allclose(B, before, atol=1e-14)
     np.testing.assert_array_equal(c, np.append(3.0 * v[:35], np.zeros(5)))
