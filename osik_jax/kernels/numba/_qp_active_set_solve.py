@@ -9,9 +9,23 @@ from __future__ import annotations
 import numpy as np
 
 from ...numerics._constants import INACTIVE
-from ._dense import add_multiple, backward, cholesky, dot, forward, gram
+from ._dense import add_multiple, backward, cholesky, dot, forward
 from ._frame import lean
+from ._padded_rows import (
+    clear,
+    largest_product,
+    minus_rows,
+    put,
+    put_difference,
+    put_inverse,
+    put_multiple,
+    put_product,
+    put_pull,
+)
 from ._qp_problem import active_bound
+from ._symmetric import factor_symmetric, solve_symmetric
+from ._tiles import padded, take_product
+from ._vectors import WIDTH
 
 EPS = 2.220446049250313e-16
 _SMALLEST_PIVOT = 1e2
@@ -36,22 +50,22 @@ def solve_on_active_set(P, W, labels, x, z):
         x: the minimiser. (n,)
         z: residuals of the rows of the cost, multipliers of those of C. (m + p,)
     """
-    count = find_used_rows(P, labels, W.used)
+    count = find_used_rows(P, labels, W.used, z)
     few = count <= len(x)
-    sound = solve_in_row_space(P, W, labels, count, x, z) if few else solve_by_hessian(P, W, labels, count, x, z)
-    find_gradient(P, W, labels, x, z)
-    return sound
+    return solve_in_row_space(P, W, labels, count, x, z) if few else solve_by_hessian(P, W, labels, count, x, z)
 
 
 @lean
-def find_used_rows(P, labels, used):
-    """Numbers of the rows of the active set: all of the cost, the active ones of C; how many they are."""
+def find_used_rows(P, labels, used, z):
+    """Numbers of the rows of the active set, all of the cost and the active ones of C; how many. The others' z is 0."""
     m, n = len(P.target), len(P.damping)
     count = 0
     for i in range(len(P.compliance)):
         if i < m or labels[n + i - m] != INACTIVE:
             used[count] = i
             count += 1
+        else:
+            z[i] = 0.0
     return count
 
 
@@ -63,20 +77,40 @@ def gap_of(P, labels, i, x, z):
     return target - dot(P.rows[i], x, 0, n) - P.compliance[i] * z[i]
 
 
-@lean
+@lean(inline="always")
+def find_gaps(P, W, labels, x, z):
+    """Of each row of the cost target - row x, of each of C target - row x - compliance z, 0 where it is active."""
+    m, n, rows = len(P.target), len(x), len(P.compliance)
+    minus_rows(W.gap, P.goal, x, P.turned, 0, n, 0, padded(rows))
+    for i in range(m, rows):
+        W.gap[i] += active_bound(P, labels[n + i - m], n + i - m) - P.compliance[i] * z[i]
+
+
+@lean(inline="always")
 def find_gradient(P, W, labels, x, z):
     """The gradient D (x - center) - B'(target - B x) - C'y of the Lagrangian; residuals of the cost go into z."""
-    m, n = len(P.target), len(x)
-    for j in range(n):
-        W.gradient[j] = P.damping[j] * (x[j] - P.center[j])
-    for i in range(len(P.compliance)):
-        if i < m:
-            z[i] = P.target[i] - dot(P.rows[i], x, 0, n)
-        if i < m or labels[n + i - m] != INACTIVE:
-            add_multiple(W.gradient, -z[i], P.rows[i], n)
+    m, n, rows = len(P.target), len(x), len(P.compliance)
+    if m == rows:
+        minus_rows(z, P.goal, x, P.turned, 0, n, 0, padded(rows))
+    else:
+        find_gaps(P, W, labels, x, z)
+        for i in range(m):
+            z[i] = W.gap[i]
+    put_pull(W.gradient, P.damping, x, P.center, padded(n))
+    minus_rows(W.gradient, W.gradient, z, P.rows, 0, rows, 0, padded(n))
 
 
 @lean
+def put_columns_of_used(P, W, count, n):
+    """The columns of the rows of the active set, one after another, each as long as these are many."""
+    for j in range(n):
+        for a in range(count):
+            W.columns[j, a] = P.turned[j, W.used[a]]
+        for a in range(count, padded(count)):
+            W.columns[j, a] = 0.0
+
+
+@lean(inline="always")
 def solve_in_row_space(P, W, labels, count, x, z):
     """Solves on the active set through a system as large as its rows (Sherman, Morrison, Woodbury).
 
@@ -86,44 +120,52 @@ def solve_in_row_space(P, W, labels, count, x, z):
         S z = target - B x0,    x_F = center_F + D_F^-1 B_F'z,    S = B_F D_F^-1 B_F' + E,
 
     where x0 is the center, and the bound where a variable is active: there nothing large cancels. Corrections are for
-    what x and z leave, -gradient and gap: S dz = gap - B D^-1 (-gradient), dx = D^-1 (-gradient + B'dz).
+    what x and z leave, gradient and gap: S dz = gap + B D^-1 gradient, dx = -D^-1 (gradient - B'dz).
     """
-    m, n, k = len(P.target), len(x), count
+    m, n, k, rows = len(P.target), len(x), count, len(P.compliance)
+    width, wide, all_used = padded(k), padded(n), count == len(P.compliance)
+    put_inverse(W.inverse, P.damping, wide)
+    put(x, P.center, wide)
     for j in range(n):
-        free = labels[j] == INACTIVE
-        x[j] = P.center[j] if free else active_bound(P, labels[j], j)
-        W.inverse_root[j] = 1.0 / np.sqrt(P.damping[j]) if free else 0.0
-        W.step[j] = 0.0
+        if labels[j] != INACTIVE:
+            x[j], W.inverse[j] = active_bound(P, labels[j], j), 0.0
+    if not all_used:
+        put_columns_of_used(P, W, k, n)
+    columns = P.turned if all_used else W.columns
+    clear(z, padded(rows))
+    find_gaps(P, W, labels, x, z)
     for a in range(k):
-        row, scaled = P.rows[W.used[a]], W.scaled[a]
-        for j in range(n):
-            scaled[j] = row[j] * W.inverse_root[j]
-        z[W.used[a]] = 0.0
-        W.right[a] = gap_of(P, labels, W.used[a], x, z)
-    gram(W.scaled, W.square, k, n)
+        W.right[a] = W.gap[W.used[a]]
+    for j in range(n):
+        put_multiple(W.scaled[j], -W.inverse[j], columns[j], width)
+    for a in range(0, k, WIDTH):
+        for i in range(a, a + WIDTH):
+            clear(W.gram[i], width)
+        take_product(W.gram, W.scaled, columns, a, min(a + WIDTH, k), a, width, 0, n)
     for a in range(k):
-        W.square[a, a] += P.compliance[W.used[a]]
-    if not cholesky(W.square, k, _SMALLEST_PIVOT * EPS):
+        W.gram[a, a] += P.compliance[W.used[a]]
+    if not factor_symmetric(W.gram, W.factor, W.turned_factor, W.pivots, W.solved, k, _SMALLEST_PIVOT * EPS):
         return False
+    clear(W.gradient, wide)
     before = np.inf
     for _ in range(_MOST_CORRECTIONS):
-        forward(W.square, W.right, k)
-        backward(W.square, W.right, k)
+        solve_symmetric(W.factor, W.turned_factor, W.pivots, W.right, k)
+        clear(W.pull, padded(rows))
         for a in range(k):
             z[W.used[a]] += W.right[a]
-            add_multiple(W.step, W.right[a], W.scaled[a], n)
-        for j in range(n):
-            W.step[j] *= W.inverse_root[j]
-        moved, far = move(P, W, x)
+            W.pull[W.used[a]] = W.right[a]
+        minus_rows(W.step, W.gradient, W.pull, P.rows, 0, rows, 0, wide)
+        put_product(W.step, W.step, W.inverse, wide)
+        put_difference(x, x, W.step, wide)
+        moved, far = largest_product(W.step, P.root, wide), largest_product(x, P.root, wide)
+        find_gradient(P, W, labels, x, z)
         if before < np.inf and (moved <= _LAST_CORRECTION * far or moved > _WORTH * before):
             break
         before = moved
-        find_gradient(P, W, labels, x, z)
-        for j in range(n):
-            W.step[j] = -W.inverse_root[j] * W.gradient[j]
-        for a in range(k):
-            gap = 0.0 if a < m else gap_of(P, labels, W.used[a], x, z)
-            W.right[a] = gap - dot(W.scaled[a], W.step, 0, n)
+        clear(W.right, width)
+        for a in range(m, k):
+            W.right[a] = W.gap[W.used[a]]
+        minus_rows(W.right, W.right, W.gradient, W.scaled, 0, n, 0, width)
     return True
 
 
@@ -188,9 +230,11 @@ def solve_by_hessian(P, W, labels, count, x, z):
         x[j] = 0.0 if labels[j] == INACTIVE else active_bound(P, labels[j], j)
     for a in range(p):
         z[W.used[m + a]] = 0.0
-    before = np.inf
-    for _ in range(_MOST_CORRECTIONS):
+    before, last = np.inf, False
+    for round in range(_MOST_CORRECTIONS + 1):
         find_gradient(P, W, labels, x, z)
+        if last or round == _MOST_CORRECTIONS:
+            break
         for j in range(n):
             W.step[j] = -W.gradient[j] if labels[j] == INACTIVE else 0.0
         forward(W.square, W.step, n)
@@ -203,7 +247,6 @@ def solve_by_hessian(P, W, labels, count, x, z):
             add_multiple(W.step, W.right[a], W.reduced[a], n)
         backward(W.square, W.step, n)
         moved, far = move(P, W, x)
-        if before < np.inf and (moved <= _LAST_CORRECTION * far or moved > _WORTH * before):
-            break
+        last = before < np.inf and (moved <= _LAST_CORRECTION * far or moved > _WORTH * before)
         before = moved
     return True

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._dense import add_multiple_absolute, dot_absolute
+from ...numerics._constants import INACTIVE
 from ._frame import lean
+from ._padded_rows import clear, largest_product, plus_sizes
 from ._qp_active_set_solve import EPS
+from ._tiles import padded
 
 _NOUGHT = 100.0
 """Roundings of what the cost pulls at x; an x that is no larger is 0."""
@@ -19,48 +21,51 @@ _TOLD_FROM_NONE = 1.0
 Tolerances of the cost's curvature would not do: a weak task, such as a posture, pulls with less than those."""
 
 
-@lean
-def find_roundoff(P, W, tolerance, x, z):
-    """Of each constraint, ``tolerance`` of the scale of its value and of its multiplier."""
+@lean(inline="always")
+def find_roundoff(P, W, labels, tolerance, x, z):
+    """Of each constraint, ``tolerance`` of the scale of its value and, where it is active, of its multiplier."""
     m, n = len(P.target), len(x)
-    most, pulled_most = 0.0, 0.0
+    wide = padded(n)
     for j in range(n):
-        root, gradient = P.root[j], W.gradient[j]
+        gradient = W.gradient[j]
         for i in range(m, len(P.compliance)):
             gradient += P.rows[i, j] * z[i]
-        W.step[j] = abs(gradient) / (root * root)
-        most, pulled_most = max(most, abs(x[j]) * root), max(pulled_most, W.step[j] * root)
+        W.step[j] = abs(gradient) * (P.reach[j] * P.reach[j])
+    most, pulled_most = largest_product(x, P.root, wide), largest_product(W.step, P.root, wide)
+    longest = largest_product(x, W.ones, wide)
     if most <= _NOUGHT * EPS * pulled_most:
-        most = pulled_most
-    else:
-        for j in range(n):
-            W.step[j] = abs(x[j])
-    longest = 0.0
+        most, longest = pulled_most, largest_product(W.step, W.ones, wide)
+    at_bound = False
     for j in range(n):
-        longest = max(longest, W.step[j])
-    for i in range(len(P.lower)):
-        value, reach, span = 0.0, 0.0, 1.0
-        if i < n:
-            value, reach = x[i], 1.0 / P.root[i]
-        else:
-            span, row = 0.0, P.rows[m + i - n]
-            for j in range(n):
-                value += row[j] * x[j]
-                span += abs(row[j])
-                reach += abs(row[j]) / P.root[j]
+        nearest = min(abs(P.lower[j]), abs(P.upper[j]))
+        scale = min(most * P.reach[j], longest) + abs(x[j]) + (nearest if nearest < np.inf else 0.0)
+        W.value_roundoff[j] = tolerance * scale
+        at_bound = at_bound or labels[j] != INACTIVE
+    for i in range(n, len(P.lower)):
+        value, reach, span, row = 0.0, 0.0, 0.0, P.rows[m + i - n]
+        for j in range(n):
+            value += row[j] * x[j]
+            span += abs(row[j])
+            reach += abs(row[j]) * P.reach[j]
         nearest = min(abs(P.lower[i]), abs(P.upper[i]))
         scale = min(most * reach, longest * span) + abs(value) + (nearest if nearest < np.inf else 0.0)
         W.value_roundoff[i] = tolerance * scale
         W.multiplier_roundoff[i] = tolerance * scale / max(reach, 1e-300) ** 2
-    find_bound_roundoff(P, W, x, z)
+    if at_bound:
+        find_bound_roundoff(P, W, x, z)
 
 
 @lean
 def find_bound_roundoff(P, W, x, z):
     """Of each variable on a bound, what counts as no multiplier: rounding of the terms of its gradient."""
-    m, n = len(P.target), len(x)
+    m, n, rows = len(P.target), len(x), len(P.compliance)
+    clear(W.pull, padded(rows))
+    plus_sizes(W.pull, W.pull, x, P.turned, 0, n, 0, padded(rows))
+    for i in range(rows):
+        size = abs(z[i]) if i >= m else abs(P.target[i]) + W.pull[i]
+        W.pull[i] = _TOLD_FROM_NONE * EPS * size
     for j in range(n):
-        W.multiplier_roundoff[j] = _TOLD_FROM_NONE * EPS * P.damping[j] * (abs(x[j]) + abs(P.center[j]))
-    for i in range(len(P.compliance)):
-        size = abs(z[i]) if i >= m else abs(P.target[i]) + dot_absolute(P.rows[i], x, n)
-        add_multiple_absolute(W.multiplier_roundoff, _TOLD_FROM_NONE * EPS * size, P.rows[i], n)
+        W.step[j] = _TOLD_FROM_NONE * EPS * P.damping[j] * (abs(x[j]) + abs(P.center[j]))
+    plus_sizes(W.step, W.step, W.pull, P.rows, 0, rows, 0, padded(n))
+    for j in range(n):
+        W.multiplier_roundoff[j] = W.step[j]

@@ -35,7 +35,7 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
             report[0] = sound and found
             return
         if sound:
-            find_roundoff(P, W, tolerance, x, z)
+            find_roundoff(P, W, labels, tolerance, x, z)
         if cold:
             steps = dual_active_set(P, W, labels, x, most_changes - report[1])
             if steps < 0:

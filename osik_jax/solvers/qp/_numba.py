@@ -30,7 +30,10 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     p = qp.rows.shape[1]
     k, constraints = m + p, n + p
     largest = max(n, k)
-    workspace = 2 * k * n + largest**2 + p * (n + p) + 2 * constraints**2 + 18 * (largest + constraints)  # as ``Work``
+    wide, high, line = (-(-size // 8) * 8 for size in (n, k, largest + constraints))  # as ``padded``
+    workspace = (
+        high * (4 * wide + 3 * high) + largest**2 + p * (n + p) + 2 * constraints**2 + 27 * line
+    )  # as ``Workspace``
     matrix, *others = jax.tree.leaves(replace(qp, packed=None))
     packed = side_by_side(*others) if qp.packed is None else qp.packed  # in the order of the fields
     x, y, active, report, _ = _target.call(
