@@ -1,12 +1,16 @@
 """Millions of steps towards targets that jump, in one batch on the default device: what fails, and how fast it goes.
 
     python -m benchmarks.jumps [results.json] [--robot g1] [--scheme weighted] [--robots 16384] [--scans 20]
-                               [--precision float32] [--radius 0.5]
+                               [--precision float32] [--radius 0.5] [--sample sample.npz]
+    python -m benchmarks.jumps --judge sample.npz
 
 The tasks are those of ``benchmarks.throughput``. A scan is 50 steps of 5 ms with the warm start carried on; before
 each, every hand gets a new target, uniform in a ball of the radius around its place at home, so that many are out of
 reach and none is led up to. The first scan compiles and is not timed, its statuses count. With ``--radius 0.02`` it is
 easy work, to be held against.
+
+``--sample`` keeps configurations, targets and answers of single steps, each the first one after a jump. ``--judge``
+solves those that were SOLVED again in double precision, from the same numbers.
 """
 
 from __future__ import annotations
@@ -36,16 +40,26 @@ RADIUS = {"nao": 0.25, "g1": 0.5, "arm7": 0.5}
 """Of the balls that suit a robot [m]."""
 
 
-def measure(given: Setting, scheme: osik.Scheme, robots: int, scans: int, radius: float) -> dict[str, Any]:
-    """Shares of statuses, the worst that a step did, and steps a second."""
+QUANTILES = dict(median=0.5, of_999=0.999, largest=1.0)
+SAMPLE = 100_000
+"""Steps that are kept, about."""
+
+
+def measure(
+    given: Setting, scheme: osik.Scheme, robots: int, scans: int, radius: float, sample: list[Any] | None = None
+) -> dict[str, Any]:
+    """Shares of statuses, the worst that a step did, and steps a second; single steps go into the sample."""
     robot, (*_, state) = given.robot, batch_of(given, scheme, robots)
     hand = given.tasks["hand"]
     assert isinstance(hand, osik.FrameTask)
     home, _ = osik.forward_kinematics(robot, robot.q0).frame_pose(robot, hand.frame)
 
-    def step(state: State, point: jax.Array) -> tuple[State, Any]:
+    def solved(state: State, point: jax.Array) -> osik.Solution:
         tasks = given.tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
-        s = osik.solve(robot, state.q, tasks, scheme=scheme, limits=given.limits, dt=DT, warm_start=state.warm_start)
+        return osik.solve(robot, state.q, tasks, scheme=scheme, limits=given.limits, dt=DT, warm_start=state.warm_start)
+
+    def step(state: State, point: jax.Array) -> tuple[State, Any]:
+        s = solved(state, point)
         seen = s.status, jnp.max(jnp.abs(s.velocity)), s.box_violation, s.iterations, jnp.isfinite(s.velocity).all()
         return State(osik.integrate(robot, state.q, s.velocity, DT), s.warm_start), seen
 
@@ -58,9 +72,15 @@ def measure(given: Setting, scheme: osik.Scheme, robots: int, scans: int, radius
 
         return jax.lax.scan(tick, state, length=STEPS)
 
+    look = jax.jit(jax.vmap(solved))
+    kept = np.arange(min(robots, -(-SAMPLE // (scans + 1))))
     rng, seconds, seen = np.random.default_rng(0), [], []
     for _ in range(scans + 1):
         points = jnp.asarray(np.asarray(home) + in_ball(rng, robots, radius), home.dtype)
+        if sample is not None:
+            first = jax.tree.map(lambda a: a[kept], state)
+            found = look(first, points[kept])
+            sample.append([np.asarray(a) for a in (first.q, points[kept], found.velocity, found.status)])
         started = time.perf_counter()
         state, found = jax.block_until_ready(scan(state, points))
         seconds.append(time.perf_counter() - started)
@@ -79,6 +99,40 @@ def measure(given: Setting, scheme: osik.Scheme, robots: int, scans: int, radius
     )
 
 
+def compared(given: Setting, scheme: osik.Scheme, sample: dict[str, np.ndarray]) -> dict[str, float]:
+    """How far answers are from those in double precision; the setting and the scheme are in double precision.
+
+    ``rows`` is the largest difference of a weighted row of a task, as a share of the largest that is asked for, and
+    ``cost`` by how much the weighted sum of squares is larger, as a share of that of standing still.
+    """
+    hand = given.tasks["hand"]
+    assert isinstance(hand, osik.FrameTask)
+
+    @jax.jit
+    @jax.vmap
+    def one(q: jax.Array, point: jax.Array, velocity: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        tasks = given.tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
+        exact = osik.solve(given.robot, q, tasks, scheme=scheme, limits=given.limits, dt=DT)
+        rows = osik.build_problem(given.robot, q, tasks, limits=given.limits, dt=DT).rows.values()
+        A, b = (jnp.concatenate([(r.weight**0.5 * part.T).T for r, part in pairs]) for pairs in _pairs(rows))
+        far = jnp.max(jnp.abs(A @ (velocity - exact.velocity))) / jnp.max(jnp.abs(b))
+        costs = [jnp.sum((A @ v - b) ** 2) for v in (velocity, exact.velocity)]
+        return far, (costs[0] - costs[1]) / jnp.sum(b**2), exact.status
+
+    usable = sample["status"] == osik.Status.SOLVED
+    parts = [np.asarray(sample[name][usable], float) for name in ("q", "target", "velocity")]
+    far, more, status = (np.asarray(a) for a in one(*parts))
+    also = status == osik.Status.SOLVED
+    figures = {f"rows_{name}": float(np.quantile(far[also], share)) for name, share in QUANTILES.items()}
+    figures |= {f"cost_{name}": float(np.quantile(more[also], share)) for name, share in QUANTILES.items()}
+    return dict(steps=len(usable), solved=int(usable.sum()), in_double_too=int(also.sum())) | figures
+
+
+def _pairs(rows: Any) -> tuple[list[tuple[osik.TaskRows, jax.Array]], ...]:
+    """Each task's rows with its matrix, and with what it wants."""
+    return [(r, r.jacobian) for r in rows], [(r, r.lower) for r in rows]
+
+
 def in_ball(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
     """Uniform in a ball around 0, (count, 3)."""
     away = rng.normal(size=(count, 3))
@@ -95,12 +149,24 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=20, help="that are timed")
     parser.add_argument("--precision", default="float32", choices=PRECISIONS)
     parser.add_argument("--radius", type=float, help="of the balls [m]; default 0.5, NAO 0.25")
+    parser.add_argument("--sample", type=Path, help="file for single steps")
+    parser.add_argument("--judge", type=Path, help="only judge a sample, of the same robot and scheme")
     given = parser.parse_args()
-    jax.config.update("jax_enable_x64", given.precision == "float64")
+    jax.config.update("jax_enable_x64", given.precision == "float64" or given.judge is not None)
     radius = RADIUS.get(given.robot, 0.5) if given.radius is None else given.radius
-    row = measure(setting(given.robot), SCHEMES[given.scheme](), given.robots, given.scans, radius)
+    sample: list[Any] | None = None if given.sample is None else []
+    if given.judge is not None:
+        with np.load(given.judge) as file:
+            row = compared(setting(given.robot), SCHEMES[given.scheme](), dict(file))
+    else:
+        row = measure(setting(given.robot), SCHEMES[given.scheme](), given.robots, given.scans, radius, sample)
+    if sample is not None:
+        names = ("q", "target", "velocity", "status")
+        np.savez(given.sample, **{n: np.concatenate(a) for n, a in zip(names, zip(*sample, strict=True), strict=True)})
     if given.results is not None:
-        asked = {key: value for key, value in vars(given).items() if key != "results"} | dict(radius=radius)
+        asked = {key: value for key, value in vars(given).items() if key not in ("results", "sample", "judge")} | dict(
+            radius=radius
+        )
         given.results.write_text(json.dumps(machine() | asked | row, indent=1) + "\n", encoding="utf-8")
     table = Table("what", "value")
     for name, value in row.items():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -34,7 +32,7 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     workspace = (
         high * (4 * wide + 3 * high) + largest**2 + p * (n + p) + 2 * constraints**2 + 27 * line
     )  # as ``Workspace``
-    matrix, *others = jax.tree.leaves(replace(qp, packed=None))
+    matrix, *others = jax.tree.leaves((qp.cost, qp.rows, qp.compliance, qp.lower, qp.upper))
     packed = side_by_side(*others) if qp.packed is None else qp.packed  # in the order of the fields
     x, y, active, report, _ = _target.call(
         "_weighted_qp",
