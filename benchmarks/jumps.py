@@ -40,13 +40,20 @@ RADIUS = {"nao": 0.25, "g1": 0.5, "arm7": 0.5}
 """Of the balls that suit a robot [m]."""
 
 
+KEPT = ("q", "target", "velocity", "status")
+"""What a sample has of each step."""
 QUANTILES = dict(median=0.5, of_999=0.999, largest=1.0)
 SAMPLE = 100_000
 """Steps that are kept, about."""
 
 
 def measure(
-    given: Setting, scheme: osik.Scheme, robots: int, scans: int, radius: float, sample: list[Any] | None = None
+    given: Setting,
+    scheme: osik.Scheme,
+    robots: int,
+    scans: int,
+    radius: float,
+    sample: list[list[np.ndarray]] | None = None,
 ) -> dict[str, Any]:
     """Shares of statuses, the worst that a step did, and steps a second; single steps go into the sample."""
     robot, (*_, state) = given.robot, batch_of(given, scheme, robots)
@@ -114,7 +121,8 @@ def compared(given: Setting, scheme: osik.Scheme, sample: dict[str, np.ndarray])
         tasks = given.tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
         exact = osik.solve(given.robot, q, tasks, scheme=scheme, limits=given.limits, dt=DT)
         rows = osik.build_problem(given.robot, q, tasks, limits=given.limits, dt=DT).rows.values()
-        A, b = (jnp.concatenate([(r.weight**0.5 * part.T).T for r, part in pairs]) for pairs in _pairs(rows))
+        A = jnp.concatenate([r.weight[:, None] ** 0.5 * r.jacobian for r in rows])
+        b = jnp.concatenate([r.weight**0.5 * r.lower for r in rows])
         far = jnp.max(jnp.abs(A @ (velocity - exact.velocity))) / jnp.max(jnp.abs(b))
         costs = [jnp.sum((A @ v - b) ** 2) for v in (velocity, exact.velocity)]
         return far, (costs[0] - costs[1]) / jnp.sum(b**2), exact.status
@@ -128,9 +136,9 @@ def compared(given: Setting, scheme: osik.Scheme, sample: dict[str, np.ndarray])
     return dict(steps=len(usable), solved=int(usable.sum()), in_double_too=int(also.sum())) | figures
 
 
-def _pairs(rows: Any) -> tuple[list[tuple[osik.TaskRows, jax.Array]], ...]:
-    """Each task's rows with its matrix, and with what it wants."""
-    return [(r, r.jacobian) for r in rows], [(r, r.lower) for r in rows]
+def joined(sample: list[list[np.ndarray]]) -> dict[str, np.ndarray]:
+    """The single steps of all scans as one array of each kind."""
+    return {name: np.concatenate([parts[i] for parts in sample]) for i, name in enumerate(KEPT)}
 
 
 def in_ball(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
@@ -154,19 +162,18 @@ def main() -> None:
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", given.precision == "float64" or given.judge is not None)
     radius = RADIUS.get(given.robot, 0.5) if given.radius is None else given.radius
-    sample: list[Any] | None = None if given.sample is None else []
+    sample: list[list[np.ndarray]] = []
+    asked_for = None if given.sample is None else sample
     if given.judge is not None:
         with np.load(given.judge) as file:
             row = compared(setting(given.robot), SCHEMES[given.scheme](), dict(file))
     else:
-        row = measure(setting(given.robot), SCHEMES[given.scheme](), given.robots, given.scans, radius, sample)
-    if sample is not None:
-        names = ("q", "target", "velocity", "status")
-        np.savez(given.sample, **{n: np.concatenate(a) for n, a in zip(names, zip(*sample, strict=True), strict=True)})
+        row = measure(setting(given.robot), SCHEMES[given.scheme](), given.robots, given.scans, radius, asked_for)
+        if sample:
+            np.savez(given.sample, allow_pickle=False, **joined(sample))
     if given.results is not None:
-        asked = {key: value for key, value in vars(given).items() if key not in ("results", "sample", "judge")} | dict(
-            radius=radius
-        )
+        files = ("results", "sample", "judge")
+        asked = {key: value for key, value in vars(given).items() if key not in files} | dict(radius=radius)
         given.results.write_text(json.dumps(machine() | asked | row, indent=1) + "\n", encoding="utf-8")
     table = Table("what", "value")
     for name, value in row.items():

@@ -84,7 +84,15 @@ def test_a_sweep_ends_before_a_call_takes_too_long(monkeypatch):
 
 @pytest.mark.slow
 def test_jumps_are_counted():
-    row = jumps.measure(throughput.setting("arm7"), osik.WeightedQP(), robots=4, scans=1, radius=0.5)
+    given, sample = throughput.setting("arm7"), []
+    row = jumps.measure(given, osik.WeightedQP(), robots=4, scans=1, radius=0.5, sample=sample)
     assert row["steps"] == row["statuses"]["SOLVED"] == 4 * 2 * jumps.STEPS
     assert row["finite"] and row["beyond_limits"] == 0.0 and row["steps_per_second"] > 0.0
     assert 0.0 < row["fastest"] <= float(osik.load_robot("arm7").velocity_limit.max())
+    steps = jumps.joined(sample)
+    right = jumps.compared(given, osik.WeightedQP(), steps)
+    assert right["steps"] == right["solved"] == right["in_double_too"] == 4 * 2
+    assert right["rows_largest"] < 1e-9 and abs(right["cost_largest"]) < 1e-9
+    steps["velocity"][0] *= 0.9
+    wrong = jumps.compared(given, osik.WeightedQP(), steps)
+    assert wrong["rows_largest"] > 1e-3 and wrong["cost_largest"] > 1e-6
