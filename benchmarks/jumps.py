@@ -163,13 +163,13 @@ def main() -> None:
     jax.config.update("jax_enable_x64", given.precision == "float64" or given.judge is not None)
     radius = RADIUS.get(given.robot, 0.5) if given.radius is None else given.radius
     sample: list[list[np.ndarray]] = []
-    asked_for = None if given.sample is None else sample
     if given.judge is not None:
         with np.load(given.judge) as file:
             row = compared(setting(given.robot), SCHEMES[given.scheme](), dict(file))
     else:
-        row = measure(setting(given.robot), SCHEMES[given.scheme](), given.robots, given.scans, radius, asked_for)
-        if sample:
+        kept = sample if given.sample else None
+        row = measure(setting(given.robot), SCHEMES[given.scheme](), given.robots, given.scans, radius, kept)
+        if given.sample:
             np.savez(given.sample, allow_pickle=False, **joined(sample))
     if given.results is not None:
         files = ("results", "sample", "judge")
