@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from xml.etree import ElementTree
 
 import jax
@@ -595,6 +596,37 @@ def test_talos_dances_with_its_feet_where_they_are(dance):
     assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["speed_over_limit_max"] <= 1.0 + 1e-9
     assert figures["joints"]["jump_frames"] == 0 and figures["shapes"]["penetration_mm_max"] < 1.0
     assert figures["tracking"]["segment_angle_deg_mean"] < 2.0
+
+
+@pytest.mark.parametrize("name", ["g1", "talos"])
+def test_guessed_capsules_cover_the_meshes_of_limbs(name):
+    """The vertices of the collision meshes that MuJoCo reads, beside capsules out of masses alone."""
+    plain, meshed = (
+        osik.Robot.from_urdf(described_urdf(name), floating_base=True, collision_meshes=meshes)
+        for meshes in (False, True)
+    )
+    capsules = guess_profile(plain).capsules
+    places = home_kinematics(plain)
+    ends = [
+        [np.asarray(p) + np.asarray(R) @ np.array(x) for x in (c.start, c.end)]
+        for c, (p, R) in zip(capsules, (places.frame_pose(plain, c.frame) for c in capsules), strict=True)
+    ]
+    model, outside = meshed.mj_model, []
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.asarray(meshed.mujoco_qpos(meshed.q0))
+    mujoco.mj_kinematics(model, data)
+    for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
+        if re.search(r"gripper|leg_.*_[56]|ankle", model.body(model.geom_bodyid[geom]).name):
+            continue  # feet have their corners, and fingers are too light
+        mesh = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        at = model.mesh_vert[first : first + count] @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+        depth = []
+        for (a, b), capsule in zip(ends, capsules, strict=True):
+            share = np.clip((at - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
+            depth.append(np.linalg.norm(at - a - share[:, None] * (b - a), axis=-1) - capsule.radius)
+        outside.append(np.maximum(np.min(depth, 0), 0.0))
+    assert 1e3 * np.concatenate(outside).mean() < {"g1": 0.3, "talos": 3.0}[name]
 
 
 def test_links_without_a_size_get_no_capsule():

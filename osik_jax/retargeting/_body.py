@@ -49,10 +49,21 @@ def shapes_apart(robot: Robot, profile: Profile) -> CollisionAvoidanceLimit | No
 
 
 def pairs_apart(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
-    """The pairs of ``shapes_apart``, as numbers of the profile's capsules."""
+    """The pairs of ``shapes_apart``, as numbers of the profile's capsules.
+
+    Those that follow are left out: of a capsule inside another that is kept from the same shape.
+    """
     apart = shapes_apart(robot, profile)
     named = [] if apart is None else apart.scene.pair_names
-    return [(int(a.removeprefix(_CAPSULE)), int(b.removeprefix(_CAPSULE))) for a, b in named]
+    pairs = [(int(a.removeprefix(_CAPSULE)), int(b.removeprefix(_CAPSULE))) for a, b in named]
+    around = [{i, *(j for j, c in enumerate(profile.capsules) if c.hides(own))}
+              for i, own in enumerate(profile.capsules)]  # fmt: skip
+    kept = {frozenset(pair) for pair in pairs}
+
+    def follows(a: int, b: int) -> bool:
+        return any(frozenset(wider) in kept for wider in itertools.product(around[a], around[b]) if wider != (a, b))
+
+    return [pair for pair in pairs if not follows(*pair)]
 
 
 def joints_between(robot: Robot, a: int, b: int) -> int:

@@ -28,13 +28,13 @@ class Goals(eqx.Module):
         present: 1 for a frame of the clip, 0 for padding behind its end. ()
     """
 
-    directions: Float[Array, "8 3"]
-    pelvis: Float[Array, "3 3"]
-    torso: Float[Array, "3 3"]
-    root: Float[Array, "3"]
-    feet: Float[Array, "2 3 3"]
-    contact: Float[Array, "4"]
-    present: Float[Array, ""]
+    directions: Float[Array, "*B 8 3"]
+    pelvis: Float[Array, "*B 3 3"]
+    torso: Float[Array, "*B 3 3"]
+    root: Float[Array, "*B 3"]
+    feet: Float[Array, "*B 2 3 3"]
+    contact: Float[Array, "*B 4"]
+    present: Float[Array, "*B"]
 
 
 class Weights(eqx.Module):

@@ -204,10 +204,11 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
 
 
 def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule], floor: float) -> tuple[Capsule, ...]:
-    """Capsules made thinner, by up to a half, that overlap at home or reach below the soles.
+    """Capsules, thinner where they reach below the soles, and inside those that overlap at home thinner ones.
 
-    Such pairs would not be kept apart, and what is below the soles would lift the feet; what would have to be thinner
-    than half for that is left out.
+    Pairs that overlap at home are not kept apart: the thinner ones, by up to a half, are in their place, and the others
+    keep all else away. What is below the soles would lift the feet; what would have to be thinner than half for that is
+    left out.
     """
     tree, out = robot.tree, []
     bodies = [tree.frame_bodies[tree.frame(c.frame)] for c in capsules]
@@ -225,7 +226,8 @@ def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule]
     for capsule, ends, factor in zip(capsules, axes, share, strict=True):
         above = (min(float(end[2]) for end in ends) - floor - _ROOM) / capsule.radius
         if above > 0.5:
-            out.append(dataclasses.replace(capsule, radius=round(min(float(factor), above) * capsule.radius, 6)))
+            for most in dict.fromkeys((1.0, float(factor))):
+                out.append(dataclasses.replace(capsule, radius=round(min(most, above) * capsule.radius, 6)))
     return tuple(out)
 
 
@@ -259,12 +261,28 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
         radius = _SHELL * float(axes[thin] if apart else 0.5 * (axes[wide] + axes[thin]))
         along, aside = turn.reshape(3, 3)[:, long], turn.reshape(3, 3)[:, wide]
         reach = max(_LONG * axes[long] - radius, 0.05 * radius)
+        spans = [-reach, reach]
+        if name not in trunk:
+            spans += _spanned(model, body, along, radius)
         aside_by = _SHELL * axes[wide] - radius
         for shift in (aside_by, -aside_by) if apart else (0.0,):
             centre = model.body_ipos[body] + shift * aside
-            ends = _pair(np.stack([centre - reach * along, centre + reach * along]))
+            ends = _pair(np.stack([centre + min(spans) * along, centre + max(spans) * along]))
             out.append(Capsule(name, *ends, round(radius, 6)))
     return out
+
+
+def _spanned(model: mujoco.MjModel, body: int, along: np.ndarray, radius: float) -> list[float]:
+    """How far a capsule goes from a body's centre of mass: to its own joint, and until it ends at its children's.
+
+    The housing around a joint belongs to the body that it moves, and weighs too little beside a motor at the other end
+    to be seen in an ellipsoid.
+    """
+    own = [-model.body_ipos[body]] * bool(model.body_jntnum[body])
+    children = [c for c in range(1, model.nbody) if model.body_parentid[c] == body and model.body_jntnum[c]]
+    ends = [float((model.body_pos[child] - model.body_ipos[body]) @ along) for child in children]
+    short = [float(np.copysign(max(abs(end) - radius, 0.0), end)) for end in ends]
+    return [float(anchor @ along) for anchor in own] + short
 
 
 def _plain_capsules(kinematics: Kinematics, profile: Profile, robot: Robot) -> list[tuple[Capsule, str | None]]:

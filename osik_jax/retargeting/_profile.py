@@ -38,6 +38,10 @@ class Capsule:
     end: Point
     radius: float
 
+    def hides(self, other: Capsule) -> bool:
+        """Whether another is inside this one, about the same segment."""
+        return dataclasses.replace(other, radius=self.radius) == self and other.radius < self.radius
+
 
 @dataclasses.dataclass(frozen=True)
 class Profile:

@@ -42,7 +42,8 @@ class Body(eqx.Module):
         frames: of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static).
         keys: the role of each keypoint (static).
         bends: whether the trunk bends (static).
-        above: the capsules that are kept above the floor: all but the feet's, which have their corners (static).
+        above: the capsules that are kept above the floor: not the feet's, which have their corners, nor those inside
+            others (static).
         pairs: the capsules that are kept apart (static).
     """
 
@@ -79,7 +80,11 @@ class Body(eqx.Module):
             frames=tuple(frame for frame, _ in places),
             keys=tuple(profile.keypoints),
             bends=profile.torso is not None,
-            above=tuple(i for i, body in enumerate(bodies) if body not in feet),
+            above=tuple(
+                i
+                for i, (body, own) in enumerate(zip(bodies, profile.capsules, strict=True))
+                if body not in feet and not any(wider.hides(own) for wider in profile.capsules)
+            ),
             pairs=tuple((int(i), int(j)) for i, j in pairs),
         )
 
