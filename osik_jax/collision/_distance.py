@@ -300,7 +300,7 @@ def _dot(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "..
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
-def _over(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
+def _over(a: Float[Array, "*B"], b: Float[Array, "*B"]) -> Float[Array, "*B"]:
     """a / b; 0 where b is 0, with derivatives 0."""
     nought = b == 0.0
     return jnp.where(nought, 0.0, a / jnp.where(nought, 1.0, b))
