@@ -94,7 +94,7 @@ def counts(W, level, i):
     return level.equal[i] != 0 or W.wanted[i] != 0.0
 
 
-@lean
+@lean(inline="always")
 def strength_of(W, level, first, longest):
     """The damping of the level: constant + unmet share, share what the step with this very damping misses."""
     m, n = level.A.shape
@@ -137,7 +137,7 @@ def missed_with(W, level, strength):
     return np.sqrt(missed)
 
 
-@lean
+@lean(inline="always")
 def find_motion(W, level, first, damping, rank_tolerance, plain):
     """What the level asks for; takes its row space off the coordinates that are left, the rank that is returned."""
     m, n = level.A.shape
@@ -203,7 +203,7 @@ def narrow(W, level, x, longest, size):
             W.low[j], W.high[j] = max(W.low[j], x[j] - room), min(W.high[j], x[j] + room)
 
 
-@lean
+@lean(inline="always")
 def solve_level(W, level, x, first, rank_tolerance):
     """Moves x as the level asks; the rank that it takes."""
     m, n = level.A.shape
@@ -246,7 +246,7 @@ def handle(frame):
         M = max(M, dimension(first_level + each * k, 8))
     W = work_at(space, n, M)
     for lane in range(lanes):
-        x, taken = vector(solution + 8 * n * lane, n), 0
+        x, taken = vector(solution + 8 * n * lane, n), np.int64(0)  # a literal would be compiled for
         fill(x, 0.0)
         fill(W.bent, 0.0)
         fill(W.low, -np.inf)

@@ -94,7 +94,7 @@ def reflect(W, m, n, first, at, pivot, length, plain):
         turns[j] = 0.0
 
 
-@lean
+@lean(inline="always")
 def take_row_space(W, m, n, first, cutoff, plain):
     """Turns the coordinates that are left so that the first ones span the level's rows; how many these are.
 
@@ -104,7 +104,7 @@ def take_row_space(W, m, n, first, cutoff, plain):
     plus_squares(W.square, W.nought, W.turn, W.beside, first, n, 0, m)
     at = first
     while at < n and at - first < m:
-        pivot = 0
+        pivot = np.int64(0)
         for i in range(1, m):
             pivot = i if W.square[i] > W.square[pivot] else pivot
         square = 0.0

@@ -181,7 +181,7 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side
 @lean
 def begin(W, x, low, high, fixed):
     """Return the point of the box that is nearest to 0, and the joints that can move in coordinates of their own."""
-    n, first, last = len(x), 0, 0
+    n, first, last = len(x), np.int64(0), 0
     for i in range(n):
         W.low[i], W.high[i], W.bent[i] = low[i], high[i], 0.0
         x[i] = min(max(0.0, low[i]), high[i])
