@@ -58,7 +58,7 @@ class WeightedQP(Scheme):
             raise OsikValueError(f"damping is {seen}; a WeightedQP needs it positive, or the velocity is not unique")
 
     def solve(self, problem: VelocityProblem, warm_start: Int[Array, " m"] | None = None) -> SchemeAnswer:
-        """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""
+        """The velocity of one step; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
         bend = self.curvature_damping * problem.curvature(problem.soft())

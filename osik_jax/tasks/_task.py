@@ -94,12 +94,12 @@ class Task(MadeForRobot, Replaceable):
         """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
 
     def during(self, dt: Float[Array, ""] | float) -> Self:
-        """The task for a tick of dt [s], which ``solve`` asks for; itself where that does not matter."""
+        """The task for a step of dt [s], which ``solve`` asks for; itself where that does not matter."""
         del dt
         return self
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The task for the next tick, once this one's answer is ``velocity``; itself where it remembers nothing."""
+        """The task for the next step, once this one's answer is ``velocity``; itself where it remembers nothing."""
         del velocity
         return self
 

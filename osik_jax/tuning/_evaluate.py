@@ -28,7 +28,7 @@ class Evaluation(eqx.Module):
 
     Attributes:
         losses: of each; of no meaning where it was dropped. (n,)
-        kept: false where the loss is not finite, or a tick failed on a NaN. (n,)
+        kept: false where the loss is not finite, or a step failed on a NaN. (n,)
     """
 
     losses: Float[Array, " n"]
