@@ -93,8 +93,8 @@ def scenario_loss(loss: LossFunction, loop: Loop, scenario: Scenarios) -> tuple[
         raise OsikValueError(
             f"the loss returned shape {value.shape} of {value.dtype}; it is one number for a trajectory"
         )
-    sound = (trajectory.solution.status != Status.NUMERICAL_ERROR).all()
-    return value, jnp.isfinite(value) & sound
+    has_numbers = (trajectory.solution.status != Status.NUMERICAL_ERROR).all()
+    return value, jnp.isfinite(value) & has_numbers
 
 
 def over_scenarios(
