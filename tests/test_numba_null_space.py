@@ -338,7 +338,7 @@ def test_a_backend_that_is_not_there(monkeypatch):
 
 @pytest.mark.release
 def test_the_scheme():
-    """A tick of an arm by both backends, in each order."""
+    """A step of an arm by both backends, in each order."""
     arm = osik.load_robot("arm7")
     tasks = {
         "hand": osik.FrameTask(arm, arm.frame_names[-1], rows="position", priority=1),

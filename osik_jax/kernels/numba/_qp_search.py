@@ -30,11 +30,11 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
     best, lives, cold, found = len(labels) + 1, _PATIENCE, False, False
     while True:
         report[2] += 1
-        sound = solve_on_active_set(P, W, labels, x, z)
-        if found or (cold and not sound):
-            report[0] = sound and found
+        is_regular = solve_on_active_set(P, W, labels, x, z)
+        if found or (cold and not is_regular):
+            report[0] = is_regular and found
             return
-        if sound:
+        if is_regular:
             find_roundoff(P, W, labels, tolerance, x, z)
         if cold:
             steps = dual_active_set(P, W, labels, x, most_changes - report[1])
@@ -47,12 +47,12 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
         for i in range(len(labels)):
             W.next[i] = right_label(P, W, labels, i, x, z)
             wrong += W.next[i] != labels[i]
-        if sound and wrong == 0:
+        if is_regular and wrong == 0:
             report[0] = 1
             return
         lives = _PATIENCE if wrong < best else lives - 1
         best = min(best, wrong)
-        cold = not sound or lives < 0
+        cold = not is_regular or lives < 0
         for i in range(len(labels)):
             pinned = i < len(x) and P.lower[i] == P.upper[i]
             labels[i] = W.next[i] if not cold else EQUALITY if pinned else INACTIVE
