@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, REDUNDANCY_TOL
 from ._dense import add_multiple, add_row, dot, fill, invert_upper, rotate
 from ._frame import lean
 
 _DEPENDENT = 1e-14
 """Of |J'n|^2; a constraint of which the active ones leave less than this depends on them."""
+_IMPLIED = REDUNDANCY_TOL[np.dtype("float64")]
+"""In units of roundoff: a dependent constraint that is violated by less is implied, by more it contradicts."""
 
 
 @lean
@@ -74,11 +76,11 @@ def value_of(P, v, i, n):
 def most_violated(P, W, labels, v, d, n, count):
     """Return the constraint whose activation raises the dual objective most, -1 for none; equalities first.
 
-    By a full step it rises by half of gap^2 / |J2'n|^2.
+    By a full step it rises by half of gap^2 / |J2'n|^2. Those that the active ones imply are passed over.
     """
     best, entering = 0.0, -1
     for i in range(len(labels)):
-        if labels[i] != INACTIVE:
+        if labels[i] != INACTIVE or W.next[i] != 0:
             continue
         value = value_of(P, v, i, n)
         gap = max(P.lower[i] - value, value - P.upper[i])
@@ -143,7 +145,8 @@ def dual_active_set(P, W, labels, x, most_changes):
 
     Args:
         P: the problem.
-        W: space, and the roundoff of values.
+        W: space, and the roundoff of values; at the end ``next`` is 1 for constraints that depend on the active ones
+            and hold, up to roundoff, where these do.
         labels: no constraint active but pinned variables. (N,)
         x: the minimiser for those. (n,)
         most_changes: cap on changes of the active set.
@@ -155,6 +158,7 @@ def dual_active_set(P, W, labels, x, most_changes):
     R, J, order = W.R, W.J, W.order
     v, d, w, u, r = W.point, W.along, W.reflected, W.multipliers, W.rates
     factor_cost(P, R, J, n)
+    fill(W.next, 0)
     for i in range(N):
         v[i] = x[i] if i < n else 0.0
     count, changes = np.int64(0), np.int64(0)  # not literals: functions of a literal are compiled once more
@@ -183,7 +187,10 @@ def dual_active_set(P, W, labels, x, most_changes):
             full = gap / left if left > _DEPENDENT * whole else np.inf
             length, leaving = ratio_test(labels, order, u, r, count)
             if not (full < np.inf or length < np.inf):
-                return -1
+                if not gap <= _IMPLIED * W.value_roundoff[entering]:
+                    return -1
+                W.next[entering] = 1
+                break
             length = min(length, full)
             for i in range(count):
                 u[i] = max(u[i] - length * r[i], 0.0) if labels[order[i]] != EQUALITY else u[i] - length * r[i]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, IMPLIED, INACTIVE
 from ._dense import dot
 from ._frame import lean
 from ._goldfarb_idnani import dual_active_set
@@ -33,6 +33,8 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
         sound = solve_on_active_set(P, W, labels, x, z)
         if found or (cold and not sound):
             report[0] = sound and found
+            for i in range(len(labels) if report[0] != 0 else 0):
+                labels[i] = IMPLIED if W.next[i] != 0 else labels[i]
             return
         if sound:
             find_roundoff(P, W, labels, tolerance, x, z)
