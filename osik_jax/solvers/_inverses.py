@@ -211,7 +211,7 @@ def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[A
 
 @_by_singular_values.defjvp
 def _by_singular_values_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Differentiate K A', K and I - damping K where damped, the Moore-Penrose inverse at constant rank (GP) where not."""
+    """Differentiate K A', K and I - damping K where damped, the inverse and S at constant rank (GP) where not."""
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
     D, K, S = _by_singular_values(a, cutoff, damping)
     damped = damping > 0.0

@@ -140,39 +140,44 @@ def ratio_test(labels, order, u, r, count):
 
 
 @lean
-def dual_active_set(P, W, labels, x, most_changes):
-    """Find the active constraints, from none but pinned variables, and write them to ``labels``.
+def dual_active_set(P, W, labels, x, z, count, most_changes):
+    """Find the active constraints, from none but pinned variables or from where it ended, and write them to ``labels``.
 
     Args:
         P: the problem.
         W: space, and the roundoff of values; at the end ``next`` is 1 for constraints that depend on the active ones
             and hold, up to roundoff, where these do.
-        labels: no constraint active but pinned variables. (N,)
+        labels: where it begins; at the start no constraint is active but pinned variables. (N,)
         x: the minimiser for those. (n,)
+        z: its residuals and multipliers. (m + p,)
+        count: how many constraints are active where it ended; -1 to start.
         most_changes: cap on changes of the active set.
 
     Returns:
-        Changes of the active set; -1 where rows cannot hold together, or the cap was met.
+        Changes of the active set, -1 where rows cannot hold together or the cap was met; how many are active.
     """
     n, N = len(x), len(labels)
     R, J, order = W.R, W.J, W.order
     v, d, w, u, r = W.point, W.along, W.reflected, W.multipliers, W.rates
-    factor_cost(P, R, J, n)
-    fill(W.next, 0)
+    if count < 0:
+        factor_cost(P, R, J, n)
+        fill(W.next, 0)
+        count = np.int64(0)
     for i in range(N):
-        v[i] = x[i] if i < n else 0.0
-    count, changes = np.int64(0), np.int64(0)  # not literals: functions of a literal are compiled once more
+        row = len(P.target) + i - n
+        v[i] = x[i] if i < n else np.sqrt(P.compliance[row]) * z[row] if labels[i] != INACTIVE else 0.0
+    changes = np.int64(0)  # not literals: functions of a literal are compiled once more
     while True:
         entering = most_violated(P, W, labels, v, d, n, count)
         if entering < 0:
-            return changes
+            return changes, count
         pushed = 0.0
         value = value_of(P, v, entering, n)
         side = 1.0 if P.lower[entering] - value >= value - P.upper[entering] else -1.0
         while True:
             changes += 1
             if changes > most_changes:
-                return -1
+                return np.int64(-1), count
             along_normal(P, J, entering, n, d)
             for k in range(N):
                 d[k] *= side
@@ -188,7 +193,7 @@ def dual_active_set(P, W, labels, x, most_changes):
             length, leaving = ratio_test(labels, order, u, r, count)
             if not (full < np.inf or length < np.inf):
                 if not gap <= _IMPLIED * W.value_roundoff[entering]:
-                    return -1
+                    return np.int64(-1), count
                 W.next[entering] = 1
                 break
             length = min(length, full)
