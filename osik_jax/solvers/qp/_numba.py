@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from ...execution._computed import side_by_side
 from ...kernels.numba import _target
+from ...numerics._constants import IMPLIED, INACTIVE
 from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._problem import QP, arrays
@@ -38,4 +39,5 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
         [((batch, n), float), ((batch, p), float), ((batch, n + p), int), ((batch, 3), int), ((workspace,), float)],
         *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
-    return Candidate(x, y, active, *(report[:, i] for i in range(3)))
+    implied = active == IMPLIED
+    return Candidate(x, y, jnp.where(implied, INACTIVE, active), *(report[:, i] for i in range(3)), implied)
