@@ -1,15 +1,13 @@
 """Kernel of ``solvers/null_space/_projection.py``: all levels of one problem after another, in coordinates.
 
 What is computed is what that file says. P_k is Z Z' with orthonormal columns Z, of which each level takes as many away
-as it has rank, so that what is left gets smaller from level to level. ``Q`` has all of them in its rows, those taken
-first; beside them, in the same rows, the rows of the level in these coordinates: [Q | Q A']. Householder reflections
-from the left, pivoted by the longest of the level's rows that is left, turn both at once: the rows of Q that a level
-has taken are then the basis of the row space of A P, and the rows beside them the level's rows on it.
+as it has rank, so that what is left gets smaller from level to level. ``turned`` has all of them in its rows, those
+taken first; ``beside`` has the level's rows in these coordinates. Householder reflections, pivoted by the longest of
+the level's rows that is left, turn both (``_row_space.py``): the rows of ``turned`` that a level has taken are then the
+basis of the row space of A P, and those of ``beside`` the level's rows on it.
 
-The motion comes from an orthogonal factorisation of those with the root of the damping below them (modified
-Gram-Schmidt with the right-hand side as a column: A. Bjorck, "Solving linear least squares problems by Gram-Schmidt
-orthogonalization", BIT 7, 1967). ``strength_of`` and ``narrow`` are ``level_damping`` and ``narrow_box`` of
-``solvers/_damping.py``; x is where P x = 0 before every level.
+``strength_of`` and ``narrow`` are ``level_damping`` and ``narrow_box`` of ``solvers/_damping.py``; x is where P x = 0
+before every level.
 """
 
 from __future__ import annotations
@@ -246,7 +244,7 @@ def handle(frame):
         M = max(M, dimension(first_level + each * k, 8))
     W = work_at(space, n, M)
     for lane in range(lanes):
-        x, taken = vector(solution + 8 * n * lane, n), np.int64(0)  # a literal would be compiled for
+        x, taken = vector(solution + 8 * n * lane, n), np.int64(0)  # no literal, which is a type of its own
         fill(x, 0.0)
         fill(W.bent, 0.0)
         fill(W.low, -np.inf)

@@ -43,9 +43,9 @@ from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
+from ._dispatch import kernel_space
 from ._implicit_diff import ActiveJoints, with_derivative
 from ._padding import PaddedLevel, Problem, initial_point, pad_levels
-from ._dispatch import kernel_space
 from ._projection import damped_step_length, level_motion
 from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
 
