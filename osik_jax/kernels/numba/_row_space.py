@@ -192,6 +192,9 @@ def solve_in_all(W, m, n, first, damping, cutoff):
     left, C = n - first, W.beside[first:]
     transpose(W.rows, C, left, m)
     set_gram(W, W.rows, left, m)
+    for j in range(left):
+        if not W.less[j, j] < 0.0:  # the rows have nothing of this coordinate
+            return False
     if not factor_damped(W, left, damping):
         return False
     trace, product = 0.0, 1.0
