@@ -40,4 +40,4 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
         *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
     implied = active == IMPLIED
-    return Candidate(x, y, jnp.where(implied, INACTIVE, active), *(report[:, i] for i in range(3)), implied)
+    return Candidate(x, y, jnp.where(implied, INACTIVE, active), *(report[:, i] for i in range(3)), redundant=implied)
