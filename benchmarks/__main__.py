@@ -7,7 +7,7 @@
 One step is forward kinematics, Jacobians, QP and integration; the clock counts from targets in NumPy to a
 configuration in NumPy. One robot: every peer in a process of its own on the same core, in turns. Many: batches of ours
 with all cores, and in turns with them as many processes of each peer as there are cores; then each other batch, of ours
-and of the peers that run batches. Gradients: ``benchmarks.rollouts``, of one tick and of many. Pinocchio scores each
+and of the peers that run batches. Gradients: ``benchmarks.rollouts``, of one step and of many. Pinocchio scores each
 motion in float64; a fast wrong answer is marked as failed. ``--python`` names the interpreter of a peer that needs an
 environment of its own. Beside the results comes a figure of throughput against the size of the batch.
 
@@ -46,9 +46,9 @@ PRECISIONS = ("float64", "float32")
 BATCHES = (1, 64, 1024, 16384)
 PARTS = ("one", "many", "gradients")
 COLD = ("weighted", "hierarchical")
-"""Schemes that carry something from tick to tick, and are measured without it too."""
+"""Schemes that carry something from step to step, and are measured without it too."""
 LONGEST = 5.0
-"""[s] a tick: a batch that would take more is left out."""
+"""[s] a step: a batch that would take more is left out."""
 
 
 def ours(scheme: str, precision: str, *, pinned: bool = False, **options: Any) -> Entrant:
@@ -68,7 +68,7 @@ class Selection:
         schemes, precisions, batches: of ours; the batches of peers too.
         peers: who takes part.
         parts: of ``PARTS``.
-        cold: whether ours also runs without what it carries from tick to tick.
+        cold: whether ours also runs without what it carries from step to step.
         resident: whether the configurations of all but a few robots of a batch stay on the device.
     """
 
@@ -104,7 +104,7 @@ class Selection:
         return [ours(scheme, precision, **options) for scheme in self.schemes for precision in self.precisions]
 
     def without_memory(self, **options: Any) -> list[Entrant]:
-        """Ours as ``mine`` has it, starting from nothing in every tick."""
+        """Ours as ``mine`` has it, starting from nothing in every step."""
         schemes = [scheme for scheme in self.schemes if scheme in COLD]
         return dataclasses.replace(self, schemes=schemes).mine(warm=False, **options) if self.cold else []
 
@@ -154,7 +154,7 @@ def measure(race: Race, selection: Selection, *, quick: bool) -> dict[str, list[
 
 
 def affordable(group: list[Entrant], before: list[dict[str, Any]], race: Race) -> Iterator[Entrant]:
-    """Those whose ticks will not be too long, as their smaller batches tell."""
+    """Those whose steps will not be too long, as their smaller batches tell."""
     for entrant in group:
         batch = entrant.options.get("batch", 1)
         alike = [

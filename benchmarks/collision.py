@@ -3,12 +3,12 @@
     python -m benchmarks.collision [results.json] [--motions 10000] [--ticks 40] [--batch 250] [--calls 30]
 
 The robot stands on both feet, keeps its centre of mass and sends each hand to a random point of a box around its body,
-in front of a table: many points are out of reach, inside a link or inside the table. Ticks of 20 ms, joint position
+in front of a table: many points are out of reach, inside a link or inside the table. Steps of 20 ms, joint position
 limits, joint speeds of at most 5 rad/s, the weighted scheme in float64. Each configuration of each motion is judged by
 Pinocchio's kinematics and coal's distances. The same motions without the limit tell how many would have met something.
 
-``without`` and ``with`` are medians of the time of a tick: solve and integrate, warm start carried on, one robot or a
-batch, the first motions' ticks one after the other.
+``without`` and ``with`` are medians of the time of a step: solve and integrate, warm start carried on, one robot or a
+batch, the first motions' steps one after the other.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ BATCHES = (1, 1024)
 
 
 class Setting(NamedTuple):
-    """What a tick is made of; the last limit avoids collisions."""
+    """What a step is made of; the last limit avoids collisions."""
 
     robot: osik.Robot
     tasks: dict[str, osik.Task]
@@ -184,7 +184,7 @@ def judged(given: Setting, run: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def tick_seconds(given: Setting, points: np.ndarray, batch: int, avoiding: bool, calls: int) -> dict[str, float]:
-    """Median of the time of a tick, and the time that compiling took [s]."""
+    """Median of the time of a step, and the time that compiling took [s]."""
 
     def tick(q: jax.Array, warm_start: Any, points: jax.Array) -> tuple[jax.Array, Any]:
         solution = osik.solve(
@@ -222,7 +222,7 @@ def main() -> None:
     parser.add_argument("--ticks", type=int, default=40)
     parser.add_argument("--batch", type=int, default=250, help="motions at once; divides --motions")
     parser.add_argument("--free", type=int, default=500, help="motions that are run without the limit too")
-    parser.add_argument("--calls", type=int, default=60, help="of a tick, timed; 0: none")
+    parser.add_argument("--calls", type=int, default=60, help="of a step, timed; 0: none")
     asked = parser.parse_args()
     if asked.motions % asked.batch or asked.free % asked.batch:
         parser.error("--batch has to divide --motions and --free")
@@ -248,8 +248,8 @@ def main() -> None:
 
 
 def show_costs(costs: list[dict[str, Any]], counts: dict[str, int]) -> None:
-    """Time of a tick."""
-    table = Table("batch", "avoiding", "tick [us]", "us a robot", "compile [s]", title=str(counts))
+    """Time of a step."""
+    table = Table("batch", "avoiding", "step [us]", "us a robot", "compile [s]", title=str(counts))
     for row in costs:
         each = 1e6 * row["seconds"]
         table.add_row(

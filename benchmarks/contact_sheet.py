@@ -30,7 +30,7 @@ SHEET = PAGE.parent / "images" / "robots.png"
 START, END = "<!-- table of demonstrations -->\n", "<!-- end of the demonstrations -->\n"
 HEAD = (
     "robot", "base", "dofs", "scheme", "what moves", "off its path [mm]", "once there [mm]", "feet drift [mm]",
-    "limits broken", "ticks solved", "CPU time [s]",
+    "limits broken", "steps solved", "CPU time [s]",
 )  # fmt: skip
 NAMES = (
     "ur5", "panda", "so101", "baxter", "tiago", "talos", "icub", "g1", "romeo", "anymal_b", "solo12", "go1",

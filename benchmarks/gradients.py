@@ -14,7 +14,7 @@ from .processes import ROOT
 from .race import Race
 
 LENGTHS = {"tick": 1, "rollout": 100}
-"""Ticks of each."""
+"""Steps of each."""
 ROBOTS = 64
 
 
@@ -24,7 +24,7 @@ def rows(race: Race, schemes: Sequence[str], precisions: Sequence[str], *, quick
     Args:
         race: whose robot it is; told what happens.
         schemes, precisions: which.
-        quick: a tenth of the ticks in a rollout.
+        quick: a tenth of the steps in a rollout.
     """
     for scheme in schemes:
         for precision in precisions:

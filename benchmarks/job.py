@@ -2,10 +2,10 @@
 
     python -m benchmarks.job FOLDER [--steps 1e8] [--robot g1] [--ticks 100] [--chunk 8192] [--precision float64]
 
-Each lane is a motion of so many ticks of the loop of ``benchmarks.throughput``, from arms somewhere in the middle of
+Each lane is a motion of so many steps of the loop of ``benchmarks.throughput``, from arms somewhere in the middle of
 their ranges to a point within 10 cm of the hand's home. Lanes are drawn chunk by chunk, split over all devices (on a
 CPU, one for each core), and what is kept of each is where it ended, how far off its hand was, and whether all of its
-ticks were SOLVED.
+steps were SOLVED.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def main() -> None:
         chunk=given.chunk,
         shared=(loop.robot, loop.tasks, loop.limits),
         out=given.folder,
-        label=f"{given.ticks} ticks of benchmarks.job",
+        label=f"{given.ticks} steps of benchmarks.job",
     )
     seconds = time.time() - started
     new = sum(path.stat().st_mtime >= started for path in given.folder.glob("*.npz"))

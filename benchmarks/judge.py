@@ -27,7 +27,7 @@ BOUNDS = {
     "position_excess": Bound(1e-4, "rad"),
     "velocity_excess": Bound(1e-3, "rad/s"),
 }
-"""Largest errors after any tick. The posture pulls at the hand: the exact weighted answer leaves 3.8 mm and 7 mrad on
+"""Largest errors after any step. The posture pulls at the hand: the exact weighted answer leaves 3.8 mm and 7 mrad on
 G1, whoever computes it; the feet keep to 0.08 mm and the centre of mass to 0.8 mm."""
 
 
@@ -36,7 +36,7 @@ def judged(work: Workload, motion: np.ndarray, lane: int = 0) -> dict[str, float
 
     Args:
         work: what was asked for.
-        motion: canonical configurations after each tick, from the first tick on. (ticks, nq)
+        motion: canonical configurations after each step, from the first step on. (steps, nq)
         lane: whose target it followed.
 
     Returns:
@@ -58,7 +58,7 @@ def judged(work: Workload, motion: np.ndarray, lane: int = 0) -> dict[str, float
 
 
 def verdict(work: Workload, motions: np.ndarray) -> dict[str, Any]:
-    """The largest errors of a row's motions (lanes, ticks, nq), and what is worse than it may be."""
+    """The largest errors of a row's motions (lanes, steps, nq), and what is worse than it may be."""
     scores = [judged(work, path, lane) for lane, path in enumerate(motions)]
     worst = {name: max(score[name] for score in scores) for name in BOUNDS}
     return dict(score=worst, failures=failures(worst))

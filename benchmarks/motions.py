@@ -14,7 +14,7 @@ from .workload import Workload
 PARTS = ("one_robot", "many_robots")
 """Of the results, whose rows have motions."""
 KEPT_TICKS = 1000
-"""First ticks of a motion that go into a file, in single precision; they hold the slowest part of the curve twice."""
+"""First steps of a motion that go into a file, in single precision; they hold the slowest part of the curve twice."""
 
 
 def moving(result: dict[str, Any]) -> Iterator[dict[str, Any]]:

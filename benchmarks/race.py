@@ -13,9 +13,9 @@ from .processes import Entrant, PeerUnavailable, Team
 from .workload import Workload
 
 WARM_UP = 10
-"""Ticks before the clock counts, after the first one, which compiles."""
+"""Steps before the clock counts, after the first one, which compiles."""
 FEWEST = 5
-"""Ticks of a turn, at least."""
+"""Steps of a turn, at least."""
 KERNELS = 20
 """Runs of the reference kernel before each turn."""
 UNDISTURBED = 20
@@ -55,8 +55,8 @@ class Race:
         Args:
             entrants: who takes part, in turns.
             rounds: turns of each.
-            ticks: of a turn, at most.
-            seconds: that a turn may take; it has ``FEWEST`` ticks at least.
+            steps: of a turn, at most.
+            seconds: that a turn may take; it has ``FEWEST`` steps at least.
         """
         records = [Record(team) for team in map(self._started, entrants) if team]
         try:
@@ -74,7 +74,7 @@ class Race:
         return [record.row() for record in records]
 
     def again(self, entrant: Entrant) -> float:
-        """Seconds of the first tick in a new process, with its programs from the compilation cache."""
+        """Seconds of the first step in a new process, with its programs from the compilation cache."""
         team = self._team(entrant)
         try:
             return team.ask(what="run", ticks=1)[0]["seconds"][0]
@@ -110,13 +110,13 @@ class Record:
         self.memory: list[dict[str, Any]] = []
 
     def warm_up(self, ticks: int, seconds: float) -> None:
-        """The first ticks, which are judged but not timed; they set how many ticks a turn has."""
+        """The first steps, which are judged but not timed; they set how many steps a turn has."""
         self.first = self._moved(1)[0][0]
         each = float(np.median(self._moved(WARM_UP)[0]))
         self.ticks = int(np.clip(seconds / each, FEWEST, max(ticks, FEWEST)))
 
     def take_turn(self) -> None:
-        """Some ticks in all its processes at once, after the reference kernel in the first."""
+        """Some steps in all its processes at once, after the reference kernel in the first."""
         self.kernel.extend(self.team.workers[0].ask(what="kernel", times=KERNELS)["seconds"])
         for own, found in zip(self.seconds, self._moved(self.ticks), strict=True):
             own.extend(found)
@@ -135,10 +135,10 @@ class Record:
         return [answer["seconds"] for answer in answers]
 
     def row(self) -> dict[str, Any]:
-        """Times in seconds; ``kernel_ratio`` is an undisturbed tick over an undisturbed reference kernel.
+        """Times in seconds; ``kernel_ratio`` is an undisturbed step over an undisturbed reference kernel.
 
         ``peak_bytes`` is of one process. ``motion`` has the canonical configurations of some robots, for the judge:
-        (robots, ticks, nq).
+        (robots, steps, nq).
         """
         entrant, pooled = self.team.entrant, np.concatenate([np.asarray(own) for own in self.seconds])
         kernel = float(np.percentile(self.kernel, UNDISTURBED))

@@ -49,7 +49,7 @@ def _one_robot(rows: list[dict[str, Any]]) -> Table:
         "µs median",
         "µs p99",
         "times mink",
-        "first tick [s]",
+        "first step [s]",
         "from cache [s]",
         "MiB",
         *_QUALITY,
@@ -74,7 +74,7 @@ def _one_robot(rows: list[dict[str, Any]]) -> Table:
 def _many_robots(rows: list[dict[str, Any]]) -> Table:
     table = Table(title="Many robots, all cores")
     memory = ("MiB a process", "MiB of the device")
-    for heading in ("entrant", "robots", "steps/s", "ms a step of all", "first tick [s]", *memory, *_QUALITY):
+    for heading in ("entrant", "robots", "steps/s", "ms a step of all", "first step [s]", *memory, *_QUALITY):
         table.add_column(heading, justify="left" if heading == "entrant" else "right")
     for row in rows:
         table.add_row(
@@ -91,7 +91,7 @@ def _many_robots(rows: list[dict[str, Any]]) -> Table:
 
 def _gradients(rows: list[dict[str, Any]]) -> Table:
     table = Table(title="Gradients over weights and targets, and the value alone")
-    heads = ("of a", "scheme", "precision", "robots", "ticks", "value [ms]", "with gradient [ms]", "times")
+    heads = ("of a", "scheme", "precision", "robots", "steps", "value [ms]", "with gradient [ms]", "times")
     for heading in (*heads, "compile [s]", "MiB", "MiB of the device", "finite"):
         table.add_column(heading, justify="left" if heading in heads[:3] else "right")
     for row in rows:
@@ -110,8 +110,8 @@ def _mebibytes(given: int | None) -> str:
     return "" if given is None else f"{given / 2**20:,.0f}"
 
 
-_QUALITY = ("ticks", "hand, feet, CoM [mm]", "solved", "judged")
-"""Slow entrants come to fewer ticks, and so not to the fastest part of the curve."""
+_QUALITY = ("steps", "hand, feet, CoM [mm]", "solved", "judged")
+"""Slow entrants come to fewer steps, and so not to the fastest part of the curve."""
 
 
 def _quality(row: dict[str, Any]) -> tuple[str, str, str, str]:

@@ -4,7 +4,7 @@
                                   [--precision float64]
 
 The setting is that of ``benchmarks.throughput``, closed loop, on the default device. The loss is the mean over robots
-of the hand's squared error in the ticks, and of its squared distance to the target where the last tick led.
+of the hand's squared error in the steps, and of its squared distance to the target where the last step led.
 ``forward`` is the loss alone, ``gradient`` both.
 """
 
@@ -87,7 +87,7 @@ def main() -> None:
         memory = dict(peak_bytes=peak_bytes(), device_peak_bytes=device_bytes())
         result = machine() | asked | memory | dict(rows=rows)
         given.results.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    table = Table("part", "ms", "times forward", "ticks/s", "finite", "compile [s]", "temporary [MiB]")
+    table = Table("part", "ms", "times forward", "steps/s", "finite", "compile [s]", "temporary [MiB]")
     for row in rows:
         each = row["seconds"]
         table.add_row(

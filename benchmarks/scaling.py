@@ -1,12 +1,12 @@
-"""Weak scaling: ticks a second of the closed loop on 1, 2, 4, ... devices, with as many lanes on each.
+"""Weak scaling: steps a second of the closed loop on 1, 2, 4, ... devices, with as many lanes on each.
 
     python -m benchmarks.scaling [results.json] [--robot nao] [--scheme weighted] [--precision float32] [--lanes 16384]
                                  [--devices 1,2,4]
 
 The setting is that of ``benchmarks.throughput``; the batch is split by ``osik_jax.scaling.sharded``, the state of each
-lane stays on its device and its memory is given to the next. ``efficiency`` is ticks a second and device, over that of
+lane stays on its device and its memory is given to the next. ``efficiency`` is steps a second and device, over that of
 the first row. ``error`` is the largest difference of any task's error [m or rad] to float64 on one CPU device, over all
-lanes, after the same ticks.
+lanes, after the same steps.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def run(robot: str, scheme: str, precision: str, lanes: int, devices: list[int])
 
 def show(rows: list[dict[str, Any]]) -> None:
     """A table, in plain text."""
-    heads = ("devices", "lanes each", "ms a call", "ticks/s", "efficiency", "solved", "error", "first call [s]")
+    heads = ("devices", "lanes each", "ms a call", "steps/s", "efficiency", "solved", "error", "first call [s]")
     print("  ".join(f"{head:>14}" for head in heads))
     for r in rows:
         cells = (

@@ -1,14 +1,14 @@
-"""Ticks a second of the closed loop against the size of the batch, on the default device.
+"""Steps a second of the closed loop against the size of the batch, on the default device.
 
     python -m benchmarks.throughput [results.json] [--robot nao] [--batches 1,64,1024] [--schemes weighted,...]
                                     [--precisions float64,float32]
 
 The robot stands on both feet, keeps its centre of mass and reaches with one hand, each lane from other angles of its
-arms and for another point; joint position and velocity limits, dt 5 ms. One call is one jitted, vmapped tick: solve,
+arms and for another point; joint position and velocity limits, dt 5 ms. One call is one jitted, vmapped step: solve,
 integrate, warm start carried on. A call is timed alone and blocked until ready; ``seconds`` is the median.
 
 ``error`` is the largest difference of any task's error [m or rad] to float64 on the CPU, in the first lanes, after the
-same ticks. ``program_bytes`` is what XLA allots to the program, with its arguments and results; ``device_peak_bytes``
+same steps. ``program_bytes`` is what XLA allots to the program, with its arguments and results; ``device_peak_bytes``
 the most that the device has held in this process, where it says so. A sweep ends where a call would take too long or
 memory runs out. A results file keeps its rows of other schemes, precisions and batches, so a sweep may be run in parts.
 """
@@ -43,7 +43,7 @@ DT = 0.005
 LANES = 64
 """Different situations; larger batches repeat them."""
 CHECKED = 10
-"""Ticks after which errors are compared; they warm up too."""
+"""Steps after which errors are compared; they warm up too."""
 TIMED = (5, 100)
 """Calls that are timed, at least and at most,"""
 SECONDS = 5.0
@@ -102,7 +102,7 @@ def arm_angles(robot: osik.Robot, parts: tuple[str, ...]) -> np.ndarray:
 
 
 class State(NamedTuple):
-    """What is carried from tick to tick."""
+    """What is carried from step to step."""
 
     q: jax.Array
     warm_start: Any
@@ -111,7 +111,7 @@ class State(NamedTuple):
 def batch_of(
     given: Setting, scheme: osik.Scheme, batch: int, *, mapped: Callable[..., Any] = jax.vmap
 ) -> tuple[Any, tuple[Any, ...], State]:
-    """The tick mapped over lanes, its arguments before the state, and the first state."""
+    """The step mapped over lanes, its arguments before the state, and the first state."""
     lanes = np.arange(batch) % LANES
     tasks = osik.batched(given.tasks, {"hand.target[0]": given.targets[lanes]})
     axes = osik.batch_axes(given.tasks, "hand.target[0]")
@@ -144,7 +144,7 @@ def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
 
 @cache
 def reference(robot: str, scheme: str) -> dict[str, np.ndarray]:
-    """Task errors of all lanes after the checked ticks, in float64 on the CPU."""
+    """Task errors of all lanes after the checked steps, in float64 on the CPU."""
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         tick, arguments, state = batch_of(setting(robot), SCHEMES[scheme](), LANES)
         program, _ = compiled(tick, *arguments, state)
@@ -241,7 +241,7 @@ def show(rows: list[dict[str, Any]]) -> None:
         for row in rows:
             print(json.dumps(row))
         return
-    table = Table("scheme", "precision", "batch", "ms a call", "ticks/s", "solved", "error", "compile [s]", "MiB")
+    table = Table("scheme", "precision", "batch", "ms a call", "steps/s", "solved", "error", "compile [s]", "MiB")
     for r in rows:
         table.add_row(
             *(r["scheme"], r["precision"], f"{r['batch']:,}"),

@@ -211,7 +211,7 @@ def report_memory(steps: int = 1000, scenarios: int = 256) -> None:
     started = time.perf_counter()
     peak = peak_memory(steps, scenarios)
     seconds = time.perf_counter() - started
-    print(f"gradient of {steps} ticks x {scenarios} scenarios of NAO: {peak:.2f} GiB at most, {seconds:.0f} s in all")
+    print(f"gradient of {steps} steps x {scenarios} scenarios of NAO: {peak:.2f} GiB at most, {seconds:.0f} s in all")
 
 
 def main(path: str | None = None) -> None:

@@ -27,7 +27,7 @@ KERNEL = (256, 35)
 
 
 class Loop:
-    """A peer, the tick that it has come to, and its motion so far."""
+    """A peer, the step that it has come to, and its motion so far."""
 
     def __init__(self, work: Workload, name: str, options: dict[str, Any]) -> None:
         self.work, self.now = work, 0
@@ -38,7 +38,7 @@ class Loop:
         self.build_seconds = time.perf_counter() - started
 
     def run(self, ticks: int) -> dict[str, Any]:
-        """Seconds of each tick, and the canonical configurations that they led to: (lanes, ticks, nq)."""
+        """Seconds of each step, and the canonical configurations that they led to: (lanes, steps, nq)."""
         lanes = 0 if self.batch is None else np.arange(self.batch)
         seconds, motion = [], []
         for tick in range(self.now, self.now + ticks):
@@ -55,7 +55,7 @@ class Loop:
         """A motion of one robot from the start along given targets; where the library raises, it stands still.
 
         Args:
-            hand, com: targets at each tick. (ticks, 3)
+            hand, com: targets at each step. (steps, 3)
             options: of the runner that is made for it.
         """
         runner, seconds, failed = self.made(self.work, **options), [], 0
@@ -67,7 +67,7 @@ class Loop:
                 motion.append(runner.canonical(found))
             except Exception as reason:  # whatever a QP solver raises where it finds nothing
                 failed += 1
-                print(f"tick {len(motion)}: {reason}", file=sys.stderr)
+                print(f"step {len(motion)}: {reason}", file=sys.stderr)
                 motion.append(motion[-1])
             seconds.append(time.perf_counter() - started)
         return dict(seconds=seconds, motion=np.array(motion).tolist(), solved=1.0 - failed / len(hand))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 DT = 0.005
-"""One tick [s]; every task asks for its whole error in one."""
+"""One step [s]; every task asks for its whole error in one."""
 EASED = 0.5
 """Seconds over which the hand's curve swells from nothing to its size."""
 COM_SECONDS = 1.0

@@ -16,7 +16,7 @@
 # After this notebook you can
 #
 # - load a robot, say what it should do (tasks) and what it must not do (limits),
-# - compute one tick of control and run the closed loop,
+# - compute one step of control and run the closed loop,
 # - look at the robot: a picture, a film, and MuJoCo's interactive viewer,
 # - do the same for hundreds of targets at once.
 
@@ -40,10 +40,10 @@ osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)  # double precision: controllers want it
 
 FAST = "OSIK_FAST" in os.environ  # the tests run this notebook with smaller sizes
-STEPS = 60 if FAST else 200  # ticks of the closed loop
+STEPS = 60 if FAST else 200  # steps of the closed loop
 GRID = 3 if FAST else 21  # targets along each side of the map
 FRAME_RATE = 2 if FAST else 10  # of the film [1/s]
-DT = 0.01  # one tick [s]
+DT = 0.01  # one step [s]
 
 plt.rcParams.update({"figure.dpi": 80, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True})
 plt.rcParams.update({"grid.color": "#e3e7ec", "axes.axisbelow": True, "axes.titlelocation": "left"})
@@ -103,20 +103,20 @@ except KeyError as error:
     print(error.args[0])
 
 # %% [markdown]
-# ## One tick
+# ## One step
 #
 # `solve` gives the velocity that serves the tasks best at a configuration. The first call compiles; after that,
 # changing any number (target, weight, gain, limit) compiles nothing.
 
 # %%
-tick = osik.solve(robot, robot.q0, tasks, scheme=osik.HierarchicalQP(), limits=limits, dt=DT)
-assert tick.status == osik.Status.SOLVED
-print("status:", osik.Status(int(tick.status)).name)
-for name, left in tick.slack.items():
+step = osik.solve(robot, robot.q0, tasks, scheme=osik.HierarchicalQP(), limits=limits, dt=DT)
+assert step.status == osik.Status.SOLVED
+print("status:", osik.Status(int(step.status)).name)
+for name, left in step.slack.items():
     print(f"{name:>10}: wanted minus got, at most {np.abs(left).max():.1e}")
 
 # %%
-moving = np.asarray(tick.velocity[6:])  # the first 6 are the free base
+moving = np.asarray(step.velocity[6:])  # the first 6 are the free base
 names = np.array([name for name in robot.joint_names if robot.joint_dof_index(name) >= 6])
 names = names[np.argsort([robot.joint_dof_index(name) for name in names])]
 busy = np.argsort(-np.abs(moving))[:10][::-1]
@@ -126,14 +126,14 @@ fastest = np.asarray(robot.velocity_limit)[6:]
 axes.barh(names[busy], 2 * fastest[busy], left=-fastest[busy], color="#e3e7ec", label="limit")
 axes.barh(names[busy], moving[busy], color=BLUE, label="velocity")
 axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-axes.set(xlabel="velocity [rad/s]", title="The first tick: legs and arm reach together")
+axes.set(xlabel="velocity [rad/s]", title="The first step: legs and arm reach together")
 axes.axvline(0.0, color="black", lw=0.8)
 plt.show()
 
 # %% [markdown]
 # ## The closed loop
 #
-# `rollout` repeats it: solve, move, solve again. All ticks are one compiled program.
+# `rollout` repeats it: solve, move, solve again. All steps are one compiled program.
 
 # %%
 motion = osik.rollout(robot, robot.q0, tasks, scheme=osik.HierarchicalQP(), limits=limits, dt=DT, steps=STEPS)
@@ -177,7 +177,7 @@ fig.tight_layout()
 plt.show()
 
 print(f"the hand ends {1e3 * distance[-1]:.2f} mm from its target; the feet moved {1e3 * slip:.1e} mm")
-assert slip < 1e-4 and room.min() > -1e-4  # a tenth of a millimetre: what a tick of 10 ms rounds off
+assert slip < 1e-4 and room.min() > -1e-4  # a tenth of a millimetre: what a step of 10 ms rounds off
 
 # %% [markdown]
 # ## A film

@@ -1,4 +1,4 @@
-"""An arm with tasks, limits and schemes, and what it answers: what the tests of derivatives of ticks share."""
+"""An arm with tasks, limits and schemes, and what it answers: what the tests of derivatives of steps share."""
 
 from __future__ import annotations
 

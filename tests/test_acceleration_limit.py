@@ -21,7 +21,7 @@ MJCF = """
   </worldbody>
 </mujoco>
 """
-TICKS = 200
+STEPS = 200
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ class State(NamedTuple):
     """One joint, and its limits."""
 
     q: Any
-    velocity: Any  # of the last tick
+    velocity: Any  # of the last step
     dt: Any
     acceleration: Any
     fastest: Any
@@ -61,10 +61,10 @@ def box(robot, s):
 
 
 def needed(speed, s):
-    """Way that braking needs from a speed on, the tick with that speed included: a sum, not the limit's formula."""
+    """Way that braking needs from a speed on, the step with that speed included: a sum, not the limit's formula."""
     change = s.acceleration * s.dt
-    ticks = np.ceil(np.maximum(speed, 0.0) / change)
-    return s.dt * (ticks * speed - change * ticks * (ticks - 1.0) / 2.0)
+    count = np.ceil(np.maximum(speed, 0.0) / change)
+    return s.dt * (count * speed - change * count * (count - 1.0) / 2.0)
 
 
 def viable_by(s):
@@ -76,7 +76,7 @@ def viable_by(s):
 
 
 def drawn(rng, count):
-    """Ranges, limits and ticks over decades; a braking takes from one tick to about a hundred."""
+    """Ranges, limits and steps over decades; a braking takes from one step to about a hundred."""
     dt = 10.0 ** rng.uniform(-3.5, -1.0, count)
     fastest = 10.0 ** rng.uniform(-1.0, 1.0, count)
     acceleration = fastest / dt / 10.0 ** rng.uniform(-0.5, 2.0, count)
@@ -97,14 +97,14 @@ def viable(rng, count):
     return s
 
 
-@partial(jax.jit, static_argnames="ticks")
-def closed_loop(robot, state, seed, *, ticks):
-    """What went wrong most, over all ticks, of each state; lanes prefer one end of the box, or change their mind."""
+@partial(jax.jit, static_argnames="count")
+def closed_loop(robot, state, seed, *, count):
+    """What went wrong most, over all steps, of each state; lanes prefer one end of the box, or change their mind."""
 
     def one(s, number):
         likes = jnp.array([13, 128, 243], jnp.uint32)[number % 3]
 
-        def tick(carry, _):
+        def step(carry, _):
             q, velocity, worst, number = carry
             number = number * jnp.uint32(1664525) + jnp.uint32(1013904223)
             now = s._replace(q=q, velocity=velocity)
@@ -123,7 +123,7 @@ def closed_loop(robot, state, seed, *, ticks):
             return (moved, v, jnp.maximum(worst, wrong), number), None
 
         start = s.q, s.velocity, jnp.full(4, -jnp.inf), number
-        (q, velocity, worst, _), _ = jax.lax.scan(tick, start, length=ticks)
+        (q, velocity, worst, _), _ = jax.lax.scan(step, start, length=count)
         return q, velocity, worst
 
     return jax.vmap(one)(state, jnp.arange(len(state.q), dtype=jnp.uint32) + jnp.uint32(seed))
@@ -140,7 +140,7 @@ class TestClosedLoop:
     def test_never_breaks_a_limit(self, rail, count):
         """Extreme choices from viable states: box, speed, acceleration and range hold to rounding, at the end too."""
         start = viable(np.random.default_rng(11), count)
-        q, velocity, worst = map(np.asarray, closed_loop(rail, jax.tree.map(jnp.asarray, start), 3, ticks=TICKS))
+        q, velocity, worst = map(np.asarray, closed_loop(rail, jax.tree.map(jnp.asarray, start), 3, count=STEPS))
         np.testing.assert_array_less(worst.max(0), 1e-13)
         end = start._replace(q=q, velocity=velocity)
         assert (viable_by(end) / (np.abs(start.lower) + np.abs(start.upper) + start.fastest)).max() < 1e-13
@@ -179,7 +179,7 @@ class TestClosedLoop:
         hardest = (start.velocity - change)[beyond & back]
         np.testing.assert_allclose(upper[beyond & back], hardest, rtol=1e-13, atol=1e-14)
         assert (beyond & back).sum() > 100
-        q, velocity, _ = map(np.asarray, closed_loop(rail, states, 4, ticks=2_000))
+        q, velocity, _ = map(np.asarray, closed_loop(rail, states, 4, count=2_000))
         end = start._replace(q=q, velocity=velocity)
         assert (viable_by(end) / (np.abs(q) + np.abs(start.lower) + np.abs(start.upper) + start.fastest)).max() < 1e-13
 
@@ -187,7 +187,7 @@ class TestClosedLoop:
 class TestInTheLoop:
     @pytest.mark.slow
     def test_rollout_hands_the_velocity_on(self, arm):
-        """The first tick starts from the velocity that the limit was given; the loop by hand gives the same path."""
+        """The first step starts from the velocity that the limit was given; the loop by hand gives the same path."""
         tasks = {"posture": osik.PostureTask(arm, target=arm.q0 + 0.3, weight=1.0)}
         limit = osik.AccelerationLimit(arm, {"*": 5.0, "joint1": np.inf}, velocity=np.full(7, 0.2))
         limits, dt, scheme = (osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)), 0.01, osik.WeightedQP()
@@ -207,7 +207,7 @@ class TestInTheLoop:
 
 class TestDerivatives:
     def test_against_differences(self, rail):
-        """Of both ends of the box, with respect to the state, the tick and every limit."""
+        """Of both ends of the box, with respect to the state, the step and every limit."""
         rng = np.random.default_rng(8)
         cases = viable(rng, 300)
         some = cases._replace(q=np.where(np.arange(300) % 3, cases.q, cases.upper + 0.1 * rng.uniform(size=300)))

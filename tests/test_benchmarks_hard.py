@@ -85,7 +85,7 @@ class TestNumbers:
         assert found.rms == pytest.approx(top / np.sqrt(7.0))
         assert found.at_range == found.feet == found.base == 0.0 and found.hand_at_end == pytest.approx(0.0, abs=1e-12)
 
-    def test_only_of_the_ticks_that_are_judged(self, work):
+    def test_only_of_the_steps_that_are_judged(self, work):
         path = self.path(work, 20)
         path[5:10, 3] += 0.01
         assert judged(work, motion_of(path, held(work, work.hand_position, 20))).rms > 0.0

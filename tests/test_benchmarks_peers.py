@@ -55,7 +55,7 @@ def test_a_good_motion_counts(work, paths, name):
 
 
 def test_a_wrong_motion_fails(work, paths):
-    """Standing still, a tick late at full speed, another lane's target, beyond limits, not a number."""
+    """Standing still, a step late at full speed, another lane's target, beyond limits, not a number."""
 
     def named(motion, lane=0):
         return {text.split()[0] for text in failures(judged(work, motion, lane))}

@@ -96,7 +96,7 @@ def test_unknown_frames_are_listed(capsys, arm_file):
 def test_options_that_make_no_sense_are_explained(capsys, arm_file):
     assert "--robot" in refused(capsys, "demo", "--frame", "torso")
     assert "--frequency is 0" in refused(capsys, "demo", "--frequency", "0")
-    assert "two control ticks" in refused(capsys, "demo", "--duration", "0")
+    assert "two control steps" in refused(capsys, "demo", "--duration", "0")
     line = refused(capsys, "demo", "--robot", str(arm_file), "--motion", "single-support")
     assert "--motion single-support is NAO's" in line and "--frame" in line
     assert "--base goes with a file" in refused(capsys, "info", "nao", "--base", "fixed")

@@ -290,7 +290,7 @@ def test_rows_are_those_of_the_pairs_that_could_meet_soonest(arm, avoidance):
     assert (near < 0.0).any() and ((near > 0.02) & (near < 0.25)).any() and (near > 0.25).any()
 
 
-def test_gain_counts_up_to_one_over_the_tick(arm, among):
+def test_gain_counts_up_to_one_over_the_step(arm, among):
     q = np.array([0.1, 0.9, -0.4])
     limits = [among.replace(gain=gain, recovery_speed=9.0) for gain in (50.0, 1e3, 10.0)]
     rows = [np.asarray(_rows(limit, arm, q, 0.02).lower) for limit in limits]
@@ -460,7 +460,7 @@ def test_longer_links_have_larger_geoms(arm):
 
 @jax.jit
 def _reaches(arm, limit, starts, targets):
-    """Closed loops that send the tip from each start to each target: all distances in each tick, and the status."""
+    """Closed loops that send the tip from each start to each target: all distances in each step, and the status."""
     limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm), limit
 
     def one(start, target):
@@ -481,7 +481,7 @@ def _tips(arm, q):
 
 
 @pytest.mark.slow
-def test_no_tick_of_a_closed_loop_penetrates(arm, among):
+def test_no_step_of_a_closed_loop_penetrates(arm, among):
     """Forty targets that the arm can reach: with the limit 15 mm are kept, without it more than half hit something."""
     reachable = np.random.default_rng(6).uniform(-2.0, 2.0, (40, 3))
     starts, targets = jnp.tile(arm.q0, (40, 1)), _tips(arm, reachable)
@@ -509,16 +509,16 @@ def test_moving_obstacles_and_numbers_compile_nothing(arm, among):
     programs = []
 
     @jax.jit
-    def tick(limit, q):
+    def solved(limit, q):
         programs.append(1)
         return osik.solve(arm, q, tasks, scheme=osik.WeightedQP(), limits=(limit,), dt=0.01).velocity
 
     q = jnp.array([0.3, 0.9, 0.4])
-    first = tick(among, q)
+    first = solved(among, q)
     assert np.isfinite(first).all()
     changed = among.moved("post", position=np.array([0.49, 0.2, 0.21]), rotation=np.eye(3)[[1, 2, 0]])
-    assert not np.allclose(tick(changed, q), first, atol=1e-3)
-    tick(changed.replace(minimum_distance=0.05, gain=3.0, recovery_speed=0.0, detection_distance=0.5), q)
+    assert not np.allclose(solved(changed, q), first, atol=1e-3)
+    solved(changed.replace(minimum_distance=0.05, gain=3.0, recovery_speed=0.0, detection_distance=0.5), q)
     assert len(programs) == 1
 
 

@@ -33,7 +33,7 @@ SCHEMES = {
 
 
 class Case(eqx.Module):
-    """All that a tick takes; arrays may have a leading axis, the lanes."""
+    """All that a step takes; arrays may have a leading axis, the lanes."""
 
     robot: osik.Robot
     q: Any
@@ -266,7 +266,7 @@ class TestPrograms:
         traces = []
 
         @jax.jit
-        def tick(case):
+        def step(case):
             traces.append(1)
             return osik.solve(
                 case.robot, case.q, case.tasks, scheme=osik.NullSpace(), limits=case.limits, dt=DT
@@ -274,7 +274,7 @@ class TestPrograms:
 
         one, other = (case(arm, jax.tree.map(lambda leaf, i=i: leaf[i], lanes)) for i in range(2))
         tasks = {**other.tasks, "elbow": other.tasks["elbow"].replace(weight=3.0, gain=0.5)}
-        assert np.abs(tick(one) - tick(Case(arm, other.q, tasks, other.limits))).max() > 1e-3
+        assert np.abs(step(one) - step(Case(arm, other.q, tasks, other.limits))).max() > 1e-3
         assert len(traces) == 1
 
     def test_without_constraints_there_is_no_level_for_them(self, arm):

@@ -1,4 +1,4 @@
-"""One tick and many: the loop against itself in Python, batches against loops, derivatives, failures and mistakes."""
+"""One step and many: the loop against itself in Python, batches against loops, derivatives, failures and mistakes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def limits(arm):
 
 
 def paths(home):
-    """Targets of the hand at every tick: a curve, and a turn about z."""
+    """Targets of the hand at every step: a curve, and a turn about z."""
     t = DT * np.arange(STEPS)
     c, s, zero, one = np.cos(t), np.sin(t), np.zeros(STEPS), np.ones(STEPS)
     turn = np.array([[c, -s, zero], [s, c, zero], [zero, zero, one]]).transpose(2, 0, 1)
@@ -96,7 +96,7 @@ class TestRollout:
         assert np.abs(q[-1] - q[0]).max() > 0.05
 
     def test_functions_of_time_for_tasks_and_feedback(self, arm, home, tasks, limits):
-        """Feedback: the configuration that the last tick led to comes back changed."""
+        """Feedback: the configuration that the last step led to comes back changed."""
         p, R = paths(home)
 
         def at(t):
@@ -160,13 +160,13 @@ class TestRollout:
         assert (joint[7:] <= float(arm.position_upper[1])).all()
         assert np.max(run.solution.box_violation) == 0.0
 
-    def test_no_ticks(self, arm, tasks):
+    def test_no_steps(self, arm, tasks):
         run = osik.rollout(arm, arm.q0, tasks, scheme=SCHEMES["weighted"], steps=0, limits=())
         np.testing.assert_array_equal(run.q, [arm.q0])
 
 
 def same(tasks):
-    """The hand's target, at every tick."""
+    """The hand's target, at every step."""
     return tuple(np.tile(part, (STEPS,) + (1,) * part.ndim) for part in tasks["hand"].target)
 
 
@@ -320,7 +320,7 @@ class TestDerivatives:
 
     @staticmethod
     def cost(arm, home, limits, name):
-        """Of the target, gain, weight and configuration of a tick with bounds active, along one direction."""
+        """Of the target, gain, weight and configuration of a step with bounds active, along one direction."""
         p, R = home
         scheme = osik.WeightedQP(damping=1e-2) if name == "weighted" else osik.NullSpace(damping=1e-2)
         hand = osik.FrameTask(arm, "hand", rows="position", target=(p, R))
@@ -346,7 +346,7 @@ class TestDerivatives:
 
     @pytest.mark.variants(slow=["null-space"])
     @pytest.mark.parametrize("name", ["weighted", "null-space"])
-    def test_one_tick_in_both_modes(self, arm, home, limits, name):
+    def test_one_step_in_both_modes(self, arm, home, limits, name):
         f, x = self.cost(arm, home, limits, name)
         flat, restore = ravel_pytree(x)
         run = jax.jit(jax.value_and_grad(lambda flat: f(restore(flat))))
@@ -408,13 +408,13 @@ class TestMistakes:
         return osik.rollout(arguments.pop("robot"), arguments.pop("q0"), arguments.pop("tasks"), **arguments)
 
     @staticmethod
-    def tick(arm, tasks, **changes):
+    def solved(arm, tasks, **changes):
         arguments = {"q": arm.q0, "tasks": tasks, "scheme": SCHEMES["weighted"], **changes}
         return osik.solve(arm, arguments.pop("q"), arguments.pop("tasks"), **arguments)
 
     def test_configurations(self, arm, tasks):
         nao = osik.load_robot("nao")
-        for call, key in ((self.tick, "q"), (self.run, "q0")):
+        for call, key in ((self.solved, "q"), (self.run, "q0")):
             with pytest.raises(ValueError, match=r"shape \(3,\).*\(7,\): joint1, joint2"):
                 call(arm, tasks, **{key: np.zeros(3)})
             with pytest.raises(ValueError, match=r"vmap"):
@@ -433,7 +433,7 @@ class TestMistakes:
             )
 
     def test_tasks(self, arm, tasks):
-        for call in (self.tick, self.run):
+        for call in (self.solved, self.run):
             with pytest.raises(ValueError, match="no task"):
                 call(arm, {})
             with pytest.raises(TypeError, match="tasks is a list; it is a dict"):
@@ -444,7 +444,7 @@ class TestMistakes:
             self.run(arm, lambda t: {})
 
     def test_schemes_limits_and_times(self, arm, tasks, limits):
-        for call in (self.tick, self.run):
+        for call in (self.solved, self.run):
             with pytest.raises(TypeError, match=r"scheme is <class .*WeightedQP\(\)"):
                 call(arm, tasks, scheme=osik.WeightedQP)
             with pytest.raises(TypeError, match=r"limits is ConfigurationLimit.*sequence"):
@@ -461,7 +461,7 @@ class TestMistakes:
     def test_targets_and_feedback(self, arm, tasks):
         with pytest.raises(KeyError, match="targets are for 'foot', which is no task; tasks: hand, elbow, posture"):
             self.run(arm, tasks, targets={"foot": np.zeros((3, 7))})
-        with pytest.raises(ValueError, match=r"targets\['posture'\] has shape \(2, 7\).*ticks, 3"):
+        with pytest.raises(ValueError, match=r"targets\['posture'\] has shape \(2, 7\).*steps, 3"):
             self.run(arm, tasks, targets={"posture": np.zeros((2, 7))})
         with pytest.raises(ValueError, match=r"target has shape \(5,\), expected \(7,\)"):
             self.run(arm, tasks, targets={"posture": np.zeros((3, 5))})

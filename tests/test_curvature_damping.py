@@ -106,7 +106,7 @@ def test_out_of_reach_it_comes_to_rest(scheme, beyond):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_inside_it_is_as_exact_as_without(scheme, arm):
-    """A hand that follows a circle, the whole error asked for in one tick."""
+    """A hand that follows a circle, the whole error asked for in one step."""
     q0 = bent(arm)
     p, rotation = kinematics_at(arm, q0).frame_pose(arm, "hand")
     t = 2.0 * np.pi * np.arange(200) * DT

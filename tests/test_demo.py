@@ -142,7 +142,7 @@ def test_measurement_of_a_motion_made_by_hand(nao):
 
 
 def check_requirements(motion, run, lifted=None):
-    """What issue 2 asks of the hierarchical scheme, from MuJoCo C alone; ``lifted``: ticks with the right foot up."""
+    """What issue 2 asks of the hierarchical scheme, from MuJoCo C alone; ``lifted``: steps with the right foot up."""
     robot = motion.robot
     first = look(robot, run.q[0])
     hulls = {feet: ConvexHull(corners(first, *feet)).equations for feet in (("l_sole", "r_sole"), ("l_sole",))}

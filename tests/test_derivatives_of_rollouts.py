@@ -1,4 +1,4 @@
-"""Second derivatives through a tick, derivatives through a rollout, and what they keep in memory."""
+"""Second derivatives through a step, derivatives through a rollout, and what they keep in memory."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def arm():
 class TestHessian:
     @pytest.mark.variants(release=["null-space", "hierarchical"])
     @all_schemes
-    def test_of_a_tick(self, arm, rng, name):
+    def test_of_a_step(self, arm, rng, name):
         """Forward over reverse, with speeds at their bounds, against central differences of the gradient; symmetric."""
         robot, _, tasks, scheme, limits, dt = arm_setting(arm, SCHEMES[name])
         hand, posture = tasks["hand"], tasks["posture"]
@@ -73,7 +73,7 @@ def path_cost(setting, steps):
 class TestRollout:
     @pytest.mark.variants(release=["hierarchical", "null-space"])
     @all_schemes
-    def test_over_two_hundred_ticks(self, arm, rng, name):
+    def test_over_two_hundred_steps(self, arm, rng, name):
         """Both modes against central differences, through changes of the active set along the way."""
         cost, x = path_cost(arm_setting(arm, SCHEMES[name]), 200)
         flat, restore = ravel_pytree(x)
@@ -95,7 +95,7 @@ class TestRollout:
     @pytest.mark.variants(release=["hierarchical"])
     @pytest.mark.parametrize("name", ["weighted", "hierarchical"])
     def test_memory_of_the_gradient(self, arm, name):
-        """A tick more keeps the state of a tick, not what its solver went through."""
+        """A step more keeps the state of a step, not what its solver went through."""
 
         def temporary(steps):
             cost, x = path_cost(arm_setting(arm, SCHEMES[name]), steps)
@@ -104,5 +104,5 @@ class TestRollout:
             assert analysis is not None
             return analysis.temp_size_in_bytes
 
-        a_tick = (temporary(300) - temporary(100)) / 200
-        assert a_tick < 1000, f"{a_tick} bytes a tick"
+        a_step = (temporary(300) - temporary(100)) / 200
+        assert a_step < 1000, f"{a_step} bytes a step"

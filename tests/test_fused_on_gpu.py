@@ -164,5 +164,5 @@ def test_the_kernel_settles_alone(rng):
     np.testing.assert_array_equal(found.active, guess)
     assert off(p.A, found.x, p.solution, p.b).max() < 1e-5
     cold = kernel(qp, jnp.zeros_like(guess), tolerance)
-    assert cold.settled.all()
+    assert cold.converged.all()
     assert off(p.A, cold.x, p.solution, p.b).max() < 1e-5

@@ -1,4 +1,4 @@
-"""Hard work of a whole robot: calm out of reach, feet that stay, derivatives at the start, ticks that are none."""
+"""Hard work of a whole robot: calm out of reach, feet that stay, derivatives at the start, steps that are none."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from osik_jax.viewer import mujoco_frame_pose, mujoco_poses
 
 DT, STEPS = 0.005, 800
 LATE = 400
-"""The first tick of those that are judged."""
+"""The first step of those that are judged."""
 CALM = 0.1
 """The rms speed of a robot at rest [rad/s]."""
 FEET = ("l_sole", "r_sole")
@@ -64,7 +64,7 @@ def held(robot, tasks, scheme, places, gains):
 
 
 def assert_calm(robot, velocity, status, rest, *, limits=True):
-    """At rest from that tick on, far from top speed after two seconds, and before never above it but without limits."""
+    """At rest from that step on, far from top speed after two seconds, and before never above it but without limits."""
     base = 6 if robot.floating_base else 0
     joints, top = velocity[..., base:], np.asarray(robot.velocity_limit)[base:]
     assert np.isfinite(velocity).all() and (not limits or (np.abs(joints) <= top * (1.0 + 1e-9)).all())
@@ -156,7 +156,7 @@ class TestAtTheStart:
         assert float(jax.jvp(cost, (0.0,), (1.0,))[1]) == pytest.approx(expected, rel=1e-6)
 
 
-class TestATickThatIsNone:
+class TestAStepThatIsNone:
     @pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
     def test_a_traced_dt_that_is_none_moves_nothing(self, arm, scheme):
         """A dt of 0 would divide, a negative one turn limits round: the status says so, and the robot stays."""

@@ -150,7 +150,7 @@ class TestBarrier:
         np.testing.assert_allclose(asked(flying, steep, q)[1].upper, (upper - value) / DT, rtol=1e-12, atol=1e-10)
 
     def test_a_hand_that_wants_through(self, arm):
-        """The hand slides along the walls, and does not pass them by more than the path curves in a tick."""
+        """The hand slides along the walls, and does not pass them by more than the path curves in a step."""
         p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
         tasks = {
             "hand": osik.FrameTask(arm, "hand", target=(p + np.array([0.3, 0.2, 0.0]), R), orientation_weight=0.0),
@@ -251,7 +251,7 @@ class TestLimitTask:
         null = np.linalg.svd(J)[2][3:]
         np.testing.assert_allclose(null @ beyond, 0.0, atol=1e-9)  # its gradient, where the hand leaves freedom
 
-    def test_knows_the_tick_and_the_last_velocity(self, arm):
+    def test_knows_the_step_and_the_last_velocity(self, arm):
         soft = {
             "range": osik.LimitTask(arm, osik.ConfigurationLimit(arm)),
             "jerk": osik.LimitTask(arm, osik.AccelerationLimit(arm, {"*": 2.0})),

@@ -83,7 +83,7 @@ def test_the_robot_goes_where_its_target_is(loop: ControlLoop) -> None:
     assert until(lambda: bool(np.linalg.norm(loop.snapshot.errors["hand"]) < 1e-3))
 
 
-def test_every_step_is_the_solution_of_its_tick(loop: ControlLoop) -> None:
+def test_every_step_is_the_solution_of_its_step(loop: ControlLoop) -> None:
     target = moved(-0.1, 0.1, 0.0)
     loop.record()
     loop.aim("hand", target)

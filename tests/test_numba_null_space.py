@@ -65,6 +65,12 @@ def dependent(p: Problems) -> Problems:
     return p._replace(levels=[mixed(level) if level[0].shape[1] > 1 else level for level in p.levels])
 
 
+def with_zero_rows(p: Problems) -> Problems:
+    """The second level has nothing but zeros, and asks for something."""
+    A, *rest = p.levels[1]
+    return p._replace(levels=[p.levels[0], (0.0 * A, *rest), *p.levels[2:]])
+
+
 @partial(jax.jit, static_argnames=("backend", "method"))
 def solved(p: Problems, *, backend: Backend = "numba", method="forward"):
     """A batch, by one backend."""
@@ -97,6 +103,7 @@ FAMILIES = {
     "tiny": random_problems(14, 8, (3, 2, 4), scale=1e-9, inequalities=True, damped=True),
     "huge": random_problems(15, 8, (3, 2, 4), scale=1e9, inequalities=True, damped=True),
     "zeros": random_problems(16, 6, (2, 3), scale=0.0),
+    "as many zero rows as are left": with_zero_rows(random_problems(17, 6, (2, 5, 2))),
 }
 every_family = pytest.mark.parametrize("p", FAMILIES.values(), ids=FAMILIES)
 
@@ -338,7 +345,7 @@ def test_a_backend_that_is_not_there(monkeypatch):
 
 @pytest.mark.release
 def test_the_scheme():
-    """A tick of an arm by both backends, in each order."""
+    """A step of an arm by both backends, in each order."""
     arm = osik.load_robot("arm7")
     tasks = {
         "hand": osik.FrameTask(arm, arm.frame_names[-1], rows="position", priority=1),

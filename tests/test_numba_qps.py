@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from optimality import by_daqp
-from problem_families import QPs
+from problem_families import PLANTED, QPs
 from recorded import QP_DAMPING, recorded_qps
 from weighted_families import MANY, M, N, P, Problems, problems
 
+from benchmarks.agreement import planted
 from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp import _numba
 from osik_jax.solvers.qp._cost import LeastSquares
@@ -35,7 +36,7 @@ def candidates(p: Problems):
     cost = LeastSquares(*map(jnp.asarray, (p.matrix, p.target, p.weight, p.damping, np.zeros((count, N)))))
     lower, upper = (jnp.concatenate(pair, 1) for pair in ((p.lower, p.rows_lower), (p.upper, p.rows_upper)))
     qp = QP(cost, jnp.asarray(p.rows), jnp.asarray(p.rows_compliance), lower, upper)
-    return _numba.solve(qp, jnp.zeros((count, N + P), int), jnp.full(count, 1e-12), 1000)
+    return _numba.solve(qp, jnp.zeros(lower.shape, int), jnp.full(count, 1e-12), 1000)
 
 
 def assert_same(p: Problems, found, expected) -> None:
@@ -131,6 +132,30 @@ def test_lanes_that_are_left_to_the_search():
     np.testing.assert_allclose(found.x[3], plain.x[3], atol=1e-8)
     others = np.setdiff1d(np.arange(COUNT), [3, 7, 11])
     np.testing.assert_array_equal(found.x[others], alone.x[others])
+
+
+@pytest.mark.parametrize(
+    ("family", "seed", "lanes"),
+    [
+        ("pinned", 0, [299, 332, 1135, 1313]),  # rows of pinned variables alone hold by themselves, but for rounding
+        ("duplicated_equalities", 1, [1372, 1514]),
+        ("duplicated_rows", 1, [2293, 3090]),
+        ("nearly_singular", 0, [2600]),  # the end of the dual method, solved anew, is beyond another bound
+    ],
+)
+def test_what_was_once_left_over_is_at_the_planted_optimum(family, seed, lanes):
+    """Problems that went to the search after the kernel, which did not solve them."""
+    qps = PLANTED[family](np.random.default_rng(seed), 4096)
+    p = planted(np.random.default_rng(seed), 4096, draw=PLANTED[family])
+    p, H, x = jax.tree.map(lambda a: a[np.asarray(lanes)], (p, qps.H, qps.x))
+    taken = candidates(p)
+    np.testing.assert_array_equal(taken.converged, 1)
+    off = np.asarray(taken.x) - x
+    cost, whole = (np.einsum("bi,bij,bj->b", v, H, v) for v in (off, x))
+    assert np.sqrt(cost / whole).max() < 1e-9
+    values = np.einsum("bpn,bn->bp", p.rows, taken.x)
+    beyond = np.maximum(p.rows_lower - values, values - p.rows_upper).max(1)
+    assert (beyond < 1e-9 * np.abs(values).max(1)).all()
 
 
 def test_one_problem_is_a_lane_of_a_batch():

@@ -214,7 +214,7 @@ def test_steady_errors_are_those_of_theory(arm, arm_world, command, left):
 
 
 class Compilations(logging.Handler):
-    """The programs of ticks that JAX says it compiles."""
+    """The programs of steps that JAX says it compiles."""
 
     def __init__(self):
         super().__init__()
@@ -222,7 +222,7 @@ class Compilations(logging.Handler):
 
     def emit(self, record):
         words = record.getMessage().split()
-        if words[0] == "Compiling" and "tick" in words[1]:
+        if words[0] == "Compiling" and "control_step" in words[1]:
             self.names.append(words[1])
 
 
@@ -268,7 +268,7 @@ def test_mistakes_are_told(nao, arm, arm_world):
         simulation.step(arm.q0.at[1].set(np.nan), DT)
     with pytest.raises(KeyError, match="bodies: link0"):
         simulation.push("torso", (1.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="one tick"):
+    with pytest.raises(ValueError, match="one step"):
         physics.simulate(
             simulation,
             {"posture": osik.PostureTask(arm, weight=1.0)},

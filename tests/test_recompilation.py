@@ -104,19 +104,19 @@ def longer(robot):
 
 
 @all_schemes
-def test_a_tick_compiles_once(arm, home, name):
+def test_a_step_compiles_once(arm, home, name):
     before, after = SCHEMES[name]
 
-    def tick(robot, scheme, q, tasks, limits, dt):
+    def step(robot, scheme, q, tasks, limits, dt):
         return osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=dt)
 
     with Compilations() as first:
-        a = tick(arm, before, *first_numbers(arm, home))
+        a = step(arm, before, *first_numbers(arm, home))
     assert first.names.count("jit(step)") == 1
     stretched, numbers = longer(arm), other_numbers(arm, home)
     with Compilations() as second:
-        b = tick(stretched, after, *numbers)
-        c = tick(arm, after, *numbers[:3], 1)
+        b = step(stretched, after, *numbers)
+        c = step(arm, after, *numbers[:3], 1)
     assert second.names == []
     assert np.abs(a.velocity - b.velocity).max() > 1e-3
     assert np.abs(c.velocity - b.velocity).max() > 1e-6
@@ -189,7 +189,7 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
 
 @pytest.mark.slow
 def test_what_is_static_compiles_again(arm):
-    """The counter counts: an iteration cap, a priority, a task more, another number of ticks."""
+    """The counter counts: an iteration cap, a priority, a task more, another number of steps."""
     task, scheme = osik.PostureTask(arm, weight=1.0), osik.WeightedQP()
     osik.solve(arm, arm.q0, {"posture": task}, scheme=scheme, limits=())
     changes = (

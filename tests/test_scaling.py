@@ -32,9 +32,9 @@ largest = lambda a, b: max(float(abs(x - y).max()) for x, y in zip(jax.tree.leav
 compiled = lambda split: sum(program.run._cache_size() for program in split._known.values())
 found = {"devices": len(jax.devices())}
 for scheme in (osik.WeightedQP(), osik.NullSpace(), osik.HierarchicalQP()):
-    tick = lambda robot, q, tasks: osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=0.01)
-    split = sharded(tick, axes)
-    a, b = split(arm, q, many), jax.jit(jax.vmap(tick, axes))(arm, q, many)
+    step = lambda robot, q, tasks: osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=0.01)
+    split = sharded(step, axes)
+    a, b = split(arm, q, many), jax.jit(jax.vmap(step, axes))(arm, q, many)
     exact = largest((a.status, a.warm_start), (b.status, b.warm_start))
     split(arm, q + 0.01, many)
     found[type(scheme).__name__] = dict(

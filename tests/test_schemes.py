@@ -34,7 +34,7 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Numbers:
-    """One tick's problem in NumPy: rows stacked, one entry of ``names`` for each row."""
+    """One step's problem in NumPy: rows stacked, one entry of ``names`` for each row."""
 
     names: np.ndarray
     jacobian: np.ndarray
@@ -228,7 +228,7 @@ class TestWeightedQP:
 
     def test_the_closed_loop_is_minks(self, g1):
         """Error and Jacobian of a FrameTask are mink's to second order in the error: the feet stay, the rest moves."""
-        robot, gain, ticks = g1.robot, 8.0, 60
+        robot, gain, count = g1.robot, 8.0, 60
         feet = ("left_ankle_roll_link", "right_ankle_roll_link")
         c = np.asarray(osik.center_of_mass(robot, kinematics_at(robot, robot.q0)))
         goal, turn = c + np.array([0.02, 0.03, -0.08]), "right_wrist_yaw_link"
@@ -251,16 +251,16 @@ class TestWeightedQP:
             scheme=osik.WeightedQP(damping=1e-4, curvature_damping=0.0),
             limits=(osik.ConfigurationLimit(robot), fast),
             dt=DT,
-            steps=ticks,
+            steps=count,
         )
-        theirs = mink_loop(robot, feet, goal, (turn, R), posture, gain * DT, ticks)
+        theirs = mink_loop(robot, feet, goal, (turn, R), posture, gain * DT, count)
         np.testing.assert_array_equal(trajectory.solution.status, osik.Status.SOLVED)
         np.testing.assert_allclose(trajectory.q, theirs, rtol=0, atol=1e-6)
         assert np.abs(theirs[-1] - theirs[0]).max() > 0.2
         assert (np.abs(np.abs(trajectory.solution.velocity[:, 6:]) - 1.2) < 1e-9).any()
 
 
-def mink_loop(robot, feet, com, turn, posture, gain, ticks):
+def mink_loop(robot, feet, com, turn, posture, gain, count):
     model = robot.mj_model
     configuration = mink.Configuration(model, q=np.array(robot.q0))
     tasks: list = [mink.FrameTask(foot, "body", 5.0, 5.0, gain=gain) for foot in feet]
@@ -276,7 +276,7 @@ def mink_loop(robot, feet, com, turn, posture, gain, ticks):
         mink.VelocityLimit(model, {name: 1.2 for name in robot.joint_names}),
     ]
     out = [configuration.q.copy()]
-    for _ in range(ticks):
+    for _ in range(count):
         here = configuration.get_transform_frame_to_world(turn[0], "body").translation()
         tasks[3].set_target(mink.SE3.from_rotation_and_translation(rotation, here))
         v = mink.solve_ik(configuration, tasks, DT, "daqp", damping=1e-4, limits=limits)

@@ -17,7 +17,7 @@ import osik_jax as osik
 pytestmark = pytest.mark.slow
 
 DT = 0.01
-TICKS = 10
+STEPS = 10
 GAIN = 20.0
 OFFSET = np.array([0.005, -0.01, 0.0075])
 ROBOTS = {
@@ -72,7 +72,7 @@ def case(request: pytest.FixtureRequest) -> Case:
     }
     limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)
     scheme = osik.WeightedQP(damping=1e-7, curvature_damping=0.0)  # else the first of the way is slower
-    run = osik.rollout(robot, q0, tasks, scheme=scheme, limits=limits, dt=DT, steps=TICKS)
+    run = osik.rollout(robot, q0, tasks, scheme=scheme, limits=limits, dt=DT, steps=STEPS)
     return Case(robot, frame, goal, tasks, jax.tree.map(np.asarray, run))
 
 
@@ -93,21 +93,21 @@ def seen_by_mujoco(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return np.array(places), np.array(joints)
 
 
-def test_every_tick_is_solved(case: Case):
+def test_every_step_is_solved(case: Case):
     np.testing.assert_array_equal(case.run.solution.status, osik.Status.SOLVED)
     assert np.isfinite(case.run.q).all()
     assert case.run.solution.kkt_residual.max() < 1e-8
 
 
 def test_the_frame_goes_where_it_is_sent(case: Case):
-    """The error falls by 1 - gain dt a tick, less what posture and speed limits take."""
+    """The error falls by 1 - gain dt a step, less what posture and speed limits take."""
     places, _ = seen_by_mujoco(case)
     error = np.linalg.norm(places - case.goal, axis=1)
     assert error[0] == pytest.approx(np.linalg.norm(OFFSET), abs=1e-9)
     ours = np.linalg.norm(case.run.solution.error["frame"][:, :3], axis=1)
     np.testing.assert_allclose(ours, error[:-1], rtol=0, atol=1e-9)
     assert (np.diff(error) < 0.0).all()
-    assert error[-1] < 1.2 * (1.0 - GAIN * DT) ** TICKS * error[0]
+    assert error[-1] < 1.2 * (1.0 - GAIN * DT) ** STEPS * error[0]
 
 
 def test_limits_are_kept(case: Case):

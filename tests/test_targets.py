@@ -68,7 +68,7 @@ class TestWays:
 
     @pytest.mark.variants(release=["rotation matrix"])
     @pytest.mark.parametrize("way", TRACED)
-    def test_at_every_tick_of_a_rollout(self, arm, way):
+    def test_at_every_step_of_a_rollout(self, arm, way):
         task, steps = osik.FrameTask(arm, "hand"), 3
         targets = jax.tree.map(lambda part: jnp.stack([jnp.asarray(part)] * steps), WAYS[way])
         options: Any = dict(scheme=osik.WeightedQP(), steps=steps)

@@ -239,7 +239,7 @@ class TestWheels:
             np.testing.assert_allclose(rows[name].jacobian[:, -1], slopes[name][:, -1], atol=1e-8)
 
     def test_a_cart_is_a_unicycle(self, cart):
-        """Wheels at given speeds: at each tick its equations, over many the arc of a circle, to the steps' error."""
+        """Wheels at given speeds: at each step its equations, over many the arc of a circle, to the steps' error."""
         speeds, dt, steps = np.array([3.0, 5.0]), 0.002, 500
         tasks = {
             "left": osik.WheelTask(cart, "left", radius=RADIUS, hard=True),

@@ -311,14 +311,14 @@ class TestGradients:
 
 @jax.jit
 def _turned(task, direction):
-    """Angles over 100 ticks of 0.02 s of a body that turns as the task asks, from no turn at all."""
+    """Angles over 100 steps of 0.02 s of a body that turns as the task asks, from no turn at all."""
 
-    def tick(rotation, _):
+    def one_step(rotation, _):
         rows = task.replace(target=direction).rows_at(jnp.zeros((1, 3)), rotation[None], jnp.eye(6)[None, :, 3:])
         spin = 0.02 * jnp.linalg.pinv(rows.jacobian) @ rows.lower
         return jaxlie.SO3.exp(spin).as_matrix() @ rotation, jnp.linalg.norm(rows.error)
 
-    return jax.lax.scan(tick, jnp.eye(3), length=100)[1]
+    return jax.lax.scan(one_step, jnp.eye(3), length=100)[1]
 
 
 class TestClosedLoop:
@@ -334,7 +334,7 @@ class TestClosedLoop:
         ],
     )
     def test_the_angle_decays_from_anywhere(self, robot, direction, angle):
-        """Right behind and nearly so too: it falls by ``1 - gain dt`` a tick, along the shortest way."""
+        """Right behind and nearly so too: it falls by ``1 - gain dt`` a step, along the shortest way."""
         task = osik.AxisAlignTask(robot, "hand", axis=(1.0, 0.0, 0.0), gain=5.0)
         np.testing.assert_allclose(_turned(task, jnp.array(direction)), angle * 0.9 ** np.arange(100), atol=1e-9)
 

@@ -126,7 +126,7 @@ class TestRows:
         assert len(none) == 6
         assert_every_number_counts(robot, tasks, configurations[0], idle=none)
 
-    def test_a_new_velocity_of_the_last_tick(self, robot, tasks):
+    def test_a_new_velocity_of_the_last_step(self, robot, tasks):
         task = tasks["low acceleration"]
         new = task.after(jnp.full(robot.nv, 0.5))
         np.testing.assert_array_equal(new.velocity, np.full(robot.nv, 0.5))
@@ -204,7 +204,7 @@ class TestClosedLoop:
         assert np.linalg.norm(run.solution.error["hand"][-1]) < 1e-3
 
     def test_couplings_decay_and_velocities_are_held(self, arm):
-        """``1 - gain dt`` a tick, while joint 1 turns at 0.2 rad/s."""
+        """``1 - gain dt`` a step, while joint 1 turns at 0.2 rad/s."""
         tasks = {
             "gear": osik.JointCouplingTask(arm, {"joint4": 1.0, "joint6": 2.0}, target=0.5, gain=5.0),
             "turn": osik.JointVelocityTask(arm, 0.2, joints=("joint1",)),

@@ -192,13 +192,13 @@ class TestFeedForward:
             k = velocity(t + ahead * dt, q + ahead * dt * k)
             return (t, q, k, total + weight * k), None
 
-        def tick(q, t):
+        def one_step(q, t):
             stages = jnp.array([[1 / 6, 0.0], [1 / 3, 0.5], [1 / 3, 0.5], [1 / 6, 1.0]])
             (_, _, _, total), _ = jax.lax.scan(step, (t, q, jnp.zeros_like(q), jnp.zeros_like(q)), stages)
             return q + dt * total, rows(t, q).error
 
         times = dt * jnp.arange(steps)
-        _, errors = jax.jit(lambda q: jax.lax.scan(tick, q, times))(q0)
+        _, errors = jax.jit(lambda q: jax.lax.scan(one_step, q, times))(q0)
         assert np.linalg.norm(errors[0][3:]) > 0.5
         np.testing.assert_allclose(errors, np.exp(-gain * times)[:, None] * errors[0], atol=1e-6 * 0.1)
 

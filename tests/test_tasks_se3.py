@@ -162,7 +162,7 @@ class TestClosedLoop:
         turn = jnp.asarray(Rotation.from_rotvec([0.3, -0.2, 0.4]).as_matrix())
         velocity = jnp.array([0.1, -0.05, 0.08, 0.5, -0.4, 0.3])
 
-        def tick(q, t):
+        def step(q, t):
             angle = velocity[3:] * t
             moved = jax.scipy.linalg.expm(jnp.cross(jnp.eye(3), angle))
             target = p + 0.05 + velocity[:3] * t, moved @ turn @ R
@@ -173,7 +173,7 @@ class TestClosedLoop:
             return osik.integrate(arm, q, solution.velocity, dt), solution.error["hand"]
 
         times = dt * jnp.arange(steps)
-        _, errors = jax.jit(lambda q: jax.lax.scan(tick, q, times))(arm.q0)
+        _, errors = jax.jit(lambda q: jax.lax.scan(step, q, times))(arm.q0)
         assert np.linalg.norm(errors[0][3:]) > 0.4
         np.testing.assert_allclose(errors, np.exp(-gain * times)[:, None] * errors[0], atol=2e-4)
         np.testing.assert_allclose(errors[-1], (1 - gain * dt) ** (steps - 1) * errors[0], atol=2e-5)

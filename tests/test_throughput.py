@@ -55,7 +55,7 @@ def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_reference_is_the_rollout():
-    """The carried tick is ``rollout``'s: errors after the checked ticks."""
+    """The carried step is ``rollout``'s: errors after the checked steps."""
     given = throughput.setting("arm7")
     wanted = throughput.reference("arm7", "weighted")
     hand: Any = given.tasks["hand"]

@@ -224,7 +224,7 @@ class TestScenarios:
             (dict(values={"hand.traget": np.zeros((3, 3))}), KeyError, "did you mean 'hand.target"),
             (dict(values={"hand.target[0]": np.zeros((3, 2))}), ValueError, "expected \\(3,\\) with an axis in front"),
             (dict(targets={"hnd": np.zeros((3, STEPS, 3))}), KeyError, "'hnd', which is no task"),
-            (dict(targets={"posture": np.zeros((3, 5, 2))}), ValueError, "one target a tick"),
+            (dict(targets={"posture": np.zeros((3, 5, 2))}), ValueError, "one target a step"),
             (dict(values={"hand.gain": np.ones(3)}), ValueError, "hand.gain.maximum is a parameter"),
         ],
     )

@@ -63,11 +63,11 @@ def in_physics(loop, seconds, by=(0.0, 0.05, -0.01), dt=0.005):
     settings: Any = dict(scheme=loop.scheme, limits=loop.limits, dt=dt, steps=len(targets["waist"][0]), targets=targets)
     recording = physics.simulate(physics.Simulation(world), loop.tasks, **settings)
     base, home = recording.q[1:], np.asarray(loop.robot.q0)
-    ticks = len(base)
-    height = np.abs(base[:, 2] - targets["waist"][0][:ticks, 2]).max()
+    count = len(base)
+    height = np.abs(base[:, 2] - targets["waist"][0][:count, 2]).max()
     tilt = 2.0 * np.arccos(np.clip(np.abs(base[:, 3:7] @ home[3:7]), 0.0, 1.0)).max()
     slip = np.linalg.norm((recording.contact_points - recording.contact_points[0])[..., :2], axis=-1).max()
-    behind = np.abs(base[:, 1] - targets["waist"][0][:ticks, 1]).max()
+    behind = np.abs(base[:, 1] - targets["waist"][0][:count, 1]).max()
     return recording.fell, height, np.degrees(tilt), slip, behind
 
 
@@ -100,7 +100,7 @@ def test_what_the_bound_is_for(tuned):
     assert fell or tilt > 3.0 or slip > 0.005
 
 
-def test_targets_by_tick_are_those_of_a_function_of_time():
+def test_targets_by_step_are_those_of_a_function_of_time():
     arm = osik.load_robot("arm7")
     world = physics.build_world(arm, servos={"*": physics.Servo(600.0, 50.0)})
     hand = osik.FrameTask(arm, "hand", rows="position", gain=5.0)
@@ -122,7 +122,7 @@ def test_targets_by_tick_are_those_of_a_function_of_time():
     simulation = physics.Simulation(world)
     with pytest.raises(KeyError, match="no task; tasks: posture"):
         physics.simulate(simulation, others, targets={"hand": (path, rotations)}, **settings)
-    with pytest.raises(ValueError, match="first axis is the ticks, 40"):
+    with pytest.raises(ValueError, match="first axis is the steps, 40"):
         physics.simulate(simulation, others | {"hand": hand}, targets={"hand": (path[:-1], rotations)}, **settings)
     with pytest.raises(ValueError, match="a function of time sets them itself"):
         physics.simulate(simulation, lambda t: others, targets={"hand": (path, rotations)}, **settings)

@@ -263,7 +263,7 @@ def test_gif_has_its_frames(tmp_path, nao):
     )
     with Image.open(path) as film:
         assert film.size == (240, 136)
-        assert getattr(film, "n_frames", 1) == 11  # ticks 0, 4, ..., 40
+        assert getattr(film, "n_frames", 1) == 11  # steps 0, 4, ..., 40
         assert film.info["duration"] == 80
         film.seek(5)
         assert len(np.unique(np.asarray(film.convert("RGB")).reshape(-1, 3), axis=0)) > 30

@@ -121,7 +121,7 @@ def reaching():
     ids=["weighted", "hierarchical"],
 )
 def test_the_closed_loop(scheme, reaching):
-    """Each tick starts from the one before: the same motion as from cold starts, in one or two factorisations."""
+    """Each step starts from the one before: the same motion as from cold starts, in one or two factorisations."""
     arm, tasks, limits = reaching
     steps = 150
     warm = osik.rollout(arm, arm.q0, tasks, scheme=scheme, limits=limits, dt=DT, steps=steps)

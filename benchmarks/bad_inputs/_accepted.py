@@ -54,7 +54,7 @@ def accepted(add: Add) -> None:
         "a gain above 2 / dt",
         lambda: reach(gain=1e6),
         None,
-        "a target may be approached in one tick; the limits hold",
+        "a target may be approached in one step; the limits hold",
         status=solved,
     )
     add("priority of NumPy", lambda: hand(priority=np.int64(2)), None, "an integer")

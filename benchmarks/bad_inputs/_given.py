@@ -1,4 +1,4 @@
-"""Robots, tasks and ticks that are right but for one thing."""
+"""Robots, tasks and steps that are right but for one thing."""
 
 # pyright: reportArgumentType=false
 from __future__ import annotations
@@ -40,7 +40,7 @@ def hand(**options: Any) -> osik.FrameTask:
 
 
 def solve(tasks: Any = None, q: Any = None, *, robot: osik.Robot | None = None, **options: Any) -> osik.Solution:
-    """A tick of the arm, or of another robot, which may be wrong in one thing."""
+    """A step of the arm, or of another robot, which may be wrong in one thing."""
     robot = arm() if robot is None else robot
     tasks = {"posture": osik.PostureTask(robot)} if tasks is None else tasks
     return osik.solve(robot, robot.q0 if q is None else q, tasks, **options)
@@ -60,7 +60,7 @@ def with_double_off(run: Callable[..., Any]) -> Any:
 
 @functools.cache
 def status_in_a_program() -> Callable[..., jax.Array]:
-    """The status of a tick whose numbers are all traced; compiled once."""
+    """The status of a step whose numbers are all traced; compiled once."""
     own, limits = hand(rows="position", target=FAR), (osik.ConfigurationLimit(arm()),)
     bounded = posture(lower=-9.0, upper=9.0)
 
@@ -74,7 +74,7 @@ def status_in_a_program() -> Callable[..., jax.Array]:
 
 
 def warm(scheme: osik.Scheme) -> Any:
-    """A warm start of a tick with one task, of the right shapes."""
+    """A warm start of a step with one task, of the right shapes."""
     shapes = jax.eval_shape(lambda: solve({"h": hand(target=FAR)}, scheme=scheme).warm_start)
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
 
@@ -82,7 +82,7 @@ def warm(scheme: osik.Scheme) -> Any:
 def reach(
     q: Any = None, *, target: Any = None, gain: float = 10.0, speeds: Any = None, **options: Any
 ) -> osik.Solution:
-    """A tick of the arm, with the same program whatever the numbers."""
+    """A step of the arm, with the same program whatever the numbers."""
     limits = (osik.ConfigurationLimit(arm()), osik.VelocityLimit(arm(), velocity=speeds))
     task = hand(rows="position", target=FAR if target is None else target, gain=gain)
     return solve({"hand": task}, q, limits=limits, **options)

@@ -83,7 +83,7 @@ def problems(add: Add) -> None:
     add("steps -1", lambda: rollout(steps=-1), V, "integer")
     add("steps 10.0", lambda: rollout(steps=10.0), V, "integer")
     add(
-        "9 targets for 10 ticks",
+        "9 targets for 10 steps",
         lambda: rollout(steps=10, targets={"hand": (np.zeros((9, 3)), np.zeros((9, 3, 3)))}),
         V,
         "10",

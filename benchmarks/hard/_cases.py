@@ -12,7 +12,7 @@ from ..workload import DT, Workload
 from ._reach import farthest
 
 CHUNK = 400
-"""Ticks of a chunk; a motion is so many or a multiple."""
+"""Steps of a chunk; a motion is so many or a multiple."""
 BEYOND = 0.35
 """How far targets are out of reach [m]."""
 OUTSIDE = 0.10
@@ -26,13 +26,13 @@ SQUAT: Mapping[str, float] = {"g1": 0.10, "nao": 0.05}
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """Targets at each tick, and which part of the motion is judged.
+    """Targets at each step, and which part of the motion is judged.
 
     Attributes:
         name: what it is called; those of the same kind have the same name.
-        hand: targets of the hand. (ticks, 3)
-        com: targets of the centre of mass. (ticks, 3)
-        judged: the first tick that is.
+        hand: targets of the hand. (steps, 3)
+        com: targets of the centre of mass. (steps, 3)
+        judged: the first step that is.
     """
 
     name: str

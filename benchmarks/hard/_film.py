@@ -30,7 +30,7 @@ from ._motion import Entrant, Motion, motions
 FILM = Path(__file__).parents[2] / "docs" / "images" / "beyond_reach.gif"
 GAIN = 200.0
 TICKS = 100
-"""That are filmed, each of them: an arm that turns round at each tick is still in every second one."""
+"""That are filmed, each of them: an arm that turns round at each step is still in every second one."""
 SLOWER = 8
 """How many times slower than it was the film shows it; DT times this is a whole number of hundredths, as GIFs count."""
 SIZE = (600, 350)
@@ -98,7 +98,7 @@ def _own(path: np.ndarray, order: list[int]) -> np.ndarray:
 
 
 def _shares(path: np.ndarray, top: np.ndarray) -> np.ndarray:
-    """The fastest joint's share of its top speed in the ticks around each configuration [%]."""
+    """The fastest joint's share of its top speed in the steps around each configuration [%]."""
     each = [np.abs((after - before)[7:] / DT / top).max() for before, after in pairwise(path)]
     window = 4
     return 1e2 * np.array([max(each[max(0, k - window) : k + window]) for k in range(len(path) - 1)])

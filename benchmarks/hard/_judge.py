@@ -20,20 +20,20 @@ AT_RANGE = 1e-4
 
 
 class Numbers(NamedTuple):
-    """Of the judged ticks of a motion.
+    """Of the judged steps of a motion.
 
     Attributes:
-        rms: joint speed, root of the mean square over joints and ticks [rad/s].
+        rms: joint speed, root of the mean square over joints and steps [rad/s].
         fastest: the largest speed of a joint as a share of that joint's top speed.
         turns: changes of direction a second, of the joint with most; both speeds are above ``MOVING``.
-        at_top: share of the ticks with a joint at its top speed.
-        at_range: share of the ticks that end with a joint at an end of its range, or beyond it.
+        at_top: share of the steps with a joint at its top speed.
+        at_range: share of the steps that end with a joint at an end of its range, or beyond it.
         feet: the largest distance of a foot from its place [m]; 0 without feet.
         hand: the largest distance of the hand from its target [m].
-        hand_at_end: that distance after the last tick [m].
+        hand_at_end: that distance after the last step [m].
         base: the fastest that the base moves [m/s], of the whole motion; 0 where it is fixed.
-        solved: share of the ticks of the whole motion that are solved.
-        seconds: of a tick, on average over the whole motion.
+        solved: share of the steps of the whole motion that are solved.
+        seconds: of a step, on average over the whole motion.
     """
 
     rms: float
@@ -77,7 +77,7 @@ def judged(work: Workload, motion: Motion) -> Numbers:
 
 
 def joint_speeds(work: Workload, motion: Motion) -> np.ndarray:
-    """Of each joint in each tick [rad/s], (ticks, joints)."""
+    """Of each joint in each step [rad/s], (steps, joints)."""
     return np.diff(_joints(work, motion), axis=0) / DT
 
 
@@ -94,13 +94,13 @@ def worst(numbers: list[Numbers]) -> Numbers:
 
 
 def _turns(speed: np.ndarray) -> np.ndarray:
-    """How often each joint changes direction from one tick to the next, (joints,)."""
+    """How often each joint changes direction from one step to the next, (joints,)."""
     way = np.where(np.abs(speed) > MOVING, np.sign(speed), 0.0)
     return np.sum(way[1:] * way[:-1] < 0.0, axis=0)
 
 
 def _distances(work: Workload, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Of the worst foot from its place and of the hand from its target, after each judged tick; (ticks,) each."""
+    """Of the worst foot from its place and of the hand from its target, after each judged step; (steps,) each."""
     model = pinocchio_model(work.urdf, work.floating)
     data, first = model.createData(), motion.case.judged
     hand, feet = model.getFrameId(work.hand), [model.getFrameId(foot) for foot in work.feet]

@@ -23,7 +23,7 @@ from ._cases import CHUNK, Case
 Tasks = dict[str, osik.Task]
 
 GAINS = (10.0, 200.0)
-"""Of all tasks [1/s]; 200 asks for the whole error in one tick."""
+"""Of all tasks [1/s]; 200 asks for the whole error in one step."""
 
 
 def _as_they_are(robot: osik.Robot, tasks: Tasks) -> Tasks:
@@ -109,9 +109,9 @@ class Motion(NamedTuple):
     Attributes:
         case: which one.
         gain: of all tasks [1/s].
-        path: canonical configurations, the start first. (ticks + 1, nq)
-        solved: share of the ticks that the library calls solved, or in which it raised nothing.
-        seconds: of a tick, on average.
+        path: canonical configurations, the start first. (steps + 1, nq)
+        solved: share of the steps that the library calls solved, or in which it raised nothing.
+        seconds: of a step, on average.
     """
 
     case: Case

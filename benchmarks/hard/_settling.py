@@ -16,7 +16,7 @@ from ._motion import GAINS, OURS, OurLoop
 from ._results import ROBOTS
 
 CHUNKS = 8
-"""Of ``CHUNK`` ticks each."""
+"""Of ``CHUNK`` steps each."""
 
 
 def settling(robots: Iterable[str] = ROBOTS, solvers: Iterable[str] = OURS) -> Iterator[list[str]]:

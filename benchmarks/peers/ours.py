@@ -1,4 +1,4 @@
-"""osik_jax: one jitted tick, or that tick over a batch, which CPU devices share."""
+"""osik_jax: one jitted step, or that step over a batch, which CPU devices share."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Runner:
         scheme: of ``SCHEMES``.
         precision: ``float64`` or ``float32``.
         batch: number of robots; None for one without a batch axis.
-        warm: carry the active set from tick to tick.
+        warm: carry the active set from step to step.
         devices: CPU devices that the batch is split over, one for each core.
         resident: of a batch, the configurations of all but so many robots stay on the device.
     """
@@ -86,7 +86,7 @@ class Runner:
         return q[..., self.places]
 
     def solved(self) -> float:
-        """Share of the lanes and ticks so far whose status is SOLVED."""
+        """Share of the lanes and steps so far whose status is SOLVED."""
         return float(np.mean([np.mean(np.asarray(fine)) for fine in self.fine]))
 
     def device(self) -> Device:
@@ -148,6 +148,6 @@ def tick_of(robot: osik.Robot, work: Workload, scheme: osik.Scheme, start: jax.A
 
 
 def _warm_start(tick: Callable[..., Any], start: jax.Array) -> Any:
-    """Shapes of a warm start, from a tick that is traced and not run."""
+    """Shapes of a warm start, from a step that is traced and not run."""
     point = jnp.zeros(3, start.dtype)
     return jax.eval_shape(lambda q: tick(q, None, point, point)[1], start)

@@ -17,7 +17,7 @@ class Runner:
         work: what to do.
         solver: of qpsolvers.
         damping: of the velocity.
-        gain: share of its error that each task asks for in a tick.
+        gain: share of its error that each task asks for in a step.
         lm_damping: of the frame tasks, times their squared errors.
     """
 

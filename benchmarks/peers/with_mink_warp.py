@@ -25,7 +25,7 @@ class Runner:
         work: what to do.
         batch: number of robots; None for one.
         resident: the configurations of all but the first lanes stay on the device.
-        iterations: of ADMM, in every tick.
+        iterations: of ADMM, in every step.
         damping: of the velocities, the peers' common one.
     """
 

@@ -74,7 +74,7 @@ class Runner:
         return self.coordinates.canonical(q)
 
     def solved(self) -> float:
-        """Share of the lanes and ticks so far that OSQP calls solved."""
+        """Share of the lanes and steps so far that OSQP calls solved."""
         return float(np.mean([np.mean(np.asarray(fine)) for fine in self.fine]))
 
     def device(self) -> Device:

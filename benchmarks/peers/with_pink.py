@@ -22,7 +22,7 @@ class Runner:
         work: what to do.
         solver: of qpsolvers.
         damping: of the velocity.
-        gain: share of its error that each task asks for in a tick.
+        gain: share of its error that each task asks for in a step.
     """
 
     packages = ("pin-pink", "pin", "daqp", "qpsolvers", "numpy")

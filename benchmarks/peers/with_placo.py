@@ -1,4 +1,4 @@
-"""PlaCo: C++ with Pinocchio and eiquadprog; its tasks ask for their whole error in one tick by themselves."""
+"""PlaCo: C++ with Pinocchio and eiquadprog; its tasks ask for their whole error in one step by themselves."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ import osik_jax as osik
 DT = 0.005
 TICKS = 400
 ITERATIONS = 20
-"""Steps of each tick, as in the example; fewer where the hand is at its target."""
+"""Steps towards each target, as in the example; fewer where the hand is at its target."""
 THRESHOLD = 1e-4
 DAMPING = 1e-3
 START = np.array([0.0, 0.0, 0.0, 0.0, 0.6, 0.0, 1.4, 0.0, 0.8, 0.0])
@@ -50,7 +50,7 @@ def report() -> Iterator[str]:
     """A row for each target and each way to solve."""
     robot = osik.Robot.from_mjcf(model_text())
     yield (
-        "target | solved by | hand off at the end [mm] | a joint moves in a tick, median [rad] | base has moved [m] | "
+        "target | solved by | hand off at the end [mm] | a joint moves in a step, median [rad] | base has moved [m] | "
         "apart from mink's at the end [rad or m]"
     )
     for where in ("near", "far"):
@@ -68,7 +68,7 @@ def report() -> Iterator[str]:
 
 
 def target_at(robot: osik.Robot, where: Where) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (ticks, 3) and the rotation of the hand's target: a curve about the start, or 0.6 m ahead of it."""
+    """Positions (steps, 3) and the rotation of the hand's target: a curve about the start, or 0.6 m ahead of it."""
     position, rotation = osik.forward_kinematics(robot, jnp.asarray(START)).frame_pose(robot, "pinch")
     t = DT * np.arange(TICKS)
     near = [0.1 * np.sin(2.0 * t), 0.15 * np.sin(1.5 * t), 0.1 * (np.cos(2.0 * t) - 1.0)]

@@ -20,7 +20,7 @@ T = TypeVar("T")
 def batch_axes(tree: T, *names: str, axis: int = 0) -> T:
     """Return which arrays of a pytree are batched, as ``jax.vmap`` takes it for ``in_axes`` or ``out_axes``.
 
-    ``jax.vmap(tick, in_axes=(0, osik.batch_axes(tasks, "hand.target")))`` maps over configurations and over the hand's
+    ``jax.vmap(step, in_axes=(0, osik.batch_axes(tasks, "hand.target")))`` maps over configurations and over the hand's
     target, while all else in ``tasks`` is shared.
 
     Args:

@@ -26,7 +26,7 @@ class Demo:
     motion: Literal["double-support", "single-support"] | None = None
     """What NAO does. Default: double-support. Any other robot sways."""
     physics: bool = False
-    """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every tick."""
+    """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every step."""
     robot: str | None = None
     """A URDF or MJCF file (or nao, arm7) to move instead."""
     base: Literal["auto", "floating", "fixed"] = "auto"
@@ -39,7 +39,7 @@ class Demo:
     duration: float = 8.0
     """Length of the motion [s]."""
     frequency: float = 200.0
-    """Control ticks a second [Hz]."""
+    """Control steps a second [Hz]."""
     schemes: tuple[Literal["weighted", "null-space", "hierarchical"], ...] = ("weighted", "null-space", "hierarchical")
     """Which schemes to run, one after the other; the film shows the last."""
     out: Path = Path("osik-demo")
@@ -119,7 +119,7 @@ def _check(command: Demo) -> None:
     if not command.frequency > 0.0:
         raise CommandError(f"--frequency is {command.frequency:g}; it has to be positive")
     if not command.duration * command.frequency >= 2.0:
-        raise CommandError(f"--duration is {command.duration:g} s; it has to last two control ticks at least")
+        raise CommandError(f"--duration is {command.duration:g} s; it has to last two control steps at least")
     if not command.schemes:
         raise CommandError("--schemes is empty; name at least one of: weighted, null-space, hierarchical")
     if command.renderer == "mujoco" and command.animation:

@@ -302,19 +302,19 @@ def _dot(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "..
 
 def _over(a: Float[Array, "*B"], b: Float[Array, "*B"]) -> Float[Array, "*B"]:
     """a / b; 0 where b is 0, with derivatives 0."""
-    nought = b == 0.0
-    return jnp.where(nought, 0.0, a / jnp.where(nought, 1.0, b))
+    is_zero = b == 0.0
+    return jnp.where(is_zero, 0.0, a / jnp.where(is_zero, 1.0, b))
 
 
 def _length(a: Float[Array, "3"]) -> Float[Array, ""]:
     """The 2-norm, with derivatives 0 at 0."""
     square = _dot(a, a)
-    nought = square == 0.0
-    return jnp.where(nought, 0.0, jnp.sqrt(jnp.where(nought, 1.0, square)))
+    is_zero = square == 0.0
+    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, square)))
 
 
 def _unit(a: Float[Array, "3"], otherwise: Float[Array, "3"]) -> Float[Array, "3"]:
     """a / |a|; where a is nothing but rounding, ``otherwise``."""
     square = _dot(a, a)
-    nought = square <= jnp.finfo(a.dtype).tiny ** 0.5
-    return jnp.where(nought, otherwise, a / jnp.sqrt(jnp.where(nought, 1.0, square)))
+    is_zero = square <= jnp.finfo(a.dtype).tiny ** 0.5
+    return jnp.where(is_zero, otherwise, a / jnp.sqrt(jnp.where(is_zero, 1.0, square)))

@@ -144,8 +144,8 @@ def world_cores(
 def unit_rows(rows: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     """Rows of length 1; those of length 0 stay so, with derivatives 0."""
     square = jnp.sum(rows * rows, -1, keepdims=True)
-    nought = square == 0.0
-    return jnp.where(nought, 0.0, rows / jnp.sqrt(jnp.where(nought, 1.0, square)))
+    is_zero = square == 0.0
+    return jnp.where(is_zero, 0.0, rows / jnp.sqrt(jnp.where(is_zero, 1.0, square)))
 
 
 def _prism() -> np.ndarray:

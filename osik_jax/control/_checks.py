@@ -1,4 +1,4 @@
-"""What is looked at before a tick is compiled and run: wrong input is told in words, outside of any program.
+"""What is looked at before a step is compiled and run: wrong input is told in words, outside of any program.
 
 Nothing here runs inside a program: what is traced is looked at as far as its type and shape go.
 """
@@ -110,12 +110,12 @@ def checked_configuration(robot: Robot, q: Any) -> Array:
 
 
 def check_steps(steps: Any) -> None:
-    """Raise ValueError where the number of ticks is none."""
+    """Raise ValueError where the number of steps is none."""
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 0:
-        raise OsikValueError(f"steps is {steps!r}; it is the number of ticks, an integer")
+        raise OsikValueError(f"steps is {steps!r}; it is the number of steps, an integer")
 
 
-_BY_TICK = "targets by tick"
+_BY_STEP = "targets by step"
 
 
 def check_target_names(tasks: Mapping[str, Task], targets: Any, what: str = "targets") -> None:
@@ -133,13 +133,13 @@ def check_targets(
     steps: int,
     robot: Robot | None = None,
 ) -> None:
-    """Raise where tasks are none, or targets by tick do not fit them."""
+    """Raise where tasks are none, or targets by step do not fit them."""
     if callable(tasks):
         if targets is not None:
             raise OsikValueError("targets go with a dict of tasks; a function of time sets them itself")
         return
     check_tasks(tasks, robot)
-    check_target_names(tasks, targets, _BY_TICK)
+    check_target_names(tasks, targets, _BY_STEP)
     for name, target in (targets or {}).items():
         for leaf in jax.tree.leaves(target):
             if not eqx.is_array_like(leaf):
@@ -149,16 +149,16 @@ def check_targets(
                 )
             if jnp.shape(leaf)[:1] != (steps,):
                 raise OsikValueError(
-                    f"targets[{name!r}] has shape {jnp.shape(leaf)}; its first axis is the ticks, {steps}"
+                    f"targets[{name!r}] has shape {jnp.shape(leaf)}; its first axis is the steps, {steps}"
                 )
 
 
 def check_warm_start(warm_start: Any) -> None:
-    """Raise TypeError where it is not made of integers; whether it fits is seen when the tick is compiled."""
+    """Raise TypeError where it is not made of integers; whether it fits is seen when the step is compiled."""
     for leaf in jax.tree.leaves(warm_start):
         if not hasattr(leaf, "dtype") or not jnp.issubdtype(leaf.dtype, jnp.integer):
             raise OsikTypeError(
-                f"warm_start is a {type(warm_start).__name__}; it is the warm_start of the tick before's Solution"
+                f"warm_start is a {type(warm_start).__name__}; it is the warm_start of the step before's Solution"
             )
 
 

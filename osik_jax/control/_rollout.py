@@ -32,7 +32,7 @@ from ._step import Targets, Tasks, aim, in_type_of, step
 
 Feedback = Callable[[Array, Array], Array]
 _Carry = tuple[Array, Any, Any]
-"""What a tick leaves to the next: configuration, velocity and warm start."""
+"""What a step leaves to the next: configuration, velocity and warm start."""
 
 
 def rollout(
@@ -49,7 +49,7 @@ def rollout(
 ) -> Trajectory:
     """Return the closed loop: solve, integrate, repeat, in one compiled scan.
 
-    Differentiable in both modes. The reverse mode keeps of each tick the configuration and what the solver found, and
+    Differentiable in both modes. The reverse mode keeps of each step the configuration and what the solver found, and
     computes the rest of it again on its way back: a long path costs little memory.
 
     Args:
@@ -59,18 +59,18 @@ def rollout(
             that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers (arrays and
             floats; integers are static) without compiling; any other function compiles once for each object.
         scheme: as in ``solve``.
-        limits: as in ``solve``. Limits and tasks that remember the last velocity get it at each tick; the
+        limits: as in ``solve``. Limits and tasks that remember the last velocity get it at each step; the
             first takes them as they are.
-        dt: time of one tick [s].
-        steps: number of ticks (static).
-        targets: targets of some tasks at each tick, by task name: what ``replace(target=...)`` takes, with a leading
+        dt: time of one step [s].
+        steps: number of steps (static).
+        targets: targets of some tasks at each step, by task name: what ``replace(target=...)`` takes, with a leading
             axis of length ``steps`` on every array.
-        feedback: measured configurations: an array with one for each tick (steps, nq), or a function of time [s] and of
-            the configuration that the last tick led to, which returns the one measured. Default: no feedback. The
-            trajectory holds where the ticks led, not what was measured.
+        feedback: measured configurations: an array with one for each step (steps, nq), or a function of time [s] and of
+            the configuration that the last step led to, which returns the one measured. Default: no feedback. The
+            trajectory holds where the steps led, not what was measured.
 
     Returns:
-        The trajectory. Every tick applies its velocity, whatever the status (``Solution.velocity`` says what it is);
+        The trajectory. Every step applies its velocity, whatever the status (``Solution.velocity`` says what it is);
         one that failed on a NaN in q or dt moves nothing: look at ``solution.status``.
 
     Raises:
@@ -85,7 +85,7 @@ def rollout(
         feedback = jnp.asarray(feedback)
         if feedback.shape != (steps, robot.nq):
             raise OsikValueError(
-                f"feedback has shape {feedback.shape}; it is one configuration a tick, {(steps, robot.nq)}"
+                f"feedback has shape {feedback.shape}; it is one configuration a step, {(steps, robot.nq)}"
             )
     numbers, static = taken_apart((tasks if callable(tasks) else dict(tasks), feedback))
     q0 = checked_configuration(robot, q0)
@@ -119,7 +119,9 @@ def _rollout(
     time = jnp.arange(steps) * dt
     measured = None if callable(feedback) else feedback
 
-    def tick(state: _Carry, now: tuple[Array, Targets | None, Array | None]) -> tuple[_Carry, tuple[Array, Solution]]:
+    def one_step(
+        state: _Carry, now: tuple[Array, Targets | None, Array | None]
+    ) -> tuple[_Carry, tuple[Array, Solution]]:
         (q, velocity, warm_start), (t, target, sensed) = state, now
         if callable(feedback):
             q = checked_configuration(robot, feedback(t, q))
@@ -131,15 +133,15 @@ def _rollout(
         q = _move(robot, q, solution.velocity, dt)
         return (q, solution.velocity, solution.warm_start), (q, solution)
 
-    ticks = (time, targets, measured)
-    cold = _cold_start(lambda now: tick((q0, None, None), now)[0][1:], ticks)
-    thrifty = jax.checkpoint(tick, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
-    _, (q, solution) = jax.lax.scan(thrifty, (q0, *cold), ticks, length=steps)
+    inputs = (time, targets, measured)
+    cold = _cold_start(lambda now: one_step((q0, None, None), now)[0][1:], inputs)
+    thrifty = jax.checkpoint(one_step, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(FOUND))
+    _, (q, solution) = jax.lax.scan(thrifty, (q0, *cold), inputs, length=steps)
     return Trajectory(time, jnp.concatenate([q0[None], q]), solution)
 
 
 def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, moved: Bool[Array, ""] | bool) -> Any:
-    """Return tasks and limits ``after`` a tick's velocity, or as they are where there was none (``moved`` false)."""
+    """Return tasks and limits ``after`` a step's velocity, or as they are where there was none (``moved`` false)."""
 
     def one(part: Task | Limit) -> Task | Limit:
         if velocity is None or type(part).after in (Task.after, Limit.after):
@@ -150,15 +152,15 @@ def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, mov
 
 
 def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
-    """Return where a tick leads; nowhere if q or dt is NaN."""
-    (usable, tick), is_valid = with_placeholder((q, jnp.asarray(dt)))
-    return jnp.where(is_valid, integrate(robot, usable, v, tick).astype(q.dtype), q)
+    """Return where a step leads; nowhere if q or dt is NaN."""
+    (usable, usable_dt), is_valid = with_placeholder((q, jnp.asarray(dt)))
+    return jnp.where(is_valid, integrate(robot, usable, v, usable_dt).astype(q.dtype), q)
 
 
-def _cold_start(tick: Callable[[Any], Any], ticks: Any) -> Any:
-    """Return zeros in the shape of what a tick leaves to the next, from one that is traced and not run."""
-    one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), jax.tree.map(jnp.asarray, ticks))
-    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(tick, one))
+def _cold_start(one_step: Callable[[Any], Any], inputs: Any) -> Any:
+    """Return zeros in the shape of what a step leaves to the next, from one that is traced and not run."""
+    one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), jax.tree.map(jnp.asarray, inputs))
+    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(one_step, one))
 
 
 def _checked(tasks: Any, robot: Robot) -> dict[str, Task]:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 
 class Solution(eqx.Module):
-    """Answer of one tick (or, with a leading axis, of many).
+    """Answer of one step (or, with a leading axis, of many).
 
     Attributes:
         velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. ``WeightedQP`` returns, by
@@ -27,7 +27,7 @@ class Solution(eqx.Module):
             status is INFEASIBLE.
         slack: of each task, J v minus the nearest point of its interval: what the task did not get. {name: (m,)}
         error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
-        warm_start: for the next tick: the active set, as a pytree of integers; None for ``NullSpace``.
+        warm_start: for the next step: the active set, as a pytree of integers; None for ``NullSpace``.
 
     All numbers are finite: what a NaN in the input spoils is 0, its derivatives too, and the status says so.
     """
@@ -47,9 +47,9 @@ class Trajectory(eqx.Module):
     """What a rollout went through.
 
     Attributes:
-        time: at the start of each tick [s]. (steps,)
-        q: configurations, the start first; ``q[k + 1]`` is where tick k led. (steps + 1, nq)
-        solution: of each tick; every leaf has a leading axis. (steps, ...)
+        time: at the start of each step [s]. (steps,)
+        q: configurations, the start first; ``q[k + 1]`` is where step k led. (steps + 1, nq)
+        solution: of each step; every leaf has a leading axis. (steps, ...)
     """
 
     time: Float[Array, " steps"]

@@ -61,12 +61,12 @@ def solve(
         tasks: by name; the names come back in ``slack`` and ``error``.
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``. Default: ``WeightedQP()``.
         limits: hard bounds on the velocity. Default: the robot's own, ``(ConfigurationLimit(robot),
-            VelocityLimit(robot))``; ``()``: none. Those that remember the last tick's velocity, such as
+            VelocityLimit(robot))``; ``()``: none. Those that remember the last step's velocity, such as
             ``AccelerationLimit``, need it each time: ``limit.after(solution.velocity)``.
-        dt: time until the next tick [s].
+        dt: time until the next step [s].
         targets: of some tasks, by name: what ``task.replace(target=...)`` takes, such as a pose as (position, rotation
             matrix), (position, quaternion w x y z), a 4 x 4 matrix or a ``jaxlie.SE3``. The other tasks keep theirs.
-        warm_start: that of the tick before (``Solution.warm_start``), with the same tasks, scheme and limits. It saves
+        warm_start: that of the step before (``Solution.warm_start``), with the same tasks, scheme and limits. It saves
             time and does not change the answer; one with wrong numbers costs time only.
 
     Returns:
@@ -205,7 +205,7 @@ def _finite(x: Array) -> Array:
 
 
 def aim(tasks: dict[str, Task], targets: Targets | None) -> dict[str, Task]:
-    """Return the tasks with this tick's targets."""
+    """Return the tasks with this step's targets."""
     aimed = {name: tasks[name].replace(target=target) for name, target in (targets or {}).items()}
     return {**tasks, **aimed}
 
@@ -243,7 +243,7 @@ def velocity_problem(
 
 
 def in_type_of(dt: Any, q: Array) -> Any:
-    """Return the tick in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
+    """Return dt in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
     return dt.astype(q.dtype) if isinstance(dt, jax.Array) else np.asarray(dt, q.dtype)
 
 

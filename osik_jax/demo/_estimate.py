@@ -14,8 +14,8 @@ from ._motion import Motion
 
 _COMPILE = {"weighted": 8.0, "null-space": 5.0, "hierarchical": 12.0}
 """How much longer a scheme's loop takes to compile than the rows of its tasks."""
-_TICK = 1e-3
-"""Running, simulating and measuring a tick [s]."""
+_STEP = 1e-3
+"""Running, simulating and measuring a step [s]."""
 _SIMULATED = 4.0
 """So many times as long with physics."""
 _PICTURE, _MESH_PICTURE = 0.15, 0.5
@@ -42,10 +42,10 @@ def estimate_seconds(
     """
     reference, delay = _reference(motion)
     compiling = reference * sum(_COMPILE[scheme] for scheme in schemes)
-    ticks = len(schemes) * motion.duration / dt * _TICK * (_SIMULATED if physics else 1.0)
+    steps = len(schemes) * motion.duration / dt * _STEP * (_SIMULATED if physics else 1.0)
     picture = _PICTURE if motion.look is None else _MESH_PICTURE
     pictures = min(_PICTURES_PER_SECOND, 1.0 / dt) * motion.duration if animation else 0.0
-    return compiling + delay * (ticks + pictures * picture / (os.cpu_count() or 1))
+    return compiling + delay * (steps + pictures * picture / (os.cpu_count() or 1))
 
 
 def _reference(motion: Motion) -> tuple[float, float]:

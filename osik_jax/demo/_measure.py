@@ -51,8 +51,8 @@ class Measurement:
         position_margin: over all joints, the least distance to a limit, as a part of half the range: 1 in the middle,
             0 at the limit, negative beyond. (T,)
         velocity_margin: the same for speeds: 1 at rest, 0 at the limit. (T - 1,)
-        position_violations: joints times ticks beyond a limit.
-        velocity_violations: joints times ticks beyond a limit.
+        position_violations: joints times steps beyond a limit.
+        velocity_violations: joints times steps beyond a limit.
     """
 
     time: Float[np.ndarray, " T"]

@@ -17,7 +17,7 @@ from ..viewer import Look
 from ._references import Path
 
 GAIN = 20.0
-"""[1/s], of all tasks but the posture: at 200 Hz a tenth of an error goes in a tick."""
+"""[1/s], of all tasks but the posture: at 200 Hz a tenth of an error goes in a step."""
 
 
 @dataclasses.dataclass(frozen=True)

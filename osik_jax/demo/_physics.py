@@ -55,7 +55,7 @@ class PhysicsMeasurement:
         com_margin: of the centre of mass inside the hull of the soles that the plan has on the floor [m]. (T,)
         effort_used: the greatest part of its limit that any servo exerts. (T,)
         busiest: the joint with the greatest part.
-        saturated: servos times ticks at their limit.
+        saturated: servos times steps at their limit.
         beyond_limits: the greatest angle by which any sensed hinge has left its position limits [rad], 0 inside. (T,)
         furthest: the hinge that leaves its limits most; ``None``: none does.
         fell: when the robot fell [s], or ``None``.

@@ -36,9 +36,9 @@ class Outcome:
     Attributes:
         compile_seconds: tracing and compiling the whole loop [s].
         run_seconds: running it once [s].
-        status: of each tick. (steps,)
-        iterations: of each tick. (steps,)
-        kkt_residual: of each tick. (steps,)
+        status: of each step. (steps,)
+        iterations: of each step. (steps,)
+        kkt_residual: of each step. (steps,)
     """
 
     compile_seconds: float
@@ -219,9 +219,9 @@ def _rows(example: Mapping[str, Any], scale: float) -> list[tuple[str, Any]]:
         )
     rows.append(("position limits broken", lambda s: limit_count(s["limits"]["position_violations"])))
     rows.append(("velocity limits broken", lambda s: limit_count(s["limits"]["velocity_violations"])))
-    rows.append(("ticks solved", lambda s: solved(s["solver"]["status"])))
+    rows.append(("steps solved", lambda s: solved(s["solver"]["status"])))
     rows.append(("compile [s]", lambda s: f"{s['solver']['compile_s']:.1f}"))
-    rows.append(("a tick [µs]", lambda s: f"{s['solver']['microseconds_per_tick']:.0f}"))
+    rows.append(("a step [µs]", lambda s: f"{s['solver']['microseconds_per_tick']:.0f}"))
     return rows
 
 
@@ -248,7 +248,7 @@ def limit_count(value: int) -> str:
 
 
 def solved(status: Mapping[str, int]) -> str:
-    """Ticks solved out of all for a cell, red where some were not."""
+    """Steps solved out of all for a cell, red where some were not."""
     total = sum(status.values())
     done = status[Status.SOLVED.name]
     return f"{done}/{total}" if done == total else f"[red]{done}/{total}[/red]"

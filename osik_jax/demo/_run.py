@@ -214,10 +214,10 @@ def draw_picture(motion: Motion, run: Run, path: str | Path, instants: Sequence[
         path: the file to write.
         instants: as parts of the duration, 0 to 1.
     """
-    ticks = [round(part * (len(run.q) - 1)) for part in instants]
-    support = [run.measurement.support[k] for k in ticks] if run.measurement.support else None
-    labels = [f"{run.measurement.time[k]:.1f} s" for k in ticks]
-    return hero_picture(path, motion.robot, [run.q[k] for k in ticks], support=support, labels=labels, look=motion.look)
+    shown = [round(part * (len(run.q) - 1)) for part in instants]
+    support = [run.measurement.support[k] for k in shown] if run.measurement.support else None
+    labels = [f"{run.measurement.time[k]:.1f} s" for k in shown]
+    return hero_picture(path, motion.robot, [run.q[k] for k in shown], support=support, labels=labels, look=motion.look)
 
 
 _DIRECTIONS = ("forward", "to the left", "up")

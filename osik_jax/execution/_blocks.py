@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from ._workers import warn_of_few_workers
 
 BLOCK = 16
-"""Lanes that a CPU core takes through a tick at a time, so that what they need stays in its second cache.
+"""Lanes that a CPU core takes through a step at a time, so that what they need stays in its second cache.
 
-The solvers have the same, so that a block of a tick is one of theirs.
+The solvers have the same, so that a block of a step is one of theirs.
 """
 
 

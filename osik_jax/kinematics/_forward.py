@@ -68,7 +68,15 @@ class Kinematics(eqx.Module):
 
 
 def frame_pose(robot: Robot, kinematics: Kinematics, frame: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Position [m] and rotation (frame axes to world axes) of a body, link, site or geom: a pose, as targets take it.
+    """Return the pose of a body, link, site or geom, as targets of tasks take it.
+
+    Args:
+        robot: the robot.
+        kinematics: of ``forward_kinematics``, at the configuration.
+        frame: its name, one of ``robot.frame_names``.
+
+    Returns:
+        The position of its origin in the world [m], (3,), and the rotation from its axes to the world's, (3, 3).
 
     Raises:
         KeyError: no such frame.

@@ -16,9 +16,19 @@ from ..robot._tree import BALL, FREE
 def integrate(
     robot: Robot, q: Num[ArrayLike, " nq"], v: Num[ArrayLike, " nv"], dt: Float[Array, ""] | float = 1.0
 ) -> Float[Array, " nq"]:
-    """Configuration reached from q at velocity v held for dt [s]. Quaternions come back normalised.
+    """Return the configuration that is reached from q at a constant velocity v after dt.
 
-    A free joint's angular velocity is in body axes: quaternion * exp(omega dt). (nq,)
+    A free joint's position moves along its linear velocity, in world axes; its quaternion, and that of a ball joint,
+    becomes ``quaternion * exp(omega dt)``: angular velocities are in body axes (MuJoCo's ``mj_integratePos``).
+
+    Args:
+        robot: the robot.
+        q: configuration. (nq,)
+        v: velocity, in the tangent space [rad/s or m/s]. (nv,)
+        dt: time [s].
+
+    Returns:
+        The configuration, its quaternions normalised. (nq,)
 
     Raises:
         ValueError: q or v has the wrong length, or (outside jit) q is not finite or holds a quaternion of zeros.

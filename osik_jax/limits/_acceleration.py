@@ -20,14 +20,14 @@ from ._configuration import ConfigurationLimit
 
 _Box = tuple[Float[Array, " nv"], Float[Array, " nv"]]
 _ROUNDING = 32.0  # machine epsilons of the way to a bound that braking leaves over
-_MOST_TICKS = 1e6  # of braking
+_MOST_STEPS = 1e6  # of braking
 
 
 class AccelerationLimit(Limit):
     """``|v - v_last| <= acceleration dt``, and no speed from which a joint cannot stop inside its range.
 
     With ``d`` the way left to a bound, the greatest speed towards it is the one from which braking by
-    ``acceleration dt`` a tick stops on the bound, in whole ticks:
+    ``acceleration dt`` a step stops on the bound, in whole steps:
 
         v = d / (n dt) + (n - 1) / 2 acceleration dt,    n the least number with  n (n + 1) / 2 acceleration dt^2 >= d
 
@@ -40,7 +40,7 @@ class AccelerationLimit(Limit):
     From other states (outside the range, too fast, stopped too late) the acceleration holds, then the velocity limit,
     then the speed from which the joint can stop at the other end; and it comes back as fast as these let it.
 
-    It needs the velocity of the last tick: ``rollout`` hands it on; around ``solve`` use
+    It needs the velocity of the last step: ``rollout`` hands it on; around ``solve`` use
     ``limit = limit.after(solution.velocity)``.
 
     Args:
@@ -48,7 +48,7 @@ class AccelerationLimit(Limit):
         acceleration: greatest accelerations [rad/s^2 or m/s^2]: an array (nv,), or a mapping from joint names or globs
             to values; joints that are not named are free. A free base takes part only when it is named (the value then
             bounds the change of each of its six velocities) or in an array. Infinite: free.
-        velocity: of the last tick, (nv,) [rad/s or m/s], or a mapping in the same way; default 0: at rest.
+        velocity: of the last step, (nv,) [rad/s or m/s], or a mapping in the same way; default 0: at rest.
         lower: lower ends of the ranges, as in ``ConfigurationLimit``; use the same there. -inf: none.
         upper: upper ends of the ranges, in the same way.
 
@@ -94,12 +94,12 @@ class AccelerationLimit(Limit):
             raise OsikValueError(f"accelerations have to be positive: {entries(seen, ~(seen > 0.0), names)}")
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The limit for the next tick, once this one's answer is ``velocity``."""
+        """The limit for the next step, once this one's answer is ``velocity``."""
         return eqx.tree_at(lambda limit: limit.velocity, self, jnp.asarray(velocity, self.velocity.dtype))
 
 
 class _Reachable(Limit):
-    """What one tick can make of the last velocity."""
+    """What one step can make of the last velocity."""
 
     kind: ClassVar[Kind] = "acceleration"
     acceleration: Float[Array, " nv"]
@@ -122,7 +122,7 @@ class _Stopping(Limit):
     upper: Float[Array, " nv"]
 
     def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
-        """Outside a range: back inside in one tick, but not faster than what can stop at the other end."""
+        """Outside a range: back inside in one step, but not faster than what can stop at the other end."""
         scalar, index = scalar_layout(robot)
         position = jnp.asarray(q)[index]
         above = stopping_speed(_way(jnp.where(scalar, self.upper, jnp.inf), position), self.acceleration, dt)
@@ -149,9 +149,9 @@ def _way(bound: Float[Array, " nv"], position: Float[Array, " nv"]) -> Float[Arr
 def stopping_speed(
     way: Float[Array, " nv"], acceleration: Float[Array, " nv"], dt: Float[Array, ""] | float
 ) -> Float[Array, " nv"]:
-    """The greatest velocity from which braking stops within the way left, of which some is used in every tick.
+    """The greatest velocity from which braking stops within the way left, of which some is used in every step.
 
-    See ``AccelerationLimit``. Piecewise linear in ``way`` [rad or m], continuous, with n ticks of braking in a piece;
+    See ``AccelerationLimit``. Piecewise linear in ``way`` [rad or m], continuous, with n steps of braking in a piece;
     ``way / dt`` for a way that is negative, or an acceleration that is infinite.
     """
     free, instant = jnp.isinf(way), jnp.isinf(acceleration)
@@ -159,7 +159,7 @@ def stopping_speed(
     change = jnp.where(instant, 1.0, acceleration) * dt
     least = jnp.finfo(way_left.dtype).tiny
     triangle = jax.lax.stop_gradient(jnp.maximum(way_left, 0.0) / jnp.maximum(change * dt, least))
-    ticks = jnp.ceil(0.5 * (jnp.sqrt(1.0 + 8.0 * triangle) - 1.0))
-    ticks = jnp.where(instant, 1.0, jnp.clip(ticks, 1.0, _MOST_TICKS))
-    speed = way_left / (ticks * dt) + 0.5 * (ticks - 1.0) * change
+    steps = jnp.ceil(0.5 * (jnp.sqrt(1.0 + 8.0 * triangle) - 1.0))
+    steps = jnp.where(instant, 1.0, jnp.clip(steps, 1.0, _MOST_STEPS))
+    speed = way_left / (steps * dt) + 0.5 * (steps - 1.0) * change
     return jnp.where(free, way, speed)

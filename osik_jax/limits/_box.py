@@ -57,9 +57,9 @@ class Limit(MadeForRobot, Replaceable):
         return None
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The limit for the next tick, once this one's answer is ``velocity``; itself where it remembers nothing.
+        """The limit for the next step, once this one's answer is ``velocity``; itself where it remembers nothing.
 
-        What remembers has it as a leaf. ``rollout`` calls this at every tick; around ``solve`` it is for you to do.
+        What remembers has it as a leaf. ``rollout`` calls this at every step; around ``solve`` it is for you to do.
         """
         del velocity
         return self

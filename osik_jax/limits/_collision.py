@@ -35,9 +35,9 @@ class CollisionAvoidanceLimit(Limit):
         n' (J_b - J_a) v >= -min(gain, 1 / dt) (d - minimum_distance)           where d < detection_distance
 
     A pair nearer than ``minimum_distance`` is asked to part at no more than ``recovery_speed``. The rows are those of
-    a tick's start: over a step, turning shapes come nearer by about ``(omega dt)**2 r / 2`` more than the rows tell,
+    a step's start: over a step, turning shapes come nearer by about ``(omega dt)**2 r / 2`` more than the rows tell,
     omega being their angular velocity relative to each other and r the distance of the nearest point from its axis.
-    That is what ``minimum_distance`` is for. The other pairs are free for the tick.
+    That is what ``minimum_distance`` is for. The other pairs are free for the step.
 
     Geoms: planes, spheres, capsules, boxes, cylinders (as prisms of 16 sides around them), ellipsoids (as polyhedra of
     42 corners around them, up to 7 % larger) and meshes (as their convex hulls). Height fields and SDFs have no

@@ -107,9 +107,9 @@ def _check_gain(gain: Array) -> None:
 def _check(robot: Robot, lower: np.ndarray, upper: np.ndarray) -> None:
     """Raises ValueError with the joints' names."""
     names = dof_names(robot)
-    crossed = np.flatnonzero(~(lower <= upper))
-    if len(crossed):
-        what = ", ".join(f"{names[i]} ({lower[i]} > {upper[i]})" for i in crossed)
+    unordered = np.flatnonzero(~(lower <= upper))
+    if len(unordered):
+        what = ", ".join(f"{names[i]} ({lower[i]} > {upper[i]})" for i in unordered)
         raise OsikValueError(f"limits with lower > upper: {what}")
     scalar, _ = scalar_layout(robot)
     bounded = np.flatnonzero(~scalar & (np.isfinite(lower) | np.isfinite(upper)))

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 """Labels of a constraint in an active set."""
+IMPLIED = 3
+"""In a kernel's candidate: inactive, for it depends on the active ones, and holds up to roundoff where they do."""
 
 # ---- damping of levels, shared with kernels
 

@@ -1,4 +1,4 @@
-"""The closed loop: sense, solve, command the servos, let MuJoCo run until the next tick."""
+"""The closed loop: sense, solve, command the servos, let MuJoCo run until the next step."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from ._simulation import Simulation
 
 
 class Command(eqx.Module):
-    """How the velocity of a tick becomes a servo target."""
+    """How the velocity of a step becomes a servo target."""
 
     @abc.abstractmethod
     def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """The configuration to servo to until the next tick.
+        """The configuration to servo to until the next step.
 
         Args:
             robot: the robot.
-            last: the command of the tick before; at first, where the robot stands. (nq,)
+            last: the command of the step before; at first, where the robot stands. (nq,)
             sensed: (nq,)
             velocity: what the tasks ask for at the sensed configuration. (nv,)
-            dt: time of one tick [s].
+            dt: time of one step [s].
         """
 
 
@@ -60,7 +60,7 @@ class Lookahead(Command):
     """Where the velocity leads from the sensed configuration in a given time: no memory, proportional action.
 
     A steady error stays, that of a servo whose stiffness is multiplied by gain times time: with a gain of 20 / s and
-    0.05 s a servo holds its load as it would with the plan as its target. A time of one tick makes a robot fall limp.
+    0.05 s a servo holds its load as it would with the plan as its target. A time of one step makes a robot fall limp.
 
     Attributes:
         time: [s].
@@ -78,7 +78,7 @@ class Lookahead(Command):
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """What MuJoCo's data held at the start and after every tick: T is the number of ticks run and one.
+    """What MuJoCo's data held at the start and after every step: T is the number of steps run and one.
 
     Attributes:
         time: [s]. (T,)
@@ -88,13 +88,13 @@ class Recording:
         com: centre of mass [m]. (T, 3)
         contact_points: of all feet, foot after foot [m]. (T, k, 3)
         contact_forces: of the floor on each of them [N]. (T, k, 3)
-        solution: of each tick; every leaf has a leading axis. (T - 1, ...)
+        solution: of each step; every leaf has a leading axis. (T - 1, ...)
         fell: whether the run ended by a fall, at ``time[-1]``.
     """
 
     time: Float[np.ndarray, " T"]
     q: Float[np.ndarray, "T nq"]
-    command: Float[np.ndarray, "ticks nq"]
+    command: Float[np.ndarray, "steps nq"]
     effort: Float[np.ndarray, "T n"]
     com: Float[np.ndarray, "T 3"]
     contact_points: Float[np.ndarray, "T k 3"]
@@ -117,9 +117,9 @@ def simulate(
 ) -> Recording:
     """Runs the loop from the simulation's present state, until the robot falls at the latest.
 
-    Each tick senses the configuration, base and joints, solves for the velocity there, makes a servo target of it and
-    lets MuJoCo run for ``dt``. One compiled program a tick; MuJoCo runs on the host. As in ``rollout``, every
-    tick applies its velocity, whatever the status.
+    Each step senses the configuration, base and joints, solves for the velocity there, makes a servo target of it and
+    lets MuJoCo run for ``dt``. One compiled program a step; MuJoCo runs on the host. As in ``rollout``, every
+    step applies its velocity, whatever the status.
 
     Args:
         simulation: the robot in its world; it is left where the run ended.
@@ -127,8 +127,8 @@ def simulate(
         scheme: as in ``rollout``.
         limits: hard bounds on the velocity, as in ``rollout``.
         dt: control period [s], a whole number of the world's timesteps.
-        steps: number of ticks.
-        targets: targets of some tasks at each tick, by task name, as in ``rollout``.
+        steps: number of steps.
+        targets: targets of some tasks at each step, by task name, as in ``rollout``.
         command: ``Integrated()`` (the default) or ``Lookahead(time)``.
         before_tick: called with the time [s] since the start and the simulation, to push the robot, say.
 
@@ -137,22 +137,22 @@ def simulate(
         TypeError, ValueError: as in ``solve``; ``dt`` is no whole number of timesteps; ``targets`` do not fit.
     """
     if steps < 1:
-        raise OsikValueError(f"steps is {steps}; there has to be one tick at least")
+        raise OsikValueError(f"steps is {steps}; there has to be one step at least")
     check_targets(tasks, targets, steps)
     robot = simulation.world.robot
     numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), is_number)
     leaves, treedef = jax.tree.flatten(structure)
     own = None if limits is None else tuple(limits)
-    program = partial(_tick, robot, numbers, scheme, own, command or Integrated(), np.asarray(dt))
-    tick = partial(program, static=(tuple(leaves), treedef))
+    program = partial(_control_step, robot, numbers, scheme, own, command or Integrated(), np.asarray(dt))
+    step = partial(program, static=(tuple(leaves), treedef))
     held = jnp.asarray(simulation.sense())
     paths = jax.tree.map(np.asarray, targets)
-    memory = _cold_start(lambda state: tick(0.0, *state, (None, None), _at(paths, 0))[1], (held, held))
+    memory = _cold_start(lambda state: step(0.0, *state, (None, None), _at(paths, 0))[1], (held, held))
     frames, commands, solutions = [_frame(simulation)], [], []
     for k in range(steps):
         if before_tick is not None:
             before_tick(k * dt, simulation)
-        held, solution = tick(k * dt, held, simulation.sense(), memory, _at(paths, k))
+        held, solution = step(k * dt, held, simulation.sense(), memory, _at(paths, k))
         memory = solution.velocity, solution.warm_start
         simulation.step(held, dt)
         frames.append(_frame(simulation))
@@ -164,7 +164,7 @@ def simulate(
 
 
 @partial(jax.jit, static_argnames="static")
-def _tick(
+def _control_step(
     robot: Robot,
     numbers: Any,
     scheme: Scheme | None,
@@ -179,7 +179,7 @@ def _tick(
     *,
     static: tuple[tuple[Any, ...], Any],
 ) -> tuple[Array, Solution]:
-    """The part of a tick that is pure: the command and the solution."""
+    """The part of a step that is pure: the command and the solution."""
     tasks: Any = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
     todo: Any = tasks(t) if callable(tasks) else aim(tasks, target)
     velocity, warm_start = memory
@@ -188,18 +188,18 @@ def _tick(
     return command(robot, last, sensed, solution.velocity, dt), solution
 
 
-def _cold_start(tick: Callable[[Any], Solution], state: Any) -> Any:
-    """Zeros in the shape of the last velocity and of a warm start, from a tick that is traced and not run.
+def _cold_start(step: Callable[[Any], Solution], state: Any) -> Any:
+    """Zeros in the shape of the last velocity and of a warm start, from a step that is traced and not run.
 
     So the first one compiles no program.
     """
-    one = jax.eval_shape(tick, state)
+    one = jax.eval_shape(step, state)
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), (one.velocity, one.warm_start))
 
 
-def _at(paths: Targets | None, tick: int) -> Targets | None:
-    """The targets of one tick."""
-    return jax.tree.map(lambda path: path[tick], paths)
+def _at(paths: Targets | None, k: int) -> Targets | None:
+    """The targets of step k."""
+    return jax.tree.map(lambda path: path[k], paths)
 
 
 def _frame(simulation: Simulation) -> tuple[np.ndarray, ...]:

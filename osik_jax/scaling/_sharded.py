@@ -20,10 +20,11 @@ _SHARED = -1
 
 
 def device_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """Devices in a row, an axis called "lanes".
+    """Return a mesh of devices in a row, with one axis called "lanes", as ``sharded`` takes it.
 
     Args:
-        devices: default: all that JAX has, those of other hosts too where ``jax.distributed`` joined them.
+        devices: some of ``jax.devices()``; default: all, those of other hosts too where ``jax.distributed`` joined
+            them.
     """
     return Mesh(np.array(jax.devices() if devices is None else list(devices)), ("lanes",))
 

@@ -37,7 +37,7 @@ class HierarchicalQP(Scheme):
     backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
     def solve(self, problem: VelocityProblem, warm_start: WorkingSet | None = None) -> SchemeAnswer:
-        """Return the velocity of one tick; the warm start is the working set of every level."""
+        """Return the velocity of one step; the warm start is the working set of every level."""
         constraints = problem.constraints()
         answer = solve_hqp(
             problem.levels(constraints),

@@ -68,7 +68,7 @@ class NullSpace(Scheme):
         return self.method == "saturated"
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
-        """Return the velocity of one tick."""
+        """Return the velocity of one step."""
         constraints = problem.constraints()
         levels = problem.levels(constraints)
         descent = -self.potential_gain * limit_potential_gradient(

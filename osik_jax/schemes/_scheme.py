@@ -31,7 +31,7 @@ _STANDING = 1e-4
 
 
 class VelocityProblem(eqx.Module):
-    """One tick: what the tasks ask of the velocity, and its limits.
+    """One step: what the tasks ask of the velocity, and its limits.
 
     Attributes:
         rows: of each task, by name.
@@ -43,7 +43,7 @@ class VelocityProblem(eqx.Module):
         position_upper: likewise, inf where free. (nv,)
         hard: names of the tasks that are constraints (static).
         limit_rows: of the limits that are no box, all together; None where there are none.
-        dt: time of the tick [s].
+        dt: time of the step [s].
         turning: dofs that turn something, which bends paths. (nv,)
         scalar: dofs that are a joint of their own: not those of a ball or a free joint. (nv,)
     """
@@ -73,7 +73,7 @@ class VelocityProblem(eqx.Module):
     def curvature(self, names: Iterable[str]) -> Float[Array, ""]:
         """Damping of the velocity that makes up for what the linear model of these tasks leaves out.
 
-        A tick leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
+        A step leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
         different chains, so their parts add up like the sides of a right angle.
         """
         bends = [self.rows[name].curvature for name in names]  # none where all tasks are hard
@@ -177,7 +177,7 @@ def status_with(
 
 
 class SchemeAnswer(eqx.Module):
-    """What a scheme says of one tick; see ``Solution`` for the fields."""
+    """What a scheme says of one step; see ``Solution`` for the fields."""
 
     velocity: Float[Array, " nv"]
     status: Int[Array, ""]
@@ -195,11 +195,11 @@ class Scheme(Replaceable):
 
     @abc.abstractmethod
     def solve(self, problem: VelocityProblem, warm_start: Any = None) -> SchemeAnswer:
-        """The velocity of one tick.
+        """The velocity of one step.
 
         Args:
-            problem: the tick.
-            warm_start: what the answer to a tick nearby had in ``warm_start``; integers, all zeros for a cold start. It
+            problem: the step.
+            warm_start: what the answer to a step nearby had in ``warm_start``; integers, all zeros for a cold start. It
                 changes the time that the answer takes, and not the answer.
         """
 

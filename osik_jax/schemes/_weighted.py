@@ -17,29 +17,28 @@ from ..solvers import Backend, Level, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
 
-_ROUNDINGS = 4.0
-"""Of the largest weight times row norm squared; a weaker damping is lost in single arithmetic."""
+_LEAST_DAMPING = 4.0
+"""In units of epsilon times the largest weight times row norm squared; a weaker damping is lost in single precision."""
 
-_SPARED = 30.0
-"""Curvature damping is spared where it is below this many times what holds a dof anyway."""
+_CALM_RATIO = 30.0
+"""Little of the curvature damping is added where it is below this many times a dof's other diagonal terms."""
 
 
 class WeightedQP(Scheme):
     """min 1/2 sum_i weight_i |J_i v - wanted_i|^2 + 1/2 damping |v|^2  subject to the box.
 
     Weights multiply squared residuals (pink and mink: ``weight = cost**2``). Rows of inequality tasks cost the square
-    of their distance to the interval. Hard tasks and limits with rows are rows of the program that cost nothing and do
-    not give way; where they contradict each other or the box, they are missed by as little as can be and the answer is
-    INFEASIBLE. Priorities are ignored. Smooth where tasks conflict; no task is met exactly while
-    another pulls against it.
+    of their distance to the interval (soft rows). Hard tasks and limits with rows are constraints (hard rows). Where
+    these are infeasible, together or with the box, they are missed by as little as can be and the answer is INFEASIBLE.
+    Priorities are ignored. Smooth where tasks conflict; no task is met exactly while another asks for something else.
 
     Attributes:
-        damping: of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, what holds a
-            dof, its damping and its posture together, is at least a few roundings of the largest weight times row norm
-            squared.
+        damping: of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, the diagonal
+            term of a dof, its damping and its posture together, is at least 4 epsilon times the largest weight times
+            row norm squared.
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
             none. What is added vanishes where the tasks are met (``TaskRows.curvature``), with the square of their
-            error where a posture or the damping holds a dof anyway.
+            error where a posture or the damping is strong enough by itself.
         max_iterations: cap on changes of the active set (static).
         backend: whose candidates for the answer are taken, as in ``solve_least_squares_qp`` (static).
     """
@@ -58,16 +57,18 @@ class WeightedQP(Scheme):
             raise OsikValueError(f"damping is {seen}; a WeightedQP needs it positive, or the velocity is not unique")
 
     def solve(self, problem: VelocityProblem, warm_start: Int[Array, " m"] | None = None) -> SchemeAnswer:
-        """The velocity of one tick; the warm start is the active set, of the box and of the inequality rows."""
+        """Return the velocity of one step; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
-        bend = self.curvature_damping * problem.curvature(problem.soft())
+        added = self.curvature_damping * problem.curvature(problem.soft())
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
             problem.upper,
             **_rows(intervals, problem.constraints()),
-            **_pulls([rows for rows in equalities if rows.dofs is not None], problem, self.damping, bend, self.backend),
+            **_diagonal_terms(
+                [rows for rows in equalities if rows.dofs is not None], problem, self.damping, added, self.backend
+            ),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
             backend=self.backend,
@@ -77,74 +78,74 @@ class WeightedQP(Scheme):
         )
 
 
-def _least(problem: VelocityProblem, backend: Backend) -> Float[Array, ""]:
-    """The weakest damping that a kernel of single precision can tell from the rounding of the Hessian; 0 for none."""
+def _least_damping(problem: VelocityProblem, backend: Backend) -> Float[Array, ""]:
+    """Return the weakest damping that a kernel of single precision tells from the Hessian's roundoff; 0 without one."""
     rows = list(problem.soft().values())
     dtype = problem.lower.dtype
     if dtype != jnp.float32 or not rows or not takes(backend, "warp", fits=True):
         return jnp.zeros((), dtype)
     steepest = [jnp.max(r.weight * jnp.sum(r.jacobian**2, 1), initial=0.0) for r in rows]
-    return jax.lax.stop_gradient(_ROUNDINGS * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
+    return jax.lax.stop_gradient(_LEAST_DAMPING * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
 
 
-def _pulls(
-    singles: list[TaskRows],
+def _diagonal_terms(
+    single_dof: list[TaskRows],
     problem: VelocityProblem,
     damping: Float[Array, ""],
-    bend: Float[Array, ""],
+    added: Float[Array, ""],
     backend: Backend,
 ) -> dict[str, Array]:
-    """Rows that each ask for one dof's velocity, with the damping: a strength and a centre for each dof.
+    """Return the cost ``1/2 sum_i d_i (v_i - center_i)^2`` of the damping and of rows on one dof each.
 
-    Of the curvature damping ``bend`` a dof that is held with strength s anyway takes ``bend^2 / (bend + 30 s)``: all of
-    it out of reach, and next to none beside a posture that is strong enough to calm what is left of an error
-    (docs/paper.md, "Curvature damping").
+    Of the curvature damping c, ``added``, a dof whose other terms are d takes ``c^2 / (c + 30 d)``: all of it out of
+    reach, and next to none beside a posture that is strong enough to calm what is left of an error (docs/paper.md,
+    "Curvature damping").
     """
     n = problem.lower.shape[0]
-    strength, pull = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)
-    for rows in singles:
-        place = np.full(n, len(rows.dofs or ()))
-        place[np.array(rows.dofs, int)] = np.arange(len(rows.dofs or ()))
-        usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of nought is NaN
-        weight, wanted = (jnp.append(a, 0.0)[place] for a in (usable, usable * rows.lower))
-        strength, pull = strength + weight, pull + wanted
-    whole = bend + _SPARED * strength
-    strength = strength + bend * (bend / jnp.where(whole > 0.0, whole, 1.0))  # bend^2 of a far target overflows
-    least = _least(problem, backend)
-    strength = jnp.where(strength < least, least, strength)
-    center = pull / strength
-    for rows in singles:
-        strength = jnp.where(jnp.isnan(rows.weight).any(), jnp.nan, strength)
-    return dict(damping=strength, center=center)
+    diagonal, weighted = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)
+    for rows in single_dof:
+        row_of_dof = np.full(n, len(rows.dofs or ()))
+        row_of_dof[np.array(rows.dofs, int)] = np.arange(len(rows.dofs or ()))
+        usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of 0 is NaN
+        weight, wanted = (jnp.append(a, 0.0)[row_of_dof] for a in (usable, usable * rows.lower))
+        diagonal, weighted = diagonal + weight, weighted + wanted
+    total = added + _CALM_RATIO * diagonal
+    diagonal = diagonal + added * (added / jnp.where(total > 0.0, total, 1.0))  # c^2 of a far target overflows
+    least = _least_damping(problem, backend)
+    diagonal = jnp.where(diagonal < least, least, diagonal)
+    center = weighted / diagonal
+    for rows in single_dof:
+        diagonal = jnp.where(jnp.isnan(rows.weight).any(), jnp.nan, diagonal)
+    return dict(damping=diagonal, center=center)
 
 
 def _stack(equalities: list[TaskRows], problem: VelocityProblem) -> tuple[Array, Array, Array]:
-    """Matrix, target and weight of equality rows."""
-    nothing = jnp.zeros((0, problem.lower.shape[0]), problem.lower.dtype)
-    none = nothing[:, 0]
+    """Return matrix, target and weight of equality rows."""
+    no_rows = jnp.zeros((0, problem.lower.shape[0]), problem.lower.dtype)
+    no_numbers = no_rows[:, 0]
     return (
-        jnp.concatenate([nothing, *(r.jacobian for r in equalities)]),
-        jnp.concatenate([none, *(r.lower for r in equalities)]),
-        jnp.concatenate([none, *(r.weight for r in equalities)]),
+        jnp.concatenate([no_rows, *(r.jacobian for r in equalities)]),
+        jnp.concatenate([no_numbers, *(r.lower for r in equalities)]),
+        jnp.concatenate([no_numbers, *(r.weight for r in equalities)]),
     )
 
 
 def _rows(intervals: list[TaskRows], constraints: Level | None) -> dict[str, Any]:
-    """The rows that give way, then those that do not."""
+    """Return the soft rows, then the hard ones."""
     soft = _soft_rows(intervals)
     if constraints is None:
         return soft
     hard = constraints.scaled()
-    stiff = dict(
+    hard_rows = dict(
         rows=hard.matrix, rows_lower=hard.lower, rows_upper=hard.upper, rows_compliance=jnp.zeros_like(hard.lower)
     )
-    both = {name: jnp.concatenate([soft[name], array]) if soft else array for name, array in stiff.items()}
+    both = {name: jnp.concatenate([soft[name], array]) if soft else array for name, array in hard_rows.items()}
     count = len(both["rows"]) - len(hard.lower)
     return both | dict(rows_equalities=(False,) * count + hard.equalities)
 
 
 def _soft_rows(intervals: list[TaskRows]) -> dict[str, Array]:
-    """Inequality rows, which give way at the price of their weight; a row of weight 0 has no bounds."""
+    """Return inequality rows as soft rows, of compliance 1 / weight; a row of weight 0 has no bounds."""
     if not intervals:
         return {}
     weight = jnp.concatenate([r.weight for r in intervals])

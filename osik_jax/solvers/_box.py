@@ -8,14 +8,14 @@ from jaxtyping import Array, Bool, Float
 from ..execution._rules import custom_jvp
 
 
-def uncrossed(
+def ordered_bounds(
     lower: Float[Array, " n"], upper: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, ""]]:
     """Return bounds in which lower > upper is an equality halfway between the two, and whether there were any."""
-    crossed = lower > upper
-    # 0 where nothing is crossed: lower + upper may be inf - inf there, and its derivative NaN
-    middle = 0.5 * jnp.where(crossed, lower + upper, 0.0)
-    return jnp.where(crossed, middle, lower), jnp.where(crossed, middle, upper), crossed.any()
+    unordered = lower > upper
+    # 0 where bounds are in order: lower + upper may be inf - inf there, and its derivative NaN
+    middle = 0.5 * jnp.where(unordered, lower + upper, 0.0)
+    return jnp.where(unordered, middle, lower), jnp.where(unordered, middle, upper), unordered.any()
 
 
 @custom_jvp

@@ -181,12 +181,22 @@ def regularised_inverse(
     matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
 ) -> Float[Array, "n m"]:
     """Return (A'A + damping I)^-1 A'; for a damping of 0 the Moore-Penrose inverse, the only one with a cutoff."""
-    return _with_gram(matrix, cutoff, damping)[0]
+    return _by_singular_values(matrix, cutoff, damping)[0]
+
+
+def regularised_space(
+    matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
+) -> Float[Array, "n n"]:
+    """Return the regularised inverse times the matrix, which is the projector onto its row space where undamped.
+
+    Their product has roundoff in proportion to the ratio of the singular values; this has not.
+    """
+    return _by_singular_values(matrix, cutoff, damping)[2]
 
 
 @custom_jvp
-def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array]:
-    """Return the inverse D, and K with D = K A': (A'A + damping I)^-1, or (A'A)^+ for a damping of 0."""
+def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
+    """Return the inverse D; K with D = K A': (A'A + damping I)^-1, or (A'A)^+ for a damping of 0; and S = D A."""
     # D = V diag(s / (s^2 + damping)) U'; K = V diag(1 / (s^2 + damping)) V', and 1 / damping outside the row space
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
     damped = damping > 0.0
@@ -195,14 +205,15 @@ def _with_gram(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Arr
     inverse = product(vt.T * jnp.where(kept, s / square, 0.0), u.T)
     outside = jnp.where(damped, 1.0 / jnp.where(damped, damping, 1.0), 0.0)
     gram = product(vt.T * (jnp.where(kept, 1.0 / square, 0.0) - outside), vt)
-    return inverse, gram + outside * jnp.eye(matrix.shape[1], dtype=matrix.dtype)
+    space = product(vt.T * jnp.where(kept, s**2 / square, 0.0), vt)
+    return inverse, gram + outside * jnp.eye(matrix.shape[1], dtype=matrix.dtype), space
 
 
-@_with_gram.defjvp
-def _with_gram_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Differentiate K A' and K where damped, and the Moore-Penrose inverse at constant rank (GP) where not."""
+@_by_singular_values.defjvp
+def _by_singular_values_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+    """Differentiate K A', K and I - damping K where damped, the inverse and S at constant rank (GP) where not."""
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
-    D, K = _with_gram(a, cutoff, damping)
+    D, K, S = _by_singular_values(a, cutoff, damping)
     damped = damping > 0.0
     wide = da.T - product(product(da.T, a), D)  # da' (I - A D)
     tall = product(da.T, product(D.T, D))
@@ -211,4 +222,5 @@ def _with_gram_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple
     half = product(D, product(da, K))  # K A' dA K
     undamped = product(dD, D.T)  # K = D D'
     dK = jnp.where(damped, -half - half.T - d_damping * product(K, K), undamped + undamped.T)
-    return (D, K), (dD, dK)
+    dS = jnp.where(damped, damping * (half + half.T) - d_damping * product(K, S), _space_rate(S, D, da))
+    return (D, K, S), (dD, dK, dS)

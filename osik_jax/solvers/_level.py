@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
 from ..numerics._dense import apply
-from ._box import uncrossed
+from ._box import ordered_bounds
 
 
 class Level(eqx.Module):
@@ -94,11 +94,11 @@ class Level(eqx.Module):
         )
         return Level(matrix, lower, upper, equalities=self.equalities)
 
-    def uncrossed(self) -> tuple[Level, Bool[Array, ""]]:
+    def ordered(self) -> tuple[Level, Bool[Array, ""]]:
         """Return the level with lower > upper replaced by equalities halfway, and whether there were any."""
         known = np.array(self.equalities, bool)
-        lower, upper, crossed = uncrossed(self.lower, jnp.where(known, self.lower, self.upper))
-        return Level(self.matrix, lower, upper, self.weight, self.equalities), crossed
+        lower, upper, unordered = ordered_bounds(self.lower, jnp.where(known, self.lower, self.upper))
+        return Level(self.matrix, lower, upper, self.weight, self.equalities), unordered
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """Return A x minus the nearest point of its interval: the slack, 0 where the row holds, (m,)."""

@@ -1,6 +1,6 @@
 """How much a task bends: bounds on the second derivative of its error along its own pull.
 
-A tick of dt changes the error by ``dt J v + dt^2/2 (grad^2 e)[v, v] + ...``, and a solver minimises
+A step of dt changes the error by ``dt J v + dt^2/2 (grad^2 e)[v, v] + ...``, and a solver minimises
 ``1/2 w |J v + gain e|^2`` as if the second term were not there. What it leaves out of the cost is, to first order,
 
     1/2 dt p . (grad^2 e)[v, v]  <=  1/2 dt c |v|^2,    p = w gain e,    c >= |sum_i p_i grad^2 e_i|,

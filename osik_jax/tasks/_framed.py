@@ -14,7 +14,7 @@ from ._task import Task, TaskRows
 
 
 class FramedTask(Task):
-    """Base of tasks on frames; a tick works on many of them in one go (``rows_of``)."""
+    """Base of tasks on frames; a step works on many of them in one go (``rows_of``)."""
 
     @property
     @abc.abstractmethod

@@ -180,15 +180,15 @@ class JointVelocityTask(VelocityTask):
 
 
 class LowAccelerationTask(VelocityTask):
-    """Wants joints to keep the velocity that they had: ``v_i = velocity_i``, that of the tick before.
+    """Wants joints to keep the velocity that they had: ``v_i = velocity_i``, that of the step before.
 
     At a low weight it makes motions smooth. It takes no energy out of a motion, so have something beside it that does,
-    such as a ``PostureTask`` or a ``DampingTask``. ``rollout`` hands the velocity from tick to tick; with ``solve``,
+    such as a ``PostureTask`` or a ``DampingTask``. ``rollout`` hands the velocity from step to step; with ``solve``,
     write ``task = task.after(solution.velocity)``.
 
     Args:
         robot: the robot.
-        velocity: that of the tick before (nv,) [rad/s or m/s], or a scalar; default 0, a robot at rest.
+        velocity: that of the step before (nv,) [rad/s or m/s], or a scalar; default 0, a robot at rest.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
             to take part.
         weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
@@ -221,5 +221,5 @@ class LowAccelerationTask(VelocityTask):
         return self.velocity[np.array(dofs, int)]
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The task for the next tick, once this one's answer is ``velocity`` [rad/s or m/s]."""
+        """The task for the next step, once this one's answer is ``velocity`` [rad/s or m/s]."""
         return self.replace(velocity=velocity)

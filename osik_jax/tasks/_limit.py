@@ -60,7 +60,7 @@ class LimitTask(Task):
         self.dt = as_scalar(1.0, "dt", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row for each dof, then those of the limit, for the tick that ``during`` says (1 s where it was not)."""
+        """One row for each dof, then those of the limit, for the step that ``during`` says (1 s where it was not)."""
         lower, upper = limit_box(robot, q, (self.limit,), self.dt)
         jacobian, own = jnp.eye(robot.nv, dtype=lower.dtype), limit_rows(robot, kinematics, q, (self.limit,), self.dt)
         if own is not None:
@@ -76,11 +76,11 @@ class LimitTask(Task):
         )
 
     def during(self, dt: Float[Array, ""] | float) -> Self:
-        """The task for a tick of dt [s]."""
+        """The task for a step of dt [s]."""
         return eqx.tree_at(lambda task: task.dt, self, jnp.asarray(dt, self.dt.dtype))
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The task for the next tick, once this one's answer is ``velocity``."""
+        """The task for the next step, once this one's answer is ``velocity``."""
         return eqx.tree_at(lambda task: task.limit, self, self.limit.after(velocity))
 
     @property

@@ -1,4 +1,4 @@
-"""The rows of all tasks of a tick."""
+"""The rows of all tasks of a step."""
 
 from __future__ import annotations
 

@@ -94,12 +94,12 @@ class Task(MadeForRobot, Replaceable):
         """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
 
     def during(self, dt: Float[Array, ""] | float) -> Self:
-        """The task for a tick of dt [s], which ``solve`` asks for; itself where that does not matter."""
+        """The task for a step of dt [s], which ``solve`` asks for; itself where that does not matter."""
         del dt
         return self
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The task for the next tick, once this one's answer is ``velocity``; itself where it remembers nothing."""
+        """The task for the next step, once this one's answer is ``velocity``; itself where it remembers nothing."""
         del velocity
         return self
 
@@ -160,15 +160,24 @@ def task_rows(
     dofs: tuple[int, ...] | None = None,
     curvature: Callable[[Float[Array, " m"]], Float[Array, ""]] | None = None,
 ) -> TaskRows:
-    """The rows of an equality task, or with bounds of an inequality task on ``error``: what ``Task.rows`` returns.
+    """Return the rows of an equality task, or with bounds of an inequality task on ``error``, as ``Task.rows`` does.
 
     Equality: ``jacobian v = -gain(error) error + feedforward``. Inequality: ``gain (lower - error) + feedforward <=
     jacobian v <= gain (upper - error) + feedforward``; infinite bounds stay infinite, and an adaptive gain is evaluated
-    at the distance of the value to the interval, 0 inside. Rows of weight 0 do not count for the gain. ``dofs``: see
-    ``TaskRows``.
+    at the distance of the value to the interval, 0 inside. Rows of weight 0 do not count for the gain.
 
-    ``curvature`` maps the weighted pull ``weight gain e`` (m,) to the bound that ``TaskRows.curvature`` holds; default:
-    the pull's length times the size of the Jacobian, which is above what a chain of hinges can bend.
+    Args:
+        error: of an equality, where the robot is less where it should be; of an inequality, the value itself, in its
+            own units, such as m or rad. (m,)
+        jacobian: derivative of ``error`` along v. (m, nv)
+        gain: [1/s], a number or an adaptive gain.
+        weight: of the squared residual of each row; 0 leaves the row out. (m,)
+        lower: lower bounds of ``error``, with ``upper``; -inf for none. (m,)
+        upper: upper bounds; inf for none. (m,)
+        feedforward: the target's own velocity, in units of ``error`` a second; default 0. (m,)
+        dofs: of rows that each ask for the velocity of one dof, which (``TaskRows``). (static)
+        curvature: maps the weighted pull ``weight gain e`` (m,) to the bound that ``TaskRows.curvature`` holds;
+            default: the pull's length times the size of the Jacobian, which is above what a chain of hinges can bend.
     """
     shift = jnp.zeros_like(error) if feedforward is None else feedforward
     linear = dofs is not None or curvature is no_curvature

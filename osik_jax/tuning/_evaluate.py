@@ -28,7 +28,7 @@ class Evaluation(eqx.Module):
 
     Attributes:
         losses: of each; of no meaning where it was dropped. (n,)
-        kept: false where the loss is not finite, or a tick failed on a NaN. (n,)
+        kept: false where the loss is not finite, or a step failed on a NaN. (n,)
     """
 
     losses: Float[Array, " n"]
@@ -93,8 +93,8 @@ def scenario_loss(loss: LossFunction, loop: Loop, scenario: Scenarios) -> tuple[
         raise OsikValueError(
             f"the loss returned shape {value.shape} of {value.dtype}; it is one number for a trajectory"
         )
-    sound = (trajectory.solution.status != Status.NUMERICAL_ERROR).all()
-    return value, jnp.isfinite(value) & sound
+    has_numbers = (trajectory.solution.status != Status.NUMERICAL_ERROR).all()
+    return value, jnp.isfinite(value) & has_numbers
 
 
 def over_scenarios(

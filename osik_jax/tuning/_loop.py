@@ -33,8 +33,8 @@ class Loop(eqx.Module):
         tasks: by name; or a function of time that returns them, of which an ``equinox.Module``'s fields have names.
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``; default: the first.
         limits: hard bounds on the velocity; default: the robot's own, as in ``rollout``.
-        dt: time of one tick [s].
-        steps: number of ticks (static).
+        dt: time of one step [s].
+        steps: number of steps (static).
 
     Raises:
         ValueError: a task has the name of another part of the loop.
@@ -82,7 +82,7 @@ class Loop(eqx.Module):
         return eqx.combine(replace_named(numbers, self.names, values), rest)
 
     def rollout(self, q0: Float[Array, " nq"] | None = None, *, targets: Targets | None = None) -> Trajectory:
-        """The loop run from a configuration (default: the robot's home), with targets by tick as ``rollout`` takes."""
+        """The loop run from a configuration (default: the robot's home), with targets by step as ``rollout`` takes."""
         return rollout(
             self.robot,
             self.robot.q0 if q0 is None else q0,

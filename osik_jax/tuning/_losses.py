@@ -110,10 +110,10 @@ def _mean_over_time(values: Float[Array, " steps"], counted: Array) -> Float[Arr
 
 
 class Smoothness(Loss):
-    """Mean over time of the squared acceleration, summed over v [rad^2/s^4, m^2/s^4], by differences between ticks.
+    """Mean over time of the squared acceleration, summed over v [rad^2/s^4, m^2/s^4], by differences between steps.
 
     Attributes:
-        from_rest: whether the first tick counts, with a velocity of zero before it. (static)
+        from_rest: whether the first step counts, with a velocity of zero before it. (static)
     """
 
     from_rest: bool = eqx.field(static=True, default=True)

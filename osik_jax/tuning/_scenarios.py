@@ -87,7 +87,7 @@ class Scenarios(eqx.Module):
             for leaf in jax.tree.leaves(target):
                 if leaf.shape[1:2] != (loop.steps,):
                     raise OsikValueError(
-                        f"targets[{name!r}] has shape {leaf.shape}; it is (n, {loop.steps}, ...), one target a tick. "
+                        f"targets[{name!r}] has shape {leaf.shape}; it is (n, {loop.steps}, ...), one target a step. "
                         f"For targets that stand still: values={{'{name}.target': ...}}"
                     )
 

@@ -108,7 +108,7 @@ def tune(
 
     Returns:
         The best loop and what there was on the way. A scenario whose loss or gradient is not finite, or in which a
-        tick failed on a NaN, is left out of that iteration's mean, and counted in ``history.dropped``.
+        step failed on a NaN, is left out of that iteration's mean, and counted in ``history.dropped``.
 
     Raises:
         KeyError: a name that does not exist; the message lists those that do.
@@ -185,7 +185,7 @@ def _compiled_step(
         if row["dropped"] == len(scenarios):
             raise OsikValueError(
                 f"no training scenario can be kept in iteration {len(state.history)}: each has a loss or gradient "
-                "that is not finite, or a tick that failed on a NaN; look at it with osik_jax.tuning.evaluate"
+                "that is not finite, or a step that failed on a NaN; look at it with osik_jax.tuning.evaluate"
             )
         seconds = time.perf_counter() - start
         history = state.history.and_then(**row, vectors=np.asarray(state.vector), seconds=seconds)

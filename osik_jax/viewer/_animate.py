@@ -100,16 +100,16 @@ def animate(
     path = Path(path)
     _check_path(path)
     stride = max(1, round(1.0 / (frames_per_second * dt)))
-    ticks = np.arange(0, len(q), stride)
+    frames = np.arange(0, len(q), stride)
     film = _Film(
         robot,
         np.asarray(q),
-        ticks,
-        ticks * dt,
+        frames,
+        frames * dt,
         size,
         renderer,
         robot_parts(robot, style=style, look=look),
-        _each(support, ticks),
+        _each(support, frames),
         trails,
         curves,
         caption,
@@ -131,13 +131,13 @@ def _check_path(path: Path) -> None:
         raise OsikValueError(f"cannot write {path.name!r}: the program ffmpeg is not installed; write a .gif")
 
 
-def _each(support: Polygons | Float[np.ndarray, "m 2"] | None, ticks: np.ndarray) -> Polygons | None:
+def _each(support: Polygons | Float[np.ndarray, "m 2"] | None, frames: np.ndarray) -> Polygons | None:
     """One polygon a picture."""
     if support is None:
         return None
     if isinstance(support, np.ndarray) and support.ndim == 2:
-        return [support] * len(ticks)
-    return [np.asarray(support[min(tick, len(support) - 1)]) for tick in ticks]
+        return [support] * len(frames)
+    return [np.asarray(support[min(k, len(support) - 1)]) for k in frames]
 
 
 class _Film:
@@ -147,7 +147,7 @@ class _Film:
         self,
         robot: Robot,
         q: np.ndarray,
-        ticks: np.ndarray,
+        frames: np.ndarray,
         time: np.ndarray,
         size: tuple[int, int],
         renderer: RendererName,
@@ -159,7 +159,7 @@ class _Film:
         azimuth: float,
         elevation: float,
     ) -> None:
-        self._robot, self._q, self._size, self._time = robot, q[ticks], size, time
+        self._robot, self._q, self._size, self._time = robot, q[frames], size, time
         self._shape = shape
         self._support = support
         points, com, paths = self._survey(trails)
@@ -173,7 +173,7 @@ class _Film:
         self._canvas = Canvas(size)
         self._add_text(caption)
         self._add_marks()
-        self._add_panels(curves, ticks)
+        self._add_panels(curves, frames)
         self._under: tuple[Float[np.ndarray, "m 2"], np.ndarray] | None = None
 
     def _survey(self, trails: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
@@ -207,12 +207,12 @@ class _Film:
             self._trail_lines.append((line, self._camera.project(path, self._size)))
         self._mark = None if self._support is None else ComMark(self._canvas, self._camera, floor=self._floor)
 
-    def _add_panels(self, curves: Curves | None, ticks: np.ndarray) -> None:
+    def _add_panels(self, curves: Curves | None, frames: np.ndarray) -> None:
         self._panels: list[PlanPanel | CurvePanel] = []
         if self._support is not None:
             self._panels.append(PlanPanel(self._canvas, (0.60, 0.53, 0.38, 0.36), self._support, self._com))
         if curves is not None:
-            values, wanted = ({k: v[ticks] for k, v in group.items()} for group in (curves.values, curves.wanted))
+            values, wanted = ({k: v[frames] for k, v in group.items()} for group in (curves.values, curves.wanted))
             bottom = 0.115 if self._support is not None else 0.32
             place = (0.60, bottom, 0.38, 0.29)
             self._panels.append(

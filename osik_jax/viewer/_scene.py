@@ -157,6 +157,9 @@ def draw_robot(
         style: ``"geoms"``, ``"sticks"``, or ``"auto"``.
         detail: fineness of round shapes; a sphere has 4 * detail meridians.
         shadow: height of the ground [m] that it throws a shadow on; ``None`` draws no shadow.
+
+    Raises:
+        ValueError: ``style="geoms"`` of a model that has none to draw.
     """
     quads, colors = robot_surface(robot_parts(robot, style=style), next(mujoco_poses(robot, q)), detail)
     colors = colors * [1.0, 1.0, 1.0, alpha]
@@ -188,7 +191,17 @@ def shadow_surface(quads: Quads, height: float) -> Poly3DCollection:
 def draw_polygon(
     axes: Axes3D, vertices: Float[np.ndarray, "m 2"], *, height: float = 0.0, color: str = GREEN
 ) -> Poly3DCollection:
-    """A support polygon on the ground [m]."""
+    """Draws a support polygon on the ground.
+
+    Args:
+        axes: 3-D axes, best from ``scene_axes``.
+        vertices: its corners in order, in world axes [m]. (m, 2)
+        height: of the ground [m].
+        color: of the edge; the face is nearly transparent.
+
+    Returns:
+        The polygon.
+    """
     corners = np.column_stack([vertices, np.full(len(vertices), height)])
     polygon = Poly3DCollection(
         [corners],
@@ -204,7 +217,17 @@ def draw_polygon(
 def draw_com(
     axes: Axes3D, com: Float[np.ndarray, "3"], *, height: float = 0.0, color: str = ORANGE
 ) -> tuple[Line2D, Line2D, Line2D]:
-    """The centre of mass [m], the plumb line below it, and where that meets the ground."""
+    """Draws the centre of mass, the plumb line below it, and where that meets the ground.
+
+    Args:
+        axes: 3-D axes, best from ``scene_axes``.
+        com: the centre of mass in world axes [m]. (3,)
+        height: of the ground [m].
+        color: of all three.
+
+    Returns:
+        The ball, the line and the mark on the ground.
+    """
     x, y, z = (float(value) for value in com)
     (line,) = axes.plot([x, x], [y, y], [z, height], color=color, lw=1.3, ls=(0, (4, 3)), zorder=_FRONT_LAYER)
     (ball,) = axes.plot(
@@ -217,7 +240,13 @@ def draw_com(
 
 
 def draw_target(axes: Axes3D, position: Float[np.ndarray, "3"], *, color: str = BLUE) -> Line2D:
-    """A cross where something should be [m]."""
+    """Draws a cross where something should be.
+
+    Args:
+        axes: 3-D axes, best from ``scene_axes``.
+        position: in world axes [m]. (3,)
+        color: of the cross.
+    """
     x, y, z = (float(value) for value in position)
     (mark,) = axes.plot(
         [x], [y], [z], marker="P", ms=10, mfc=color, mec="white", mew=1.2, ls="", zorder=_FRONT_LAYER + 2

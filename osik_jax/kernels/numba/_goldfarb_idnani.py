@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, REDUNDANCY_TOL
 from ._dense import add_multiple, add_row, dot, fill, invert_upper, rotate
 from ._frame import lean
 
 _DEPENDENT = 1e-14
 """Of |J'n|^2; a constraint of which the active ones leave less than this depends on them."""
+_IMPLIED = REDUNDANCY_TOL[np.dtype("float64")]
+"""In units of roundoff: a dependent constraint that is violated by less is implied, by more it contradicts."""
 
 
 @lean
@@ -74,11 +76,11 @@ def value_of(P, v, i, n):
 def most_violated(P, W, labels, v, d, n, count):
     """Return the constraint whose activation raises the dual objective most, -1 for none; equalities first.
 
-    By a full step it rises by half of gap^2 / |J2'n|^2.
+    By a full step it rises by half of gap^2 / |J2'n|^2. Those that the active ones imply are passed over.
     """
     best, entering = 0.0, -1
     for i in range(len(labels)):
-        if labels[i] != INACTIVE:
+        if labels[i] != INACTIVE or W.next[i] != 0:
             continue
         value = value_of(P, v, i, n)
         gap = max(P.lower[i] - value, value - P.upper[i])
@@ -138,37 +140,44 @@ def ratio_test(labels, order, u, r, count):
 
 
 @lean
-def dual_active_set(P, W, labels, x, most_changes):
-    """Find the active constraints, from none but pinned variables, and write them to ``labels``.
+def dual_active_set(P, W, labels, x, z, count, most_changes):
+    """Find the active constraints, from none but pinned variables or from where it ended, and write them to ``labels``.
 
     Args:
         P: the problem.
-        W: space, and the roundoff of values.
-        labels: no constraint active but pinned variables. (N,)
+        W: space, and the roundoff of values; at the end ``next`` is 1 for constraints that depend on the active ones
+            and hold, up to roundoff, where these do.
+        labels: where it begins; at the start no constraint is active but pinned variables. (N,)
         x: the minimiser for those. (n,)
+        z: its residuals and multipliers. (m + p,)
+        count: how many constraints are active where it ended; -1 to start.
         most_changes: cap on changes of the active set.
 
     Returns:
-        Changes of the active set; -1 where rows cannot hold together, or the cap was met.
+        Changes of the active set, -1 where rows cannot hold together or the cap was met; how many are active.
     """
     n, N = len(x), len(labels)
     R, J, order = W.R, W.J, W.order
     v, d, w, u, r = W.point, W.along, W.reflected, W.multipliers, W.rates
-    factor_cost(P, R, J, n)
+    if count < 0:
+        factor_cost(P, R, J, n)
+        fill(W.next, 0)
+        count = np.int64(0)
     for i in range(N):
-        v[i] = x[i] if i < n else 0.0
-    count, changes = np.int64(0), np.int64(0)  # not literals: functions of a literal are compiled once more
+        row = len(P.target) + i - n
+        v[i] = x[i] if i < n else np.sqrt(P.compliance[row]) * z[row] if labels[i] != INACTIVE else 0.0
+    changes = np.int64(0)  # not literals: functions of a literal are compiled once more
     while True:
         entering = most_violated(P, W, labels, v, d, n, count)
         if entering < 0:
-            return changes
+            return changes, count
         pushed = 0.0
         value = value_of(P, v, entering, n)
         side = 1.0 if P.lower[entering] - value >= value - P.upper[entering] else -1.0
         while True:
             changes += 1
             if changes > most_changes:
-                return -1
+                return np.int64(-1), count
             along_normal(P, J, entering, n, d)
             for k in range(N):
                 d[k] *= side
@@ -183,7 +192,10 @@ def dual_active_set(P, W, labels, x, most_changes):
             full = gap / left if left > _DEPENDENT * whole else np.inf
             length, leaving = ratio_test(labels, order, u, r, count)
             if not (full < np.inf or length < np.inf):
-                return -1
+                if not gap <= _IMPLIED * W.value_roundoff[entering]:
+                    return np.int64(-1), count
+                W.next[entering] = 1
+                break
             length = min(length, full)
             for i in range(count):
                 u[i] = max(u[i] - length * r[i], 0.0) if labels[order[i]] != EQUALITY else u[i] - length * r[i]

@@ -1,15 +1,13 @@
 """Kernel of ``solvers/null_space/_projection.py``: all levels of one problem after another, in coordinates.
 
 What is computed is what that file says. P_k is Z Z' with orthonormal columns Z, of which each level takes as many away
-as it has rank, so that what is left gets smaller from level to level. ``Q`` has all of them in its rows, those taken
-first; beside them, in the same rows, the rows of the level in these coordinates: [Q | Q A']. Householder reflections
-from the left, pivoted by the longest of the level's rows that is left, turn both at once: the rows of Q that a level
-has taken are then the basis of the row space of A P, and the rows beside them the level's rows on it.
+as it has rank, so that what is left gets smaller from level to level. ``turned`` has all of them in its rows, those
+taken first; ``beside`` has the level's rows in these coordinates. Householder reflections, pivoted by the longest of
+the level's rows that is left, turn both (``_row_space.py``): the rows of ``turned`` that a level has taken are then the
+basis of the row space of A P, and those of ``beside`` the level's rows on it.
 
-The motion comes from an orthogonal factorisation of those with the root of the damping below them (modified
-Gram-Schmidt with the right-hand side as a column: A. Bjorck, "Solving linear least squares problems by Gram-Schmidt
-orthogonalization", BIT 7, 1967). ``strength_of`` and ``narrow`` are ``level_damping`` and ``narrow_box`` of
-``solvers/_damping.py``; x is where P x = 0 before every level.
+``strength_of`` and ``narrow`` are ``level_damping`` and ``narrow_box`` of ``solvers/_damping.py``; x is where P x = 0
+before every level.
 """
 
 from __future__ import annotations
@@ -26,8 +24,21 @@ from ...numerics._constants import (
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
 )
-from ._dense import add_multiple, backward, cholesky, dot, fill, forward
-from ._frame import arguments, compiled, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
+from ._dense import add_multiple, dot, fill
+from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
+from ._padded_rows import clear, minus_rows, plus_rows, plus_squares, put_multiple, transpose
+from ._row_space import (
+    are_independent,
+    set_beside,
+    set_gram,
+    solve_by_rows,
+    solve_in_all,
+    solve_on_basis,
+    take_row_space,
+)
+from ._row_space_workspace import work_at
+from ._symmetric import factor_symmetric, solve_symmetric
+from ._tiles import padded
 
 
 class Level(NamedTuple):
@@ -43,33 +54,6 @@ class Level(NamedTuple):
     bends: np.ndarray
 
 
-class Work(NamedTuple):
-    """Space for one problem; M rows of the longest level, r = min(M, n).
-
-    Fields: ``turned`` (n, n + M) as above. ``gram``, ``factor`` (M, M). ``columns`` (r, M + r) and ``triangle`` (r, r):
-    the factorisation for the motion. ``turn`` (n,) a reflection, ``along`` (n + M,) what it takes from each column.
-    ``value``, ``wanted``, ``solved``, ``square`` (M,) of the level's rows; ``right`` (M + r,). ``motion``, ``low``,
-    ``high``, ``bent`` (n,).
-    """
-
-    turned: np.ndarray
-    gram: np.ndarray
-    factor: np.ndarray
-    columns: np.ndarray
-    triangle: np.ndarray
-    turn: np.ndarray
-    along: np.ndarray
-    value: np.ndarray
-    wanted: np.ndarray
-    solved: np.ndarray
-    square: np.ndarray
-    right: np.ndarray
-    motion: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    bent: np.ndarray
-
-
 @lean
 def gap(level, i, value):
     """From a value of row i to the nearest point of its interval."""
@@ -79,31 +63,27 @@ def gap(level, i, value):
 
 
 @lean
+def load(W, level):
+    """The level's rows into rows of whole blocks, and into columns; minus them, so that products are taken off."""
+    m, n = level.A.shape
+    for i in range(m):
+        put_multiple(W.rows[i], -1.0, level.A[i], n)
+    for i in range(m, padded(m)):
+        clear(W.rows[i], n)
+    transpose(W.columns, W.rows, m, n)
+    plus_squares(W.size, W.nought, W.turn, W.columns, 0, n, 0, m)
+
+
+@lean
 def look(W, level, x):
     """What the level's rows are at x and ask for; the square of the longest row, and the size of all."""
     m, n = level.A.shape
     longest, size = 0.0, 0.0
+    minus_rows(W.value, W.nought, x, W.columns, 0, n, 0, m)
     for i in range(m):
-        row = level.A[i]
-        W.value[i] = dot(row, x, 0, n)
         W.wanted[i] = gap(level, i, W.value[i])
-        square = dot(row, row, 0, n)
-        longest, size = max(longest, square), size + square
+        longest, size = max(longest, W.size[i]), size + W.size[i]
     return longest, np.sqrt(size)
-
-
-@lean
-def set_beside(W, level, first, plain):
-    """The level's rows in the coordinates that are left, beside Q; ``plain`` where Q is the identity."""
-    m, n = level.A.shape
-    for i in range(m):
-        row = level.A[i]
-        if plain:
-            for j in range(n):
-                W.turned[j, n + i] = row[j]
-        else:
-            for j in range(first, n):
-                W.turned[j, n + i] = dot(row, W.turned[j], 0, n)
 
 
 @lean
@@ -112,21 +92,16 @@ def counts(W, level, i):
     return level.equal[i] != 0 or W.wanted[i] != 0.0
 
 
-@lean
+@lean(inline="always")
 def strength_of(W, level, first, longest):
     """The damping of the level: constant + unmet share, share what the step with this very damping misses."""
     m, n = level.A.shape
     whole = level.constant
     if level.unmet != 0.0:
-        for i in range(m):
-            fill(W.gram[i], 0.0)
-        for j in range(first, n):
-            row = W.turned[j, n:]
-            for i in range(m):
-                add_multiple(W.gram[i], row[i], row, m)
+        set_gram(W, W.beside[first:], m, n - first)
         trace = 0.0
         for i in range(m):
-            trace += W.gram[i, i] if counts(W, level, i) else 0.0
+            trace -= W.less[i, i] if counts(W, level, i) else 0.0
         share = 1.0
         for _ in range(DAMPING_ITERATIONS):
             strength = level.constant + level.unmet * share + DAMPING_RIDGE * trace
@@ -140,108 +115,47 @@ def missed_with(W, level, strength):
     """Size of the residual that the step with this damping leaves; rows that do not count are 0 in the step."""
     m = len(level.A)
     for i in range(m):
-        here = counts(W, level, i)
-        for k in range(i):
-            W.factor[i, k] = W.gram[i, k] if here and counts(W, level, k) else 0.0
-        W.factor[i, i] = (W.gram[i, i] if here else 0.0) + (strength if strength > 0.0 else 1.0)
-        W.solved[i] = W.wanted[i] if here else 0.0
-    if not cholesky(W.factor, m, 0.0):
+        put_multiple(W.symmetric[i], -1.0, W.less[i], padded(m))
+        W.symmetric[i, i] += strength if strength > 0.0 else 1.0
+        W.solved[i] = W.wanted[i]
+    for i in range(m, padded(m)):
+        clear(W.symmetric[i], m)
+    for i in range(m):
+        if not counts(W, level, i):
+            for k in range(m):
+                W.symmetric[i, k], W.symmetric[k, i] = 0.0, 0.0
+            W.symmetric[i, i] = 1.0
+    if not factor_symmetric(W.symmetric, W.lower, W.upper, W.inverse, W.diagonal, m, 0.0):
         return 0.0
-    forward(W.factor, W.solved, m)
-    backward(W.factor, W.solved, m)
+    solve_symmetric(W.lower, W.upper, W.inverse, W.solved, m)
+    minus_rows(W.missing, W.value, W.solved, W.less, 0, m, 0, m)
     missed = 0.0
     for i in range(m):
-        missed += gap(level, i, W.value[i] + dot(W.gram[i], W.solved, 0, m)) ** 2
+        missed += gap(level, i, W.missing[i]) ** 2
     return np.sqrt(missed)
 
 
-@lean
-def take_row_space(W, m, n, first, cutoff):
-    """Turns the coordinates that are left so that the first ones span the level's rows; how many these are.
-
-    The longest row that is left is the pivot, the first of equals; one no longer than the cutoff ends it.
-    """
-    width = n + m
-    fill(W.square, 0.0)
-    for j in range(first, n):
-        row = W.turned[j, n:]
-        for i in range(m):
-            W.square[i] += row[i] * row[i]
-    at = first
-    while at < n and at - first < m:
-        pivot = 0
-        for i in range(1, m):
-            pivot = i if W.square[i] > W.square[pivot] else pivot
-        length = 0.0
-        for j in range(at, n):
-            W.turn[j] = W.turned[j, n + pivot]
-            length += W.turn[j] * W.turn[j]
-        length = np.sqrt(length)
-        if not length > cutoff:
-            break
-        head = W.turn[at]
-        W.turn[at] = head + (length if head >= 0.0 else -length)
-        scale = 1.0 / (length * (length + abs(head)))
-        fill(W.along, 0.0)
-        for j in range(at, n):
-            add_multiple(W.along, W.turn[j], W.turned[j], width)
-        fill(W.square, 0.0)
-        for j in range(at, n):
-            add_multiple(W.turned[j], -scale * W.turn[j], W.along, width)
-            if j > at:
-                row = W.turned[j, n:]
-                for i in range(m):
-                    W.square[i] += row[i] * row[i]
-        at += 1
-    return at - first
-
-
-@lean
-def solve_on_basis(W, m, n, first, rank, damping):
-    """``right`` becomes y of least |C y - wanted|^2 + damping |y|^2, C the level's rows on the basis of their space."""
-    root = np.sqrt(damping)
-    for k in range(rank):
-        column, row = W.columns[k], W.turned[first + k, n:]
-        for i in range(m):
-            column[i] = row[i]
-        for i in range(m, m + rank):
-            column[i] = 0.0
-        column[m + k] = root
-    fill(W.right, 0.0)
-    for i in range(m):
-        W.right[i] = W.wanted[i]
-    for k in range(rank):
-        column, stop = W.columns[k], m + k + 1
-        size = np.sqrt(dot(column, column, 0, stop))
-        for i in range(stop):
-            column[i] /= size
-        W.triangle[k, k] = size
-        for a in range(k + 1, rank):
-            W.triangle[k, a] = dot(column, W.columns[a], 0, stop)
-            add_multiple(W.columns[a], -W.triangle[k, a], column, stop)
-        share = dot(column, W.right, 0, stop)
-        add_multiple(W.right, -share, column, stop)
-        W.solved[k] = share
-    for k in range(rank - 1, -1, -1):
-        W.right[k] = (W.solved[k] - dot(W.triangle[k], W.right, k + 1, rank)) / W.triangle[k, k]
-
-
-@lean
-def find_motion(W, level, first, damping, rank_tolerance):
+@lean(inline="always")
+def find_motion(W, level, first, damping, rank_tolerance, plain):
     """What the level asks for; takes its row space off the coordinates that are left, the rank that is returned."""
     m, n = level.A.shape
-    square = 0.0
+    square, many = 0.0, 0
     for i in range(m):
         if counts(W, level, i):
-            square += dot(level.A[i], level.A[i], 0, n)
+            square, many = square + W.size[i], many + 1
         else:
             for j in range(first, n):
-                W.turned[j, n + i] = 0.0
-    rank = take_row_space(W, m, n, first, rank_tolerance * np.sqrt(square))
-    solve_on_basis(W, m, n, first, rank, damping)
-    fill(W.motion, 0.0)
-    for k in range(rank):
-        add_multiple(W.motion, W.right[k], W.turned[first + k], n)
+                W.beside[j, i] = 0.0
+    cutoff = rank_tolerance * np.sqrt(square)
+    if many >= n - first and solve_in_all(W, m, n, first, damping, cutoff):
+        rank = n - first
+    else:
+        if many < m or level.unmet == 0.0 or many >= n - first:
+            set_gram(W, W.beside[first:], m, n - first)
+        rank = take_row_space(W, m, n, first, cutoff, plain)
+        if not (are_independent(W, m, rank) and solve_by_rows(W, m, first, rank, damping)):
+            solve_on_basis(W, m, n, first, rank, damping)
+    plus_rows(W.motion, W.nought, W.right, W.turned[first:], 0, rank, 0, n)
     return rank
 
 
@@ -266,9 +180,10 @@ def narrow(W, level, x, longest, size):
         W.bent[j] = max(W.bent[j], level.bends[j] / (size if size > 0.0 else 1.0))
     if not level.unmet > NEGLIGIBLE_DAMPING * longest:
         return
+    minus_rows(W.missing, W.nought, x, W.columns, 0, n, 0, m)
     missed = 0.0
     for i in range(m):
-        missed += gap(level, i, dot(level.A[i], x, 0, n)) ** 2
+        missed += gap(level, i, W.missing[i]) ** 2
     missed = min(np.sqrt(missed), level.demand)
     if not level.unmet * (missed / (level.demand if level.demand > 0.0 else 1.0)) > NEGLIGIBLE_DAMPING * longest:
         return
@@ -286,13 +201,15 @@ def narrow(W, level, x, longest, size):
             W.low[j], W.high[j] = max(W.low[j], x[j] - room), min(W.high[j], x[j] + room)
 
 
-@lean
+@lean(inline="always")
 def solve_level(W, level, x, first, rank_tolerance):
     """Moves x as the level asks; the rank that it takes."""
+    m, n = level.A.shape
+    load(W, level)
     longest, size = look(W, level, x)
-    set_beside(W, level, first, first == 0)
+    set_beside(W, m, n, first, first == 0)
     damping = strength_of(W, level, first, longest)
-    rank = find_motion(W, level, first, damping, rank_tolerance)
+    rank = find_motion(W, level, first, damping, rank_tolerance, first == 0)
     move(W, x)
     narrow(W, level, x, longest, size)
     return rank
@@ -312,23 +229,6 @@ def end(W, x, secondary, first, projector):
     move(W, x)
 
 
-@compiled
-def work_at(space, n, M):
-    """The space for one problem, in the numbers at an address: ``(n + 11) (n + M) + 2 M^2 + r (M + 2 r)``."""
-    r = min(M, n)
-    turned, at = matrix(space, n, n + M), space + 8 * n * (n + M)
-    gram, at = matrix(at, M, M), at + 8 * M * M
-    factor, at = matrix(at, M, M), at + 8 * M * M
-    columns, at = matrix(at, r, M + r), at + 8 * r * (M + r)
-    triangle, at = matrix(at, r, r), at + 8 * r * r
-    line = 8 * (n + M)
-    return Work(
-        turned, gram, factor, columns, triangle, vector(at, n), vector(at + line, n + M), vector(at + 2 * line, M),
-        vector(at + 3 * line, M), vector(at + 4 * line, M), vector(at + 5 * line, M), vector(at + 6 * line, M + r),
-        vector(at + 7 * line, n), vector(at + 8 * line, n), vector(at + 9 * line, n), vector(at + 10 * line, n),
-    )  # fmt: skip
-
-
 def handle(frame):
     """One call of XLA: arguments as in ``solvers/null_space/_dispatch.py``, a leading axis of lanes on each."""
     if not is_call(frame):
@@ -344,7 +244,7 @@ def handle(frame):
         M = max(M, dimension(first_level + each * k, 8))
     W = work_at(space, n, M)
     for lane in range(lanes):
-        x, taken = vector(solution + 8 * n * lane, n), 0
+        x, taken = vector(solution + 8 * n * lane, n), np.int64(0)  # no literal, which is a type of its own
         fill(x, 0.0)
         fill(W.bent, 0.0)
         fill(W.low, -np.inf)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
+import numpy as np
+
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, IMPLIED, INACTIVE
 from ._dense import dot
 from ._frame import lean
 from ._goldfarb_idnani import dual_active_set
@@ -11,6 +13,8 @@ from ._qp_roundoff import find_roundoff
 
 _PATIENCE = 2
 """Exchanges that leave no fewer wrong signs, before the dual active-set method."""
+_MOST_DUAL = 8
+"""Times that the dual active-set method begins or goes on: its end, solved anew, may be a little off another bound."""
 
 
 @lean(inline="always")
@@ -27,36 +31,49 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
         z: multipliers of the rows. (m + p,)
         report: whether there is a candidate, changes, systems factored. (3,)
     """
-    best, lives, cold, found = len(labels) + 1, _PATIENCE, False, False
+    best, lives, cold, times, held = len(labels) + 1, _PATIENCE, False, 0, np.int64(-1)
     while True:
         report[2] += 1
-        sound = solve_on_active_set(P, W, labels, x, z)
-        if found or (cold and not sound):
-            report[0] = sound and found
+        is_regular = solve_on_active_set(P, W, labels, x, z)
+        if cold and not is_regular:
             return
-        if sound:
+        if is_regular:
             find_roundoff(P, W, labels, tolerance, x, z)
+        if times > 0 and (times == _MOST_DUAL or not leaves_out(P, W, labels, x, z)):
+            report[0] = 1
+            for i in range(len(labels)):
+                labels[i] = IMPLIED if W.next[i] != 0 else labels[i]
+            return
         if cold:
-            steps = dual_active_set(P, W, labels, x, most_changes - report[1])
+            steps, held = dual_active_set(P, W, labels, x, z, held, most_changes - report[1])
             if steps < 0:
                 return
             report[1] += steps
-            found = True
+            times += 1
             continue
         wrong = 0
         for i in range(len(labels)):
             W.next[i] = right_label(P, W, labels, i, x, z)
             wrong += W.next[i] != labels[i]
-        if sound and wrong == 0:
+        if is_regular and wrong == 0:
             report[0] = 1
             return
         lives = _PATIENCE if wrong < best else lives - 1
         best = min(best, wrong)
-        cold = not sound or lives < 0
+        cold = not is_regular or lives < 0
         for i in range(len(labels)):
             pinned = i < len(x) and P.lower[i] == P.upper[i]
             labels[i] = W.next[i] if not cold else EQUALITY if pinned else INACTIVE
         report[1] += 0 if cold else wrong
+
+
+@lean
+def leaves_out(P, W, labels, x, z):
+    """Return whether a constraint is violated that is inactive, and not implied by the active ones."""
+    for i in range(len(labels)):
+        if labels[i] == INACTIVE and W.next[i] == 0 and right_label(P, W, labels, i, x, z) != INACTIVE:
+            return True
+    return False
 
 
 @lean

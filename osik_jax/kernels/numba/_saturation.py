@@ -16,13 +16,13 @@ from ._projection import (
     Level,
     counts,
     find_motion,
+    load,
     look,
     narrow,
-    set_beside,
     strength_of,
-    take_row_space,
-    work_at,
 )
+from ._row_space import set_beside, take_row_space
+from ._row_space_workspace import work_at, work_size
 from ._saturation_search import Search, bound, search, size
 from ._vectors import add, dot
 
@@ -135,11 +135,11 @@ def take_off_stops(W, first, blocking):
     for i in range(n):
         if blocking[i] != 0:
             for j in range(first, n):
-                W.turned[j, n + count] = W.turned[j, i]
+                W.beside[j, count] = W.turned[j, i]
             count += 1
     if count == 0:
         return 0
-    rank = take_row_space(W, count, n, first, BLOCKING_RANK)
+    rank = take_row_space(W, count, n, first, BLOCKING_RANK, False)
     for i in range(n):
         if blocking[i] != 0:
             for j in range(first + rank, n):
@@ -155,11 +155,12 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side
         The coordinates that it takes, its scale, the blocker, changes of the active set, whether the search ended.
     """
     n = len(x)
-    set_beside(W, level, first, plain)
+    load(W, level)
+    set_beside(W, len(level.A), n, first, plain)
     longest, whole = look(W, level, x)
     damping = damping_of(W, S, level, x, first, longest)
     look(W, level, x)
-    rank = find_motion(W, level, first, damping, rank_tolerance)
+    rank = find_motion(W, level, first, damping, rank_tolerance, plain)
     scale, held, stop, changes, done = attempt(W, S, x, target, first + rank, most, LEAST)
     if not done and changes < most:
         scale, held, stop, more, done = attempt(W, S, x, target, first + rank, most, LOOSER)
@@ -180,7 +181,7 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side
 @lean
 def begin(W, x, low, high, fixed):
     """Return the point of the box that is nearest to 0, and the joints that can move in coordinates of their own."""
-    n, first, last = len(x), 0, 0
+    n, first, last = len(x), np.int64(0), 0
     for i in range(n):
         W.low[i], W.high[i], W.bent[i] = low[i], high[i], 0.0
         x[i] = min(max(0.0, low[i]), high[i])
@@ -213,7 +214,7 @@ def handle(frame):
     space, marks = data(found + 72), data(found + 80)
     width = max(M, n)
     W = work_at(space, n, width)
-    at = space + 8 * ((n + 11) * (n + width) + 2 * width * width + n * (width + 2 * n))
+    at = space + 8 * work_size(n, width)
     duals, before, at, line = matrix(at, n, n), matrix(at + 8 * n * n, n, n), at + 16 * n * n, 8 * n
     S = Search(
         duals, before, vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n),

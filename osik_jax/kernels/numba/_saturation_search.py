@@ -357,7 +357,7 @@ def search(W, S, start, target, first, most, least):
                 continue
             entering, side, out = -1, -1 if sign > 0.0 else 1, -1
             lower, its_rate = scale_of(W, S, start, first, held, k, side, least)
-            if not lower < scale:  # but for rounding it is where the others put it
+            if not lower < scale - SATURATION_ROUNDOFF:  # but for rounding it is where the others put it
                 S.passed[k] = side
                 continue
             largest = UNEVEN

@@ -5,9 +5,9 @@
 
 A lane solves on its active set (``_qp_active_set_solve``) and looks at the signs: bounds that are crossed become
 active, those whose multiplier has the wrong sign become inactive, all at once (block pivoting, ``_qp_search``). Where
-that stops helping, the dual active-set method begins anew (``_goldfarb_idnani``), which cannot cycle. Whatever comes of
-it is a candidate, which JAX certifies. No candidate comes of rows that cannot hold together, rows that depend
-on each other, and numbers that are none.
+that stops helping, the dual active-set method begins anew (``_goldfarb_idnani``), which cannot cycle, and goes on where
+its end, solved anew, misses a bound. Whatever comes of it is a candidate, which JAX certifies. No candidate comes of
+rows that cannot hold together, and numbers that are none.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ def handle(frame):
     schur, at = matrix(at, p, p), at + 8 * p * p
     R, at = matrix(at, N, N), at + 8 * N * N
     J, at = matrix(at, N, N), at + 8 * N * N
+    fill(vector(at, 21 * line >> 3), 0.0)  # what is behind the vectors
     W = Workspace(
         square, gram, factor, turned_factor, columns, scaled, reduced, schur, R, J, vector(at, padded(q)),
         vector(at + line, high), vector(at + 2 * line, high), vector(at + 3 * line, high), vector(at + 4 * line, high),

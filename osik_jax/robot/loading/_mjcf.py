@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 
 from ..._errors import OsikValueError
-from ._mjmodel import LEAST_INERTIA, as_mapping, element_names, from_mjmodel
+from ._followers import as_mapping
+from ._mjmodel import LEAST_INERTIA, element_names, from_mjmodel
 from ._source import Source, check_root, parse_xml, read_source
 
 FLOATING_BASE = "floating_base"

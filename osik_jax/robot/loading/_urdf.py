@@ -14,7 +14,8 @@ import numpy as np
 
 from ..._errors import OsikValueError, warn
 from .._feet import find_feet
-from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, as_mapping, from_mjmodel, quaternion
+from ._followers import as_mapping
+from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, from_mjmodel, quaternion
 from ._packages import Packages, is_uri
 from ._source import check_root, parse_xml, read_source
 from ._urdf_elements import IDENTITY, Joint, Link, Pose, Shape, Urdf, read_urdf

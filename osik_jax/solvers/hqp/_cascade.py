@@ -42,6 +42,14 @@ class CascadeResult(NamedTuple):
     done: Bool[Array, ""]
 
 
+def first_working_sets(hierarchy: PaddedHierarchy, warm_start: WorkingSet | None) -> WorkingSet:
+    """Return the working sets of a batch that a kernel tries first: the warm starts, or zeros for none."""
+    batch, count, m, _ = hierarchy.levels.matrix.shape
+    h = hierarchy.hard.shape[1]
+    zeros = WorkingSet(jnp.zeros((batch, count, h), int), jnp.zeros((batch, count, m), int))
+    return zeros if warm_start is None else warm_start
+
+
 def result_of_kernel(
     x: Array,
     multipliers: Array,

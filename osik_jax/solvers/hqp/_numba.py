@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...kernels.numba import _target
-from ._cascade import CascadeResult, result_of_kernel
+from ._cascade import CascadeResult, first_working_sets, result_of_kernel
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
@@ -29,8 +29,7 @@ def solve(
     """
     batch, count, m, n = hierarchy.levels.matrix.shape
     h = hierarchy.hard.shape[1]
-    zeros = WorkingSet(jnp.zeros((batch, count, h), int), jnp.zeros((batch, count, m), int))
-    guess = zeros if warm_start is None else warm_start
+    guess = first_working_sets(hierarchy, warm_start)
     row_of_hard = [layout.hard_of_row[layout.level_of_hard[q]].index(q) for q in range(n, h)]
     floats = dict(x=(n,), multipliers=(count, h), slack_norms=(count,), dampings=(count,), residual=())
     ints = dict(active_bounds=(n,), active=(count, h), frozen=(count, h), in_cost=(count, m), own=(count, m))

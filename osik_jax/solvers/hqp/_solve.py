@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ...execution import _rules
 from ...execution._backends import Backend, check_backend, here
 from ...numerics._constants import HIERARCHY_RANK, ZERO_PIVOT
-from .._box import clip_roundoff, uncrossed
+from .._box import clip_roundoff, ordered_bounds
 from .._damping import Damping, per_level
 from .._level import Level
 from .._status import Status
@@ -74,9 +74,9 @@ def solve_hqp(
     is_finite = _is_finite(levels, lower, upper) & damping_is_valid
     # where the data are not finite, a placeholder is solved: equalities of zeros in a box of ones
     is_equality = [level.equal | ~is_finite for level in levels]
-    levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True) if levels else ((), ())
-    low, high, box_crossed = uncrossed(lower, upper)
-    bounds_are_ordered = ~jnp.stack([box_crossed, *crossed]).any()
+    levels, unordered = zip(*(level.ordered() for level in levels), strict=True) if levels else ((), ())
+    low, high, box_unordered = ordered_bounds(lower, upper)
+    bounds_are_ordered = ~jnp.stack([box_unordered, *unordered]).any()
     low, high = (jnp.where(is_finite, b, one).astype(dtype) for b, one in ((low, -1.0), (high, 1.0)))
     scaled = [jax.tree.map(lambda leaf: jnp.where(is_finite, leaf, 0.0), level.scaled()) for level in levels]
     # a last level without rows and with a damping of 1 minimises |x|^2

@@ -28,7 +28,7 @@ from ...numerics._constants import (
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
 )
-from ._cascade import CascadeResult, result_of_kernel
+from ._cascade import CascadeResult, first_working_sets, result_of_kernel
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
@@ -118,8 +118,7 @@ def solve(
     shape = Shape.of(layout)
     batch, count, m, n = hierarchy.levels.matrix.shape
     h = hierarchy.hard.shape[1]
-    zeros = WorkingSet(jnp.zeros((batch, count, h), int), jnp.zeros((batch, count, m), int))
-    guess = zeros if warm_start is None else warm_start
+    guess = first_working_sets(hierarchy, warm_start)
 
     def without_padding(a: Array) -> Array:
         return jnp.concatenate([a[:, k, :size] for k, size in enumerate(shape.row_counts)], 1)

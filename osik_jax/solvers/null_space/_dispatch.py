@@ -58,16 +58,19 @@ def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Arr
     return in_lanes(partial(on_platforms, dict(numba=_by_numba), plain))
 
 
+def kernel_space(n: int, m: int) -> int:
+    """Return the numbers that a kernel needs for one problem, which XLA allocates as one more result."""
+    side = -(-max(n, m) // 8) * 8 + 8
+    return 15 * side**2 + 17 * side  # as ``work_size`` in the kernel
+
+
 def _by_numba(
     levels: list[Level], secondary: Float[Array, "B n"], damping: Damping, rank_tol: Float[Array, " B"]
 ) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
     batch, n = secondary.shape
     m = max(level.lower.shape[1] for level in levels)
-    # memory of one problem; XLA allocates it as one more result
-    r = min(m, n)
-    space = (n + 11) * (n + m) + 2 * m**2 + r * (m + 2 * r)  # as ``Work`` in the kernel
     equal = [jax.vmap(lambda one: one.equal)(level) for level in levels]
     rows = [a for level, e in zip(levels, equal, strict=True) for a in (level.matrix, level.lower, level.upper, e)]
-    shapes = (batch, n), (batch, n, n), (space,)
+    shapes = (batch, n), (batch, n, n), (kernel_space(n, m),)
     x, projector, _ = _target.call("_projection", [(s, float) for s in shapes], secondary, *damping, rank_tol, *rows)
     return x, projector

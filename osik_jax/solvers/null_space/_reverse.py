@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 from ...execution._backends import Backend
 from ...numerics._dense import apply, product
 from .._damping import Damping
-from .._inverses import regularised_inverse, row_space_and_motion
+from .._inverses import regularised_inverse, regularised_space, row_space_and_motion
 from ..hqp import Level
 from ._problem import ActiveTask
 
@@ -83,14 +83,18 @@ def _least_change(
         below: rows and damping of the levels below, the lowest first.
         rank_tol: relative length under which a row counts as dependent.
     """
+    is_projector = jnp.asarray(True)
     for rows, damping in reversed(below):
         restricted = product(rows, free)
         cutoff = _cutoff(rows, rank_tol)
         # with all of the damping for the motion, and its constant part for the projector
         whole = regularised_inverse(restricted, cutoff, damping.constant + damping.unmet)
         change = change - apply(free, apply(whole, apply(rows, change)))
-        inverse = regularised_inverse(restricted, cutoff, damping.constant)
-        free = free - product(free, product(inverse, restricted))
+        space = regularised_space(restricted, cutoff, damping.constant)
+        # rows that hardly leave others have roundoff outside of ``free``, which must not come into the next one's rank;
+        # a projector takes it off on both sides, to the square of it
+        is_projector &= damping.constant == 0.0
+        free = free - product(free, jnp.where(is_projector, product(space, free), space))
     return change
 
 

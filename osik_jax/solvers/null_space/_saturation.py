@@ -43,6 +43,7 @@ from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
+from ._dispatch import kernel_space
 from ._implicit_diff import ActiveJoints, with_derivative
 from ._padding import PaddedLevel, Problem, initial_point, pad_levels
 from ._projection import damped_step_length, level_motion
@@ -167,7 +168,7 @@ def _by_numba(max_iterations: int, problem: Problem) -> _Result:
     batch, count, m, n = problem.levels.matrix.shape
     width = max(m, n)
     # as ``Work`` and ``Search`` in the kernel; rows there are read in blocks of eight numbers
-    space = (n + 11) * (n + width) + 2 * width**2 + n * (width + 2 * n) + n * (2 * n + 9)
+    space = kernel_space(n, width) + n * (2 * n + 9)
     floats = (batch, n), (batch, n, n), (batch, count)
     ints = (batch, count), (batch, count, n), (batch, count, n), (batch, count), (batch, n), (batch, 2)
     x, projector, scales, done, at_bound, blocking, blocker, active, report, *_ = _target.call(

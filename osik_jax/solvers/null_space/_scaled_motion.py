@@ -255,11 +255,13 @@ def _result(problem: ScaledMotion, active_set: _ActiveSet, at: _Iterate, iterati
     active = jnp.where(active_set.active != 0, active_set.active, active_set.blocking)
     x = clip_to_box(jnp.where(active != 0, problem.bound(active), at.x), problem.lower, problem.upper)
     residual = jnp.max(jnp.abs(x - at.x))
+    # joints that are at their bounds where the whole motion ends do not stop it
+    is_whole = at.scale >= 1.0 - SATURATION_ROUNDOFF
     return SaturationResult(
         x=x,
         scale=at.scale,
         active=active_set.active,
-        blocking=active_set.blocking,
+        blocking=jnp.where(is_whole, 0, active_set.blocking),
         blocker=active_set.blocker,
         iterations=iterations,
         done=(residual <= SATURATION_RESIDUAL * problem.size(at.scale)) & jnp.isfinite(at.x).all(),

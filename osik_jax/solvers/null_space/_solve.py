@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ..._errors import OsikValueError
 from ...execution._backends import Backend, check_backend, here, takes
 from ...numerics._constants import NULL_SPACE_RANK
-from .._box import clip_to_box, uncrossed
+from .._box import clip_to_box, ordered_bounds
 from .._damping import Damping, per_level
 from .._status import Status
 from ..hqp import Level
@@ -86,8 +86,8 @@ def solve_nullspace(
     # bounds with lower > upper become equalities halfway; the status says so
     # without a secondary motion x is the smallest: the motion towards 0
     motion = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
-    levels, crossed = zip(*(level.uncrossed() for level in levels), strict=True)
-    bounds_are_ordered = ~jnp.stack(crossed).any()
+    levels, unordered = zip(*(level.ordered() for level in levels), strict=True)
+    bounds_are_ordered = ~jnp.stack(unordered).any()
     dampings = per_level(damping, len(levels), n, dtype)
     # where the data are not finite, a placeholder of zeros is solved, in a box of ones
     is_valid = is_finite(levels, motion, *dampings) & (True if box is None else _exist(*box))
@@ -102,7 +102,7 @@ def solve_nullspace(
             answer = _unbounded(*solve_reverse(scaled, motion, one_each, rank_tol, backend), count=len(levels))
         return _solution(valid, answer, is_valid, bounds_are_ordered, jnp.zeros(n, dtype))
     limit = 10 * (n + 2) if max_iterations is None else max_iterations
-    low, high, empty = uncrossed(*box)
+    low, high, empty = ordered_bounds(*box)
     safe = jnp.where(is_valid, low, -1.0), jnp.where(is_valid, high, 1.0)
     target = None if secondary is None else motion
     answer = solve_saturated(scaled, *safe, target, one_each, rank_tol, limit, backend)

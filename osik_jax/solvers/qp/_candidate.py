@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 
 class Candidate(NamedTuple):
@@ -16,3 +16,4 @@ class Candidate(NamedTuple):
     converged: Int[Array, " B"]  # whether the kernel has nothing left to change
     iterations: Int[Array, " B"]
     factorizations: Int[Array, " B"]
+    redundant: Bool[Array, "B n+p"] | None = None  # constraints that the active ones imply; None for none

@@ -135,12 +135,12 @@ def _block(batch: int) -> int:
 
 def _as_result(qp: QP, candidate: Candidate) -> SearchResult:
     """Return a candidate as the end of a search, not yet certified."""
-    zeros = jnp.zeros_like(candidate.iterations)
+    zeros, redundant = jnp.zeros_like(candidate.iterations), candidate.redundant
     return SearchResult(
         x=candidate.x,
         row_multipliers=candidate.row_multipliers,
         active=candidate.active,
-        redundant=jnp.zeros(candidate.active.shape, bool),
+        redundant=jnp.zeros(candidate.active.shape, bool) if redundant is None else redundant,
         iterations=candidate.iterations,
         factorizations=candidate.factorizations,
         done=zeros.astype(bool),

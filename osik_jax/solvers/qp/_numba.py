@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...execution._computed import side_by_side
 from ...kernels.numba import _target
+from ...numerics._constants import IMPLIED, INACTIVE
 from ._candidate import Candidate
 from ._cost import LeastSquares
-from ._problem import QP
+from ._problem import QP, arrays
 
 
 def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
@@ -32,11 +32,12 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     workspace = (
         high * (4 * wide + 3 * high) + largest**2 + p * (n + p) + 2 * constraints**2 + 27 * line
     )  # as ``Workspace``
-    matrix, *others = jax.tree.leaves((qp.cost, qp.rows, qp.compliance, qp.lower, qp.upper))
-    packed = side_by_side(*others) if qp.packed is None else qp.packed  # in the order of the fields
+    (matrix, *others), _ = arrays(qp)
+    packed = side_by_side(*others) if qp.packed is None else qp.packed
     x, y, active, report, _ = _target.call(
         "_weighted_qp",
         [((batch, n), float), ((batch, p), float), ((batch, n + p), int), ((batch, 3), int), ((workspace,), float)],
         *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
-    return Candidate(x, y, active, *(report[:, i] for i in range(3)))
+    implied = active == IMPLIED
+    return Candidate(x, y, jnp.where(implied, INACTIVE, active), *(report[:, i] for i in range(3)), redundant=implied)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -47,13 +47,17 @@ class QP(eqx.Module):
         return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
 
 
+def arrays(qp: QP) -> tuple[list[Array], Any]:
+    """Return the cost's matrix, then all other arrays in the order in which ``packed`` has them; and their tree."""
+    return jax.tree.flatten(replace(qp, packed=None))
+
+
 def unpack(like: QP, matrix: Float[Array, "..."], packed: Float[Array, " k"]) -> QP:
     """Return a problem of the shapes of another, from its matrix and all its other arrays, one after another."""
-    leaves, tree = jax.tree.flatten(replace(like, packed=None))
-    rest = leaves[1:]
+    (first, *rest), tree = arrays(like)
     parts = jnp.split(packed, np.cumsum([a.size for a in rest])[:-1])
     others = [part.reshape(a.shape).astype(a.dtype) for part, a in zip(parts, rest, strict=True)]
-    return jax.tree.unflatten(tree, [matrix.reshape(leaves[0].shape).astype(leaves[0].dtype), *others])
+    return jax.tree.unflatten(tree, [matrix.reshape(first.shape).astype(first.dtype), *others])
 
 
 class QPSolution(eqx.Module):

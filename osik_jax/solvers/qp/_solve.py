@@ -15,7 +15,7 @@ from ...execution import _rules
 from ...execution._backends import Backend, check_backend, here
 from ...numerics._constants import FEASIBILITY, INACTIVE
 from ...numerics._dense import apply
-from .._box import clip_roundoff, uncrossed
+from .._box import clip_roundoff, ordered_bounds
 from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._dispatch import qp_solver
@@ -188,7 +188,7 @@ def _solve(
     n, dtype = m - p, qp.lower.dtype
     tolerance = jnp.asarray(FEASIBILITY if tolerance is None else tolerance, dtype)
     # bounds with lower > upper become equalities halfway; the status says so
-    low, high, crossed = uncrossed(qp.lower, _upper(qp))
+    low, high, unordered = ordered_bounds(qp.lower, _upper(qp))
     # NaN and negative weights are replaced before the first operation, so that derivatives stay finite
     safe, is_valid = _with_placeholder(replace(qp, lower=low, upper=high))
     start = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
@@ -214,7 +214,7 @@ def _solve(
     value = apply(safe.rows, x)
     return QPSolution(
         x=x,
-        status=_status(is_finite, crossed, result),
+        status=_status(is_finite, unordered, result),
         iterations=result.iterations,
         factorizations=result.factorizations,
         kkt_residual=result.residual,
@@ -232,9 +232,9 @@ def _upper(qp: QP) -> Float[Array, " n_and_p"]:
     return jnp.where(np.array(qp.known_equalities), qp.lower, qp.upper)
 
 
-def _status(is_finite: Bool[Array, ""], crossed: Bool[Array, ""], result: SearchResult) -> Array:
+def _status(is_finite: Bool[Array, ""], unordered: Bool[Array, ""], result: SearchResult) -> Array:
     status = jnp.where(result.optimal, Status.SOLVED, Status.MAX_ITERATIONS)
-    status = jnp.where(result.infeasible | crossed, Status.INFEASIBLE, status)
+    status = jnp.where(result.infeasible | unordered, Status.INFEASIBLE, status)
     return jnp.where(is_finite, status, Status.NUMERICAL_ERROR)
 
 

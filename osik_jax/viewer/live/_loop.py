@@ -288,7 +288,7 @@ class ControlLoop:
         run_before_others()
         deadline = time.perf_counter()
         while not self._stop.is_set():
-            self._tick()
+            self._run_once()
             deadline += self.dt
             wait = deadline - time.perf_counter()
             if wait > 0.0:
@@ -296,7 +296,7 @@ class ControlLoop:
             elif wait < -_LATE * self.dt:
                 deadline = time.perf_counter()
 
-    def _tick(self) -> None:
+    def _run_once(self) -> None:
         begin = time.perf_counter()
         while self._orders:
             self._orders.popleft()()

@@ -1,4 +1,4 @@
-"""Derivatives of a tick with respect to every number: robot, q, tasks, scheme, limits, dt."""
+"""Derivatives of a step with respect to every number: robot, q, tasks, scheme, limits, dt."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ def scattered(rng, setting, spread, cases=CASES):
     return path, (base, change, moves, turns)
 
 
-class TestTick:
+class TestStep:
     @pytest.mark.variants(release=["hierarchical", "null-space"])
     @all_schemes
-    def test_a_thousand_ticks_of_the_arm(self, arm, rng, name):
+    def test_a_thousand_steps_of_the_arm(self, arm, rng, name):
         """Velocity, slacks and errors, along a change of everything at once."""
         path, cases = scattered(rng, arm_setting(arm, SCHEMES[name]), 0.4)
         assert_exact(check(answer, path, cases), most=0.9)

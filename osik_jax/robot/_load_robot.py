@@ -1,0 +1,54 @@
+"""Robots by name: those that come with the package, and those of robot_descriptions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from .._errors import OsikTypeError
+from . import loading
+from ._home_configuration import Home
+from ._robot import LockedJoints, PositionLimits, Robot
+
+
+def load_robot(
+    name: str,
+    *,
+    floating_base: bool | None = None,
+    velocity_limits: Mapping[str, float] | None = None,
+    position_limits: PositionLimits | None = None,
+    locked_joints: LockedJoints = (),
+    home: Home | None = None,
+) -> Robot:
+    """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
+
+    Any other name is one of the package robot_descriptions (the extra ``descriptions``): MuJoCo Menagerie as
+    ``panda_mj_description``, ``g1_mj_description`` and so on, URDFs as ``panda_description``. That package clones the
+    robot's git repository into a cache when it is asked for the first time.
+
+    Args:
+        name: of the robot.
+        floating_base: as in ``Robot.from_mjcf`` and, for URDFs, ``Robot.from_urdf``.
+        velocity_limits: likewise.
+        position_limits: likewise.
+        locked_joints: likewise.
+        home: likewise.
+
+    Raises:
+        KeyError: no such robot; the message lists those with names like it. No such joint or keyframe.
+        ImportError: the robot is one of robot_descriptions, which is not installed.
+        ValueError: the robot comes as xacro alone, its file cannot be read, or ``home`` does not fit.
+
+    Warns:
+        OsikWarning: as in ``Robot.from_mjcf`` and ``Robot.from_urdf``.
+    """
+    if not isinstance(name, str):
+        raise OsikTypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, loading.ROBOTS))}")
+    load = loading.embedded if name in loading.ROBOTS else loading.described
+    fields = load(
+        name,
+        floating_base=floating_base,
+        velocity_limits=velocity_limits,
+        position_limits=position_limits,
+        locked_joints=locked_joints,
+    )
+    return Robot._at_home(fields, home)

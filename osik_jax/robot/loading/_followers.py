@@ -1,0 +1,149 @@
+"""Mimic joints and locked joints of a MuJoCo model: which joints follow others, and which have one value."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from ..._errors import OsikTypeError, OsikValueError, unknown_name
+from .._tree import BALL, FREE, QPOS_WIDTH
+
+_LOCK_TOLERANCE = 1e-9
+"""How far the value asked of a locked follower may be from where its leader puts it [rad or m]."""
+
+
+class Follower(NamedTuple):
+    """By joint index, ``q_joint = multiplier * q_leader + offset``."""
+
+    joint: int
+    leader: int
+    multiplier: float
+    offset: float
+
+
+class Lock(NamedTuple):
+    """The qpos entries that a joint is to be locked at, and whether the user gave them."""
+
+    value: np.ndarray
+    given: bool
+
+
+def as_mapping(locked: Iterable[str] | Mapping[str, float]) -> dict[str, float | None]:
+    """Names or globs of joints to lock; None where no value is given."""
+    if isinstance(locked, str):
+        raise OsikTypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
+    return dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked)
+
+
+def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
+    """Joints whose name is, or else matches the glob, ``pattern``; KeyError with the names where none does."""
+    if pattern in names:
+        return [names.index(pattern)]
+    found = [j for j, name in enumerate(names) if fnmatch.fnmatchcase(name, str(pattern))]
+    if not found:
+        raise unknown_name("joint", pattern, names)
+    return found
+
+
+def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[str, float | None]) -> dict[int, Lock]:
+    """Joint index to what is asked of it; without a value, a joint stays where qpos0 has it."""
+    out: dict[int, Lock] = {}
+    for pattern, value in asked.items():
+        for joint in match_joints(pattern, names):
+            start, kind = model.jnt_qposadr[joint], int(model.jnt_type[joint])
+            if value is None:
+                out[joint] = Lock(model.qpos0[start : start + QPOS_WIDTH[kind]].copy(), given=False)
+            elif kind in (FREE, BALL):
+                raise OsikValueError(
+                    f"joint {names[joint]!r} is free or ball: it can only be locked where the model has it"
+                )
+            elif not math.isfinite(value):
+                raise OsikValueError(f"joint {names[joint]!r} cannot be locked at {value}")
+            else:
+                out[joint] = Lock(np.array([float(value)]), given=True)
+    return out
+
+
+def equality_followers(model: mujoco.MjModel) -> tuple[list[Follower], dict[int, np.ndarray]]:
+    """What the active joint equality constraints say: linear in another joint, or (second result) constant.
+
+    Those of a higher degree are left out.
+    """
+    followers, constants = [], {}
+    for e in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool)):
+        joint, leader = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        constant, slope, *higher = (float(x) for x in model.eq_data[e][:5])
+        reference = float(model.qpos0[model.jnt_qposadr[joint]])
+        if leader < 0 or not (slope or any(higher)):
+            constants[joint] = np.array([reference + constant])
+        elif not any(higher):
+            start = float(model.qpos0[model.jnt_qposadr[leader]])
+            followers.append(Follower(joint, leader, slope, reference + constant - slope * start))
+    return followers, constants
+
+
+def resolve_followers(
+    names: tuple[str, ...],
+    relations: Sequence[Follower],
+    constants: Mapping[int, np.ndarray],
+    asked: Mapping[int, Lock],
+) -> tuple[list[Follower], dict[int, np.ndarray]]:
+    """Followers of independent joints, chains followed to their end, and the values of all locked joints.
+
+    A follower whose leader is locked is locked where the leader puts it.
+    """
+    table: dict[int, Follower] = {}
+    for relation in relations:
+        if relation.joint in table or relation.joint in constants:
+            raise OsikValueError(f"joint {names[relation.joint]!r} is tied by more than one joint equality")
+        table[relation.joint] = relation
+    locked = {joint: lock.value for joint, lock in asked.items() if joint not in table} | dict(constants)
+    followers = []
+    for joint in sorted(table):
+        follower = _end_of_chain(names, table, joint)
+        if follower.leader in locked:
+            locked[joint] = follower.multiplier * locked[follower.leader] + follower.offset
+            _check_lock(names, follower, asked.get(joint), locked[joint])
+        elif joint in asked:
+            raise OsikValueError(
+                f"joint {names[joint]!r} cannot be locked alone: it mimics {names[follower.leader]!r}, lock that one"
+            )
+        else:
+            followers.append(follower)
+    return followers, locked
+
+
+def _end_of_chain(names: tuple[str, ...], table: Mapping[int, Follower], joint: int) -> Follower:
+    """The follower in terms of a leader that follows nobody."""
+    _, leader, multiplier, offset = table[joint]
+    seen = [joint]
+    while leader in table:
+        if leader in seen:
+            raise OsikValueError(f"joints mimic each other in a circle: {', '.join(names[j] for j in seen)}")
+        seen.append(leader)
+        _, leader, m, o = table[leader]
+        multiplier, offset = multiplier * m, multiplier * o + offset
+    return Follower(joint, leader, multiplier, offset)
+
+
+def _check_lock(names: tuple[str, ...], follower: Follower, asked: Lock | None, value: np.ndarray) -> None:
+    if asked is not None and asked.given and abs(asked.value - value).max() > _LOCK_TOLERANCE:
+        raise OsikValueError(
+            f"joint {names[follower.joint]!r} cannot be locked at {asked.value[0]}: it mimics "
+            f"{names[follower.leader]!r}, which puts it at {value[0]}"
+        )
+
+
+def qpos_offset(model: mujoco.MjModel, followers: list[Follower], locked: Mapping[int, np.ndarray]) -> np.ndarray:
+    """Values of locked joints and offsets of followers in the model's qpos, 0 elsewhere."""
+    out = np.zeros(model.nq)
+    for joint, value in locked.items():
+        out[model.jnt_qposadr[joint] :][: len(value)] = value
+    for follower in followers:
+        out[model.jnt_qposadr[follower.joint]] = follower.offset
+    return out
