@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -49,7 +48,8 @@ class QP(eqx.Module):
 
 def arrays(qp: QP) -> tuple[list[Array], Any]:
     """Return the cost's matrix, then all other arrays in the order in which ``packed`` has them; and their tree."""
-    return jax.tree.flatten(replace(qp, packed=None))
+    # not by replace: the constructor's annotations are of one problem, and a kernel gets a batch
+    return jax.tree.flatten(eqx.tree_at(lambda p: p.packed, qp, None, is_leaf=lambda leaf: leaf is None))
 
 
 def unpack(like: QP, matrix: Float[Array, "..."], packed: Float[Array, " k"]) -> QP:
