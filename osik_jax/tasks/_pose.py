@@ -229,7 +229,7 @@ def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian
     given = (position, rotation, jacobian, numbers)
     lanes, count, nv = max(len(a) for a in given), len(kept), jacobian.shape[-1]
     options = np.array([*task.kept, task.axes == "frame", task.orientation_jacobian == "geometric"], np.int32)
-    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (7 * nv + 12,)
+    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (6 * nv + 12,)
     error, rows, wanted, curvature, pull, levers, _ = _target.call(
         "_pose_rows", [(shape, float) for shape in shapes], *given, options
     )

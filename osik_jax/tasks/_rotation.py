@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from ..execution._backends import cuda_is_default
+
 _SMALL_SINE_SQUARED = 1e-6
 _SMALL_ANGLE_SQUARED = 1e-2
 
@@ -55,5 +57,12 @@ def cross_matrix(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """The matrix product, in full precision on every device."""
+    """The matrix product, in full precision on every device.
+
+    Sums of three are written out where JAX's default is a GPU, whose library takes nine times as long for a batch of
+    them. On a CPU they make a gradient a sixth slower.
+    """
+    if cuda_is_default() and a.ndim == 2 and a.shape[1] == 3:
+        x, y, z = (a[:, i, None] * b[i] if b.ndim == 2 else a[:, i] * b[i] for i in range(3))
+        return x + y + z
     return jnp.matmul(a, b, precision="highest")

@@ -152,34 +152,33 @@ def pose_rows(p, R, J, p_wanted, R_wanted, rates, in_frame, geometric, whole, er
 
 
 @lean
-def paired(pull, J, first, bends):
-    """Return the Frobenius norm of the entries ``pull . (axis_i x arm_j)``; arms are rows of J from ``first`` on.
+def paired(pull, axes, arms):
+    """Return the Frobenius norm of the matrix with the entries ``pull . (axis_i x arm_j)``.
 
     Args:
         pull: a vector.
-        J: [linear; angular]. (6, nv)
-        first: 0 or 3.
-        bends: whether each dof turns something. (nv,)
+        axes: products of the axes with each other: xx, xy, xz, yy, yz, zz.
+        arms: those of the arms.
     """
     size = max(abs(pull[0]), abs(pull[1]), abs(pull[2]))
     if not size > 0.0:
         return 0.0
-    unit = scaled(1.0 / size, pull)
-    txx, txy, txz, tyy, tyz, tzz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    axx, axy, axz, ayy, ayz, azz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for j in range(J.shape[1]):
-        if bends[j] == 0.0:
-            continue
-        x, y, z = cross(unit, (J[3, j], J[4, j], J[5, j]))
-        txx, txy, txz, tyy, tyz, tzz = txx + x * x, txy + x * y, txz + x * z, tyy + y * y, tyz + y * z, tzz + z * z
-        x, y, z = J[first, j], J[first + 1, j], J[first + 2, j]
-        axx, axy, axz, ayy, ayz, azz = axx + x * x, axy + x * y, axz + x * z, ayy + y * y, ayz + y * z, azz + z * z
-    squared = txx * axx + tyy * ayy + tzz * azz + 2.0 * (txy * axy + txz * axz + tyz * ayz)
+    x, y, z = scaled(1.0 / size, pull)
+    xx, xy, xz, yy, yz, zz = axes
+    # products of ``pull x axis_i`` with each other
+    txx = y * y * zz - 2.0 * y * z * yz + z * z * yy
+    tyy = z * z * xx - 2.0 * z * x * xz + x * x * zz
+    tzz = x * x * yy - 2.0 * x * y * xy + y * y * xx
+    txy = y * z * xz - x * y * zz - z * z * xy + x * z * yz
+    txz = x * y * yz - y * y * xz - x * z * yy + y * z * xy
+    tyz = x * z * xy - y * z * xx - x * x * yz + x * y * xz
+    xx, xy, xz, yy, yz, zz = arms
+    squared = txx * xx + tyy * yy + tzz * zz + 2.0 * (txy * xy + txz * xz + tyz * yz)
     return size * np.sqrt(squared) if squared > 0.0 else 0.0
 
 
 @lean
-def pose_curvature(R, J, weight, pull, kept, in_frame, bends):
+def pose_curvature(R, J, weight, pull, kept, in_frame):
     """Return ``tasks/_curvature.py: pose_curvature`` of the weighted pull of the rows that are kept."""
     fx, fy, fz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     row = 0
@@ -203,9 +202,17 @@ def pose_curvature(R, J, weight, pull, kept, in_frame, bends):
     force, torque = (fx, fy, fz), (tx, ty, tz)
     if in_frame:
         force, torque = rotated(R, force), rotated(R, torque)
+    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    axx, axy, axz, ayy, ayz, azz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(J.shape[1]):
-        bends[j] = 1.0 if J[3, j] != 0.0 or J[4, j] != 0.0 or J[5, j] != 0.0 else 0.0
-    return (paired(force, J, 0, bends) + 0.5 * paired(torque, J, 3, bends)) / np.sqrt(2.0)
+        x, y, z = J[3, j], J[4, j], J[5, j]
+        if x == 0.0 and y == 0.0 and z == 0.0:
+            continue
+        xx, xy, xz, yy, yz, zz = xx + x * x, xy + x * y, xz + x * z, yy + y * y, yz + y * z, zz + z * z
+        x, y, z = J[0, j], J[1, j], J[2, j]
+        axx, axy, axz, ayy, ayz, azz = axx + x * x, axy + x * y, axz + x * z, ayy + y * y, ayz + y * z, azz + z * z
+    axes = (xx, xy, xz, yy, yz, zz)
+    return (paired(force, axes, (axx, axy, axz, ayy, ayz, azz)) + 0.5 * paired(torque, axes, axes)) / np.sqrt(2.0)
 
 
 def handle(frame):
@@ -216,8 +223,8 @@ def handle(frame):
     lanes, m, nv = dimension(found, 0), dimension(found, 8), dimension(found + 8, 16)
     options = whole_numbers(data(given + 32), 8)
     in_frame, geometric, space = options[6] != 0, options[7] != 0, data(found + 48)
-    whole, bends = matrix(space, 6, nv), vector(space + 48 * nv, nv)
-    wrong, forward = vector(space + 56 * nv, 6), vector(space + 56 * nv + 48, 6)
+    whole = matrix(space, 6, nv)
+    wrong, forward = vector(space + 48 * nv, 6), vector(space + 48 * nv + 48, 6)
     # bytes between the lanes of each argument, 0 where all have the same
     at, facing = 24 * (dimension(given, 0) > 1), 72 * (dimension(given + 8, 0) > 1)
     moving, other = 48 * nv * (dimension(given + 16, 0) > 1), 8 * (19 + m) * (dimension(given + 24, 0) > 1)
@@ -245,5 +252,5 @@ def handle(frame):
             row += 1
         for j in range(nv):
             levers[j] = np.sqrt(levers[j])
-        vector(data(found + 24) + 8 * lane, 1)[0] = pose_curvature(R, J, weight, pull, options, in_frame, bends)
+        vector(data(found + 24) + 8 * lane, 1)[0] = pose_curvature(R, J, weight, pull, options, in_frame)
     return 0
