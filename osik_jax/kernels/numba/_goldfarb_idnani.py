@@ -16,14 +16,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, REDUNDANCY_TOL
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, KERNEL_DEPENDENCE, REDUNDANCY_TOL
 from ._dense import add_multiple, add_row, dot, fill, invert_upper, rotate
 from ._frame import lean
 
-_DEPENDENT = 1e-14
-"""Of |J'n|^2; a constraint of which the active ones leave less than this depends on them."""
-_IMPLIED = REDUNDANCY_TOL[np.dtype("float64")]
-"""In units of roundoff: a dependent constraint that is violated by less is implied, by more it contradicts."""
+_REDUNDANCY_TOL = REDUNDANCY_TOL[np.dtype("float64")]
 
 
 @lean
@@ -189,10 +186,10 @@ def dual_active_set(P, W, labels, x, z, count, most_changes):
             whole, left = dot(d, d, 0, N), dot(d, d, count, N)
             value = value_of(P, v, entering, n)
             gap = max(P.lower[entering] - value if side > 0.0 else value - P.upper[entering], 0.0)
-            full = gap / left if left > _DEPENDENT * whole else np.inf
+            full = gap / left if left > KERNEL_DEPENDENCE * whole else np.inf
             length, leaving = ratio_test(labels, order, u, r, count)
             if not (full < np.inf or length < np.inf):
-                if not gap <= _IMPLIED * W.value_roundoff[entering]:
+                if not gap <= _REDUNDANCY_TOL * W.value_roundoff[entering]:
                     return np.int64(-1), count
                 W.next[entering] = 1
                 break

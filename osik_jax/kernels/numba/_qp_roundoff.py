@@ -7,18 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import INACTIVE
+from ...numerics._constants import BOUND_MULTIPLIER, EPSILON, INACTIVE, ZERO_TOL
 from ._frame import lean
 from ._padded_rows import clear, largest_product, plus_sizes
-from ._qp_active_set_solve import EPS
 from ._tiles import padded
-
-_NOUGHT = 100.0
-"""Roundings of what the cost pulls at x; an x that is no larger is 0."""
-_TOLD_FROM_NONE = 1.0
-"""Roundings of the terms at a variable on a bound; a multiplier of the wrong sign that is larger lets it go.
-
-Tolerances of the cost's curvature would not do: a weak task, such as a posture, pulls with less than those."""
 
 
 @lean(inline="always")
@@ -33,7 +25,7 @@ def find_roundoff(P, W, labels, tolerance, x, z):
         W.step[j] = abs(gradient) * (P.reach[j] * P.reach[j])
     most, pulled_most = largest_product(x, P.root, wide), largest_product(W.step, P.root, wide)
     longest = largest_product(x, W.ones, wide)
-    if most <= _NOUGHT * EPS * pulled_most:
+    if most <= ZERO_TOL * EPSILON * pulled_most:
         most, longest = pulled_most, largest_product(W.step, W.ones, wide)
     at_bound = False
     for j in range(n):
@@ -63,9 +55,9 @@ def find_bound_roundoff(P, W, x, z):
     plus_sizes(W.pull, W.pull, x, P.turned, 0, n, 0, padded(rows))
     for i in range(rows):
         size = abs(z[i]) if i >= m else abs(P.target[i]) + W.pull[i]
-        W.pull[i] = _TOLD_FROM_NONE * EPS * size
+        W.pull[i] = BOUND_MULTIPLIER * EPSILON * size
     for j in range(n):
-        W.step[j] = _TOLD_FROM_NONE * EPS * P.damping[j] * (abs(x[j]) + abs(P.center[j]))
+        W.step[j] = BOUND_MULTIPLIER * EPSILON * P.damping[j] * (abs(x[j]) + abs(P.center[j]))
     plus_sizes(W.step, W.step, W.pull, P.rows, 0, rows, 0, padded(n))
     for j in range(n):
         W.multiplier_roundoff[j] = W.step[j]

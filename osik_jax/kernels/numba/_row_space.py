@@ -14,14 +14,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...numerics._constants import INDEPENDENT_ROWS
 from ._dense import add_multiple, dot, fill
 from ._frame import lean
 from ._padded_rows import add_to_rows, clear, minus_rows, plus_rows, plus_squares, put, put_multiple, transpose
 from ._symmetric import factor_symmetric, solve_symmetric
 from ._tiles import padded, take_product
-
-WELL_APART = 1e-7
-"""Least eigenvalue of a Gram matrix, of its trace, from which on its factors are accurate enough."""
 
 
 @lean
@@ -163,7 +161,7 @@ def are_independent(W, m, rank):
     mean, product = trace / max(rank - 1, 1), 1.0
     for k in range(rank):
         product *= W.right[k] / mean
-    return product * mean >= WELL_APART * trace
+    return product * mean >= INDEPENDENT_ROWS * trace
 
 
 @lean
@@ -204,7 +202,7 @@ def solve_in_all(W, m, n, first, damping, cutoff):
     for j in range(left):
         product /= W.inverse[j] * mean
     least = product * mean
-    if not (least >= WELL_APART * trace and least - damping > 2.0 * m * cutoff * cutoff):
+    if not (least >= INDEPENDENT_ROWS * trace and least - damping > 2.0 * m * cutoff * cutoff):
         return False
     plus_rows(W.right, W.nought, W.wanted, W.rows, 0, m, 0, left)
     solve_symmetric(W.lower, W.upper, W.inverse, W.right, left)

@@ -9,7 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE, FULL_STEP, NEGLIGIBLE_STEP, SATURATION_RESIDUAL
+from ...numerics._constants import (
+    BLOCKING_RANK,
+    BOUND_DISTANCE,
+    FULL_STEP,
+    LOOSE_SATURATION_RANK,
+    NEGLIGIBLE_STEP,
+    SATURATION_RANK,
+    SATURATION_RESIDUAL,
+)
 from ._dense import fill
 from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
 from ._projection import (
@@ -25,12 +33,6 @@ from ._row_space import set_beside, take_row_space
 from ._row_space_workspace import work_at, work_size
 from ._saturation_search import Search, bound, search, size
 from ._vectors import add, dot
-
-LEAST = 1e-9
-"""Part of a joint's unit vector in the null space and outside the span of held ones, with less of which it depends on
-them; part of the largest in a combination, with less of which a joint does not stop the motion."""
-LOOSER = 1e-6
-"""The same for a second attempt, where the answer of the first does not hold: joints nearly depended on each other."""
 
 
 @lean
@@ -161,9 +163,9 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side
     damping = damping_of(W, S, level, x, first, longest)
     look(W, level, x)
     rank = find_motion(W, level, first, damping, rank_tolerance, plain)
-    scale, held, stop, changes, done = attempt(W, S, x, target, first + rank, most, LEAST)
+    scale, held, stop, changes, done = attempt(W, S, x, target, first + rank, most, SATURATION_RANK)
     if not done and changes < most:
-        scale, held, stop, more, done = attempt(W, S, x, target, first + rank, most, LOOSER)
+        scale, held, stop, more, done = attempt(W, S, x, target, first + rank, most, LOOSE_SATURATION_RANK)
         changes += more
     blocker = decide(S, held, stop, side, blocking)
     if not done:

@@ -31,13 +31,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...numerics._constants import SATURATION_ROUNDOFF
+from ...numerics._constants import LARGEST_RATE, SATURATION_ROUNDOFF
 from ._dense import fill
 from ._frame import lean
 from ._vectors import add, add_squares, dot
-
-UNEVEN = 10.0
-"""Of a combination, so many times what the entering joint has: a joint with more is what the others say most about."""
 
 
 class Search(NamedTuple):
@@ -360,7 +357,7 @@ def search(W, S, start, target, first, most, least):
             if not lower < scale - SATURATION_ROUNDOFF:  # but for rounding it is where the others put it
                 S.passed[k] = side
                 continue
-            largest = UNEVEN
+            largest = LARGEST_RATE
             for a in range(held):
                 if abs(S.rate[a]) > largest:
                     out, largest = a, abs(S.rate[a])
