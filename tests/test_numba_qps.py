@@ -9,6 +9,7 @@ import pytest
 from optimality import by_daqp
 from problem_families import PLANTED, QPs
 from recorded import QP_DAMPING, recorded_qps
+from used_memory import used_memory
 from weighted_families import MANY, M, N, P, Problems, problems
 
 from benchmarks.agreement import planted
@@ -156,6 +157,18 @@ def test_what_was_once_left_over_is_at_the_planted_optimum(family, seed, lanes):
     values = np.einsum("bpn,bn->bp", p.rows, taken.x)
     beyond = np.maximum(p.rows_lower - values, values - p.rows_upper).max(1)
     assert (beyond < 1e-9 * np.abs(values).max(1)).all()
+
+
+@pytest.mark.parametrize("m", [M, MANY])
+def test_memory_that_was_used_before_says_nothing(m, monkeypatch):
+    """Whatever the kernel finds in its space and results; ``MANY`` rows are more than variables."""
+    p, found = problems(m=m), []
+    for left in (0.0, np.nan, 1e300):
+        with used_memory(monkeypatch, left):
+            found.append(candidates(p))
+    assert (found[0].converged != 0).mean() > 0.99 and np.isfinite(found[0].x).all()
+    for other in found[1:]:
+        jax.tree.map(np.testing.assert_array_equal, found[0], other)
 
 
 def test_one_problem_is_a_lane_of_a_batch():

@@ -21,7 +21,7 @@ import numpy as np
 
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 """Labels of a constraint in an active set."""
-IMPLIED = 3
+REDUNDANT = 3
 """In a kernel's candidate: inactive, for it depends on the active ones, and holds up to roundoff where they do."""
 
 EPSILON = float(np.finfo(np.float64).eps)

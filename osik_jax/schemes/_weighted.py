@@ -37,7 +37,7 @@ class WeightedQP(Scheme):
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
             none. What is added vanishes where the tasks are met (``TaskRows.curvature``), with the square of their
             error where a posture or the damping is strong enough by itself.
-        max_iterations: cap on changes of the active set (static).
+        max_iterations: limit on changes of the active set (static).
         backend: whose candidates for the answer are taken, as in ``solve_least_squares_qp`` (static).
     """
 

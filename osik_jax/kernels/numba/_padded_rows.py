@@ -317,7 +317,7 @@ def _multiply_plain(out, a, b, stop):
 
 
 @lean
-def _pull_plain(out, d, a, b, stop):
+def _damping_gradient_plain(out, d, a, b, stop):
     for j in range(min(stop, len(out), len(d), len(a), len(b))):
         out[j] = d[j] * (a[j] - b[j])
 
@@ -334,8 +334,10 @@ put_difference: Any = _subtract_plain if _CHECKED else _each("subtract", lambda 
 """``(out, a, b, stop)``: out = a - b."""
 put_product: Any = _multiply_plain if _CHECKED else _each("multiply", lambda builder, a, b: builder.fmul(a, b), 2)
 """``(out, a, b, stop)``: out = a b."""
-put_pull: Any = (
-    _pull_plain if _CHECKED else _each("pull", lambda builder, d, a, b: builder.fmul(d, builder.fsub(a, b)), 3)
+put_damping_gradient: Any = (
+    _damping_gradient_plain
+    if _CHECKED
+    else _each("damping_gradient", lambda builder, d, a, b: builder.fmul(d, builder.fsub(a, b)), 3)
 )
 """``(out, d, a, b, stop)``: out = d (a - b)."""
 

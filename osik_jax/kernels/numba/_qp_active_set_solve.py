@@ -16,11 +16,11 @@ from ._padded_rows import (
     largest_product,
     minus_rows,
     put,
+    put_damping_gradient,
     put_difference,
     put_inverse,
     put_multiple,
     put_product,
-    put_pull,
 )
 from ._qp_problem import active_bound
 from ._symmetric import factor_symmetric, solve_symmetric
@@ -89,7 +89,7 @@ def find_gradient(P, W, labels, x, z):
         find_gaps(P, W, labels, x, z)
         for i in range(m):
             z[i] = W.gap[i]
-    put_pull(W.gradient, P.damping, x, P.center, padded(n))
+    put_damping_gradient(W.gradient, P.damping, x, P.center, padded(n))
     minus_rows(W.gradient, W.gradient, z, P.rows, 0, rows, 0, padded(n))
 
 
@@ -143,11 +143,11 @@ def solve_in_row_space(P, W, labels, count, x, z):
     before = np.inf
     for _ in range(_MAX_REFINEMENTS):
         solve_symmetric(W.factor, W.turned_factor, W.pivots, W.right, k)
-        clear(W.pull, padded(rows))
+        clear(W.row_terms, padded(rows))
         for a in range(k):
             z[W.used[a]] += W.right[a]
-            W.pull[W.used[a]] = W.right[a]
-        minus_rows(W.step, W.gradient, W.pull, P.rows, 0, rows, 0, wide)
+            W.row_terms[W.used[a]] = W.right[a]
+        minus_rows(W.step, W.gradient, W.row_terms, P.rows, 0, rows, 0, wide)
         put_product(W.step, W.step, W.inverse, wide)
         put_difference(x, x, W.step, wide)
         moved, far = largest_product(W.step, P.root, wide), largest_product(x, P.root, wide)

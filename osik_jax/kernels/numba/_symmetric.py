@@ -182,10 +182,10 @@ def factor_symmetric(S, L, T, inverse, diagonal, n, smallest):
             take_product(S, T, S, k, k + WIDTH, k, wide, 0, k)
         _factor_rows(S, T, inverse, k, wide)
     transpose_upper(L, T, wide, wide)
-    sound = True
+    is_regular = True
     for j in range(n):
-        sound = sound and inverse[j] > 0.0 and smallest * diagonal[j] * inverse[j] <= 1.0
-    return sound
+        is_regular = is_regular and inverse[j] > 0.0 and smallest * diagonal[j] * inverse[j] <= 1.0
+    return is_regular
 
 
 @lean
