@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -328,7 +328,7 @@ def test_memory_that_was_used_before_says_nothing(name, method, monkeypatch):
     found = []
     for left in (0.0, np.nan):
         with used_memory(monkeypatch, left):
-            found.append(jax.jit(partial(solved.__wrapped__, method=method))(FAMILIES[name]))
+            found.append(jax.jit(partial(cast(Any, solved).__wrapped__, method=method))(FAMILIES[name]))
     assert np.isfinite(found[0].x).all()
     jax.tree.map(np.testing.assert_array_equal, *found)
 
