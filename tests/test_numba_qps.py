@@ -208,7 +208,7 @@ def test_sums_and_factors_in_blocks_are_those_of_numpy():
     """Of every size up to three blocks, in matrices that are wider; what is behind them comes into nothing."""
     import numba
 
-    from osik_jax.kernels.numba import _padded_rows, _symmetric
+    from osik_jax.kernels.numba import _padded_rows, _symmetric, _transpose
 
     @numba.njit
     def solved_by_blocks(S, L, T, inverse, diagonal, b, n):
@@ -229,7 +229,7 @@ def test_sums_and_factors_in_blocks_are_those_of_numpy():
 
     @numba.njit
     def others(T, B, u, v, c):
-        _padded_rows.transpose(T, B, 13, 35)
+        _transpose.transpose(T, B, 13, 35)
         _padded_rows.add_to_rows(B, u, v, 2, 7, 8, 40)
         _padded_rows.put_multiple(c, 3.0, v, 35)
         return _padded_rows.largest_product(v, v, 40)

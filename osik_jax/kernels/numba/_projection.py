@@ -26,7 +26,7 @@ from ...numerics._constants import (
 )
 from ._dense import add_multiple, dot, fill
 from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
-from ._padded_rows import clear, minus_rows, plus_rows, plus_squares, put_multiple, transpose
+from ._padded_rows import clear, minus_rows, plus_rows, plus_squares, put_multiple
 from ._row_space import (
     are_independent,
     set_beside,
@@ -39,6 +39,7 @@ from ._row_space import (
 from ._row_space_workspace import work_at
 from ._symmetric import factor_symmetric, solve_symmetric
 from ._tiles import padded
+from ._transpose import transpose
 
 
 class Level(NamedTuple):

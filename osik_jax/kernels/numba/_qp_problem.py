@@ -8,8 +8,9 @@ import numpy as np
 
 from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
 from ._frame import lean
-from ._padded_rows import plus_squares, put_inverse, put_multiple, put_root, transpose
+from ._padded_rows import plus_squares, put_inverse, put_multiple, put_root
 from ._tiles import padded
+from ._transpose import transpose
 
 
 class Problem(NamedTuple):

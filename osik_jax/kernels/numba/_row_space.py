@@ -17,9 +17,10 @@ import numpy as np
 from ...numerics._constants import INDEPENDENT_ROWS
 from ._dense import add_multiple, dot, fill
 from ._frame import lean
-from ._padded_rows import add_to_rows, clear, minus_rows, plus_rows, plus_squares, put, put_multiple, transpose
+from ._padded_rows import add_to_rows, clear, minus_rows, plus_rows, plus_squares, put, put_multiple
 from ._symmetric import factor_symmetric, solve_symmetric
 from ._tiles import padded, take_product
+from ._transpose import transpose
 
 
 @lean
