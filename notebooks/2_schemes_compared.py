@@ -42,9 +42,9 @@ osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)
 
 FAST = "OSIK_FAST" in os.environ  # the tests run this notebook with smaller sizes
-REPEATS = 1 if FAST else 15  # of each run, for the time of a tick
+REPEATS = 1 if FAST else 15  # of each run, for the time of a step
 SWEEP = 2 if FAST else 13  # points of each curve over a parameter
-DT, STEPS = 0.01, 500  # one tick [s], and how many: 5 s
+DT, STEPS = 0.01, 500  # one step [s], and how many: 5 s
 
 plt.rcParams.update({"figure.dpi": 80, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True})
 plt.rcParams.update({"grid.color": "#e3e7ec", "axes.axisbelow": True, "axes.titlelocation": "left"})
@@ -162,7 +162,7 @@ for name in SCHEMES:
             given = arguments(situation, name, calm)
             results[situation, name, calm] = measured(jax.block_until_ready(run(*given)), given[2])
 unsolved = {key: result["solved"] for key, result in results.items() if result["solved"] < 1.0}
-assert all(key[:2] == ("out of reach", "null space, saturated") for key in unsolved)  # else every tick is solved
+assert all(key[:2] == ("out of reach", "null space, saturated") for key in unsolved)  # else every step is solved
 assert min(unsolved.values(), default=1.0) > 0.95  # there some steps hold still: joints at limits depend on each other
 
 # %% [markdown]
@@ -170,7 +170,7 @@ assert min(unsolved.values(), default=1.0) > 0.95  # there some steps hold still
 # elbow should be.
 
 # %%
-WAITING = 275  # the tick in the middle of the wait
+WAITING = 275  # the step in the middle of the wait
 
 
 def drawn(situation):
@@ -256,8 +256,8 @@ for name in SCHEMES:
 #
 # **How smoothly.** Bare, all schemes use every direction that has any effect, however little. Where a task
 # cannot be met, that is a direction in which the joints race and the task gains nothing: the joints jump from one speed
-# limit to the other at every tick, and without limits (null space) they race off. The accuracy of the answer is not the
-# problem: each of these ticks is solved. Damping ends it, at once and in all schemes.
+# limit to the other at every step, and without limits (null space) they race off. The accuracy of the answer is not the
+# problem: each of these steps is solved. Damping ends it, at once and in all schemes.
 
 # %%
 fig, grid = plt.subplots(1, 2, figsize=(11, 3.0), sharey=True)
@@ -451,7 +451,7 @@ assert results["joint limit", "null space", False]["beyond limit"] > 1e-3
 # %% [markdown]
 # ## How fast
 #
-# Time of one tick inside the compiled loop: the median of repeated runs, after those above that compiled, on the
+# Time of one step inside the compiled loop: the median of repeated runs, after those above that compiled, on the
 # machine that made this notebook. The schemes take turns, so that whatever else the machine does meets all of them; a
 # busy one makes all slower. All are for one robot alone; for batches see `3_many_at_once`.
 
@@ -465,16 +465,16 @@ for _ in range(REPEATS):
         times.append((time.perf_counter() - start) / STEPS)
 print(f"{os.cpu_count()} cores, JAX {jax.__version__}, {os.getloadavg()[0]:.1f} processes running on average")
 
-ticks = {name: [1e6 * np.median(took[situation, name]) for situation in SITUATIONS] for name in SCHEMES}  # [us]
+step_times = {name: [1e6 * np.median(took[situation, name]) for situation in SITUATIONS] for name in SCHEMES}  # [us]
 
 fig, axes = plt.subplots(figsize=(7.5, 3.0))
-for row, (name, values) in enumerate(ticks.items()):
+for row, (name, values) in enumerate(step_times.items()):
     axes.barh(row, np.median(values), color=COLORS[name], height=0.5)
     axes.plot(values, [row] * len(values), "|", color="black", ms=14)
 axes.set_yticks(range(len(SCHEMES)), SCHEMES)
 axes.invert_yaxis()
 axes.set(
-    xlabel="time of a tick [µs] (bars: median; marks: each situation)",
+    xlabel="time of a step [µs] (bars: median; marks: each situation)",
     title="One robot with 7 joints, 13 rows of tasks, on a CPU",
 )
 fig.tight_layout()
@@ -500,14 +500,14 @@ def take_it_when(name):
     reasons = ["the first task must not give way" if strict else "a compromise is fine"]
     reasons += ["limits must hold" if inside else "limits are looked after elsewhere"]
     reasons += ["targets may be out of reach"] if calm else []
-    reasons += ["microseconds count"] if name == min(ticks, key=lambda other: np.median(ticks[other])) else []
+    reasons += ["microseconds count"] if name == min(step_times, key=lambda other: np.median(step_times[other])) else []
     return ", ".join(reasons)
 
 
 table = [
     "| | conflict: hand off [mm] | conflict: elbow off [mm] | conflict: acceleration [rad/s²]"
     " | out of reach: acceleration [rad/s²] | almost straight: hand off [mm] | beyond a joint limit [rad]"
-    " | speed / limit | a tick [µs] | take it when |",
+    " | speed / limit | a step [µs] | take it when |",
     "|" + "---|" * 10,
 ]
 for name in SCHEMES:
@@ -521,7 +521,7 @@ for name in SCHEMES:
         f"| **{name}** | {off['hand'][0]:.1f} → {off['hand'][1]:.1f} | {off['elbow'][0]:.0f} → {off['elbow'][1]:.0f}"
         f" | {rough_pair[0]:.0f} → {rough_pair[1]:.1f} | {far_pair[0]:.0f} → {far_pair[1]:.0f}"
         f" | {straight[0]:.1f} → {straight[1]:.1f} | {worst(name, 'beyond limit', True):.2g}"
-        f" | {worst(name, 'speed', True):.2g} | {np.median(ticks[name]):.0f} | {take_it_when(name)} |"
+        f" | {worst(name, 'speed', True):.2g} | {np.median(step_times[name]):.0f} | {take_it_when(name)} |"
     )
 display(Markdown("\n".join(table)))
 

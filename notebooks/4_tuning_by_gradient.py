@@ -155,25 +155,25 @@ assert tuned.parameters["posture.weight"] < 0.1 * min(tuned.parameters[f"{name}.
 
 # %%
 held_points = points[8:12]
-ticks = round(SECONDS / DT)
-time = DT * np.arange(ticks)
+steps = round(SECONDS / DT)
+time = DT * np.arange(steps)
 which = np.minimum((time / 2.0).astype(int), 3)
 glide = np.clip(time - 2.0 * which, 0.0, 1.0)
 glide = (glide**3 * (10.0 - 15.0 * glide + 6.0 * glide**2))[:, None]  # from 0 to 1, at rest at both ends
 stops = np.concatenate([[[np.asarray(tasks[name].target[0]) for name in hands]], held_points])
-places = stops[which] + glide[..., None] * (stops[which + 1] - stops[which])  # (ticks, hands, 3)
-paths = {name: (places[:, i], np.tile(tasks[name].target[1], (ticks, 1, 1))) for i, name in enumerate(hands)}
+places = stops[which] + glide[..., None] * (stops[which + 1] - stops[which])  # (steps, hands, 3)
+paths = {name: (places[:, i], np.tile(tasks[name].target[1], (steps, 1, 1))) for i, name in enumerate(hands)}
 
 
 def planned(own):
     """The kinematic motion of a loop."""
-    limited = dict(scheme=own.scheme, limits=own.limits, dt=DT, steps=ticks)
+    limited = dict(scheme=own.scheme, limits=own.limits, dt=DT, steps=steps)
     return osik.rollout(robot, robot.q0, own.tasks, targets=paths, **limited)
 
 
 before, after = planned(start), planned(tuned.loop)
 picture = Path(tempfile.mkdtemp()) / "before_and_after.png"
-moment = min(ticks, round(2.0 / DT)) - 1  # before the targets change
+moment = min(steps, round(2.0 / DT)) - 1  # before the targets change
 poses = [np.asarray(path.q[moment]) for path in (before, after)]
 vertices = [np.asarray(support.vertices)] * 2
 display(Image(hero_picture(picture, robot, poses, support=vertices, labels=["before", "after"], size=SIZE)))
@@ -193,7 +193,7 @@ for panel, names, title in ((left, hands, "Hands reach ..."), (right, feet, "...
     panel.legend(frameon=False)
 fig.tight_layout()
 plt.show()
-ends = np.arange(round(2.0 / DT) - 1, ticks, round(2.0 / DT))
+ends = np.arange(round(2.0 / DT) - 1, steps, round(2.0 / DT))
 print("hands off at the end of each reach [mm], before:", off(before, hands)[ends].round(1))
 print("                                          after:", off(after, hands)[ends].round(1))
 assert off(after, hands)[ends].max() < 0.25 * off(before, hands)[ends].max()
@@ -340,13 +340,13 @@ plt.show()
 # %%
 legs = dict.fromkeys(("*Hip*", "*Knee*", "*Ankle*"), physics.Servo(stiffness=150.0, damping=5.0))
 world = physics.build_world(robot, servos=legs)
-FINER = 5  # ticks of 5 ms in one of the plan
+FINER = 5  # steps of 5 ms in one of the plan
 fine_paths = jax.tree.map(lambda path: np.repeat(path, FINER, axis=0), paths)
 
 
 def in_physics(own):
     """The loop in MuJoCo, until it ends or falls."""
-    settings = dict(scheme=own.scheme, limits=own.limits, dt=DT / FINER, steps=FINER * ticks, targets=fine_paths)
+    settings = dict(scheme=own.scheme, limits=own.limits, dt=DT / FINER, steps=FINER * steps, targets=fine_paths)
     return physics.simulate(physics.Simulation(world), own.tasks, **settings)
 
 

@@ -70,7 +70,7 @@ plt.rcParams |= {"axes.spines.top": False, "axes.spines.right": False, "axes.tit
 motions = {name: scene(DURATION) for name, scene in SCENES.items()}
 runs = {name: demo.run_physics(motion, SCHEME, dt=DT) for name, motion in motions.items()}
 for name, run in runs.items():
-    print(f"{name}: {len(run.plan.q) - 1} ticks, fell: {run.physics.fell is not None}")
+    print(f"{name}: {len(run.plan.q) - 1} steps, fell: {run.physics.fell is not None}")
     assert run.physics.fell is None
 
 # %% [markdown]
@@ -87,11 +87,11 @@ INSTANTS = (0.0, 0.5) if FAST else (0.0, 0.24, 0.34, 0.48, 0.64)  # parts of the
 
 def snapshots(robot, q, support, instants, size=(400, 200) if FAST else (1200, 420)):
     """A picture of some instants of a motion, given as parts of its duration."""
-    ticks = [round(part * (len(q) - 1)) for part in instants]
+    steps = [round(part * (len(q) - 1)) for part in instants]
     with tempfile.TemporaryDirectory() as folder:
-        labels = [f"{DT * k:.1f} s" for k in ticks]
-        settings = {"support": [support[k] for k in ticks], "labels": labels, "size": size}
-        return plt.imread(hero_picture(Path(folder) / "robots.png", robot, [q[k] for k in ticks], **settings))
+        labels = [f"{DT * k:.1f} s" for k in steps]
+        settings = {"support": [support[k] for k in steps], "labels": labels, "size": size}
+        return plt.imread(hero_picture(Path(folder) / "robots.png", robot, [q[k] for k in steps], **settings))
 
 
 name, run = list(runs.items())[-1]
@@ -202,7 +202,7 @@ def qp(H, g, low, high, rows=NO_ROWS, rows_low=-FREE, rows_high=FREE):
 
 
 def closed_loop(velocity, q, steps, dt):
-    """Configurations that q' = velocity(tick, q) leads through, the start first."""
+    """Configurations that q' = velocity(step, q) leads through, the start first."""
     path = [q]
     for k in range(steps):
         path.append(path[-1] + dt * velocity(k, path[-1]))
@@ -223,10 +223,10 @@ summary = []  # what is wrong, what is measured, right, wrong
 #
 # The cost is $\tfrac12\sum_i w_i\|J_i v-\dot e_i^*\|^2$ with the wanted rate $\dot e^*=-\lambda e$. Printed without the
 # star, it compares $Jv$ with the error's own rate, which is $Jv$ again: every velocity has cost 0, and damping chooses
-# none. If one reads it as the rate of the tick before, the hand keeps the velocity that it has.
+# none. If one reads it as the rate of the step before, the hand keeps the velocity that it has.
 
 # %%
-GAIN, TICK, STEPS = 4.0, 0.01, 150
+GAIN, TIME_STEP, STEPS = 4.0, 0.01, 150
 goal = p0 + np.array([0.05, 0.10, -0.05])
 
 
@@ -248,20 +248,21 @@ def own_rate(k, q):
 
 
 def coasting(k, q, start=20):
-    """As printed, e' from the tick before; the right cost gives it a start."""
+    """As printed, e' from the step before; the right cost gives it a start."""
     if k < start:
         coasting.rate = -GAIN * (look(q)[0] - goal)
         return wanted(k, q)
     return least_squares(look(q)[2][:3], coasting.rate)
 
 
-time = TICK * np.arange(STEPS + 1)
-far = {f: 1e3 * np.linalg.norm(hand_path(closed_loop(f, q0, STEPS, TICK)) - goal, axis=-1) for f in (wanted, own_rate)}
-far[coasting] = 1e3 * np.linalg.norm(hand_path(closed_loop(coasting, q0, 90, TICK)) - goal, axis=-1)
+time = TIME_STEP * np.arange(STEPS + 1)
+lengths = {wanted: STEPS, own_rate: STEPS, coasting: 90}
+paths = {f: hand_path(closed_loop(f, q0, steps, TIME_STEP)) for f, steps in lengths.items()}
+far = {f: 1e3 * np.linalg.norm(path - goal, axis=-1) for f, path in paths.items()}
 figure, axes = plt.subplots(figsize=(7, 2.8), layout="constrained")
 axes.plot(time, far[wanted], color=BLUE, lw=2.5, label="wanted rate (right)")
 axes.plot(time, far[own_rate], color=RED, label="own rate (printed): nothing moves")
-axes.plot(time[:91], far[coasting], color=RED, ls="--", label="rate of the last tick, from 0.2 s on: flies past")
+axes.plot(time[:91], far[coasting], color=RED, ls="--", label="rate of the last step, from 0.2 s on: flies past")
 axes.set(title="With the error's own rate the hand never arrives", xlabel="time [s]", ylabel="hand to goal [mm]")
 axes.legend()
 assert far[wanted][-1] < 0.5 and np.ptp(far[own_rate]) == 0.0 and far[coasting][-1] > far[coasting].min() + 10.0
@@ -270,7 +271,7 @@ summary.append(("eq. 4: own rate", "hand to goal at the end [mm]", far[wanted][-
 # %% [markdown]
 # ### Limits: $q-q_{lower}$ where $q_{lower}-q$ is right
 #
-# One tick may not lead beyond a limit: $(q_{lower}-q)/\Delta t\le v\le(q_{upper}-q)/\Delta t$. With the left side
+# One step may not lead beyond a limit: $(q_{lower}-q)/\Delta t\le v\le(q_{upper}-q)/\Delta t$. With the left side
 # turned round it is *positive* inside the range: joints are made to move up, and above the middle of its range a joint
 # has no velocity at all that fits. With speed limits on top (right), every joint runs up at its top speed until one is
 # at its limit; then nothing fits.
@@ -290,12 +291,12 @@ def boxed(turned):
     for _ in range(STEPS):
         q = path[-1]
         p, _, J, *_ = look(q)
-        low, high = (q - lower if turned else lower - q) / TICK, (upper - q) / TICK
+        low, high = (q - lower if turned else lower - q) / TIME_STEP, (upper - q) / TIME_STEP
         box = np.clip(low, -top_speed, top_speed), np.clip(high, -top_speed, top_speed)
         answer = qp(J[:3].T @ J[:3] + 1e-6 * np.eye(7), J[:3].T @ (GAIN * (p - goal)), *box)
         if answer.status != Status.SOLVED:
             break
-        path.append(q + TICK * np.asarray(answer.x))
+        path.append(q + TIME_STEP * np.asarray(answer.x))
     return np.array(path), Status(int(answer.status)).name
 
 
@@ -314,16 +315,16 @@ messages = (
     (other, printed, RED, f"printed: all go up, {said_printed}"),
 )
 for axes, path, color, title in messages:
-    axes.plot(TICK * np.arange(len(path)), (path - lower) / (upper - lower), color=color)
-    axes.set(title=title, xlabel="time [s]", xlim=(0.0, TICK * STEPS), ylim=(-0.03, 1.03))
+    axes.plot(TIME_STEP * np.arange(len(path)), (path - lower) / (upper - lower), color=color)
+    axes.set(title=title, xlabel="time [s]", xlim=(0.0, TIME_STEP * STEPS), ylim=(-0.03, 1.03))
     axes.set_ylabel("joint angles, part of their range")
 print(f"configurations at which a velocity fits: right {feasible['right']:.2%}, printed {feasible['printed']:.2%}")
 print(f"(seven joints, each in the lower half of its range: 1 / 2^7 = {1 / 2**7:.2%})")
-print(f"with speed limits too, as printed: {said_printed} after {len(printed) - 1} ticks")
+print(f"with speed limits too, as printed: {said_printed} after {len(printed) - 1} steps")
 assert feasible["right"] == 1.0 and abs(feasible["printed"] - 2**-7) < 2e-3
 assert said == "SOLVED" and said_printed == "INFEASIBLE"
 assert (right >= lower).all() and (right <= upper).all()
-rise = np.diff(printed, axis=0) / TICK
+rise = np.diff(printed, axis=0) / TIME_STEP
 assert np.allclose(rise[:-1], top_speed)  # every joint upwards, as fast as it can, whatever the task
 summary.append(("limits turned round", "configurations with a solution [%]", 100.0, 100.0 * feasible["printed"]))
 
@@ -337,13 +338,13 @@ summary.append(("limits turned round", "configurations with a solution [%]", 100
 
 # %%
 def standard(scale, step):
-    """Distance to a goal 1 mm away over 15 ticks, with ``scale`` H; ``step`` is gain times tick."""
+    """Distance to a goal 1 mm away over 15 steps, with ``scale`` H; ``step`` is gain times time step."""
     near = p0 + np.array([0.0, 1e-3, 0.0])
     q, distances = q0, [1e-3]
     for _ in range(15):
         p, _, J, *_ = look(q)
-        H, g = J[:3].T @ J[:3] + 1e-9 * np.eye(7), J[:3].T @ (step / TICK * (p - near))
-        q = q + TICK * np.asarray(qp(scale * H, g, -1e3 * np.ones(7), 1e3 * np.ones(7)).x)
+        H, g = J[:3].T @ J[:3] + 1e-9 * np.eye(7), J[:3].T @ (step / TIME_STEP * (p - near))
+        q = q + TIME_STEP * np.asarray(qp(scale * H, g, -1e3 * np.ones(7), 1e3 * np.ones(7)).x)
         distances.append(np.linalg.norm(look(q)[0] - near))
     return np.array(distances)
 
@@ -352,15 +353,15 @@ figure, columns = plt.subplots(1, 2, figsize=(9, 2.9), sharey=True, layout="cons
 half = {}
 for axes, step, outcome in zip(columns, (0.1, 1.2), ("twice as quick as asked", "unstable"), strict=True):
     half[step] = standard(1.0, step), standard(0.5, step)
-    axes.semilogy(1e3 * half[step][0], "o-", color=BLUE, ms=4, label=f"H: times {abs(1 - step):.1f} a tick")
-    axes.semilogy(1e3 * half[step][1], "s-", color=RED, ms=4, label=f"H/2: times {abs(1 - 2 * step):.1f} a tick")
+    axes.semilogy(1e3 * half[step][0], "o-", color=BLUE, ms=4, label=f"H: times {abs(1 - step):.1f} a step")
+    axes.semilogy(1e3 * half[step][1], "s-", color=RED, ms=4, label=f"H/2: times {abs(1 - 2 * step):.1f} a step")
     axes.set(
-        title=f"gain times tick {step}: H/2 is {outcome}", xlabel="tick", ylabel="hand to goal [mm]", ylim=(1e-5, 1e4)
+        title=f"gain times dt {step}: H/2 is {outcome}", xlabel="step", ylabel="hand to goal [mm]", ylim=(1e-5, 1e4)
     )
     axes.legend(fontsize=8)
 np.testing.assert_allclose([pair[1] / pair[0] for pair in half[0.1]], [0.9, 0.8], rtol=1e-2)
 assert half[1.2][0][-1] < 1e-8 and half[1.2][1][-1] > 0.05
-summary.append(("eq. 5: half of H", "hand to goal after 15 ticks [mm]", 1e3 * half[1.2][0][-1], 1e3 * half[1.2][1][-1]))
+summary.append(("eq. 5: half of H", "hand to goal after 15 steps [mm]", 1e3 * half[1.2][0][-1], 1e3 * half[1.2][1][-1]))
 
 # %% [markdown]
 # ### Eqs. (6), (7): "any reflexive inverse" is not enough
@@ -430,9 +431,9 @@ def swaying(damping):
     def velocity(k, q):
         p, _, J, *_ = look(q)
         hold = np.linalg.pinv(J[:3]) @ (-10.0 * (p - p0))
-        return hold + projector(J[:3], damping) @ POSTURE * np.cos(np.pi * k * TICK)
+        return hold + projector(J[:3], damping) @ POSTURE * np.cos(np.pi * k * TIME_STEP)
 
-    return 1e3 * np.linalg.norm(hand_path(closed_loop(velocity, q0, 200, TICK)) - p0, axis=-1)
+    return 1e3 * np.linalg.norm(hand_path(closed_loop(velocity, q0, 200, TIME_STEP)) - p0, axis=-1)
 
 
 not_idempotent = [np.linalg.norm(P @ P - P) for P in (projector(A1, d) for d in DAMPINGS)]
@@ -448,7 +449,7 @@ left.set(title="a damped projector leaks", xlabel=r"damping $\delta$")
 left.legend(fontsize=8)
 for (damping, values), color, style in zip(drift.items(), (BLUE, RED, RED), ("-", "-", "--"), strict=True):
     label = f"damping {damping:g} in it" if damping else "projector undamped (right)"
-    other.plot(TICK * np.arange(201), values, color=color, ls=style, label=label)
+    other.plot(TIME_STEP * np.arange(201), values, color=color, ls=style, label=label)
 other.set(title="so the hand is not held", xlabel="time [s]", ylabel="hand off its place [mm]")
 other.legend(fontsize=8)
 assert np.linalg.norm(exact @ exact - exact) < 1e-12 and not_idempotent[-1] > 0.1
@@ -490,14 +491,14 @@ def along_potential(sign):
         free *= min(1.0, 1.0 / np.abs(free / top_speed).max())  # never faster than the joints can
         return inverse @ (-10.0 * (p - p0)) + free
 
-    path = closed_loop(velocity, q0, 400, TICK)
+    path = closed_loop(velocity, q0, 400, TIME_STEP)
     return np.min(2 * np.minimum(path - lower, upper - path) / (upper - lower), -1)
 
 
 room = {sign: along_potential(sign) for sign in (-1.0, 1.0)}
 figure, axes = plt.subplots(figsize=(7, 2.8), layout="constrained")
-axes.plot(TICK * np.arange(401), room[-1.0], color=BLUE, lw=2.5, label=r"$-\alpha\,\partial f/\partial q$ (right)")
-axes.plot(TICK * np.arange(401), room[1.0], color=RED, label=r"$+\alpha\,\partial f/\partial q$ (printed)")
+axes.plot(TIME_STEP * np.arange(401), room[-1.0], color=BLUE, lw=2.5, label=r"$-\alpha\,\partial f/\partial q$ (right)")
+axes.plot(TIME_STEP * np.arange(401), room[1.0], color=RED, label=r"$+\alpha\,\partial f/\partial q$ (printed)")
 axes.axhline(0.0, color="k", ls="--", lw=1)
 axes.annotate("limit", (4.0, 0.0), xytext=(-4, 3), textcoords="offset points", ha="right")
 axes.set(title="With the printed sign a joint leaves its range", xlabel="time [s]", ylim=(-0.5, None))
@@ -545,9 +546,9 @@ summary.append(("eq. 9: l, u swapped", "solved (1) or infeasible (0)", 1.0, 0.0)
 
 # %%
 RADIUS, OMEGA = 0.05, 2 * np.pi / 3.0
-moments = TICK * np.arange(301)
+moments = TIME_STEP * np.arange(301)
 circle = p0 + RADIUS * np.stack([0 * moments, np.sin(OMEGA * moments), np.cos(OMEGA * moments) - 1.0], -1)
-rate = np.diff(circle, axis=0) / TICK
+rate = np.diff(circle, axis=0) / TIME_STEP
 
 
 def tracking(forward):
@@ -557,7 +558,7 @@ def tracking(forward):
         p, _, J, *_ = look(q)
         return least_squares(J[:3], -GAIN * (p - circle[k]) + forward * rate[k])
 
-    return hand_path(closed_loop(velocity, q0, 300, TICK))
+    return hand_path(closed_loop(velocity, q0, 300, TIME_STEP))
 
 
 with_it, without = tracking(1.0), tracking(0.0)
@@ -619,7 +620,7 @@ def turning_two_rows(E):
         *_, J, e, _ = look(q, aim)
         return least_squares((E(e) @ J[3:])[:2], -GAIN * e[:2])
 
-    return np.array([np.linalg.norm(look(q, aim)[3][:2]) for q in closed_loop(velocity, q0, 100, TICK)])
+    return np.array([np.linalg.norm(look(q, aim)[3][:2]) for q in closed_loop(velocity, q0, 100, TIME_STEP)])
 
 
 figure, (left, other) = plt.subplots(1, 2, figsize=(9.5, 3.2), layout="constrained")
@@ -628,10 +629,10 @@ for (label, E), color, style in zip(VARIANTS.items(), (BLUE, RED, GREY), ("-", "
     missed = [rate_error(E, angle) for angle in angles]
     decay[label] = turning_two_rows(E)
     left.semilogy(np.degrees(angles), np.maximum(missed, 1e-10), color=color, ls=style, label=label)
-    other.semilogy(TICK * np.arange(101), np.degrees(decay[label]), color=color, ls=style, lw=2, label=label)
+    other.semilogy(TIME_STEP * np.arange(101), np.degrees(decay[label]), color=color, ls=style, lw=2, label=label)
     assert (max(missed) < 1e-6) == (E is left_inverse)
-asked = decay["its transpose"][0] * (1 - GAIN * TICK) ** np.arange(101)
-other.semilogy(TICK * np.arange(101), np.degrees(asked), "k:", label="as asked")
+asked = decay["its transpose"][0] * (1 - GAIN * TIME_STEP) ** np.arange(101)
+other.semilogy(TIME_STEP * np.arange(101), np.degrees(asked), "k:", label="as asked")
 left.set(title="rate of the error: part that is missed", xlabel="angle of the error [deg]", ylabel="relative")
 left.legend(fontsize=8)
 other.set(title="two rows of three: too slow without E", xlabel="time [s]", ylabel="error about x and y [deg]")
@@ -657,9 +658,9 @@ assert len(summary) == 9
 #   ([solvers](../docs/solvers.md)).
 # - **Limits are hard**: a box that always exists and is kept exactly by `WeightedQP`, `HierarchicalQP` and
 #   `NullSpace(method="saturated")` ([choosing a scheme](../docs/choosing_a_scheme.md)).
-# - **Inequalities at any priority**, with slack and status reported for each tick
+# - **Inequalities at any priority**, with slack and status reported for each step
 #   ([tasks and limits](../docs/tasks_and_limits.md)).
-# - **Derivatives**: of a tick and of a whole motion, with respect to every number, so that weights and gains are tuned
+# - **Derivatives**: of a step and of a whole motion, with respect to every number, so that weights and gains are tuned
 #   by gradient ([tuning](../docs/tuning.md)).
 # - **Many at once**: a `vmap` over targets, weights or robots ([batches](../docs/batches.md)).
 # - **No recompilation** when a number changes ([traced versus static](../docs/traced_vs_static.md)).

@@ -385,4 +385,4 @@ show(around.figure())
 # ## Next
 #
 # - The page on inverse kinematics in `docs`: every option, obstacles, how it searches, and numbers.
-# - `1_quickstart`: from a configuration to motion, tick by tick.
+# - `1_quickstart`: from a configuration to motion, step by step.

@@ -215,7 +215,7 @@ def test_report_agrees_with_mujoco(short, nao):
     hull = ConvexHull(corners(data[0], "l_sole", "r_sole")).equations
     margin = min(-np.max(hull[:, :2] @ d.subtree_com[1][:2] + hull[:, 2]) for d in data)
     assert figures["balance"]["least_margin_mm"] == pytest.approx(1e3 * margin, rel=1e-9)
-    assert figures["balance"]["ticks_outside"] == 0
+    assert figures["balance"]["steps_outside"] == 0
     assert figures["limits"]["position_violations"] == figures["limits"]["velocity_violations"] == 0
     limit = np.asarray(nao.velocity_limit)
     margin = 1.0 - np.max(np.abs(v[:, np.isfinite(limit)]) / limit[np.isfinite(limit)])

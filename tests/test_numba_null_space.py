@@ -4,12 +4,13 @@ import os
 import subprocess
 import sys
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from used_memory import used_memory
 
 import osik_jax as osik
 from osik_jax.execution import _backends
@@ -318,6 +319,18 @@ def test_numbers_that_overflow_are_an_error_of_their_lane():
         found = solved(p, backend=backend)
         assert np.isfinite(found.x).all()
         assert (np.delete(np.asarray(found.status), 2) == Status.SOLVED).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["damped, more rows", "a humanoid's", "dependent and damped"])
+def test_memory_that_was_used_before_says_nothing(name, method, monkeypatch):
+    """Whatever the kernels find in their space and results; none writes behind its space."""
+    found = []
+    for left in (0.0, np.nan):
+        with used_memory(monkeypatch, left):
+            found.append(jax.jit(partial(cast(Any, solved).__wrapped__, method=method))(FAMILIES[name]))
+    assert np.isfinite(found[0].x).all()
+    jax.tree.map(np.testing.assert_array_equal, *found)
 
 
 def test_programs_for_other_machines():

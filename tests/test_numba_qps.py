@@ -9,6 +9,7 @@ import pytest
 from optimality import by_daqp
 from problem_families import PLANTED, QPs
 from recorded import QP_DAMPING, recorded_qps
+from used_memory import used_memory
 from weighted_families import MANY, M, N, P, Problems, problems
 
 from benchmarks.agreement import planted
@@ -158,6 +159,18 @@ def test_what_was_once_left_over_is_at_the_planted_optimum(family, seed, lanes):
     assert (beyond < 1e-9 * np.abs(values).max(1)).all()
 
 
+@pytest.mark.parametrize("m", [M, MANY])
+def test_memory_that_was_used_before_says_nothing(m, monkeypatch):
+    """Whatever the kernel finds in its space and results; ``MANY`` rows are more than variables."""
+    p, found = problems(m=m), []
+    for left in (0.0, np.nan, 1e300):
+        with used_memory(monkeypatch, left):
+            found.append(candidates(p))
+    assert (found[0].converged != 0).mean() > 0.99 and np.isfinite(found[0].x).all()
+    for other in found[1:]:
+        jax.tree.map(np.testing.assert_array_equal, found[0], other)
+
+
 def test_one_problem_is_a_lane_of_a_batch():
     p = problems(seed=5)
     batch = solved(p)
@@ -195,7 +208,7 @@ def test_sums_and_factors_in_blocks_are_those_of_numpy():
     """Of every size up to three blocks, in matrices that are wider; what is behind them comes into nothing."""
     import numba
 
-    from osik_jax.kernels.numba import _padded_rows, _symmetric
+    from osik_jax.kernels.numba import _padded_rows, _symmetric, _transpose
 
     @numba.njit
     def solved_by_blocks(S, L, T, inverse, diagonal, b, n):
@@ -216,7 +229,7 @@ def test_sums_and_factors_in_blocks_are_those_of_numpy():
 
     @numba.njit
     def others(T, B, u, v, c):
-        _padded_rows.transpose(T, B, 13, 35)
+        _transpose.transpose(T, B, 13, 35)
         _padded_rows.add_to_rows(B, u, v, 2, 7, 8, 40)
         _padded_rows.put_multiple(c, 3.0, v, 35)
         return _padded_rows.largest_product(v, v, 40)

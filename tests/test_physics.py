@@ -184,7 +184,7 @@ def test_a_fall_ends_the_run(nao, nao_world):
         dt=DT,
         steps=400,
         command=physics.Integrated(),
-        before_tick=push,
+        before_step=push,
         limits=(),
     )
     assert recording.fell and simulation.fallen()

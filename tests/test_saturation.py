@@ -581,3 +581,25 @@ class TestScheme:
     def test_mistakes(self):
         with pytest.raises(ValueError, match="method is 'sideways'; methods: classical, reverse, saturated"):
             osik.NullSpace(method=cast(Any, "sideways"))
+
+
+@pytest.mark.parametrize("backend", ["jax", "numba"])
+def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend):
+    """In closed form: the level asks 8 x - y = 65, x ends at its bound 7.9, and y = -1.8 but for roundoff at its own.
+
+    What y is beyond its bound is more than roundoff of the numbers, and less than that of the scale, which falls by a
+    65th of it. So nothing is blocked, and y follows what is asked.
+    """
+    if backend == "numba":
+        pytest.importorskip("numba")
+    lower, upper = jnp.array([-jnp.inf, -1.8 + 1.2e-10]), jnp.array([7.9, jnp.inf])
+
+    def solved(wanted):
+        level = Level(jnp.array([[8.0, -1.0]]), wanted, wanted)
+        return solve_nullspace([level], lower, upper, backend=backend)
+
+    answer, derivative = jax.jit(lambda b: (solved(b), jax.jacfwd(lambda b: solved(b).x)(b)))(jnp.array([65.0]))
+    assert answer.status == Status.SOLVED
+    np.testing.assert_allclose(answer.x, [7.9, -1.8], atol=1e-9)
+    np.testing.assert_allclose(answer.scales, 1.0, atol=1e-11)
+    np.testing.assert_allclose(derivative[:, 0], [0.0, -1.0], atol=1e-9)

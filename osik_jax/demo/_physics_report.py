@@ -51,7 +51,7 @@ def physics_figures(physics: PhysicsMeasurement) -> dict[str, Any]:
         "least_com_margin_mm": _least(physics.com_margin),
         "greatest_part_of_torque_limit": float(physics.effort_used.max()),
         "busiest_joint": physics.busiest,
-        "servo_ticks_at_limit": physics.saturated,
+        "servo_steps_at_limit": physics.saturated,
         "joints_beyond_limits_deg": float(np.degrees(physics.beyond_limits.max())),
         "furthest_beyond": physics.furthest,
         "reached": reached(physics),
@@ -98,12 +98,12 @@ def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
         ("centre of mass inside by [mm]", lambda s: _margin(s["physics"]["least_com_margin_mm"])),
         ("greatest torque, of its limit", lambda s: number(s["physics"]["greatest_part_of_torque_limit"], None)),
         ("  in", lambda s: s["physics"]["busiest_joint"]),
-        ("servo steps at the limit", lambda s: str(s["physics"]["servo_ticks_at_limit"])),
+        ("servo steps at the limit", lambda s: str(s["physics"]["servo_steps_at_limit"])),
         ("joints beyond their position limits [deg]", lambda s: number(s["physics"]["joints_beyond_limits_deg"], None)),
         *(_goal_row(label) for label in example["goals"]),
         ("velocity limits broken", lambda s: limit_count(s["limits"]["velocity_violations"])),
         ("steps solved", lambda s: solved(s["solver"]["status"])),
-        ("a step, MuJoCo and records too [µs]", lambda s: f"{s['solver']['microseconds_per_tick']:.0f}"),
+        ("a step, MuJoCo and records too [µs]", lambda s: f"{s['solver']['microseconds_per_step']:.0f}"),
     ]
 
 

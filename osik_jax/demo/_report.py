@@ -124,7 +124,7 @@ def _scheme(motion: Motion, name: str, outcome: Outcome, m: Measurement) -> dict
     if motion.balanced:
         out["balance"] = {
             "least_margin_mm": 1e3 * float(m.com_margin.min()),
-            "ticks_outside": int((m.com_margin < 0.0).sum()),
+            "steps_outside": int((m.com_margin < 0.0).sum()),
         }
     return out | {"reached": _reached(motion, m)}
 
@@ -156,7 +156,7 @@ def _solver(outcome: Outcome) -> dict[str, Any]:
         "kkt_residual_max": _finite(outcome.kkt_residual.max()),
         "compile_s": outcome.compile_seconds,
         "run_s": outcome.run_seconds,
-        "microseconds_per_tick": 1e6 * outcome.run_seconds / steps,
+        "microseconds_per_step": 1e6 * outcome.run_seconds / steps,
     }
 
 
@@ -221,7 +221,7 @@ def _rows(example: Mapping[str, Any], scale: float) -> list[tuple[str, Any]]:
     rows.append(("velocity limits broken", lambda s: limit_count(s["limits"]["velocity_violations"])))
     rows.append(("steps solved", lambda s: solved(s["solver"]["status"])))
     rows.append(("compile [s]", lambda s: f"{s['solver']['compile_s']:.1f}"))
-    rows.append(("a step [µs]", lambda s: f"{s['solver']['microseconds_per_tick']:.0f}"))
+    rows.append(("a step [µs]", lambda s: f"{s['solver']['microseconds_per_step']:.0f}"))
     return rows
 
 

@@ -2,17 +2,30 @@
 
 Where data in single precision take another number, there is one for each precision. Most are relative: to machine
 epsilon, to roundoff (a tolerance times the scale of a constraint, ``constraint_scales``), or to what their line says.
-Those that a method in plain JAX shares with its kernels are here so that both decide alike: neither imports the other.
-Sizes of blocks and of shared memory, which change the time and not the answer, are where they are used; so are the
-numbers of a kernel's own method, whose answers are certified.
+Kernels for CPUs have them compiled in, and texts for CUDA get them as constants (``solvers/qp/_warp.py`` and
+``solvers/hqp/_warp.py``), so that methods in plain JAX and their kernels decide alike: neither imports the other.
+
+Not here, because they are no tolerances of a solver:
+
+- sizes of blocks, tiles, workspaces and shared memory, which change the time and not the answer;
+- guards against division by 0 (1e-300, 1e-37, ``finfo.tiny``), and limits on iterations in proportion to a problem's
+  size: what they are is what the line that has them says, and for the limits the docstring of the public function;
+- what a user may set: defaults of solvers and schemes, such as ``damping``, stand in their signatures;
+- parts of a scheme's model, such as how much curvature damping a level gets (``schemes/_scheme.py``, ``_weighted.py``);
+- robots, tasks, limits and collisions (a sine that is too small for a formula, a unit quaternion), and searches that
+  use the solvers: ``inverse/``, ``retargeting/``.
 """
 
 import jax.numpy as jnp
+import numpy as np
 
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 """Labels of a constraint in an active set."""
-IMPLIED = 3
+REDUNDANT = 3
 """In a kernel's candidate: inactive, for it depends on the active ones, and holds up to roundoff where they do."""
+
+EPSILON = float(np.finfo(np.float64).eps)
+"""Machine epsilon of double precision, in which kernels for CPUs compute."""
 
 # ---- damping of levels, shared with kernels
 
@@ -20,6 +33,8 @@ DAMPING_ITERATIONS = 3
 """Steps towards the fixed point of a level's damping; each shrinks an excess by the factor unmet / s^2."""
 DAMPING_RIDGE = 1e-13
 """Relative to the trace of the Gram matrix of a level's rows: keeps its Cholesky factor from breaking."""
+DAMPING_RIDGE_ROUNDOFF = 10.0
+"""In units of machine epsilon: the ridge is no smaller, which counts in single precision."""
 NEGLIGIBLE_DAMPING = 1e-13
 """Relative to the square of the level's longest row: gradients of a smaller damping are below roundoff."""
 COST_FRACTION = 0.1
@@ -42,6 +57,14 @@ BOUND_DISTANCE = 1e-9
 """Relative to the bound: a joint at a larger distance is not at its bound."""
 SATURATION_RESIDUAL = 2e-9
 """Relative to the terms that x is made of: the largest residual of the active bounds with which an answer is taken."""
+SATURATION_RANK = 1e-9
+"""In a kernel: the part of a joint's unit vector in the null space and outside the span of held ones, with less of
+which it depends on them; of the largest in a combination, with less of which a joint does not stop the motion."""
+LOOSE_SATURATION_RANK = 1e-6
+"""The same for a second attempt, where the answer of the first does not hold: joints nearly depended on each other."""
+LARGEST_RATE = 10.0
+"""In a kernel, in units of what the entering joint has in a combination: a joint with more is what the others say most
+about, and takes the entering one's place."""
 
 # ---- answers and certificates
 
@@ -72,6 +95,8 @@ MAX_LOSS = 100.0
 
 DEPENDENCE_TOL = 100.0
 """In units of machine epsilon: a constraint of whose diagonal the active ones leave less depends on them."""
+KERNEL_DEPENDENCE = 1e-14
+"""The same in Numba's kernel, which has orthogonal factors: relative to the square of the constraint's normal."""
 REDUNDANCY_TOL = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
 """In units of roundoff: a dependent constraint that is violated by less is redundant, by more infeasible."""
 
@@ -85,10 +110,16 @@ RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
 """In units of roundoff; an answer that the dual method does not change is accepted with violations up to this."""
 MAX_INFEASIBLE = 2
 """Dual methods that end as infeasible before projected Newton takes over; one that changes nothing is enough."""
+ROW_MULTIPLIER = 1e-3
+"""Relative to what all rows add to a variable's gradient: a multiplier of a row that is smaller has no sign."""
 SOFT_COMPLIANCE = 1e-12
 """Compliance of infeasible hard rows relative to C diag(H)^-1 C': with it the least violation has a derivative."""
 KKT_RIDGE = {jnp.dtype("float64"): 10.0, jnp.dtype("float32"): 1.0}
 """In units of machine epsilon times the diagonal: keeps the factor of a semidefinite Hessian from breaking."""
+QUADRATIC_RIDGE = 10.0
+"""The same for the square root of a Hessian that was given as a matrix, relative to its largest diagonal element."""
+SCHUR_RIDGE = 10.0
+"""The same for the system of the active rows."""
 LAST_CORRECTION = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}
 """Relative to the answer: a smaller correction is the last; the next would be its square, or roundoff."""
 MAX_REFINEMENTS = 5
@@ -104,6 +135,30 @@ ROW_SPACE_CORRECTION, ROW_SPACE_ACCURACY = 1e-6, 1e-13
 GRADIENT_STEPS = 100
 """Steps of the projected gradient behind an answer that is MAX_ITERATIONS."""
 
+# ---- weighted QPs in kernels: double precision is Numba's, single precision CUDA's
+
+KERNEL_REFINEMENTS = {jnp.dtype("float64"): 10, jnp.dtype("float32"): 6}
+"""Corrections at most."""
+KERNEL_CORRECTION = 1e-10
+"""Relative to the answer, in double precision: a smaller correction is the last. In single precision
+``LAST_CORRECTION``, for the one that would come next."""
+MIN_DECREASE = 0.25
+"""A correction that shrinks to more than this part of the one before was roundoff."""
+KERNEL_PIVOT = 1e2
+"""In units of machine epsilon times the diagonal element: a smaller pivot says that rows depend on each other."""
+BOUND_MULTIPLIER = 1.0
+"""In units of machine epsilon times the terms of a gradient: a variable on a bound with a larger multiplier of the
+wrong sign is let go. Tolerances of the cost's curvature would not do: a weak task, such as a posture, pulls with less
+than those."""
+VIOLATION_TOL = 10.0
+"""In units of roundoff, in single precision: a bound that is violated by less holds."""
+MAX_EXCHANGES = 2
+"""Exchanges that leave no fewer wrong labels, before the dual active-set method."""
+MAX_DUAL_STARTS = 8
+"""Times that the dual active-set method begins or goes on: its end, solved anew, may be a little off another bound."""
+MAX_FACTORIZATIONS = 100
+"""Systems that the kernel in single precision factors at most; the rest is searched."""
+
 # ---- projected Newton
 
 PENALTY = 1e5
@@ -114,6 +169,11 @@ NEWTON_ROUNDOFF = 4e-15
 """Relative to the terms of the gradient; a variable with a smaller gradient is stationary."""
 SMALL_STEP = 1e-13
 """Relative to x; a Newton step that is shorter is the last on its face."""
+FULL_STEP_ROUNDOFF = 4.0
+"""In units of the roundoff of the cost: a full step is taken where a shorter one is not better by more."""
+FEASIBLE_AT_ONCE, FEASIBLE_DECREASE = 1e-3, 0.1
+"""In units of the feasibility tolerance: with less violation the updates of the multipliers end. With at most 1 they
+end where an update leaves more than the second of what was violated."""
 MAX_JOINT_RELEASES = 10
 """Iterations in which all bounds that the gradient points away from are released at once; then one at a time."""
 MAX_UPDATES = 40
@@ -130,6 +190,17 @@ UNCHANGED = 1e-9
 HIERARCHY_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
 """The part of a row outside the span of others with less than which it depends on them; data in single precision have
 more roundoff, which makes dependent rows independent."""
+STEP_TOL = 1e-13
+"""Relative to the scale of a level's rows: a step that changes them by less is none."""
+MULTIPLIER_TOL = 1e-10
+"""Relative to the level's gradient: a smaller multiplier is 0."""
+HARD_ROW_TOL = 1e-11
+"""Relative to the scale of a row: a smaller violation is none."""
+STATIONARITY_TOL = 10.0
+"""In units of the multiplier's tolerance and of roundoff: a gradient along free directions that is smaller is 0, in
+kernels."""
+SINGULAR_TOL = 100.0
+"""In units of machine epsilon of the data: singular values that are smaller are not inverted in derivatives."""
 ZERO_PIVOT = 1e-2
 """In units of the rank tolerance: a pivot up to this is 0, whatever rank another factorisation has found."""
 EXTRA_DAMPING = 1e-9
@@ -148,11 +219,16 @@ FACTOR_RIDGE = 1e-14
 
 # ---- null spaces
 
+INDEPENDENT_ROWS = 1e-7
+"""In a kernel, relative to the trace of a Gram matrix: its least eigenvalue, from which on its factors are accurate
+enough."""
 NULL_SPACE_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
 """Of a level's Frobenius norm: a row with less outside the span of others depends on them; data in single precision
 have more roundoff, which makes dependent rows independent."""
 MISSING_COMPLIANCE = 1e-7
 """Of the missing part of the motion: the squared length of x that it outweighs."""
+STIFFER_COMPLIANCE = 0.1
+"""Factor of that compliance in every other attempt: a stiffer penalty on the missing part."""
 SATURATION_ROUNDOFF = 1e-11
 """Relative to the terms that x is made of: a smaller violation of a bound counts as none."""
 INDEPENDENCE_TOL = 1e-5
@@ -162,6 +238,10 @@ NEGLIGIBLE_ENTRY = 1e-7
 SATURATION_ATTEMPTS = 6
 """Where an answer is not accepted, the next attempt has a lower compliance, and only the part of the motion near the
 scale that was found: motions that are too large for their box by orders of magnitude lose digits."""
+ATTEMPT_GROWTH = 8.0
+"""Factor of the part of the motion that is considered, after an attempt that was accepted with less than all of it."""
+ATTEMPT_SCALE = 1e-3, 0.25
+"""Least and largest scale that a failed attempt may have found; the next considers twice as much of its motion."""
 SATURATION_ACCURACY = 1e-15
 """Relative to the terms that x is made of: an answer with a smaller residual is not refined."""
 MAX_SATURATION_REFINEMENTS = 5
@@ -169,3 +249,13 @@ MAX_SATURATION_REFINEMENTS = 5
 DERIVATIVE_RANK = 1e-7
 """A saturated joint with less of its column of the projector outside the span of the others has no derivative of its
 own."""
+
+# ---- schemes
+
+CONSTRAINT_TOL = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
+"""Relative to what its numbers amount to: a hard row that is missed by less holds."""
+STANDING_SPEED = 1e-4
+"""Speed [rad/s or m/s] that counts at least: of a robot at rest, roundoff is all that there is."""
+SINGLE_DAMPING = 4.0
+"""In units of epsilon times the largest weight times row norm squared: a kernel in single precision gets no weaker
+damping, which would be lost in the Hessian's roundoff."""

@@ -113,7 +113,7 @@ def simulate(
     steps: int,
     targets: Targets | None = None,
     command: Command | None = None,
-    before_tick: Callable[[float, Simulation], None] | None = None,
+    before_step: Callable[[float, Simulation], None] | None = None,
 ) -> Recording:
     """Runs the loop from the simulation's present state, until the robot falls at the latest.
 
@@ -130,7 +130,7 @@ def simulate(
         steps: number of steps.
         targets: targets of some tasks at each step, by task name, as in ``rollout``.
         command: ``Integrated()`` (the default) or ``Lookahead(time)``.
-        before_tick: called with the time [s] since the start and the simulation, to push the robot, say.
+        before_step: called with the time [s] since the start and the simulation, to push the robot, say.
 
     Raises:
         KeyError: ``targets`` names a task that does not exist.
@@ -150,8 +150,8 @@ def simulate(
     memory = _cold_start(lambda state: step(0.0, *state, (None, None), _at(paths, 0))[1], (held, held))
     frames, commands, solutions = [_frame(simulation)], [], []
     for k in range(steps):
-        if before_tick is not None:
-            before_tick(k * dt, simulation)
+        if before_step is not None:
+            before_step(k * dt, simulation)
         held, solution = step(k * dt, held, simulation.sense(), memory, _at(paths, k))
         memory = solution.velocity, solution.warm_start
         simulation.step(held, dt)

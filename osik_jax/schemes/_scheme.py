@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .._errors import OsikValueError
 from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
+from ..numerics._constants import CONSTRAINT_TOL, STANDING_SPEED
 from ..numerics._dense import apply
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
@@ -21,13 +22,9 @@ from ..solvers._level import positive_root
 from ..tasks import TaskRows
 from ..tasks._curvature import length, row_sums
 
-_HOLDS = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
-"""A hard row that is missed by less, of what its numbers amount to, holds."""
 _HELD = 2.0
 """Of a priority's curvature damping, where others are above it: a pull that it cannot meet is held by their rows, which
 bend too."""
-_STANDING = 1e-4
-"""Speed [rad/s or m/s] that counts at least: of a robot at rest, rounding is all that there is."""
 
 
 class VelocityProblem(eqx.Module):
@@ -168,9 +165,9 @@ def status_with(
     level = constraints.scaled()
     finite = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (level.lower, level.upper)]
     nearest = jnp.minimum(*finite)
-    fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), _STANDING)
+    fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), STANDING_SPEED)
     size = level.length * fastest + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
-    missed = jnp.abs(level.distance(velocity)) > _HOLDS[velocity.dtype] * size
+    missed = jnp.abs(level.distance(velocity)) > CONSTRAINT_TOL[velocity.dtype] * size
     if start is not None:
         missed &= level.equal | (level.distance(start) != 0.0)
     return jnp.where(missed.any() & (status == Status.SOLVED), Status.INFEASIBLE, status)

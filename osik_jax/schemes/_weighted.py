@@ -13,12 +13,10 @@ from jaxtyping import Array, Float, Int
 from .._errors import OsikValueError
 from ..execution._backends import check_backend, takes
 from ..numerics._arguments import concrete
+from ..numerics._constants import SINGLE_DAMPING
 from ..solvers import Backend, Level, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
-
-_LEAST_DAMPING = 4.0
-"""In units of epsilon times the largest weight times row norm squared; a weaker damping is lost in single precision."""
 
 _CALM_RATIO = 30.0
 """Little of the curvature damping is added where it is below this many times a dof's other diagonal terms."""
@@ -39,7 +37,7 @@ class WeightedQP(Scheme):
         curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
             none. What is added vanishes where the tasks are met (``TaskRows.curvature``), with the square of their
             error where a posture or the damping is strong enough by itself.
-        max_iterations: cap on changes of the active set (static).
+        max_iterations: limit on changes of the active set (static).
         backend: whose candidates for the answer are taken, as in ``solve_least_squares_qp`` (static).
     """
 
@@ -85,7 +83,7 @@ def _least_damping(problem: VelocityProblem, backend: Backend) -> Float[Array, "
     if dtype != jnp.float32 or not rows or not takes(backend, "warp", fits=True):
         return jnp.zeros((), dtype)
     steepest = [jnp.max(r.weight * jnp.sum(r.jacobian**2, 1), initial=0.0) for r in rows]
-    return jax.lax.stop_gradient(_LEAST_DAMPING * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
+    return jax.lax.stop_gradient(SINGLE_DAMPING * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
 
 
 def _diagonal_terms(

@@ -22,6 +22,7 @@ from ..numerics._constants import (
     COST_FRACTION,
     DAMPING_ITERATIONS,
     DAMPING_RIDGE,
+    DAMPING_RIDGE_ROUNDOFF,
     MIN_RADIUS,
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
@@ -122,7 +123,7 @@ def level_damping(
     rows = jnp.where(in_cost[:, None], product(level.matrix, projector), 0.0)
     gram = product(rows, rows.T)
     eye = jnp.eye(len(goal), dtype=gram.dtype)
-    ridge = max(DAMPING_RIDGE, 10.0 * float(jnp.finfo(gram.dtype).eps)) * jnp.trace(gram)
+    ridge = max(DAMPING_RIDGE, DAMPING_RIDGE_ROUNDOFF * float(jnp.finfo(gram.dtype).eps)) * jnp.trace(gram)
     demand = jnp.where(damping.demand > 0.0, damping.demand, 1.0)
     ratio = jnp.ones_like(damping.unmet)
     for _ in range(DAMPING_ITERATIONS):

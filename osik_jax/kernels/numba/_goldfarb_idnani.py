@@ -1,7 +1,7 @@
 """The dual active-set method from a cold start, with factors that are updated.
 
 D. Goldfarb, A. Idnani, "A numerically stable dual method for solving strictly convex quadratic programs", Mathematical
-Programming 27, 1983. Rows of C may give way, so the unknowns are v = (x, s) with t = sqrt(E) s and E their
+Programming 27, 1983. Rows of C may be soft, so the unknowns are v = (x, s) with t = sqrt(E) s and E their
 compliances; the cost is 1/2 |s|^2 more, and constraint i has the normal n_i = e_i for a bound, (C_q, sqrt(E_q) e_q) for
 a row. With N the normals of the active constraints, each in the direction in which it pushes,
 
@@ -16,14 +16,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, REDUNDANCY_TOL
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, KERNEL_DEPENDENCE, REDUNDANCY_TOL
 from ._dense import add_multiple, add_row, dot, fill, invert_upper, rotate
 from ._frame import lean
 
-_DEPENDENT = 1e-14
-"""Of |J'n|^2; a constraint of which the active ones leave less than this depends on them."""
-_IMPLIED = REDUNDANCY_TOL[np.dtype("float64")]
-"""In units of roundoff: a dependent constraint that is violated by less is implied, by more it contradicts."""
+_REDUNDANCY_TOL = REDUNDANCY_TOL[np.dtype("float64")]
 
 
 @lean
@@ -76,7 +73,7 @@ def value_of(P, v, i, n):
 def most_violated(P, W, labels, v, d, n, count):
     """Return the constraint whose activation raises the dual objective most, -1 for none; equalities first.
 
-    By a full step it rises by half of gap^2 / |J2'n|^2. Those that the active ones imply are passed over.
+    By a full step it rises by half of gap^2 / |J2'n|^2. Redundant ones are passed over.
     """
     best, entering = 0.0, -1
     for i in range(len(labels)):
@@ -151,10 +148,10 @@ def dual_active_set(P, W, labels, x, z, count, most_changes):
         x: the minimiser for those. (n,)
         z: its residuals and multipliers. (m + p,)
         count: how many constraints are active where it ended; -1 to start.
-        most_changes: cap on changes of the active set.
+        most_changes: limit on changes of the active set.
 
     Returns:
-        Changes of the active set, -1 where rows cannot hold together or the cap was met; how many are active.
+        Changes of the active set, -1 where rows cannot hold together or the limit was met; how many are active.
     """
     n, N = len(x), len(labels)
     R, J, order = W.R, W.J, W.order
@@ -189,10 +186,10 @@ def dual_active_set(P, W, labels, x, z, count, most_changes):
             whole, left = dot(d, d, 0, N), dot(d, d, count, N)
             value = value_of(P, v, entering, n)
             gap = max(P.lower[entering] - value if side > 0.0 else value - P.upper[entering], 0.0)
-            full = gap / left if left > _DEPENDENT * whole else np.inf
+            full = gap / left if left > KERNEL_DEPENDENCE * whole else np.inf
             length, leaving = ratio_test(labels, order, u, r, count)
             if not (full < np.inf or length < np.inf):
-                if not gap <= _IMPLIED * W.value_roundoff[entering]:
+                if not gap <= _REDUNDANCY_TOL * W.value_roundoff[entering]:
                     return np.int64(-1), count
                 W.next[entering] = 1
                 break

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from math import isnan, sqrt
 
+from ...numerics._constants import STATIONARITY_TOL
 from . import _level_workspace as ws
 from ._frame import lean
 from ._level_factors import cholesky_solve, factor_active_rows, factor_level_rows, from_basis, to_basis
@@ -128,7 +129,7 @@ def sign_tolerance(s):
 @lean
 def is_stationary(s):
     """Check that what is left of the gradient in the free columns is roundoff."""
-    return s.residual <= 10.0 * (s.multiplier_tol * s.size * s.root_cost + gradient_roundoff(s))
+    return s.residual <= STATIONARITY_TOL * (s.multiplier_tol * s.size * s.root_cost + gradient_roundoff(s))
 
 
 @lean

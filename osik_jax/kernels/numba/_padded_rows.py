@@ -3,9 +3,6 @@
 A sum that goes row by row through memory waits for each row to be written before the next is added. Here a few blocks
 of columns stay in registers until all rows are in them. Rows are ``padded`` numbers long, so that every block is whole;
 what is behind their last number comes into nothing else. With Numba's bounds checks on, these are plain loops.
-
-A call hands every array over as seven numbers or more on the stack, and functions that Numba inlines take long to
-compile. So each of these takes the addresses of its arrays and calls a function of those, which is written once.
 """
 
 from __future__ import annotations
@@ -19,75 +16,12 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from ._addresses import BYTES, ONES, ZEROS, address, blocks_of, call_of, everywhere, load, row_bytes, store
 from ._frame import lean
 from ._vectors import _BLOCK, _CHECKED, _DOUBLE, _INDEX, _LANE, WIDTH, _multiply_add, _splat
 
-BYTES = 8 * WIDTH
-"""Of a block."""
 _MOST = 5
 """Blocks that are summed at a time."""
-_ONES, _NOUGHT = _BLOCK([1.0] * WIDTH), _BLOCK([0.0] * WIDTH)
-
-
-def call_of(builder: Any, name: str, body: Callable[..., Any], arguments: list[Any], result: Any = None) -> Any:
-    """Calls a function of numbers and addresses, ``body(builder, *arguments)``, written where the module has none."""
-    name = f"osik_jax_{name}"
-    function = builder.module.globals.get(name)
-    if function is None:
-        kind = ir.FunctionType(ir.VoidType() if result is None else result, [a.type for a in arguments])
-        function = ir.Function(builder.module, kind, name)
-        function.linkage = "internal"
-        function.attributes.add("noinline")
-        inside = ir.IRBuilder(function.append_basic_block("entry"))
-        found = body(inside, *function.args)
-        inside.ret_void() if result is None else inside.ret(found)
-    return builder.call(function, arguments)
-
-
-def _address(context: Any, builder: Any, kind: Any, array: Any, *place: Any) -> Any:
-    """Of an array's number at a place, which may leave its last axis out."""
-    assert kind.layout == "C" and kind.dtype == types.float64, kind
-    made = context.make_array(kind)(context, builder, array)
-    at = builder.ptrtoint(made.data, _INDEX)
-    for k, index in enumerate(place):
-        step = _step(builder, made, kind) if k < kind.ndim - 1 else _INDEX(8)
-        at = builder.add(at, builder.mul(step, index))
-    return at
-
-
-def _step(builder: Any, made: Any, kind: Any) -> Any:
-    """Bytes of a matrix's row."""
-    return builder.mul(_INDEX(8), cgutils.unpack_tuple(builder, made.shape, kind.ndim)[-1])
-
-
-def row_bytes(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Bytes between the rows of a matrix."""
-    return _step(builder, context.make_array(kind)(context, builder, array), kind)
-
-
-def blocks_of(builder: Any, count: Any) -> Any:
-    """Blocks that so many numbers fill."""
-    return builder.ashr(builder.add(count, _INDEX(WIDTH - 1)), _INDEX(WIDTH.bit_length() - 1))
-
-
-def _block(builder: Any, at: Any, k: int = 0) -> Any:
-    """A pointer to the k-th block from an address on."""
-    return builder.inttoptr(builder.add(at, _INDEX(BYTES * k)), _BLOCK.as_pointer())
-
-
-def load(builder: Any, at: Any, k: int = 0) -> Any:
-    """The k-th block from an address on."""
-    return builder.load(_block(builder, at, k), align=8)
-
-
-def store(builder: Any, block: Any, at: Any, k: int = 0) -> None:
-    """Writes a block there."""
-    builder.store(block, _block(builder, at, k), align=8)
-
-
-def everywhere(builder: Any, at: Any) -> Any:
-    """A block of the number at an address."""
-    return _splat(builder, builder.load(builder.inttoptr(at, _DOUBLE.as_pointer())), _BLOCK)
 
 
 def _of_block(name: str) -> Callable[[Any, Any], Any]:
@@ -145,10 +79,10 @@ def _summing(what: str) -> Any:
             out, base, a, B, first, last, start, stop = arguments
             kinds = signature.args
             given = [
-                _address(context, builder, kinds[0], out, start),
-                _address(context, builder, kinds[1], base, start),
-                _address(context, builder, kinds[2], a, first),
-                _address(context, builder, kinds[3], B, first, start),
+                address(context, builder, kinds[0], out, start),
+                address(context, builder, kinds[1], base, start),
+                address(context, builder, kinds[2], a, first),
+                address(context, builder, kinds[3], B, first, start),
                 row_bytes(context, builder, kinds[3], B),
                 builder.sub(last, first),
                 blocks_of(builder, builder.sub(stop, start)),
@@ -177,9 +111,9 @@ def _spreading(typing_context, B, a, v, first, last, start, stop):
         B, a, v, first, last, start, stop = arguments
         kinds = signature.args
         given = [
-            _address(context, builder, kinds[0], B, first, start),
-            _address(context, builder, kinds[1], a, first),
-            _address(context, builder, kinds[2], v, start),
+            address(context, builder, kinds[0], B, first, start),
+            address(context, builder, kinds[1], a, first),
+            address(context, builder, kinds[2], v, start),
             row_bytes(context, builder, kinds[0], B),
             builder.sub(last, first),
             blocks_of(builder, builder.sub(stop, start)),
@@ -261,7 +195,7 @@ def _each(name: str, formula: Callable[..., Any], count: int) -> Any:
 
     def write(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         *vectors, stop = arguments
-        places = [_address(context, builder, kind, v) for kind, v in zip(signature.args, vectors, strict=False)]
+        places = [address(context, builder, kind, v) for kind, v in zip(signature.args, vectors, strict=False)]
         call_of(builder, name, body, [*places, blocks_of(builder, stop)])
         return context.get_dummy_value()
 
@@ -317,16 +251,16 @@ def _multiply_plain(out, a, b, stop):
 
 
 @lean
-def _pull_plain(out, d, a, b, stop):
+def _damping_gradient_plain(out, d, a, b, stop):
     for j in range(min(stop, len(out), len(d), len(a), len(b))):
         out[j] = d[j] * (a[j] - b[j])
 
 
-clear: Any = _clear_plain if _CHECKED else _each("clear", lambda builder: _NOUGHT, 0)
+clear: Any = _clear_plain if _CHECKED else _each("clear", lambda builder: ZEROS, 0)
 """``(out, stop)``: out = 0 up to a column; whole blocks, as in all that follow."""
 put: Any = _copy_plain if _CHECKED else _each("put", lambda builder, a: a, 1)
 """``(out, a, stop)``: out = a."""
-put_inverse: Any = _invert_plain if _CHECKED else _each("invert", lambda builder, a: builder.fdiv(_ONES, a), 1)
+put_inverse: Any = _invert_plain if _CHECKED else _each("invert", lambda builder, a: builder.fdiv(ONES, a), 1)
 """``(out, a, stop)``: out = 1 / a."""
 put_root: Any = _root_plain if _CHECKED else _each("root", _square_root, 1)
 """``(out, a, stop)``: out = sqrt(a)."""
@@ -334,8 +268,10 @@ put_difference: Any = _subtract_plain if _CHECKED else _each("subtract", lambda 
 """``(out, a, b, stop)``: out = a - b."""
 put_product: Any = _multiply_plain if _CHECKED else _each("multiply", lambda builder, a, b: builder.fmul(a, b), 2)
 """``(out, a, b, stop)``: out = a b."""
-put_pull: Any = (
-    _pull_plain if _CHECKED else _each("pull", lambda builder, d, a, b: builder.fmul(d, builder.fsub(a, b)), 3)
+put_damping_gradient: Any = (
+    _damping_gradient_plain
+    if _CHECKED
+    else _each("damping_gradient", lambda builder, d, a, b: builder.fmul(d, builder.fsub(a, b)), 3)
 )
 """``(out, d, a, b, stop)``: out = d (a - b)."""
 
@@ -360,7 +296,7 @@ def _multiplying(typing_context, out, by, a, n):
 
     def generate(context, builder, signature, arguments):
         _, by, _, n = arguments
-        places = [_address(context, builder, signature.args[k], arguments[k]) for k in (0, 2)]
+        places = [address(context, builder, signature.args[k], arguments[k]) for k in (0, 2)]
         call_of(builder, "multiple", body, [places[0], by, places[1], n])
         return context.get_dummy_value()
 
@@ -382,7 +318,7 @@ def _seeking(typing_context, a, b, stop):
         return builder.select(builder.fcmp_ordered(">", x, y), x, y)
 
     def body(builder, a, b, blocks):
-        most = cgutils.alloca_once_value(builder, _NOUGHT)
+        most = cgutils.alloca_once_value(builder, ZEROS)
         with cgutils.for_range(builder, blocks) as loop:
             x, y = (load(builder, builder.add(at, builder.mul(_INDEX(BYTES), loop.index))) for at in (a, b))
             builder.store(larger(builder, _absolute(builder, builder.fmul(x, y)), builder.load(most)), most)
@@ -395,7 +331,7 @@ def _seeking(typing_context, a, b, stop):
         return builder.extract_element(block, _LANE(0))
 
     def generate(context, builder, signature, arguments):
-        places = [_address(context, builder, signature.args[k], arguments[k]) for k in range(2)]
+        places = [address(context, builder, signature.args[k], arguments[k]) for k in range(2)]
         return call_of(builder, "largest", body, [*places, blocks_of(builder, arguments[2])], _DOUBLE)
 
     return types.float64(a, b, types.int64), generate
@@ -411,63 +347,3 @@ def _largest_plain(a, b, stop):
 
 largest_product: Any = _largest_plain if _CHECKED else cast(Any, intrinsic)(_seeking)
 """``(a, b, stop)``: the largest |a_j b_j| up to a column; what is no number counts as none."""
-
-
-def _turn_block(builder: Any, T: Any, B: Any, into: Any, step: Any) -> None:
-    """A block of rows at T, ``into`` bytes apart, becomes the transpose of one at B: rounds of exchanged halves."""
-    rows = [load(builder, builder.add(B, builder.mul(step, _INDEX(r)))) for r in range(WIDTH)]
-    apart, kind = 1, ir.VectorType(_LANE, WIDTH)
-    while apart < WIDTH:
-        lower = kind([c + (WIDTH - apart if c & apart else 0) for c in range(WIDTH)])
-        upper = kind([c + (WIDTH if c & apart else apart) for c in range(WIDTH)])
-        turned = list(rows)
-        for r in range(WIDTH):
-            if not r & apart:
-                turned[r] = builder.shuffle_vector(rows[r], rows[r + apart], lower)
-                turned[r + apart] = builder.shuffle_vector(rows[r], rows[r + apart], upper)
-        rows, apart = turned, 2 * apart
-    for r, row in enumerate(rows):
-        store(builder, row, builder.add(T, builder.mul(into, _INDEX(r))))
-
-
-def _transposing(upper: bool) -> Any:
-    def body(builder, T, B, into, step, m, n):
-        with cgutils.for_range_slice(builder, _INDEX(0), m, _INDEX(WIDTH), inc=True) as (i, _):
-            begin = i if upper else _INDEX(0)
-            with cgutils.for_range_slice(builder, begin, n, _INDEX(WIDTH), inc=True) as (j, _):
-                to = builder.add(T, builder.add(builder.mul(into, j), builder.mul(_INDEX(8), i)))
-                of = builder.add(B, builder.add(builder.mul(step, i), builder.mul(_INDEX(8), j)))
-                _turn_block(builder, to, of, into, step)
-
-    def take(typing_context, T, B, m, n):
-        def generate(context, builder, signature, arguments):
-            T, B, m, n = arguments
-            kinds = signature.args
-            places = [_address(context, builder, kind, a) for kind, a in zip(kinds[:2], (T, B), strict=True)]
-            steps = [row_bytes(context, builder, kind, a) for kind, a in zip(kinds[:2], (T, B), strict=True)]
-            call_of(builder, "transpose_upper" if upper else "transpose", body, [*places, *steps, m, n])
-            return context.get_dummy_value()
-
-        return types.void(T, B, types.int64, types.int64), generate
-
-    return cast(Any, intrinsic)(take)
-
-
-@lean
-def _transpose_plain(T, B, m, n):
-    for i in range(m):
-        for j in range(n):
-            T[j, i] = B[i, j]
-
-
-@lean
-def _transpose_upper_plain(T, B, m, n):
-    for i in range(m):
-        for j in range(i, n):
-            T[j, i] = B[i, j]
-
-
-transpose: Any = _transpose_plain if _CHECKED else _transposing(False)
-"""``(T, B, m, n)``: T = B' for m rows of n numbers, in whole blocks: both have ``padded`` rows too."""
-transpose_upper: Any = _transpose_upper_plain if _CHECKED else _transposing(True)
-"""Likewise of the upper half, with the blocks on the diagonal whole."""

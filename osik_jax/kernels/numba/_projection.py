@@ -6,7 +6,7 @@ taken first; ``beside`` has the level's rows in these coordinates. Householder r
 the level's rows that is left, turn both (``_row_space.py``): the rows of ``turned`` that a level has taken are then the
 basis of the row space of A P, and those of ``beside`` the level's rows on it.
 
-``strength_of`` and ``narrow`` are ``level_damping`` and ``narrow_box`` of ``solvers/_damping.py``; x is where P x = 0
+``level_damping`` and ``narrow`` are ``level_damping`` and ``narrow_box`` of ``solvers/_damping.py``; x is where P x = 0
 before every level.
 """
 
@@ -26,7 +26,7 @@ from ...numerics._constants import (
 )
 from ._dense import add_multiple, dot, fill
 from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
-from ._padded_rows import clear, minus_rows, plus_rows, plus_squares, put_multiple, transpose
+from ._padded_rows import clear, minus_rows, plus_rows, plus_squares, put_multiple
 from ._row_space import (
     are_independent,
     set_beside,
@@ -39,6 +39,7 @@ from ._row_space import (
 from ._row_space_workspace import work_at
 from ._symmetric import factor_symmetric, solve_symmetric
 from ._tiles import padded
+from ._transpose import transpose
 
 
 class Level(NamedTuple):
@@ -71,7 +72,7 @@ def load(W, level):
     for i in range(m, padded(m)):
         clear(W.rows[i], n)
     transpose(W.columns, W.rows, m, n)
-    plus_squares(W.size, W.nought, W.turn, W.columns, 0, n, 0, m)
+    plus_squares(W.size, W.zeros, W.turn, W.columns, 0, n, 0, m)
 
 
 @lean
@@ -79,7 +80,7 @@ def look(W, level, x):
     """What the level's rows are at x and ask for; the square of the longest row, and the size of all."""
     m, n = level.A.shape
     longest, size = 0.0, 0.0
-    minus_rows(W.value, W.nought, x, W.columns, 0, n, 0, m)
+    minus_rows(W.value, W.zeros, x, W.columns, 0, n, 0, m)
     for i in range(m):
         W.wanted[i] = gap(level, i, W.value[i])
         longest, size = max(longest, W.size[i]), size + W.size[i]
@@ -93,8 +94,8 @@ def counts(W, level, i):
 
 
 @lean(inline="always")
-def strength_of(W, level, first, longest):
-    """The damping of the level: constant + unmet share, share what the step with this very damping misses."""
+def level_damping(W, level, first, longest):
+    """The damping of the level: constant + unmet ratio, the ratio of what the step with this very damping misses."""
     m, n = level.A.shape
     whole = level.constant
     if level.unmet != 0.0:
@@ -102,21 +103,21 @@ def strength_of(W, level, first, longest):
         trace = 0.0
         for i in range(m):
             trace -= W.less[i, i] if counts(W, level, i) else 0.0
-        share = 1.0
+        ratio = 1.0
         for _ in range(DAMPING_ITERATIONS):
-            strength = level.constant + level.unmet * share + DAMPING_RIDGE * trace
-            share = min(missed_with(W, level, strength) / (level.demand if level.demand > 0.0 else 1.0), 1.0)
-        whole += level.unmet * share
+            damping = level.constant + level.unmet * ratio + DAMPING_RIDGE * trace
+            ratio = min(missed_with(W, level, damping) / (level.demand if level.demand > 0.0 else 1.0), 1.0)
+        whole += level.unmet * ratio
     return whole if whole > NEGLIGIBLE_DAMPING * longest else 0.0
 
 
 @lean
-def missed_with(W, level, strength):
+def missed_with(W, level, damping):
     """Size of the residual that the step with this damping leaves; rows that do not count are 0 in the step."""
     m = len(level.A)
     for i in range(m):
         put_multiple(W.symmetric[i], -1.0, W.less[i], padded(m))
-        W.symmetric[i, i] += strength if strength > 0.0 else 1.0
+        W.symmetric[i, i] += damping if damping > 0.0 else 1.0
         W.solved[i] = W.wanted[i]
     for i in range(m, padded(m)):
         clear(W.symmetric[i], m)
@@ -155,7 +156,7 @@ def find_motion(W, level, first, damping, rank_tolerance, plain):
         rank = take_row_space(W, m, n, first, cutoff, plain)
         if not (are_independent(W, m, rank) and solve_by_rows(W, m, first, rank, damping)):
             solve_on_basis(W, m, n, first, rank, damping)
-    plus_rows(W.motion, W.nought, W.right, W.turned[first:], 0, rank, 0, n)
+    plus_rows(W.motion, W.zeros, W.right, W.turned[first:], 0, rank, 0, n)
     return rank
 
 
@@ -164,11 +165,11 @@ def move(W, x):
     """Adds as much of the motion to x as stays within what levels out of reach leave to those below."""
     part, n = 1.0, len(x)
     for i in range(n):
-        way = W.motion[i]
-        if way != 0.0:
-            room = W.high[i] - x[i] if way > 0.0 else x[i] - W.low[i]
+        step = W.motion[i]
+        if step != 0.0:
+            room = W.high[i] - x[i] if step > 0.0 else x[i] - W.low[i]
             if room < np.inf:
-                part = min(part, room / abs(way))
+                part = min(part, room / abs(step))
     add_multiple(x, part, W.motion, n)
 
 
@@ -180,7 +181,7 @@ def narrow(W, level, x, longest, size):
         W.bent[j] = max(W.bent[j], level.bends[j] / (size if size > 0.0 else 1.0))
     if not level.unmet > NEGLIGIBLE_DAMPING * longest:
         return
-    minus_rows(W.missing, W.nought, x, W.columns, 0, n, 0, m)
+    minus_rows(W.missing, W.zeros, x, W.columns, 0, n, 0, m)
     missed = 0.0
     for i in range(m):
         missed += gap(level, i, W.missing[i]) ** 2
@@ -208,7 +209,7 @@ def solve_level(W, level, x, first, rank_tolerance):
     load(W, level)
     longest, size = look(W, level, x)
     set_beside(W, m, n, first, first == 0)
-    damping = strength_of(W, level, first, longest)
+    damping = level_damping(W, level, first, longest)
     rank = find_motion(W, level, first, damping, rank_tolerance, first == 0)
     move(W, x)
     narrow(W, level, x, longest, size)

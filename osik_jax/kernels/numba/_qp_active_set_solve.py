@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import INACTIVE
+from ...numerics._constants import EPSILON, INACTIVE, KERNEL_CORRECTION, KERNEL_PIVOT, KERNEL_REFINEMENTS, MIN_DECREASE
 from ._dense import add_multiple, backward, cholesky, dot, forward
 from ._frame import lean
 from ._padded_rows import (
@@ -16,25 +16,18 @@ from ._padded_rows import (
     largest_product,
     minus_rows,
     put,
+    put_damping_gradient,
     put_difference,
     put_inverse,
     put_multiple,
     put_product,
-    put_pull,
 )
 from ._qp_problem import active_bound
 from ._symmetric import factor_symmetric, solve_symmetric
 from ._tiles import padded, take_product
 from ._vectors import WIDTH
 
-EPS = 2.220446049250313e-16
-_SMALLEST_PIVOT = 1e2
-"""Roundings of its diagonal element; a smaller pivot says that rows depend on each other."""
-_MOST_CORRECTIONS = 10
-_LAST_CORRECTION = 1e-10
-"""A correction by this share of x is the last."""
-_WORTH = 0.25
-"""A correction that is not this much smaller than the one before is rounding."""
+_MAX_REFINEMENTS = KERNEL_REFINEMENTS[np.dtype("float64")]
 
 
 @lean(inline="always")
@@ -96,7 +89,7 @@ def find_gradient(P, W, labels, x, z):
         find_gaps(P, W, labels, x, z)
         for i in range(m):
             z[i] = W.gap[i]
-    put_pull(W.gradient, P.damping, x, P.center, padded(n))
+    put_damping_gradient(W.gradient, P.damping, x, P.center, padded(n))
     minus_rows(W.gradient, W.gradient, z, P.rows, 0, rows, 0, padded(n))
 
 
@@ -144,22 +137,22 @@ def solve_in_row_space(P, W, labels, count, x, z):
         take_product(W.gram, W.scaled, columns, a, min(a + WIDTH, k), a, width, 0, n)
     for a in range(k):
         W.gram[a, a] += P.compliance[W.used[a]]
-    if not factor_symmetric(W.gram, W.factor, W.turned_factor, W.pivots, W.solved, k, _SMALLEST_PIVOT * EPS):
+    if not factor_symmetric(W.gram, W.factor, W.turned_factor, W.pivots, W.solved, k, KERNEL_PIVOT * EPSILON):
         return False
     clear(W.gradient, wide)
     before = np.inf
-    for _ in range(_MOST_CORRECTIONS):
+    for _ in range(_MAX_REFINEMENTS):
         solve_symmetric(W.factor, W.turned_factor, W.pivots, W.right, k)
-        clear(W.pull, padded(rows))
+        clear(W.row_terms, padded(rows))
         for a in range(k):
             z[W.used[a]] += W.right[a]
-            W.pull[W.used[a]] = W.right[a]
-        minus_rows(W.step, W.gradient, W.pull, P.rows, 0, rows, 0, wide)
+            W.row_terms[W.used[a]] = W.right[a]
+        minus_rows(W.step, W.gradient, W.row_terms, P.rows, 0, rows, 0, wide)
         put_product(W.step, W.step, W.inverse, wide)
         put_difference(x, x, W.step, wide)
         moved, far = largest_product(W.step, P.root, wide), largest_product(x, P.root, wide)
         find_gradient(P, W, labels, x, z)
-        if before < np.inf and (moved <= _LAST_CORRECTION * far or moved > _WORTH * before):
+        if before < np.inf and (moved <= KERNEL_CORRECTION * far or moved > MIN_DECREASE * before):
             break
         before = moved
         clear(W.right, width)
@@ -203,7 +196,7 @@ def factor_hessian(P, W, labels, count):
                     W.square[a, b] = 0.0
         else:
             W.square[a, a] = 1.0
-    if not cholesky(W.square, n, EPS):
+    if not cholesky(W.square, n, EPSILON):
         return False
     for a in range(count - m):
         row, reduced = P.rows[W.used[m + a]], W.reduced[a]
@@ -213,7 +206,7 @@ def factor_hessian(P, W, labels, count):
         for b in range(a + 1):
             W.schur[a, b] = dot(reduced, W.reduced[b], 0, n)
         W.schur[a, a] += P.compliance[W.used[m + a]]
-    return cholesky(W.schur, count - m, _SMALLEST_PIVOT * EPS)
+    return cholesky(W.schur, count - m, KERNEL_PIVOT * EPSILON)
 
 
 @lean
@@ -231,9 +224,9 @@ def solve_by_hessian(P, W, labels, count, x, z):
     for a in range(p):
         z[W.used[m + a]] = 0.0
     before, last = np.inf, False
-    for round in range(_MOST_CORRECTIONS + 1):
+    for round in range(_MAX_REFINEMENTS + 1):
         find_gradient(P, W, labels, x, z)
-        if last or round == _MOST_CORRECTIONS:
+        if last or round == _MAX_REFINEMENTS:
             break
         for j in range(n):
             W.step[j] = -W.gradient[j] if labels[j] == INACTIVE else 0.0
@@ -247,6 +240,6 @@ def solve_by_hessian(P, W, labels, count, x, z):
             add_multiple(W.step, W.right[a], W.reduced[a], n)
         backward(W.square, W.step, n)
         moved, far = move(P, W, x)
-        last = before < np.inf and (moved <= _LAST_CORRECTION * far or moved > _WORTH * before)
+        last = before < np.inf and (moved <= KERNEL_CORRECTION * far or moved > MIN_DECREASE * before)
         before = moved
     return True

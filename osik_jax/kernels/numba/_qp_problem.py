@@ -8,8 +8,9 @@ import numpy as np
 
 from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE
 from ._frame import lean
-from ._padded_rows import plus_squares, put_inverse, put_multiple, put_root, transpose
+from ._padded_rows import plus_squares, put_inverse, put_multiple, put_root
 from ._tiles import padded
+from ._transpose import transpose
 
 
 class Problem(NamedTuple):
@@ -18,7 +19,7 @@ class Problem(NamedTuple):
     Fields: ``rows`` [sqrt(W) A; C], (m + p, n), and ``turned``, its transpose. ``target`` sqrt(W) target, (m,), and
     ``goal``, the same and noughts, (m + p,). ``compliance`` ones, then those of the rows of C, (m + p,). ``damping``
     and ``center`` (n,). ``lower`` and ``upper`` (n + p,). ``root`` of the Hessian's diagonal, the unit in which each
-    variable is measured, and ``reach``, 1 over it, (n,). All but bounds and compliance are ``padded``.
+    variable is measured, and ``inverse_root``, 1 over it, (n,). All but bounds and compliance are ``padded``.
     """
 
     rows: np.ndarray
@@ -31,7 +32,7 @@ class Problem(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     root: np.ndarray
-    reach: np.ndarray
+    inverse_root: np.ndarray
 
 
 class Workspace(NamedTuple):
@@ -40,7 +41,7 @@ class Workspace(NamedTuple):
     Fields: ``square`` (q, q) a Cholesky factor. Of the rows' space ``gram`` (k, k), its ``factor`` and
     ``turned_factor`` (k, k), ``pivots`` (k,). ``columns`` (n, k) of the used rows, and ``scaled`` (n, k) those over the
     damping, negative. ``reduced`` (p, n) and ``schur`` (p, p): rows of C behind the factor of the Hessian. ``used``
-    (k,) numbers of rows; ``gap`` and ``pull`` (k,) of rows. ``right`` (q,), ``solved`` (k,). ``inverse`` of the
+    (k,) numbers of rows; ``gap`` and ``row_terms`` (k,). ``right`` (q,), ``solved`` (k,). ``inverse`` of the
     damping, ``step``, ``gradient`` and ``ones`` (n,). ``value_roundoff`` and ``multiplier_roundoff`` (N,). ``next``
     (N,) labels. The rest is the dual active-set method's: ``R``, ``J`` (N, N), ``point``, ``along``, ``reflected``,
     ``multipliers``, ``rates``, ``order`` (N,). Vectors are ``padded``, and so are rows and columns of what is (k, k) or
@@ -61,7 +62,7 @@ class Workspace(NamedTuple):
     solved: np.ndarray
     pivots: np.ndarray
     gap: np.ndarray
-    pull: np.ndarray
+    row_terms: np.ndarray
     ones: np.ndarray
     inverse: np.ndarray
     step: np.ndarray
@@ -97,7 +98,7 @@ def begin(P, A, target, weight, damping, center, C, compliance):
     transpose(P.turned, P.rows, m + p, n)
     plus_squares(P.root, P.damping, P.damping, P.rows, 0, m, 0, wide)
     put_root(P.root, P.root, wide)
-    put_inverse(P.reach, P.root, wide)
+    put_inverse(P.inverse_root, P.root, wide)
 
 
 @lean
@@ -116,5 +117,5 @@ def first_labels(P, guess, labels):
 
 @lean
 def active_bound(P, label, i):
-    """The bound at which constraint i is held."""
+    """The bound at which constraint i is active."""
     return P.upper[i] if label == AT_UPPER else P.lower[i]

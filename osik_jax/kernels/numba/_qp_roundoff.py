@@ -7,18 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import INACTIVE
+from ...numerics._constants import BOUND_MULTIPLIER, EPSILON, INACTIVE, ZERO_TOL
 from ._frame import lean
 from ._padded_rows import clear, largest_product, plus_sizes
-from ._qp_active_set_solve import EPS
 from ._tiles import padded
-
-_NOUGHT = 100.0
-"""Roundings of what the cost pulls at x; an x that is no larger is 0."""
-_TOLD_FROM_NONE = 1.0
-"""Roundings of the terms at a variable on a bound; a multiplier of the wrong sign that is larger lets it go.
-
-Tolerances of the cost's curvature would not do: a weak task, such as a posture, pulls with less than those."""
 
 
 @lean(inline="always")
@@ -30,15 +22,15 @@ def find_roundoff(P, W, labels, tolerance, x, z):
         gradient = W.gradient[j]
         for i in range(m, len(P.compliance)):
             gradient += P.rows[i, j] * z[i]
-        W.step[j] = abs(gradient) * (P.reach[j] * P.reach[j])
-    most, pulled_most = largest_product(x, P.root, wide), largest_product(W.step, P.root, wide)
+        W.step[j] = abs(gradient) * (P.inverse_root[j] * P.inverse_root[j])
+    most, newton_most = largest_product(x, P.root, wide), largest_product(W.step, P.root, wide)
     longest = largest_product(x, W.ones, wide)
-    if most <= _NOUGHT * EPS * pulled_most:
-        most, longest = pulled_most, largest_product(W.step, W.ones, wide)
+    if most <= ZERO_TOL * EPSILON * newton_most:
+        most, longest = newton_most, largest_product(W.step, W.ones, wide)
     at_bound = False
     for j in range(n):
         nearest = min(abs(P.lower[j]), abs(P.upper[j]))
-        scale = min(most * P.reach[j], longest) + abs(x[j]) + (nearest if nearest < np.inf else 0.0)
+        scale = min(most * P.inverse_root[j], longest) + abs(x[j]) + (nearest if nearest < np.inf else 0.0)
         W.value_roundoff[j] = tolerance * scale
         at_bound = at_bound or labels[j] != INACTIVE
     for i in range(n, len(P.lower)):
@@ -46,7 +38,7 @@ def find_roundoff(P, W, labels, tolerance, x, z):
         for j in range(n):
             value += row[j] * x[j]
             span += abs(row[j])
-            reach += abs(row[j]) * P.reach[j]
+            reach += abs(row[j]) * P.inverse_root[j]
         nearest = min(abs(P.lower[i]), abs(P.upper[i]))
         scale = min(most * reach, longest * span) + abs(value) + (nearest if nearest < np.inf else 0.0)
         W.value_roundoff[i] = tolerance * scale
@@ -59,13 +51,13 @@ def find_roundoff(P, W, labels, tolerance, x, z):
 def find_bound_roundoff(P, W, x, z):
     """Of each variable on a bound, what counts as no multiplier: rounding of the terms of its gradient."""
     m, n, rows = len(P.target), len(x), len(P.compliance)
-    clear(W.pull, padded(rows))
-    plus_sizes(W.pull, W.pull, x, P.turned, 0, n, 0, padded(rows))
+    clear(W.row_terms, padded(rows))
+    plus_sizes(W.row_terms, W.row_terms, x, P.turned, 0, n, 0, padded(rows))
     for i in range(rows):
-        size = abs(z[i]) if i >= m else abs(P.target[i]) + W.pull[i]
-        W.pull[i] = _TOLD_FROM_NONE * EPS * size
+        size = abs(z[i]) if i >= m else abs(P.target[i]) + W.row_terms[i]
+        W.row_terms[i] = BOUND_MULTIPLIER * EPSILON * size
     for j in range(n):
-        W.step[j] = _TOLD_FROM_NONE * EPS * P.damping[j] * (abs(x[j]) + abs(P.center[j]))
-    plus_sizes(W.step, W.step, W.pull, P.rows, 0, rows, 0, padded(n))
+        W.step[j] = BOUND_MULTIPLIER * EPSILON * P.damping[j] * (abs(x[j]) + abs(P.center[j]))
+    plus_sizes(W.step, W.step, W.row_terms, P.rows, 0, rows, 0, padded(n))
     for j in range(n):
         W.multiplier_roundoff[j] = W.step[j]

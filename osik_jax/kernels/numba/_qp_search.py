@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, IMPLIED, INACTIVE
+from ...numerics._constants import AT_LOWER, AT_UPPER, EQUALITY, INACTIVE, MAX_DUAL_STARTS, MAX_EXCHANGES, REDUNDANT
 from ._dense import dot
 from ._frame import lean
 from ._goldfarb_idnani import dual_active_set
 from ._qp_active_set_solve import solve_on_active_set
 from ._qp_roundoff import find_roundoff
-
-_PATIENCE = 2
-"""Exchanges that leave no fewer wrong signs, before the dual active-set method."""
-_MOST_DUAL = 8
-"""Times that the dual active-set method begins or goes on: its end, solved anew, may be a little off another bound."""
 
 
 @lean(inline="always")
@@ -26,12 +21,12 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
         W: space.
         labels: the guess; the active set at the end. (n + p,)
         tolerance: violation that counts as none, relative to the scale of the constraint.
-        most_changes: cap on changes of the active set.
+        most_changes: limit on changes of the active set.
         x: the minimiser. (n,)
         z: multipliers of the rows. (m + p,)
         report: whether there is a candidate, changes, systems factored. (3,)
     """
-    best, lives, cold, times, held = len(labels) + 1, _PATIENCE, False, 0, np.int64(-1)
+    best, lives, cold, times, active_count = len(labels) + 1, MAX_EXCHANGES, False, 0, np.int64(-1)
     while True:
         report[2] += 1
         is_regular = solve_on_active_set(P, W, labels, x, z)
@@ -39,13 +34,13 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
             return
         if is_regular:
             find_roundoff(P, W, labels, tolerance, x, z)
-        if times > 0 and (times == _MOST_DUAL or not leaves_out(P, W, labels, x, z)):
+        if times > 0 and (times == MAX_DUAL_STARTS or not leaves_out(P, W, labels, x, z)):
             report[0] = 1
             for i in range(len(labels)):
-                labels[i] = IMPLIED if W.next[i] != 0 else labels[i]
+                labels[i] = REDUNDANT if W.next[i] != 0 else labels[i]
             return
         if cold:
-            steps, held = dual_active_set(P, W, labels, x, z, held, most_changes - report[1])
+            steps, active_count = dual_active_set(P, W, labels, x, z, active_count, most_changes - report[1])
             if steps < 0:
                 return
             report[1] += steps
@@ -58,7 +53,7 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
         if is_regular and wrong == 0:
             report[0] = 1
             return
-        lives = _PATIENCE if wrong < best else lives - 1
+        lives = MAX_EXCHANGES if wrong < best else lives - 1
         best = min(best, wrong)
         cold = not is_regular or lives < 0
         for i in range(len(labels)):
@@ -69,7 +64,7 @@ def search(P, W, labels, tolerance, most_changes, x, z, report):
 
 @lean
 def leaves_out(P, W, labels, x, z):
-    """Return whether a constraint is violated that is inactive, and not implied by the active ones."""
+    """Return whether a constraint is violated that is inactive, and not redundant beside the active ones."""
     for i in range(len(labels)):
         if labels[i] == INACTIVE and W.next[i] == 0 and right_label(P, W, labels, i, x, z) != INACTIVE:
             return True

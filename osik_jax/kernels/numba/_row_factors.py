@@ -47,9 +47,9 @@ def next_column(columns, triangle, k, m, root):
     column[m + k] = root
     for _ in range(2):
         for a in range(k):
-            share = dot(columns[a], column, 0, m + a + 1)  # nothing of column a is below that
-            add_multiple(column, -share, columns[a], m + a + 1)
-            triangle[a, k] += share
+            coefficient = dot(columns[a], column, 0, m + a + 1)  # nothing of column a is below that
+            add_multiple(column, -coefficient, columns[a], m + a + 1)
+            triangle[a, k] += coefficient
     size = np.sqrt(dot(column, column, 0, stop))
     triangle[k, k] = size
     for i in range(stop):
@@ -69,9 +69,9 @@ def factor(rest, cutoff, root, basis, columns, triangle):
         if not next_direction(rest, basis, k, cutoff):
             return
         for i in range(m):
-            share = dot(rest[i], basis[k], 0, n)
-            columns[k, i] = share
-            add_multiple(rest[i], -share, basis[k], n)
+            coefficient = dot(rest[i], basis[k], 0, n)
+            columns[k, i] = coefficient
+            add_multiple(rest[i], -coefficient, basis[k], n)
         next_column(columns, triangle, k, m, root)
 
 

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...numerics._constants import INDEPENDENT_ROWS
 from ._dense import add_multiple, dot, fill
 from ._frame import lean
-from ._padded_rows import add_to_rows, clear, minus_rows, plus_rows, plus_squares, put, put_multiple, transpose
+from ._padded_rows import add_to_rows, clear, minus_rows, plus_rows, plus_squares, put, put_multiple
 from ._symmetric import factor_symmetric, solve_symmetric
 from ._tiles import padded, take_product
-
-WELL_APART = 1e-7
-"""Least eigenvalue of a Gram matrix, of its trace, from which on its factors are accurate enough."""
+from ._transpose import transpose
 
 
 @lean
@@ -67,10 +66,10 @@ def reflect(W, m, n, first, at, pivot, length, plain):
     k, head = at - first, W.turn[at]
     W.turn[at] = head + (length if head >= 0.0 else -length)
     scale = 1.0 / (length * (length + abs(head)))
-    plus_rows(W.share, W.nought, W.turn, W.beside, at, n, 0, m)
-    put_multiple(W.share, -scale, W.share, padded(m))
-    add_to_rows(W.beside, W.turn, W.share, at, n, 0, m)
-    plus_squares(W.square, W.nought, W.turn, W.beside, at + 1, n, 0, m)
+    plus_rows(W.products, W.zeros, W.turn, W.beside, at, n, 0, m)
+    put_multiple(W.products, -scale, W.products, padded(m))
+    add_to_rows(W.beside, W.turn, W.products, at, n, 0, m)
+    plus_squares(W.square, W.zeros, W.turn, W.beside, at + 1, n, 0, m)
     row = W.along[k]
     if plain:
         for j in range(at):
@@ -78,10 +77,10 @@ def reflect(W, m, n, first, at, pivot, length, plain):
         for j in range(at, n):
             row[j] = W.turn[j]
     else:
-        plus_rows(row, W.nought, W.turn, W.turned, at, n, 0, n)
+        plus_rows(row, W.zeros, W.turn, W.turned, at, n, 0, n)
     if k > 0:
-        plus_rows(W.share, W.nought, W.turn, W.turns_by_coordinate, at, n, 0, k)
-        minus_rows(row, row, W.share, W.along, 0, k, 0, n)
+        plus_rows(W.products, W.zeros, W.turn, W.turns_by_coordinate, at, n, 0, k)
+        minus_rows(row, row, W.products, W.along, 0, k, 0, n)
     put_multiple(row, scale, row, padded(n))
     turns = W.turns[k]
     for j in range(first):
@@ -101,7 +100,7 @@ def take_row_space(W, m, n, first, cutoff, plain):
     The longest row that is left is the pivot, the first of equals; one no longer than the cutoff ends it. ``right`` has
     the squares of their lengths.
     """
-    plus_squares(W.square, W.nought, W.turn, W.beside, first, n, 0, m)
+    plus_squares(W.square, W.zeros, W.turn, W.beside, first, n, 0, m)
     at = first
     while at < n and at - first < m:
         pivot = np.int64(0)
@@ -145,9 +144,9 @@ def solve_on_basis(W, m, n, first, rank, damping):
         for a in range(k + 1, rank):
             W.triangle[k, a] = dot(column, W.basis_columns[a], 0, stop)
             add_multiple(W.basis_columns[a], -W.triangle[k, a], column, stop)
-        share = dot(column, W.right, 0, stop)
-        add_multiple(W.right, -share, column, stop)
-        W.solved[k] = share
+        coefficient = dot(column, W.right, 0, stop)
+        add_multiple(W.right, -coefficient, column, stop)
+        W.solved[k] = coefficient
     for k in range(rank - 1, -1, -1):
         W.right[k] = (W.solved[k] - dot(W.triangle[k], W.right, k + 1, rank)) / W.triangle[k, k]
 
@@ -163,7 +162,7 @@ def are_independent(W, m, rank):
     mean, product = trace / max(rank - 1, 1), 1.0
     for k in range(rank):
         product *= W.right[k] / mean
-    return product * mean >= WELL_APART * trace
+    return product * mean >= INDEPENDENT_ROWS * trace
 
 
 @lean
@@ -171,7 +170,7 @@ def solve_by_rows(W, m, first, rank, damping):
     """Likewise ``right``, from rows that are independent: C' (C C' + damping)^-1 wanted, corrected once."""
     if not factor_damped(W, m, damping):
         return False
-    put(W.solved, W.nought, m)
+    put(W.solved, W.zeros, m)
     put(W.missing, W.wanted, m)
     for again in range(2):
         solve_symmetric(W.lower, W.upper, W.inverse, W.missing, m)
@@ -204,12 +203,12 @@ def solve_in_all(W, m, n, first, damping, cutoff):
     for j in range(left):
         product /= W.inverse[j] * mean
     least = product * mean
-    if not (least >= WELL_APART * trace and least - damping > 2.0 * m * cutoff * cutoff):
+    if not (least >= INDEPENDENT_ROWS * trace and least - damping > 2.0 * m * cutoff * cutoff):
         return False
-    plus_rows(W.right, W.nought, W.wanted, W.rows, 0, m, 0, left)
+    plus_rows(W.right, W.zeros, W.wanted, W.rows, 0, m, 0, left)
     solve_symmetric(W.lower, W.upper, W.inverse, W.right, left)
     minus_rows(W.missing, W.wanted, W.right, C, 0, left, 0, m)
-    plus_rows(W.solved, W.nought, W.missing, W.rows, 0, m, 0, left)
+    plus_rows(W.solved, W.zeros, W.missing, W.rows, 0, m, 0, left)
     for j in range(left):
         W.solved[j] -= damping * W.right[j]
     solve_symmetric(W.lower, W.upper, W.inverse, W.solved, left)

@@ -1,6 +1,6 @@
 """Space of the null space's kernels for one problem, in rows of whole blocks of eight numbers.
 
-What is behind the last number of a row may be anything, except where a field says that there are noughts.
+What is behind the last number of a row may be anything, except where a field says that there are 0s.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ._frame import compiled, matrix, vector
+from ._sizes import row_space_numbers
 from ._tiles import padded
 from ._vectors import WIDTH
 
@@ -21,15 +22,15 @@ class Work(NamedTuple):
         turned: orthonormal rows, of which those taken come first. (n, n)
         beside: the level's rows in these coordinates, a column each. (n, w)
         across: the transpose of ``turned``, from the first row that is left on. (n, n)
-        rows, columns: minus the level's rows, and their transpose, with noughts behind them. (w, n), (n, w)
+        rows, columns: minus the level's rows, and their transpose, with 0s behind them. (w, n), (n, w)
         less: minus a Gram matrix, of rows or of columns. (w, w)
         symmetric, upper, lower: what is factored, and its factors. (w, w)
         turns, turns_by_coordinate: reflections of one level, a row (and a block more) or a column each. (n, n), (n, n)
         along: what they take from ``turned``. (n, n)
         basis_columns, triangle: the factorisation of a level that is nearly dependent. (n, w + n), (n, n)
         turn: a reflection.
-        share: what it takes from each column of ``beside``; its products with others.
-        nought: noughts.
+        products: what it takes from each column of ``beside``; its products with others.
+        zeros: 0s.
         value, wanted, size: of the level's rows: what they are, what they ask for, their squared length.
         square: of what is left of them in the coordinates that are left.
         inverse, diagonal: of the factors.
@@ -53,8 +54,8 @@ class Work(NamedTuple):
     basis_columns: np.ndarray
     triangle: np.ndarray
     turn: np.ndarray
-    share: np.ndarray
-    nought: np.ndarray
+    products: np.ndarray
+    zeros: np.ndarray
     value: np.ndarray
     wanted: np.ndarray
     size: np.ndarray
@@ -70,16 +71,12 @@ class Work(NamedTuple):
     bent: np.ndarray
 
 
-@compiled
-def work_size(n, M):
-    """Numbers of the space for one problem."""
-    side = padded(max(n, M)) + WIDTH
-    return 15 * side * side + 17 * side
+work_size = compiled(row_space_numbers)
 
 
 @compiled
 def work_at(space, n, M):
-    """Return the space for one problem, in the numbers at an address, which become noughts."""
+    """Return the space for one problem, in the numbers at an address, which become 0s."""
     tall, wide = padded(n) + WIDTH, padded(n)
     w = padded(max(n, M))
     side = w + WIDTH

@@ -9,28 +9,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE, FULL_STEP, NEGLIGIBLE_STEP, SATURATION_RESIDUAL
+from ...numerics._constants import (
+    BLOCKING_RANK,
+    BOUND_DISTANCE,
+    FULL_STEP,
+    LOOSE_SATURATION_RANK,
+    NEGLIGIBLE_STEP,
+    SATURATION_RANK,
+    SATURATION_RESIDUAL,
+)
 from ._dense import fill
 from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
 from ._projection import (
     Level,
     counts,
     find_motion,
+    level_damping,
     load,
     look,
     narrow,
-    strength_of,
 )
 from ._row_space import set_beside, take_row_space
 from ._row_space_workspace import work_at, work_size
 from ._saturation_search import Search, bound, search, size
 from ._vectors import add, dot
-
-LEAST = 1e-9
-"""Part of a joint's unit vector in the null space and outside the span of held ones, with less of which it depends on
-them; part of the largest in a combination, with less of which a joint does not stop the motion."""
-LOOSER = 1e-6
-"""The same for a second attempt, where the answer of the first does not hold: joints nearly depended on each other."""
 
 
 @lean
@@ -54,23 +56,23 @@ def damping_of(W, S, level, x, first, longest):
         for j in range(first, n):
             add(S.x, -dot(W.turned[j], x, 0, n), W.turned[j], 0, n)
         look(W, level, S.x)
-    return strength_of(W, level, first, longest)
+    return level_damping(W, level, first, longest)
 
 
 @lean
 def damped_part(W, S, level, x, damping):
-    """Return the part of the way from x to where the search ended at which the damped cost of the level is least."""
+    """Return the part of the step from x to where the search ended at which the damped cost of the level is least."""
     m, n = level.A.shape
     if not damping > 0.0:
         return 1.0
-    gain, cost, size, way = 0.0, 0.0, 0.0, 0.0
+    gain, cost, size, square = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         S.along[i] = S.x[i] - x[i]
-        way += S.along[i] * S.along[i]
+        square += S.along[i] * S.along[i]
         size += x[i] * x[i]
-    if not way > NEGLIGIBLE_STEP * NEGLIGIBLE_STEP * size:
+    if not square > NEGLIGIBLE_STEP * NEGLIGIBLE_STEP * size:
         return 1.0
-    cost = damping * way
+    cost = damping * square
     for i in range(m):
         if counts(W, level, i):
             moved = dot(level.A[i], S.along, 0, n)
@@ -80,12 +82,12 @@ def damped_part(W, S, level, x, damping):
 
 
 @lean
-def put_on_bounds(W, S, held, stop):
+def put_on_bounds(W, S, count, stop):
     """Put joints on their bounds, where they are up to roundoff; return that roundoff, infinite where x is NaN."""
     n, off = len(S.x), 0.0
     for i in range(n):
         before = S.x[i]
-        if S.side[i] != 0:
+        if S.at_bound[i] != 0:
             S.x[i] = bound(W, S, i)
         elif i == stop:
             S.x[i] = W.low[i] if S.passed[i] < 0 else W.high[i]
@@ -102,29 +104,29 @@ def attempt(W, S, x, target, first, most, least):
     for j in range(first, n):
         for i in range(n):
             S.before[j, i] = W.turned[j, i]
-    scale, held, stop, changes, done = search(W, S, x, target, first, most, least)
-    done = done and put_on_bounds(W, S, held, stop) <= SATURATION_RESIDUAL * size(W, S, x, target, scale, held)
+    scale, count, stop, changes, done = search(W, S, x, target, first, most, least)
+    done = done and put_on_bounds(W, S, count, stop) <= SATURATION_RESIDUAL * size(W, S, x, target, scale, count)
     if not done:
         for j in range(first, n):
             for i in range(n):
                 W.turned[j, i] = S.before[j, i]
-    return scale, held, stop, changes, done
+    return scale, stop, changes, done
 
 
 @lean
-def decide(S, held, stop, side, blocking):
+def label_joints(S, stop, at_bound, blocking):
     """Return the joints on their bounds, those that stop the motion, and which of them the others say most about."""
-    n, blocker, most = len(side), 0, 0.0
+    n, blocker, most = len(at_bound), 0, 0.0
     for i in range(n):
-        side[i], blocking[i] = S.side[i], 0
+        at_bound[i], blocking[i] = S.at_bound[i], 0
     if stop >= 0:
         for i in range(n):
             if S.normal[i] != 0.0:
-                blocking[i] = S.passed[i] if i == stop else S.side[i]
+                blocking[i] = S.passed[i] if i == stop else S.at_bound[i]
             if abs(S.normal[i]) > most:
                 blocker, most = i, abs(S.normal[i])
-        side[stop] = S.passed[stop]
-        side[blocker] = 0
+        at_bound[stop] = S.passed[stop]
+        at_bound[blocker] = 0
     return blocker
 
 
@@ -148,7 +150,7 @@ def take_off_stops(W, first, blocking):
 
 
 @lean
-def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side, blocking):
+def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, at_bound, blocking):
     """Move x as the level asks.
 
     Returns:
@@ -161,13 +163,13 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, side
     damping = damping_of(W, S, level, x, first, longest)
     look(W, level, x)
     rank = find_motion(W, level, first, damping, rank_tolerance, plain)
-    scale, held, stop, changes, done = attempt(W, S, x, target, first + rank, most, LEAST)
+    scale, stop, changes, done = attempt(W, S, x, target, first + rank, most, SATURATION_RANK)
     if not done and changes < most:
-        scale, held, stop, more, done = attempt(W, S, x, target, first + rank, most, LOOSER)
+        scale, stop, more, done = attempt(W, S, x, target, first + rank, most, LOOSE_SATURATION_RANK)
         changes += more
-    blocker = decide(S, held, stop, side, blocking)
+    blocker = label_joints(S, stop, at_bound, blocking)
     if not done:
-        fill(side, 0)
+        fill(at_bound, 0)
         fill(blocking, 0)
         narrow(W, level, x, longest, whole)
         return rank, 0.0, blocker, changes, False
@@ -209,7 +211,7 @@ def handle(frame):
     bends, targets, lower, upper = data(given + 56), data(given + 64), data(given + 72), data(given + 80)
     rank, most = data(given + 88), whole_numbers(data(given + 96), 1)[0]
     solution, projector, scales = data(found), data(found + 8), data(found + 16)
-    dones, sides, blockings = data(found + 24), data(found + 32), data(found + 40)
+    dones, at_bounds, blockings = data(found + 24), data(found + 32), data(found + 40)
     blockers, actives, reports = data(found + 48), data(found + 56), data(found + 64)
     space, marks = data(found + 72), data(found + 80)
     width = max(M, n)
@@ -245,10 +247,10 @@ def handle(frame):
                 vector(unmet, lanes * levels)[each], vector(demand, lanes * levels)[each],
                 vector(bends + 8 * n * each, n),
             )  # fmt: skip
-            side, blocking = whole_numbers(sides + 4 * n * each, n), whole_numbers(blockings + 4 * n * each, n)
+            at_bound, blocking = whole_numbers(at_bounds + 4 * n * each, n), whole_numbers(blockings + 4 * n * each, n)
             target = vector(targets + 8 * n * each, n)
             taken, scale, blocker, changes, done = solve_level(
-                W, S, level, x, target, first, plain, vector(rank, lanes)[lane], most, side, blocking
+                W, S, level, x, target, first, plain, vector(rank, lanes)[lane], most, at_bound, blocking
             )
             plain, first = plain and taken == 0 and changes == 0, first + taken
             vector(scales, lanes * levels)[each] = scale
@@ -256,11 +258,11 @@ def handle(frame):
             whole_numbers(blockers, lanes * levels)[each] = blocker
             for i in range(n):
                 fixed[i] = blocking[i] if fixed[i] == 0 else fixed[i]
-                active[i] = fixed[i] if fixed[i] != 0 else side[i]
+                active[i] = fixed[i] if fixed[i] != 0 else at_bound[i]
             report[0], report[1] = report[0] != 0 and done, report[1] + changes
         for i in range(n):
-            at_bound = low[i] if active[i] < 0 else high[i]
-            if (active[i] == 1 or active[i] == -1) and abs(x[i] - at_bound) > BOUND_DISTANCE * (1.0 + abs(at_bound)):
+            its_bound = low[i] if active[i] < 0 else high[i]
+            if abs(active[i]) == 1 and abs(x[i] - its_bound) > BOUND_DISTANCE * (1.0 + abs(its_bound)):
                 active[i] = 0
         own = matrix(projector + 8 * n * n * lane, n, n)
         fill(own.reshape(-1), 0.0)

@@ -7,9 +7,9 @@ a lane may take its own way.
 
 At a scale that is given it is the dual method of D. Goldfarb and A. Idnani ("A numerically stable dual method for
 solving strictly convex quadratic programs", Mathematical Programming 27, 1983). It begins at x without bounds. Joints
-that are violated are put on their bounds one after another, those that push no longer on the way are let go, and the
-cost never falls, so that no set of joints returns. Where a joint's column of the projector is made up of those of held
-ones, sum_i rate_i column_i, and none of these can be let go,
+that are violated are put on their bounds one after another, those whose multiplier gets 0 meanwhile are let go, and the
+cost never falls, so that no set of joints returns. Where a joint's column of the projector is made up of those of
+saturated ones, sum_i rate_i column_i, and none of these can be let go,
 
     normal . x = x_k - sum_i rate_i x_i
 
@@ -21,7 +21,7 @@ the new scale, and lets those go first that push in the wrong direction there. T
 there are finitely many; at the end there is an x in the box.
 
 Column i of ``turned``, from row ``first`` on, is joint i in coordinates of the null space; these are turned in place,
-so that the first ``held`` of them have all of the joints that are on their bounds (an orthogonal factorisation). What
+so that the first ``count`` of them have all of the joints that are on their bounds (an orthogonal factorisation). What
 rounding does is then in proportion to how dependent the joints are, and not to its square.
 """
 
@@ -31,24 +31,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...numerics._constants import SATURATION_ROUNDOFF
+from ...numerics._constants import LARGEST_RATE, SATURATION_ROUNDOFF
 from ._dense import fill
 from ._frame import lean
 from ._vectors import add, add_squares, dot
-
-UNEVEN = 10.0
-"""Of a combination, so many times what the entering joint has: a joint with more is what the others say most about."""
 
 
 class Search(NamedTuple):
     """Space for the search of one level, of n numbers each but for two.
 
-    Fields: of the held joints, in the order in which coordinates are theirs: ``duals`` (n, n), in coordinates, of which
-    each has 1 along its own joint's column and 0 along the others'; the multipliers ``y``; ``rate``, how much of a
-    column they make up; ``who`` they are; ``stays``, whether they stop the motion. Of all joints: ``x``; ``free``,
-    the squared length of what is not held of their columns; ``along``, a way of theirs; ``normal``, the combination
-    that stops the motion; ``pull``, the target's part of x; ``side``; ``passed``, the sides of free ones that the held
-    ones put on their bounds. In coordinates: ``place`` and ``turn``; ``before`` (n, n) has them as they were.
+    Fields: of the saturated joints, in the order in which coordinates are theirs: ``duals`` (n, n), in coordinates, of
+    which each has 1 along its own joint's column and 0 along the others'; the multipliers ``y``; ``rate``, how much of
+    a column they make up; ``who`` they are; ``stays``, whether they stop the motion. Of all joints: ``x``; ``free``,
+    the squared length of what is left of their columns; ``along``, a direction of theirs; ``normal``, the combination
+    that stops the motion; ``target_part``, of x; ``at_bound``, the label of each; ``passed``, the labels of free ones
+    that the saturated ones put on their bounds. In coordinates: ``place`` and ``turn``; ``before`` (n, n) has them as
+    they were.
     """
 
     duals: np.ndarray
@@ -59,84 +57,84 @@ class Search(NamedTuple):
     free: np.ndarray
     along: np.ndarray
     normal: np.ndarray
-    pull: np.ndarray
+    target_part: np.ndarray
     place: np.ndarray
     turn: np.ndarray
     who: np.ndarray
     stays: np.ndarray
-    side: np.ndarray
+    at_bound: np.ndarray
     passed: np.ndarray
 
 
 @lean
 def bound(W, S, i):
-    """Return where joint i is held."""
-    return W.high[i] if S.side[i] > 0 else W.low[i]
+    """Return the bound at which joint i is."""
+    return W.high[i] if S.at_bound[i] > 0 else W.low[i]
 
 
 @lean
-def settle(W, S, start, scale, first, held):
-    """Compute x at a scale with the held joints on their bounds, and their multipliers; refined once."""
-    n, stop = len(start), first + held
+def settle(W, S, start, scale, first, count):
+    """Compute x at a scale with the saturated joints on their bounds, and their multipliers; refined once."""
+    n, stop = len(start), first + count
     for i in range(n):
-        S.x[i] = start[i] + scale * W.motion[i] + S.pull[i]
-    for a in range(held):
+        S.x[i] = start[i] + scale * W.motion[i] + S.target_part[i]
+    for a in range(count):
         S.y[a] = 0.0
-    for _ in range(2 if held > 0 else 0):
+    for _ in range(2 if count > 0 else 0):
         fill(S.place, 0.0)
-        for a in range(held):
+        for a in range(count):
             i = S.who[a]
             add(S.place, bound(W, S, i) - S.x[i], S.duals[a], first, stop)
         for j in range(first, stop):
             add(S.x, S.place[j], W.turned[j], 0, n)
-        for a in range(held):
+        for a in range(count):
             S.y[a] += dot(S.duals[a], S.place, first, stop)
 
 
 @lean
-def settle_stopped(W, S, start, scale, first, held, stop, rate):
+def settle_stopped(W, S, start, scale, first, count, stop, rate):
     """Compute the same at the scale near this one that puts the stopping joint on its bound; return the scale."""
-    settle(W, S, start, scale, first, held)
+    settle(W, S, start, scale, first, count)
     for _ in range(2 if stop >= 0 else 0):
         off = (W.low[stop] if S.passed[stop] < 0 else W.high[stop]) - S.x[stop]
         if off == 0.0:
             break
         scale = min(max(scale + off / rate, 0.0), 1.0)
-        settle(W, S, start, scale, first, held)
+        settle(W, S, start, scale, first, count)
     return scale
 
 
 @lean
-def size(W, S, start, target, scale, held):
+def size(W, S, start, target, scale, count):
     """Return the size of the numbers that x is made of."""
     most = 0.0
     for i in range(len(start)):
         most = max(most, abs(start[i]) + scale * abs(W.motion[i]) + abs(target[i]))
-    for a in range(held):
+    for a in range(count):
         most = max(most, abs(bound(W, S, S.who[a])))
     return most
 
 
 @lean
-def most_wrong(S, held, noise):
-    """Return the held joint that pulls most, where it should push; -1 for none."""
-    worst, which = -noise, -1
-    for a in range(held):
-        push = -S.side[S.who[a]] * S.y[a]
+def most_wrong(S, count, roundoff):
+    """Return the saturated joint with the largest multiplier of the wrong sign; -1 for none."""
+    worst, which = -roundoff, -1
+    for a in range(count):
+        push = -S.at_bound[S.who[a]] * S.y[a]
         if S.stays[a] == 0 and push < worst:
             worst, which = push, a
     return which
 
 
 @lean
-def most_violated(W, S, n, noise, least):
+def most_violated(W, S, n, roundoff, least):
     """Return the free joint beyond its bound whose saturation costs most; -1 for none."""
     most, which = 0.0, -1
     for i in range(n):
-        if S.side[i] == 0 and S.passed[i] == 0:
+        if S.at_bound[i] == 0 and S.passed[i] == 0:
             beyond = max(W.low[i] - S.x[i], S.x[i] - W.high[i])
             gain = beyond * beyond / max(S.free[i], least * least)
-            if beyond > noise and gain > most:
+            if beyond > roundoff and gain > most:
                 most, which = gain, i
     return which
 
@@ -150,12 +148,12 @@ def sum_along(W, S, vector, start, stop):
 
 
 @lean
-def look_along(W, S, first, held, k):
-    """Compute what of column k the held ones make up, and how all joints move along the rest; its squared length."""
-    n, stop = len(S.x), first + held
+def look_along(W, S, first, count, k):
+    """Compute what of column k saturated joints make up, and how all move along the rest; return its squared length."""
+    n, stop = len(S.x), first + count
     for j in range(first, n):
         S.turn[j] = W.turned[j, k]
-    for a in range(held):
+    for a in range(count):
         S.rate[a] = dot(S.duals[a], S.turn, first, stop)
     sum_along(W, S, S.turn, stop, n)
     return dot(S.turn, S.turn, stop, n)
@@ -177,32 +175,32 @@ def reflect(W, S, turn, head, norm, start, stop):
 
 
 @lean
-def hold(W, S, first, held, k, square):
-    """Make joint k the last of the held ones, after ``look_along``."""
-    n, head = len(S.x), first + held
+def saturate(W, S, first, count, k, square):
+    """Make joint k the last of the saturated ones, after ``look_along``."""
+    n, head = len(S.x), first + count
     reflect(W, S, S.turn, head, np.sqrt(square), head, n)
     for j in range(head + 1, n):
         W.turned[j, k] = 0.0
     pivot = W.turned[head, k]
-    for a in range(held):
+    for a in range(count):
         S.duals[a, head] = -S.rate[a] / pivot
-    fill(S.duals[held], 0.0)
-    S.duals[held, head] = 1.0 / pivot
+    fill(S.duals[count], 0.0)
+    S.duals[count, head] = 1.0 / pivot
     for i in range(n):
         S.free[i] -= W.turned[head, i] * W.turned[head, i]
-    S.who[held], S.stays[held] = k, 0
+    S.who[count], S.stays[count] = k, 0
 
 
 @lean
-def release(W, S, first, held, a):
-    """Release a held joint to where it has no multiplier."""
-    n, stop, last = len(S.x), first + held, first + held - 1
+def release(W, S, first, count, a):
+    """Release a saturated joint to where it has no multiplier."""
+    n, stop, last = len(S.x), first + count, first + count - 1
     own = S.duals[a]
     sum_along(W, S, own, first, stop)
-    for b in range(held):  # once more, for rounding
+    for b in range(count):  # once more, for rounding
         S.rate[b] = (1.0 if b == a else 0.0) - S.along[S.who[b]]
     fill(S.turn, 0.0)
-    for b in range(held):
+    for b in range(count):
         add(S.turn, S.rate[b], S.duals[b], first, stop)
     add(own, 1.0, S.turn, first, stop)
     sum_along(W, S, own, first, stop)
@@ -212,15 +210,15 @@ def release(W, S, first, held, a):
     by = S.y[a] / square
     if by != 0.0:
         add(S.x, -by, S.along, 0, n)
-        for b in range(held):
+        for b in range(count):
             S.y[b] -= by * dot(S.duals[b], own, first, stop)
     scale = reflect(W, S, S.turn, last, np.sqrt(square), first, stop)
-    S.side[S.who[a]] = 0
-    if a < held - 1:
-        S.who[a], S.stays[a], S.y[a] = S.who[held - 1], S.stays[held - 1], S.y[held - 1]
+    S.at_bound[S.who[a]] = 0
+    if a < count - 1:
+        S.who[a], S.stays[a], S.y[a] = S.who[count - 1], S.stays[count - 1], S.y[count - 1]
         for j in range(first, stop):
-            own[j] = S.duals[held - 1, j]
-    for b in range(held - 1):
+            own[j] = S.duals[count - 1, j]
+    for b in range(count - 1):
         add(S.duals[b], -scale * dot(S.duals[b], S.turn, first, stop), S.turn, first, stop)
         S.duals[b, last] = 0.0
         W.turned[last, S.who[b]] = 0.0
@@ -228,17 +226,17 @@ def release(W, S, first, held, a):
 
 
 @lean
-def scale_of(W, S, start, first, held, k, side, least):
-    """Return the scale at which joint k, whose column the held ones make up, is on its bound with them; its rate."""
-    stop, largest = first + held, 1.0
-    for a in range(held):  # the rates once more, for rounding
+def scale_of(W, S, start, first, count, k, label, least):
+    """Return the scale at which joint k, whose column saturated joints make up, is on its bound with them; its rate."""
+    stop, largest = first + count, 1.0
+    for a in range(count):  # the rates once more, for rounding
         for j in range(first, stop):
             S.turn[j] -= S.rate[a] * W.turned[j, S.who[a]]
-    for a in range(held):
+    for a in range(count):
         S.rate[a] += dot(S.duals[a], S.turn, first, stop)
         largest = max(largest, abs(S.rate[a]))
-    gap, rate = (W.low[k] if side < 0 else W.high[k]) - start[k], W.motion[k]
-    for a in range(held):
+    gap, rate = (W.low[k] if label < 0 else W.high[k]) - start[k], W.motion[k]
+    for a in range(count):
         if abs(S.rate[a]) > least * largest:
             i = S.who[a]
             gap -= S.rate[a] * (bound(W, S, i) - start[i])
@@ -249,89 +247,89 @@ def scale_of(W, S, start, first, held, k, side, least):
 
 
 @lean
-def stop_by(S, held, k, side):
+def stop_by(S, count, k, label):
     """Let joint k, and those that its column is made of, stop the motion: no other is beside its bounds or let go."""
     fill(S.normal, 0.0)
     fill(S.passed, 0)
-    S.normal[k], S.passed[k] = 1.0, side
-    for a in range(held):
+    S.normal[k], S.passed[k] = 1.0, label
+    for a in range(count):
         S.stays[a] = S.rate[a] != 0.0
         S.normal[S.who[a]] = -S.rate[a]
 
 
 @lean
-def exchange(W, S, first, held, a, stop):
-    """Hold the joint that stops the motion beside the held ones in place of one of these."""
-    other, side = S.who[a], S.side[S.who[a]]
+def exchange(W, S, first, count, a, stop):
+    """Saturate the joint that stops the motion beside the saturated ones in place of one of these."""
+    other, label = S.who[a], S.at_bound[S.who[a]]
     S.y[a] = 0.0
-    release(W, S, first, held, a)
-    square = look_along(W, S, first, held - 1, stop)
-    hold(W, S, first, held - 1, stop, square)
-    S.y[held - 1], S.stays[held - 1], S.side[stop] = 0.0, 1, S.passed[stop]
-    S.passed[stop], S.passed[other] = 0, side
+    release(W, S, first, count, a)
+    square = look_along(W, S, first, count - 1, stop)
+    saturate(W, S, first, count - 1, stop, square)
+    S.y[count - 1], S.stays[count - 1], S.at_bound[stop] = 0.0, 1, S.passed[stop]
+    S.passed[stop], S.passed[other] = 0, label
     return other
 
 
 @lean
-def first_to_leave(S, held, sign, nothing):
-    """Return the length of the dual step at which a held joint pushes no longer, and which; infinite, -1 for none."""
+def first_to_leave(S, count, sign, negligible):
+    """Return the dual step at which a saturated joint's multiplier is 0, and which joint; infinite, -1 for none."""
     length, leaving = np.inf, -1
-    for a in range(held):
-        side = S.side[S.who[a]]
-        falls = side * sign * S.rate[a]
-        if S.stays[a] == 0 and falls < -nothing:
-            step = max(-side * S.y[a], 0.0) / -falls
+    for a in range(count):
+        label = S.at_bound[S.who[a]]
+        falls = label * sign * S.rate[a]
+        if S.stays[a] == 0 and falls < -negligible:
+            step = max(-label * S.y[a], 0.0) / -falls
             if step < length:
                 length, leaving = step, a
     return length, leaving
 
 
 @lean
-def first_to_cross(S, held, sign, nothing):
-    """Return the held joint among those that stop the motion which a further combination releases; -1 for none."""
+def first_to_cross(S, count, sign, negligible):
+    """Return the saturated joint among those that stop the motion which a further combination releases; -1 for none."""
     out, most = -1, 0.0
-    for a in range(held):
+    for a in range(count):
         i = S.who[a]
-        falls = S.side[i] * sign * S.rate[a]
-        if S.stays[a] != 0 and falls < -nothing and -falls > most * abs(S.normal[i]):
+        falls = S.at_bound[i] * sign * S.rate[a]
+        if S.stays[a] != 0 and falls < -negligible and -falls > most * abs(S.normal[i]):
             out, most = a, -falls / abs(S.normal[i])
     return out
 
 
 @lean
 def begin_search(W, S, start, target, first):
-    """Begin with no joint held, and with what the null space makes of the target."""
+    """Begin with no joint saturated, and with what the null space makes of the target."""
     n = len(start)
-    fill(S.pull, 0.0)
+    fill(S.target_part, 0.0)
     fill(S.free, 0.0)
-    fill(S.side, 0)
+    fill(S.at_bound, 0)
     fill(S.passed, 0)
     for i in range(n):
         S.along[i] = target[i] - start[i]
     for j in range(first, n):
-        add(S.pull, dot(W.turned[j], S.along, 0, n), W.turned[j], 0, n)
+        add(S.target_part, dot(W.turned[j], S.along, 0, n), W.turned[j], 0, n)
         add_squares(S.free, W.turned[j], 0, n)
 
 
 @lean
 def search(W, S, start, target, first, most, least):
-    """Return the scale, how many joints are held, the one that stops the motion, changes, and whether it is done.
+    """Return the scale, how many joints are saturated, the one that stops the motion, changes, and whether it is done.
 
     ``S.x`` is the answer, inside its box.
     """
     n = len(start)
-    held, stop, scale, rate, changes, entering, sign, push = 0, -1, 1.0, 0.0, 0, -1, 1.0, 0.0
+    count, stop, scale, rate, changes, entering, sign, push = 0, -1, 1.0, 0.0, 0, -1, 1.0, 0.0
     begin_search(W, S, start, target, first)
-    settle(W, S, start, scale, first, held)
-    whole = size(W, S, start, target, scale, held)
+    settle(W, S, start, scale, first, count)
+    whole = size(W, S, start, target, scale, count)
     dropping, going = False, True
     while going and changes < most:
         if dropping:
-            wrong = most_wrong(S, held, SATURATION_ROUNDOFF * whole)
+            wrong = most_wrong(S, count, SATURATION_ROUNDOFF * whole)
             dropping = wrong >= 0
             if dropping:
-                release(W, S, first, held, wrong)
-                held, changes = held - 1, changes + 1
+                release(W, S, first, count, wrong)
+                count, changes = count - 1, changes + 1
                 continue
         if entering < 0:
             entering = most_violated(W, S, n, SATURATION_ROUNDOFF * whole, least)
@@ -341,54 +339,54 @@ def search(W, S, start, target, first, most, least):
             sign = 1.0 if W.low[entering] - S.x[entering] >= S.x[entering] - W.high[entering] else -1.0
             push = 0.0
         k, changes = entering, changes + 1
-        square = look_along(W, S, first, held, k)
+        square = look_along(W, S, first, count, k)
         full, largest = np.inf, 1.0
         if square > least * least:
             full = max(W.low[k] - S.x[k] if sign > 0.0 else S.x[k] - W.high[k], 0.0) / square
-        for a in range(held):
+        for a in range(count):
             largest = max(largest, abs(S.rate[a]))
-        length, leaving = first_to_leave(S, held, sign, (SATURATION_ROUNDOFF if full < np.inf else least) * largest)
+        length, leaving = first_to_leave(S, count, sign, (SATURATION_ROUNDOFF if full < np.inf else least) * largest)
         if leaving < 0 and full == np.inf:
-            out = first_to_cross(S, held, sign, least * largest)
+            out = first_to_cross(S, count, sign, least * largest)
             if out >= 0:
                 changes += 1
-                stop, push = exchange(W, S, first, held, out, stop), 0.0
-                settle(W, S, start, scale, first, held)
+                stop, push = exchange(W, S, first, count, out, stop), 0.0
+                settle(W, S, start, scale, first, count)
                 continue
-            entering, side, out = -1, -1 if sign > 0.0 else 1, -1
-            lower, its_rate = scale_of(W, S, start, first, held, k, side, least)
+            entering, label, out = -1, -1 if sign > 0.0 else 1, -1
+            lower, its_rate = scale_of(W, S, start, first, count, k, label, least)
             if not lower < scale - SATURATION_ROUNDOFF:  # but for rounding it is where the others put it
-                S.passed[k] = side
+                S.passed[k] = label
                 continue
-            largest = UNEVEN
-            for a in range(held):
+            largest = LARGEST_RATE
+            for a in range(count):
                 if abs(S.rate[a]) > largest:
                     out, largest = a, abs(S.rate[a])
             if out >= 0:
-                S.passed[k] = side
-                k, changes = exchange(W, S, first, held, out, k), changes + 2
-                side = S.passed[k]
-                look_along(W, S, first, held, k)
-                lower, its_rate = scale_of(W, S, start, first, held, k, side, least)
-            stop_by(S, held, k, side)
+                S.passed[k] = label
+                k, changes = exchange(W, S, first, count, out, k), changes + 2
+                label = S.passed[k]
+                look_along(W, S, first, count, k)
+                lower, its_rate = scale_of(W, S, start, first, count, k, label, least)
+            stop_by(S, count, k, label)
             stop, rate, dropping = k, its_rate, True
-            scale = settle_stopped(W, S, start, min(lower, scale), first, held, stop, rate)
-            whole = size(W, S, start, target, scale, held)
+            scale = settle_stopped(W, S, start, min(lower, scale), first, count, stop, rate)
+            whole = size(W, S, start, target, scale, count)
             continue
         step = sign * min(length, full)
         add(S.x, step, S.along, 0, n)
-        add(S.y, -step, S.rate, 0, held)
+        add(S.y, -step, S.rate, 0, count)
         push += step
         if length < full:
             S.y[leaving] = 0.0
-            release(W, S, first, held, leaving)
-            held -= 1
+            release(W, S, first, count, leaving)
+            count -= 1
         else:
-            hold(W, S, first, held, k, square)
-            S.y[held], S.side[k] = push, -1 if sign > 0.0 else 1
+            saturate(W, S, first, count, k, square)
+            S.y[count], S.at_bound[k] = push, -1 if sign > 0.0 else 1
             S.x[k] = bound(W, S, k)
             whole = max(whole, abs(S.x[k]))
-            held, entering = held + 1, -1
-    if held > 0:
-        scale = settle_stopped(W, S, start, scale, first, held, stop, rate)
-    return scale, held, stop, changes, not going
+            count, entering = count + 1, -1
+    if count > 0:
+        scale = settle_stopped(W, S, start, scale, first, count, stop, rate)
+    return scale, count, stop, changes, not going

@@ -13,24 +13,15 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from ._addresses import BYTES, ONES, address, call_of, everywhere, load, row_bytes, store
 from ._frame import lean
-from ._padded_rows import (
-    _ONES,
-    BYTES,
-    _address,
-    call_of,
-    everywhere,
-    load,
-    row_bytes,
-    store,
-    sum_rows,
-    transpose_upper,
-)
+from ._padded_rows import sum_rows
 from ._tiles import padded, take_product
+from ._transpose import transpose_upper
 from ._vectors import _BLOCK, _CHECKED, _INDEX, _LANE, WIDTH, _multiply_add
 
 _LANES = ir.VectorType(_LANE, WIDTH)
-_NOTHING, _NOUGHT = ir.Constant(_BLOCK, ir.Undefined), _BLOCK([0.0] * WIDTH)
+_NOTHING, _ZEROS = ir.Constant(_BLOCK, ir.Undefined), _BLOCK([0.0] * WIDTH)
 
 
 def _lane(builder: Any, block: Any, k: int) -> Any:
@@ -40,15 +31,15 @@ def _lane(builder: Any, block: Any, k: int) -> Any:
 
 def _only(builder: Any, block: Any, lanes: range) -> Any:
     """A block with noughts elsewhere."""
-    return builder.shuffle_vector(block, _NOUGHT, _LANES([k if k in lanes else WIDTH for k in range(WIDTH)]))
+    return builder.shuffle_vector(block, _ZEROS, _LANES([k if k in lanes else WIDTH for k in range(WIDTH)]))
 
 
 def _factor_block(builder: Any, S: Any, T: Any, inverse: Any, step: Any) -> None:
     """The block of S on the diagonal becomes D L', that of T L', above their diagonals; 1 / D goes into ``inverse``."""
     rows = [load(builder, builder.add(S, builder.mul(step, _INDEX(r)))) for r in range(WIDTH)]
-    inverses = _ONES
+    inverses = ONES
     for j in range(WIDTH):
-        by = builder.fdiv(_ONES, _lane(builder, rows[j], j))
+        by = builder.fdiv(ONES, _lane(builder, rows[j], j))
         inverses = builder.shuffle_vector(inverses, by, _LANES([k if k != j else WIDTH + j for k in range(WIDTH)]))
         unit = builder.fmul(rows[j], by)
         store(builder, unit, builder.add(T, builder.mul(step, _INDEX(j))))
@@ -86,8 +77,8 @@ def _factoring(typing_context, S, T, inverse, k, wide):
         S, T, inverse, k, wide = arguments
         kinds = signature.args
         step = row_bytes(context, builder, kinds[0], S)
-        places = [_address(context, builder, kind, a, k, k) for kind, a in zip(kinds[:2], (S, T), strict=True)]
-        given = [*places, _address(context, builder, kinds[2], inverse, k), step]
+        places = [address(context, builder, kind, a, k, k) for kind, a in zip(kinds[:2], (S, T), strict=True)]
+        given = [*places, address(context, builder, kinds[2], inverse, k), step]
         call_of(builder, "factor", body, [*given, builder.mul(_INDEX(8), builder.sub(wide, k))])
         return context.get_dummy_value()
 
@@ -132,7 +123,7 @@ def _solving(typing_context, L, T, inverse, b, wide):
 
     def generate(context, builder, signature, arguments):
         *arrays, wide = arguments
-        given = [_address(context, builder, kind, a) for kind, a in zip(signature.args, arrays, strict=False)]
+        given = [address(context, builder, kind, a) for kind, a in zip(signature.args, arrays, strict=False)]
         call_of(builder, "solve", body, [*given, row_bytes(context, builder, signature.args[0], arrays[0]), wide])
         return context.get_dummy_value()
 
@@ -182,10 +173,10 @@ def factor_symmetric(S, L, T, inverse, diagonal, n, smallest):
             take_product(S, T, S, k, k + WIDTH, k, wide, 0, k)
         _factor_rows(S, T, inverse, k, wide)
     transpose_upper(L, T, wide, wide)
-    sound = True
+    is_regular = True
     for j in range(n):
-        sound = sound and inverse[j] > 0.0 and smallest * diagonal[j] * inverse[j] <= 1.0
-    return sound
+        is_regular = is_regular and inverse[j] > 0.0 and smallest * diagonal[j] * inverse[j] <= 1.0
+    return is_regular
 
 
 @lean

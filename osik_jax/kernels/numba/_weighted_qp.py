@@ -3,7 +3,7 @@
     min 1/2 sum_i weight_i (A x - target)_i^2 + 1/2 sum_j damping_j (x_j - center_j)^2 + 1/2 sum_q t_q^2 / compliance_q
     over lower <= [x; C x + t] <= upper
 
-A lane solves on its active set (``_qp_active_set_solve``) and looks at the signs: bounds that are crossed become
+A lane solves on its active set (``_qp_active_set_solve``) and looks at the signs: bounds that are violated become
 active, those whose multiplier has the wrong sign become inactive, all at once (block pivoting, ``_qp_search``). Where
 that stops helping, the dual active-set method begins anew (``_goldfarb_idnani``), which cannot cycle, and goes on where
 its end, solved anew, misses a bound. Whatever comes of it is a candidate, which JAX certifies. No candidate comes of

@@ -5,16 +5,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from ...numerics._constants import HARD_ROW_TOL, HIERARCHY_RANK, MULTIPLIER_TOL, STEP_TOL
 
 
 class Tolerances(NamedTuple):
     """The tolerances below which a number counts as zero, relative to the scale of the quantity at hand."""
 
-    rank: Float[Array, ""] | float = 1e-10  # part of a row outside the span of others, relative to the row
-    step: Float[Array, ""] | float = 1e-13  # change of the level's rows by a step, relative to their scale
-    multiplier: Float[Array, ""] | float = 1e-10  # multiplier, relative to the level's gradient
-    feasible: Float[Array, ""] | float = 1e-11  # violation of a row, relative to its scale
+    # part of a row outside the span of others, relative to the row
+    rank: Float[Array, ""] | float = HIERARCHY_RANK[jnp.dtype("float64")]
+    step: Float[Array, ""] | float = STEP_TOL  # change of the level's rows by a step, relative to their scale
+    multiplier: Float[Array, ""] | float = MULTIPLIER_TOL  # multiplier, relative to the level's gradient
+    feasible: Float[Array, ""] | float = HARD_ROW_TOL  # violation of a row, relative to its scale
 
 
 class WorkingSet(NamedTuple):

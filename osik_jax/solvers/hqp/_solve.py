@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ...execution import _rules
 from ...execution._backends import Backend, check_backend, here
-from ...numerics._constants import HIERARCHY_RANK, ZERO_PIVOT
+from ...numerics._constants import HIERARCHY_RANK, SINGULAR_TOL, ZERO_PIVOT
 from .._box import clip_roundoff, ordered_bounds
 from .._damping import Damping, per_level
 from .._level import Level
@@ -90,7 +90,7 @@ def solve_hqp(
     solve = hierarchy_solver(layout, max_iterations, here(check_backend(backend)))
     result = _rules.found(solve(*jax.lax.stop_gradient((hierarchy, traced, warm_start))))
     # the derivative is computed in the precision of the data: no singular value below its roundoff is inverted
-    singular_tol = jnp.maximum(ZERO_PIVOT * traced.rank, 100.0 * jnp.finfo(dtype).eps)
+    singular_tol = jnp.maximum(ZERO_PIVOT * traced.rank, SINGULAR_TOL * jnp.finfo(dtype).eps)
     x = with_derivative(result.x, result.active_sets, hierarchy, singular_tol)
     return _solution(levels, result, x, is_finite, bounds_are_ordered, lower, upper)
 

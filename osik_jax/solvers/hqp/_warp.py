@@ -27,6 +27,7 @@ from ...numerics._constants import (
     MIN_RADIUS,
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
+    STATIONARITY_TOL,
 )
 from ._cascade import CascadeResult, first_working_sets, result_of_kernel
 from ._padding import Layout, PaddedHierarchy
@@ -218,7 +219,7 @@ def source(shape: Shape, parts: tuple[str, ...] = PARTS) -> str:
     head = [f"constexpr int {name} = {value};" for name, value in numbers.items()]
     constants = dict(NEGLIGIBLE_DAMPING=NEGLIGIBLE_DAMPING, COST_FRACTION=COST_FRACTION, DAMPING_RIDGE=DAMPING_RIDGE)
     constants |= dict(MIN_RADIUS=MIN_RADIUS, NEGLIGIBLE_CURVATURE=NEGLIGIBLE_CURVATURE)
-    constants |= dict(EXTRA_DAMPING=EXTRA_DAMPING, FACTOR_RIDGE=FACTOR_RIDGE)
+    constants |= dict(EXTRA_DAMPING=EXTRA_DAMPING, FACTOR_RIDGE=FACTOR_RIDGE, STATIONARITY_TOL=STATIONARITY_TOL)
     head += [f"constexpr double {name} = {value!r};" for name, value in constants.items()]
     head += [f"const int {name}[] = {{{', '.join(map(str, values))}}};" for name, values in lists.items()]
     return "\n".join(head) + "\n" + rolled(text("hqp", parts))

@@ -18,6 +18,7 @@ from ...execution._backends import Backend, on_platforms, takes
 from ...execution._lanes import in_lanes
 from ...execution._rules import custom_jvp
 from ...kernels.numba import _target
+from ...kernels.numba._sizes import row_space_numbers
 from .._damping import Damping
 from ..hqp import Level
 from ._projection import solve_forward
@@ -58,12 +59,6 @@ def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Arr
     return in_lanes(partial(on_platforms, dict(numba=_by_numba), plain))
 
 
-def kernel_space(n: int, m: int) -> int:
-    """Return the numbers that a kernel needs for one problem, which XLA allocates as one more result."""
-    side = -(-max(n, m) // 8) * 8 + 8
-    return 15 * side**2 + 17 * side  # as ``work_size`` in the kernel
-
-
 def _by_numba(
     levels: list[Level], secondary: Float[Array, "B n"], damping: Damping, rank_tol: Float[Array, " B"]
 ) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
@@ -71,6 +66,6 @@ def _by_numba(
     m = max(level.lower.shape[1] for level in levels)
     equal = [jax.vmap(lambda one: one.equal)(level) for level in levels]
     rows = [a for level, e in zip(levels, equal, strict=True) for a in (level.matrix, level.lower, level.upper, e)]
-    shapes = (batch, n), (batch, n, n), (kernel_space(n, m),)
+    shapes = (batch, n), (batch, n, n), (row_space_numbers(n, m),)  # the last is space to work in
     x, projector, _ = _target.call("_projection", [(s, float) for s in shapes], secondary, *damping, rank_tol, *rows)
     return x, projector

@@ -39,11 +39,11 @@ from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_a_few
 from ...execution._rules import found as kept
 from ...kernels.numba import _target
+from ...kernels.numba._sizes import row_space_numbers, saturation_numbers
 from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
-from ._dispatch import kernel_space
 from ._implicit_diff import ActiveJoints, with_derivative
 from ._padding import PaddedLevel, Problem, initial_point, pad_levels
 from ._projection import damped_step_length, level_motion
@@ -166,14 +166,12 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> _R
 def _by_numba(max_iterations: int, problem: Problem) -> _Result:
     """Return the kernel's answers, ``done`` where it has one."""
     batch, count, m, n = problem.levels.matrix.shape
-    width = max(m, n)
-    # as ``Work`` and ``Search`` in the kernel; rows there are read in blocks of eight numbers
-    space = kernel_space(n, width) + n * (2 * n + 9)
+    space = row_space_numbers(n, m) + saturation_numbers(n)
     floats = (batch, n), (batch, n, n), (batch, count)
     ints = (batch, count), (batch, count, n), (batch, count, n), (batch, count), (batch, n), (batch, 2)
     x, projector, scales, done, at_bound, blocking, blocker, active, report, *_ = _target.call(
         "_saturation",
-        [*((s, float) for s in floats), *((s, int) for s in ints), ((space + 8,), float), ((5 * n,), int)],
+        [*((s, float) for s in floats), *((s, int) for s in ints), ((space,), float), ((5 * n,), int)],
         *(*problem.levels, *problem.damping, problem.targets, problem.lower, problem.upper, problem.rank_tol),
         np.array([max_iterations], np.int32),
     )

@@ -40,6 +40,8 @@ from ...execution._double import first_smallest
 from ...execution._lanes import choose
 from ...numerics._constants import (
     AT_UPPER,
+    ATTEMPT_GROWTH,
+    ATTEMPT_SCALE,
     INACTIVE,
     INDEPENDENCE_TOL,
     MAX_SATURATION_REFINEMENTS,
@@ -49,6 +51,7 @@ from ...numerics._constants import (
     SATURATION_ATTEMPTS,
     SATURATION_RESIDUAL,
     SATURATION_ROUNDOFF,
+    STIFFER_COMPLIANCE,
 )
 from ...numerics._dense import apply
 from .._box import clip_to_box
@@ -106,13 +109,13 @@ def solve_scaled_motion(problem: ScaledMotion, max_iterations: int) -> Saturatio
         # ``part``: of the motion that this attempt considers
         number, part, before = carry
         # a lower compliance in every other attempt: a stiffer penalty on the missing part
-        compliance = MISSING_COMPLIANCE * jnp.where(number % 2 == 1, 0.1, 1.0).astype(part.dtype)
+        compliance = MISSING_COMPLIANCE * jnp.where(number % 2 == 1, STIFFER_COMPLIANCE, 1.0).astype(part.dtype)
         partial_motion = problem._replace(motion=part[:, None] * problem.motion)
         result = _attempt(partial_motion, compliance, ~before.done, max_iterations)
         is_blocked = (result.blocking != 0).any(-1)
         is_final = result.done & (is_blocked | (part == 1.0))
         # after a success more of the motion is considered, after a failure the part near the scale that was found
-        growth = jnp.where(result.done, 8.0, 2.0 * jnp.clip(jnp.nan_to_num(result.scale), 1e-3, 0.25))
+        growth = jnp.where(result.done, ATTEMPT_GROWTH, 2.0 * jnp.clip(jnp.nan_to_num(result.scale), *ATTEMPT_SCALE))
         iterations = before.iterations + result.iterations
         result = result._replace(scale=part * result.scale, iterations=iterations, done=is_final)
         return number + 1, jnp.minimum(part * growth, 1.0), choose(before.done, before, result)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ...numerics._constants import QUADRATIC_RIDGE
 from ...numerics._dense import apply, product
 
 
@@ -39,7 +40,7 @@ class Quadratic(eqx.Module):
 
     def square_root(self, free: Bool[Array, " n"]) -> Float[Array, "n n"]:
         """Return R with R'R = H over the free variables, ones for the others (Cholesky, with a ridge of roundoff)."""
-        eps = 10.0 * float(jnp.finfo(self.matrix.dtype).eps)
+        eps = QUADRATIC_RIDGE * float(jnp.finfo(self.matrix.dtype).eps)
         square = jnp.where(free[:, None] & free[None, :], self.matrix, 0.0)
         # relative to the largest diagonal element, so that a semidefinite H has a factor too
         ridge = jnp.where(free, eps * jnp.max(jnp.diagonal(square), initial=eps), 1.0)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import INACTIVE, KKT_RIDGE, LAST_CORRECTION, MAX_REFINEMENTS
+from ...numerics._constants import INACTIVE, KKT_RIDGE, LAST_CORRECTION, MAX_REFINEMENTS, SCHUR_RIDGE
 from ...numerics._dense import apply, product
 from ._problem import QP, active_bounds
 
@@ -56,7 +56,7 @@ def factorize(qp: QP, hessian: Float[Array, "n n"], active: Int[Array, " n_and_p
     half = forward(lower, rows.T)
     schur = product(half.T, half) + jnp.diag(jnp.where(active_rows, qp.compliance, 0.0))
     diagonal = jnp.diagonal(schur)
-    ridge = jnp.where(active_rows, 10.0 * eps * diagonal + jnp.where(diagonal == 0.0, eps, 0.0), 1.0)
+    ridge = jnp.where(active_rows, SCHUR_RIDGE * eps * diagonal + jnp.where(diagonal == 0.0, eps, 0.0), 1.0)
     return KKTFactor(free, active_rows, lower, backward(lower, half), inverse_root(cholesky(schur + jnp.diag(ridge))))
 
 

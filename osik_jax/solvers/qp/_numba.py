@@ -7,7 +7,8 @@ from jaxtyping import Array, Float, Int
 
 from ...execution._computed import side_by_side
 from ...kernels.numba import _target
-from ...numerics._constants import IMPLIED, INACTIVE
+from ...kernels.numba._sizes import weighted_qp_numbers
+from ...numerics._constants import INACTIVE, REDUNDANT
 from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._problem import QP, arrays
@@ -26,18 +27,20 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     assert isinstance(cost, LeastSquares)
     batch, m, n = cost.matrix.shape
     p = qp.rows.shape[1]
-    k, constraints = m + p, n + p
-    largest = max(n, k)
-    wide, high, line = (-(-size // 8) * 8 for size in (n, k, largest + constraints))  # as ``padded``
-    workspace = (
-        high * (4 * wide + 3 * high) + largest**2 + p * (n + p) + 2 * constraints**2 + 27 * line
-    )  # as ``Workspace``
     (matrix, *others), _ = arrays(qp)
     packed = side_by_side(*others) if qp.packed is None else qp.packed
     x, y, active, report, _ = _target.call(
         "_weighted_qp",
-        [((batch, n), float), ((batch, p), float), ((batch, n + p), int), ((batch, 3), int), ((workspace,), float)],
+        [
+            ((batch, n), float),
+            ((batch, p), float),
+            ((batch, n + p), int),
+            ((batch, 3), int),
+            ((weighted_qp_numbers(n, m, p),), float),
+        ],
         *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
-    implied = active == IMPLIED
-    return Candidate(x, y, jnp.where(implied, INACTIVE, active), *(report[:, i] for i in range(3)), redundant=implied)
+    redundant = active == REDUNDANT
+    return Candidate(
+        x, y, jnp.where(redundant, INACTIVE, active), *(report[:, i] for i in range(3)), redundant=redundant
+    )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, INACTIVE, ZERO_TOL
+from ...numerics._constants import AT_LOWER, AT_UPPER, INACTIVE, ROW_MULTIPLIER, ZERO_TOL
 from ...numerics._dense import apply
 from .._box import violation
 from .._certificate import relative_kkt_residual
@@ -150,7 +150,7 @@ def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"
     nearest = jnp.minimum(*bounds)
     value = floor + jnp.abs(values) + jnp.where(jnp.isfinite(nearest), nearest, 0.0)
     # the multiplier that moves the value by its scale, and a part of what the rows add to the gradient
-    row_terms = jnp.concatenate([1e-3 * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
+    row_terms = jnp.concatenate([ROW_MULTIPLIER * apply(jnp.abs(qp.rows).T, jnp.abs(y)), jnp.zeros_like(y)])
     return Scales(value, value / jnp.maximum(per_curvature, jnp.finfo(x.dtype).tiny) ** 2 + row_terms)
 
 

@@ -28,6 +28,9 @@ from ...numerics._constants import (
     AT_UPPER,
     COMPLIANCE_DECREASE,
     EQUALITY,
+    FEASIBLE_AT_ONCE,
+    FEASIBLE_DECREASE,
+    FULL_STEP_ROUNDOFF,
     INACTIVE,
     MAX_JOINT_RELEASES,
     MAX_UPDATES,
@@ -243,7 +246,7 @@ def _line_search(
     is_inside = to_bound >= 1.0
     is_full = is_inside & (lengths == 1.0)
     # the full step is preferred by a few units of roundoff
-    best = first_smallest(changes - jnp.where(is_full, 4.0 * roundoff, 0.0))
+    best = first_smallest(changes - jnp.where(is_full, FULL_STEP_ROUNDOFF * roundoff, 0.0))
     return steps[best], changes[best] < -roundoff[best], is_full[best], is_inside
 
 
@@ -270,7 +273,8 @@ def _update_multipliers(feasibility_tol: float, qp: QP, s: NewtonState, at: Line
     infeasibility = jnp.max(jnp.abs(off) / jnp.where(off == 0.0, 1.0, tolerance), initial=0.0)
     certified = is_farkas_certificate(qp.rows, gap / s.compliance, gap, s.x, *_box(qp)) & (infeasibility > 1.0)
     # feasible, far under the tolerance or where the updates have ceased to help
-    feasible = (infeasibility <= 1e-3) | ((infeasibility <= 1.0) & (infeasibility > 0.1 * s.infeasibility))
+    ceased = infeasibility > FEASIBLE_DECREASE * s.infeasibility
+    feasible = (infeasibility <= FEASIBLE_AT_ONCE) | ((infeasibility <= 1.0) & ceased)
     turns_infeasible = certified & ~s.infeasible
     root = jnp.sqrt(qp.cost.diagonal())
     unchanged = jnp.max(jnp.abs(s.x - s.last_x) * root) <= UNCHANGED * jnp.max(jnp.abs(s.x) * root)

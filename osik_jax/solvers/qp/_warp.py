@@ -16,6 +16,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...kernels.warp import text
+from ...numerics._constants import (
+    KERNEL_REFINEMENTS,
+    KKT_RIDGE,
+    LAST_CORRECTION,
+    MAX_EXCHANGES,
+    MAX_FACTORIZATIONS,
+    MIN_DECREASE,
+    VIOLATION_TOL,
+)
 from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._problem import QP
@@ -120,4 +129,12 @@ def _kernel(shape: Shape) -> Callable[..., Any]:
 def source(shape: Shape, parts: tuple[str, ...] = PARTS) -> str:
     """Return the CUDA text for a shape: its numbers as constants, then the body of the kernel, or some of its parts."""
     n, m, p = shape
-    return f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};\n{text('qp', parts)}"
+    single = jnp.dtype("float32")
+    numbers = dict(MAX_REFINEMENTS=KERNEL_REFINEMENTS[single], MAX_FACTORIZATIONS=MAX_FACTORIZATIONS)
+    numbers |= dict(MAX_EXCHANGES=MAX_EXCHANGES)
+    constants = dict(RIDGE=KKT_RIDGE[single] * float(jnp.finfo(single).eps), LAST_CORRECTION=LAST_CORRECTION[single])
+    constants |= dict(VIOLATION_TOL=VIOLATION_TOL, MIN_DECREASE=MIN_DECREASE)
+    head = [f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};"]
+    head += [f"constexpr int {name} = {value};" for name, value in numbers.items()]
+    head += [f"constexpr float {name} = {value!r}f;" for name, value in constants.items()]
+    return "\n".join(head) + "\n" + text("qp", parts)

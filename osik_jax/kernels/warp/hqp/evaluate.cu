@@ -22,4 +22,4 @@ auto evaluate = [&]() {                             // slack, its norm, and the 
 auto wrong_force = [&](double force, int at, double longest) { return -force * at * longest; };
 auto roundoff = [&]() { return size * step_tol * (size * x_max + root_cost); };
 auto sign_tolerance = [&]() { return multiplier_tol * gradient_norm + roundoff(); };
-auto is_stationary = [&]() { return residual <= 10.0 * (multiplier_tol * size * root_cost + roundoff()); };
+auto is_stationary = [&]() { return residual <= STATIONARITY_TOL * (multiplier_tol * size * root_cost + roundoff()); };

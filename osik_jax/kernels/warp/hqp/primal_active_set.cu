@@ -60,7 +60,7 @@ auto exact_line_search = [&](const double* rate, double along_x, double along_d)
   for (int g = 0; g < G; ++g)
     if (in_level[g]) work_a[lane + 32 * g] = value[g], work_b[lane + 32 * g] = rate[g];
   __syncwarp();
-  auto slope = [&](double t) {
+  auto derivative = [&](double t) {
     double total = along_x + t * along_d;
     for (int a = 0; a < m; ++a) {
       const size_t at = problem * ROWS + OFFSET[level] + a;
@@ -82,14 +82,14 @@ auto exact_line_search = [&](const double* rate, double along_x, double along_d)
   breakpoint[2 * G] = lane == 0 ? 0.0 : 1.0;
 #pragma unroll
   for (int e = 0; e < 2 * G + 1; ++e)
-    if (slope(breakpoint[e]) < 0.0) before = fmax(before, breakpoint[e]);
+    if (derivative(breakpoint[e]) < 0.0) before = fmax(before, breakpoint[e]);
   before = warp_max(before);
 #pragma unroll
   for (int e = 0; e < 2 * G + 1; ++e)
     if (breakpoint[e] > before) after = fmin(after, breakpoint[e]);
   after = -warp_max(-after);
   const double trial = is_finite(after) ? 0.5 * (before + after) : before + 1.0;
-  const double at_first = slope(before), at_last = slope(trial);
+  const double at_first = derivative(before), at_last = derivative(trial);
   const bool rising = at_last > at_first;
   return rising ? fmax(before - at_first * (trial - before) / (at_last - at_first), 0.0) : before;
 };

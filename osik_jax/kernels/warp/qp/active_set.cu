@@ -24,7 +24,7 @@ while (!hard && factorizations < MAX_FACTORIZATIONS && changes <= max_iterations
   refine();
   const int wrong_count = find_wrong_labels();
   converged = wrong_count == 0 && entering < 0;
-  patience = wrong_count < fewest_wrong ? MAX_STALLED : patience - 1;
+  patience = wrong_count < fewest_wrong ? MAX_EXCHANGES : patience - 1;
   fewest_wrong = wrong_count < fewest_wrong ? wrong_count : fewest_wrong;
   use_dual = use_dual || patience < 0;
   if (converged) break;

@@ -4,7 +4,7 @@ auto find_wrong_variables = [&](float x_size, float x_max) {  // to `next`; retu
 #pragma unroll
   for (int h = 0; h < H; ++h) {
     float roundoff = relative_tol * (fminf(x_size / root[h], x_max) + fabsf(x[h]) + nearest_bound(low[h], high[h]));
-    float multiplier_tol = roundoff * root[h] * root[h], violation_tol = FEASIBILITY_TOL * roundoff;
+    float multiplier_tol = roundoff * root[h] * root[h], violation_tol = VIOLATION_TOL * roundoff;
     next[h] = label[h];
     if (label[h] == FREE)
       next[h] = x[h] < low[h] - violation_tol ? AT_LOWER : x[h] > high[h] + violation_tol ? AT_UPPER : FREE;
@@ -24,7 +24,7 @@ auto find_wrong_rows = [&](float x_size, float x_max) {       // to `next_row_la
     }
     float scale = fminf(x_size * row_reach, x_max * row_sum) + fabsf(value) + nearest_bound(row_low, row_high);
     float roundoff = relative_tol * scale;
-    float multiplier_tol = roundoff / fmaxf(row_reach * row_reach, 1e-37f), violation_tol = FEASIBILITY_TOL * roundoff;
+    float multiplier_tol = roundoff / fmaxf(row_reach * row_reach, 1e-37f), violation_tol = VIOLATION_TOL * roundoff;
     if (row_label == FREE)
       next_row_label = value < row_low - violation_tol ? AT_LOWER : value > row_high + violation_tol ? AT_UPPER : FREE;
     else

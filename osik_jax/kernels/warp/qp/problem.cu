@@ -37,7 +37,7 @@ for (int r = lane; r < M; r += 32) {
   row_targets[r] = target.data[problem * M + r];
 }
 
-int factorizations = 0, changes = 0, fewest_wrong = CONSTRAINTS + 1, patience = MAX_STALLED;
+int factorizations = 0, changes = 0, fewest_wrong = CONSTRAINTS + 1, patience = MAX_EXCHANGES;
 bool converged = false, use_dual = false;
 int entering = -1;                            // the constraint that the dual method makes active, -1 for none
 float entering_multiplier = 0.f;              // its multiplier so far

@@ -1,7 +1,7 @@
 // Sizes and shared memory of one warp: the rows, the inverse factor, and vectors to work with.
 //
 // Variable i belongs to lane i % 32, in its slot i / 32. Constants from _warp.py: N variables, M rows of the cost, P
-// soft rows (at most 32), WARPS of a block.
+// soft rows (at most 32), WARPS of a block; and those of numerics/_constants.py.
 
 constexpr int H = N > 32 ? 2 : 1;             // variables of a lane
 constexpr int ROWS = M + P;
@@ -11,13 +11,6 @@ constexpr int PADDED_ROWS = (ROWS + 3) / 4 * 4;
 constexpr int CONSTRAINTS = N + P;
 constexpr unsigned ALL = 0xffffffffu;
 constexpr int FREE = 0, AT_LOWER = -1, AT_UPPER = 1, EQUALITY = 2;
-constexpr float RIDGE = 1.1920929e-7f;        // relative to the diagonal: machine epsilon
-constexpr float LAST_CORRECTION = 1e-6f;      // relative to x: the correction that would come next
-constexpr float FEASIBILITY_TOL = 10.f;       // in units of roundoff: a bound that is violated by less holds
-constexpr float MIN_DECREASE = 0.25f;         // a correction that shrinks to more than this was roundoff
-constexpr int MAX_REFINEMENTS = 6;
-constexpr int MAX_FACTORIZATIONS = 100;
-constexpr int MAX_STALLED = 2;                // exchanges that leave no fewer wrong labels, before the dual method
 
 __shared__ float4 shared_rows[WARPS][(ROWS + 1) * LD / 4];
 __shared__ float4 shared_inverse[WARPS][N * LD / 4];
