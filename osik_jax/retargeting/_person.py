@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._contact import find_contact, find_ground
+from ._contact import find_contact, find_ground, find_noise, noise_steps
 from ._motion import CONTACT_POINTS, HumanMotion
 
 LIMBS = (
@@ -95,6 +95,7 @@ class Measures:
         leg: length of a leg, thigh and shank [m].
         ankle: height of the ankles above the floor when standing [m].
         ground: height of the floor [m].
+        noise: of heels and toes, standard deviation on each coordinate [m].
         flat: of each side, knee, ankle and toe of a foot that is flat on the floor [m]. (1, 3) each
         straight: axes of pelvis and chest in the rest pose; None where that is not known. (1, 3, 3) each
     """
@@ -102,6 +103,7 @@ class Measures:
     leg: float
     ankle: float
     ground: float
+    noise: float
     flat: Mapping[str, Mapping[str, np.ndarray]]
     straight: tuple[np.ndarray, np.ndarray] | None
 
@@ -123,10 +125,11 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
     legs = [np.linalg.norm(points[b] - points[a], axis=-1).mean() for a, b in LIMBS[:4]]
     soles = _with_soles(points, flat)
     found = np.stack([soles[name] for name in CONTACT_POINTS], 1)
-    ground = find_ground(found) if motion.ground is None else motion.ground
+    noise = find_noise(found)
+    ground = find_ground(found, noise_steps(noise, motion.fps)) if motion.ground is None else motion.ground
     ankles = np.minimum(points["left_ankle"][:, 2], points["right_ankle"][:, 2])
     ankle = float(np.percentile(ankles, 5)) - ground
-    return Measures(0.5 * float(sum(legs)), ankle, ground, flat, straight)
+    return Measures(0.5 * float(sum(legs)), ankle, ground, noise, flat, straight)
 
 
 def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measures | None = None) -> Person:
@@ -140,7 +143,9 @@ def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measure
     known = measure(motion, roles) if measures is None else measures
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
     soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
-    contact = find_contact(soles, motion.fps, known.ground) if motion.contact is None else motion.contact
+    contact = motion.contact
+    if contact is None:
+        contact = find_contact(soles, motion.fps, known.ground, noise=known.noise)
     points = {role: track - [0.0, 0.0, known.ground] for role, track in points.items()}
     turns, straight = _turns(points), known.straight
     pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
