@@ -63,10 +63,10 @@ def find_ground(points: Float[np.ndarray, "F k 3"], steps: int = 1) -> float:
     Heights are means over ``steps`` (``noise_steps``) where these are more than one, since the lowest of noisy heights
     is too low.
     """
-    return float(np.percentile(_mean(points[..., 2], steps).min(1), _LOW_SHARE))
+    return float(np.percentile(mean_over(points[..., 2], steps).min(1), _LOW_SHARE))
 
 
-def _mean(values: Float[np.ndarray, "F k"], steps: int) -> Float[np.ndarray, "F k"]:
+def mean_over(values: Float[np.ndarray, "F k"], steps: int) -> Float[np.ndarray, "F k"]:
     """Means over so many steps around each frame, over those that there are at the ends; as they are for one step."""
     if steps == 1 or len(values) <= steps:
         return values
@@ -105,7 +105,7 @@ def find_contact(
         speed: [m/s]
     """
     steps = min(noise_steps(noise, fps, speed), max(len(points) - 1, 1))
-    low = _mean(points[..., 2], steps) - ground < height
+    low = mean_over(points[..., 2], steps) - ground < height
     stands = low & _still(points, fps, noise, speed, steps)
     least = max(2, round(_SHORTEST * fps))
     longest, back = max(least, steps) + 1, _STAYS + 2.0 * noise * np.sqrt(2.0 / steps) * (steps > 1)

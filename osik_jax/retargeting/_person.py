@@ -8,7 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._contact import find_contact, find_ground, find_noise, noise_steps
+from ._contact import find_contact, find_noise
+from ._floor import Floor, find_floor
 from ._motion import CONTACT_POINTS, HumanMotion
 
 LIMBS = (
@@ -94,7 +95,7 @@ class Measures:
     Attributes:
         leg: length of a leg, thigh and shank [m].
         ankle: height of the ankles above the floor when standing [m].
-        ground: height of the floor [m].
+        floor: where the floor is.
         noise: of heels and toes, standard deviation on each coordinate [m].
         flat: of each side, knee, ankle and toe of a foot that is flat on the floor [m]. (1, 3) each
         straight: axes of pelvis and chest in the rest pose; None where that is not known. (1, 3, 3) each
@@ -102,7 +103,7 @@ class Measures:
 
     leg: float
     ankle: float
-    ground: float
+    floor: Floor
     noise: float
     flat: Mapping[str, Mapping[str, np.ndarray]]
     straight: tuple[np.ndarray, np.ndarray] | None
@@ -126,10 +127,10 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
     soles = _with_soles(points, flat)
     found = np.stack([soles[name] for name in CONTACT_POINTS], 1)
     noise = find_noise(found)
-    ground = find_ground(found, noise_steps(noise, motion.fps)) if motion.ground is None else motion.ground
-    ankles = np.minimum(points["left_ankle"][:, 2], points["right_ankle"][:, 2])
-    ankle = float(np.percentile(ankles, 5)) - ground
-    return Measures(0.5 * float(sum(legs)), ankle, ground, noise, flat, straight)
+    floor = find_floor(found, motion.fps, noise) if motion.ground is None else Floor(motion.ground)
+    ankles = np.stack([points["left_ankle"], points["right_ankle"]], 1)
+    ankle = float(np.percentile(floor.leveled(ankles, motion.fps)[..., 2].min(1), 5))
+    return Measures(0.5 * float(sum(legs)), ankle, floor, noise, flat, straight)
 
 
 def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measures | None = None) -> Person:
@@ -141,12 +142,13 @@ def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measure
         measures: of the person, where the clip is too short to show them; None: the clip's own.
     """
     known = measure(motion, roles) if measures is None else measures
+    floor = known.floor if measures is None else dataclasses.replace(known.floor, drift=0.0)
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
-    soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
+    points = {role: floor.leveled(track, motion.fps) for role, track in points.items()}
     contact = motion.contact
     if contact is None:
-        contact = find_contact(soles, motion.fps, known.ground, noise=known.noise)
-    points = {role: track - [0.0, 0.0, known.ground] for role, track in points.items()}
+        soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
+        contact = find_contact(soles, motion.fps, 0.0, noise=known.noise)
     turns, straight = _turns(points), known.straight
     pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
     return Person(
