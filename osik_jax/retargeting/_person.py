@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._errors import OsikValueError
 from ._contact import find_contact, find_noise
 from ._floor import Floor, find_floor
 from ._motion import CONTACT_POINTS, HumanMotion
@@ -30,6 +31,8 @@ OPTIONAL = ("pelvis", "chest", "neck", "head", "left_heel", "left_toe", "right_h
 _SHORTEST = 1e-9
 _SPINE = 1e-3
 _TOE, _SOLE, _HEEL = 0.35, 0.12, 0.3
+_FLAT = 0.05
+_LEGS = (0.1, 3.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,6 +118,9 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
     Args:
         motion: the clip.
         roles: of each of a person's joints, what the clip calls it (``find_roles``).
+
+    Raises:
+        ValueError: legs of a length that nobody's have: the clip is not in metres.
     """
     points = {role: motion.track(name) for role, name in roles.items()}
     straight, flat = None, {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
@@ -123,14 +129,16 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
         rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
         flat = {side: {**rest, **_toes(rest, side)} for side in SIDES}
         straight = _turns(_with_soles(rest, flat))
-    legs = [np.linalg.norm(points[b] - points[a], axis=-1).mean() for a, b in LIMBS[:4]]
+    leg = 0.5 * float(sum(np.linalg.norm(points[b] - points[a], axis=-1).mean() for a, b in LIMBS[:4]))
+    if not _LEGS[0] < leg < _LEGS[1]:
+        raise OsikValueError(f"the legs of {motion.name} are {leg:.4g} m long; positions are metres")
     soles = _with_soles(points, flat)
     found = np.stack([soles[name] for name in CONTACT_POINTS], 1)
     noise = find_noise(found)
     floor = find_floor(found, motion.fps, noise) if motion.ground is None else Floor(motion.ground)
     ankles = np.stack([points["left_ankle"], points["right_ankle"]], 1)
     ankle = float(np.percentile(floor.leveled(ankles, motion.fps)[..., 2].min(1), 5))
-    return Measures(0.5 * float(sum(legs)), ankle, floor, noise, flat, straight)
+    return Measures(leg, ankle, floor, noise, flat, straight)
 
 
 def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measures | None = None) -> Person:
@@ -214,8 +222,14 @@ def _toe(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
 
 
 def _flat(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
-    """The one frame in which ankle and toe are lowest: the foot is taken to be flat in it."""
-    frame = int(np.argmin(points[f"{side}_ankle"][:, 2] + points[f"{side}_toe"][:, 2]))
+    """One frame in which the foot is taken to be flat: of those with ankle and toe lowest, the one in the middle.
+
+    A twentieth of the frames, by how much higher the ankle is than the toe: some have the foot in the floor, or on its
+    tip.
+    """
+    ankle, toe = points[f"{side}_ankle"][:, 2], points[f"{side}_toe"][:, 2]
+    low = np.argsort(ankle + toe, kind="stable")[: int(np.ceil(_FLAT * len(toe)))]
+    frame = low[np.argsort((ankle - toe)[low], kind="stable")[len(low) // 2]]
     return {
         name: points[f"{side}_{name.split('_', 1)[1]}"][frame, None]
         for name in (f"{side}_knee", f"{side}_ankle", f"{side}_toe")
