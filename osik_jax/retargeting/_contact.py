@@ -110,13 +110,13 @@ def find_contact(
     least = max(2, round(_SHORTEST * fps))
     longest, back = max(least, steps) + 1, _STAYS + 2.0 * noise * np.sqrt(2.0 / steps) * (steps > 1)
     for k in range(points.shape[1]):
-        for start, end in _stretches(~stands[:, k]):
+        for start, end in stretches(~stands[:, k]):
             inside = start > 0 and end < len(points) and low[start:end, k].all()
             if inside and end - start <= longest:
                 before = points[max(start - steps, 0) : start, k].mean(0)
                 if np.linalg.norm(points[end : end + steps, k].mean(0) - before) < back:
                     stands[start:end, k] = True
-        for start, end in _stretches(stands[:, k]):
+        for start, end in stretches(stands[:, k]):
             if end - start < least:
                 stands[start:end, k] = False
     return stands
@@ -144,7 +144,7 @@ def _still(
     return count >= np.minimum(2, there)
 
 
-def _stretches(flag: Bool[np.ndarray, " F"]) -> list[tuple[int, int]]:
+def stretches(flag: Bool[np.ndarray, " F"]) -> list[tuple[int, int]]:
     """First frame, and the one after the last, of each stretch in which a flag holds."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flag, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
