@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 from osik_jax.retargeting import (
     HumanMotion,
     RobotMotion,
+    find_roles,
     load_motion,
     load_robot_motion,
     read_bvh,
     write_csv,
 )
+from osik_jax.retargeting._person import measure
 
 _TO_Z_UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 
@@ -83,6 +85,8 @@ def test_a_skeleton_of_no_persons_size_asks_for_the_unit(tmp_path):
         load_motion(path, unit="yard")
 
 
+_SPINE = "\t\tOFFSET 0.0 0.25 0.0\n"
+_THREE = "\t\tCHANNELS 3 Zrotation Xrotation Yrotation\n"
 BROKEN = {
     "no start": (lambda t: t.replace("HIERARCHY", "TREE"), r"line 1: a BVH file starts with HIERARCHY"),
     "two offsets": (lambda t: t.replace("OFFSET 0.0 0.25 0.0", "OFFSET 0.0 0.25"), r"line 8: OFFSET has 2 numbers.*3"),
@@ -97,6 +101,33 @@ BROKEN = {
     "short": (lambda t: t[: t.rindex(" ")] + "\n", r"line \d+: a frame has 56 numbers where there should be 57"),
     "cut": (lambda t: t[: t.index("MOTION")], r"ends where .*MOTION should come"),
     "no offset": (lambda t: t.replace("\t\tOFFSET 0.0 0.25 0.0\n", ""), r"Spine has no OFFSET"),
+    "two offsets of one": (lambda t: t.replace(_SPINE, 2 * _SPINE), r"line 9: Spine has an OFFSET already"),
+    "channels twice": (lambda t: t.replace(_SPINE, _SPINE + 2 * _THREE), r"line 10: Spine has CHANNELS already"),
+    "channels of an end": (
+        lambda t: t.replace("\tOFFSET 0 0 0\n", "\tOFFSET 0 0 0\n" + _THREE, 1),
+        r"line \d+: an End Site has no CHANNELS",
+    ),
+    "joint in an end": (
+        lambda t: t.replace("\tOFFSET 0 0 0\n", "\tOFFSET 0 0 0\nJOINT tip\n{\n}\n", 1),
+        r"nothing is inside an End Site but",
+    ),
+    "two roots": (lambda t: t.replace("MOTION\n", "ROOT Other\n{\nOFFSET 0 0 0\n}\nMOTION\n"), r"line 112: .*one ROOT"),
+    "no name": (lambda t: t.replace("ROOT Hips", "ROOT"), r"line 2: ROOT has no name"),
+    "no brace": (lambda t: t.replace("ROOT Hips\n{", "ROOT Hips"), r"line 3: \{ should follow Hips"),
+    "count in words": (lambda t: t.replace("Frames: 24", "Frames: many"), r"line 113: Frames: and their number"),
+    "no count": (lambda t: t.replace("Frames: 24\n", ""), r"line 113: Frames: and their number"),
+    "no frame time": (lambda t: t.replace("Frame Time: 0.033333333\n", ""), r"line 114: Frame Time: and seconds"),
+    "milliseconds": (lambda t: t.replace("Time: 0.033333333", "Time: 33.3"), r"line 114: the frame time is in seconds"),
+    "no frames": (
+        lambda t: t[: t.index("0.033333333")].replace(": 24", ": 0") + "0.03\n",
+        r"says Frames: 0, and has 0",
+    ),
+    "long": (lambda t: t.rstrip() + " 3.0\n", r"line 138: a frame has 58 numbers where there should be 57"),
+    "overflow": (lambda t: t[: t.rindex(" ")] + " 1e400\n", r"line 138: a frame is not finite"),
+    "decimal commas": (lambda t: t.replace("0.0 0.25 0.0", "0,0 0,25 0,0"), r"line 8: OFFSET is not numbers"),
+    "two motions": (lambda t: t + t[t.index("MOTION") :], r"line 139: a frame is not numbers; the line is 'MOTION'"),
+    "a page": (lambda t: "<!DOCTYPE html><html>404</html>", r"line 1: a BVH file starts with HIERARCHY"),
+    "nothing": (lambda t: "", r"ends where HIERARCHY should come"),
 }
 
 
@@ -141,7 +172,19 @@ def test_keypoints_come_back(tmp_path):
         (dict(joint_names=["hip", "hip"]), "joint names occur twice: hip"),
         (dict(fps=0.0), "fps is 0.0"),
         (dict(contact=np.zeros((4, 3))), r"contact has shape \(4, 3\)"),
-        (dict(positions=np.array([object()])), "cannot be read as an .npz of plain arrays"),
+        (
+            dict(positions=np.array([object()])),
+            "cannot be read as an .npz of plain arrays: it is none, or holds objects",
+        ),
+        (dict(positions=np.full((4, 2, 3), "a")), "positions is of type <U1; it has to be numbers"),
+        (dict(positions=np.zeros((4, 6))), r"positions has shape \(4, 6\), expected \(4, 2, 3\)"),
+        (dict(positions=np.zeros((0, 2, 3))), "a frame and a joint at least; this one has 0 and 2"),
+        (dict(fps=np.array([30.0, 30.0])), "fps is one number, not 2"),
+        (dict(contact=np.full((4, 4), "yes")), "contact is of type <U3; it has to be numbers"),
+        (dict(contact=np.full((4, 4), 0.5)), "contact is 0 or 1, not 0.5"),
+        (dict(contact=np.full((4, 4), np.nan)), "contact is 0 or 1, not nan"),
+        (dict(ground=np.zeros(4)), "ground is one number, not 4"),
+        (dict(rest_positions=np.zeros((3, 3))), r"rest_positions has shape \(3, 3\), expected \(2, 3\)"),
     ],
 )
 def test_broken_keypoints_say_what_is_wrong(tmp_path, changes, message):
@@ -179,12 +222,40 @@ def test_a_table_comes_back(tmp_path):
         (lambda t: [*t[:3], t[3].rsplit(",", 1)[0] + ",yes", *t[4:]], "line 4, column contact.right_toe: 'yes'"),
         (lambda t: [*t[:3], *t[4:]], "line 4: the time steps by 0.04 s"),
         (lambda t: t[:1], "has 1 lines"),
+        (lambda t: [], "has 0 lines"),
+        (lambda t: [line.replace(",", ";") for line in t], "line 1: no column is called time"),
+        (lambda t: [*t[:3], '"' + t[3], *t[4:]], "line 4: 1 values, but there are 11 headings"),
+        (lambda t: [*t[:3], t[2], *t[4:]], "line 4: the time steps by 0 s, elsewhere by 0.02 s"),
     ],
 )
 def test_a_broken_table_says_which_line_and_column(tmp_path, edit, message):
     path, _, _ = _table(tmp_path / "clip.csv", edit)
     with pytest.raises(ValueError, match=message):
         load_motion(path)
+
+
+def test_text_is_read_however_it_is_encoded(tmp_path):
+    path = write_bvh(tmp_path / "clip.bvh", dancer())
+    text, whole = path.read_text(), load_motion(path)
+    for content in (text.encode("utf-8-sig"), text.encode("utf-16"), text.replace("\n", "\r\n").encode()):
+        path.write_bytes(content)
+        np.testing.assert_array_equal(load_motion(path).positions, whole.positions)
+    table, positions, _ = _table(tmp_path / "clip.csv")
+    table.write_bytes(table.read_text().encode("utf-8-sig"))
+    np.testing.assert_array_equal(load_motion(table).positions, positions)
+    table.write_bytes(table.read_text(encoding="utf-8-sig").encode("utf-16"))
+    with pytest.raises(ValueError, match=r"clip\.csv is no table in UTF-8: .*position 0"):
+        load_motion(table)
+    (tmp_path / "folder.bvh").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"no such file: .*folder\.bvh"):
+        load_motion(tmp_path / "folder.bvh")
+
+
+def test_positions_in_millimetres_are_told(tmp_path):
+    motion = load_motion(write_bvh(tmp_path / "clip.bvh", dancer()))
+    large = HumanMotion("clip", 30.0, motion.joint_names, 1000.0 * motion.positions)
+    with pytest.raises(ValueError, match="legs of clip are 830 m long; positions are metres"):
+        measure(large, find_roles(large.joint_names))
 
 
 def test_files_that_are_not_there_and_options_that_do_not_go_with_them(tmp_path):

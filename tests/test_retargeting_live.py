@@ -109,7 +109,7 @@ def test_short_streams_and_wrong_frames(nao, motion, live):
     assert live.finish() == []
     assert live.step(motion.positions[0]) is None and len(live.finish()) == 1
     live.reset()
-    with pytest.raises(ValueError, match=r"a frame has shape \(3, 3\), expected \(23, 3\): Hips, "):
+    with pytest.raises(ValueError, match=r"a frame has shape \(3, 3\), expected \(18, 3\): Hips, "):
         live.step(motion.positions[0, :3])
     live.step(motion.positions[0], [True] * 4)
     with pytest.raises(ValueError, match="in some frames and not in others"):

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from ..collision import CollisionShape
@@ -19,6 +19,7 @@ from ..kinematics._home import home_kinematics
 from ..limits import CollisionAvoidanceLimit
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
+from ._contact import stretches
 from ._goals import Goals
 from ._person import LIMBS, SIDES, Person
 from ._profile import Profile
@@ -27,6 +28,8 @@ from ._terms import Bounds
 JOINTS_APART = 3
 _CAPSULE = "capsule "
 _INSET, _SHARE = 1e-3, 0.98
+_LONG = 60
+"""For how many frames a point stands before it is held more firmly."""
 _AT_END, _BENT = 0.01, 1.0
 """What counts as the end of a range, as a share of it; how far from there plans begin [rad], to the middle at most."""
 
@@ -143,7 +146,8 @@ class Build:
         root[:, 2] += self.ankle - scale * person.ankle
         dtype = self.start.dtype
         parts: dict[str, Any] = {  # NumPy's arrays: each one of JAX's would cost more than its numbers
-            **{name: getattr(person, name) for name in ("directions", "pelvis", "torso", "feet", "contact")},
+            **{name: getattr(person, name) for name in ("directions", "pelvis", "torso", "feet")},
+            "contact": _firmness(person.contact) if dtype == np.float64 else person.contact,
             "root": root,
             "present": np.ones(len(root)),
         }
@@ -163,6 +167,20 @@ class Build:
         step, change = _SHARE * self.speed * dt, _SHARE * np.asarray(acceleration) * dt**2
         parts: list[Any] = [self.lower + inset, self.upper - inset, step, change]
         return Bounds(*(part.astype(self.start.dtype) for part in parts))
+
+
+def _firmness(contact: Bool[np.ndarray, "F 4"]) -> Float[np.ndarray, "F 4"]:
+    """1 where a point stands, and more where it does so for long.
+
+    What a standing point gives way adds up from frame to frame, while what pulls at it does too: as the square of the
+    frames. The weight of each step is ``stance`` times the square of this number, which grows as they do. Not in single
+    precision, to which such a weight beside those of limbs is too much.
+    """
+    out = contact.astype(float)
+    for k in range(contact.shape[1]):
+        for start, end in stretches(contact[:, k]):
+            out[start:end, k] = max(1.0, (end - start) / _LONG)
+    return out
 
 
 def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]:

@@ -6,6 +6,7 @@ the skeleton's rest pose.
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
 import os
 from collections.abc import Iterator
@@ -23,6 +24,10 @@ Up = Literal["x", "y", "z"]
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "cmu": 0.0254 / 0.45}
 """Metres a unit. ``cmu``: that of the CMU database's skeletons."""
 _HEIGHTS = (1.0, 2.3)
+_SLOWEST = 1.0
+_UPRIGHT = 0.6
+"""How far the head is above the feet in a rest pose in which one stands, as a share of the way along the joints."""
+_AXES: tuple[Up, Up, Up] = ("x", "y", "z")
 _TO_Z_UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 _CHANNELS = {f"{axis}{kind}": (kind, axis.lower()) for axis in "XYZ" for kind in ("position", "rotation")}
 
@@ -35,6 +40,7 @@ class _Joint:
     parent: int
     offset: np.ndarray
     channels: tuple[tuple[str, str], ...] = ()
+    is_end: bool = False
 
 
 class _Lines:
@@ -54,7 +60,7 @@ class _Lines:
     def error(self, what: str) -> ValueError:
         """The error of the line that was read last."""
         number, words = self._lines[max(self._at - 1, 0)] if self._lines else (1, [])
-        return ValueError(f"{self.path}, line {number}: {what}; the line is {' '.join(words)[:60]!r}")
+        return OsikValueError(f"{self.path}, line {number}: {what}; the line is {' '.join(words)[:60]!r}")
 
     def rest(self) -> Iterator[list[str]]:
         while self._at < len(self._lines):
@@ -77,15 +83,17 @@ def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, u
     """Reads a BVH file.
 
     A joint's rotation is the product of its channels in the order in which the file lists them. The ends of chains
-    (``End Site``) become joints called ``PARENT_end``. ``rest_positions`` is the pose with all rotations 0, its root at
-    the origin. Facing z with y up becomes facing x with z up.
+    (``End Site``) become joints called ``PARENT_end``, where they are not where their parent is. ``rest_positions`` is
+    the pose with all rotations 0, its root at the origin; None where nobody stands in it, as in files that have all
+    bones along one axis. Facing z with y up becomes facing x with z up.
 
     Args:
         path: the file.
         unit: metres a unit, or ``"m"``, ``"cm"``, ``"mm"``, ``"inch"``, ``"cmu"``. None: the one of these in which
-            the rest pose is between 1 and 2.3 m large.
-        up: the file's axis that points up. None: the one along which the head is above the hips in the rest pose; y
-            where no joint is called head.
+            the rest pose is between 1 and 2.3 m large; the way from a foot to the head along the joints, where nobody
+            stands in that.
+        up: the file's axis that points up. None: the one along which the head is above the hips in the rest pose, above
+            the feet on the mean of all frames where nobody stands in that; y where no joint is called head.
 
     Raises:
         FileNotFoundError: no such file.
@@ -93,22 +101,38 @@ def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, u
         KeyError: no such unit.
     """
     source = str(path)
-    lines = _Lines(source, Path(path).read_text(encoding="utf-8", errors="replace"))
+    lines = _Lines(source, _text(Path(path)))
     joints = _hierarchy(lines)
     fps, values = _frames(lines, sum(len(joint.channels) for joint in joints))
-    rest = _rest(joints)
-    scale = _scale(source, unit, float(np.ptp(rest, axis=0).max()))
-    order = list(_TO_Z_UP[_up(joints, rest) if up is None else up])
     positions, rotations = _forward(joints, values)
+    rest = _rest(joints)
+    heads, feet = _named(joints, "head"), _named(joints, "foot", "ankle", "toe")
+    way = _way(joints, heads[-1], feet[-1]) if heads and feet else 0.0
+    stands = _stands(rest[heads[-1]] - rest[feet].mean(0), way, up) if way else True
+    size = float(np.ptp(rest, axis=0).max()) if stands else way
+    if up is None:
+        places = rest if stands else positions.mean(0) - positions[:, feet].mean((0, 1))
+        up = _AXES[int(np.argmax(places[heads[-1]]))] if heads else "y"
+    scale, order = _scale(source, unit, size), list(_TO_Z_UP[up])
     rotations = np.concatenate([rotations[..., :1], rotations[..., 1:][..., order]], -1)
+    kept = [i for i, joint in enumerate(joints) if not joint.is_end or joint.offset.any()]
     return HumanMotion(
         name=Path(path).stem,
         fps=fps,
-        joint_names=tuple(joint.name for joint in joints),
-        positions=scale * positions[..., order],
-        rotations=continuous(rotations),
-        rest_positions=scale * rest[:, order],
+        joint_names=tuple(joints[i].name for i in kept),
+        positions=scale * positions[:, kept][..., order],
+        rotations=continuous(rotations[:, kept]),
+        rest_positions=scale * rest[kept][:, order] if stands else None,
     )
+
+
+def _text(path: Path) -> str:
+    """The file as text: UTF-8 or what is near it, or UTF-16 that says so at its start."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {path}")
+    content = path.read_bytes()
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
 
 
 def _hierarchy(lines: _Lines) -> list[_Joint]:
@@ -120,12 +144,20 @@ def _hierarchy(lines: _Lines) -> list[_Joint]:
         words = lines.next("JOINT, End Site, } or MOTION")
         word = words[0].upper()
         if word in ("ROOT", "JOINT") or (word, *map(str.upper, words[1:2])) == ("END", "SITE"):
-            _check_place(lines, word, bool(joints), bool(open_joints))
+            _check_place(lines, word, joints, open_joints)
             open_joints.append(_joint(lines, words, joints, open_joints[-1] if open_joints else -1))
         elif word == "OFFSET" and open_joints:
-            joints[open_joints[-1]].offset = np.array(lines.numbers(words[1:], 3, "OFFSET"))
+            joint = joints[open_joints[-1]]
+            if not np.isnan(joint.offset).any():
+                raise lines.error(f"{joint.name} has an OFFSET already")
+            joint.offset = np.array(lines.numbers(words[1:], 3, "OFFSET"))
         elif word == "CHANNELS" and open_joints:
-            joints[open_joints[-1]].channels = _channels(lines, words)
+            joint = joints[open_joints[-1]]
+            if joint.is_end or joint.channels:
+                raise lines.error(
+                    "an End Site has no CHANNELS" if joint.is_end else f"{joint.name} has CHANNELS already"
+                )
+            joint.channels = _channels(lines, words)
         elif word == "}" and open_joints:
             if np.isnan(joints[open_joints[-1]].offset).any():
                 raise lines.error(f"{joints[open_joints[-1]].name} has no OFFSET")
@@ -136,10 +168,12 @@ def _hierarchy(lines: _Lines) -> list[_Joint]:
             raise lines.error(f"{words[0]} is not expected here")
 
 
-def _check_place(lines: _Lines, word: str, started: bool, inside: bool) -> None:
-    """Whether a joint may start here: one ROOT first, all others inside it."""
-    if (word == "ROOT") == started or (word == "ROOT") == inside:
+def _check_place(lines: _Lines, word: str, joints: list[_Joint], open_joints: list[int]) -> None:
+    """Whether a joint may start here: one ROOT first, all others inside it, and none inside an End Site."""
+    if (word == "ROOT") == bool(joints) or (word == "ROOT") == bool(open_joints):
         raise lines.error("a skeleton is one ROOT, and every JOINT and End Site is inside it")
+    if open_joints and joints[open_joints[-1]].is_end:
+        raise lines.error("nothing is inside an End Site but its OFFSET")
 
 
 def _joint(lines: _Lines, words: list[str], joints: list[_Joint], parent: int) -> int:
@@ -155,7 +189,7 @@ def _joint(lines: _Lines, words: list[str], joints: list[_Joint], parent: int) -
         raise lines.error(f"a second joint is called {name}")
     if words[-1] != "{" and lines.next("{") != ["{"]:
         raise lines.error(f"{{ should follow {name}")
-    joints.append(_Joint(name, parent, np.full(3, np.nan)))
+    joints.append(_Joint(name, parent, np.full(3, np.nan), is_end=words[0].upper() == "END"))
     return len(joints) - 1
 
 
@@ -182,6 +216,8 @@ def _frames(lines: _Lines, channels: int) -> tuple[float, Float[np.ndarray, "F C
     step = lines.numbers(words[2:], 1, "Frame Time")[0]
     if not step > 0.0:
         raise lines.error("the frame time has to be more than 0 s")
+    if step > _SLOWEST:
+        raise lines.error("the frame time is in seconds, and from one frame to the next it is less than one")
     rows = [lines.numbers(words, channels, "a frame") for words in lines.rest()]
     if len(rows) != count or not rows:
         raise lines.error(f"the file says Frames: {count}, and has {len(rows)}")
@@ -220,11 +256,24 @@ def _forward(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.n
     return positions, rotations
 
 
-def _up(joints: list[_Joint], rest: np.ndarray) -> Up:
-    """The axis along which the head is above the root in the rest pose."""
-    heads = [i for i, joint in enumerate(joints) if "head" in joint.name.lower()]
-    axes: tuple[Up, Up, Up] = ("x", "y", "z")
-    return axes[int(np.argmax(rest[heads[-1]]))] if heads else "y"
+def _named(joints: list[_Joint], *words: str) -> list[int]:
+    """The joints with one of some words in their names."""
+    return [i for i, joint in enumerate(joints) if any(word in joint.name.lower() for word in words)]
+
+
+def _stands(feet_to_head: Float[np.ndarray, "3"], way: float, up: Up | None) -> bool:
+    """Whether somebody stands in the rest pose: the head is above the feet by most of the way along the joints."""
+    above = feet_to_head.max() if up is None else feet_to_head[_AXES.index(up)]
+    return bool(above > _UPRIGHT * way)
+
+
+def _way(joints: list[_Joint], a: int, b: int) -> float:
+    """Length of the way along the joints from one to another, in the file's unit."""
+
+    def to_root(joint: int) -> list[int]:
+        return [] if joint < 0 else [joint, *to_root(joints[joint].parent)]
+
+    return float(sum(np.linalg.norm(joints[i].offset) for i in {*to_root(a)} ^ {*to_root(b)}))
 
 
 def _scale(path: str, unit: str | float | None, size: float) -> float:

@@ -24,7 +24,8 @@ class Goals(eqx.Module):
         torso: axes of the chest as columns. (3, 3)
         root: midpoint of the hips [m]. (3,)
         feet: axes of the left and right foot as columns. (2, 3, 3)
-        contact: 1 where left heel, left toe, right heel and right toe stand, 0 elsewhere. (4,)
+        contact: 1 where left heel, left toe, right heel and right toe stand, more where they do so for long, 0
+            elsewhere. (4,)
         present: 1 for a frame of the clip, 0 for padding behind its end. ()
     """
 

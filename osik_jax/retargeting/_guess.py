@@ -17,6 +17,7 @@ from ..physics._world import contact_corners, sole_points
 from ..robot import Robot
 from ..robot._feet import find_feet
 from ._body import JOINTS_APART, joints_between
+from ._facing import by_name, facing_x
 from ._person import SIDES
 from ._profile import Capsule, Foot, Place, Point, Profile
 
@@ -57,7 +58,9 @@ def guess_profile(robot: Robot) -> Profile:
     feet = find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
     if len(feet) != 2:
         raise OsikValueError(f"two feet are needed, and {len(feet)} frames look like some: {', '.join(feet) or 'none'}")
-    feet = sorted(feet, key=lambda name: -_y(kinematics.frame_pose(robot, name)[0]))
+    feet = by_name(sorted(feet, key=lambda name: -_y(kinematics.frame_pose(robot, name)[0])))
+    robot = facing_x(robot, feet[0], feet[1])
+    kinematics = home_kinematics(robot)
     legs = _chains(robot, kinematics, [tree.frame_bodies[tree.frame(name)] for name in feet])
     used = {body for leg in legs for body in leg.bodies}
     arms = _chains(robot, kinematics, _hands(robot, kinematics, used))

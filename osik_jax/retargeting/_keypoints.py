@@ -50,7 +50,8 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
                 raise OsikValueError("it holds one array and not several by name")
             return {name: data[name] for name in data.files}
     except (ValueError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise OsikValueError(f"{path} cannot be read as an .npz of plain arrays: {error}") from None
+        why = "it is none, or holds objects" if "pickle" in str(error) else error
+        raise OsikValueError(f"{path} cannot be read as an .npz of plain arrays: {why}") from None
 
 
 def _from_npz(path: Path) -> HumanMotion:
@@ -58,7 +59,9 @@ def _from_npz(path: Path) -> HumanMotion:
     missing = [name for name in ("fps", "positions", "joint_names") if name not in arrays]
     if missing:
         raise OsikValueError(f"{path} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
-    contact = arrays.get("contact")
+    contact = _numbers(path, arrays, "contact")
+    if contact is not None and not np.isin(contact, (0.0, 1.0)).all():
+        raise OsikValueError(f"{path}: contact is 0 or 1, not {contact[~np.isin(contact, (0.0, 1.0))][0]:g}")
     if contact is not None and contact.ndim == 2 and contact.shape[1] == 2:
         contact = contact[:, [0, 0, 1, 1]]
     rotations = _numbers(path, arrays, "rotations")
@@ -97,8 +100,11 @@ def _number(path: Path, arrays: dict[str, np.ndarray], name: str) -> float:
 def _from_csv(path: Path) -> HumanMotion:
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if row]
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise OsikValueError(f"{path} is no table in UTF-8: {error}") from None
     if len(rows) < 3:
         raise OsikValueError(f"{path} has {len(rows)} lines; it needs one of headings and two of numbers at least")
     headings = [name.strip() for name in rows[0][1]]

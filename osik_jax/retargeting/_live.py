@@ -192,7 +192,6 @@ class LiveRetargeter(OnRobot):
             self._standing.joint_names,
             _filled(seen, self._known),
             contact=contact,
-            ground=self._measures.ground,
         )
         person = read_person(motion, self.roles, self._measures)
         goals = jax.tree.map(lambda leaf: leaf[_HISTORY - _PAST :], self._build.goals(person))

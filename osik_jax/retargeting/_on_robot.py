@@ -11,6 +11,8 @@ from ..limits import AccelerationLimit, ConfigurationLimit, VelocityLimit
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._body import Build, pairs_apart
+from ._facing import facing_x
+from ._person import SIDES
 from ._profile import Profile
 from ._profile_file import check_profile, find_profile
 from ._terms import Body, Bounds
@@ -28,7 +30,7 @@ class OnRobot:
         balance: as of ``Retargeter``.
 
     Attributes:
-        robot: the robot.
+        robot: the robot; where it faces another way at home, with that turned so that it faces x.
         profile: how it is seen.
         balance: as given.
         limits: of position, speed and acceleration, which hold exactly.
@@ -49,10 +51,11 @@ class OnRobot:
             raise OsikValueError("retargeting moves a robot's base: load the robot with floating_base=True")
         if balance is not None and not (np.isfinite(balance) and balance >= 0.0):
             raise OsikValueError(f"balance is {balance}; it is a length in metres, 0 or more")
-        self.robot = robot
         self.balance = balance
         self.profile = find_profile(robot) if profile is None else profile
         check_profile(robot, self.profile)
+        hips = (self.profile.keypoints[f"{side}_hip"][0] for side in SIDES)
+        robot = self.robot = facing_x(robot, *hips)
         self.limits = ConfigurationLimit(robot), VelocityLimit(robot), _on_joints(robot, acceleration)
         self._acceleration = np.asarray(self.limits[2].acceleration)
         self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile), balance)

@@ -8,7 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._contact import find_contact, find_ground
+from .._errors import OsikValueError
+from ._contact import find_contact, find_noise
+from ._floor import Floor, find_floor
 from ._motion import CONTACT_POINTS, HumanMotion
 
 LIMBS = (
@@ -29,6 +31,8 @@ OPTIONAL = ("pelvis", "chest", "neck", "head", "left_heel", "left_toe", "right_h
 _SHORTEST = 1e-9
 _SPINE = 1e-3
 _TOE, _SOLE, _HEEL = 0.35, 0.12, 0.3
+_FLAT = 0.05
+_LEGS = (0.1, 3.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,14 +98,16 @@ class Measures:
     Attributes:
         leg: length of a leg, thigh and shank [m].
         ankle: height of the ankles above the floor when standing [m].
-        ground: height of the floor [m].
+        floor: where the floor is.
+        noise: of heels and toes, standard deviation on each coordinate [m].
         flat: of each side, knee, ankle and toe of a foot that is flat on the floor [m]. (1, 3) each
         straight: axes of pelvis and chest in the rest pose; None where that is not known. (1, 3, 3) each
     """
 
     leg: float
     ankle: float
-    ground: float
+    floor: Floor
+    noise: float
     flat: Mapping[str, Mapping[str, np.ndarray]]
     straight: tuple[np.ndarray, np.ndarray] | None
 
@@ -112,6 +118,9 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
     Args:
         motion: the clip.
         roles: of each of a person's joints, what the clip calls it (``find_roles``).
+
+    Raises:
+        ValueError: legs of a length that nobody's have: the clip is not in metres.
     """
     points = {role: motion.track(name) for role, name in roles.items()}
     straight, flat = None, {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
@@ -120,13 +129,16 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
         rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
         flat = {side: {**rest, **_toes(rest, side)} for side in SIDES}
         straight = _turns(_with_soles(rest, flat))
-    legs = [np.linalg.norm(points[b] - points[a], axis=-1).mean() for a, b in LIMBS[:4]]
+    leg = 0.5 * float(sum(np.linalg.norm(points[b] - points[a], axis=-1).mean() for a, b in LIMBS[:4]))
+    if not _LEGS[0] < leg < _LEGS[1]:
+        raise OsikValueError(f"the legs of {motion.name} are {leg:.4g} m long; positions are metres")
     soles = _with_soles(points, flat)
     found = np.stack([soles[name] for name in CONTACT_POINTS], 1)
-    ground = find_ground(found) if motion.ground is None else motion.ground
-    ankles = np.minimum(points["left_ankle"][:, 2], points["right_ankle"][:, 2])
-    ankle = float(np.percentile(ankles, 5)) - ground
-    return Measures(0.5 * float(sum(legs)), ankle, ground, flat, straight)
+    noise = find_noise(found)
+    floor = find_floor(found, motion.fps, noise) if motion.ground is None else Floor(motion.ground)
+    ankles = np.stack([points["left_ankle"], points["right_ankle"]], 1)
+    ankle = float(np.percentile(floor.leveled(ankles, motion.fps)[..., 2].min(1), 5))
+    return Measures(leg, ankle, floor, noise, flat, straight)
 
 
 def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measures | None = None) -> Person:
@@ -138,10 +150,13 @@ def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measure
         measures: of the person, where the clip is too short to show them; None: the clip's own.
     """
     known = measure(motion, roles) if measures is None else measures
+    floor = known.floor if measures is None else dataclasses.replace(known.floor, drift=0.0)
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
-    soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
-    contact = find_contact(soles, motion.fps, known.ground) if motion.contact is None else motion.contact
-    points = {role: track - [0.0, 0.0, known.ground] for role, track in points.items()}
+    points = {role: floor.leveled(track, motion.fps) for role, track in points.items()}
+    contact = motion.contact
+    if contact is None:
+        soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
+        contact = find_contact(soles, motion.fps, 0.0, noise=known.noise)
     turns, straight = _turns(points), known.straight
     pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
     return Person(
@@ -207,8 +222,14 @@ def _toe(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
 
 
 def _flat(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
-    """The one frame in which ankle and toe are lowest: the foot is taken to be flat in it."""
-    frame = int(np.argmin(points[f"{side}_ankle"][:, 2] + points[f"{side}_toe"][:, 2]))
+    """One frame in which the foot is taken to be flat: of those with ankle and toe lowest, the one in the middle.
+
+    A twentieth of the frames, by how much higher the ankle is than the toe: some have the foot in the floor, or on its
+    tip.
+    """
+    ankle, toe = points[f"{side}_ankle"][:, 2], points[f"{side}_toe"][:, 2]
+    low = np.argsort(ankle + toe, kind="stable")[: int(np.ceil(_FLAT * len(toe)))]
+    frame = low[np.argsort((ankle - toe)[low], kind="stable")[len(low) // 2]]
     return {
         name: points[f"{side}_{name.split('_', 1)[1]}"][frame, None]
         for name in (f"{side}_knee", f"{side}_ankle", f"{side}_toe")

@@ -305,7 +305,7 @@ def _balanced(
     centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
     at, both = jnp.sum(share * centers, 0), jnp.max(contact[:2]) * jnp.max(contact[2:]) > 0.5
     # beside a row that does not count, a polygon that is one: its numbers are finite
-    stands = jnp.where(both, jnp.repeat(contact, 2), 1.0)
+    stands = jnp.where(both, jnp.repeat(contact > 0.5, 2), 1.0)
     found = overhang(at[:2], place.points[corners][:, :2], stands)
     direction = jnp.append(found.direction, 0.0)
     pulls = [place.motion.rates(robot.tree.moves, share * direction, centers)]

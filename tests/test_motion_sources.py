@@ -1,0 +1,207 @@
+"""One motion in the ways in which programs write it: names, orders, units, axes, rest poses, more joints."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from motion_files import FIGURE, Figure, dancer, write_bvh
+from scipy.spatial.transform import Rotation
+
+from osik_jax.retargeting import HumanMotion, find_roles, load_motion
+from osik_jax.retargeting._person import NEEDED, read_person
+
+NAMES = [name for name, _, _ in FIGURE]
+SAME = ("directions", "pelvis", "torso", "feet", "root", "contact")
+
+
+def figure():
+    """The dancer, with a heading of its own."""
+    own = dancer(frames=24)
+    angles = own.angles.copy()
+    angles[:, 0, 2] = 25.0  # z, x, y
+    return dataclasses.replace(own, angles=angles)
+
+
+def with_rest(own, turns, orders="ZXY"):
+    """The same motion of a skeleton whose joints are turned by constant rotations in its rest pose."""
+    _, global_turns = own.forward()
+    joints, local = [], np.zeros_like(global_turns)
+    for i, (name, parent, offset) in enumerate(own.joints):
+        before = turns[parent] if parent >= 0 else np.eye(3)
+        joints.append((name, parent, tuple(before.T @ np.array(offset))))
+        own_local = (
+            global_turns[:, i] if parent < 0 else np.swapaxes(global_turns[:, parent], 1, 2) @ global_turns[:, i]
+        )
+        local[:, i] = before.T @ own_local @ turns[i]
+    angles = np.stack([Rotation.from_matrix(t).as_euler(orders, degrees=True) for t in local.swapaxes(0, 1)], 1)
+    return Figure(tuple(joints), own.root, angles, (orders,) * len(joints), own.fps)
+
+
+def no_turns():
+    return np.tile(np.eye(3), (len(FIGURE), 1, 1))
+
+
+def a_pose():
+    """Arms 45 degrees down in the rest pose."""
+    turns = no_turns()
+    for side, sign in (("Left", -1.0), ("Right", 1.0)):
+        for name in ("Arm", "ForeArm", "Hand"):
+            turns[NAMES.index(f"{side}{name}")] = Rotation.from_euler("z", sign * -45.0, degrees=True).as_matrix()
+    return turns
+
+
+def along_x():
+    """All bones along x in the rest pose, as they are in files of programs with axes on their bones."""
+    turns = no_turns()
+    for i in range(len(FIGURE)):
+        ends = [np.array(offset) for _, parent, offset in FIGURE if parent == i]
+        if ends and i:
+            turns[i] = Rotation.align_vectors(ends[:1], [[np.linalg.norm(ends[0]), 0.0, 0.0]])[0].as_matrix()
+    turns[0] = Rotation.from_euler("zx", [90.0, 30.0], degrees=True).as_matrix()
+    return turns
+
+
+def renamed(own, names):
+    return dataclasses.replace(own, joints=tuple((names(name), parent, offset) for name, parent, offset in own.joints))
+
+
+def turned_up(own, up):
+    """The same in axes with another one up: a rotation of all axes, forward stays the one after it."""
+    shift = {"y": 0, "z": 1, "x": 2}[up]
+    if not shift:
+        return own
+    change = np.roll(np.eye(3), shift, axis=0)
+    joints = tuple((name, parent, tuple(change @ np.array(offset))) for name, parent, offset in own.joints)
+    orders = "".join("XYZ"[("XYZ".index(axis) + shift) % 3] for axis in own.orders[0])
+    return Figure(joints, own.root @ change.T, own.angles, (orders,) * len(joints), own.fps)
+
+
+def with_more(own):
+    """With fingers, eyes and a second joint in the neck's place, which nobody asked for."""
+    hands = [(f"{side}HandIndex{k}", NAMES.index(f"{side}Hand"), (0.02, 0.0, 0.03)) for side in ("Left", "Right")
+             for k in (1, 2)]  # fmt: skip
+    more = [
+        *hands,
+        ("LeftEye", NAMES.index("Head"), (0.03, 0.05, 0.08)),
+        ("RightEye", NAMES.index("Head"), (-0.03, 0.05, 0.08)),
+    ]
+    angles = np.concatenate([own.angles, np.full((len(own.root), len(more), 3), 20.0)], 1)
+    joints, orders = (*own.joints, *more), own.orders + own.orders[:1] * len(more)
+    return Figure(joints, own.root, angles, orders, own.fps)
+
+
+RIGIFY = dict(zip(NAMES, (
+    "spine", "spine.001", "neck", "head", "upper_arm.L", "forearm.L", "hand.L", "upper_arm.R", "forearm.R", "hand.R",
+    "thigh.L", "shin.L", "foot.L", "toe.L", "thigh.R", "shin.R", "foot.R", "toe.R"), strict=True))  # fmt: skip
+UNREAL = dict(zip(NAMES, (
+    "pelvis", "spine_01", "neck_01", "head", "upperarm_l", "lowerarm_l", "hand_l", "upperarm_r", "lowerarm_r", "hand_r",
+    "thigh_l", "calf_l", "foot_l", "ball_l", "thigh_r", "calf_r", "foot_r", "ball_r"), strict=True))  # fmt: skip
+WRITTEN = {
+    "CMU": lambda path: write_bvh(path, with_rest(figure(), no_turns(), "ZYX"), 0.0254 / 0.45),
+    "Mixamo, cm, A-pose": lambda path: write_bvh(
+        path, renamed(with_more(with_rest(figure(), a_pose())), lambda name: f"mixamorig:{name}"), 0.01
+    ),
+    "Mixamo, number before the colon, mm": lambda path: write_bvh(
+        path, renamed(with_more(figure()), lambda name: f"mixamorig9:{name}"), 0.001
+    ),
+    "XYZ, inch, z up": lambda path: write_bvh(path, turned_up(with_rest(figure(), no_turns(), "XYZ"), "z"), 0.0254),
+    "YXZ, m, x up": lambda path: write_bvh(path, turned_up(with_rest(figure(), a_pose(), "YXZ"), "x"), 1.0),
+    "bones along x, cm": lambda path: write_bvh(path, with_rest(figure(), along_x(), "ZYX"), 0.01),
+    "bones along x, cm, z up": lambda path: write_bvh(path, turned_up(with_rest(figure(), along_x()), "z"), 0.01),
+    "toes called LeftToe": lambda path: write_bvh(path, renamed(figure(), lambda name: name.replace("ToeBase", "Toe"))),
+    "Blender": lambda path: write_bvh(path, turned_up(renamed(figure(), RIGIFY.__getitem__), "z")),
+    "Unreal, cm": lambda path: write_bvh(path, turned_up(renamed(figure(), UNREAL.__getitem__), "z"), 0.01),
+}
+
+
+def seen(motion):
+    return read_person(motion, find_roles(motion.joint_names))
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    return seen(load_motion(write_bvh(tmp_path_factory.mktemp("bvh") / "clip.bvh", figure())))
+
+
+@pytest.mark.parametrize("source", WRITTEN)
+def test_a_person_is_the_same_whoever_wrote_the_file(tmp_path, truth, source):
+    person = seen(load_motion(WRITTEN[source](tmp_path / "clip.bvh")))
+    for name in SAME:
+        np.testing.assert_allclose(getattr(person, name), getattr(truth, name), atol=2e-8, err_msg=name)
+    assert (person.leg, person.ankle) == pytest.approx((truth.leg, truth.ankle), abs=1e-9)
+
+
+SMPL = dict(
+    Hips="pelvis", LeftUpLeg="left_hip", LeftLeg="left_knee", LeftFoot="left_ankle", LeftToeBase="left_foot",
+    Spine="spine2", Neck="neck", Head="head", LeftArm="left_shoulder", LeftForeArm="left_elbow", LeftHand="left_wrist",
+)  # fmt: skip
+
+
+def smpl(name):
+    return SMPL[name] if name in SMPL else SMPL[name.replace("Right", "Left")].replace("left", "right")
+
+
+@pytest.mark.parametrize("kind", ["smpl", "smpl short", "roles", "deepmimic"])
+def test_keypoints_are_the_same_person_as_the_file(tmp_path, truth, kind):
+    source = load_motion(write_bvh(tmp_path / "clip.bvh", figure()))
+    kept = [source.joint_names.index(name) for name in NAMES]
+    names = {
+        "smpl": [smpl(name) for name in NAMES],
+        "smpl short": [
+            smpl(name)
+            .replace("left_", "L_")
+            .replace("right_", "R_")
+            .replace("_foot", "_toe")
+            .replace("spine2", "spine")
+            for name in NAMES
+        ],
+        "roles": [smpl(name).replace("_foot", "_toe").replace("spine2", "chest") for name in NAMES],
+        "deepmimic": [
+            smpl(n).replace("_foot", "_toe").replace("spine2", "chest").replace("pelvis", "root") for n in NAMES
+        ],
+    }[kind]
+    rest = source.rest_positions
+    assert rest is not None
+    extra = np.random.default_rng(0).normal(size=(source.frames, 1, 3))  # a joint that no preset knows
+    positions = np.concatenate([source.positions[:, kept], extra], 1)
+    rest = np.concatenate([rest[kept], extra[0]])
+    np.savez(tmp_path / "clip.npz", fps=30.0, positions=positions, joint_names=[*names, "jaw"], rest_positions=rest)
+    person = seen(load_motion(tmp_path / "clip.npz"))
+    for name in SAME:
+        np.testing.assert_allclose(getattr(person, name), getattr(truth, name), atol=1e-12, err_msg=name)
+
+
+def test_limbs_that_end_at_end_sites(tmp_path):
+    # skeletons without hands and toes, whose forearms and feet are leaves: the End Sites are wrist and toe
+    names = [name for name in NAMES if "Hand" not in name and "Toe" not in name]
+    left = renamed(turned_up(figure(), "z"), RIGIFY.__getitem__)
+    path = write_bvh(tmp_path / "clip.bvh", left)
+    lines, out, ends = path.read_text().splitlines(), [], []
+    for line in lines:
+        if "JOINT hand" in line or "JOINT toe" in line:
+            line = (
+                line.replace("JOINT hand", "End Site").replace("JOINT toe", "End Site")[: line.index("JOINT")]
+                + "End Site"
+            )
+            ends.append(len(out))
+        out.append(line)
+    # what is inside an End Site's braces is its OFFSET alone
+    for start in reversed(ends):
+        del out[start + 3 : start + 3 + 5]
+    motion_at = out.index("MOTION")
+    order = [line.split()[-1] for line in lines if "JOINT" in line or "ROOT" in line]
+    gone = [3 + 3 * i + k for i, name in enumerate(order) if name.startswith(("hand", "toe")) for k in range(3)]
+    rows = [" ".join(np.delete(row.split(), gone)) for row in out[motion_at + 3 :]]
+    path.write_text("\n".join(out[: motion_at + 3] + rows) + "\n")
+    motion = load_motion(path)
+    roles = find_roles(motion.joint_names)
+    assert roles["left_wrist"] == "forearm.L_end" and roles["right_toe"] == "foot.R_end" and len(names) == 14
+    whole = load_motion(write_bvh(tmp_path / "whole.bvh", left))
+    for name, own in (("forearm.L_end", "hand.L"), ("foot.R_end", "toe.R")):
+        np.testing.assert_allclose(motion.track(name), whole.track(own), atol=1e-12)
+
+
+def test_an_end_site_at_its_parent_is_no_joint(tmp_path):
+    motion = load_motion(write_bvh(tmp_path / "clip.bvh", figure()))
+    assert sorted(motion.joint_names) == sorted(NAMES)
+    assert isinstance(motion, HumanMotion) and set(NEEDED) <= set(find_roles(motion.joint_names))
