@@ -151,7 +151,7 @@ def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
     profile = find_profile(nao)
     person = read_person(load_motion(dance), find_roles(load_motion(dance).joint_names))
     build = Build.of(nao, profile)
-    goals = jax.tree.map(lambda leaf: leaf[7], build.goals(person))
+    goals = jax.tree.map(lambda leaf: jnp.asarray(leaf[7]), build.goals(person))
     body = Body.of(nao, profile, pairs_apart(nao, profile)[:1], 0.01)
     bounds = build.bounds(np.full(nao.nv, 240.0), 1.0 / FPS)
     rng = np.random.default_rng(1)
