@@ -19,12 +19,13 @@ from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._body import Build
 from ._goals import Goals, Weights
+from ._lanes import padded
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION
 from ._person import LIMBS
 from ._plan import at_solution, make_plan
 from ._profile import Profile
-from ._retarget import Retargeter, checked_by_name, padded
+from ._retarget import Retargeter, checked_by_name
 from ._terms import Body, Bounds, frame_rows
 
 TUNED = ("pelvis", "torso", "root", "foot", "posture", "smooth", "smooth_base")
