@@ -557,7 +557,8 @@ def test_a_g1_is_guessed_from_its_urdf():
         np.testing.assert_allclose(guess.feet[side].toe, [[0.12, 0.03, -0.035], [0.12, -0.03, -0.035]], atol=1e-9)
     assert (guess.pelvis, guess.torso) == ("pelvis", "torso_link")
     for role in ("left_knee", "right_elbow", "left_wrist", "right_shoulder"):
-        assert guess.keypoints[role] == own.keypoints[role]
+        assert guess.keypoints[role][0] == own.keypoints[role][0]
+        np.testing.assert_allclose(own.keypoints[role][1], guess.keypoints[role][1], atol=0.02)  # a fit moves it
 
 
 @pytest.mark.parametrize(
@@ -675,7 +676,7 @@ def test_a_plan_that_begins_on_its_side_ends_on_its_soles(nao, dance):
 
 
 def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
-    profile = dataclasses.replace(load_profile("g1"), scale=0.8)
+    profile = dataclasses.replace(load_profile("g1"), scale=0.8, stretch=1.0)
     save_profile(profile, tmp_path / "robot.toml")
     assert load_profile(tmp_path / "robot.toml") == profile
     with pytest.raises(KeyError, match="no frame 'pelvis'"):
