@@ -40,8 +40,8 @@ from osik_jax.retargeting import (
     report,
 )
 from osik_jax.retargeting._described import DESCRIBED, described_urdf
+from osik_jax.retargeting._lanes import as_lane, solve_lanes
 from osik_jax.retargeting._live_command import replay
-from osik_jax.retargeting._retarget import _lane, _solve_lanes
 from osik_jax.runtime import configure_cpu
 
 from .machine import processor
@@ -129,13 +129,13 @@ def fastest(retargeter: Retargeter, motion: HumanMotion, repeats: int) -> tuple[
 def program_alone(retargeter: Retargeter, motion: HumanMotion, copies: int) -> None:
     """Prints what one program makes of copies of a clip, without reading and writing them."""
     clip = retargeter._prepared(motion, None, None)
-    lanes = jax.tree.map(lambda leaf: np.stack([leaf] * copies), _lane(clip, len(clip.start)))
+    lanes = jax.tree.map(lambda leaf: np.stack([leaf] * copies), as_lane(clip, len(clip.start)))
     lanes = jax.device_put(lanes)
     weights, limits, most = retargeter.profile.weights, retargeter.limits, np.asarray(retargeter.max_iterations)
     spent, solved = [], None
     for _ in range(4):
         begin = time.perf_counter()
-        solved = jax.block_until_ready(_solve_lanes(lanes, retargeter._body, weights, limits, most))
+        solved = jax.block_until_ready(solve_lanes(lanes, retargeter._body, weights, limits, most))
         spent.append(time.perf_counter() - begin)
     assert solved is not None
     iterations = np.asarray(solved.iterations)

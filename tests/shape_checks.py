@@ -42,6 +42,8 @@ def _from_numpy_too(hint: Any) -> Any:
         if set(get_args(npt.ArrayLike)) <= set(get_args(hint)):
             return Any  # it has protocols that tuples and lists have for type checkers alone
         return Union[tuple(_from_numpy_too(part) for part in get_args(hint))]  # noqa: UP007
+    if get_origin(hint) is tuple:
+        return tuple[tuple(_from_numpy_too(part) for part in get_args(hint))]
     if hint is jax.Array:
         return jax.Array | np.ndarray
     if isinstance(hint, type) and issubclass(hint, AbstractArray) and hint.array_type is jax.Array:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 import osik_jax as osik
 from osik_jax import cli
 from osik_jax.execution import _backends
+from osik_jax.kinematics import forward_kinematics
 from osik_jax.kinematics._home import home_kinematics
 from osik_jax.retargeting import (
     HumanMotion,
@@ -44,6 +45,7 @@ from osik_jax.retargeting._contact import find_contact, find_ground
 from osik_jax.retargeting._described import described_urdf
 from osik_jax.retargeting._facing import by_name
 from osik_jax.retargeting._finish import follow
+from osik_jax.retargeting._fit import FitLoss, _Setting
 from osik_jax.retargeting._folder import _Lengths, retarget_folder
 from osik_jax.retargeting._person import NEEDED, SIDES, read_person
 from osik_jax.retargeting._plan import make_plan
@@ -152,7 +154,7 @@ def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
     profile = find_profile(nao)
     person = read_person(load_motion(dance), find_roles(load_motion(dance).joint_names))
     build = Build.of(nao, profile)
-    goals = jax.tree.map(lambda leaf: leaf[7], build.goals(person))
+    goals = jax.tree.map(lambda leaf: jnp.asarray(leaf[7]), build.goals(person))
     body = Body.of(nao, profile, pairs_apart(nao, profile)[:1], 0.01)
     bounds = build.bounds(np.full(nao.nv, 240.0), 1.0 / FPS)
     rng = np.random.default_rng(1)
@@ -586,7 +588,8 @@ def test_a_g1_is_guessed_from_its_urdf():
         np.testing.assert_allclose(guess.feet[side].toe, [[0.12, 0.03, -0.035], [0.12, -0.03, -0.035]], atol=1e-9)
     assert (guess.pelvis, guess.torso) == ("pelvis", "torso_link")
     for role in ("left_knee", "right_elbow", "left_wrist", "right_shoulder"):
-        assert guess.keypoints[role] == own.keypoints[role]
+        assert guess.keypoints[role][0] == own.keypoints[role][0]
+        np.testing.assert_allclose(own.keypoints[role][1], guess.keypoints[role][1], atol=0.02)  # a fit moves it
 
 
 @pytest.mark.parametrize(
@@ -690,8 +693,21 @@ def test_robots_that_cannot_walk_are_refused():
         guess_profile(arm)
 
 
+def test_a_plan_that_begins_on_its_side_ends_on_its_soles(nao, dance):
+    """On their backs, feet have their corners on the floor too, which is what bounds ask for."""
+    own = Retargeter(nao)
+    clip = own._prepared(load_motion(dance), None, None)
+    start = clip.start.copy()
+    rolled = Rotation.from_euler("x", 120.0, degrees=True) * Rotation.from_quat(start[:, 3:7], scalar_first=True)
+    start[:, 3:7] = rolled.as_quat(scalar_first=True)
+    plan = make_plan(own._body, clip.goals, own.profile.weights, clip.bounds, start, 100)
+    turns = [forward_kinematics(nao, q).frame_poses(nao, ("l_sole", "r_sole"))[1] for q in plan.q[: clip.frames : 10]]
+    assert np.array(turns)[..., 2, 2].min() > 1.0 - 1e-6
+    assert float(plan.cost[1]) < 1e-4
+
+
 def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
-    profile = dataclasses.replace(load_profile("g1"), scale=0.8)
+    profile = dataclasses.replace(load_profile("g1"), scale=0.8, stretch=1.0)
     save_profile(profile, tmp_path / "robot.toml")
     assert load_profile(tmp_path / "robot.toml") == profile
     with pytest.raises(KeyError, match="no frame 'pelvis'"):
@@ -733,6 +749,23 @@ def test_a_profile_comes_back_from_its_file(tmp_path):
     changed = dataclasses.replace(load_profile("nao"), stretch=1.1)
     save_profile(changed, tmp_path / "robot.toml")
     assert load_profile(tmp_path / "robot.toml") == changed
+
+
+@pytest.mark.slow
+def test_the_gradient_of_a_fit_is_the_slope_of_its_loss(nao, dance):
+    """By central differences, over plans that go on from the same one; what the gradient leaves out is small here."""
+    own = load_profile("nao")
+    own = dataclasses.replace(own, weights=dataclasses.replace(own.weights, smooth=2.0))
+    setting = _Setting(Retargeter(nao, profile=own), FitLoss())
+    (problem,), _ = setting.problems([load_motion(dance)], [], None)
+    here, step = setting.origin(), 0.05
+    _, slope, plan = setting.slope(here, problem, setting.plan(here, problem))
+
+    def loss_at(move):
+        moved = here._replace(weights={**here.weights, "smooth": here.weights["smooth"] + move})
+        return setting.slope(moved, problem, plan)[0]
+
+    assert float(slope.weights["smooth"]) == pytest.approx((loss_at(step) - loss_at(-step)) / (2.0 * step), rel=0.02)
 
 
 @pytest.mark.slow

@@ -19,9 +19,9 @@ from ._profile_file import find_profile as find_profile
 from ._profile_file import load_profile as load_profile
 from ._profile_file import save_profile as save_profile
 from ._report import report as report
-from ._retarget import Retargeted as Retargeted
 from ._retarget import Retargeter as Retargeter
 from ._retarget import retarget as retarget
+from ._retargeted import Retargeted as Retargeted
 from ._robot_motion import RobotMotion as RobotMotion
 from ._robot_motion import load_robot_motion as load_robot_motion
 from ._robot_motion import write_csv as write_csv

@@ -16,7 +16,8 @@ from ._motion import HumanMotion
 from ._profile import Profile
 from ._profile_file import save_profile
 from ._report import report
-from ._retarget import Retargeted, Retargeter
+from ._retarget import Retargeter
+from ._retargeted import Retargeted
 from ._robot_motion import write_csv
 
 _HELD_OUT = 4

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ._person import LIMBS
-from ._retarget import Retargeted
+from ._retargeted import Retargeted
 
 _TRUNK = (
     ("left_hip", "right_hip"),

@@ -19,12 +19,13 @@ from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._body import Build
 from ._goals import Goals, Weights
+from ._lanes import padded
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION
 from ._person import LIMBS
-from ._plan import at_solution, make_plan
+from ._plan import at_solution, make_plan, mend_plan
 from ._profile import Profile
-from ._retarget import Retargeter, checked_by_name, padded
+from ._retarget import Retargeter, checked_by_name
 from ._terms import Body, Bounds, frame_rows
 
 TUNED = ("pelvis", "torso", "root", "foot", "posture", "smooth", "smooth_base")
@@ -35,6 +36,8 @@ _WEIGHT, _SCALE, _PLACE = 1.0, 0.1, 1e-3
 """Units: of the logarithm of a weight, of that of the scale, of a keypoint's place [m]."""
 _MOST_WEIGHT, _MOST_SCALE, _MOST_PLACE = 3.0, 0.1, 0.02
 """How far they may go."""
+_SETTLING, _FOLLOWING = 150, 40
+"""Iterations of a plan beyond where ``retarget`` ends: before the first step, and in each, from the plan before."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,9 +111,11 @@ def fit(
     """Tunes a profile's scale, keypoints (by up to 2 cm) and weights on some clips.
 
     The gradient is that of the plan's solution: where a sum of squares is least, a change of what it depends on moves
-    the solution by one step of Gauss and Newton, which is differentiated. Adam goes down the mean of the clips' losses,
-    each relative to what it was at first. The step with the least loss of the clips that are held out is taken: few
-    clips are soon learned by heart. Where none is better than the profile that was given, that comes back.
+    the solution by one step of Gauss and Newton, which is differentiated. For that a plan goes on far beyond where
+    ``retarget`` ends, and each step's begins with the one before: so the loss is that of the same minimum throughout,
+    and has no jumps. Adam goes down the mean of the clips' losses, each relative to what it was at first. Of the clips
+    that are held out the loss is that of what ``retarget`` gives, and the step where it is least is taken: few clips
+    are soon learned by heart. Where none is better than the profile that was given, that comes back.
 
     Args:
         robot: as of ``retarget``.
@@ -121,7 +126,7 @@ def fit(
         loss: None: ``FitLoss()``.
         acceleration: as of ``retarget``.
         steps: of Adam.
-        max_iterations: of each plan.
+        max_iterations: of each plan that ``retarget`` would make.
 
     Raises:
         ImportError: optax is not installed (the extra ``tuning``).
@@ -144,12 +149,14 @@ def fit(
     seen: list[_Parameters] = []
     learned: list[list[float]] = []
     judged: list[list[float]] = []
+    plans = [setting.plan(now, problem) for problem in train]
     for step in range(steps + 1):
-        found = [setting.slope(now, problem) for problem in train]
+        found = [setting.slope(now, problem, plan) for problem, plan in zip(train, plans, strict=True)]
         seen.append(now)
-        learned.append([value for value, _ in found])
+        learned.append([value for value, _, _ in found])
+        plans = [plan for _, _, plan in found]
         judged.append([setting.loss(now, problem) for problem in others])
-        scaled = [_over(slope, unit) for (_, slope), unit in zip(found, learned[0], strict=True)]
+        scaled = [_over(slope, unit) for (_, slope, _), unit in zip(found, learned[0], strict=True)]
         slopes: Any = jax.tree.map(lambda *leaves: sum(leaves) / len(leaves), *scaled)
         if step == steps or not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes)):
             break
@@ -200,18 +207,21 @@ class _Setting:
         return found[: len(motions)], found[len(motions) :]
 
     def loss(self, at: _Parameters, problem: _Problem) -> float:
-        """Of one clip."""
-        return float(_value(at, self.body, problem, self.weights, self.build.ankle, self.terms, self.most))
+        """Of what ``retarget`` gives for a clip."""
+        most = jnp.asarray(self.own.max_iterations)
+        return float(_value(at, self.body, problem, self.weights, self.build.ankle, self.terms, most))
 
-    def slope(self, at: _Parameters, problem: _Problem) -> tuple[float, Any]:
-        """The loss of one clip and its gradient."""
-        value, slope = _value_and_slope(at, self.body, problem, self.weights, self.build.ankle, self.terms, self.most)
-        return float(value), slope
+    def plan(self, at: _Parameters, problem: _Problem) -> Array:
+        """A clip's plan, at its minimum but for little: (F, nq)."""
+        given = self.body, problem, self.weights, self.build.ankle
+        return _settled(at, *given, _planned(at, *given, jnp.asarray(self.own.max_iterations)), _SETTLING)
 
-    @property
-    def most(self) -> Array:
-        """Iterations of a plan."""
-        return jnp.asarray(self.own.max_iterations)
+    def slope(self, at: _Parameters, problem: _Problem, plan: Array) -> tuple[float, Any, Array]:
+        """The loss at the minimum that is near a plan, its gradient, and the plan there."""
+        given = self.body, problem, self.weights, self.build.ankle
+        plan = _settled(at, *given, plan, _FOLLOWING)
+        value, slope = _value_and_slope(at, *given, self.terms, plan)
+        return float(value), slope, plan
 
     def profile(self, at: _Parameters) -> Profile:
         """The profile with what was tuned, in four digits."""
@@ -258,7 +268,34 @@ def _tuned_weights(weights: Weights, at: _Parameters) -> dict[str, Array]:
     }
 
 
-def _loss(
+def _asked(
+    at: _Parameters, body: Body, problem: _Problem, weights: Weights, lift: float
+) -> tuple[Body, Goals, Weights, Bounds]:
+    """What a plan is made for."""
+    moved = eqx.tree_at(lambda b: b.offsets, body, body.offsets.at[: len(body.keys)].add(_moves(at)))
+    tuned = dataclasses.replace(weights, **_tuned_weights(weights, at))
+    up = jnp.array([0.0, 0.0, 1.0], problem.path.dtype)
+    goals = dataclasses.replace(problem.goals, root=_factor(at.scale) * problem.path + lift * up)
+    return moved, goals, tuned, problem.bounds
+
+
+@jax.jit
+def _planned(at: _Parameters, body: Body, problem: _Problem, weights: Weights, lift: float, most: Array) -> Array:
+    """As ``retarget`` plans: (F, nq)."""
+    return make_plan(*_asked(at, body, problem, weights, lift), problem.start, most).q
+
+
+@jax.jit
+def _settled(
+    at: _Parameters, body: Body, problem: _Problem, weights: Weights, lift: float, plan: Array, more: int
+) -> Array:
+    """A plan after so many more iterations: (F, nq)."""
+    asked = _asked(at, body, problem, weights, lift)
+    return mend_plan(*asked, plan, jnp.ones(len(plan), plan.dtype), more).q
+
+
+@jax.jit
+def _value(
     at: _Parameters,
     body: Body,
     problem: _Problem,
@@ -267,19 +304,25 @@ def _loss(
     terms: tuple[float, ...],
     most: Array,
 ) -> Float[Array, ""]:
-    """The loss of a clip."""
-    keys = len(body.keys)
-    moved = eqx.tree_at(lambda b: b.offsets, body, body.offsets.at[:keys].add(_moves(at)))
-    tuned = dataclasses.replace(weights, **_tuned_weights(weights, at))
-    up = jnp.array([0.0, 0.0, 1.0], problem.path.dtype)
-    goals = dataclasses.replace(problem.goals, root=_factor(at.scale) * problem.path + lift * up)
-    fixed = jax.lax.stop_gradient((moved, goals, tuned, problem.bounds))
-    plan = make_plan(*fixed, problem.start, most)
-    q = at_solution(moved, goals, tuned, problem.bounds, jax.lax.stop_gradient(plan.q))
+    """The loss of a clip as ``retarget`` plans it."""
+    plan = _planned(at, body, problem, weights, lift, most)
+    return jnp.dot(jnp.array(terms, plan.dtype), _measured(body, plan, problem, weights))
+
+
+def _loss(
+    at: _Parameters,
+    body: Body,
+    problem: _Problem,
+    weights: Weights,
+    lift: float,
+    terms: tuple[float, ...],
+    plan: Array,
+) -> Float[Array, ""]:
+    """The loss of a clip whose plan is at its minimum."""
+    q = at_solution(*_asked(at, body, problem, weights, lift), jax.lax.stop_gradient(plan))
     return jnp.dot(jnp.array(terms, q.dtype), _measured(body, q, problem, weights))
 
 
-_value = jax.jit(_loss)
 _value_and_slope = jax.jit(jax.value_and_grad(_loss))
 
 

@@ -19,11 +19,12 @@ from ..scaling._lock import only_job
 from ..scaling._progress import Progress, reported
 from ._bvh import Up
 from ._command import write_json, write_motion
+from ._lanes import Clip, one_a_core, shared_length
 from ._load import clips_in, load_clip
 from ._motion import HumanMotion
 from ._profile_file import profile_text, save_profile
 from ._report import report
-from ._retarget import Clip, Retargeter, one_a_core, shared_length
+from ._retarget import Retargeter
 
 FIGURES = {
     "off_plan_rad": ("off_plan_rad",),

@@ -16,7 +16,7 @@ from ..robot import Robot
 from ._live import LiveFrame, LiveRetargeter
 from ._motion import HumanMotion
 from ._person import read_person
-from ._retarget import Retargeted, as_retargeted
+from ._retargeted import Retargeted, as_retargeted
 from ._robot_motion import in_mujoco_order
 
 Make = Callable[[HumanMotion], LiveRetargeter]

@@ -178,10 +178,18 @@ def at_solution(
 
 
 def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq"]:
-    """A better first guess: one frame in four is worked on with soft bounds, and what it moves the others move too."""
+    """A better first guess: one frame in four is worked on with soft bounds, and what it moves the others move too.
+
+    Feet are turned as the person's at the weight of limbs here: one that lands on its back has its corners on the floor
+    too, and stays so once the bounds are stiff.
+    """
     robot, frames = clip.body.robot, len(start)
     part = slice(None, None, _STRIDE)
-    wide = dataclasses.replace(clip.weights, **{k: getattr(clip.weights, k) / _STRIDE**3 for k in _SMOOTHNESS})
+    wide = dataclasses.replace(
+        clip.weights,
+        foot=jnp.maximum(clip.weights.foot, clip.weights.limb),
+        **{name: getattr(clip.weights, name) / _STRIDE**3 for name in _SMOOTHNESS},
+    )
     less = clip._replace(
         goals=jax.tree.map(lambda leaf: leaf[part], clip.goals),
         free=clip.free[part],

@@ -14,7 +14,7 @@ from ..tasks._polygon import hull
 from ._body import JOINTS_APART, joints_between
 from ._person import LIMBS, SIDES
 from ._profile import Profile
-from ._retarget import Retargeted
+from ._retargeted import Retargeted
 
 JUMP = 15.0
 """A change of joint speed from one frame to the next that counts as a jump [rad/s]."""

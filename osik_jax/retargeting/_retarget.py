@@ -6,76 +6,40 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikValueError
 from ..execution._workers import cores
-from ..limits import Limit
 from ..robot import Robot
-from ..scaling import Saved, ShardedFunction, run_in_chunks, sharded
+from ..scaling import Saved, run_in_chunks
 from ..scaling._progress import reported
 from ._finish import follow
-from ._goals import Goals, Weights
+from ._lanes import (
+    LENGTHS,
+    Clip,
+    Solved,
+    as_lane,
+    even,
+    one_a_core,
+    padded,
+    shared_length,
+    solve_lane,
+    solve_side_by_side,
+)
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
-from ._person import Person, read_person
+from ._person import read_person
 from ._plan import make_plan
 from ._profile import Profile
-from ._robot_motion import RobotMotion, in_mujoco_order
+from ._retargeted import Retargeted, as_retargeted
 from ._skeletons import find_roles
-from ._terms import Body, Bounds
 
-_LENGTHS = 16
 _Checked = tuple[HumanMotion, Mapping[str, str]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Retargeted:
-    """A robot's motion, and the person's that it was made from.
-
-    Attributes:
-        robot: the robot.
-        profile: how it was seen.
-        motion: in MuJoCo's order: what files hold.
-        q: configurations of ``robot``. (F, nq)
-        human: where the person's joints were, the floor at height 0 [m]. (F, J, 3)
-        human_names: of them: roles, and ``root``, the midpoint of the hips.
-        contact: whether left heel, left toe, right heel and right toe stand. (F, 4)
-        iterations: systems that the plan took; 0 where it was made frame by frame.
-        cost: what is left of the wishes, and of the bounds that have to hold; 0 where it was made frame by frame.
-        off_plan: how far the farthest joint is from the plan in each frame because a limit held it [rad or m]. (F,)
-    """
-
-    robot: Robot
-    profile: Profile
-    motion: RobotMotion
-    q: Float[np.ndarray, "F nq"]
-    human: Float[np.ndarray, "F J 3"]
-    human_names: tuple[str, ...]
-    contact: Bool[np.ndarray, "F 4"]
-    iterations: int
-    cost: tuple[float, float]
-    off_plan: Float[np.ndarray, " F"]
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes an ``.npz`` with ``fps``, ``qpos``, ``joint_names``, ``human``, ``human_names`` and ``contact``."""
-        np.savez_compressed(
-            Path(path),
-            fps=self.motion.fps,
-            qpos=self.motion.qpos,
-            joint_names=np.array(self.motion.joint_names),
-            human=self.human,
-            human_names=np.array(self.human_names),
-            contact=self.contact,
-            ground=0.0,
-        )
 
 
 class Retargeter(OnRobot):
@@ -164,11 +128,11 @@ class Retargeter(OnRobot):
             groups.setdefault(shared_length(clip), []).append(i)
         found: dict[int, Retargeted] = {}
         for length, members in sorted(groups.items()):
-            lanes = [_lane(clips[i], length) for i in members]
+            lanes = [as_lane(clips[i], length) for i in members]
             solved = run_in_chunks(
-                _solve_side_by_side,
+                solve_side_by_side,
                 jax.tree.map(lambda *leaves: np.stack(leaves), *lanes),
-                chunk=_even(len(members), chunk),
+                chunk=even(len(members), chunk),
                 shared=self._shared,
                 out=None if out is None else Path(out) / f"frames_{length}",
                 progress=progress,
@@ -187,7 +151,7 @@ class Retargeter(OnRobot):
         """The same of a clip that can be read, whose joints have these names."""
         person = read_person(motion, roles)
         goals = self._build.goals(person)
-        goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % _LENGTHS)
+        goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
         dt = 1.0 / motion.fps
         return Clip(person, motion.frames, goals, start, self._bounds(dt), dt)
 
@@ -199,11 +163,11 @@ class Retargeter(OnRobot):
         Returns:
             for each clip a function that makes its record; it raises ValueError where the motion is not finite.
         """
-        batch = [_lane(clip, length) for clip in clips]
+        batch = [as_lane(clip, length) for clip in clips]
         if not one_a_core():
             batch += batch[-1:] * (lanes - len(batch))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *batch)
-        results = jax.tree.map(np.asarray, _solve_side_by_side(stacked, *self._shared))
+        results = jax.tree.map(np.asarray, solve_side_by_side(stacked, *self._shared))
         return [
             partial(self._finished, clip, jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
             for lane, clip in enumerate(clips)
@@ -211,14 +175,14 @@ class Retargeter(OnRobot):
 
     @property
     def _shared(self) -> tuple[Any, ...]:
-        """What all lanes have in common, as ``_solve_lanes`` takes it."""
+        """What all lanes have in common, as ``solve_lanes`` takes it."""
         smoothness = np.asarray(self.smoothness, self._build.start.dtype)
         return self._body, self.profile.weights, self.limits, np.asarray(self.max_iterations), smoothness
 
     def _made_by_a_core(self, checked: _Checked) -> Retargeted:
         """A clip from reading to its record: while one thread holds Python's lock for that, others compute."""
         clip = self._read(*checked)
-        solved = _solve_lane(_lane(clip, shared_length(clip)), *self._shared)
+        solved = solve_lane(as_lane(clip, shared_length(clip)), *self._shared)
         return self._finished(clip, jax.tree.map(np.asarray, solved))
 
     def _finished(self, clip: Clip, solved: Solved) -> Retargeted:
@@ -241,120 +205,6 @@ def checked_by_name(motion: HumanMotion, mapping: Mapping[str, str] | None, fps:
         return _checked(motion, mapping, fps)
     except (ValueError, KeyError) as error:
         raise type(error)(f"{motion.name}: {error.args[0]}") from error
-
-
-def as_retargeted(
-    robot: Robot, profile: Profile, person: Person, q: Float[np.ndarray, "F nq"], off_plan: Float[np.ndarray, " F"]
-) -> Retargeted:
-    """The record of a motion that was made from a person's."""
-    return Retargeted(
-        robot=robot,
-        profile=profile,
-        motion=in_mujoco_order(robot, q, person.fps),
-        q=q,
-        human=np.stack([*person.points.values(), person.root], 1),
-        human_names=(*person.points, "root"),
-        contact=person.contact,
-        iterations=0,
-        cost=(0.0, 0.0),
-        off_plan=off_plan,
-    )
-
-
-class Solved(NamedTuple):
-    """What both passes give; of many clips, every leaf has a leading axis."""
-
-    q: Array
-    off_plan: Array
-    iterations: Array
-    cost: Array
-
-
-class Clip(NamedTuple):
-    """A clip in the form that is computed with."""
-
-    person: Person
-    frames: int
-    goals: Goals
-    start: np.ndarray
-    bounds: Bounds
-    dt: float
-
-
-def _lane(clip: Clip, length: int) -> _Lane:
-    """A clip as one of a batch whose clips have this many frames, padding included."""
-    frames = len(clip.start)
-    goals, start = (clip.goals, clip.start) if frames >= length else padded(clip.goals, clip.start, length - frames)
-    return jax.tree.map(np.asarray, (goals, start, clip.bounds, np.asarray(clip.dt)))
-
-
-def shared_length(clip: Clip) -> int:
-    """A length that clips of about as many frames share: at most a quarter more, and few different ones."""
-    step = max(_LENGTHS, (1 << (clip.frames - 1).bit_length()) // 8)
-    return -(-clip.frames // step) * step
-
-
-def _even(count: int, most: int) -> int:
-    """At most so many at once that every chunk has as many, but for the last, which has hardly fewer."""
-    return -(-count // -(-count // most)) if most > 0 else most
-
-
-def one_a_core() -> bool:
-    """Whether clips are worked on one at a time by each core, and not all of them in one program."""
-    return jax.default_backend() == "cpu"
-
-
-_Lane = tuple[Goals, Array, Bounds, Array]
-
-
-def _solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
-    """All lanes: on CPUs as many at a time as there are cores, in threads: a program does not hold Python's lock.
-
-    Elsewhere in one program, split over all devices. ``shared`` is what ``_solve_lane`` takes after the lane.
-    """
-    if not one_a_core() and len(jax.devices()) > 1:
-        return _over_devices(len(shared))(lanes, *shared)
-    if not one_a_core() or isinstance(jax.tree.leaves(lanes)[0], Tracer):
-        return _solve_lanes(lanes, *shared)
-
-    def one(i: int) -> Solved:
-        return jax.tree.map(np.asarray, _solve_lane(jax.tree.map(lambda leaf: leaf[i], lanes), *shared))
-
-    with ThreadPoolExecutor(cores()) as pool:
-        solved = list(pool.map(one, range(len(lanes[1]))))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *solved)
-
-
-@jax.jit
-def _solve_lane(
-    lane: _Lane,
-    body: Body,
-    weights: Weights,
-    limits: Sequence[Limit],
-    max_iterations: Array,
-    smoothness: Array | float = 0.0,
-) -> Solved:
-    goals, start, bounds, dt = lane
-    plan = make_plan(body, goals, weights.smoother(smoothness, dt), bounds, start, max_iterations)
-    q, off = follow(body.robot, plan.q, limits, dt)
-    return Solved(q, off, plan.iterations, plan.cost)
-
-
-@jax.jit
-def _solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
-    def one(lane: _Lane) -> Solved:
-        return _solve_lane(lane, *shared)
-
-    if one_a_core():
-        # one after another: side by side they would wait for the slowest, and leave the cache in between
-        return jax.lax.map(one, lanes)
-    return jax.vmap(one)(lanes)
-
-
-@cache
-def _over_devices(shared: int) -> ShardedFunction:
-    """``_solve_lanes`` with so many arguments that all lanes share, each device with its own part of the lanes."""
-    return sharded(_solve_lane, (0, *[None] * shared))
 
 
 def retarget(
@@ -403,15 +253,3 @@ def retarget(
         max_iterations=max_iterations,
     )
     return own.retarget(motion, mapping=mapping, fps=fps)
-
-
-def padded(goals: Goals, start: Float[np.ndarray, "F nq"], more: int) -> tuple[Goals, Float[np.ndarray, "T nq"]]:
-    """Goals and first guess with frames behind the end, so that clips of about one length share a program."""
-    frames = len(start)
-
-    def longer(leaf: np.ndarray) -> np.ndarray:
-        return np.concatenate([leaf, np.repeat(leaf[-1:], more, 0)])
-
-    goals, start = jax.tree.map(longer, (goals, start))
-    present = np.where(np.arange(frames + more) < frames, goals.present, 0.0).astype(start.dtype)
-    return dataclasses.replace(goals, present=present, contact=goals.contact * present[:, None]), start

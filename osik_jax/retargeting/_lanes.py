@@ -1,0 +1,134 @@
+"""Clips as lanes of one program: padded to a length that they share, and solved side by side."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from ..execution._workers import cores
+from ..limits import Limit
+from ..scaling import ShardedFunction, sharded
+from ._finish import follow
+from ._goals import Goals, Weights
+from ._person import Person
+from ._plan import make_plan
+from ._terms import Body, Bounds
+
+LENGTHS = 16
+"""Lengths of programs are multiples of this."""
+
+
+class Solved(NamedTuple):
+    """What both passes give; of many clips, every leaf has a leading axis."""
+
+    q: Array
+    off_plan: Array
+    iterations: Array
+    cost: Array
+
+
+class Clip(NamedTuple):
+    """A clip in the form that is computed with."""
+
+    person: Person
+    frames: int
+    goals: Goals
+    start: np.ndarray
+    bounds: Bounds
+    dt: float
+
+
+def as_lane(clip: Clip, length: int) -> _Lane:
+    """A clip as one of a batch whose clips have this many frames, padding included."""
+    frames = len(clip.start)
+    goals, start = (clip.goals, clip.start) if frames >= length else padded(clip.goals, clip.start, length - frames)
+    return jax.tree.map(np.asarray, (goals, start, clip.bounds, np.asarray(clip.dt)))
+
+
+def shared_length(clip: Clip) -> int:
+    """A length that clips of about as many frames share: at most a quarter more, and few different ones."""
+    step = max(LENGTHS, (1 << (clip.frames - 1).bit_length()) // 8)
+    return -(-clip.frames // step) * step
+
+
+def even(count: int, most: int) -> int:
+    """At most so many at once that every chunk has as many, but for the last, which has hardly fewer."""
+    return -(-count // -(-count // most)) if most > 0 else most
+
+
+def one_a_core() -> bool:
+    """Whether clips are worked on one at a time by each core, and not all of them in one program."""
+    return jax.default_backend() == "cpu"
+
+
+_Lane = tuple[Goals, Array, Bounds, Array]
+
+
+def solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
+    """All lanes: on CPUs as many at a time as there are cores, in threads: a program does not hold Python's lock.
+
+    Elsewhere in one program, split over all devices. ``shared`` is what ``solve_lane`` takes after the lane.
+    """
+    if not one_a_core() and len(jax.devices()) > 1:
+        return _over_devices(len(shared))(lanes, *shared)
+    if not one_a_core() or isinstance(jax.tree.leaves(lanes)[0], Tracer):
+        return solve_lanes(lanes, *shared)
+
+    def one(i: int) -> Solved:
+        return jax.tree.map(np.asarray, solve_lane(jax.tree.map(lambda leaf: leaf[i], lanes), *shared))
+
+    with ThreadPoolExecutor(cores()) as pool:
+        solved = list(pool.map(one, range(len(lanes[1]))))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *solved)
+
+
+@jax.jit
+def solve_lane(
+    lane: _Lane,
+    body: Body,
+    weights: Weights,
+    limits: Sequence[Limit],
+    max_iterations: Array,
+    smoothness: Array | float = 0.0,
+) -> Solved:
+    goals, start, bounds, dt = lane
+    plan = make_plan(body, goals, weights.smoother(smoothness, dt), bounds, start, max_iterations)
+    q, off = follow(body.robot, plan.q, limits, dt)
+    return Solved(q, off, plan.iterations, plan.cost)
+
+
+@jax.jit
+def solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
+    def one(lane: _Lane) -> Solved:
+        return solve_lane(lane, *shared)
+
+    if one_a_core():
+        # one after another: side by side they would wait for the slowest, and leave the cache in between
+        return jax.lax.map(one, lanes)
+    return jax.vmap(one)(lanes)
+
+
+@cache
+def _over_devices(shared: int) -> ShardedFunction:
+    """``solve_lanes`` with so many arguments that all lanes share, each device with its own part of the lanes."""
+    return sharded(solve_lane, (0, *[None] * shared))
+
+
+def padded(goals: Goals, start: Float[np.ndarray, "F nq"], more: int) -> tuple[Goals, Float[np.ndarray, "T nq"]]:
+    """Goals and first guess with frames behind the end, so that clips of about one length share a program."""
+    frames = len(start)
+
+    def longer(leaf: np.ndarray) -> np.ndarray:
+        return np.concatenate([leaf, np.repeat(leaf[-1:], more, 0)])
+
+    goals, start = jax.tree.map(longer, (goals, start))
+    present = np.where(np.arange(frames + more) < frames, goals.present, 0.0).astype(start.dtype)
+    return dataclasses.replace(goals, present=present, contact=goals.contact * present[:, None]), start
