@@ -5,6 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+_ONE_THREAD = 31
+"""Of as many numbers XLA makes a sum in one thread of a GPU."""
+
 
 def product(a: Float[Array, "*B m k"], b: Float[Array, "*B k n"]) -> Float[Array, "*B m n"]:
     """Return the matrix a b, or each of a batch."""
@@ -14,3 +17,13 @@ def product(a: Float[Array, "*B m k"], b: Float[Array, "*B k n"]) -> Float[Array
 def apply(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
     """Return the vector a x."""
     return jnp.matmul(a, x, precision="highest")
+
+
+def short_sum(a: Float[Array, "*B n"]) -> Float[Array, "*B"]:
+    """Return the sums along the last axis, of tens of numbers each, for a GPU.
+
+    XLA adds up to 31 numbers in one thread; from 32 on a warp takes each sum, which is longer at work for fewer than
+    hundreds. So longer ones are cut.
+    """
+    parts = -(-a.shape[-1] // _ONE_THREAD)
+    return sum((jnp.sum(part, -1) for part in jnp.array_split(a, parts, -1)), jnp.zeros(a.shape[:-1], a.dtype))

@@ -14,6 +14,7 @@ from .._errors import OsikValueError
 from ..execution._backends import check_backend, takes
 from ..numerics._arguments import concrete
 from ..numerics._constants import SINGLE_DAMPING
+from ..numerics._dense import short_sum
 from ..solvers import Backend, Level, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
@@ -82,7 +83,9 @@ def _least_damping(problem: VelocityProblem, backend: Backend) -> Float[Array, "
     dtype = problem.lower.dtype
     if dtype != jnp.float32 or not rows or not takes(backend, "warp", fits=True):
         return jnp.zeros((), dtype)
-    steepest = [jnp.max(r.weight * jnp.sum(r.jacobian**2, 1), initial=0.0) for r in rows]
+    # a row of one dof asks for its velocity as it is: of length 1
+    squared = [1.0 if r.dofs is not None else short_sum(r.jacobian**2) for r in rows]
+    steepest = [jnp.max(r.weight * length, initial=0.0) for r, length in zip(rows, squared, strict=True)]
     return jax.lax.stop_gradient(SINGLE_DAMPING * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
 
 

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..execution._backends import cuda_is_default
-from ..kinematics._rigid import cross
+from ..numerics._dense import short_sum
 from ._gain import safe_norm
 from ._rotation import dot
 
@@ -51,7 +51,7 @@ def pose_curvature(
 
 def _gram(rows: Float[Array, "3 n"]) -> Float[Array, "3 3"]:
     """Products of the rows with each other; as sums on a GPU, whose library takes five times as long for a batch."""
-    return jnp.sum(rows[:, None] * rows[None], axis=-1) if cuda_is_default() else dot(rows, rows.T)
+    return short_sum(rows[:, None] * rows[None]) if cuda_is_default() else dot(rows, rows.T)
 
 
 def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 3"], arms: Float[Array, "3 3"]) -> Float[Array, ""]:
@@ -61,9 +61,17 @@ def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 3"], arms: Float[Arra
     ``pull x axis_i`` with each other, which are the axes' own between two cross products, and those of the arms.
     """
     size = _largest(pull)
-    unit = (pull / size)[:, None]
-    turned = cross(unit, cross(unit, axes, along=0).T, along=0)
-    squared = jnp.sum(turned * arms)
+    x, y, z = pull / size
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = axes
+    turned = {  # a few sums of numbers are one operation, and products of small matrices are several
+        (0, 0): y * y * zz - 2.0 * y * z * yz + z * z * yy,
+        (1, 1): z * z * xx - 2.0 * z * x * xz + x * x * zz,
+        (2, 2): x * x * yy - 2.0 * x * y * xy + y * y * xx,
+        (0, 1): y * z * xz - x * y * zz - z * z * xy + x * z * yz,
+        (0, 2): x * y * yz - y * y * xz - x * z * yy + y * z * xy,
+        (1, 2): x * z * xy - y * z * xx - x * x * yz + x * y * xz,
+    }
+    squared = sum((1.0 if i == j else 2.0) * entry * arms[i, j] for (i, j), entry in turned.items())
     positive = squared > 0.0
     return size * jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
