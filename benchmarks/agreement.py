@@ -1,13 +1,14 @@
 """Kernels beside plain JAX, problem by problem: random problems solved by both.
 
     python -m benchmarks.agreement --solver qp|hqp|nullspace|reverse|saturated [--count 1000000]
-        [--backend numba] [--seed 0] [--batch 4096]
+        [--backend numba] [--seed 0] [--batch 4096] [--keep FILE]
 
 Each family is drawn as often as the others: for weighted QPs those of ``tests/weighted_families.py`` and the planted
 ones of ``tests/problem_families.py`` as least squares, for the others those of ``tests/hierarchy_families.py``. Each
 line of the result is that of a family: its problems; by status, the kernel's first, those whose status differs; those
 of the others in which the rows of a QP's cost, or the norm of what a level misses, differ by more than 1e-7 of their
-size, and the largest such difference; and those that the kernel left to the search.
+size, and the largest such difference; and those that the kernel left to the search. ``--keep`` writes the problems
+that differ to a file, for ``kept`` to read: who is right is a third method's to say.
 
 Null spaces without bounds (``nullspace``, ``reverse``) are given the same levels without their box. There an inequality
 counts where the levels above leave it violated, so where these put it on its bound, roundoff decides whether it counts:
@@ -26,6 +27,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from osik_jax.runtime import configure_cpu
 from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace
 from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
 from osik_jax.solvers.null_space import _saturation
@@ -61,6 +63,7 @@ class Tally:
     apart: int = 0
     worst: float = 0.0
     left_over: int = 0
+    kept: list[Any] = dataclasses.field(default_factory=list)
 
     def add(self, mine: Any, plain: Any, off: np.ndarray, left_over: int) -> None:
         """Count a batch: the kernel's answers, those of plain JAX, and how far they are apart."""
@@ -77,6 +80,32 @@ class Tally:
         statuses = ", ".join(f"{name} {count}" for name, count in self.statuses.items()) or "none"
         found = f"{self.problems} problems; statuses: {statuses}; apart: {self.apart}, {self.worst:.1e} at most"
         return f"{found}; left over: {self.left_over}"
+
+
+def differ(mine: Any, plain: Any, off: np.ndarray) -> np.ndarray:
+    """Which problems differ, in status or in their answer."""
+    return (np.asarray(mine.status) != np.asarray(plain.status)) | (off > APART)
+
+
+def keep(file: str, tallies: dict[str, Tally]) -> None:
+    """Write the problems that differ, an array of each of their numbers under family and position."""
+    leaves = {
+        f"{name}/{at}": np.concatenate(parts)
+        for name, tally in tallies.items()
+        for at, parts in enumerate(zip(*(jax.tree.leaves(p) for p in tally.kept), strict=True))
+    }
+    np.savez_compressed(file, **leaves)  # pyright: ignore[reportArgumentType]
+
+
+def kept(file: str, solver: str) -> dict[str, Any]:
+    """Read what ``keep`` wrote: by family, the problems as they were drawn."""
+    found, out = np.load(file), {}
+    for name, draw in comparison(solver).families.items():
+        if f"{name}/0" in found:
+            structure = jax.tree.structure(draw(np.random.default_rng(0), 1))
+            leaves = [found[f"{name}/{at}"] for at in range(structure.num_leaves)]
+            out[name] = jax.tree.unflatten(structure, leaves)
+    return out
 
 
 def weighted(rng: np.random.Generator, count: int, *, m: int) -> Problems:
@@ -173,7 +202,9 @@ def main() -> None:
     parser.add_argument("--backend", default="numba")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--batch", type=int, default=4096, help="problems of one call")
+    parser.add_argument("--keep", help="file for the problems that differ, .npz")
     asked = parser.parse_args()
+    configure_cpu()
     jax.config.update("jax_enable_x64", True)
     families, solve, difference = comparison(asked.solver)
     left_over = count_left_over()
@@ -188,7 +219,13 @@ def main() -> None:
             p, before = draw(rng, asked.batch), left_over[0]
             mine, plain = jax.block_until_ready((solved(p, asked.backend), solved(p, "jax")))
             jax.effects_barrier()
-            tallies[name].add(mine, plain, difference(p, mine, plain), left_over[0] - before)
+            off = difference(p, mine, plain)
+            tallies[name].add(mine, plain, off, left_over[0] - before)
+            if asked.keep:
+                which = differ(mine, plain, off)
+                tallies[name].kept.append(jax.tree.map(lambda a: a[which], p))  # noqa: B023
+    if asked.keep:
+        keep(asked.keep, tallies)
     for name, tally in tallies.items():
         print(f"{name}: {tally}", flush=True)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from hierarchy_families import degenerate
 from optimality import outside_cone
 from task_checks import kinematics_at
 
@@ -328,6 +329,36 @@ class TestByHand:
         """Joint 0 has to move at 0.4 at least."""
         answer = solve_nullspace([Level([[1.0, 1.0]], [0.0])], jnp.array([0.4, -1.0]), jnp.array([1.0, 1.0]))
         np.testing.assert_allclose(answer.x, [0.4, -0.4], rtol=0, atol=1e-15)
+
+    @pytest.mark.parametrize("backend", ["jax", "auto"])
+    def test_joints_at_their_bounds_in_zero_stop_a_level_at_the_scale_0(self, backend):
+        """x is 0 and nothing moves: the numbers that x is made of have no size that roundoff is small beside."""
+        p = degenerate(np.random.default_rng(0), 64)
+
+        def one(p):
+            return solve_nullspace([Level(*level) for level in p.levels], p.lower, p.upper, backend=backend)
+
+        answer = jax.jit(jax.vmap(one))(p)
+        np.testing.assert_array_equal(answer.status, Status.SOLVED)
+        assert ((np.abs(answer.x).max(1) == 0.0) & (np.asarray(answer.scales)[:, 0] == 0.0)).any()
+
+    @pytest.mark.parametrize("backend", ["jax", "auto"])
+    def test_levels_without_a_null_space_keep_those_above_to_rounding(self, backend):
+        """Ten rows in ten variables; joints at their bounds then stop the second level, and nothing is left to move."""
+        rng, lanes = np.random.default_rng(3), 300
+        A, b = rng.normal(size=(2, lanes, 5, N)), 1.5 * rng.normal(size=(2, lanes, 5))
+        lower, upper = -rng.exponential(1.0, (lanes, N)), rng.exponential(1.0, (lanes, N))
+
+        def one(A, b, lower, upper):
+            levels = [Level(A[0], b[0]), Level(A[1], b[1])]
+            return (solve_nullspace(levels[:k], lower, upper, backend=backend) for k in (1, 2))
+
+        first, second = jax.jit(jax.vmap(lambda *p: tuple(one(*p)), (1, 1, 0, 0)))(A, b, lower, upper)
+        np.testing.assert_array_equal(second.status, Status.SOLVED)
+        stopped = np.asarray(second.scales[:, 1]) < 1e-6
+        assert stopped.sum() > 50
+        off = np.abs(np.einsum("bmn,bn->bm", A[0], np.asarray(second.x - first.x))).max(1)
+        assert off[stopped].max() < 1e-12
 
     def test_one_sided_bounds(self):
         level = [Level([[1.0, 1.0]], [-4.0])]

@@ -233,6 +233,8 @@ SATURATION_ROUNDOFF = 1e-11
 """Relative to the terms that x is made of: a smaller violation of a bound counts as none."""
 INDEPENDENCE_TOL = 1e-5
 """Relative to a combination of joints: where the null space changes it by less, it does not change it."""
+PROJECTOR_ROUNDOFF = 0.1
+"""Diagonals of projectors are 1 at most; a smaller one has the dependence tolerance of one as large as this."""
 NEGLIGIBLE_ENTRY = 1e-7
 """Joints with a smaller entry in the combination do not block the motion."""
 SATURATION_ATTEMPTS = 6

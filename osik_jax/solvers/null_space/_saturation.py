@@ -184,7 +184,9 @@ def _level_problem(
 ) -> tuple[ScaledMotion, Array]:
     """Return the motion that a level asks for and where x may be, and the damping of the level."""
     motion, projector, total = level_motion(level, state.x, state.projector, damping, problem.rank_tol, backend)
-    return ScaledMotion(state.x, motion, target, projector, state.lower, state.upper), total
+    # the trace is the number of directions that are left; where none is, the numbers are roundoff
+    space = jnp.where(jnp.trace(projector) < 0.5, 0.0, projector)
+    return ScaledMotion(state.x, motion, target, space, state.lower, state.upper), total
 
 
 def _after_level(

@@ -47,6 +47,7 @@ from ...numerics._constants import (
     MAX_SATURATION_REFINEMENTS,
     MISSING_COMPLIANCE,
     NEGLIGIBLE_ENTRY,
+    PROJECTOR_ROUNDOFF,
     SATURATION_ACCURACY,
     SATURATION_ATTEMPTS,
     SATURATION_RESIDUAL,
@@ -152,7 +153,8 @@ def _tableau(problem: ScaledMotion, compliance: Float[Array, ""]) -> tuple[Const
         upper=problem.upper * root,
         equality=jnp.zeros(len(value), bool),
         roundoff=Roundoff(roundoff, roundoff),
-        scale=jnp.where(diagonal > 0.0, 1.0, 0.0).astype(value.dtype),
+        # of a joint that hardly moves, the projector's roundoff is no way to move it
+        scale=jnp.where(diagonal > 0.0, jnp.maximum(1.0, PROJECTOR_ROUNDOFF * root**2), 0.0).astype(value.dtype),
     )
     inactive = jnp.full(len(value), INACTIVE, jnp.int32)
     scaled = tableau * root[:, None] * root[None, :]
@@ -258,6 +260,8 @@ def _result(problem: ScaledMotion, active_set: _ActiveSet, at: _Iterate, iterati
     active = jnp.where(active_set.active != 0, active_set.active, active_set.blocking)
     x = clip_to_box(jnp.where(active != 0, problem.bound(active), at.x), problem.lower, problem.upper)
     residual = jnp.max(jnp.abs(x - at.x))
+    # a motion whose scale is 0 leaves roundoff of its own
+    roundoff = jnp.finfo(x.dtype).eps * problem.size(jnp.ones((), x.dtype))
     # joints that are at their bounds where the whole motion ends do not stop it
     is_whole = at.scale >= 1.0 - SATURATION_ROUNDOFF
     return SaturationResult(
@@ -267,7 +271,7 @@ def _result(problem: ScaledMotion, active_set: _ActiveSet, at: _Iterate, iterati
         blocking=jnp.where(is_whole, 0, active_set.blocking),
         blocker=active_set.blocker,
         iterations=iterations,
-        done=(residual <= SATURATION_RESIDUAL * problem.size(at.scale)) & jnp.isfinite(at.x).all(),
+        done=(residual <= SATURATION_RESIDUAL * problem.size(at.scale) + roundoff) & jnp.isfinite(at.x).all(),
     )
 
 
