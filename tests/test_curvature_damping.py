@@ -1,5 +1,7 @@
 """What the linear model leaves out, damped: bounds against MuJoCo, calm out of reach, exact inside, differentiable."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -8,6 +10,7 @@ import pytest
 from task_checks import kinematics_at
 
 import osik_jax as osik
+from osik_jax.numerics._dense import short_sum
 
 DT = 0.005
 SCHEMES = {
@@ -226,3 +229,28 @@ def test_its_share_is_traced(arm):
     for kappa in (0.0, 0.5, 1.0):
         velocity(osik.WeightedQP(curvature_damping=kappa))
     assert len(traces) == 1
+
+
+@pytest.mark.parametrize("options", [dict(), dict(rows="position", axes="frame"), dict(error="se3")])
+def test_products_as_a_gpu_takes_them_are_the_same(arm, options, monkeypatch):
+    """Small products are written out where JAX's default is a GPU; here that is only said."""
+    q = bent(arm)
+    p, turn = osik.forward_kinematics(arm, q).frame_pose(arm, "hand")
+    task = osik.FrameTask(arm, "hand", target=(p + 0.3, turn.T), weight=2.0, **options)
+
+    def rows(q):
+        found = task.rows(arm, osik.forward_kinematics(arm, q), q)
+        return found.error, found.jacobian, found.curvature
+
+    there, slopes = rows(q), jax.jacfwd(rows)(q)
+    for module in ("tasks._curvature", "tasks._rotation", "kinematics._forward"):
+        monkeypatch.setattr(f"osik_jax.{module}.cuda_is_default", lambda: True)
+    same = partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-13)
+    jax.tree.map(same, rows(q), there)
+    jax.tree.map(same, jax.jacfwd(rows)(q), slopes)
+
+
+@pytest.mark.parametrize("count", [0, 1, 31, 32, 70])
+def test_sums_in_parts_are_sums(count, rng):
+    numbers = rng.normal(size=(3, count))
+    np.testing.assert_allclose(short_sum(jnp.asarray(numbers)), numbers.sum(1), rtol=1e-13, atol=1e-15)

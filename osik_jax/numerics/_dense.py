@@ -25,5 +25,6 @@ def short_sum(a: Float[Array, "*B n"]) -> Float[Array, "*B"]:
     XLA adds up to 31 numbers in one thread; from 32 on a warp takes each sum, which is longer at work for fewer than
     hundreds. So longer ones are cut.
     """
-    parts = -(-a.shape[-1] // _ONE_THREAD)
-    return sum((jnp.sum(part, -1) for part in jnp.array_split(a, parts, -1)), jnp.zeros(a.shape[:-1], a.dtype))
+    parts = max(1, -(-a.shape[-1] // _ONE_THREAD))
+    first, *rest = (jnp.sum(part, -1) for part in jnp.array_split(a, parts, -1))
+    return sum(rest, first)
