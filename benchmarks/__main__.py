@@ -140,14 +140,14 @@ def measure(race: Race, selection: Selection, *, quick: bool) -> dict[str, list[
     slopes: list[dict[str, Any]] = []
     if "one" in selection.parts:
         entrants = one_robot(selection)
-        single = race.run(entrants, rounds=rounds, ticks=200, seconds=seconds)
+        single = race.run(entrants, rounds=rounds, steps=200, seconds=seconds)
         for row in single:
             if row["peer"] in BATCHED:
                 (entrant,) = [entrant for entrant in entrants if entrant.name == row["name"]]
-                row["first_tick_warm_seconds"] = race.again(entrant)
+                row["first_step_warm_seconds"] = race.again(entrant)
     if "many" in selection.parts:
         for group in many_robots(selection):
-            many += race.run(affordable(group, many, race), rounds=rounds, ticks=400, seconds=5 * seconds)
+            many += race.run(affordable(group, many, race), rounds=rounds, steps=400, seconds=5 * seconds)
     if "gradients" in selection.parts and "osik_jax" in selection.peers:
         slopes = list(gradients.rows(race, selection.schemes, selection.precisions, quick=quick))
     return dict(one_robot=single, many_robots=many, gradients=slopes)
@@ -158,13 +158,13 @@ def affordable(group: list[Entrant], before: list[dict[str, Any]], race: Race) -
     for entrant in group:
         batch = entrant.options.get("batch", 1)
         alike = [
-            row["tick_seconds_median"] * batch / row["options"]["batch"]
+            row["step_seconds_median"] * batch / row["options"]["batch"]
             for row in before
             if row["peer"] == entrant.peer
             and row["options"] == dict(entrant.options) | dict(batch=row["options"].get("batch"))
         ]
         if alike and alike[-1] > LONGEST:
-            race.report(f"{entrant.name} is left out: about {alike[-1]:.0f} s a tick")
+            race.report(f"{entrant.name} is left out: about {alike[-1]:.0f} s a step")
         else:
             yield entrant
 
@@ -173,7 +173,7 @@ def settings() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("results", nargs="?", type=Path, help="JSON file; the figure is a .png beside it")
-    parser.add_argument("--quick", action="store_true", help="about three minutes: one scheme and precision, few ticks")
+    parser.add_argument("--quick", action="store_true", help="about three minutes: one scheme and precision, few steps")
     parser.add_argument("--robot", default="g1", choices=sorted(ROBOTS))
     parser.add_argument("--parts", type=listed(str, PARTS), help=", ".join(PARTS))
     parser.add_argument("--peers", type=listed(str, PEERS), help=", ".join(PEERS))

@@ -1,6 +1,6 @@
 """Collision avoidance: a Unitree G1 reaches for points in and around itself; what meets, and what avoiding it costs.
 
-    python -m benchmarks.collision [results.json] [--motions 10000] [--ticks 40] [--batch 250] [--calls 30]
+    python -m benchmarks.collision [results.json] [--motions 10000] [--steps 40] [--batch 250] [--calls 30]
 
 The robot stands on both feet, keeps its centre of mass and sends each hand to a random point of a box around its body,
 in front of a table: many points are out of reach, inside a link or inside the table. Steps of 20 ms, joint position
@@ -135,7 +135,7 @@ class Judge:
         return min(result.min_distance for result in self.shape_data.distanceResults)
 
 
-def run_motions(given: Setting, points: np.ndarray, ticks: int, batch: int, avoiding: bool) -> dict[str, np.ndarray]:
+def run_motions(given: Setting, points: np.ndarray, steps: int, batch: int, avoiding: bool) -> dict[str, np.ndarray]:
     """Configurations, statuses and the hands' last errors of all motions, and how many programs were compiled."""
     traced = []
 
@@ -149,7 +149,7 @@ def run_motions(given: Setting, points: np.ndarray, ticks: int, batch: int, avoi
                 scheme=osik.WeightedQP(damping=1e-4),
                 limits=given.limits_for(avoiding),
                 dt=DT,
-                steps=ticks,
+                steps=steps,
             )
             errors = [jnp.linalg.norm(out.solution.error[hand][-1]) for hand in HANDS]
             return out.q, out.solution.status, jnp.stack(errors)
@@ -172,21 +172,21 @@ def judged(given: Setting, run: dict[str, np.ndarray]) -> dict[str, Any]:
     infeasible = run["status"] == osik.Status.INFEASIBLE
     return dict(
         motions=len(least),
-        ticks=run["status"].shape[1],
+        steps=run["status"].shape[1],
         penetrations=int((least < 0.0).sum()),
         below_minimum=int((least < MINIMUM_DISTANCE).sum()),
         smallest_distance=float(least.min()),
-        infeasible_ticks=float(infeasible.mean()),
+        infeasible_steps=float(infeasible.mean()),
         other_failures=float(((run["status"] != osik.Status.SOLVED) & ~infeasible).mean()),
         reached=float((run["errors"] < 0.01).mean()),
         programs=int(run["programs"]),
     )
 
 
-def tick_seconds(given: Setting, points: np.ndarray, batch: int, avoiding: bool, calls: int) -> dict[str, float]:
+def step_seconds(given: Setting, points: np.ndarray, batch: int, avoiding: bool, calls: int) -> dict[str, float]:
     """Median of the time of a step, and the time that compiling took [s]."""
 
-    def tick(q: jax.Array, warm_start: Any, points: jax.Array) -> tuple[jax.Array, Any]:
+    def step(q: jax.Array, warm_start: Any, points: jax.Array) -> tuple[jax.Array, Any]:
         solution = osik.solve(
             given.robot,
             q,
@@ -198,7 +198,7 @@ def tick_seconds(given: Setting, points: np.ndarray, batch: int, avoiding: bool,
         )
         return osik.integrate(given.robot, q, solution.velocity, DT), solution.warm_start
 
-    one = tick if batch == 1 else jax.vmap(tick)
+    one = step if batch == 1 else jax.vmap(step)
     points = points[0] if batch == 1 else points[np.arange(batch) % len(points)]
     q = given.robot.q0 if batch == 1 else jnp.tile(given.robot.q0, (batch, 1))
     cold = jax.tree.map(
@@ -219,7 +219,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.collision", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("results", nargs="?", type=Path, help="JSON file")
     parser.add_argument("--motions", type=int, default=10000)
-    parser.add_argument("--ticks", type=int, default=40)
+    parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--batch", type=int, default=250, help="motions at once; divides --motions")
     parser.add_argument("--free", type=int, default=500, help="motions that are run without the limit too")
     parser.add_argument("--calls", type=int, default=60, help="of a step, timed; 0: none")
@@ -232,13 +232,13 @@ def main() -> None:
     assert isinstance(avoidance, osik.CollisionAvoidanceLimit)
     counts = dict(pairs=len(avoidance.pairs), rows=avoidance.max_pairs, shapes=len(G1) + 1)
     costs = [
-        dict(batch=batch, avoiding=avoiding, **tick_seconds(given, points, batch, avoiding, asked.calls))
+        dict(batch=batch, avoiding=avoiding, **step_seconds(given, points, batch, avoiding, asked.calls))
         for batch, avoiding in itertools.product(BATCHES, (False, True))
         if asked.calls
     ]
     show_costs(costs, counts)
     motions = {
-        name: judged(given, run_motions(given, some, asked.ticks, asked.batch, avoiding))
+        name: judged(given, run_motions(given, some, asked.steps, asked.batch, avoiding))
         for name, some, avoiding in (("without", points[: asked.free], False), ("with", points, True))
     }
     show_motions(motions)

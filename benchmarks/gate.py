@@ -26,7 +26,7 @@ ENTRANTS = {
 def measured(race: Race) -> dict[str, dict[str, Any]]:
     """Rows by name."""
     entrants = [Entrant(name, "osik_jax", options, cores(1)) for name, options in ENTRANTS.items()]
-    rows = race.run(entrants, rounds=9, ticks=100, seconds=0.2)
+    rows = race.run(entrants, rounds=9, steps=100, seconds=0.2)
     return {row["name"]: row | verdict(race.work, row.pop("motion")) for row in rows}
 
 
@@ -55,9 +55,9 @@ def check(race: Race, console: Console, *, update: bool = False) -> int:
         return 0
     baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
     found = verdicts(rows, baseline)
-    table = Table("entrant", "µs a tick", "times the kernel", "baseline", "verdict")
+    table = Table("entrant", "µs a step", "times the kernel", "baseline", "verdict")
     for name, row in rows.items():
         ratios = f"{row['kernel_ratio']:.3g}", f"{baseline['ratios'][name]:.3g}"
-        table.add_row(name, f"{1e6 * row['tick_seconds_median']:.0f}", *ratios, found[name] or "good")
+        table.add_row(name, f"{1e6 * row['step_seconds_median']:.0f}", *ratios, found[name] or "good")
     console.print(table)
     return int(any(found.values()))

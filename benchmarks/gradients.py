@@ -13,7 +13,7 @@ from typing import Any
 from .processes import ROOT
 from .race import Race
 
-LENGTHS = {"tick": 1, "rollout": 100}
+LENGTHS = {"step": 1, "rollout": 100}
 """Steps of each."""
 ROBOTS = 64
 
@@ -28,15 +28,15 @@ def rows(race: Race, schemes: Sequence[str], precisions: Sequence[str], *, quick
     """
     for scheme in schemes:
         for precision in precisions:
-            for name, ticks in LENGTHS.items():
-                ticks = max(ticks // 10, 1) if quick else ticks
+            for name, steps in LENGTHS.items():
+                steps = max(steps // 10, 1) if quick else steps
                 race.report(f"gradient of a {name}, {scheme}, {precision}")
-                label = dict(what=name, scheme=scheme, precision=precision, robots=ROBOTS, ticks=ticks)
+                label = dict(what=name, scheme=scheme, precision=precision, robots=ROBOTS, steps=steps)
                 yield label | _measured(race.work.robot, label)
 
 
 def _measured(robot: str, asked: dict[str, Any]) -> dict[str, Any]:
-    options = {key: asked[key] for key in ("scheme", "precision", "robots", "ticks")}
+    options = {key: asked[key] for key in ("scheme", "precision", "robots", "steps")}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rollouts.json"
         words = [str(word) for key, value in options.items() for word in (f"--{key}", value)]

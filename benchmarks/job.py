@@ -1,6 +1,6 @@
 """A long job: random reaching motions, their ends on disk; killed and started again, it goes on where it was.
 
-    python -m benchmarks.job FOLDER [--steps 1e8] [--robot g1] [--ticks 100] [--chunk 8192] [--precision float64]
+    python -m benchmarks.job FOLDER [--steps 1e8] [--robot g1] [--length 100] [--chunk 8192] [--precision float64]
 
 Each lane is a motion of so many steps of the loop of ``benchmarks.throughput``, from arms somewhere in the middle of
 their ranges to a point within 10 cm of the hand's home. Lanes are drawn chunk by chunk, split over all devices (on a
@@ -32,14 +32,14 @@ REACH = 0.1
 SEED = 0
 
 
-def motion(ticks: int) -> Any:
+def motion(length: int) -> Any:
     """The function of one lane: a start and a target to what is kept of its motion."""
 
     def lane(own: tuple[jax.Array, jax.Array], robot: Any, tasks: Any, limits: Any) -> dict[str, jax.Array]:
         start, point = own
         hand = tasks["hand"]
         aimed = tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
-        run = osik.rollout(robot, start, aimed, scheme=osik.WeightedQP(), limits=limits, dt=DT, steps=ticks)
+        run = osik.rollout(robot, start, aimed, scheme=osik.WeightedQP(), limits=limits, dt=DT, steps=length)
         end = osik.forward_kinematics(robot, run.q[-1]).frame_pose(robot, hand.frame)[0]
         solved = (run.solution.status == osik.Status.SOLVED).all()
         return dict(q=run.q[-1], error=jnp.linalg.norm(end - point), solved=solved)
@@ -69,30 +69,30 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--steps", type=float, default=1e8, help="of all robots together")
     parser.add_argument("--robot", default="g1", choices=sorted(ROBOTS))
-    parser.add_argument("--ticks", type=int, default=100, help="of a motion")
+    parser.add_argument("--length", type=int, default=100, help="of a motion")
     parser.add_argument("--chunk", type=int, default=8192, help="motions at a time")
     parser.add_argument("--precision", default="float64", choices=PRECISIONS)
     given = parser.parse_args()
     if len(cores()) > 1:
         jax.config.update("jax_num_cpu_devices", len(cores()))
     jax.config.update("jax_enable_x64", given.precision == "float64")
-    loop, count = setting(given.robot), int(given.steps / given.ticks)
+    loop, count = setting(given.robot), int(given.steps / given.length)
     started = time.time()  # as files are dated
     saved = scaling.run_in_chunks(
-        scaling.sharded(motion(given.ticks), in_axes=(0, None, None, None)),
+        scaling.sharded(motion(given.length), in_axes=(0, None, None, None)),
         drawn(loop, given.robot),
         count=count,
         chunk=given.chunk,
         shared=(loop.robot, loop.tasks, loop.limits),
         out=given.folder,
-        label=f"{given.ticks} steps of benchmarks.job",
+        label=f"{given.length} steps of benchmarks.job",
     )
     seconds = time.time() - started
     new = sum(path.stat().st_mtime >= started for path in given.folder.glob("*.npz"))
     ran = min(new * given.chunk, count)
     found = saved.read(["error", "solved"])
     print(
-        f"{ran * given.ticks:,} steps in {seconds:.0f} s; of {count:,} motions {found['solved'].mean():.2%} SOLVED "
+        f"{ran * given.length:,} steps in {seconds:.0f} s; of {count:,} motions {found['solved'].mean():.2%} SOLVED "
         f"throughout, hands {1e3 * np.median(found['error']):.2f} mm off at the end (median)"
     )
 

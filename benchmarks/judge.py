@@ -47,11 +47,11 @@ def judged(work: Workload, motion: np.ndarray, lane: int = 0) -> dict[str, float
     model = pinocchio_model(work.urdf, work.floating)
     data = model.createData()
     before, worst = work.start, dict.fromkeys(BOUNDS, 0.0)
-    for tick, q in enumerate(np.asarray(motion, float)):
+    for step, q in enumerate(np.asarray(motion, float)):
         q = q.copy()
         if work.floating:
             q[3:7] /= np.linalg.norm(q[3:7])
-        found = _tracking(work, model, data, q, tick, lane) | _excess(work, before, q)
+        found = _tracking(work, model, data, q, step, lane) | _excess(work, before, q)
         worst = {name: max(worst[name], value) for name, value in found.items()}
         before = q
     return worst
@@ -74,20 +74,20 @@ def failures(score: dict[str, float]) -> list[str]:
 
 
 def _tracking(
-    work: Workload, model: pin.Model, data: pin.Data, q: np.ndarray, tick: int, lane: int
+    work: Workload, model: pin.Model, data: pin.Data, q: np.ndarray, step: int, lane: int
 ) -> dict[str, float]:
     pin.framesForwardKinematics(model, data, q)
     hand = data.oMf[model.getFrameId(work.hand)]
     feet = [data.oMf[model.getFrameId(foot)] for foot in work.feet]
-    com = pin.centerOfMass(model, data, q) if work.feet else work.com_at(tick)
+    com = pin.centerOfMass(model, data, q) if work.feet else work.com_at(step)
     moved = [np.linalg.norm(f.translation - p) for f, p in zip(feet, work.foot_positions, strict=True)]
     turned = [np.linalg.norm(pin.log3(f.rotation.T @ R)) for f, R in zip(feet, work.foot_rotations, strict=True)]
     return dict(
-        hand=float(np.linalg.norm(hand.translation - work.hand_at(tick, lane))),
+        hand=float(np.linalg.norm(hand.translation - work.hand_at(step, lane))),
         hand_rotation=float(np.linalg.norm(pin.log3(hand.rotation.T @ work.hand_rotation))),
         feet=float(max(moved, default=0.0)),
         feet_rotation=float(max(turned, default=0.0)),
-        com=float(np.linalg.norm(com - work.com_at(tick))),
+        com=float(np.linalg.norm(com - work.com_at(step))),
     )
 
 

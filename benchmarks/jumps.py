@@ -72,12 +72,12 @@ def measure(
 
     @jax.jit
     def scan(state: State, points: jax.Array) -> tuple[State, Any]:
-        def tick(state: State, _: None) -> tuple[State, Any]:
+        def all_robots(state: State, _: None) -> tuple[State, Any]:
             state, (status, speed, beyond, iterations, finite) = jax.vmap(step)(state, points)
             count = jnp.sum(status[:, None] == jnp.array(list(osik.Status)), 0)
             return state, (count, speed.max(), beyond.max(), iterations.mean(), iterations.max(), finite.all())
 
-        return jax.lax.scan(tick, state, length=STEPS)
+        return jax.lax.scan(all_robots, state, length=STEPS)
 
     look = jax.jit(jax.vmap(solved))
     kept = np.arange(min(robots, -(-SAMPLE // (scans + 1))))

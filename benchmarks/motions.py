@@ -13,7 +13,7 @@ from .workload import Workload
 
 PARTS = ("one_robot", "many_robots")
 """Of the results, whose rows have motions."""
-KEPT_TICKS = 1000
+KEPT_STEPS = 1000
 """First steps of a motion that go into a file, in single precision; they hold the slowest part of the curve twice."""
 
 
@@ -34,7 +34,7 @@ def judged(result: dict[str, Any], work: Workload) -> dict[str, Any]:
 
 def kept(result: dict[str, Any], work: Workload, path: Path | None) -> dict[str, Any]:
     """The results without verdicts; their motions go into a file beside theirs, if that has a name."""
-    arrays = {str(i): row.pop("motion")[:, :KEPT_TICKS].astype(np.float32) for i, row in enumerate(moving(result))}
+    arrays = {str(i): row.pop("motion")[:, :KEPT_STEPS].astype(np.float32) for i, row in enumerate(moving(result))}
     if path is not None:
         np.savez_compressed(_beside(path), allow_pickle=False, workload=np.array(work.to_json()), **arrays)
     for row in moving(result):

@@ -1,4 +1,4 @@
-"""Where a tick's time goes: its parts alone, each a program of its own, and the operations that take most of it.
+"""Where a step's time goes: its parts alone, each a program of its own, and the operations that take most of it.
 
     python -m benchmarks.parts [results.json] [--robot g1] [--batches 1,1024] [--scheme weighted] [--precision float64]
                                [--operations 20]
@@ -54,7 +54,7 @@ def parts(given: Setting, scheme: osik.Scheme) -> tuple[dict[str, Callable[..., 
         aimed = tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
         return osik.solve(robot, q, aimed, scheme=scheme, limits=limits, dt=DT, warm_start=warm_start)
 
-    def tick(q: jax.Array, point: jax.Array, warm_start: Any) -> tuple[jax.Array, Any, jax.Array]:
+    def step(q: jax.Array, point: jax.Array, warm_start: Any) -> tuple[jax.Array, Any, jax.Array]:
         solution = solve(q, point, warm_start)
         return osik.integrate(robot, q, solution.velocity, DT), solution.warm_start, solution.status
 
@@ -65,7 +65,7 @@ def parts(given: Setting, scheme: osik.Scheme) -> tuple[dict[str, Callable[..., 
         "dispatch": lambda q, *_: q + 1.0,
         "forward kinematics": lambda q, *_: kinematics_by("auto", robot, q),
         "rows": lambda q, *_: rows_of(robot, kinematics_by("auto", robot, q), q, tasks),
-        "tick": tick,
+        "step": step,
         "gradient": jax.value_and_grad(speed, argnums=(0, 1)),
     }
     warm_starts = jax.jit(jax.vmap(lambda *situation: solve(*situation).warm_start))(given.starts, given.targets)
@@ -119,7 +119,7 @@ def measure(given: Setting, scheme: str, batch: int, operations: int) -> list[di
     for name, function in functions.items():
         program, compile_seconds = compiled(function if batch == 1 else jax.vmap(function), *args)
         row = dict(part=name, batch=batch, seconds=median_seconds(program, *args), compile_seconds=compile_seconds)
-        slowest = profiled(program, args, operations) if operations and name == "tick" else []
+        slowest = profiled(program, args, operations) if operations and name == "step" else []
         rows.append(row | dict(operations=operations_of(program.as_text() or ""), slowest=slowest))
     return rows
 
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--batches", type=listed(int), default=[1, 1024])
     parser.add_argument("--scheme", default="weighted", choices=sorted(SCHEMES))
     parser.add_argument("--precision", default="float64", choices=PRECISIONS)
-    parser.add_argument("--operations", type=int, default=0, help="list so many of the slowest of the tick")
+    parser.add_argument("--operations", type=int, default=0, help="list so many of the slowest of the step")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", given.precision == "float64")
     chosen, rows = setting(given.robot), []

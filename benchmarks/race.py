@@ -49,7 +49,7 @@ class Race:
     def __exit__(self, *_: object) -> None:
         self._folder.cleanup()
 
-    def run(self, entrants: Iterable[Entrant], *, rounds: int, ticks: int, seconds: float) -> list[dict[str, Any]]:
+    def run(self, entrants: Iterable[Entrant], *, rounds: int, steps: int, seconds: float) -> list[dict[str, Any]]:
         """Rows of those entrants that could start, not judged yet.
 
         Args:
@@ -61,8 +61,8 @@ class Race:
         records = [Record(team) for team in map(self._started, entrants) if team]
         try:
             for record in records:
-                self.report(f"{record.team.entrant.name}: first ticks")
-                record.warm_up(ticks, seconds)
+                self.report(f"{record.team.entrant.name}: first steps")
+                record.warm_up(steps, seconds)
             for _ in range(rounds):
                 for record in records:
                     record.take_turn()
@@ -77,7 +77,7 @@ class Race:
         """Seconds of the first step in a new process, with its programs from the compilation cache."""
         team = self._team(entrant)
         try:
-            return team.ask(what="run", ticks=1)[0]["seconds"][0]
+            return team.ask(what="run", steps=1)[0]["seconds"][0]
         finally:
             team.close()
 
@@ -103,30 +103,30 @@ class Record:
 
     def __init__(self, team: Team) -> None:
         self.team = team
-        self.ticks, self.first, self.solved = FEWEST, 0.0, 1.0
+        self.steps, self.first, self.solved = FEWEST, 0.0, 1.0
         self.seconds: list[list[float]] = [[] for _ in team.workers]
         self.kernel: list[float] = []
         self.motion: list[list[Any]] = []
         self.memory: list[dict[str, Any]] = []
 
-    def warm_up(self, ticks: int, seconds: float) -> None:
+    def warm_up(self, steps: int, seconds: float) -> None:
         """The first steps, which are judged but not timed; they set how many steps a turn has."""
         self.first = self._moved(1)[0][0]
         each = float(np.median(self._moved(WARM_UP)[0]))
-        self.ticks = int(np.clip(seconds / each, FEWEST, max(ticks, FEWEST)))
+        self.steps = int(np.clip(seconds / each, FEWEST, max(steps, FEWEST)))
 
     def take_turn(self) -> None:
         """Some steps in all its processes at once, after the reference kernel in the first."""
         self.kernel.extend(self.team.workers[0].ask(what="kernel", times=KERNELS)["seconds"])
-        for own, found in zip(self.seconds, self._moved(self.ticks), strict=True):
+        for own, found in zip(self.seconds, self._moved(self.steps), strict=True):
             own.extend(found)
 
     def weigh(self) -> None:
         """What its processes have had in memory."""
         self.memory = self.team.ask(what="memory")
 
-    def _moved(self, ticks: int) -> list[list[float]]:
-        answers = self.team.ask(what="run", ticks=ticks)
+    def _moved(self, steps: int) -> list[list[float]]:
+        answers = self.team.ask(what="run", steps=steps)
         self.solved = min(answer["solved"] for answer in answers)
         for lane, path in enumerate(answers[0]["motion"]):
             if lane == len(self.motion):
@@ -148,15 +148,15 @@ class Record:
             options=dict(entrant.options),
             cores=list(entrant.cores),
             robots=entrant.robots,
-            timed_ticks=len(pooled),
-            judged_ticks=len(self.motion[0]),
-            tick_seconds_median=float(np.median(pooled)),
-            tick_seconds_p99=float(np.percentile(pooled, 99)),
+            timed_steps=len(pooled),
+            judged_steps=len(self.motion[0]),
+            step_seconds_median=float(np.median(pooled)),
+            step_seconds_p99=float(np.percentile(pooled, 99)),
             steps_per_second=(entrant.options.get("batch") or 1) * sum(1.0 / float(np.mean(s)) for s in self.seconds),
             kernel_seconds=kernel,
             kernel_ratio=float(np.percentile(pooled, UNDISTURBED)) / kernel,
             build_seconds=self.team.workers[0].hello["build_seconds"],
-            first_tick_seconds=self.first,
+            first_step_seconds=self.first,
             device=self.memory[0]["device"],
             peak_bytes=_largest([each["peak_bytes"] for each in self.memory]),
             device_peak_bytes=_largest([each["device_peak_bytes"] for each in self.memory]),

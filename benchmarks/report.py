@@ -55,15 +55,15 @@ def _one_robot(rows: list[dict[str, Any]]) -> Table:
         *_QUALITY,
     ):
         table.add_column(heading, justify="left" if heading == "entrant" else "right")
-    mink = next((row["tick_seconds_median"] for row in rows if row["peer"] == "mink"), None)
+    mink = next((row["step_seconds_median"] for row in rows if row["peer"] == "mink"), None)
     for row in rows:
-        median, warm = row["tick_seconds_median"], row.get("first_tick_warm_seconds")
+        median, warm = row["step_seconds_median"], row.get("first_step_warm_seconds")
         table.add_row(
             row["name"],
             f"{1e6 * median:.0f}",
-            f"{1e6 * row['tick_seconds_p99']:.0f}",
+            f"{1e6 * row['step_seconds_p99']:.0f}",
             f"{median / mink:.2f}" if mink else "",
-            f"{row['first_tick_seconds']:.2g}",
+            f"{row['first_step_seconds']:.2g}",
             f"{warm:.2g}" if warm is not None else "",
             _mebibytes(row["peak_bytes"]),
             *_quality(row),
@@ -81,8 +81,8 @@ def _many_robots(rows: list[dict[str, Any]]) -> Table:
             row["name"],
             f"{row['robots']:,}",
             f"{row['steps_per_second']:,.0f}",
-            f"{1e3 * row['tick_seconds_median']:.3g}",
-            f"{row['first_tick_seconds']:.2g}",
+            f"{1e3 * row['step_seconds_median']:.3g}",
+            f"{row['first_step_seconds']:.2g}",
             *(_mebibytes(row[key]) for key in ("peak_bytes", "device_peak_bytes")),
             *_quality(row),
         )
@@ -97,7 +97,7 @@ def _gradients(rows: list[dict[str, Any]]) -> Table:
     for row in rows:
         forward, gradient = row["forward_seconds"], row["gradient_seconds"]
         table.add_row(
-            *(row["what"], row["scheme"], row["precision"], f"{row['robots']:,}", str(row["ticks"])),
+            *(row["what"], row["scheme"], row["precision"], f"{row['robots']:,}", str(row["steps"])),
             *(f"{1e3 * forward:.3g}", f"{1e3 * gradient:.3g}", f"{gradient / forward:.2f}"),
             f"{row['compile_seconds']:.1f}",
             *(_mebibytes(row[key]) for key in ("peak_bytes", "device_peak_bytes")),
@@ -115,8 +115,8 @@ _QUALITY = ("steps", "hand, feet, CoM [mm]", "solved", "judged")
 
 
 def _quality(row: dict[str, Any]) -> tuple[str, str, str, str]:
-    ticks, solved = f"{row['judged_ticks']:,}", f"{row['solved']:.4f}"
+    steps, solved = f"{row['judged_steps']:,}", f"{row['solved']:.4f}"
     if row["score"] is None:
-        return ticks, "", solved, "not yet"
+        return steps, "", solved, "not yet"
     errors = ", ".join(f"{1e3 * row['score'][name]:.2f}" for name in ("hand", "feet", "com"))
-    return ticks, errors, solved, "FAILED" if row["failures"] else "good"
+    return steps, errors, solved, "FAILED" if row["failures"] else "good"

@@ -1,6 +1,6 @@
 """What the gradient through rollouts costs: over weights that all robots share and the target of each.
 
-    python -m benchmarks.rollouts [results.json] [--robot g1] [--robots 64] [--ticks 100] [--scheme weighted]
+    python -m benchmarks.rollouts [results.json] [--robot g1] [--robots 64] [--steps 100] [--scheme weighted]
                                   [--precision float64]
 
 The setting is that of ``benchmarks.throughput``, closed loop, on the default device. The loss is the mean over robots
@@ -34,7 +34,7 @@ CALLS = 5
 """Timed calls of each, after one that does not count."""
 
 
-def measure(robot: str, scheme: str, robots: int, ticks: int) -> list[dict[str, Any]]:
+def measure(robot: str, scheme: str, robots: int, steps: int) -> list[dict[str, Any]]:
     """A row of the loss, and one of the loss with its gradient."""
     given = setting(robot)
     hand = given.tasks["hand"]
@@ -44,7 +44,7 @@ def measure(robot: str, scheme: str, robots: int, ticks: int) -> list[dict[str, 
 
     def path(q: jax.Array, point: jax.Array, tasks: dict[str, osik.Task]) -> jax.Array:
         aimed = tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
-        run = osik.rollout(given.robot, q, aimed, scheme=SCHEMES[scheme](), limits=given.limits, dt=DT, steps=ticks)
+        run = osik.rollout(given.robot, q, aimed, scheme=SCHEMES[scheme](), limits=given.limits, dt=DT, steps=steps)
         end, _ = osik.forward_kinematics(given.robot, run.q[-1]).frame_pose(given.robot, hand.frame)
         return jnp.mean(run.solution.error["hand"] ** 2) + jnp.sum((end - point) ** 2)
 
@@ -76,12 +76,12 @@ def main() -> None:
     parser.add_argument("results", nargs="?", type=Path, help="JSON file")
     parser.add_argument("--robot", default="g1", choices=sorted(ROBOTS))
     parser.add_argument("--robots", type=int, default=64)
-    parser.add_argument("--ticks", type=int, default=100)
+    parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--scheme", default="weighted", choices=sorted(SCHEMES))
     parser.add_argument("--precision", default="float64", choices=PRECISIONS)
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", given.precision == "float64")
-    rows = measure(given.robot, given.scheme, given.robots, given.ticks)
+    rows = measure(given.robot, given.scheme, given.robots, given.steps)
     if given.results is not None:
         asked = {key: value for key, value in vars(given).items() if key != "results"}
         memory = dict(peak_bytes=peak_bytes(), device_peak_bytes=device_bytes())
@@ -92,7 +92,7 @@ def main() -> None:
         each = row["seconds"]
         table.add_row(
             *(row["part"], f"{1e3 * each:,.1f}", f"{each / rows[0]['seconds']:.2f}"),
-            *(f"{given.robots * given.ticks / each:,.0f}", str(row["finite"]), f"{row['compile_seconds']:.1f}"),
+            *(f"{given.robots * given.steps / each:,.0f}", str(row["finite"]), f"{row['compile_seconds']:.1f}"),
             f"{row['temporary_bytes'] / 2**20:,.1f}",
         )
     Console(width=110).print(table)

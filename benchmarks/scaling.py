@@ -48,14 +48,14 @@ HALF_A_MINUTE = 30.0
 def measure(given: Setting, scheme: str, devices: int, lanes: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
     """One row: so many devices, with so many lanes on each."""
     mapped = partial(sharded, mesh=device_mesh(jax.devices()[:devices]), donate_argnums=4)
-    tick, arguments, first = batch_of(given, SCHEMES[scheme](), devices * lanes, mapped=mapped)
-    *arguments, state = tick.place(*arguments, first)
+    step, arguments, first = batch_of(given, SCHEMES[scheme](), devices * lanes, mapped=mapped)
+    *arguments, state = step.place(*arguments, first)
     solved: list[float] = []
     seconds: list[float] = []
     worst, calls = np.inf, CHECKED + TIMED[0]
     while len(solved) < calls and (len(solved) <= CHECKED or sum(seconds[1:]) < HALF_A_MINUTE):
         started = time.perf_counter()
-        state, error, fine = jax.block_until_ready(tick(*arguments, state))
+        state, error, fine = jax.block_until_ready(step(*arguments, state))
         seconds.append(time.perf_counter() - started)
         solved.append(float(np.mean(fine)))
         if len(solved) == CHECKED:
@@ -67,7 +67,7 @@ def measure(given: Setting, scheme: str, devices: int, lanes: int, wanted: dict[
         devices=devices,
         lanes_per_device=lanes,
         seconds=each,
-        ticks_per_second=devices * lanes / each,
+        steps_per_second=devices * lanes / each,
         first_call_seconds=seconds[0],
         solved=float(np.mean(solved)),
         error=worst,
@@ -90,7 +90,7 @@ def run(robot: str, scheme: str, precision: str, lanes: int, devices: list[int])
         given, alone = setting(robot), None
         for count in devices:
             row = measure(given, scheme, count, lanes, wanted)
-            each = row["ticks_per_second"] / count
+            each = row["steps_per_second"] / count
             alone = alone or each
             yield dict(robot=robot, scheme=scheme, precision=precision) | row | dict(efficiency=each / alone)
 
@@ -102,7 +102,7 @@ def show(rows: list[dict[str, Any]]) -> None:
     for r in rows:
         cells = (
             *(f"{r['devices']}", f"{r['lanes_per_device']:,}", f"{1e3 * r['seconds']:.3g}"),
-            *(f"{r['ticks_per_second']:,.0f}", f"{r['efficiency']:.3f}", f"{r['solved']:.4f}", f"{r['error']:.1e}"),
+            *(f"{r['steps_per_second']:,.0f}", f"{r['efficiency']:.3f}", f"{r['solved']:.4f}", f"{r['error']:.1e}"),
             f"{r['first_call_seconds']:.1f}",
         )
         print("  ".join(f"{cell:>14}" for cell in cells))

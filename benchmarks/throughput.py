@@ -120,7 +120,7 @@ def batch_of(
         q, warm_start = state
         return osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=DT, warm_start=warm_start)
 
-    def tick(robot: Any, tasks: Any, scheme: Any, limits: Any, state: State) -> tuple[State, Any, Any]:
+    def step(robot: Any, tasks: Any, scheme: Any, limits: Any, state: State) -> tuple[State, Any, Any]:
         solution = solve(robot, tasks, scheme, limits, state)
         q = osik.integrate(robot, state.q, solution.velocity, DT)
         return State(q, solution.warm_start), solution.error, solution.status == osik.Status.SOLVED
@@ -131,7 +131,7 @@ def batch_of(
     )
     none = jax.tree.map(lambda a: jnp.zeros((batch, *a.shape), a.dtype), first)
     arguments = (given.robot, tasks, scheme, given.limits)
-    return mapped(tick, in_axes=(None, axes, None, None, 0)), arguments, State(starts, none)
+    return mapped(step, in_axes=(None, axes, None, None, 0)), arguments, State(starts, none)
 
 
 def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
@@ -146,8 +146,8 @@ def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
 def reference(robot: str, scheme: str) -> dict[str, np.ndarray]:
     """Task errors of all lanes after the checked steps, in float64 on the CPU."""
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        tick, arguments, state = batch_of(setting(robot), SCHEMES[scheme](), LANES)
-        program, _ = compiled(tick, *arguments, state)
+        step, arguments, state = batch_of(setting(robot), SCHEMES[scheme](), LANES)
+        program, _ = compiled(step, *arguments, state)
         for _ in range(CHECKED):
             state, error, _ = program(*arguments, state)
         return {name: np.asarray(e) for name, e in error.items()}
@@ -155,8 +155,8 @@ def reference(robot: str, scheme: str) -> dict[str, np.ndarray]:
 
 def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
     """One row: how fast, how right, how much memory."""
-    tick, arguments, state = batch_of(given, scheme, batch)
-    program, compile_seconds = compiled(tick, *arguments, state)
+    step, arguments, state = batch_of(given, scheme, batch)
+    program, compile_seconds = compiled(step, *arguments, state)
     solved: list[Any] = []
     seconds: list[float] = []
     errors: dict[str, float] = {}
@@ -176,7 +176,7 @@ def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, n
     return dict(
         batch=batch,
         seconds=each,
-        ticks_per_second=batch / each,
+        steps_per_second=batch / each,
         compile_seconds=compile_seconds,
         solved=float(np.mean(solved)),
         error=max(errors.values()),
@@ -245,7 +245,7 @@ def show(rows: list[dict[str, Any]]) -> None:
     for r in rows:
         table.add_row(
             *(r["scheme"], r["precision"], f"{r['batch']:,}"),
-            *(f"{1e3 * r['seconds']:.3g}", f"{r['ticks_per_second']:,.0f}", f"{r['solved']:.4f}", f"{r['error']:.1e}"),
+            *(f"{1e3 * r['seconds']:.3g}", f"{r['steps_per_second']:,.0f}", f"{r['solved']:.4f}", f"{r['error']:.1e}"),
             *(f"{r['compile_seconds']:.1f}", f"{r['program_bytes'] / 2**20:.2g}"),
         )
     Console(width=110).print(table)

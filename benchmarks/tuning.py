@@ -1,7 +1,7 @@
 """Tuning by gradient beside CMA-ES: the same loop, scenarios, start and space, the same number of rollouts.
 
     python -m benchmarks.tuning [results.json]
-    python -m benchmarks.tuning --memory [ticks] [scenarios]      peak of one gradient; default 1000 and 256
+    python -m benchmarks.tuning --memory [steps] [scenarios]      peak of one gradient; default 1000 and 256
 
 NAO stands on both feet and reaches with both hands for points that its arms can reach. All weights and gains start at
 the library's defaults, 1 and 10 / s. Training and held-out scenarios are drawn apart; neither method sees the second.

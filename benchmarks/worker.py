@@ -37,17 +37,17 @@ class Loop:
         self.runner = self.made(work, **options)
         self.build_seconds = time.perf_counter() - started
 
-    def run(self, ticks: int) -> dict[str, Any]:
+    def run(self, steps: int) -> dict[str, Any]:
         """Seconds of each step, and the canonical configurations that they led to: (lanes, steps, nq)."""
         lanes = 0 if self.batch is None else np.arange(self.batch)
         seconds, motion = [], []
-        for tick in range(self.now, self.now + ticks):
-            hand, com = self.work.hand_at(tick, lanes), self.work.com_at(tick)
+        for step in range(self.now, self.now + steps):
+            hand, com = self.work.hand_at(step, lanes), self.work.com_at(step)
             started = time.perf_counter()
-            q = self.runner.tick(hand, com)
+            q = self.runner.step(hand, com)
             seconds.append(time.perf_counter() - started)
             motion.append(self.runner.canonical(q if self.batch is None else q[:JUDGED_LANES]))
-        self.now += ticks
+        self.now += steps
         paths = np.array(motion)[None] if self.batch is None else np.array(motion).swapaxes(0, 1)
         return dict(seconds=seconds, motion=paths.tolist(), solved=self.runner.solved())
 
@@ -63,7 +63,7 @@ class Loop:
         for targets in zip(hand, com, strict=True):
             started = time.perf_counter()
             try:
-                found = runner.tick(*targets)
+                found = runner.step(*targets)
                 motion.append(runner.canonical(found))
             except Exception as reason:  # whatever a QP solver raises where it finds nothing
                 failed += 1
@@ -91,7 +91,7 @@ def answer(loop: Loop, question: dict[str, Any]) -> dict[str, Any]:
     """
     match question["what"]:
         case "run":
-            return loop.run(question["ticks"])
+            return loop.run(question["steps"])
         case "follow":
             return loop.follow(np.array(question["hand"]), np.array(question["com"]), question["options"])
         case "kernel":

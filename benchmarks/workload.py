@@ -74,15 +74,15 @@ class Workload:
     velocity: np.ndarray
     costs: Costs = Costs()
 
-    def hand_at(self, tick: int, lanes: np.ndarray | int = 0) -> np.ndarray:
+    def hand_at(self, step: int, lanes: np.ndarray | int = 0) -> np.ndarray:
         """Target of the hand; lane 0 is the standard one, each other at another phase of the curve: (..., 3)."""
-        t = tick * DT
+        t = step * DT
         phase = 2.4 * np.asarray(lanes)[..., None]
         return self.hand_position + _eased(t / EASED) * self.amplitude * np.sin(RATES * t + phase)
 
-    def com_at(self, tick: int) -> np.ndarray:
+    def com_at(self, step: int) -> np.ndarray:
         """Target of the centre of mass, (3,)."""
-        return self.com_start + _eased(tick * DT / COM_SECONDS) * (self.com_goal - self.com_start)
+        return self.com_start + _eased(step * DT / COM_SECONDS) * (self.com_goal - self.com_start)
 
     def to_json(self) -> str:
         """Text that ``from_json`` reads."""

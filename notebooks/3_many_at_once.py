@@ -244,7 +244,7 @@ record = json.loads((data / "throughput_h200.json").read_text())
 print(f"{record['device']}, jax {record['jax']}")
 rows = {(r["scheme"], r["precision"], r["batch"]): r for r in record["rows"]}
 for (scheme, precision, batch), r in rows.items():
-    per_second, gib = r["ticks_per_second"], r["program_bytes"] / 2**30
+    per_second, gib = r["steps_per_second"], r["program_bytes"] / 2**30
     case = f"{scheme:>13} {precision} {batch:7,}"
     print(f"{case}: {1e3 * r['seconds']:7.2f} ms, {per_second:10,.0f} steps/s, {gib:6.3f} GiB, {r['error']:.0e} off")
 allowed = {"float64": 1e-13, "float32": 2e-5}  # [m, rad], against float64 on a CPU
@@ -256,7 +256,7 @@ SCHEMES = {"weighted": BLUE, "null-space": ORANGE, "hierarchical": GREEN}
 for scheme, color in SCHEMES.items():
     for precision, style in (("float64", "o-"), ("float32", "s:")):
         found = sorted(batch for s, p, batch in rows if (s, p) == (scheme, precision))
-        per_second = [rows[scheme, precision, batch]["ticks_per_second"] for batch in found]
+        per_second = [rows[scheme, precision, batch]["steps_per_second"] for batch in found]
         left.loglog(found, per_second, style, color=color, ms=4, label=f"{scheme}, {precision}")
         memory = [rows[scheme, precision, batch]["program_bytes"] / 2**20 for batch in found]
         right.loglog(found, memory, style, color=color, ms=4)
@@ -291,7 +291,7 @@ def seconds_of(scheme, precision, batch):
 
 def best(scheme, precision="float64"):
     """The most steps a second in the record, and the batch that had it."""
-    return max((r["ticks_per_second"], b) for (s, p, b), r in rows.items() if (s, p) == (scheme, precision))
+    return max((r["steps_per_second"], b) for (s, p, b), r in rows.items() if (s, p) == (scheme, precision))
 
 
 stretch = {name: seconds_of(name, "float64", 1024) / seconds_of(name, "float64", 1) for name in SCHEMES}

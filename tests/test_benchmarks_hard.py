@@ -31,8 +31,8 @@ def motion_of(path, case, solved=1.0):
     return Motion(case, 10.0, path, solved, 1e-4)
 
 
-def held(work, place, ticks, judged=0):
-    return Case("beyond", np.tile(place, (ticks, 1)), np.tile(work.com_start, (ticks, 1)), judged)
+def held(work, place, steps, judged=0):
+    return Case("beyond", np.tile(place, (steps, 1)), np.tile(work.com_start, (steps, 1)), judged)
 
 
 class TestReach:
@@ -72,15 +72,15 @@ class TestReach:
 class TestNumbers:
     """Motions that are made up, whose numbers are known."""
 
-    def path(self, work, ticks):
-        return np.tile(work.start, (ticks + 1, 1))
+    def path(self, work, steps):
+        return np.tile(work.start, (steps + 1, 1))
 
     def test_of_a_joint_that_turns_round_at_each_step(self, work):
-        ticks, top = 40, work.velocity[1]
-        path = self.path(work, ticks)
+        steps, top = 40, work.velocity[1]
+        path = self.path(work, steps)
         path[1::2, 1] += DT * top
-        found = judged(work, motion_of(path, held(work, work.hand_position, ticks)))
-        assert found.turns == pytest.approx((ticks - 1) / (ticks * DT))
+        found = judged(work, motion_of(path, held(work, work.hand_position, steps)))
+        assert found.turns == pytest.approx((steps - 1) / (steps * DT))
         assert found.fastest == pytest.approx(1.0) and found.at_top == 1.0
         assert found.rms == pytest.approx(top / np.sqrt(7.0))
         assert found.at_range == found.feet == found.base == 0.0 and found.hand_at_end == pytest.approx(0.0, abs=1e-12)

@@ -19,12 +19,12 @@ def test_rows_of_all_parts(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["parts", str(path), "--robot", "arm7", "--batches", "3", "--operations", "4"])
     parts.main()
     rows = {row["part"]: row for row in json.loads(path.read_text())["rows"]}
-    assert list(rows) == ["dispatch", "forward kinematics", "rows", "tick", "gradient"]
+    assert list(rows) == ["dispatch", "forward kinematics", "rows", "step", "gradient"]
     assert all(row["seconds"] > 0.0 and row["compile_seconds"] > 0.0 and row["batch"] == 3 for row in rows.values())
     operations = {part: row["operations"] for part, row in rows.items()}
     assert operations["dispatch"] == operations["forward kinematics"] == 1  # a kernel is one
-    assert 1 < operations["rows"] < operations["tick"] < operations["gradient"]
-    slowest = rows["tick"]["slowest"]
+    assert 1 < operations["rows"] < operations["step"] < operations["gradient"]
+    slowest = rows["step"]["slowest"]
     assert len(slowest) == 4 and all(seconds > 0.0 for _, seconds in slowest)
     assert "gradient" in capsys.readouterr().out
 
@@ -41,7 +41,7 @@ def test_an_operation_is_found_where_it_is():
 @pytest.mark.release
 def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
     path = tmp_path / "rollouts.json"
-    monkeypatch.setattr(sys, "argv", ["rollouts", str(path), "--robot", "arm7", "--robots", "2", "--ticks", "3"])
+    monkeypatch.setattr(sys, "argv", ["rollouts", str(path), "--robot", "arm7", "--robots", "2", "--steps", "3"])
     rollouts.main()
     forward, gradient = json.loads(path.read_text())["rows"]
     assert (forward["part"], gradient["part"]) == ("forward", "gradient")
@@ -52,7 +52,7 @@ def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_job_goes_on_where_it_was(tmp_path, monkeypatch, capsys):
     """Of three chunks the middle one is lost: it alone is run, and comes out as it was."""
-    command = ["job", str(tmp_path), "--robot", "arm7", "--steps", "18", "--ticks", "2", "--chunk", "3"]
+    command = ["job", str(tmp_path), "--robot", "arm7", "--steps", "18", "--length", "2", "--chunk", "3"]
     monkeypatch.setattr(sys, "argv", command)
     monkeypatch.setattr(job, "cores", lambda: (0,))
     job.main()

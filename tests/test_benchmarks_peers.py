@@ -21,7 +21,7 @@ from benchmarks.race import Race
 from benchmarks.robots import pinocchio_model, workload
 from benchmarks.workload import DT, Workload
 
-TICKS = 40
+STEPS = 40
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,8 @@ def work():
     return workload("panda")
 
 
-def motion_of(runner: Any, work: Workload, ticks: int = TICKS, lane: int = 0) -> np.ndarray:
-    return np.array([runner.canonical(runner.tick(work.hand_at(k, lane), work.com_at(k))) for k in range(ticks)])
+def motion_of(runner: Any, work: Workload, steps: int = STEPS, lane: int = 0) -> np.ndarray:
+    return np.array([runner.canonical(runner.step(work.hand_at(k, lane), work.com_at(k))) for k in range(steps)])
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_a_wrong_motion_fails(work, paths):
         return {text.split()[0] for text in failures(judged(work, motion, lane))}
 
     good = paths["mink"]
-    assert named(np.tile(work.start, (TICKS, 1))) == {"hand"}
+    assert named(np.tile(work.start, (STEPS, 1))) == {"hand"}
     assert "hand" in named(good, lane=1)
     jump = good.copy()
     jump[20:, 0] += 1.1 * DT * work.velocity[0]
@@ -126,19 +126,19 @@ def test_every_robot_can_do_its_workload(name):
     """The exact answer of a QP, mink's, is within the judge's bounds wherever the curve is fastest."""
     work = workload(name)
     for lane in (0, 1):
-        assert not failures(judged(work, motion_of(peer("mink")(work), work, ticks=600, lane=lane), lane))
+        assert not failures(judged(work, motion_of(peer("mink")(work), work, steps=600, lane=lane), lane))
 
 
 def test_processes_take_turns_and_who_is_missing_is_left_out(work, tmp_path, capsys):
     said: list[str] = []
     with Race(work, pythons={"placo": "no-such-python"}, report=said.append) as race:
         entrants = [Entrant("one", "mink", cores=cores(1)), Entrant("nobody", "placo")]
-        (row,) = race.run(entrants, rounds=2, ticks=20, seconds=1.0)
-    assert row["timed_ticks"] == 40 and row["robots"] == 1
-    assert row["judged_ticks"] == 51 and row["motion"].shape == (1, 51, 7)
+        (row,) = race.run(entrants, rounds=2, steps=20, seconds=1.0)
+    assert row["timed_steps"] == 40 and row["robots"] == 1
+    assert row["judged_steps"] == 51 and row["motion"].shape == (1, 51, 7)
     assert 2**24 < row["peak_bytes"] < 2**34 and row["device"] is row["device_peak_bytes"] is None
-    assert 0.0 < row["tick_seconds_median"] <= row["tick_seconds_p99"] < 1.0
-    assert 0.0 < row["kernel_ratio"] <= row["tick_seconds_median"] / row["kernel_seconds"]
+    assert 0.0 < row["step_seconds_median"] <= row["step_seconds_p99"] < 1.0
+    assert 0.0 < row["kernel_ratio"] <= row["step_seconds_median"] / row["kernel_seconds"]
     assert "no-such-python" in race.missing["placo"] and any("placo is left out" in text for text in said)
     assert race.versions["mink"].keys() >= {"mink", "mujoco", "daqp", "python"}
     result = report.surroundings() | dict(robot="panda", one_robot=[row], many_robots=[], gradients=[], missing={})
@@ -187,10 +187,10 @@ def test_a_figure_has_a_line_of_each(tmp_path):
 def test_a_batch_that_would_take_too_long_is_left_out(work):
     said: list[str] = []
     with Race(work, pythons={}, report=said.append) as race:
-        small = dict(peer="mjinx", options=dict(batch=4), tick_seconds_median=0.6 * LONGEST)
+        small = dict(peer="mjinx", options=dict(batch=4), step_seconds_median=0.6 * LONGEST)
         large = Entrant("mjinx, batch 8", "mjinx", dict(batch=8))
         assert list(affordable([large], [small], race)) == [] and "left out" in said[-1]
-        quicker = small | dict(tick_seconds_median=0.4 * LONGEST)
+        quicker = small | dict(step_seconds_median=0.4 * LONGEST)
         assert list(affordable([large], [small | dict(peer="mink-warp"), quicker], race)) == [large]
 
 

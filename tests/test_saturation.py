@@ -614,16 +614,21 @@ class TestScheme:
             osik.NullSpace(method=cast(Any, "sideways"))
 
 
+@pytest.mark.parametrize("excess", [0.1, 1e-7])
 @pytest.mark.parametrize("backend", ["jax", "numba"])
-def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend):
-    """In closed form: the level asks 8 x - y = 65, x ends at its bound 7.9, and y = -1.8 but for roundoff at its own.
+def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend, excess):
+    """In closed form: the level asks 8 x - y = 65, x ends at its bound, and y = 8 x - 65 but for roundoff at its own.
 
     What y is beyond its bound is more than roundoff of the numbers, and less than that of the scale, which falls by a
-    65th of it. So nothing is blocked, and y follows what is asked.
+    65th of it. So nothing is blocked, and y follows what is asked. Without bounds x is 8, beyond its bound by
+    ``excess``: the larger one tries Numba's kernel, the smaller one plain JAX, whose penalty lowers the scale by a
+    share of it.
     """
     if backend == "numba":
         pytest.importorskip("numba")
-    lower, upper = jnp.array([-jnp.inf, -1.8 + 1.2e-10]), jnp.array([7.9, jnp.inf])
+    x = 8.0 - excess
+    y = 8.0 * x - 65.0
+    lower, upper = jnp.array([-jnp.inf, y + 1.2e-10]), jnp.array([x, jnp.inf])
 
     def solved(wanted):
         level = Level(jnp.array([[8.0, -1.0]]), wanted, wanted)
@@ -631,6 +636,6 @@ def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend):
 
     answer, derivative = jax.jit(lambda b: (solved(b), jax.jacfwd(lambda b: solved(b).x)(b)))(jnp.array([65.0]))
     assert answer.status == Status.SOLVED
-    np.testing.assert_allclose(answer.x, [7.9, -1.8], atol=1e-9)
+    np.testing.assert_allclose(answer.x, [x, y], atol=1e-9)
     np.testing.assert_allclose(answer.scales, 1.0, atol=1e-11)
     np.testing.assert_allclose(derivative[:, 0], [0.0, -1.0], atol=1e-9)

@@ -34,7 +34,7 @@ def test_a_row_is_right(path):
     assert result["jax"] == jax.__version__ and result["platform"] == "cpu"
     (row,) = result["rows"]
     assert row["solved"] == 1.0 and row["error"] < 1e-12
-    assert row["ticks_per_second"] == row["batch"] / row["seconds"] > 0.0
+    assert row["steps_per_second"] == row["batch"] / row["seconds"] > 0.0
     assert row["compile_seconds"] > 0.0 and row["program_bytes"] > row["batch"] * 7 * 8
 
 

@@ -62,17 +62,17 @@ def directions(work: Workload) -> np.ndarray:
 
 def _beyond(work: Workload) -> list[Case]:
     """Held for 4 s, judged in the last 2."""
-    ticks = 2 * CHUNK
+    steps = 2 * CHUNK
     places = [farthest(work, u) + BEYOND * u for u in directions(work)]
-    return [Case("beyond", _held(place, ticks), _held(work.com_start, ticks), CHUNK) for place in places]
+    return [Case("beyond", _held(place, steps), _held(work.com_start, steps), CHUNK) for place in places]
 
 
 def _jumps(work: Workload) -> Case:
     """Uniform in a ball around the hand's place at the start."""
-    rng, ticks = np.random.default_rng(SEED), 2 * CHUNK
-    away = in_ball(rng, ticks // STEPS, RADIUS[work.robot])
+    rng, steps = np.random.default_rng(SEED), 2 * CHUNK
+    away = in_ball(rng, steps // STEPS, RADIUS[work.robot])
     path = np.repeat(work.hand_position + away, STEPS, axis=0)
-    return Case("jumps", path, _held(work.com_start, ticks))
+    return Case("jumps", path, _held(work.com_start, steps))
 
 
 def _stretch(work: Workload) -> Case:
@@ -86,9 +86,9 @@ def _stretch(work: Workload) -> Case:
 
 def _inside(work: Workload) -> Case:
     """The standard workload's curve of the hand; judged after its first second."""
-    ticks = 2 * CHUNK
-    path = np.array([work.hand_at(k) for k in range(ticks)])
-    return Case("inside", path, _held(work.com_start, ticks), CHUNK // 2)
+    steps = 2 * CHUNK
+    path = np.array([work.hand_at(k) for k in range(steps)])
+    return Case("inside", path, _held(work.com_start, steps), CHUNK // 2)
 
 
 def _squat(work: Workload) -> Case:
@@ -100,8 +100,8 @@ def _squat(work: Workload) -> Case:
     return Case("squat", hand, com, CHUNK)
 
 
-def _held(place: np.ndarray, ticks: int) -> np.ndarray:
-    return np.tile(place, (ticks, 1))
+def _held(place: np.ndarray, steps: int) -> np.ndarray:
+    return np.tile(place, (steps, 1))
 
 
 def _eased(s: np.ndarray) -> np.ndarray:

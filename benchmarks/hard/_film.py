@@ -29,7 +29,7 @@ from ._motion import Entrant, Motion, motions
 
 FILM = Path(__file__).parents[2] / "docs" / "images" / "beyond_reach.gif"
 GAIN = 200.0
-TICKS = 100
+STEPS = 100
 """That are filmed, each of them: an arm that turns round at each step is still in every second one."""
 SLOWER = 8
 """How many times slower than it was the film shows it; DT times this is a whole number of hundredths, as GIFs count."""
@@ -61,7 +61,7 @@ def _pictures(found: dict[str, Motion], work: Workload, case: Case) -> Iterator[
     robot = standing(work)
     shape = robot_parts(robot, look=viewer.read_look(file_of("g1")))
     order = places(robot, work)
-    paths = [_own(motion.path, order)[: TICKS + 1] for motion in found.values()]
+    paths = [_own(motion.path, order)[: STEPS + 1] for motion in found.values()]
     across = Camera((0.0, 0.0, 0.0), 1.0, AZIMUTH, 0.0, 1.0).axes[0]
     shifts = np.array([-APART * across, APART * across])
     goals = case.hand[0] + shifts

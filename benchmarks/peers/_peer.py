@@ -25,7 +25,7 @@ class Peer(Protocol):
     packages: tuple[str, ...]
     """Whose versions matter."""
 
-    def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
+    def step(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
         """One step, targets in and configuration out, in the library's own layout; this is timed."""
         ...
 

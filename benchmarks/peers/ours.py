@@ -63,17 +63,17 @@ class Runner:
         self.robot = standing(work)
         self.places = np.array(places(self.robot, work))
         start = self.robot.q0
-        tick = tick_of(self.robot, work, SCHEMES[scheme](), start)
-        none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), _warm_start(tick, start))
+        step = step_of(self.robot, work, SCHEMES[scheme](), start)
+        none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), _warm_start(step, start))
         self.q, self.warm_start = start, none
-        self.program, self.warm = jax.jit(tick), warm
+        self.program, self.warm = jax.jit(step), warm
         if batch is not None:
-            self.program = sharded(tick, in_axes=(0, 0, 0, None))
+            self.program = sharded(step, in_axes=(0, 0, 0, None))
             self.q, self.warm_start = jax.tree.map(lambda a: jnp.tile(a, (batch, *[1] * a.ndim)), (start, none))
         self.none = self.warm_start
         self.fine: list[jax.Array] = []
 
-    def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
+    def step(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Targets, QP, integration in one program."""
         self.q, self.warm_start, fine = self.program(
             self.q, self.warm_start if self.warm else self.none, hand.astype(self.q.dtype), com.astype(self.q.dtype)
@@ -130,13 +130,13 @@ def tasks_of(robot: osik.Robot, work: Workload, start: jax.Array) -> dict[str, o
     return tasks
 
 
-def tick_of(robot: osik.Robot, work: Workload, scheme: osik.Scheme, start: jax.Array) -> Callable[..., Any]:
+def step_of(robot: osik.Robot, work: Workload, scheme: osik.Scheme, start: jax.Array) -> Callable[..., Any]:
     """(q, warm start, hand, centre of mass) to (q, warm start, solved), as a user's control loop would have it."""
     tasks = tasks_of(robot, work, start)
     limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)
     rotation = jnp.asarray(work.hand_rotation, robot.q0.dtype)
 
-    def tick(q: jax.Array, warm_start: Any, hand: jax.Array, com: jax.Array) -> tuple[jax.Array, Any, jax.Array]:
+    def step(q: jax.Array, warm_start: Any, hand: jax.Array, com: jax.Array) -> tuple[jax.Array, Any, jax.Array]:
         aimed = tasks | {"hand": tasks["hand"].replace(target=(hand, rotation))}
         if "com" in tasks:
             aimed["com"] = tasks["com"].replace(target=com)
@@ -144,10 +144,10 @@ def tick_of(robot: osik.Robot, work: Workload, scheme: osik.Scheme, start: jax.A
         q = osik.integrate(robot, q, solution.velocity, DT)
         return q, solution.warm_start, solution.status == osik.Status.SOLVED
 
-    return tick
+    return step
 
 
-def _warm_start(tick: Callable[..., Any], start: jax.Array) -> Any:
+def _warm_start(step: Callable[..., Any], start: jax.Array) -> Any:
     """Shapes of a warm start, from a step that is traced and not run."""
     point = jnp.zeros(3, start.dtype)
-    return jax.eval_shape(lambda q: tick(q, None, point, point)[1], start)
+    return jax.eval_shape(lambda q: step(q, None, point, point)[1], start)

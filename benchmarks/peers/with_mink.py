@@ -40,7 +40,7 @@ class Runner:
         speeds = dict(zip(work.joints, work.velocity, strict=True))
         self.limits = [mink.ConfigurationLimit(model, gain=1.0), mink.VelocityLimit(model, speeds)]
 
-    def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
+    def step(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Targets, QP, integration."""
         self.hand.set_target(mink.SE3.from_rotation_and_translation(self.hand_rotation, hand))
         if self.work.feet:

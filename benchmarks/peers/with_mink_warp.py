@@ -54,7 +54,7 @@ class Runner:
             self.configuration, limits=limits, admm_iters=iterations, damping=damping
         )
 
-    def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
+    def step(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Targets, QP, integration."""
         self.pose[:, 4:] = hand
         with warp.ScopedDevice(self.where):

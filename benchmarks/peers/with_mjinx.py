@@ -58,12 +58,12 @@ class Runner:
         start = self.coordinates.own(work.start)
         self.problem = self._problem(start)
         self.solver = mjinx.solvers.LocalIKSolver(self.model, eq_qp_solve=equations, maxiter=iterations)
-        tick = self._tick()
-        self.program = jax.jit(tick if batch is None else jax.vmap(tick, in_axes=(0, 0, None)))
+        step = self._step()
+        self.program = jax.jit(step if batch is None else jax.vmap(step, in_axes=(0, 0, None)))
         self.q = jnp.asarray(start if batch is None else np.tile(start, (batch, 1)), float)
         self.fine: list[jax.Array] = []
 
-    def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
+    def step(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Targets, QP, integration in one program."""
         self.q, fine = self.program(self.q, hand.astype(self.q.dtype), com.astype(self.q.dtype))
         self.fine.append(fine)
@@ -105,11 +105,11 @@ class Runner:
         problem.add_component(mjinx.components.barriers.JointBarrier("limits", gain=gain, **base))
         return problem
 
-    def _tick(self) -> Callable[..., tuple[jax.Array, jax.Array]]:
+    def _step(self) -> Callable[..., tuple[jax.Array, jax.Array]]:
         solver, given, memory = self.solver, self.problem.compile(), self.solver.init()
         rotation = SO3.from_matrix(jnp.asarray(self.work.hand_rotation, float))
 
-        def tick(q: jax.Array, hand: jax.Array, com: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def step(q: jax.Array, hand: jax.Array, com: jax.Array) -> tuple[jax.Array, jax.Array]:
             with jdc.copy_and_mutate(given, validate=False) as aimed:
                 aimed.components[self.work.hand].target_frame = SE3.from_rotation_and_translation(rotation, hand)
                 if self.work.feet:
@@ -118,7 +118,7 @@ class Runner:
             q = mjinx.configuration.integrate(self.model, q, solution.v_opt, DT)
             return q, solution.status == _SOLVED
 
-        return tick
+        return step
 
 
 _SOLVED = 1

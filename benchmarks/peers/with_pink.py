@@ -34,7 +34,7 @@ class Runner:
         self._set_up_tasks()
         self.limits = [pink.limits.ConfigurationLimit(model, config_limit_gain=1.0), pink.limits.VelocityLimit(model)]
 
-    def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
+    def step(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Targets, QP, integration."""
         self.hand.set_target(pin.SE3(self.work.hand_rotation, hand))
         if self.work.feet:

@@ -33,7 +33,7 @@ class Runner:
         self._set_up_tasks()
         self.solver.add_regularization_task(damping)
 
-    def tick(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
+    def step(self, hand: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Targets, QP and integration in one call."""
         self.pose[:3, 3] = hand
         self.hand.T_world_frame = self.pose

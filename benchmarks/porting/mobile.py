@@ -15,7 +15,7 @@ from jaxtyping import Array
 import osik_jax as osik
 
 DT = 0.005
-TICKS = 400
+STEPS = 400
 ITERATIONS = 20
 """Steps towards each target, as in the example; fewer where the hand is at its target."""
 THRESHOLD = 1e-4
@@ -70,7 +70,7 @@ def report() -> Iterator[str]:
 def target_at(robot: osik.Robot, where: Where) -> tuple[np.ndarray, np.ndarray]:
     """Positions (steps, 3) and the rotation of the hand's target: a curve about the start, or 0.6 m ahead of it."""
     position, rotation = osik.forward_kinematics(robot, jnp.asarray(START)).frame_pose(robot, "pinch")
-    t = DT * np.arange(TICKS)
+    t = DT * np.arange(STEPS)
     near = [0.1 * np.sin(2.0 * t), 0.15 * np.sin(1.5 * t), 0.1 * (np.cos(2.0 * t) - 1.0)]
     far = [0.6 * np.minimum(t, 1.0), 0.1 * np.sin(1.5 * t), 0.0 * t]
     return np.asarray(position) + np.stack(near if where == "near" else far, axis=1), np.asarray(rotation)
@@ -127,19 +127,19 @@ def _in_osik(
         there = jnp.maximum(jnp.linalg.norm(error[:3]), jnp.linalg.norm(error[3:])) <= THRESHOLD
         return q, count + 1, there
 
-    def tick(q: Array, point: Array) -> tuple[Array, Array]:
+    def control_step(q: Array, point: Array) -> tuple[Array, Array]:
         task = hand.replace(target=(point, rotation))
         start = q, jnp.asarray(0), jnp.asarray(False)
         q, *_ = jax.lax.while_loop(lambda s: (s[1] < ITERATIONS) & ~s[2], lambda s: step(s, task), start)
         return q, q
 
-    _, path = jax.jit(lambda q: jax.lax.scan(tick, q, jnp.asarray(points)))(jnp.asarray(START))
+    _, path = jax.jit(lambda q: jax.lax.scan(control_step, q, jnp.asarray(points)))(jnp.asarray(START))
     return np.concatenate([START[None], np.asarray(path)])
 
 
 def _measured(robot: osik.Robot, where: Where, motion: np.ndarray, reference: np.ndarray) -> list[str]:
     hand = osik.forward_kinematics(robot, jnp.asarray(motion[-1])).frame_pose(robot, "pinch")[0]
-    moved = np.abs(np.diff(motion, axis=0)).max(axis=1)[TICKS // 2 :]
+    moved = np.abs(np.diff(motion, axis=0)).max(axis=1)[STEPS // 2 :]
     return [
         f"{1e3 * np.linalg.norm(np.asarray(hand) - target_at(robot, where)[0][-1]):.2f}",
         f"{np.median(moved):.4f}",

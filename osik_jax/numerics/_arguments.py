@@ -9,9 +9,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, DTypeLike, Float
 
 from .._errors import OsikTypeError, OsikValueError
+
+
+def float_dtype(dtype: DTypeLike, what: str) -> np.dtype:
+    """Return a floating-point type that JAX has now; ``float`` stands for JAX's default.
+
+    Raises:
+        TypeError: no floating-point type.
+        ValueError: float64 while ``jax_enable_x64`` is off.
+    """
+    wanted = np.dtype(jnp.result_type(float) if dtype is float else dtype)
+    if not jnp.issubdtype(wanted, np.floating):
+        raise OsikTypeError(f"dtype is {dtype!r}; {what} floating-point: float32 or float64")
+    if wanted == np.float64 and jnp.result_type(float) != wanted:
+        raise OsikValueError("float64 needs jax.config.update('jax_enable_x64', True) first")
+    return wanted
 
 
 def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:

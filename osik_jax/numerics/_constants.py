@@ -58,7 +58,7 @@ BOUND_DISTANCE = 1e-9
 SATURATION_RESIDUAL = 2e-9
 """Relative to the terms that x is made of: the largest residual of the active bounds with which an answer is taken."""
 SATURATION_RANK = 1e-9
-"""In a kernel: the part of a joint's unit vector in the null space and outside the span of held ones, with less of
+"""In a kernel: the part of a joint's unit vector in the null space and outside the span of saturated ones, with less of
 which it depends on them; of the largest in a combination, with less of which a joint does not stop the motion."""
 LOOSE_SATURATION_RANK = 1e-6
 """The same for a second attempt, where the answer of the first does not hold: joints nearly depended on each other."""

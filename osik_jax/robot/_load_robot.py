@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from .._errors import OsikTypeError
 from . import loading
 from ._home_configuration import Home
-from ._robot import LockedJoints, PositionLimits, Robot
+from ._robot import Robot
+from .loading import LoadOptions, LockedJoints, PositionLimits
 
 
 def load_robot(
@@ -44,11 +45,10 @@ def load_robot(
     if not isinstance(name, str):
         raise OsikTypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, loading.ROBOTS))}")
     load = loading.embedded if name in loading.ROBOTS else loading.described
-    fields = load(
-        name,
+    options = LoadOptions(
         floating_base=floating_base,
         velocity_limits=velocity_limits,
         position_limits=position_limits,
         locked_joints=locked_joints,
     )
-    return Robot._at_home(fields, home)
+    return Robot._at_home(load(name, options), home)

@@ -9,22 +9,18 @@ from typing import Any, Self
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jaxtyping import Array, ArrayLike, DTypeLike, Float, Num
 
-from .._errors import OsikKeyError, OsikTypeError, OsikValueError
+from ..numerics._arguments import float_dtype
 from . import loading
+from ._configuration import check_configuration, with_joints
 from ._describe import described
 from ._home_configuration import Home, home_configuration
 from ._links import Factors, scaled_leaves
-from ._tree import BALL, FREE, KinematicTree, ModelHolder
-
-LockedJoints = Iterable[str] | Mapping[str, float]
-PositionLimits = Mapping[str, tuple[float, float]]
-_UNIT_QUATERNION_TOLERANCE = 1e-8
+from ._tree import FREE, KinematicTree, ModelHolder
+from .loading import LoadOptions, LockedJoints, PositionLimits
 
 
 class Robot(eqx.Module):
@@ -134,8 +130,7 @@ class Robot(eqx.Module):
             OsikWarning: the base is fixed because nothing in the file looks like feet, or a joint cannot move because
                 its range is a single value.
         """
-        fields = loading.from_urdf(
-            urdf,
+        options = LoadOptions(
             floating_base=floating_base,
             velocity_limits=velocity_limits,
             position_limits=position_limits,
@@ -143,7 +138,7 @@ class Robot(eqx.Module):
             collision_meshes=collision_meshes,
             package_dirs=package_dirs,
         )
-        return cls._at_home(fields, home)
+        return cls._at_home(loading.from_urdf(urdf, options), home)
 
     @classmethod
     def from_mjcf(
@@ -185,14 +180,13 @@ class Robot(eqx.Module):
             OsikWarning: a joint cannot move because its range is a single value. MuJoCo reads ``range="0 0"`` as no
                 limit at all, and so does this.
         """
-        fields = loading.from_mjcf(
-            mjcf,
+        options = LoadOptions(
             floating_base=floating_base,
             velocity_limits=velocity_limits,
             position_limits=position_limits,
             locked_joints=locked_joints,
         )
-        return cls._at_home(fields, home)
+        return cls._at_home(loading.from_mjcf(mjcf, options), home)
 
     @classmethod
     def from_mjmodel(
@@ -223,10 +217,10 @@ class Robot(eqx.Module):
         Warns:
             OsikWarning: a joint cannot move because its range is a single value.
         """
-        fields = loading.from_mjmodel(
-            model, velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked_joints
+        options = LoadOptions(
+            velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked_joints
         )
-        return cls._at_home(fields, home)
+        return cls._at_home(loading.from_mjmodel(model, options), home)
 
     @classmethod
     def _at_home(cls, fields: Mapping[str, Any], home: Home | None) -> Self:
@@ -290,7 +284,7 @@ class Robot(eqx.Module):
         Raises:
             KeyError: no such joint, or it is locked.
         """
-        return self.tree.qpos_address[self._owner(name)]
+        return self.tree.qpos_address[self.tree.owner(name)]
 
     def joint_dof_index(self, name: str) -> int:
         """Where a joint's velocities start in v; a follower sits where its leader sits.
@@ -298,15 +292,7 @@ class Robot(eqx.Module):
         Raises:
             KeyError: no such joint, or it is locked.
         """
-        return self.tree.dof_address[self._owner(name)]
-
-    def _owner(self, name: str) -> int:
-        joint = self.tree.joint(name)
-        if joint in self.tree.locked:
-            raise OsikKeyError(
-                f"joint {name!r} is locked, so it has no place in q; joints: {', '.join(self.joint_names)}"
-            )
-        return {f: leader for f, leader, _ in self.tree.followers}.get(joint, joint)
+        return self.tree.dof_address[self.tree.owner(name)]
 
     def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
         """The configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
@@ -320,18 +306,7 @@ class Robot(eqx.Module):
             KeyError: no such joint, or it is locked.
             ValueError: a free or ball joint, which no single number sets.
         """
-        q = jnp.asarray(self.q0 if base is None else base)
-        coefficient = self.tree.qpos_source[1]
-        for name, value in joints.items():
-            joint = self.tree.joint(name)
-            if self.tree.joint_types[joint] in (FREE, BALL):
-                raise OsikValueError(
-                    f"joint {name!r} is free or ball: set its entries of q, from joint_qpos_index({name!r})"
-                )
-            full = self.tree.full_qpos_address[joint]
-            index = self.joint_qpos_index(name)
-            q = q.at[index].set((value - self.qpos_offset[full]) / coefficient[full])
-        return q
+        return with_joints(self, joints, base)
 
     def with_home(self, home: Home) -> Self:
         """The same robot with another ``q0``, which is what tasks made from then on aim at by default.
@@ -365,11 +340,7 @@ class Robot(eqx.Module):
             TypeError: no floating-point type.
             ValueError: float64 while ``jax_enable_x64`` is off.
         """
-        wanted = np.dtype(jnp.result_type(float) if dtype is float else dtype)
-        if not jnp.issubdtype(wanted, np.floating):
-            raise OsikTypeError(f"dtype is {dtype!r}; a robot's numbers are floating-point: float32 or float64")
-        if wanted == np.float64 and jnp.result_type(float) != wanted:
-            raise OsikValueError("float64 needs jax.config.update('jax_enable_x64', True) first")
+        wanted = float_dtype(dtype, "a robot's numbers are")
         return jax.tree.map(lambda leaf: leaf.astype(wanted), self)
 
     def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
@@ -424,23 +395,4 @@ class Robot(eqx.Module):
             q: what should be a configuration. (nq,)
             name: what the message calls it.
         """
-        shape = jnp.shape(q)
-        if shape != (self.nq,):
-            raise OsikValueError(
-                f"{name} has shape {shape}, this robot's configurations have shape ({self.nq},): "
-                f"{', '.join(self.tree.joint_names[j] for j in self.tree.independent)}. Batch with jax.vmap."
-            )
-        if isinstance(q, jax.core.Tracer):
-            return
-        values = np.asarray(q)
-        if not np.isfinite(values).all():
-            raise OsikValueError(f"{name} is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
-        for joint, start in self.tree.qpos_address.items():
-            kind = self.tree.joint_types[joint]
-            if kind in (FREE, BALL):
-                first = start + (3 if kind == FREE else 0)
-                if np.linalg.norm(values[first : first + 4]) < _UNIT_QUATERNION_TOLERANCE:
-                    raise OsikValueError(
-                        f"{name}[{first}:{first + 4}], the quaternion of joint {self.tree.joint_names[joint]!r}, is "
-                        "zero; the identity is (1, 0, 0, 0)"
-                    )
+        check_configuration(self, q, name)

@@ -11,7 +11,7 @@ import jax
 import mujoco
 import numpy as np
 
-from .._errors import unknown_name
+from .._errors import OsikKeyError, unknown_name
 
 FREE, BALL, SLIDE, HINGE = (
     int(t)
@@ -255,6 +255,18 @@ class KinematicTree:
             return self._joint_index[name]
         except (KeyError, TypeError):
             raise unknown_name("joint", name, self.joint_names) from None
+
+    def owner(self, name: str) -> int:
+        """Index of the independent joint whose entries of q and v move a joint: its leader, or itself.
+
+        Raises:
+            KeyError: no such joint, or it is locked.
+        """
+        joint = self.joint(name)
+        if joint in self.locked:
+            names = (self.joint_names[j] for j in self.independent if self.joint_types[j] != FREE)
+            raise OsikKeyError(f"joint {name!r} is locked, so it has no place in q; joints: {', '.join(names)}")
+        return {follower: leader for follower, leader, _ in self.followers}.get(joint, joint)
 
     @cached_property
     def _frame_index(self) -> dict[str, int]:

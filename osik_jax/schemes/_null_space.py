@@ -74,7 +74,8 @@ class NullSpace(Scheme):
         descent = -self.potential_gain * limit_potential_gradient(
             problem.position, problem.position_lower, problem.position_upper, self.margin
         )
-        damping = problem.dampings(constraints, self.damping, self.curvature_damping, held=self.method != "reverse")
+        below_others = self.method != "reverse"
+        damping = problem.dampings(constraints, self.damping, self.curvature_damping, below_others=below_others)
         answer = solve_nullspace(
             levels,
             *((problem.lower, problem.upper) if self.saturates else ()),

@@ -22,9 +22,9 @@ from ..solvers._level import positive_root
 from ..tasks import TaskRows
 from ..tasks._curvature import length, row_sums
 
-_HELD = 2.0
-"""Of a priority's curvature damping, where others are above it: a pull that it cannot meet is held by their rows, which
-bend too."""
+_BELOW_OTHERS = 2.0
+"""Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it
+cannot meet."""
 
 
 class VelocityProblem(eqx.Module):
@@ -82,7 +82,7 @@ class VelocityProblem(eqx.Module):
         constant: Float[Array, ""],
         curvature: Float[Array, ""] | float,
         *,
-        held: bool = True,
+        below_others: bool = True,
     ) -> list[Damping]:
         """Of each level of ``levels``: the constraints bend, but damping would let them off a part of what they ask.
 
@@ -90,14 +90,14 @@ class VelocityProblem(eqx.Module):
             constraints: as ``constraints`` has them.
             constant: damping that each priority has anyway.
             curvature: kappa, the share that each takes of its curvature.
-            held: whether what a priority cannot meet is held by the rows of the levels above it.
+            below_others: whether the rows of the levels above a priority balance what it cannot meet.
         """
         found = []
         if constraints is not None:
             found.append(Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping())
         for names in self.by_priority():
             pulls = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
-            share = (_HELD if held and found else 1.0) * curvature
+            share = (_BELOW_OTHERS if below_others and found else 1.0) * curvature
             found.append(
                 Damping(
                     constant, share * self.curvature(names), length(jnp.concatenate(pulls)), share * self.bends(names)
@@ -109,7 +109,7 @@ class VelocityProblem(eqx.Module):
         """What a motion of each dof costs these tasks at second order, along a unit pull (``row_sums``).
 
         0 for those of ball and free joints: a box for the components of a turn would depend on where the world's axes
-        point. What stands is held by its legs.
+        point. Where a robot stands, its legs keep its base from turning.
         """
         arms = [jnp.broadcast_to(self.rows[name].levers, self.lower.shape) for name in names]
         farthest = jnp.max(jnp.stack(arms), axis=0)

@@ -97,7 +97,7 @@ def solve_clip(n, N, system, damping, right, x, upper, near, work):
         near: memory for N of all frames. (F N, N)
         work: more memory. (N + 2 m + 2, N)
     """
-    rows, weight, first, second = system.moving, system.held, system.first, system.second
+    rows, weight, first, second = system.moving, system.weight, system.first, system.second
     frames, m = weight.shape
     while frames > 1 and not (is_coupled(weight, first, second, frames - 1) or any_number(right[frames - 1])):
         frames -= 1  # behind a clip's end

@@ -225,7 +225,7 @@ def clipped(x, lower, upper):
 def ask_joints(K, V, q, alone, gradient):
     """What joints cost by themselves, wishes and bounds."""
     posture, limit, stiffness = V.wishes[POSTURE], V.wishes[LIMIT], V.wishes[STIFFNESS]
-    soft, stiff = 0.0, 0.0
+    soft, penalty = 0.0, 0.0
     for j in range(len(alone)):
         alone[j], gradient[j] = 0.0, 0.0
         if K.joints[j] >= 0:
@@ -235,8 +235,8 @@ def ask_joints(K, V, q, alone, gradient):
             alone[j] = posture + stiffness * weight
             gradient[j] = posture * off + stiffness * weight * outside
             soft += 0.5 * posture * off * off
-            stiff += 0.5 * weight * outside * outside
-    return soft, stiff
+            penalty += 0.5 * weight * outside * outside
+    return soft, penalty
 
 
 @lean
@@ -253,23 +253,23 @@ def ask(K, V, W, G, t, J, n):
     if K.counts[BENDS] != 0:
         row, more = ask_turn(K, V, W, J, row, 1, nine(G.torso[t]), V.wishes[TORSO], n)
         soft += more
-    row, stiff = ask_floor(K, V, W, J, row, G.contact[t], n)
+    row, penalty = ask_floor(K, V, W, J, row, G.contact[t], n)
     row, more = ask_apart(K, V, W, J, row, n)
-    stiff += more
+    penalty += more
     row, more = ask_balance(K, V, W, J, row, G.contact[t], n)
-    return row, soft, stiff + more
+    return row, soft, penalty + more
 
 
 @lean
-def tie(J, row, moving, held, move, held_next, move_next, n):
+def tie(J, row, moving, weight, move, weight_next, move_next, n):
     """Rows of standing points, that weigh by the frame before and by the next: the number of rows then."""
     for k in range(POINTS):
-        weight = held[k] + held_next[k]
-        if weight > 0.0:
-            root = np.sqrt(weight)
+        both = weight[k] + weight_next[k]
+        if both > 0.0:
+            root = np.sqrt(both)
             for j in range(n):
                 J[row, j] = root * moving[k, j]
-            J[row, n] = (held[k] * move[k] - held_next[k] * move_next[k]) / root
+            J[row, n] = (weight[k] * move[k] - weight_next[k] * move_next[k]) / root
             row += 1
     return row
 
@@ -302,9 +302,9 @@ def ask_clip(K, V, W, G, R, q, out):
         what wishes cost, and what bounds do.
     """
     frames, n = out.gradient.shape
-    soft, stiff = 0.0, 0.0
+    soft, penalty = 0.0, 0.0
     for k in range(POINTS):
-        R.held[2, k] = R.move[2, k] = 0.0
+        R.weight[2, k] = R.move[2, k] = 0.0
     for t in range(frames):
         now, before = t % 2, 1 - t % 2
         there, moving = G.present[t] != 0.0, out.moving[t * POINTS : t * POINTS + POINTS]
@@ -317,19 +317,19 @@ def ask_clip(K, V, W, G, R, q, out):
         for k in range(POINTS):
             weight = V.wishes[STANCE] * G.contact[t, k // 2] * G.contact[t - 1, k // 2] if t > 0 else 0.0
             move = R.points[now, k] - R.points[before, k] if weight != 0.0 else 0.0
-            R.held[now, k], R.move[now, k] = V.wishes[STIFFNESS] * weight, move
-            out.held[t, k] = R.held[now, k]
-            stiff += 0.5 * weight * move * move
+            R.weight[now, k], R.move[now, k] = V.wishes[STIFFNESS] * weight, move
+            out.weight[t, k] = R.weight[now, k]
+            penalty += 0.5 * weight * move * move
         if t > 0:
             close(R, out, t - 1, now, n)
         if there:
             wishes, bounds = ask_joints(K, V, q[t], out.alone[t], out.gradient[t])
-            soft, stiff = soft + wishes, stiff + bounds
+            soft, penalty = soft + wishes, penalty + bounds
             rows = R.rows[now * R.most : now * R.most + R.most]
             R.count[now], wishes, bounds = ask(K, V, W, G, t, rows, n)
-            soft, stiff = soft + wishes, stiff + bounds
+            soft, penalty = soft + wishes, penalty + bounds
     close(R, out, frames - 1, 2, n)
-    return soft, stiff
+    return soft, penalty
 
 
 @lean
@@ -337,5 +337,5 @@ def close(R, out, t, following, n):
     """Finishes frame t, of which ``following`` says where the standing points of the next are."""
     own, N = t % 2, out.blocks.shape[1]
     J, moving = R.rows[own * R.most : own * R.most + R.most], out.moving[t * POINTS : t * POINTS + POINTS]
-    count = tie(J, R.count[own], moving, R.held[own], R.move[own], R.held[following], R.move[following], n)
+    count = tie(J, R.count[own], moving, R.weight[own], R.move[own], R.weight[following], R.move[following], n)
     finish(J, count, out.blocks[t * N : t * N + N], out.gradient[t], n)

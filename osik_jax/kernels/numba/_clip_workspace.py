@@ -124,7 +124,7 @@ class Kept(NamedTuple):
 
     rows: np.ndarray
     points: np.ndarray
-    held: np.ndarray
+    weight: np.ndarray
     move: np.ndarray
     count: np.ndarray
     most: int
@@ -135,7 +135,7 @@ class Linearised(NamedTuple):
 
     blocks: np.ndarray  # (F N, N)
     moving: np.ndarray  # (F POINTS, N)
-    held: np.ndarray  # (F, POINTS)
+    weight: np.ndarray  # (F, POINTS), of what standing points move
     gradient: np.ndarray  # (F, n)
     alone: np.ndarray  # (F, n)
     first: np.ndarray  # (F, n)
@@ -225,6 +225,6 @@ def kept(c, at):
     N, most = padded(c[DOFS] + 1), ROWS + 2 * c[ABOVE] + c[MOST_PAIRS]
     rows, at = matrix(at, 2 * most, N), at + 16 * most * N
     points, at = matrix(at, 2, POINTS), at + 16 * POINTS
-    held, at = matrix(at, 3, POINTS), at + 24 * POINTS
+    weight, at = matrix(at, 3, POINTS), at + 24 * POINTS
     move, at = matrix(at, 3, POINTS), at + 24 * POINTS
-    return Kept(rows, points, held, move, whole_numbers(at, 2), most), at + 8
+    return Kept(rows, points, weight, move, whole_numbers(at, 2), most), at + 8

@@ -73,7 +73,7 @@ def limit_step(V, there, t, step, out):
 @lean
 def limit_change(K, V, there, t, before, step, out):
     """What a change of steps costs, and one beyond the limits of acceleration, in frames t to t + 2."""
-    limit, stiffness, soft, stiff = V.wishes[SPEED], V.wishes[STIFFNESS], 0.0, 0.0
+    limit, stiffness, soft, penalty = V.wishes[SPEED], V.wishes[STIFFNESS], 0.0, 0.0
     for j in range(len(step)):
         value, bound = there * (step[j] - before[j]), V.change[j]
         smooth = there * (V.wishes[SMOOTH] if K.joints[j] >= 0 else V.wishes[SMOOTH_BASE])
@@ -81,7 +81,7 @@ def limit_change(K, V, there, t, before, step, out):
         beyond = limit / bound**2 if over != 0.0 else 0.0
         c, a = smooth + stiffness * beyond, smooth * value + stiffness * beyond * over
         soft += 0.5 * smooth * value * value
-        stiff += 0.5 * beyond * over * over
+        penalty += 0.5 * beyond * over * over
         out.alone[t, j] += c
         out.alone[t + 1, j] += 4.0 * c
         out.alone[t + 2, j] += c
@@ -91,13 +91,13 @@ def limit_change(K, V, there, t, before, step, out):
         out.gradient[t, j] += a
         out.gradient[t + 1, j] -= 2.0 * a
         out.gradient[t + 2, j] += a
-    return soft, stiff
+    return soft, penalty
 
 
 @lean
 def linearise(K, V, W, G, R, T, q, out):
     """Gauss-Newton's system at some configurations; what wishes and bounds cost there."""
-    soft, stiff = ask_clip(K, V, W, G, R, q, out)
+    soft, penalty = ask_clip(K, V, W, G, R, q, out)
     frames = len(q)
     for t in range(frames):
         fill(out.first[t], 0.0)
@@ -107,13 +107,13 @@ def linearise(K, V, W, G, R, T, q, out):
             fill(T.before, 0.0)
             continue
         difference(K.scalars, K.turns, q[t], q[t + 1], T.step)
-        stiff += limit_step(V, G.present[t + 1], t, T.step, out)
+        penalty += limit_step(V, G.present[t + 1], t, T.step, out)
         if t > 0:
             wishes, bounds = limit_change(K, V, G.present[t + 1], t - 1, T.before, T.step, out)
-            soft, stiff = soft + wishes, stiff + bounds
+            soft, penalty = soft + wishes, penalty + bounds
         for j in range(len(T.step)):
             T.before[j] = T.step[j]
-    return soft, stiff
+    return soft, penalty
 
 
 @lean
@@ -158,7 +158,7 @@ def descend(K, V, W, G, R, T, C, free, q, other, here, there, cost):
     stiffness, damping, growth = C[STIFFNESS_AT_FIRST], C[DAMPING_AT_FIRST], C[CAREFUL]
     ready, settled, iterations = False, 0.0, 0
     V.wishes[STIFFNESS] = stiffness
-    soft, stiff = linearise(K, V, W, G, R, T, q, here)
+    soft, penalty = linearise(K, V, W, G, R, T, q, here)
     swapped = False
     while iterations < C[MOST_ITERATIONS]:
         if (C[UNTIL_SETTLED] != 0.0 and settled >= C[SETTLED]) or (C[UNTIL_READY] != 0.0 and ready):
@@ -167,14 +167,14 @@ def descend(K, V, W, G, R, T, C, free, q, other, here, there, cost):
         V.wishes[STIFFNESS] = stiffer
         if swapped:
             step_from(K, C, T, there, free, damping, other, q)
-            soft_there, stiff_there = linearise(K, V, W, G, R, T, q, here)
+            soft_there, penalty_there = linearise(K, V, W, G, R, T, q, here)
         else:
             step_from(K, C, T, here, free, damping, q, other)
-            soft_there, stiff_there = linearise(K, V, W, G, R, T, other, there)
-        before, after = soft + stiffness * stiff, soft_there + stiffness * stiff_there
+            soft_there, penalty_there = linearise(K, V, W, G, R, T, other, there)
+        before, after = soft + stiffness * penalty, soft_there + stiffness * penalty_there
         better = after < before
         small = C[LITTLE] * soft
-        little = stiffness >= 1.0 and before - after < small and (better or stiff < small)
+        little = stiffness >= 1.0 and before - after < small and (better or penalty < small)
         if little:
             settled += 2.0 if better else 1.0
         elif better:
@@ -186,9 +186,9 @@ def descend(K, V, W, G, R, T, C, free, q, other, here, there, cost):
         growth = C[CAREFUL] if better else 2.0 * growth
         if better:
             ready = before - after < C[SLOWING] * before
-            soft, stiff, stiffness, swapped = soft_there, stiff_there, stiffer, not swapped
+            soft, penalty, stiffness, swapped = soft_there, penalty_there, stiffer, not swapped
         iterations += 1
-    cost[0], cost[1] = soft, stiff
+    cost[0], cost[1] = soft, penalty
     return iterations, swapped
 
 
@@ -198,12 +198,12 @@ def system(at, frames, n):
     N = padded(n + 1)
     blocks, at = matrix(at, frames * N, N), at + 8 * frames * N * N
     moving, at = matrix(at, frames * POINTS, N), at + 8 * frames * POINTS * N
-    held, at = matrix(at, frames, POINTS), at + 8 * frames * POINTS
+    weight, at = matrix(at, frames, POINTS), at + 8 * frames * POINTS
     gradient, at = matrix(at, frames, n), at + 8 * frames * n
     alone, at = matrix(at, frames, n), at + 8 * frames * n
     first, at = matrix(at, frames, n), at + 8 * frames * n
     second, at = matrix(at, frames, n), at + 8 * frames * n
-    return Linearised(blocks, moving, held, gradient, alone, first, second), at
+    return Linearised(blocks, moving, weight, gradient, alone, first, second), at
 
 
 @compiled

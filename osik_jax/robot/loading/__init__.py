@@ -6,6 +6,9 @@ from ._embedded import ROBOTS as ROBOTS
 from ._embedded import embedded as embedded
 from ._mjcf import from_mjcf as from_mjcf
 from ._mjmodel import from_mjmodel as from_mjmodel
+from ._options import LoadOptions as LoadOptions
+from ._options import LockedJoints as LockedJoints
+from ._options import PositionLimits as PositionLimits
 from ._source import is_mjcf as is_mjcf
 from ._urdf import from_urdf as from_urdf
 from ._write import to_mjcf as to_mjcf

@@ -12,14 +12,15 @@ from typing import Any
 from ..._errors import OsikKeyError, OsikValueError, unknown_name
 from ._embedded import ROBOTS
 from ._mjcf import from_mjcf
+from ._options import LoadOptions
 from ._urdf import from_urdf
 
 SUFFIX = "_description"
 _NEAREST = 8
 
 
-def described(name: str, **options: Any) -> dict[str, Any]:
-    """The fields of a robot that ``robot_descriptions`` knows; options as of ``from_mjcf`` and ``from_urdf``.
+def described(name: str, options: LoadOptions) -> dict[str, Any]:
+    """The fields of a robot that ``robot_descriptions`` knows; its own packages are ``options.package_dirs``.
 
     Raises:
         ImportError: the package is not installed.
@@ -31,9 +32,9 @@ def described(name: str, **options: Any) -> dict[str, Any]:
         raise _unknown(name, known)
     module = importlib.import_module(f"robot_descriptions.{name}")
     if hasattr(module, "MJCF_PATH"):
-        return from_mjcf(module.MJCF_PATH, **options)
+        return from_mjcf(module.MJCF_PATH, options)
     if hasattr(module, "URDF_PATH"):
-        return from_urdf(module.URDF_PATH, package_dirs=_package_dirs(module), **options)
+        return from_urdf(module.URDF_PATH, options._replace(package_dirs=_package_dirs(module)))
     xacro = getattr(module, "XACRO_PATH", None)
     if xacro is None:
         raise OsikValueError(f"robot {name!r} comes neither as MJCF nor as URDF")

@@ -6,11 +6,12 @@ from importlib import resources
 from typing import Any
 
 from ._mjcf import from_mjcf
+from ._options import LoadOptions
 
 ROBOTS = ("nao", "arm7")
 
 
-def embedded(name: str, **options: Any) -> dict[str, Any]:
-    """The fields of an embedded robot, one of ``ROBOTS``; options as of ``from_mjcf``."""
+def embedded(name: str, options: LoadOptions) -> dict[str, Any]:
+    """The fields of an embedded robot, one of ``ROBOTS``."""
     text = (resources.files("osik_jax") / "robot" / "models" / f"{name}.xml").read_text(encoding="utf-8")
-    return from_mjcf(text, **options)
+    return from_mjcf(text, options)

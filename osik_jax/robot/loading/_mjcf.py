@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from ..._errors import OsikValueError
-from ._followers import as_mapping
 from ._mjmodel import LEAST_INERTIA, element_names, from_mjmodel
+from ._options import LoadOptions
 from ._source import Source, check_root, parse_xml, read_source
 
 FLOATING_BASE = "floating_base"
 
 
-def from_mjcf(
-    mjcf: str | os.PathLike[str],
-    *,
-    floating_base: bool | None = None,
-    velocity_limits: Mapping[str, float] | None = None,
-    position_limits: Mapping[str, tuple[float, float]] | None = None,
-    locked_joints: Iterable[str] | Mapping[str, float] = (),
-) -> dict[str, Any]:
+def from_mjcf(mjcf: str | os.PathLike[str], options: LoadOptions) -> dict[str, Any]:
     """The fields of a Robot from an MJCF file or text; see ``Robot.from_mjcf``."""
     source = read_source(mjcf, "MJCF")
     check_root(parse_xml(source), "mujoco", source)
     try:
-        model = _model(source, floating_base)
+        model = _model(source, options.floating_base)
     except ValueError as error:
         raise OsikValueError(f"{source.label}: {error}") from None
-    locked = as_mapping(locked_joints)
-    if floating_base is False:
-        locked = dict.fromkeys(_free_joints(model)) | locked
-    return from_mjmodel(model, velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked)
+    fixed = _free_joints(model) if options.floating_base is False else ()
+    return from_mjmodel(model, options, fixed=fixed)
 
 
 def _model(source: Source, floating_base: bool | None) -> mujoco.MjModel:

@@ -21,6 +21,7 @@ from ._followers import (
     qpos_offset,
     resolve_followers,
 )
+from ._options import LoadOptions, PositionLimits
 
 VELOCITY_LIMIT_PREFIX = "velocity_limit/"
 """A custom numeric of this name and a joint's holds the joint's greatest speed [rad/s or m/s]."""
@@ -43,20 +44,20 @@ class Placement(NamedTuple):
     rotation: np.ndarray
 
 
-def from_mjmodel(
-    model: mujoco.MjModel,
-    *,
-    velocity_limits: Mapping[str, float] | None = None,
-    position_limits: Mapping[str, tuple[float, float]] | None = None,
-    locked_joints: Iterable[str] | Mapping[str, float] = (),
-) -> dict[str, Any]:
-    """The fields of a Robot from a MuJoCo model; see ``Robot.from_mjmodel``."""
+def from_mjmodel(model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable[str] = ()) -> dict[str, Any]:
+    """The fields of a Robot from a MuJoCo model; see ``Robot.from_mjmodel``.
+
+    Args:
+        model: the model, with the floating base that it is to have.
+        options: of which limits and locked joints are honoured here.
+        fixed: names of free joints that are locked where the model has them, unless ``options`` lock them too.
+    """
     if not isinstance(model, mujoco.MjModel):
         raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
     names = element_names(model, mujoco.mjtObj.mjOBJ_JOINT, "joint", model.njnt)
     body_names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
     _check(model, names, body_names)
-    asked = asked_locks(model, names, as_mapping(locked_joints))
+    asked = asked_locks(model, names, {**dict.fromkeys(fixed), **as_mapping(options.locked_joints)})
     followers, locked = resolve_followers(names, *equality_followers(model), asked)
     bodies, placement = _moving_bodies(model)
     frames = _frames(model, body_names, placement)
@@ -76,9 +77,10 @@ def from_mjmodel(
     )
     if tree.nv == 0:
         raise OsikValueError(f"the model has no joint left to move; joints: {', '.join(names)}, all locked")
-    low, high = _ranges(model, names, position_limits or {})
-    lower, upper, speed = _limits(tree, followers, low, high, _speeds(model, names, velocity_limits or {}))
-    _warn_of_frozen(tree, lower, upper, position_limits or {})
+    ranges = options.position_limits or {}
+    low, high = _ranges(model, names, ranges)
+    lower, upper, speed = _limits(tree, followers, low, high, _speeds(model, names, options.velocity_limits or {}))
+    _warn_of_frozen(tree, lower, upper, ranges)
     home = model.key_qpos[0] if model.nkey else model.qpos0
     arrays = dict(
         **_body_arrays(model, bodies, placement),
@@ -229,9 +231,7 @@ def _set_speed(speeds: np.ndarray, names: tuple[str, ...], pattern: str, value: 
         speeds[joint] = value
 
 
-def _ranges(
-    model: mujoco.MjModel, names: tuple[str, ...], given: Mapping[str, tuple[float, float]]
-) -> tuple[np.ndarray, np.ndarray]:
+def _ranges(model: mujoco.MjModel, names: tuple[str, ...], given: PositionLimits) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper limit of each joint: from the model, then from ``given``."""
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     scalar = np.isin(model.jnt_type, (HINGE, SLIDE))
@@ -276,9 +276,7 @@ def _limits(
     return lower, upper, velocity
 
 
-def _warn_of_frozen(
-    tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, given: Mapping[str, tuple[float, float]]
-) -> None:
+def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, given: PositionLimits) -> None:
     """Names the joints whose range is one value, but for those whose range the user gave."""
     stated = {joint for pattern in given for joint in match_joints(pattern, tree.joint_names)}
     frozen = [j for j, dof in tree.dof_address.items() if upper[dof] - lower[dof] <= _ONE_VALUE and j not in stated]

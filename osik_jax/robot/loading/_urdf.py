@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ import numpy as np
 
 from ..._errors import OsikValueError, warn
 from .._feet import find_feet
-from ._followers import as_mapping
 from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, from_mjmodel, quaternion
+from ._options import LoadOptions
 from ._packages import Packages, is_uri
 from ._source import check_root, parse_xml, read_source
 from ._urdf_elements import IDENTITY, Joint, Link, Pose, Shape, Urdf, read_urdf
@@ -33,33 +33,22 @@ _VISUAL_GROUP, _COLLISION_GROUP = 2, 3
 _MESH_SUFFIXES = (".stl", ".obj", ".msh")
 
 
-def from_urdf(
-    urdf: str | os.PathLike[str],
-    *,
-    floating_base: bool | None = None,
-    velocity_limits: Mapping[str, float] | None = None,
-    position_limits: Mapping[str, tuple[float, float]] | None = None,
-    locked_joints: Iterable[str] | Mapping[str, float] = (),
-    collision_meshes: bool = False,
-    package_dirs: Iterable[str | os.PathLike[str]] = (),
-) -> dict[str, Any]:
+def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> dict[str, Any]:
     """The fields of a Robot from a URDF file or text; see ``Robot.from_urdf``."""
-    packages = Packages(package_dirs)
+    packages = Packages(options.package_dirs)
     source = read_source(packages.path(urdf) if is_uri(urdf) else urdf, "URDF")
     root = parse_xml(source)
     check_root(root, "robot", source)
     try:
-        description = _with_base(read_urdf(root), floating_base, source.label)
+        description = _with_base(read_urdf(root), options.floating_base, source.label)
         spec = urdf_spec(description)
-        if collision_meshes:
+        if options.collision_meshes:
             _add_meshes(spec, description, packages, source.path)
         model = spec.compile()
     except ValueError as error:
         raise OsikValueError(f"{source.label}: {error}") from None
-    locked = as_mapping(locked_joints)
-    if floating_base is False:
-        locked = {j.name: None for j in description.joints if j.kind == "floating"} | locked
-    return from_mjmodel(model, velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked)
+    floating = [joint.name for joint in description.joints if joint.kind == "floating"]
+    return from_mjmodel(model, options, fixed=floating if options.floating_base is False else ())
 
 
 def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:

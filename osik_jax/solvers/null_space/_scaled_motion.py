@@ -180,7 +180,11 @@ class _ActiveSet(NamedTuple):
 
 
 def _active_set(problem: ScaledMotion, root: Float[Array, " n"], end: DualState) -> _ActiveSet:
-    """Return the saturated joints; where they block the motion, all but the one that the others determine best."""
+    """Return the saturated joints; where they depend on each other, all but one.
+
+    That is the one which the others determine best, if they block the motion; if the whole motion ends where they are,
+    the one without which all multipliers have their signs.
+    """
     # the dual method's answer, back in the units of the joints
     active = jnp.where(end.active == INACTIVE, 0, jnp.where(end.active == AT_UPPER, 1, -1)).astype(jnp.int32)
     is_active = active != 0
@@ -193,7 +197,10 @@ def _active_set(problem: ScaledMotion, root: Float[Array, " n"], end: DualState)
     normal = normal / jnp.where(largest > 0.0, largest, 1.0)
     normal = jnp.where(jnp.abs(normal) > NEGLIGIBLE_ENTRY, normal, 0.0)
     blocks = (largest > 0.0) & (jnp.max(jnp.abs(apply(problem.projector, normal))) <= INDEPENDENCE_TOL)
-    blocker = first_smallest(-jnp.abs(normal))
+    # where the whole motion ends, multipliers are not of the penalty's order: the one that reaches 0 first is released
+    ratios = jnp.where(normal != 0.0, y / jnp.where(normal != 0.0, normal, 1.0), jnp.inf)
+    is_whole = blocked_scale(problem, active, normal) >= 1.0 - SATURATION_ROUNDOFF
+    blocker = first_smallest(jnp.where(is_whole, ratios, -jnp.abs(normal)))
     removed = blocks & (jnp.arange(len(normal)) == blocker)
     # the inverse of the block without the blocker, and multipliers without the part of the penalty's order
     column = inverse[blocker]

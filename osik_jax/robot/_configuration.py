@@ -1,0 +1,61 @@
+"""Configurations by the names of joints, and what may be wrong with one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Num
+
+from .._errors import OsikValueError
+from ._tree import BALL, FREE, QPOS_WIDTH
+
+if TYPE_CHECKING:
+    from ._robot import Robot
+
+_LEAST_QUATERNION = 1e-8
+"""A quaternion that is not longer has no direction, so it counts as zero."""
+
+
+def with_joints(robot: Robot, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
+    """See ``Robot.configuration``."""
+    q = jnp.asarray(robot.q0 if base is None else base)
+    coefficient = robot.tree.qpos_source[1]
+    for name, value in joints.items():
+        joint = robot.tree.joint(name)
+        if robot.tree.joint_types[joint] in (FREE, BALL):
+            raise OsikValueError(
+                f"joint {name!r} is free or ball: set its entries of q, from joint_qpos_index({name!r})"
+            )
+        full = robot.tree.full_qpos_address[joint]
+        index = robot.joint_qpos_index(name)
+        q = q.at[index].set((value - robot.qpos_offset[full]) / coefficient[full])
+    return q
+
+
+def check_configuration(robot: Robot, q: Num[ArrayLike, " nq"], name: str) -> None:
+    """See ``Robot.check_configuration``."""
+    tree, shape = robot.tree, jnp.shape(q)
+    if shape != (tree.nq,):
+        raise OsikValueError(
+            f"{name} has shape {shape}, this robot's configurations have shape ({tree.nq},): {tree.dof_owners}. "
+            "Batch with jax.vmap."
+        )
+    if isinstance(q, Tracer):
+        return
+    values = np.asarray(q)
+    if not np.isfinite(values).all():
+        raise OsikValueError(f"{name} is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
+    for joint, start in tree.qpos_address.items():
+        kind = tree.joint_types[joint]
+        if kind not in (FREE, BALL):
+            continue
+        end = start + QPOS_WIDTH[kind]
+        if np.linalg.norm(values[end - 4 : end]) < _LEAST_QUATERNION:
+            raise OsikValueError(
+                f"{name}[{end - 4}:{end}], the quaternion of joint {tree.joint_names[joint]!r}, is zero; the identity "
+                "is (1, 0, 0, 0)"
+            )

@@ -1,0 +1,25 @@
+"""What may be asked for when a robot is loaded: one record that all readers hand on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple, TypeAlias
+
+LockedJoints: TypeAlias = Iterable[str] | Mapping[str, float]
+PositionLimits: TypeAlias = Mapping[str, tuple[float, float]]
+
+
+class LoadOptions(NamedTuple):
+    """The keywords of ``load_robot`` and of ``Robot``'s constructors, which say what each means.
+
+    A new keyword is a field here, and one in the signature of those who offer it; readers take what they honour and
+    hand on the whole. ``home`` is no field: it is looked at when there is a robot.
+    """
+
+    floating_base: bool | None = None
+    velocity_limits: Mapping[str, float] | None = None
+    position_limits: PositionLimits | None = None
+    locked_joints: LockedJoints = ()
+    collision_meshes: bool = False
+    package_dirs: Iterable[str | os.PathLike[str]] = ()
