@@ -711,6 +711,9 @@ def test_limbs_that_are_straight_at_home_begin_bent(nao):
     for side, turn in (("L", -1.0), ("R", 1.0)):
         width = 1.54461 - 0.0349066  # NAO's documentation: elbow roll from 2 to 88.5 degrees
         assert start[elbows[side]] - straight[elbows[side]] == pytest.approx(turn * width / 2, abs=1e-3)
+    straight[elbows["R"]] += 0.03 * width  # overstretched by as much as a GR3's
+    nearly = Build.of(dataclasses.replace(nao, q0=jnp.asarray(straight)), profile).start
+    np.testing.assert_allclose(nearly, start, atol=1e-12)
 
 
 def test_robots_that_cannot_walk_are_refused():
