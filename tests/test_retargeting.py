@@ -47,6 +47,7 @@ from osik_jax.retargeting._facing import by_name
 from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._fit import FitLoss, _Setting
 from osik_jax.retargeting._folder import _Lengths, retarget_folder
+from osik_jax.retargeting._guess import shrunk
 from osik_jax.retargeting._person import NEEDED, SIDES, read_person
 from osik_jax.retargeting._plan import make_plan
 from osik_jax.retargeting._terms import Body, frame_rows
@@ -670,6 +671,36 @@ def test_links_without_a_size_get_no_capsule():
     assert "l_ankle_2" not in capsules and min(capsules.values()) > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("urdf", "link", "ends"),
+    [
+        ("icub_description/robots/icub.urdf", "chest", ("l_shoulder_1", "r_shoulder_1")),
+        ("romeo_description/urdf/romeo.urdf", "LHipPitchLink", ("LHipPitchLink", "LKneePitchLink")),
+    ],
+)
+def test_links_are_no_longer_than_between_their_joints(urdf, link, ends):
+    """By their inertias an iCub's chest is 63 cm wide, and a Romeo's thigh 88 cm long."""
+    robot = osik.Robot.from_urdf(described_urdf("g1").parents[2] / urdf, floating_base=True)
+    places = home_kinematics(robot)
+    first, last = (np.asarray(places.frame_pose(robot, frame)[0]) for frame in ends)
+    along = (last - first) / np.linalg.norm(last - first)
+    capsules = [capsule for capsule in guess_profile(robot).capsules if capsule.frame == link]
+    position, rotation = (np.asarray(x) for x in places.frame_pose(robot, link))
+    for c in capsules:
+        at = (position + np.array([c.start, c.end]) @ rotation.T - first) @ along
+        room = 2.0 * max(capsule.radius for capsule in capsules) + 1e-6  # a housing, and the capsule's round end
+        assert at.min() - c.radius > -room and at.max() + c.radius < np.linalg.norm(last - first) + room
+    assert capsules
+
+
+def test_links_that_are_too_light_for_their_size_are_made_smaller():
+    """An ellipsoid of water weighs 4/3 pi a b c times 1,000; one of 8 times its volume and its mass is too light."""
+    axes = np.array([0.2, 0.1, 0.05])
+    mass = 4.0 / 3.0 * np.pi * float(np.prod(axes)) * 1000.0
+    assert shrunk(mass, 2.0 * axes) == pytest.approx(0.5)
+    assert shrunk(mass, axes) == shrunk(mass, 1.5 * axes) == 1.0
+
+
 def test_limbs_that_are_straight_at_home_begin_bent(nao):
     profile = load_profile("nao")
     np.testing.assert_array_equal(Build.of(nao, profile).start, nao.q0)  # nothing is at an end of its range
@@ -683,6 +714,9 @@ def test_limbs_that_are_straight_at_home_begin_bent(nao):
     for side, turn in (("L", -1.0), ("R", 1.0)):
         width = 1.54461 - 0.0349066  # NAO's documentation: elbow roll from 2 to 88.5 degrees
         assert start[elbows[side]] - straight[elbows[side]] == pytest.approx(turn * width / 2, abs=1e-3)
+    straight[elbows["R"]] += 0.03 * width  # overstretched by as much as a GR3's
+    nearly = Build.of(dataclasses.replace(nao, q0=jnp.asarray(straight)), profile).start
+    np.testing.assert_allclose(nearly, start, atol=1e-12)
 
 
 def test_robots_that_cannot_walk_are_refused():

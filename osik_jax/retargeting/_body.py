@@ -30,8 +30,9 @@ _CAPSULE = "capsule "
 _INSET, _SHARE = 1e-3, 0.98
 _LONG = 60
 """For how many frames a point stands before it is held more firmly."""
-_AT_END, _BENT = 0.01, 1.0
-"""What counts as the end of a range, as a share of it; how far from there plans begin [rad], to the middle at most."""
+_AT_END, _ARM_AT_END, _BENT = 0.01, 0.05, 1.0
+"""What counts as the end of a range, as a share of it, and that of an arm, whose elbow may be overstretched a little (a
+GR3's by 3 %); how far from there plans begin [rad], to the middle at most."""
 
 
 def shapes_apart(robot: Robot, profile: Profile) -> CollisionAvoidanceLimit | None:
@@ -193,13 +194,14 @@ def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]
     scalar, index = scalar_layout(robot)
     ends = [profile.keypoints[end][0] for _, end in LIMBS]
     bodies = [robot.tree.frame_bodies[robot.tree.frame(frame)] for frame in ends]
-    moves = np.asarray(independent_columns(robot.tree, jnp.asarray(robot.tree.moves[bodies], float))).any(0)
+    each = np.asarray(independent_columns(robot.tree, jnp.asarray(robot.tree.moves[bodies], float))).astype(bool)
+    moves, at_end = each.any(0), np.where(each[:4].any(0), _AT_END, _ARM_AT_END)
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     for dof in np.flatnonzero(scalar & moves & np.isfinite(upper - lower)):
         width, home = upper[dof] - lower[dof], q[index[dof]]
         inside = min(_BENT, 0.5 * width)
-        if home - lower[dof] < _AT_END * width:
+        if home - lower[dof] < at_end[dof] * width:
             q[index[dof]] = lower[dof] + inside
-        elif upper[dof] - home < _AT_END * width:
+        elif upper[dof] - home < at_end[dof] * width:
             q[index[dof]] = upper[dof] - inside
     return q

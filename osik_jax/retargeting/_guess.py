@@ -27,6 +27,9 @@ _HAND = 0.6
 _LEAST_MASS, _LEAST_SIZE, _THINNEST, _WIDE, _LONG, _SHELL = 3e-3, 1e-3, 0.1, 1.6, 1.15, 1.2
 """Links that count, as a share of the robot's mass; what is smaller [m] or flatter is not trusted; a trunk that is
 wider gets two capsules; how much of an ellipsoid's length and width a capsule has."""
+_LIGHTEST, _USUAL = 200.0, 1000.0
+"""Density below which an ellipsoid is not believed, and that which it is given then [kg/m^3]: of the links of a G1, a
+NAO, a Talos, a GR1T2 and a GR3 the lightest has 210 (a Talos' head), and more than half have over 1,000."""
 _SAME, _ROOM = 1e-6, 6e-3
 _ORIGIN: Point = (0.0, 0.0, 0.0)
 _GRIPS = re.compile(r"grip|finger|thumb|hand$", re.IGNORECASE)
@@ -257,6 +260,7 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_iquat[body])
         axes = np.sqrt(np.maximum(2.5 / mass * (inertia.sum() - 2.0 * inertia), 0.0))
+        axes *= shrunk(mass, axes)
         long, wide, thin = np.argsort(-axes)
         if not axes[thin] > max(_LEAST_SIZE, _THINNEST * axes[long]):
             continue
@@ -267,12 +271,39 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
         spans = [-reach, reach]
         if name not in trunk:
             spans += _spanned(model, body, along, radius)
+        spans = _between_joints(model, body, along, radius, spans)
         aside_by = _SHELL * axes[wide] - radius
         for shift in (aside_by, -aside_by) if apart else (0.0,):
             centre = model.body_ipos[body] + shift * aside
             ends = _pair(np.stack([centre + min(spans) * along, centre + max(spans) * along]))
             out.append(Capsule(name, *ends, round(radius, 6)))
     return out
+
+
+def shrunk(mass: float, axes: np.ndarray) -> float:
+    """What an ellipsoid's semi-axes [m] are multiplied with, so that it weighs what a link may.
+
+    Inertias that files have about another point than the centre of mass, or as placeholders, are those of ellipsoids
+    that are far too large: too light for their size.
+    """
+    density = mass / max(4.0 / 3.0 * np.pi * float(np.prod(axes)), 1e-12)
+    return (density / _USUAL) ** (1.0 / 3.0) if density < _LIGHTEST else 1.0
+
+
+def _between_joints(
+    model: mujoco.MjModel, body: int, along: np.ndarray, radius: float, spans: list[float]
+) -> list[float]:
+    """A capsule's ends: of a link that is longer than wide between its joints, at most a radius beyond these.
+
+    What carries limbs on both sides of its centre of mass ends at their joints.
+    """
+    children = [c for c in range(1, model.nbody) if model.body_parentid[c] == body and model.body_jntnum[c]]
+    limbs = [float((model.body_pos[child] - model.body_ipos[body]) @ along) for child in children]
+    ends = limbs + [float(-model.body_ipos[body] @ along)] * bool(model.body_jntnum[body])
+    if not children or max(ends) - min(ends) < 2.0 * radius:
+        return spans
+    room = 0.0 if min(limbs) < 0.0 < max(limbs) else radius
+    return [float(x) for x in np.clip(spans, min(ends) - room, max(ends) + room)]
 
 
 def _spanned(model: mujoco.MjModel, body: int, along: np.ndarray, radius: float) -> list[float]:
