@@ -130,7 +130,7 @@ def test_null_spaces(shape, solver):
     assert levels_difference(p, found, plain).max() < 1e-7
 
 
-NOT_YET = "6 of 40 differ: a row missed by roundoff alone counts as violated in one program, for the levels below"
+NOT_YET = "6 of 40 differ, where rows of a level depend on each other but for 1e-8; the cause is not found"
 
 
 @pytest.mark.slow
