@@ -159,7 +159,7 @@ def levels_difference(p: Hierarchies, mine: Any, plain: Any) -> np.ndarray:
     off = np.zeros(len(p.lower))
     for a, b, level in zip(mine.slacks, plain.slacks, p.levels, strict=True):
         rows = np.sqrt(level.weight)[..., None] * level.A
-        size = np.linalg.norm(rows, axis=2).max(1) * (1.0 + np.abs(plain.x).max(1))
+        size = np.linalg.norm(rows, axis=2).max(1, initial=0.0) * (1.0 + np.abs(plain.x).max(1))
         norms = [np.linalg.norm(np.sqrt(level.weight) * np.asarray(w), axis=1) for w in (a, b)]
         off = np.maximum(off, np.abs(norms[0] - norms[1]) / np.where(size > 0.0, size, 1.0))
     return off

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import pytest
 from task_checks import moved_by
 
 import osik_jax as osik
+from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp, solve_nullspace, solve_qp
 from osik_jax.viewer import mujoco_poses, robot_com
 
 DT = 0.01
@@ -103,6 +105,55 @@ class TestBatchesEqualLoops:
         got = together((0, 0, 0, None), osik.stack(robots), start, osik.stack(sets), limits)
         loop = [velocity(*own, limits) for own in zip(robots, start, sets, strict=True)]
         np.testing.assert_allclose(got, np.stack(loop), atol=1e-10)
+
+
+def levels(A, b):
+    return [Level(A[:1], b[:1]), Level(A[1:], b[1:] - 1.0, b[1:])]
+
+
+SOLVERS = {
+    "qp": lambda A, b, box: solve_qp(A.T @ A + jnp.eye(3), b, *box),
+    "least squares": lambda A, b, box: solve_least_squares_qp(A, b, jnp.ones(3), *box, A[:1], b[:1], b[:1]),
+    "hierarchy": lambda A, b, box: solve_hqp(levels(A, b), *box),
+    "null space": lambda A, b, _: solve_nullspace(levels(A, b)),
+    "reverse": lambda A, b, _: solve_nullspace(levels(A, b), order="reverse"),
+    "saturated": lambda A, b, box: solve_nullspace(levels(A, b), *box),
+}
+
+
+class TestBatchesOfNone:
+    """A batch of 0 problems gives arrays of 0, whoever computes them."""
+
+    box = -np.ones(3), np.ones(3)
+
+    @pytest.mark.parametrize("solver", SOLVERS)
+    def test_solvers(self, solver):
+        def solve(A, b):
+            return SOLVERS[solver](A, b, self.box)
+
+        def two_axes(A, b):
+            return jax.vmap(jax.vmap(solve))(A, b)
+
+        for batch, run in (((0, 2), jax.jit(two_axes)), ((2, 0), partial(jax.eval_shape, two_axes))):
+            answer = run(jnp.zeros((*batch, 3, 3)), jnp.zeros((*batch, 3)))
+            assert answer.x.shape == (*batch, 3)
+            assert all(leaf.shape[:2] == batch for leaf in jax.tree.leaves(answer))
+
+    @pytest.mark.parametrize(
+        "scheme",
+        [
+            osik.WeightedQP(),
+            osik.HierarchicalQP(),
+            *(osik.NullSpace(method=method) for method in ("classical", "reverse", "saturated")),
+        ],
+        ids=repr,
+    )
+    def test_schemes(self, arm, tasks, limits, start, scheme):
+        def solve(q):
+            return osik.solve(arm, q, tasks, scheme=scheme, limits=limits, dt=DT)
+
+        answer = jax.jit(jax.vmap(solve))(start[:0])
+        assert answer.velocity.shape == (0, arm.nv) and answer.status.shape == (0,)
 
 
 class TestNames:

@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ._backends import on_platforms
 from ._blocks import first_axes_as_one
+from ._lanes import lanes_of, no_lanes
 from ._rules import custom_jvp
 
 
@@ -59,11 +60,12 @@ def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
     @custom_vmap
     def lanes(*args: Any) -> Any:
-        return solve(*args)
+        return solve(*args) if lanes_of(args) else no_lanes(solve, args)
 
     @lanes.def_vmap
     def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
-        inner = max(a.shape[int(own)] for a, own in _pairs(args, in_batched))
+        lengths = {a.shape[int(own)] for a, own in _pairs(args, in_batched)}
+        inner = 0 if 0 in lengths else max(lengths)
 
         def merged(a: jax.Array, batched: bool) -> jax.Array:
             if not batched and len(a) == 1:

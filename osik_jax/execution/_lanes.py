@@ -31,6 +31,8 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
     @custom_vmap
     def lanes(*args: Any) -> Any:
+        if lanes_of(args) == 0:
+            return no_lanes(solve, args)
         return in_blocks(solve, args, BLOCK)
 
     @lanes.def_vmap
@@ -38,14 +40,27 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
         wide = jax.tree.map(
             lambda a, batched: a if batched else jnp.broadcast_to(a, (axis_size, *a.shape)), args, tuple(in_batched)
         )
-        merged = jax.tree.map(first_axes_as_one, wide)
-        out = jax.tree.map(lambda a: a.reshape(axis_size, a.shape[0] // axis_size, *a.shape[1:]), lanes(*merged))
+        inner = jax.tree.leaves(wide)[0].shape[1]
+        out = lanes(*jax.tree.map(first_axes_as_one, wide))
+        out = jax.tree.map(lambda a: a.reshape(axis_size, inner, *a.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
     def one(*args: Any) -> Any:
         return jax.tree.map(lambda a: a[0], lanes(*jax.tree.map(lambda a: jnp.asarray(a)[None], args)))
 
     return one
+
+
+def lanes_of(args: Any) -> int:
+    """Return how many lanes there are of arrays that have all of them, or one that all lanes share."""
+    counts = {a.shape[0] for a in jax.tree.leaves(args)}
+    return 0 if 0 in counts else max(counts)
+
+
+def no_lanes(solve: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    """Return what ``solve`` returns for a batch of 0 problems: it is asked for the shapes of one, and not run."""
+    one = jax.tree.map(lambda a: jax.ShapeDtypeStruct((1, *a.shape[1:]), a.dtype), args)
+    return jax.tree.map(lambda a: jnp.zeros((0, *a.shape[1:]), a.dtype), jax.eval_shape(solve, *one))
 
 
 def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, Any], Any], block: int) -> Any:

@@ -188,7 +188,7 @@ def _level_problem(
         may_block=~state.frozen & bounded & (level_of_hard < k),
         is_own=level_of_hard == k,
         is_own_inequality=(level_of_hard == k) & ~hierarchy.hard_is_equality,
-        hard_of_row=jnp.asarray(layout.hard_of_row)[k],
+        hard_of_row=jnp.asarray(layout.hard_of_row, int)[k],
         projector=state.projector,
         x=state.x,
     )
