@@ -174,9 +174,9 @@ def descend(K, V, W, G, R, T, C, free, q, other, here, there, cost):
         before, after = soft + stiffness * stiff, soft_there + stiffness * stiff_there
         better = after < before
         small = C[LITTLE] * soft
-        little = stiffness >= 1.0 and before - after < small and (better or stiff < small)
+        little = stiffness >= 1.0 and before - after < small
         if little:
-            settled += 2.0 if better else 1.0
+            settled += (1.0 if better else 0.0) + (1.0 if stiff < small else 0.0)
         elif better:
             settled = 0.0
         if not better and damping >= C[MOST]:
