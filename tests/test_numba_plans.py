@@ -63,6 +63,14 @@ def test_a_plan_is_improved_as_by_the_plain_method(until, nao, motion):
     assert np.abs(found.q - q)[3:FRAMES, 7:].max() > 0.1
 
 
+@pytest.mark.slow
+def test_a_plan_ends_with_the_same_step_as_by_the_plain_method(nao, motion):
+    clip, _ = clip_of(nao, motion)
+    start = jnp.asarray(Retargeter(nao)._prepared(motion, None, None).start)
+    by_kernel, plainly = (function(clip, start, jnp.array(100)) for function in compiled("settled"))
+    assert by_kernel.iterations == plainly.iterations < 100
+
+
 def test_the_centre_of_mass_is_kept_as_by_the_plain_method(nao, motion):
     clip, q = clip_of(nao, motion, 0.02)
     by_kernel, plainly = compiled("spent")

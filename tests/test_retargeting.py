@@ -49,7 +49,7 @@ from osik_jax.retargeting._fit import FitLoss, _Setting
 from osik_jax.retargeting._folder import _Lengths, retarget_folder
 from osik_jax.retargeting._guess import shrunk
 from osik_jax.retargeting._person import NEEDED, SIDES, read_person
-from osik_jax.retargeting._plan import make_plan
+from osik_jax.retargeting._plan import _Clip, _improved, _State, make_plan
 from osik_jax.retargeting._terms import Body, frame_rows
 
 FPS = 30.0
@@ -303,15 +303,15 @@ SPLIT = """
 import dataclasses, json, sys
 import jax, numpy as np
 import osik_jax as osik
-from osik_jax.retargeting import Retargeter, _retarget, load_motion
+from osik_jax.retargeting import Retargeter, _lanes, _retarget, load_motion
 
 motion, own = load_motion(sys.argv[1]), Retargeter(osik.load_robot("nao"), max_iterations=3)
 motions = [motion, dataclasses.replace(motion, positions=motion.positions[::-1], rotations=None), motion]
 alone = [own.retarget(clip) for clip in motions]
-_retarget.one_a_core = lambda: False  # as where there are GPUs
+_lanes.one_a_core = _retarget.one_a_core = lambda: False  # as where there are GPUs
 over = []
-solve = _retarget._over_devices(5)
-_retarget._over_devices = lambda shared: lambda *args: over.append(solve(*args)) or over[-1]
+solve = _lanes._over_devices(5)
+_lanes._over_devices = lambda shared: lambda *args: over.append(solve(*args)) or over[-1]
 together = own.retarget_all(motions, chunk=2, progress=False)
 print(json.dumps({
     "devices": [len(found.q.sharding.device_set) for found in over if hasattr(found.q, "sharding")],
@@ -566,6 +566,25 @@ def test_what_stands_for_long_does_not_creep(nao, tmp_path):
     motion = load_motion(write_bvh(tmp_path / "long.bvh", dancer(600)))
     figures = report(retarget(nao, motion))
     assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.01
+
+
+def test_a_step_that_is_damped_does_not_end_a_plan_whose_bounds_are_broken(nao, dance):
+    own = Retargeter(nao)
+    asked = own._prepared(load_motion(dance).resampled(10.0), None, None)
+    weights = own.profile.weights
+    clip = _Clip(own._body, asked.goals, weights, asked.bounds, jnp.ones(len(asked.start)))
+    plan = make_plan(own._body, asked.goals, weights, asked.bounds, asked.start, 100)
+    step = jax.jit(_improved)
+
+    def counted(q, damping):
+        before = _State.at(clip, jnp.asarray(q), 1.0, damping)
+        after = step(clip, before)
+        gain = sum(before.here.costs) - sum(after.here.costs)
+        assert 0.0 < gain < 2e-3 * before.here.costs[0]
+        return int(after.settled)
+
+    sunk = plan.q.at[:, 2].add(-0.02)
+    assert counted(plan.q, 1e4) == 2 and counted(sunk, 1e17) == 1
 
 
 def test_a_guess_sees_the_same_robot(nao):

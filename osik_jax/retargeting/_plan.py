@@ -45,7 +45,8 @@ stretched legs swing from one end of what the bounds leave them to the other.
 
 _LITTLE, _SETTLED = 2e-3, 2
 """A gain that is little, as a share of what the wishes cost, and what makes an end: a step that gains so little counts
-as two, a refused one as one."""
+as two, a refused one as one. Where bounds are broken by more than that share, a step counts as one and a refused one
+not at all: what gains little there may be damped and not done."""
 
 _Ending = Literal["ready", "settled", "spent"]
 _START = {
@@ -132,7 +133,8 @@ def make_plan(
     Levenberg and Marquardt's method. Bounds that have to hold begin soft and get stiffer with each step that is
     taken, so that limbs find their way before feet and limits pin them down; they do so on a part of the frames first,
     which is a quarter of the work. It ends when a step gains less than a small part of what the wishes cost, with all
-    bounds at their full stiffness, or when two are refused where the bounds are kept.
+    bounds at their full stiffness, or when two are refused where the bounds are kept; where they are not, it takes two
+    steps of little gain with no better one between them.
     """
     clip = _Clip(body, goals, weights, bounds, jnp.ones(len(start), start.dtype))
     return _descended(clip, _from_a_part(clip, start), max_iterations, until="settled")
@@ -260,8 +262,9 @@ def _improved(clip: _Clip, state: _State) -> _State:
     least = jnp.where(~better | (stiffer >= 1.0), _STIFF_DAMPING, _LEAST_DAMPING)
     damping = jnp.clip(state.damping * jnp.where(better, _CALMER, state.growth), least, _MOST_DAMPING)
     growth = jnp.where(better, _CAREFUL, 2.0 * state.growth)
-    little = (state.stiffness >= 1.0) & (before - after < _LITTLE * soft) & (better | (stiff < _LITTLE * soft))
-    settled = jnp.where(little, state.settled + jnp.where(better, 2, 1), jnp.where(better, 0, state.settled))
+    little, kept = (state.stiffness >= 1.0) & (before - after < _LITTLE * soft), stiff < _LITTLE * soft
+    counted = better.astype(int) + kept.astype(int)
+    settled = jnp.where(little, state.settled + counted, jnp.where(better, 0, state.settled))
     settled = jnp.where(~better & (state.damping >= _MOST_DAMPING), _SETTLED, settled)
     ready = jnp.where(better, before - after < _SLOWING * before, state.ready)
     old, new = (state.q, here, state.stiffness), (candidate, there, stiffer)

@@ -174,9 +174,9 @@ def descend(K, V, W, G, R, T, C, free, q, other, here, there, cost):
         before, after = soft + stiffness * penalty, soft_there + stiffness * penalty_there
         better = after < before
         small = C[LITTLE] * soft
-        little = stiffness >= 1.0 and before - after < small and (better or penalty < small)
+        little = stiffness >= 1.0 and before - after < small
         if little:
-            settled += 2.0 if better else 1.0
+            settled += (1.0 if better else 0.0) + (1.0 if penalty < small else 0.0)
         elif better:
             settled = 0.0
         if not better and damping >= C[MOST]:
