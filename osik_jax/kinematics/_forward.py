@@ -100,10 +100,10 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     turn = rotation[joint_parents]
     anchor = position[joint_parents] + rotate(turn, local.xanchor)
     linear, angular = _motion_axes(robot.tree, rotate(turn, local.xaxis), rotation)
-    axes = linear, angular, anchor[robot.tree.dof_joint]
+    anchor = anchor[robot.tree.dof_joint]
     if cuda_is_default():  # or XLA gathers them anew in each Jacobian
-        axes = jax.lax.optimization_barrier(axes)
-    return Kinematics(position, rotation, *axes)
+        linear, angular, anchor = jax.lax.optimization_barrier((linear, angular, anchor))
+    return Kinematics(position, rotation, linear, angular, anchor)
 
 
 def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
