@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import resource
@@ -18,7 +19,7 @@ from jax.core import Tracer
 
 from osik_jax import scaling
 from osik_jax._progress import Pace
-from osik_jax.scaling._chunk_file import DamagedFile, Part, check_chunk, read_chunk
+from osik_jax.scaling._chunk_file import DamagedFile, OtherJob, Part, check_chunk, read_chunk
 
 X = np.arange(20.0)
 program = jax.jit(lambda x, a: {"square": a * x**2, "twice": jnp.stack([x, x], -1)})
@@ -93,6 +94,19 @@ def test_a_damaged_chunk_is_named_and_made_anew(done, damage):
         warnings.simplefilter("error")
         run(done, function, shared=(3.0,))
     assert function.ran == [12]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_chunk_is_closed(done, damage):
+    path = done / "00000003.npz"
+    path.write_bytes(DAMAGES[damage](path.read_bytes(), done))
+    gc.collect()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ResourceWarning)
+        with pytest.raises((DamagedFile, OtherJob)):
+            check_chunk(path, Part(3), scaling.load(done).manifest["job"])
+        gc.collect()
+    assert [str(w.message) for w in caught] == []
 
 
 def test_no_byte_of_a_chunk_changes_unseen(done):

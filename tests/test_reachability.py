@@ -206,6 +206,10 @@ def test_a_file_keeps_it(planar_map, tmp_path):
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     with pytest.raises(ValueError, match=r"other\.npz is no reachability map: it has no format"):
         reachability.load_map(tmp_path / "other.npz")
+    with open(tmp_path / "single.npz", "wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(ValueError, match=r"single\.npz holds one array and not several by name"):
+        reachability.load_map(tmp_path / "single.npz")
 
 
 def test_the_picture_shows_the_slice(planar_map, tmp_path):

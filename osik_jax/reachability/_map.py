@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._errors import OsikValueError
+from .._npz import open_npz
 from ..scaling._chunk_file import whole_file
 
 if TYPE_CHECKING:
@@ -96,8 +97,8 @@ def load_map(path: str | os.PathLike[str]) -> ReachabilityMap:
         ValueError: it is no map, or one of another version.
     """
     names = [field.name for field in dataclasses.fields(ReachabilityMap)]
-    with np.load(path, allow_pickle=False) as file:
-        missing = [name for name in ("format", *names) if name not in getattr(file, "files", ())]
+    with open_npz(path) as file:
+        missing = [name for name in ("format", *names) if name not in file.files]
         if missing:
             raise OsikValueError(f"{os.fspath(path)} is no reachability map: it has no {missing[0]}")
         if int(file["format"]) != _FORMAT:

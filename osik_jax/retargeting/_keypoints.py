@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .._errors import OsikValueError
+from .._npz import open_npz
 from ._motion import CONTACT_POINTS, HumanMotion
 from ._rotations import continuous
 
@@ -45,9 +46,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")
     try:
-        with np.load(path, allow_pickle=False) as data:
-            if not hasattr(data, "files"):
-                raise OsikValueError("it holds one array and not several by name")
+        with open_npz(path) as data:
             return {name: data[name] for name in data.files}
     except (ValueError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
         why = "it is none, or holds objects" if "pickle" in str(error) else error

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._errors import OsikValueError
+from .._npz import open_npz
 
 _RESULT = "result."
 _JOB, _PART, _NAMES, _LANES = "job", "part", "names", "lanes"
@@ -146,7 +147,7 @@ def opened(path: Path) -> Iterator[Any]:
         OSError: the file is not there, or may not be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_npz(path) as file:
             yield file
     except (DamagedFile, OtherJob, MemoryError):
         raise

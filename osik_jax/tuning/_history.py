@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._errors import OsikValueError
+from .._npz import open_npz
 from ._parameters import ParameterSpace
 
 _FORMAT = 1
@@ -111,7 +112,7 @@ def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: A
         FileNotFoundError: no such file.
         ValueError: it is of other parameters, or another optimiser.
     """
-    with np.load(path, allow_pickle=False) as file:
+    with open_npz(path) as file:
         arrays = dict(file)
     if arrays.get("format") != _FORMAT:
         raise OsikValueError(f"{os.fspath(path)} is no state of a tuning that this version can read")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..._errors import OsikValueError, warn
+from ..._npz import open_npz
 from ...reachability import load_map
 from ...robot import Robot
 from .._parts import robot_parts
@@ -91,8 +92,8 @@ def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, por
 def is_map(path: Path) -> bool:
     """Whether a file is what ``osik reach`` writes, rather than a motion."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return "reached" in getattr(file, "files", ())
+        with open_npz(path) as file:
+            return "reached" in file.files
     except (OSError, ValueError):
         return False  # what is wrong with it is told where it is read
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError
+from ..._npz import open_npz
 from ...robot import Robot
 from ...robot._tree import FREE
 from .._look import Look
@@ -63,7 +63,7 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
         ValueError: no motion, or one of another robot.
     """
     try:
-        with np.load(Path(path), allow_pickle=False) as file:
+        with open_npz(path) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
         raise FileNotFoundError(f"no such file: {path}") from None
