@@ -150,6 +150,7 @@ def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path, arm_file):
 def test_an_interrupt_ends_in_one_line(tmp_path, arm_file):
     """Ctrl-C once the time that it takes has been told."""
     words = [sys.executable, "-m", "osik_jax.cli", "demo", "--robot", str(arm_file), "--duration", "60", "--out"]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background ignores it
     with subprocess.Popen(
         [*words, str(tmp_path / "out")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
     ) as process:
