@@ -52,6 +52,12 @@ def arrays(qp: QP) -> tuple[list[Array], Any]:
     return jax.tree.flatten(eqx.tree_at(lambda p: p.packed, qp, None, is_leaf=lambda leaf: leaf is None))
 
 
+def pack(qp: QP) -> tuple[Array, Array]:
+    """Return the cost's matrix and all other arrays as one, as ``unpack`` takes them."""
+    (matrix, *others), _ = arrays(qp)
+    return matrix, jnp.concatenate([jnp.ravel(a) for a in others])
+
+
 def unpack(like: QP, matrix: Float[Array, "..."], packed: Float[Array, " k"]) -> QP:
     """Return a problem of the shapes of another, from its matrix and all its other arrays, one after another."""
     (first, *rest), tree = arrays(like)
