@@ -165,6 +165,12 @@ def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: I
 
     The conditions are stationarity, ``grad cost(x) - C'y = multipliers of the box``; signs of the multipliers;
     feasibility, and complementarity of the rows with a multiplier.
+
+    Args:
+        qp: the problem.
+        x: the point, inside its box.
+        y: multipliers of the rows; those of the box follow from the gradient.
+        active: labels of the box, then of the rows.
     """
     n = len(x)
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)

@@ -261,14 +261,25 @@ def usable_guess(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
 def is_optimal(
     qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
 ) -> Bool[Array, ""]:
-    """Check that the minimiser on the active set is the minimiser: constraints hold, multipliers have their signs."""
+    """Check that the minimiser on the active set is the minimiser: constraints hold, multipliers have their signs.
+
+    The arguments are those of ``violated_conditions``.
+    """
     return ~jnp.any(violated_conditions(qp, result, x, y, roundoff))
 
 
 def violated_conditions(
     qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
 ) -> Bool[Array, " m"]:
-    """Return which constraints are violated, inactive equalities, or have a multiplier of the wrong sign."""
+    """Return which constraints are violated, inactive equalities, or have a multiplier of the wrong sign.
+
+    Args:
+        qp: the problem.
+        result: the iterate, of which the active set and the redundant equalities are looked at.
+        x: the minimiser on that active set.
+        y: multipliers of the rows there; those of the box follow from the gradient.
+        roundoff: which violations and multipliers are none.
+    """
     active = result.active
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
     multipliers = jnp.concatenate([gradient, y])
