@@ -100,6 +100,14 @@ def cuda_is_default() -> bool:
     return getattr(device, "platform", device) in ("gpu", "cuda")
 
 
+def cpu_is_default() -> bool:
+    """Return whether JAX computes on a CPU where it is not told otherwise.
+
+    There, a program may be laid out for what costs time on a core: each operation by itself, and what its cache holds.
+    """
+    return jax.default_backend() == "cpu"
+
+
 def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
     """Return whether a solver has to make a program with the candidates of a kernel in it.
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ._backends import cpu_is_default
 from ._workers import warn_of_few_workers
 
 BLOCK = 16
@@ -28,7 +29,7 @@ def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) ->
     count = jax.tree.leaves(args)[0].shape[0]
     if count > 1:
         warn_of_few_workers()
-    if count <= size or jax.default_backend() != "cpu":
+    if count <= size or not cpu_is_default():
         return function(*args)
     blocks = -(-count // size)
     padding = blocks * size - count

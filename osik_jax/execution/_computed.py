@@ -64,8 +64,7 @@ def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
     @lanes.def_vmap
     def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
-        lengths = {a.shape[int(own)] for a, own in _pairs(args, in_batched)}
-        inner = 0 if 0 in lengths else max(lengths)
+        inner = lanes_of(args, in_batched)
 
         def merged(a: jax.Array, batched: bool) -> jax.Array:
             if not batched and len(a) == 1:
@@ -89,7 +88,7 @@ def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def wide(*args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
-        lanes = max(len(a) for a in leaves)
+        lanes = lanes_of(leaves)
         own = [len(a) == lanes for a in leaves]
         rest = [a if many else a[0] for a, many in zip(leaves, own, strict=True)]
 
@@ -107,9 +106,5 @@ def side_by_side(*arrays: ArrayLike) -> Float[Array, "lanes k"]:
     An argument of a kernel costs time, and one that is made of constants alone is made once.
     """
     flat = [jnp.reshape(a, (len(a), -1)) for a in map(jnp.asarray, arrays)]
-    lanes = max(len(a) for a in flat)
+    lanes = lanes_of(flat)
     return jnp.concatenate([jnp.broadcast_to(a, (lanes, a.shape[1])) for a in flat], 1)
-
-
-def _pairs(args: Any, flags: Any) -> list[tuple[jax.Array, bool]]:
-    return list(zip(jax.tree.leaves(args), jax.tree.leaves(flags), strict=True))

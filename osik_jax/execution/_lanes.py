@@ -15,7 +15,11 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
+from ._backends import cpu_is_default
 from ._blocks import BLOCK, first_axes_as_one, in_blocks
+
+FEW_ON_CPU, FEW = 4, 256
+"""Lanes that are worked on together where most are done."""
 
 
 def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
@@ -51,9 +55,15 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
     return one
 
 
-def lanes_of(args: Any) -> int:
-    """Return how many lanes there are of arrays that have all of them, or one that all lanes share."""
-    counts = {a.shape[0] for a in jax.tree.leaves(args)}
+def lanes_of(args: Any, axes: Any = None) -> int:
+    """Return how many lanes there are of arrays that have all of them, or one that all lanes share.
+
+    Args:
+        args: a pytree of arrays.
+        axes: which axis of each is that of the lanes; default: the first. Flags count as 0 and 1.
+    """
+    leaves = jax.tree.leaves(args)
+    counts = {a.shape[int(axis)] for a, axis in zip(leaves, jax.tree.leaves(axes) or [0] * len(leaves), strict=True)}
     return 0 if 0 in counts else max(counts)
 
 
@@ -86,9 +96,20 @@ def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, A
     return jax.lax.while_loop(lambda carry: ~jnp.all(carry[1]), body, (state, done))[0]
 
 
-def with_a_few(data: Any, state: Any, done: Bool[Array, " B"], again: Callable[[Any, Any], Any], block: int) -> Any:
-    """Return what ``with_the_rest`` does, by a function of a block's data and state; a short batch is one block."""
+def with_a_few(
+    data: Any, state: Any, done: Bool[Array, " B"], again: Callable[[Any, Any], Any], block: int | None = None
+) -> Any:
+    """Return what ``with_the_rest`` does, by a function of a block's data and state; a short batch is one block.
+
+    Args:
+        data: a pytree whose arrays have a leading axis, the lanes; it does not change.
+        state: likewise.
+        done: lanes that stay as they are.
+        again: from a block's data and state to its new state.
+        block: lanes that are worked on together; default: a few, as is good where most lanes are done.
+    """
     lanes = len(done)
+    block = (FEW_ON_CPU if cpu_is_default() else FEW) if block is None else block
 
     def gathered(at: Array, state: Any) -> Any:
         return again(*jax.tree.map(lambda a: a[at], (data, state)))

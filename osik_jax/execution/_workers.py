@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import os
 
-import jax
-
 from .._errors import warn
+from ._backends import cpu_is_default
 
 ENOUGH = 8
 """Workers: one more than batched factorisations are likely to run at once."""
@@ -27,7 +26,7 @@ def cores() -> int:
 def warn_of_few_workers() -> None:
     """Warn, once, where a batch is about to be solved by a pool whose size nobody has chosen."""
     global _warned
-    if _warned or "PJRT_NPROC" in os.environ or not 1 < cores() < ENOUGH or jax.default_backend() != "cpu":
+    if _warned or "PJRT_NPROC" in os.environ or not 1 < cores() < ENOUGH or not cpu_is_default():
         return
     _warned = True
     warn(

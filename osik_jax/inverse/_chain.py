@@ -25,12 +25,12 @@ class Layout(NamedTuple):
 
     Attributes:
         joints: the robot's joints, parents first.
-        parents: place in ``joints`` of the joint before each, one past the last for the world.
+        parents: index in ``joints`` of the joint before each, one past the last for the world.
         hinges: whether each joint turns; the others slide.
         entries: entry of q that moves each joint, -1 for a locked one.
         factors: of that entry.
         dofs: entries of q that move any of the frames, in order: the coordinates of the search.
-        ends: place in ``joints`` of the joint that carries each frame, one past the last for the world.
+        ends: index in ``joints`` of the joint that carries each frame, one past the last for the world.
         carries: whether each joint carries each frame.
     """
 
@@ -88,19 +88,19 @@ def chain_layout(tree: KinematicTree, frames: Sequence[str]) -> Layout:
     """The structure of the chain to some frames, of which ``is_plain`` holds."""
     paths = [_carrying(tree, name) for name in frames]
     joints = sorted({joint for path in paths for joint in path})
-    place = {joint: at for at, joint in enumerate(joints)}
+    index_of = {joint: at for at, joint in enumerate(joints)}
     before = {joint: path[at - 1] if at else -1 for path in paths for at, joint in enumerate(path)}
     index, factor = tree.qpos_source
     starts = tree.full_qpos_address
     entries = [int(index[starts[j]]) if factor[starts[j]] else -1 for j in joints]
     return Layout(
         joints=tuple(joints),
-        parents=tuple(place.get(before[j], len(joints)) for j in joints),
+        parents=tuple(index_of.get(before[j], len(joints)) for j in joints),
         hinges=tuple(tree.joint_types[j] == HINGE for j in joints),
         entries=tuple(entries),
         factors=tuple(float(factor[starts[j]]) for j in joints),
         dofs=tuple(sorted({entry for entry in entries if entry >= 0})),
-        ends=tuple(place[path[-1]] if path else len(joints) for path in paths),
+        ends=tuple(index_of[path[-1]] if path else len(joints) for path in paths),
         carries=tuple(tuple(j in path for j in joints) for path in paths),
     )
 
@@ -165,8 +165,8 @@ def _motions(
     return constant, first, second
 
 
-class Placed(NamedTuple):
-    """Where joints and frames are, in world axes.
+class ChainKinematics(NamedTuple):
+    """Axes of the joints and poses of the frames, in world axes.
 
     Attributes:
         axis: of each joint. (k, 3, lanes)
@@ -181,8 +181,8 @@ class Placed(NamedTuple):
     rotation: Float[Array, "frames 3 3 lanes"]
 
 
-def place(chain: Chain, x: Float[Array, "n lanes"]) -> Placed:
-    """Where everything is with these values of the chain's coordinates.
+def chain_kinematics(chain: Chain, x: Float[Array, "n lanes"]) -> ChainKinematics:
+    """Forward kinematics of the chain.
 
     Args:
         chain: the chain.
@@ -195,21 +195,21 @@ def place(chain: Chain, x: Float[Array, "n lanes"]) -> Placed:
     anchor = _times(poses[:-1, :, :3], chain.anchor[:, :, None, None])[:, :, 0] + poses[:-1, :, 3]
     ends = poses[np.array(layout.ends)]
     tips = _times(ends[:, :, :3], chain.tip[..., None])
-    return Placed(turned, anchor, tips[:, :, 3] + ends[:, :, 3], tips[:, :, :3])
+    return ChainKinematics(turned, anchor, tips[:, :, 3] + ends[:, :, 3], tips[:, :, :3])
 
 
 def _local_poses(chain: Chain, x: Float[Array, "n lanes"]) -> Float[Array, "k 3 4 lanes"]:
     layout = chain.layout
-    spot = np.array([layout.dofs.index(entry) if entry >= 0 else 0 for entry in layout.entries])
+    coordinate = np.array([layout.dofs.index(entry) if entry >= 0 else 0 for entry in layout.entries])
     factor = np.array(layout.factors)
-    angle = x[spot] * jnp.asarray(factor, x.dtype)[:, None] + chain.offset[:, None]
+    angle = x[coordinate] * jnp.asarray(factor, x.dtype)[:, None] + chain.offset[:, None]
     hinge = np.array(layout.hinges)[:, None]
     half = jnp.sin(0.5 * angle)
     first, second = jnp.where(hinge, jnp.sin(angle), angle), jnp.where(hinge, 2.0 * half**2, 0.0)
     # A library call, or XLA's CPU backend computes each sine again for every entry of the matrices that it is in.
     parts = jnp.stack([chain.constant, chain.first, chain.second], -1).reshape(-1, 12, 3)
-    shares = jnp.stack([jnp.ones_like(first), first, second], 1)
-    return jnp.matmul(parts, shares, precision="highest").reshape(-1, 3, 4, x.shape[-1])
+    coefficients = jnp.stack([jnp.ones_like(first), first, second], 1)
+    return jnp.matmul(parts, coefficients, precision="highest").reshape(-1, 3, 4, x.shape[-1])
 
 
 def _world_poses(layout: Layout, local: Float[Array, "k 3 4 lanes"]) -> Float[Array, "k_1 3 4 lanes"]:
@@ -247,15 +247,15 @@ def _times(a: Float[Array, "*k m 3 lanes"], b: Float[Array, "*k 3 n lanes"]) -> 
     return first + second + third
 
 
-def jacobian(chain: Chain, placed: Placed) -> Float[Array, "frames 6 n lanes"]:
+def jacobian(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames 6 n lanes"]:
     """Of each frame over the chain's coordinates: rows [linear; angular] in world axes, linear at its origin."""
     layout = chain.layout
     hinge = np.array(layout.hinges)[:, None, None]
     columns = []
     for at, carried in enumerate(layout.carries):
-        arm = placed.position[at] - placed.anchor
-        linear = jnp.where(hinge, cross(placed.axis, arm, along=-2), placed.axis)
-        both = jnp.concatenate([linear, jnp.where(hinge, placed.axis, 0.0)], 1)
+        arm = kinematics.position[at] - kinematics.anchor
+        linear = jnp.where(hinge, cross(kinematics.axis, arm, along=-2), kinematics.axis)
+        both = jnp.concatenate([linear, jnp.where(hinge, kinematics.axis, 0.0)], 1)
         columns.append(jnp.where(np.array(carried)[:, None, None], both, 0.0))
     own = jnp.stack(columns)  # (frames, k, 6, lanes)
     return jnp.stack([_column(layout, own, dof) for dof in layout.dofs], 2)

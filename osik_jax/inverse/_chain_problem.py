@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, scalar_layout
 from ..robot._tree import HINGE
-from ._chain import Chain, chain_layout, make_chain, place
+from ._chain import Chain, chain_kinematics, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal
 from ._fixed import at_solution
 from ._pool import Errors
@@ -22,11 +22,11 @@ from ._solution import InverseKinematicsSolution
 _ROUNDINGS = 64.0
 """Machine epsilons, of the robot's size, by which computed errors may be off."""
 _ENOUGH = 0.01
-"""Share of the tolerance at which a search is done; the next step would be a rounding."""
+"""Score at which a search is done; the next step would be a rounding."""
 _RADIAN = 0.1
-"""What a radian counts as, as a share of the length of the chain."""
-_PULLS = 1e-3
-"""A joint is stopped by its limit where the error pulls it with at least this share of what it could."""
+"""What a radian counts as, relative to the length of the chain."""
+_STOPPED = 1e-3
+"""A joint is stopped by its limit where the gradient is at least this, relative to its largest value for the error."""
 
 
 class Settings(NamedTuple):
@@ -39,7 +39,7 @@ class Settings(NamedTuple):
         key: of the starts.
         tolerance: of position [m] and orientation [rad]. (2,)
         seeds: number of searches that ``nearest`` spreads out. ()
-        parts: what else a way to search is made of.
+        parts: what else a search is made of.
     """
 
     home: Float[Array, " nq"]
@@ -63,7 +63,7 @@ class ChainRoute(NamedTuple):
     rows: tuple[tuple[bool, ...], ...]
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
-        """The way to search."""
+        """The search for these frames."""
         return chain_search(robot, self, settings, warm=warm, near=near)
 
     def beyond(self, search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
@@ -135,12 +135,12 @@ def _starts(robot: Robot, coordinates: np.ndarray, lower: Array, upper: Array, f
 
 def reaches(chain: Chain, x: Array, lower: Array, upper: Array) -> tuple[Float[Array, " frames"], Array]:
     """Length of the links to each frame [m], slides drawn out; and where the first joint of each is. (frames, 3)."""
-    placed, layout = place(chain, x[:, None]), chain.layout
+    kinematics, layout = chain_kinematics(chain, x[:, None]), chain.layout
     travel = jnp.maximum(jnp.abs(upper - x), jnp.abs(lower - x))
     lengths, roots = [], []
     for at, carried in enumerate(layout.carries):
         path = np.flatnonzero(carried)
-        points = jnp.concatenate([placed.anchor[path, :, 0], placed.position[at, :, 0][None]])
+        points = jnp.concatenate([kinematics.anchor[path, :, 0], kinematics.position[at, :, 0][None]])
         whole = jnp.sum(jnp.sqrt(jnp.sum((points[1:] - points[:-1]) ** 2, -1)))
         slides = [(j, layout.entries[j]) for j in path.tolist() if not layout.hinges[j] and layout.entries[j] >= 0]
         drawn = [abs(layout.factors[j]) * travel[layout.dofs.index(entry)] for j, entry in slides]
@@ -162,7 +162,7 @@ def answer(
     x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
     fixed_search, fixed_x = jax.lax.stop_gradient((search, x))
     turned = Goal(jnp.moveaxis(goal.position, 0, -1), jnp.moveaxis(goal.rotation, 0, -1))
-    residual, pull, errors = _evaluated(fixed_search, fixed_x.T, jax.lax.stop_gradient(turned))
+    residual, active, errors = _evaluated(fixed_search, fixed_x.T, jax.lax.stop_gradient(turned))
     converged = errors.score <= 1.0
     coordinates = np.array(search.chain.layout.dofs, int)
     whole = jnp.broadcast_to(search.home, (len(x), robot.nq)).at[:, coordinates].set(x)
@@ -175,22 +175,22 @@ def answer(
         seed=seed,
         steps=steps,
         residual={name: jnp.moveaxis(residual[at], -1, 0) for at, name in enumerate(route.frames)},
-        at_limit=at_limit.at[:, dof_of_entries(robot)[coordinates]].set(pull.T),
+        at_limit=at_limit.at[:, dof_of_entries(robot)[coordinates]].set(active.T),
         beyond_reach=_beyond(fixed_search, jax.lax.stop_gradient(goal)),
         joints=tuple(dof_names(robot)),
     )
 
 
 def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
-    """Residual of each frame (frames, 6, lanes), which limits stop it (n, lanes), and the errors."""
+    """Residual of each frame (frames, 6, lanes), at which limits it is stopped (n, lanes), and the errors."""
     error, matrix, errors = search.linearised(x, goal)
     rows = np.array(search.rows)
     scale = jnp.where(np.arange(6) < 3, 1.0, search.length)[None].repeat(len(rows), 0)[rows]
     residual = jnp.zeros((*rows.shape, x.shape[-1]), x.dtype).at[np.nonzero(rows)].set(error / scale[:, None])
-    pull = jnp.sum(matrix * error[:, None], 0)
+    gradient = jnp.sum(matrix * error[:, None], 0)
     most = jnp.sqrt(jnp.sum(matrix**2, 0)) * jnp.sqrt(errors.cost)
-    stopped = jnp.abs(pull) > _PULLS * most
-    low, high = (x <= search.lower[:, None]) & (pull > 0.0), (x >= search.upper[:, None]) & (pull < 0.0)
+    stopped = jnp.abs(gradient) > _STOPPED * most
+    low, high = (x <= search.lower[:, None]) & (gradient > 0.0), (x >= search.upper[:, None]) & (gradient < 0.0)
     return residual, jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0), errors
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
-from ._chain import Chain, jacobian, place
+from ._chain import Chain, chain_kinematics, jacobian
 from ._error import rotation_error
 from ._linear import solve_positive
 from ._pool import Errors
@@ -40,7 +40,7 @@ class ChainSearch(eqx.Module):
 
     Such a damping needs no line search, and vanishes fast enough for quadratic convergence (T. Sugihara, "Solvability-
     unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on Robotics 27(5), 2011). A
-    joint at a limit that the error pulls further is left out of the step.
+    joint at a limit beyond which the negative gradient points is left out of the step.
 
     Attributes:
         rows: of each frame, the rows that count: x, y, z, rotation about x, y, z (static).
@@ -82,8 +82,8 @@ class ChainSearch(eqx.Module):
         del goal
         points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
         if self.near:
-            share = jnp.minimum(seed.astype(points.dtype) / self.seeds, 1.0)[:, None]
-            points = self.first + share * (points - self.first)
+            ratio = jnp.minimum(seed.astype(points.dtype) / self.seeds, 1.0)[:, None]
+            points = self.first + ratio * (points - self.first)
         elif self.warm:
             points = jnp.where((seed == 0)[:, None], self.first, points)
         return jnp.clip(points, self.lower, self.upper)
@@ -105,9 +105,9 @@ class ChainSearch(eqx.Module):
     def step(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Float[Array, "n lanes"], Errors]:
         """Where a step leads, and the errors of where it sets out; lanes last. A search that is done stays."""
         error, matrix, errors = self.linearised(x, goal)
-        pull = _transposed_times(matrix, error)
+        gradient = _transposed_times(matrix, error)
         lower, upper = self.lower[:, None], self.upper[:, None]
-        free = ~(((x <= lower) & (pull > 0.0)) | ((x >= upper) & (pull < 0.0)))
+        free = ~(((x <= lower) & (gradient > 0.0)) | ((x >= upper) & (gradient < 0.0)))
         matrix = jnp.where(free, matrix, 0.0)
         damping = _DAMPING * errors.cost + _LEAST_DAMPING * self.length**2
         done, home = errors.score <= self.enough, jnp.zeros_like(x)
@@ -134,18 +134,18 @@ class ChainSearch(eqx.Module):
         return jnp.sqrt(jnp.sum((x - self.first) ** 2))
 
     def finishing(self) -> ChainSearch:
-        """The same search without its pull to the first configuration, for the last steps."""
+        """The same search without the term that draws it to the first configuration, for the last steps."""
         return dataclasses.replace(self, near=False)
 
     def linearised(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
         """Error of each row that counts [m], its derivative (rows, n, lanes), and the errors of the frames."""
-        placed = place(self.chain, x)
-        linear = placed.position - goal.position
-        angular = rotation_error(placed.rotation, goal.rotation)
+        kinematics = chain_kinematics(self.chain, x)
+        linear = kinematics.position - goal.position
+        angular = rotation_error(kinematics.rotation, goal.rotation)
         scale = jnp.where(np.arange(6) < 3, 1.0, self.length).astype(x.dtype)
         kept = np.flatnonzero(np.array(self.rows).ravel())
         rows = jnp.concatenate([linear, angular], 1) * scale[:, None]
-        matrix = jacobian(self.chain, placed) * scale[:, None, None]
+        matrix = jacobian(self.chain, kinematics) * scale[:, None, None]
         lanes = x.shape[-1]
         error = rows.reshape(-1, lanes)[kept]
         matrix = matrix.reshape(-1, len(x), lanes)[kept]

@@ -14,7 +14,7 @@ from ._pool import Errors, Search
 LAST = 8
 """Steps at the end."""
 _SETTLED = 0.1
-"""Score of a search that has come to its end; of those the nearest is taken before any that is on its way."""
+"""Score of a search that has come to its end; of those the nearest is taken before any that still moves."""
 
 
 class Outcomes(NamedTuple):
@@ -33,11 +33,11 @@ def search_all(search: Search, goals: Any, *, seeds: int, steps: int, last: Sear
     """So many searches of so many steps for each target.
 
     Args:
-        search: the way to search.
+        search: the method.
         goals: pytree of the targets, with the targets in front.
         seeds: searches for each target.
         steps: of each.
-        last: the way to take a few more steps at the end, if another.
+        last: the method of a few more steps at the end, if another.
     """
     targets = len(jax.tree.leaves(goals)[0])
     number = jnp.tile(jnp.arange(seeds, dtype=jnp.int32), targets)

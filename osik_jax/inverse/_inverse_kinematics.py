@@ -75,7 +75,7 @@ def inverse_kinematics(
         tasks: by the name of a frame, where it should be, in world axes: ``(position (3,), rotation (3, 3))``,
             ``(position, quaternion w x y z (4,))``, a (4, 4) matrix, a ``jaxlie.SE3``, or a position (3,) alone, whose
             orientation is then free [m]. Arrays with one more axis in front are many targets. Or by any name, a task:
-            its gain does not matter, nor do target velocities. Tasks on places (frames, centre of mass, contacts, axes
+            its gain does not matter, nor do target velocities. Tasks on poses (frames, centre of mass, contacts, axes
             and the like) and hard tasks have to be met; others (postures) are preferences, which fade out on the way.
         targets: of tasks, by name, what ``replace(target=...)`` takes with one more axis in front, for many targets.
         scheme: for tasks, as in ``solve``. Default: ``WeightedQP()``.

@@ -13,7 +13,7 @@ CHECK = 4
 _TRIAL = 8
 """Steps that every search may take before it has to make progress."""
 _PROGRESS = 0.7
-"""A search goes on where a few steps have brought the cost below this share of what it was."""
+"""A search goes on where a few steps have brought the cost below this, relative to what it was."""
 
 
 class Errors(NamedTuple):
@@ -22,7 +22,7 @@ class Errors(NamedTuple):
     Attributes:
         position: largest of the distances [m].
         orientation: largest of the angles [rad].
-        score: largest error as a share of its tolerance: 1 and less is converged.
+        score: largest error relative to its tolerance: 1 and less is converged.
         cost: what the steps reduce.
     """
 
@@ -34,7 +34,7 @@ class Errors(NamedTuple):
 
 @runtime_checkable
 class Search(Protocol):
-    """One way to search: a pytree, whose methods take arrays with the lanes in front."""
+    """A search method: a pytree, whose methods take arrays with the lanes in front."""
 
     def begin(self, seed: Int[Array, " lanes"], goal: Any) -> Float[Array, "lanes n"]:
         """Where a search with this number starts."""
@@ -91,7 +91,7 @@ def run_pool(
     Deterministic: which search a lane takes up depends on nothing but the arguments.
 
     Args:
-        search: the way to search.
+        search: the method.
         goals: pytree of the targets, with the targets in front.
         open_: targets that are looked for; the others, which fill up a batch, are left alone.
         lanes: searches that go on at the same time.
@@ -122,7 +122,7 @@ def _of(goals: Any, target: Int[Array, " lanes"]) -> Any:
 
 
 def _first_state(size: Any, targets: int, lanes: int) -> _State:
-    """All lanes idle. What belongs to targets has one more place, for what idle lanes write."""
+    """All lanes idle. Arrays over targets have one more row, for what idle lanes write."""
     worst = jnp.full(targets + 1, jnp.inf, size.dtype)
     none = jnp.zeros(targets + 1, jnp.int32)
     idle = jnp.zeros(lanes, jnp.int32)
@@ -176,10 +176,10 @@ def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
     none = jnp.full(found.seed.shape, len(number), jnp.int32)
     winner = none.at[lanes.target].min(jnp.where(wins, number, len(number)))
     wins &= winner[lanes.target] == number
-    place = jnp.where(wins, lanes.target, len(found.seed))  # out of range: dropped
+    row = jnp.where(wins, lanes.target, len(found.seed))  # out of range: dropped
 
     def put(old: Array, new: Array) -> Array:
-        return old.at[place].set(new, mode="drop")
+        return old.at[row].set(new, mode="drop")
 
     return Found(
         put(found.x, x),

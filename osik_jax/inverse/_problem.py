@@ -1,4 +1,4 @@
-"""From poses and tasks by name to what is searched for, and in which way."""
+"""From poses and tasks by name to what is searched for, and by which method."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Problem(NamedTuple):
     """What is searched for.
 
     Attributes:
-        route: the way to search (static).
+        route: the search method (static).
         goals: pytree with the targets in front.
         parts: what else the search is made of; None for a ``ChainRoute``.
         many: whether the user gave a batch.

@@ -23,7 +23,7 @@ def unit_points(shift: UInt[Array, " n"], number: Int[Array, "..."], dtype: jnp.
     for n = 1. In integers that wrap around, so that a late point is as exact as the first.
 
     Args:
-        shift: start, as a share of the cube in units of 2**-32.
+        shift: start, as a fraction of the cube in units of 2**-32.
         number: of the points.
         dtype: of the result.
     """
@@ -36,5 +36,5 @@ def _increments(dimensions: int) -> np.ndarray:
     phi = 1.5
     for _ in range(64):  # a contraction: phi = (1 + phi)^(1 / (n + 1))
         phi = (1.0 + phi) ** (1.0 / (dimensions + 1))
-    shares = phi ** -np.arange(1.0, dimensions + 1.0) % 1.0
-    return np.floor(shares * 2.0**_BITS).astype(np.uint64).astype(np.uint32)
+    fractions = phi ** -np.arange(1.0, dimensions + 1.0) % 1.0
+    return np.floor(fractions * 2.0**_BITS).astype(np.uint64).astype(np.uint32)

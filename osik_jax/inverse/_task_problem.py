@@ -30,7 +30,7 @@ _KEPT = (ConfigurationLimit, CollisionAvoidanceLimit, PositionBarrier)
 _ENOUGH = 0.01
 _RADIUS = 1.0
 """What the positions' rounding is counted by [m]."""
-_PULLS = 1e-3
+_STOPPED = 1e-3
 _AT = 1e-6
 """A joint that is nearer to its limit is at it [rad or m]."""
 
@@ -47,7 +47,7 @@ class TaskRoute(NamedTuple):
     """Tasks and limits of any kind; hashable."""
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> TaskSearch:
-        """The way to search."""
+        """The search for these tasks."""
         del warm, near
         parts: TaskParts = settings.parts
         lower, upper = entry_limits(robot, settings.lower, settings.upper)
@@ -109,7 +109,9 @@ def read_tasks(robot: Robot, given: Mapping[str, Any]) -> dict[str, Task]:
     """
     check_tasks(given, robot)
     if not any(is_goal(task) for task in given.values()):
-        raise OsikValueError("no task says where anything has to be: give a FrameTask, a ComTask or another on a place")
+        raise OsikValueError(
+            "no task says where anything has to be: give a FrameTask, a ComTask or another task on a pose"
+        )
     tasks = {}
     for name, task in given.items():
         still = {field: 0.0 for field in ("target_velocity",) if field in task.replaceable}
@@ -127,7 +129,7 @@ def read_scheme(scheme: Scheme) -> Scheme:
 def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ...]:
     """The limits that speak of configurations; those on speeds do not bind a search.
 
-    Rows ask for the whole way to their bounds in a step.
+    Their rows have gain 1: a step may go as far as their bounds.
     """
     given = (ConfigurationLimit(robot),) if limits is None else limits
     kept = [limit for limit in given if isinstance(limit, _KEPT)]
@@ -149,16 +151,17 @@ def _evaluated(
 ) -> tuple[dict[str, Array], Int[Array, " nv"], Errors]:
     """Residual of each goal, which limits stop the robot, and the errors."""
     rows, errors = search.errors(q, goal)
-    pulls = [jnp.matmul(own.jacobian.T, own.weight * own.pull, precision="highest") for own in rows.values()]
+    gradients = [jnp.matmul(own.jacobian.T, own.weight * own.pull, precision="highest") for own in rows.values()]
     sizes = [jnp.sqrt(jnp.sum(own.weight * own.pull**2)) for own in rows.values()]
     levers = [jnp.sqrt(jnp.matmul(own.weight, own.jacobian**2, precision="highest")) for own in rows.values()]
-    pull, most = sum(pulls), sum(size * lever for size, lever in zip(sizes, levers, strict=True))
+    gradient, most = sum(gradients), sum(size * lever for size, lever in zip(sizes, levers, strict=True))
     box = [limit.box(search.robot, q, 1.0) for limit in search.limits if isinstance(limit, ConfigurationLimit)]
     low = sum((lower >= -_AT).astype(jnp.int32) for lower, _ in box) > 0 if box else jnp.zeros(search.robot.nv, bool)
     high = sum((upper <= _AT).astype(jnp.int32) for _, upper in box) > 0 if box else jnp.zeros(search.robot.nv, bool)
-    stopped = jnp.abs(pull) > _PULLS * most
-    side = (stopped & high & (pull < 0.0)).astype(jnp.int32) - (stopped & low & (pull > 0.0)).astype(jnp.int32)
-    return {name: jnp.where(own.weight > 0.0, own.pull, 0.0) for name, own in rows.items()}, side, errors
+    stopped = jnp.abs(gradient) > _STOPPED * most
+    at_lower, at_upper = stopped & low & (gradient > 0.0), stopped & high & (gradient < 0.0)
+    active = at_upper.astype(jnp.int32) - at_lower.astype(jnp.int32)
+    return {name: jnp.where(own.weight > 0.0, own.pull, 0.0) for name, own in rows.items()}, active, errors
 
 
 def _clearance(robot: Robot, limit: CollisionAvoidanceLimit, q: Float[Array, " nq"]) -> tuple[Array, Array]:

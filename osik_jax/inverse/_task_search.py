@@ -51,11 +51,11 @@ _TURNS = (LookAtTask, AxisAlignTask)
 _LONGEST = 1.0
 """Longest step of a coordinate [rad or m]."""
 CURVATURE = 0.1
-"""Share of the schemes' curvature damping: with all of it steps are safe and short, and a search may go astray."""
-_WISHES = 0.05
-"""Share of a preference that counts, for each tolerance that the goals are off: none at the end."""
+"""Factor of the schemes' curvature damping: with all of it steps are safe and short, and a search may go astray."""
+_PREFERENCES = 0.05
+"""Gain of the preferences, for each tolerance that the goals are off: 0 at the end."""
 _CLEAR = 0.1
-"""Share of the position tolerance by which limits with rows may be off."""
+"""Fraction of the position tolerance by which limits with rows may be off."""
 _SPREADS = 8
 """Searches start at this many distances from the first configuration, in turn."""
 
@@ -110,9 +110,9 @@ class TaskSearch(eqx.Module):
         """Where a search with this number starts: the first configuration, then points ever further from it."""
         del goal
         points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
-        share = ((seed + _SPREADS - 1) % _SPREADS + 1).astype(points.dtype) / _SPREADS
-        share = jnp.where(seed == 0, 0.0, share)[:, None]
-        return jnp.clip(self.first + share * (points - self.first), self.lower, self.upper)
+        ratio = ((seed + _SPREADS - 1) % _SPREADS + 1).astype(points.dtype) / _SPREADS
+        ratio = jnp.where(seed == 0, 0.0, ratio)[:, None]
+        return jnp.clip(self.first + ratio * (points - self.first), self.lower, self.upper)
 
     def advance(self, x: Float[Array, "lanes nq"], goal: Aims, steps: int) -> tuple[Array, Array, Errors]:
         """Some steps: where the last one set out, where it led, and the errors of where it set out."""
@@ -127,12 +127,12 @@ class TaskSearch(eqx.Module):
     def step(self, q: Float[Array, " nq"], goal: Aims) -> tuple[Float[Array, " nq"], Errors]:
         """Where a step leads, and the errors of where it sets out. A search that is done stays."""
         errors = self.errors(q, goal)[1]
-        share = jnp.minimum(_WISHES * errors.score, 1.0)
-        wished = {
-            name: task if is_goal(task) else task.replace(gain=share.astype(q.dtype))
+        gain = jnp.minimum(_PREFERENCES * errors.score, 1.0)
+        faded = {
+            name: task if is_goal(task) else task.replace(gain=gain.astype(q.dtype))
             for name, task in self.aimed(goal).items()
         }
-        problem = self._problem(q, wished)
+        problem = self._problem(q, faded)
         step = jnp.full_like(problem.lower, _LONGEST)
         problem = dataclasses.replace(
             problem, lower=jnp.clip(problem.lower, -step, step), upper=jnp.clip(problem.upper, -step, step)
@@ -193,8 +193,8 @@ def is_goal(task: Task) -> bool:
 def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:
     """Length of what a task is off in metres and in radians; what is in other units counts as metres."""
     position = position_rows(task, len(rows.error))
-    pull = jnp.where(rows.weight > 0.0, rows.pull, 0.0)
-    parts = (jnp.sum(jnp.where(mask, pull, 0.0) ** 2) for mask in (position, ~position))
+    residual = jnp.where(rows.weight > 0.0, rows.pull, 0.0)
+    parts = (jnp.sum(jnp.where(mask, residual, 0.0) ** 2) for mask in (position, ~position))
     first, second = (jnp.sqrt(jnp.where(part > 0.0, part, 1.0)) * (part > 0.0) for part in parts)
     return first, second
 

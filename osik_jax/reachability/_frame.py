@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from ..inverse._chain import is_plain, jacobian, place
+from ..inverse._chain import chain_kinematics, is_plain, jacobian
 from ..inverse._chain_problem import ChainRoute, Settings
 from ..inverse._chain_search import ChainSearch, Goal
 from ..inverse._inverse_kinematics import joint_box
@@ -80,7 +80,7 @@ def _search(robot: Robot, settings: Settings, route: ChainRoute) -> ChainSearch:
 @partial(jax.jit, static_argnames="route")
 def _sampled(robot: Robot, settings: Settings, number: Array, *, route: ChainRoute) -> Array:
     search = _search(robot, settings, route)
-    return place(search.chain, search.begin(number, None).T).position[0].T  # pyright: ignore[reportArgumentType]
+    return chain_kinematics(search.chain, search.begin(number, None).T).position[0].T  # pyright: ignore[reportArgumentType]
 
 
 @partial(jax.jit, static_argnames="route")
@@ -93,7 +93,7 @@ def _beyond(robot: Robot, settings: Settings, positions: Array, *, route: ChainR
 def _manipulability(robot: Robot, settings: Settings, q: Array, *, route: ChainRoute) -> Array:
     """Of sqrt(det(J J')) and sqrt(det(J' J)), the one that is not 0 for the number of joints alone."""
     chain = _search(robot, settings, route).chain
-    matrix = jnp.moveaxis(jacobian(chain, place(chain, q.T[np.array(chain.layout.dofs, int)]))[0], -1, 0)
+    matrix = jnp.moveaxis(jacobian(chain, chain_kinematics(chain, q.T[np.array(chain.layout.dofs, int)]))[0], -1, 0)
     rows = matrix if matrix.shape[1] <= matrix.shape[2] else jnp.swapaxes(matrix, 1, 2)
     return jax.vmap(partial(volume, log=False))(rows)
 
@@ -101,5 +101,5 @@ def _manipulability(robot: Robot, settings: Settings, q: Array, *, route: ChainR
 @partial(jax.jit, static_argnames="route")
 def _links(robot: Robot, settings: Settings, *, route: ChainRoute) -> Array:
     search = _search(robot, settings, route)
-    placed = place(search.chain, search.first[:, None])
+    placed = chain_kinematics(search.chain, search.first[:, None])
     return jnp.concatenate([placed.anchor[..., 0], placed.position[..., 0]])

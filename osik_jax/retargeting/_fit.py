@@ -96,6 +96,15 @@ class _Problem(NamedTuple):
     rate: Float[Array, ""]
 
 
+class _Given(NamedTuple):
+    """What a clip's loss depends on beside the parameters and the plan."""
+
+    body: Body
+    problem: _Problem
+    weights: Weights
+    lift: float | Array  # of the hips' path, by the height of the ankles [m]
+
+
 def fit(
     robot: Robot,
     motions: Sequence[HumanMotion],
@@ -209,19 +218,22 @@ class _Setting:
     def loss(self, at: _Parameters, problem: _Problem) -> float:
         """Of what ``retarget`` gives for a clip."""
         most = jnp.asarray(self.own.max_iterations)
-        return float(_value(at, self.body, problem, self.weights, self.build.ankle, self.terms, most))
+        return float(_value(at, self._given(problem), self.terms, most))
 
     def plan(self, at: _Parameters, problem: _Problem) -> Array:
         """A clip's plan, at its minimum but for little: (F, nq)."""
-        given = self.body, problem, self.weights, self.build.ankle
-        return _settled(at, *given, _planned(at, *given, jnp.asarray(self.own.max_iterations)), _SETTLING)
+        given = self._given(problem)
+        return _settled(at, given, _planned(at, given, jnp.asarray(self.own.max_iterations)), _SETTLING)
 
     def slope(self, at: _Parameters, problem: _Problem, plan: Array) -> tuple[float, Any, Array]:
         """The loss at the minimum that is near a plan, its gradient, and the plan there."""
-        given = self.body, problem, self.weights, self.build.ankle
-        plan = _settled(at, *given, plan, _FOLLOWING)
-        value, slope = _value_and_slope(at, *given, self.terms, plan)
+        given = self._given(problem)
+        plan = _settled(at, given, plan, _FOLLOWING)
+        value, slope = _value_and_slope(at, given, self.terms, plan)
         return float(value), slope, plan
+
+    def _given(self, problem: _Problem) -> _Given:
+        return _Given(self.body, problem, self.weights, self.build.ankle)
 
     def profile(self, at: _Parameters) -> Profile:
         """The profile with what was tuned, in four digits."""
@@ -268,66 +280,47 @@ def _tuned_weights(weights: Weights, at: _Parameters) -> dict[str, Array]:
     }
 
 
-def _asked(
-    at: _Parameters, body: Body, problem: _Problem, weights: Weights, lift: float
-) -> tuple[Body, Goals, Weights, Bounds]:
+def _asked(at: _Parameters, given: _Given) -> tuple[Body, Goals, Weights, Bounds]:
     """What a plan is made for."""
+    body, problem = given.body, given.problem
     moved = eqx.tree_at(lambda b: b.offsets, body, body.offsets.at[: len(body.keys)].add(_moves(at)))
-    tuned = dataclasses.replace(weights, **_tuned_weights(weights, at))
+    tuned = dataclasses.replace(given.weights, **_tuned_weights(given.weights, at))
     up = jnp.array([0.0, 0.0, 1.0], problem.path.dtype)
-    goals = dataclasses.replace(problem.goals, root=_factor(at.scale) * problem.path + lift * up)
+    goals = dataclasses.replace(problem.goals, root=_factor(at.scale) * problem.path + given.lift * up)
     return moved, goals, tuned, problem.bounds
 
 
 @jax.jit
-def _planned(at: _Parameters, body: Body, problem: _Problem, weights: Weights, lift: float, most: Array) -> Array:
+def _planned(at: _Parameters, given: _Given, most: Array) -> Array:
     """As ``retarget`` plans: (F, nq)."""
-    return make_plan(*_asked(at, body, problem, weights, lift), problem.start, most).q
+    return make_plan(*_asked(at, given), given.problem.start, most).q
 
 
 @jax.jit
-def _settled(
-    at: _Parameters, body: Body, problem: _Problem, weights: Weights, lift: float, plan: Array, more: int
-) -> Array:
+def _settled(at: _Parameters, given: _Given, plan: Array, more: int) -> Array:
     """A plan after so many more iterations: (F, nq)."""
-    asked = _asked(at, body, problem, weights, lift)
-    return mend_plan(*asked, plan, jnp.ones(len(plan), plan.dtype), more).q
+    return mend_plan(*_asked(at, given), plan, jnp.ones(len(plan), plan.dtype), more).q
 
 
 @jax.jit
-def _value(
-    at: _Parameters,
-    body: Body,
-    problem: _Problem,
-    weights: Weights,
-    lift: float,
-    terms: tuple[float, ...],
-    most: Array,
-) -> Float[Array, ""]:
+def _value(at: _Parameters, given: _Given, terms: tuple[float, ...], most: Array) -> Float[Array, ""]:
     """The loss of a clip as ``retarget`` plans it."""
-    plan = _planned(at, body, problem, weights, lift, most)
-    return jnp.dot(jnp.array(terms, plan.dtype), _measured(body, plan, problem, weights))
+    plan = _planned(at, given, most)
+    return jnp.dot(jnp.array(terms, plan.dtype), _measured(given, plan))
 
 
-def _loss(
-    at: _Parameters,
-    body: Body,
-    problem: _Problem,
-    weights: Weights,
-    lift: float,
-    terms: tuple[float, ...],
-    plan: Array,
-) -> Float[Array, ""]:
+def _loss(at: _Parameters, given: _Given, terms: tuple[float, ...], plan: Array) -> Float[Array, ""]:
     """The loss of a clip whose plan is at its minimum."""
-    q = at_solution(*_asked(at, body, problem, weights, lift), jax.lax.stop_gradient(plan))
-    return jnp.dot(jnp.array(terms, q.dtype), _measured(body, q, problem, weights))
+    q = at_solution(*_asked(at, given), jax.lax.stop_gradient(plan))
+    return jnp.dot(jnp.array(terms, q.dtype), _measured(given, q))
 
 
 _value_and_slope = jax.jit(jax.value_and_grad(_loss))
 
 
-def _measured(body: Body, q: Float[Array, "F nq"], problem: _Problem, weights: Weights) -> Float[Array, "5"]:
+def _measured(given: _Given, q: Float[Array, "F nq"]) -> Float[Array, "5"]:
     """What ``FitLoss`` weighs, in its order."""
+    body, problem, weights, _ = given
     robot, keys, goals = body.robot, len(body.keys), problem.goals
     names = tuple(dict.fromkeys(body.frames))
     index = np.array([names.index(name) for name in body.frames])

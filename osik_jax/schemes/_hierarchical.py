@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from ..execution._backends import check_backend
 from ..solvers import Backend, WorkingSet, solve_hqp
-from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf, status_with
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iterations, status_with
 
 
 class HierarchicalQP(Scheme):
@@ -33,7 +33,7 @@ class HierarchicalQP(Scheme):
 
     damping: Float[Array, ""] = eqx.field(default=0.0, converter=as_leaf("damping"), kw_only=True)
     curvature_damping: Float[Array, ""] = eqx.field(default=1.0, converter=as_leaf("curvature_damping"), kw_only=True)
-    max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
+    max_iterations: int | None = eqx.field(default=None, static=True, converter=as_max_iterations)
     backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
     def solve(self, problem: VelocityProblem, warm_start: WorkingSet | None = None) -> SchemeAnswer:

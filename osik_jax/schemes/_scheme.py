@@ -89,24 +89,27 @@ class VelocityProblem(eqx.Module):
         Args:
             constraints: as ``constraints`` has them.
             constant: damping that each priority has anyway.
-            curvature: kappa, the share that each takes of its curvature.
+            curvature: kappa, the factor of each priority's curvature damping.
             below_others: whether the rows of the levels above a priority balance what it cannot meet.
         """
         found = []
         if constraints is not None:
             found.append(Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping())
         for names in self.by_priority():
-            pulls = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
-            share = (_BELOW_OTHERS if below_others and found else 1.0) * curvature
+            residuals = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
+            factor = (_BELOW_OTHERS if below_others and found else 1.0) * curvature
             found.append(
                 Damping(
-                    constant, share * self.curvature(names), length(jnp.concatenate(pulls)), share * self.bends(names)
+                    constant,
+                    factor * self.curvature(names),
+                    length(jnp.concatenate(residuals)),
+                    factor * self.bends(names),
                 )
             )
         return found
 
     def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
-        """What a motion of each dof costs these tasks at second order, along a unit pull (``row_sums``).
+        """What a motion of each dof costs these tasks at second order, along a residual of length 1 (``row_sums``).
 
         0 for those of ball and free joints: a box for the components of a turn would depend on where the world's axes
         point. Where a robot stands, its legs keep its base from turning.
@@ -185,7 +188,7 @@ class SchemeAnswer(eqx.Module):
 
 
 class Scheme(Replaceable):
-    """Base of the schemes: how tasks that cannot all be met share the robot.
+    """Base of the schemes: how tasks that cannot all be met are weighed against each other.
 
     ``scheme.replace(name=value, ...)`` is the same scheme with other numbers, those that ``scheme.replaceable`` lists.
     """
@@ -204,8 +207,8 @@ class Scheme(Replaceable):
         return as_scalar(value, name, getattr(self, name).dtype)
 
 
-def as_cap(value: Any) -> int | None:
-    """A cap on iterations: an integer from 0 up, Python's or NumPy's, or None.
+def as_max_iterations(value: Any) -> int | None:
+    """A maximum of iterations: an integer from 0 up, Python's or NumPy's, or None.
 
     Raises:
         ValueError: anything else.
@@ -213,7 +216,7 @@ def as_cap(value: Any) -> int | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-        raise OsikValueError(f"max_iterations is {value!r}; it is an integer, or None for the solver's own cap")
+        raise OsikValueError(f"max_iterations is {value!r}; it is an integer, or None for the solver's own maximum")
     return int(value)
 
 

@@ -17,7 +17,7 @@ from ..numerics._constants import SINGLE_DAMPING
 from ..numerics._dense import short_sum
 from ..solvers import Backend, Level, solve_least_squares_qp
 from ..tasks import TaskRows
-from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_cap, as_leaf
+from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iterations
 
 _CALM_RATIO = 30.0
 """Little of the curvature damping is added where it is below this many times a dof's other diagonal terms."""
@@ -44,7 +44,7 @@ class WeightedQP(Scheme):
 
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
     curvature_damping: Float[Array, ""] = eqx.field(default=1.25, converter=as_leaf("curvature_damping"), kw_only=True)
-    max_iterations: int | None = eqx.field(default=None, static=True, converter=as_cap)
+    max_iterations: int | None = eqx.field(default=None, static=True, converter=as_max_iterations)
     backend: Backend = eqx.field(default="auto", static=True, kw_only=True, converter=check_backend)
 
     def __check_init__(self) -> None:

@@ -82,12 +82,12 @@ def nearest(start_a, along_a, radius_a, start_b, along_b, radius_b):
     """
     s, t = parameters(along_a, along_b, minus(start_a, start_b))
     on_a, on_b = plus(start_a, times(s, along_a)), plus(start_b, times(t, along_b))
-    way = minus(on_b, on_a)
-    square = inner(way, way)
+    between = minus(on_b, on_a)
+    square = inner(between, between)
     if square <= _TINY:
         outward = plus(minus(start_b, start_a), times(0.5, minus(along_b, along_a)))
         normal = across(along_a, along_b, outward)
     else:
-        normal = times(1.0 / np.sqrt(square), way)
+        normal = times(1.0 / np.sqrt(square), between)
     distance = np.sqrt(square) - radius_a - radius_b
     return distance, plus(on_a, times(radius_a, normal)), minus(on_b, times(radius_b, normal)), normal

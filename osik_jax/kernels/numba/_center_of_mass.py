@@ -29,14 +29,14 @@ def move_center(J, below, owners, columns, factors, lin, ang, anchors):
         column = columns[dof]
         if column < 0:
             continue
-        body, share = owners[dof], factors[dof] / whole
+        body, ratio = owners[dof], factors[dof] / whole
         mass, anchor, along = below[body, 0], triple(anchors, dof), triple(lin, dof)
         arm = minus(
             (below[body, 1], below[body, 2], below[body, 3]), (mass * anchor[0], mass * anchor[1], mass * anchor[2])
         )
         speed = cross(triple(ang, dof), arm)
         for i in range(3):
-            J[i, column] += share * (mass * along[i] + speed[i])
+            J[i, column] += ratio * (mass * along[i] + speed[i])
 
 
 @compiled

@@ -17,8 +17,8 @@ def length(a, weight):
     if not size > 0.0:
         return 0.0
     for i in range(len(a)):
-        share = weight[i] * a[i] / size
-        total += share * share
+        term = weight[i] * a[i] / size
+        total += term * term
     return size * np.sqrt(total)
 
 

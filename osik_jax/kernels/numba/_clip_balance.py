@@ -19,15 +19,15 @@ def center_of(K, V, W):
     """The centre of mass."""
     center = (0.0, 0.0, 0.0)
     for body in range(K.counts[BODIES]):
-        if V.shares[body] != 0.0:
+        if V.mass_fractions[body] != 0.0:
             at = plus(triple(W.position, body), rotated(turning(W.rotation, body), triple(V.centers, body)))
-            center = plus(center, times(V.shares[body], at))
+            center = plus(center, times(V.mass_fractions[body], at))
     return center
 
 
 @lean
-def reach(first, W, contact, d):
-    """How far the standing corners reach along d, and against it."""
+def support(first, W, contact, d):
+    """Support function of the standing corners, along d and along -d."""
     farthest, nearest = -np.inf, np.inf
     for k in range(CORNERS):
         if contact[k // 2] > 0.5:
@@ -37,16 +37,16 @@ def reach(first, W, contact, d):
 
 
 @lean
-def flat(way):
-    """A way in the plane of the floor, and its length."""
-    return (way[0], way[1], 0.0), np.sqrt(way[0] * way[0] + way[1] * way[1])
+def flat(vector):
+    """A vector's part in the plane of the floor, and its length."""
+    return (vector[0], vector[1], 0.0), np.sqrt(vector[0] * vector[0] + vector[1] * vector[1])
 
 
 @lean
 def find_overhang(K, V, W, contact, center):
-    """As ``overhang``; for the shares, both corners and the share of the second."""
+    """As ``overhang``; for the shares, both corners and the ratio of the edge at which the nearest point is."""
     first, shortest = K.counts[KEYS] + 4, V.wishes[SHORTEST]
-    most, direction, a, b, share, width = -np.inf, (0.0, 0.0, 0.0), 0, 0, 0.0, np.inf
+    most, direction, a, b, ratio, width = -np.inf, (0.0, 0.0, 0.0), 0, 0, 0.0, np.inf
     for i in range(CORNERS):
         if not contact[i // 2] > 0.5:
             continue
@@ -54,24 +54,24 @@ def find_overhang(K, V, W, contact, center):
         off, length = flat(minus(center, start))
         if length > shortest:
             d = times(1.0 / length, off)
-            distance = inner(d, center) - reach(first, W, contact, d)[0]
+            distance = inner(d, center) - support(first, W, contact, d)[0]
             if distance > most:
-                most, direction, a, b, share = distance, d, i, i, 0.0
+                most, direction, a, b, ratio = distance, d, i, i, 0.0
         for j in range(i + 1, CORNERS):
             edge, length = flat(minus(triple(W.points, first + j), start))
             if not contact[j // 2] > 0.5 or not length > shortest:
                 continue
             along = times(1.0 / length, edge)
             across = (along[1], -along[0], 0.0)
-            one, other = reach(first, W, contact, across)
+            one, other = support(first, W, contact, across)
             width = min(width, one + other)
             for side in range(2):
                 d = across if side == 0 else times(-1.0, across)
                 distance = inner(d, center) - (one if side == 0 else other)
                 if distance > most:
                     most, direction, a, b = distance, d, i, j
-                    share = min(max(inner(along, off) / length, 0.0), 1.0)
-    return most, direction, a, b, share, width
+                    ratio = min(max(inner(along, off) / length, 0.0), 1.0)
+    return most, direction, a, b, ratio, width
 
 
 @lean
@@ -81,18 +81,18 @@ def ask_balance(K, V, W, J, row, contact, n):
     if weight == 0.0 or not (max(contact[0], contact[1]) > 0.5 and max(contact[2], contact[3]) > 0.5):
         return row, 0.0
     center = center_of(K, V, W)
-    distance, d, a, b, share, width = find_overhang(K, V, W, contact, center)
+    distance, d, a, b, ratio, width = find_overhang(K, V, W, contact, center)
     gap = distance + min(V.wishes[INSIDE], width / 3.0)
     if not gap > 0.0:
         return row, 0.0
     origin = triple(W.position, K.counts[ROOT])
     for body in range(K.counts[BODIES]):
-        if V.shares[body] != 0.0:
+        if V.mass_fractions[body] != 0.0:
             at = plus(triple(W.position, body), rotated(turning(W.rotation, body), triple(V.centers, body)))
-            pull = times(V.shares[body], d)
-            add_rates(W.line, W.masks[body], W.motion, pull, cross(minus(at, origin), pull))
+            direction = times(V.mass_fractions[body], d)
+            add_rates(W.line, W.masks[body], W.motion, direction, cross(minus(at, origin), direction))
     first = K.counts[KEYS] + 4
-    add_point(K, W, first + a, times(share - 1.0, d))
-    add_point(K, W, first + b, times(-share, d))
+    add_point(K, W, first + a, times(ratio - 1.0, d))
+    add_point(K, W, first + b, times(-ratio, d))
     put_row(K, V, W, J, row, np.sqrt(V.wishes[STIFFNESS] * weight), gap, n)
     return row + 1, 0.5 * weight * gap * gap

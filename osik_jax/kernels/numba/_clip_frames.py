@@ -48,22 +48,22 @@ from ._vectors import WIDTH
 def ask_limbs(K, V, W, J, row, wanted, n):
     """Rows of directions: the next row, and half the weighted sum of squares.
 
-    What a direction d changes by is across it, ``(I - d d') / length`` times what the way changes by: two rows do for
-    the three. A limb that is shorter than what counts as a length has none.
+    What a direction d changes by is across it, ``(I - d d') / length`` times what the segment changes by: two rows do
+    for the three. A limb that is shorter than what counts as a length has none.
     """
     weight, cost = V.wishes[LIMB], 0.0
     root = np.sqrt(weight)
     for limb in range(K.counts[LIMBS] - 1):
         a, b = K.limbs[2 * limb], K.limbs[2 * limb + 1]
-        way = minus(triple(W.points, b), triple(W.points, a))
-        length = np.sqrt(inner(way, way))
+        segment = minus(triple(W.points, b), triple(W.points, a))
+        length = np.sqrt(inner(segment, segment))
         inverse = 1.0 / max(length, V.wishes[SHORTEST])
-        d = times(inverse, way)
+        d = times(inverse, segment)
         off = minus(d, three(wanted, 3 * limb))
         cost += 0.5 * weight * inner(off, off)
         if length < V.wishes[SHORTEST]:
             continue
-        first = across(way, way, way)
+        first = across(segment, segment, segment)
         second = cross(d, first)
         for i in range(2):
             side = first if i == 0 else second
@@ -135,7 +135,7 @@ def ask_floor(K, V, W, J, row, contact, n):
 
 @lean
 def capsule(K, V, W, i):
-    """One end of its axis, the way to the other, and its radius."""
+    """One end of its axis, the vector to the other, and its radius."""
     k = K.counts[KEYS] + 12 + 2 * i
     start = triple(W.points, k)
     return start, minus(triple(W.points, k + 1), start), V.radii[i]
@@ -144,16 +144,16 @@ def capsule(K, V, W, i):
 @lean
 def find_near(K, V, W):
     """How many pairs of capsules are nearer than the margin: their numbers and distances are in ``W.near``."""
-    margin, count, middles = V.wishes[MARGIN], 0, W.middles
+    margin, count, spheres = V.wishes[MARGIN], 0, W.spheres
     for i in range(K.counts[CAPSULES]):
         start, along, radius = capsule(K, V, W, i)
-        put(middles, i, plus(start, times(0.5, along)))
-        middles[i, 3] = 0.5 * np.sqrt(inner(along, along)) + radius + 0.5 * margin
+        put(spheres, i, plus(start, times(0.5, along)))
+        spheres[i, 3] = 0.5 * np.sqrt(inner(along, along)) + radius + 0.5 * margin
     for p in range(K.counts[PAIRS]):
         a, b = K.pairs[2 * p], K.pairs[2 * p + 1]
-        x, y, z = middles[b, 0] - middles[a, 0], middles[b, 1] - middles[a, 1], middles[b, 2] - middles[a, 2]
-        reach = middles[a, 3] + middles[b, 3]
-        if x * x + y * y + z * z < reach * reach:
+        x, y, z = spheres[b, 0] - spheres[a, 0], spheres[b, 1] - spheres[a, 1], spheres[b, 2] - spheres[a, 2]
+        radii = spheres[a, 3] + spheres[b, 3]
+        if x * x + y * y + z * z < radii * radii:
             start_a, along_a, radius_a = capsule(K, V, W, a)
             start_b, along_b, radius_b = capsule(K, V, W, b)
             distance = nearest(start_a, along_a, radius_a, start_b, along_b, radius_b)[0]

@@ -58,7 +58,7 @@ class Numbers(NamedTuple):
     rest: np.ndarray
     step: np.ndarray
     change: np.ndarray
-    shares: np.ndarray  # of each body in the robot's mass
+    mass_fractions: np.ndarray  # of each body in the robot's mass
     centers: np.ndarray  # where that is in the body
     wishes: np.ndarray
 
@@ -78,7 +78,7 @@ class Memory(NamedTuple):
     turned: np.ndarray
     line: np.ndarray
     near: np.ndarray  # numbers of the pairs that are too near, and how near
-    middles: np.ndarray  # of capsules, and how far they reach from there
+    spheres: np.ndarray  # around capsules: center and radius
 
 
 class Goal(NamedTuple):
@@ -187,13 +187,13 @@ def numbers(c, at, wishes):
     rest, at = vector(at, n), at + 8 * n
     step, at = vector(at, n), at + 8 * n
     change, at = vector(at, n), at + 8 * n
-    shares, at = vector(at, c[BODIES]), at + 8 * c[BODIES]
+    mass_fractions, at = vector(at, c[BODIES]), at + 8 * c[BODIES]
     centers, at = matrix(at, c[BODIES], 3), at + 24 * c[BODIES]
     for i in range(WISHES):
         wishes[i] = vector(at, WISHES)[i]
     return Numbers(
         coefficient, offset, reference, body_at, body_along, joint_at, joint_along, factors, points, turns, home,
-        radii, lower, upper, rest, step, change, shares, centers, wishes,
+        radii, lower, upper, rest, step, change, mass_fractions, centers, wishes,
     )  # fmt: skip
 
 
@@ -213,9 +213,9 @@ def memory(c, at):
     turned, at = matrix(at, 4, 9), at + 288
     line, at = vector(at, wide), at + 8 * wide
     near, at = vector(at, 2 * c[PAIRS]), at + 16 * c[PAIRS]
-    middles, at = matrix(at, c[CAPSULES], 4), at + 32 * c[CAPSULES]
+    spheres, at = matrix(at, c[CAPSULES], 4), at + 32 * c[CAPSULES]
     return Memory(
-        value, position, rotation, linear, angular, anchors, motion, masks, points, turned, line, near, middles
+        value, position, rotation, linear, angular, anchors, motion, masks, points, turned, line, near, spheres
     ), at
 
 

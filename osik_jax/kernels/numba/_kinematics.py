@@ -78,14 +78,14 @@ def place_bodies(parents, kinds, owners, value, reference, at, along, joint_at, 
                     put(anchors, dof + k, seen)
                 joint, place, dof = joint + 1, place + 4, dof + 3
                 continue
-            way = value[place] - reference[place]
+            displacement = value[place] - reference[place]
             put(anchors, dof, seen)
             if kind == SLIDE:
-                pos = plus(pos, (way * axis[0], way * axis[1], way * axis[2]))
+                pos = plus(pos, (displacement * axis[0], displacement * axis[1], displacement * axis[2]))
                 put(lin, dof, rotated(frame, axis))
                 put(ang, dof, nothing)
             else:
-                sine, cosine = np.sin(0.5 * way), np.cos(0.5 * way)
+                sine, cosine = np.sin(0.5 * displacement), np.cos(0.5 * displacement)
                 x, y, z = triple(joint_along, joint)
                 quat = multiplied(quat, (cosine, sine * x, sine * y, sine * z))
                 pos = minus(anchor, carried(quat, fixed))

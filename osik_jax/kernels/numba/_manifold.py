@@ -1,4 +1,4 @@
-"""``kinematics/_manifold.py`` for kernels: moving along the manifold of configurations, and the way back."""
+"""``kinematics/_manifold.py`` for kernels: moving along the manifold of configurations, and its inverse."""
 
 from __future__ import annotations
 
@@ -37,11 +37,12 @@ def integrate(scalars, turns, q, v, out):
         x, y, z = v[dof], v[dof + 1], v[dof + 2]
         square = x * x + y * y + z * z
         if square < _SMALL:
-            cosine, share = 1.0 - square / 8.0 + square * square / 384.0, 0.5 - square / 48.0 + square * square / 3840.0
+            cosine = 1.0 - square / 8.0 + square * square / 384.0
+            factor = 0.5 - square / 48.0 + square * square / 3840.0
         else:
             angle = np.sqrt(square)
-            cosine, share = np.cos(0.5 * angle), np.sin(0.5 * angle) / angle
-        w, x, y, z = multiplied(_unit(q, at), (cosine, share * x, share * y, share * z))
+            cosine, factor = np.cos(0.5 * angle), np.sin(0.5 * angle) / angle
+        w, x, y, z = multiplied(_unit(q, at), (cosine, factor * x, factor * y, factor * z))
         length = np.sqrt(w * w + x * x + y * y + z * z)
         out[at], out[at + 1], out[at + 2], out[at + 3] = w / length, x / length, y / length, z / length
 

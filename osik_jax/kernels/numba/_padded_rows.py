@@ -128,40 +128,24 @@ _plus, _minus, _sizes, _squares = map(_summing, ("plus", "minus", "sizes", "squa
 _spread: Any = cast(Any, intrinsic)(_spreading)
 
 
-@lean
-def _plus_plain(out, base, a, B, first, last, start, stop):
-    for c in range(start, min(stop, len(out), len(base))):
-        total = base[c]
-        for j in range(first, last):
-            total += a[j] * B[j, c]
-        out[c] = total
+def _summing_plain(term: Any) -> Any:
+    """The same as a plain loop; ``term(a_j, B_jc)`` is added."""
+
+    @lean
+    def plain(out, base, a, B, first, last, start, stop):
+        for c in range(start, min(stop, len(out), len(base))):
+            total = base[c]
+            for j in range(first, last):
+                total += term(a[j], B[j, c])
+            out[c] = total
+
+    return plain
 
 
-@lean
-def _minus_plain(out, base, a, B, first, last, start, stop):
-    for c in range(start, min(stop, len(out), len(base))):
-        total = base[c]
-        for j in range(first, last):
-            total -= a[j] * B[j, c]
-        out[c] = total
-
-
-@lean
-def _sizes_plain(out, base, a, B, first, last, start, stop):
-    for c in range(start, min(stop, len(out), len(base))):
-        total = base[c]
-        for j in range(first, last):
-            total += abs(a[j] * B[j, c])
-        out[c] = total
-
-
-@lean
-def _squares_plain(out, base, a, B, first, last, start, stop):
-    for c in range(start, min(stop, len(out), len(base))):
-        total = base[c]
-        for j in range(first, last):
-            total += B[j, c] * B[j, c]
-        out[c] = total
+_plus_plain = _summing_plain(lean(lambda a, b: a * b))
+_minus_plain = _summing_plain(lean(lambda a, b: -(a * b)))
+_sizes_plain = _summing_plain(lean(lambda a, b: abs(a * b)))
+_squares_plain = _summing_plain(lean(lambda a, b: b * b))
 
 
 @lean
@@ -220,34 +204,32 @@ def _clear_plain(out, stop):
         out[j] = 0.0
 
 
-@lean
-def _copy_plain(out, a, stop):
-    for j in range(min(stop, len(out), len(a))):
-        out[j] = a[j]
+def _of_one_plain(formula: Any) -> Any:
+    """``out = formula(a)`` as a plain loop."""
+
+    @lean
+    def plain(out, a, stop):
+        for j in range(min(stop, len(out), len(a))):
+            out[j] = formula(a[j])
+
+    return plain
 
 
-@lean
-def _invert_plain(out, a, stop):
-    for j in range(min(stop, len(out), len(a))):
-        out[j] = 1.0 / a[j]
+def _of_two_plain(formula: Any) -> Any:
+    """``out = formula(a, b)`` as a plain loop."""
+
+    @lean
+    def plain(out, a, b, stop):
+        for j in range(min(stop, len(out), len(a), len(b))):
+            out[j] = formula(a[j], b[j])
+
+    return plain
 
 
-@lean
-def _root_plain(out, a, stop):
-    for j in range(min(stop, len(out), len(a))):
-        out[j] = np.sqrt(a[j])
-
-
-@lean
-def _subtract_plain(out, a, b, stop):
-    for j in range(min(stop, len(out), len(a), len(b))):
-        out[j] = a[j] - b[j]
-
-
-@lean
-def _multiply_plain(out, a, b, stop):
-    for j in range(min(stop, len(out), len(a), len(b))):
-        out[j] = a[j] * b[j]
+_copy_plain, _invert_plain, _root_plain = map(
+    _of_one_plain, (lean(lambda a: a), lean(lambda a: 1.0 / a), lean(lambda a: np.sqrt(a)))
+)
+_subtract_plain, _multiply_plain = map(_of_two_plain, (lean(lambda a, b: a - b), lean(lambda a, b: a * b)))
 
 
 @lean

@@ -118,7 +118,7 @@ def linearise(K, V, W, G, R, T, q, out):
 
 @lean
 def step_from(K, C, T, here, free, damping, q, candidate):
-    """Solves the damped system, and goes the way that it says, as far as the linear model is good."""
+    """Solves the damped system and takes the step, no longer than the linear model is good for."""
     frames, n = T.right.shape
     N = padded(n + 1)
     for t in range(frames):

@@ -56,9 +56,9 @@ def quaternion_of(m):
     else:
         t = 1.0 + m[0] + m[4] + m[8]
         q = t, m[7] - m[5], m[2] - m[6], m[3] - m[1]
-    share = 0.5 / np.sqrt(t)
-    share = -share if q[0] < 0.0 else share
-    return share * q[0], share * q[1], share * q[2], share * q[3]
+    factor = 0.5 / np.sqrt(t)
+    factor = -factor if q[0] < 0.0 else factor
+    return factor * q[0], factor * q[1], factor * q[2], factor * q[3]
 
 
 @lean

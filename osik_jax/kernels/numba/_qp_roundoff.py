@@ -34,15 +34,15 @@ def find_roundoff(P, W, labels, tolerance, x, z):
         W.value_roundoff[j] = tolerance * scale
         at_bound = at_bound or labels[j] != INACTIVE
     for i in range(n, len(P.lower)):
-        value, reach, span, row = 0.0, 0.0, 0.0, P.rows[m + i - n]
+        value, per_curvature, per_unit, row = 0.0, 0.0, 0.0, P.rows[m + i - n]
         for j in range(n):
             value += row[j] * x[j]
-            span += abs(row[j])
-            reach += abs(row[j]) * P.inverse_root[j]
+            per_unit += abs(row[j])
+            per_curvature += abs(row[j]) * P.inverse_root[j]
         nearest = min(abs(P.lower[i]), abs(P.upper[i]))
-        scale = min(most * reach, longest * span) + abs(value) + (nearest if nearest < np.inf else 0.0)
+        scale = min(most * per_curvature, longest * per_unit) + abs(value) + (nearest if nearest < np.inf else 0.0)
         W.value_roundoff[i] = tolerance * scale
-        W.multiplier_roundoff[i] = tolerance * scale / max(reach, 1e-300) ** 2
+        W.multiplier_roundoff[i] = tolerance * scale / max(per_curvature, 1e-300) ** 2
     if at_bound:
         find_bound_roundoff(P, W, x, z)
 

@@ -110,8 +110,8 @@ def carried(q, v):
 @lean
 def rotation_of(q):
     """Return the rotation of a quaternion of any length but 0."""
-    share = 2.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    x, y, z = share * q[1], share * q[2], share * q[3]
+    factor = 2.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    x, y, z = factor * q[1], factor * q[2], factor * q[3]
     wx, wy, wz = q[0] * x, q[0] * y, q[0] * z
     xx, xy, xz = q[1] * x, q[1] * y, q[1] * z
     yy, yz, zz = q[2] * y, q[2] * z, q[3] * z

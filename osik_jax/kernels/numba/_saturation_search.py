@@ -3,7 +3,7 @@
     min 1/2 |x - target|^2   over   x = start + scale motion + P u,   lower <= x <= upper
 
 for the largest scale <= 1 for which there is such an x. The problem is that file's and the method is another, for here
-a lane may take its own way.
+a lane may branch as it needs.
 
 At a scale that is given it is the dual method of D. Goldfarb and A. Idnani ("A numerically stable dual method for
 solving strictly convex quadratic programs", Mathematical Programming 27, 1983). It begins at x without bounds. Joints

@@ -41,7 +41,7 @@ def handle(frame):
     factor, at = matrix(at, high, high), at + 8 * high * high
     turned_factor, at = matrix(at, high, high), at + 8 * high * high
     goal, own, ones, middle = at, at + line, at + 2 * line, at + 3 * line
-    root, reach, at = at + 4 * line, at + 5 * line, at + 6 * line
+    root, inverse_root, at = at + 4 * line, at + 5 * line, at + 6 * line
     fill(vector(space, (at - space) >> 3), 0.0)  # what is behind the rows
     fill(vector(own, wide), 1.0)
     fill(vector(ones, wide), 1.0)
@@ -69,7 +69,7 @@ def handle(frame):
         lower = C + 8 * (p * n + p)
         P = Problem(
             rows, turned, vector(goal, m), vector(goal, high), compliances, vector(own, n), vector(middle, n),
-            vector(lower, N), vector(lower + 8 * N, N), vector(root, n), vector(reach, n),
+            vector(lower, N), vector(lower + 8 * N, N), vector(root, n), vector(inverse_root, n),
         )  # fmt: skip
         labels = whole_numbers(active + last // 2, N)
         said, guessed = whole_numbers(report + 12 * lane, 3), whole_numbers(guess + last // 2, N)

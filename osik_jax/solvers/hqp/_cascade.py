@@ -124,16 +124,9 @@ def solve_cascade(
     numbers = jnp.arange(layout.levels)
     state, outcomes = jax.lax.scan(solve_next, first, (numbers, levels, guesses))
     active_sets, working_sets, multipliers, slack_norms = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes)
-    n = layout.variables
-    # a bound that levels narrowed for those below them is none of the box
-    narrowed = jnp.where(
-        state.active_bounds < 0,
-        state.lower[:, :n] > hierarchy.hard_lower[:, :n],
-        state.upper[:, :n] < hierarchy.hard_upper[:, :n],
-    )
     result = CascadeResult(
         x=state.x,
-        active_bounds=jnp.where(narrowed, 0, state.active_bounds),
+        active_bounds=_bounds_of_the_box(hierarchy, state),
         active_sets=active_sets,
         working_sets=working_sets,
         multipliers=multipliers,
@@ -144,6 +137,17 @@ def solve_cascade(
         done=state.done,
     )
     return jax.vmap(certify_levels)(result, hierarchy, tolerances)
+
+
+def _bounds_of_the_box(hierarchy: PaddedHierarchy, state: CascadeState) -> Int[Array, "B n"]:
+    """Return which bounds of the box are active: one that levels narrowed for those below them is none of it."""
+    n = state.x.shape[1]
+    narrowed = jnp.where(
+        state.active_bounds < 0,
+        state.lower[:, :n] > hierarchy.hard_lower[:, :n],
+        state.upper[:, :n] < hierarchy.hard_upper[:, :n],
+    )
+    return jnp.where(narrowed, 0, state.active_bounds)
 
 
 def _start(hierarchy: PaddedHierarchy) -> CascadeState:

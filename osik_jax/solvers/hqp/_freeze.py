@@ -48,6 +48,14 @@ class LevelOutcome(NamedTuple):
     slack_norm: Float[Array, "*B"]  # at the level's own optimum
 
 
+class _Determined(NamedTuple):
+    """What all minimisers of a level have in common."""
+
+    slack: Float[Array, " m"]
+    in_cost: Bool[Array, " m"]  # own rows that are equalities or outside their interval
+    frozen: Bool[Array, " h"]  # active hard rows with a nonzero multiplier
+
+
 def freeze(
     state: CascadeState, problem: LevelProblem, end: PrimalState, tolerances: Tolerances
 ) -> tuple[CascadeState, LevelOutcome]:
@@ -59,7 +67,32 @@ def freeze(
         end: its optimum.
         tolerances: what counts as zero.
     """
-    n, level = len(problem.x), problem.level
+    found = _determined(problem, end, tolerances)
+    frozen_count = jnp.sum(found.frozen, dtype=jnp.int32)
+    same_cost = jnp.all(found.in_cost == end.in_cost)
+    # the rank is known from the level's own factors where these have all the rows that are frozen here
+    known_rank = jnp.where(same_cost & jnp.all(found.frozen == (end.active != 0)), frozen_count + end.rank, -1)
+    basis, rank = _row_space(_rows_to_freeze(problem, found), problem.projector, known_rank, tolerances.rank)
+    # active rows without a multiplier are left out of the derivative, unless the rank of the cost's rows would then
+    # be another (a tie)
+    tie = same_cost & (rank - frozen_count != end.rank) & (problem.damping == 0.0)
+    kept = jnp.where(found.frozen | tie, end.active, 0)
+    side = jnp.where(found.in_cost, jnp.where(found.slack > 0.0, 1, -1), 0).astype(jnp.int32)
+    active_sets = ActiveSets(
+        active=jnp.where(problem.damping > 0.0, end.active, kept),
+        frozen=kept,
+        in_cost=side,
+        rank=jnp.where(tie, end.rank, rank - frozen_count),
+    )
+    own = jnp.where(problem.is_equality, 2, side).astype(jnp.int32)
+    slack_norm = jnp.sqrt(jnp.sum(found.slack**2))
+    outcome = LevelOutcome(active_sets, WorkingSet(end.active, own), end.multiplier, slack_norm)
+    return _state_below(state, problem, end, found, basis), outcome
+
+
+def _determined(problem: LevelProblem, end: PrimalState, tolerances: Tolerances) -> _Determined:
+    """Return which rows have the same value at all minimisers: those with a slack, and those with a multiplier."""
+    level = problem.level
     value = apply(level.matrix, end.x)
     slack = value - jnp.clip(value, level.lower, level.upper)
     root_cost = problem.root_cost(end.x, slack)
@@ -71,32 +104,37 @@ def freeze(
     force_tol = tolerances.multiplier * jnp.sqrt(jnp.sum(gradient**2)) + roundoff
     # a force that the damping alone explains leaves the levels below room on the face that the level has reached
     frozen = (end.active != 0) & (force > force_tol + problem.damping * jnp.sqrt(jnp.sum(end.x**2)))
-    rows = jnp.argsort(~frozen, stable=True)[:n]
-    # rows of unit length, and own rows in units of the longest, so that one rank tolerance fits all
-    length = jnp.where(frozen, problem.length, 1.0)[rows]
-    to_freeze = jnp.concatenate(
+    return _Determined(slack, in_cost, frozen)
+
+
+def _rows_to_freeze(problem: LevelProblem, found: _Determined) -> Float[Array, "k n"]:
+    """Return them with unit length, and own rows in units of the longest, so that one rank tolerance fits all."""
+    level, n = problem.level, len(problem.x)
+    rows = jnp.argsort(~found.frozen, stable=True)[:n]
+    length = jnp.where(found.frozen, problem.length, 1.0)[rows]
+    return jnp.concatenate(
         [
-            jnp.where(frozen[rows], 1.0 / length, 0.0)[:, None] * problem.hard[rows],
-            jnp.where(in_cost[:, None], level.matrix, 0.0) / jnp.where(level.size > 0.0, level.size, 1.0),
+            jnp.where(found.frozen[rows], 1.0 / length, 0.0)[:, None] * problem.hard[rows],
+            jnp.where(found.in_cost[:, None], level.matrix, 0.0) / jnp.where(level.size > 0.0, level.size, 1.0),
         ]
     )
-    frozen_count = jnp.sum(frozen, dtype=jnp.int32)
-    same_cost = jnp.all(in_cost == end.in_cost)
-    # the rank is known from the level's own factors where these have all the rows that are frozen here
-    known_rank = jnp.where(same_cost & jnp.all(frozen == (end.active != 0)), frozen_count + end.rank, -1)
-    basis, rank = _row_space(to_freeze, problem.projector, known_rank, tolerances.rank)
-    own_side = jnp.where(in_cost, jnp.where(slack > 0.0, 1, -1), 0).astype(jnp.int32)
-    reached = apply(problem.hard, end.x)
+
+
+def _state_below(
+    state: CascadeState, problem: LevelProblem, end: PrimalState, found: _Determined, basis: Float[Array, "n k"]
+) -> CascadeState:
+    """Return what the level below starts with; ``basis`` is one of the space that is frozen here."""
+    n, reached = len(problem.x), apply(problem.hard, end.x)
     low, high, curvature = narrow_box(
-        problem.damping_terms, level, state.curvature, end.x, problem.lower[:n], problem.upper[:n]
+        problem.damping_terms, problem.level, state.curvature, end.x, problem.lower[:n], problem.upper[:n]
     )
     # the levels below may not make a row of this level worse: its interval is widened to the value reached, no further
-    after = state._replace(
+    return state._replace(
         x=end.x,
         lower=jnp.where(problem.is_own, jnp.minimum(problem.lower, reached), problem.lower).at[:n].set(low),
         upper=jnp.where(problem.is_own, jnp.maximum(problem.upper, reached), problem.upper).at[:n].set(high),
-        frozen=state.frozen | frozen | problem.scatter(in_cost),
-        active=jnp.where(frozen, 0, end.active),
+        frozen=state.frozen | found.frozen | problem.scatter(found.in_cost),
+        active=jnp.where(found.frozen, 0, end.active),
         projector=problem.projector - product(basis, basis.T),
         curvature=curvature,
         active_bounds=jnp.where(
@@ -105,19 +143,6 @@ def freeze(
         residual=jnp.maximum(state.residual, end.residual),
         done=state.done & end.done,
     )
-    own = jnp.where(problem.is_equality, 2, own_side).astype(jnp.int32)
-    # active rows without a multiplier are left out of the derivative, unless the rank of the cost's rows would then
-    # be another (a tie)
-    tie = same_cost & (rank - frozen_count != end.rank) & (problem.damping == 0.0)
-    kept = jnp.where(frozen | tie, end.active, 0)
-    active_sets = ActiveSets(
-        active=jnp.where(problem.damping > 0.0, end.active, kept),
-        frozen=kept,
-        in_cost=own_side,
-        rank=jnp.where(tie, end.rank, rank - frozen_count),
-    )
-    slack_norm = jnp.sqrt(jnp.sum(slack**2))
-    return after, LevelOutcome(active_sets, WorkingSet(end.active, own), end.multiplier, slack_norm)
 
 
 def skip(state: CascadeState, problem: LevelProblem) -> tuple[CascadeState, LevelOutcome]:

@@ -119,21 +119,6 @@ def solve(
     shape = Shape.of(layout)
     batch, count, m, n = hierarchy.levels.matrix.shape
     h = hierarchy.hard.shape[1]
-    guess = first_working_sets(hierarchy, warm_start)
-
-    def without_padding(a: Array) -> Array:
-        return jnp.concatenate([a[:, k, :size] for k, size in enumerate(shape.row_counts)], 1)
-
-    levels, is_equality = hierarchy.levels, hierarchy.is_equality.astype(jnp.int32)
-    inputs = (
-        jnp.swapaxes(without_padding(levels.matrix), 1, 2),
-        *(without_padding(a) for a in (levels.lower, levels.upper, is_equality)),
-        *(hierarchy.hard_lower, hierarchy.hard_upper, hierarchy.hard_is_equality.astype(jnp.int32)),
-        *(a.astype(jnp.int32) for a in guess),
-        jnp.stack(hierarchy.damping[:3], 1),
-        hierarchy.damping.bends,
-        jnp.stack(tolerances, -1),
-    )
     sizes = dict(
         solution=n,
         active_bounds=n,
@@ -144,7 +129,7 @@ def solve(
     )
     sizes |= dict(ranks=count, multipliers=count * h, slack_norms=count, level_dampings=count, residuals=1, report=3)
     results = _kernel(shape)(
-        *(a.reshape(batch, -1) for a in inputs),
+        *(a.reshape(batch, -1) for a in _inputs(shape, hierarchy, tolerances, warm_start)),
         max_iterations,
         launch_dims=32 * batch,
         output_dims={name: (batch, size) for name, size in sizes.items()},
@@ -167,6 +152,26 @@ def solve(
         own,
         ranks,
         report,
+    )
+
+
+def _inputs(
+    shape: Shape, hierarchy: PaddedHierarchy, tolerances: Tolerances, warm_start: WorkingSet | None
+) -> tuple[Array, ...]:
+    """Return the kernel's arrays in the order of ``_INPUTS``, with a leading axis of problems; levels not padded."""
+
+    def without_padding(a: Array) -> Array:
+        return jnp.concatenate([a[:, k, :size] for k, size in enumerate(shape.row_counts)], 1)
+
+    levels, is_equality = hierarchy.levels, hierarchy.is_equality.astype(jnp.int32)
+    return (
+        jnp.swapaxes(without_padding(levels.matrix), 1, 2),
+        *(without_padding(a) for a in (levels.lower, levels.upper, is_equality)),
+        *(hierarchy.hard_lower, hierarchy.hard_upper, hierarchy.hard_is_equality.astype(jnp.int32)),
+        *(a.astype(jnp.int32) for a in first_working_sets(hierarchy, warm_start)),
+        jnp.stack(hierarchy.damping[:3], 1),
+        hierarchy.damping.bends,
+        jnp.stack(tolerances, -1),
     )
 
 

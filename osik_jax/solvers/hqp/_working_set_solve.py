@@ -138,6 +138,14 @@ def wrong_signs(
     """Return which active rows pull x away from their bound instead of stopping it there.
 
     Forces multiplier * row length are compared with the multiplier tolerance of the gradient's norm, plus ``roundoff``.
+
+    Args:
+        problem: the level.
+        active: label of each hard row at the point.
+        multiplier: of each hard row, as ``multipliers`` has it.
+        gradient: of the level's cost there.
+        roundoff: of that gradient.
+        tolerances: what counts as zero.
     """
     # a force is positive where it holds x back: at an upper bound (1) downhill points up, at a lower (-1) down
     force = multiplier * active * problem.length

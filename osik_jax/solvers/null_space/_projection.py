@@ -79,7 +79,17 @@ def level_motion(
     rank_tol: Array | float,
     backend: Backend = "jax",
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
-    """Return the motion of one level from x, the projector for the next level, and the level's damping."""
+    """Return the motion of one level from x, the projector for the next level, and the level's damping.
+
+    Args:
+        level: the level; rows inside their interval at x take no part.
+        x: what the levels above have reached.
+        projector: P_{k-1}, onto the null space of the levels above; the motion stays in it.
+        damping: the parts of the level's damping.
+        rank_tol: rows that stand out of the span of the others by less than this, relative to the norm of all that take
+            part, count as dependent.
+        backend: of the factors (static).
+    """
     if not level.matrix.shape[0]:
         return jnp.zeros_like(x), projector, jnp.zeros_like(x[0])
     task = ActiveTask.at(level, x, rank_tol)
@@ -104,6 +114,13 @@ def damped_step_length(
     The motion of a level without bounds is the damped optimum; the bounds of some joints may ask far larger motions of
     the others for the same motion of the rows, and that is not worth its cost. With ``d = end - start`` the cost
     ``1/2 |t A d - error|^2 + 1/2 damping t^2 |d|^2`` is least at ``t = error'A d / (|A d|^2 + damping |d|^2)``.
+
+    Args:
+        level: the level, A the rows of it that take part at ``start``.
+        start: what the levels above have reached.
+        end: where the bounds let the level go at most.
+        damping: of the level, in squared singular values.
+        rank_tol: as in ``level_motion``.
     """
     task = ActiveTask.at(level, start, rank_tol)
     step = end - start

@@ -52,6 +52,12 @@ def arrays(qp: QP) -> tuple[list[Array], Any]:
     return jax.tree.flatten(eqx.tree_at(lambda p: p.packed, qp, None, is_leaf=lambda leaf: leaf is None))
 
 
+def pack(qp: QP) -> tuple[Array, Array]:
+    """Return the cost's matrix and all other arrays as one, as ``unpack`` takes them."""
+    (matrix, *others), _ = arrays(qp)
+    return matrix, jnp.concatenate([jnp.ravel(a) for a in others])
+
+
 def unpack(like: QP, matrix: Float[Array, "..."], packed: Float[Array, " k"]) -> QP:
     """Return a problem of the shapes of another, from its matrix and all its other arrays, one after another."""
     (first, *rest), tree = arrays(like)
@@ -159,6 +165,12 @@ def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: I
 
     The conditions are stationarity, ``grad cost(x) - C'y = multipliers of the box``; signs of the multipliers;
     feasibility, and complementarity of the rows with a multiplier.
+
+    Args:
+        qp: the problem.
+        x: the point, inside its box.
+        y: multipliers of the rows; those of the box follow from the gradient.
+        active: labels of the box, then of the rows.
     """
     n = len(x)
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)

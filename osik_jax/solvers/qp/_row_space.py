@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ...execution._lanes import choose
 from ...numerics._constants import (
     INACTIVE,
     MAX_CONTRACTION,
@@ -30,9 +31,11 @@ from ...numerics._constants import (
     ROW_SPACE_PIVOT,
 )
 from ...numerics._dense import apply, product
+from .._goldfarb_idnani import Roundoff
 from ._cost import LeastSquares
 from ._kkt_solve import backward, cholesky, forward, refine
-from ._problem import QP, active_bounds
+from ._problem import QP, active_bounds, constraint_scales
+from ._search import SearchResult, is_optimal
 
 
 class RowFactor(NamedTuple):
@@ -49,10 +52,26 @@ class RowFactor(NamedTuple):
 
 def has_few_rows(qp: QP) -> bool:
     """Return whether the system of the rows is the smaller one (static); ``qp`` has a leading axis of problems."""
-    if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float64:
+    if not isinstance(qp.cost, LeastSquares):
         return False
     _, m, n = qp.cost.matrix.shape
     return m + qp.rows.shape[1] <= MAX_ROW_RATIO * n
+
+
+def try_row_space(qp: QP, start: SearchResult, tolerance: Float[Array, " B"]) -> SearchResult:
+    """Return the answers where the guess is right, for less than a round of the search; else ``start``.
+
+    Args:
+        qp: problems of which ``has_few_rows`` holds, with a leading axis, as on all arguments.
+        start: where their search begins, with the guess.
+        tolerance: violation that counts as none, relative to the scale of the constraint.
+    """
+    x, y, is_valid = solve_in_row_space(qp, start.active)
+    scales = jax.vmap(constraint_scales)(qp, jax.vmap(lambda one: one.cost.diagonal())(qp), x, y)
+    roundoff = Roundoff(*(tolerance[:, None] * a for a in scales))
+    optimal = is_valid & jax.vmap(is_optimal)(qp, start, x, y, roundoff)
+    end = start._replace(x=x, row_multipliers=y, factorizations=start.factorizations + 1, done=optimal, optimal=optimal)
+    return choose(optimal, end, start)
 
 
 def solve_in_row_space(

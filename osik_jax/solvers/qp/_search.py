@@ -1,12 +1,12 @@
 """The search for the active set in plain JAX: guess, factor, check; where the check fails, the dual method goes on.
 
-The guess is the warm start, or no active bound at all; where it is right, one factorisation is all there is. In a batch
-on a CPU a problem of few rows tries it by a row-space solve first. The answer always comes from a fresh factorisation
-at the final active set, never from the tableau that found it.
+The guess is the warm start, or no active bound at all; where it is right, one factorisation is all there is. The answer
+always comes from a fresh factorisation at the final active set, never from the tableau that found it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -34,11 +34,7 @@ from ._kkt_solve import factorize, solve_on_active_set
 from ._problem import QP, constraint_scales, kkt_residual
 from ._projected_gradient import projected_gradient
 from ._projected_newton import projected_newton
-from ._row_space import has_few_rows, solve_in_row_space
 from ._tableau import find_active_set
-
-_BLOCK_ON_CPU, _BLOCK = 4, 256
-"""Problems that are worked on together where most are done."""
 
 
 class SearchResult(NamedTuple):
@@ -57,6 +53,10 @@ class SearchResult(NamedTuple):
     infeasible: Bool[Array, ""]  # proven: no point of the box satisfies the hard rows; x is the least violation
     compliance: Float[Array, " p"]  # of the rows in the problem that ``x`` solves
     residual: Float[Array, ""]  # of the optimality conditions
+
+
+FirstTry = Callable[[QP, SearchResult, Array], SearchResult]
+"""From a batch of problems, where their search begins and tolerances to results, ``done`` where the guess was right."""
 
 
 def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
@@ -81,7 +81,13 @@ def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B
 
 
 def search(
-    qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int, by_pivots: bool = True
+    qp: QP,
+    guess: Int[Array, "B m"],
+    tolerance: Float[Array, " B"],
+    *,
+    max_iterations: int,
+    by_pivots: bool = True,
+    first_try: FirstTry | None = None,
 ) -> SearchResult:
     """Solve a batch: every argument has a leading axis of problems.
 
@@ -95,10 +101,12 @@ def search(
         max_iterations: limit on the changes of the active set (static).
         by_pivots: whether the dual method goes on from a guess that is wrong; without it projected Newton does at once
             (static). A kernel has tried the former by then, and it is much of what there is to compile.
+        first_try: what answers, in double precision, problems whose guess is right; the others are searched a few at a
+            time. None: all are searched (static).
     """
     kkt_tol = KKT_TOLERANCE[qp.lower.dtype]
-    solve = partial(_solve_batch, max_iterations=max_iterations, kkt_tol=kkt_tol, by_pivots=by_pivots)
-    return in_double(solve)(qp, guess, tolerance)
+    rounds = partial(_search_rounds, max_iterations=max_iterations, kkt_tol=kkt_tol, by_pivots=by_pivots)
+    return in_double(partial(_solve_batch, rounds=rounds, first_try=first_try, kkt_tol=kkt_tol))(qp, guess, tolerance)
 
 
 def _solve_batch(
@@ -106,26 +114,21 @@ def _solve_batch(
     guess: Int[Array, "B m"],
     tolerance: Float[Array, " B"],
     *,
-    max_iterations: int,
+    rounds: Callable[[tuple[QP, Array], SearchResult], SearchResult],
+    first_try: FirstTry | None,
     kkt_tol: float,
-    by_pivots: bool,
 ) -> SearchResult:
     """Return the answers, and projected gradient steps where there is none."""
-    batch, start = len(guess), initial_result(qp, guess, tolerance)
-    search_all = partial(_search_rounds, max_iterations=max_iterations, kkt_tol=kkt_tol, by_pivots=by_pivots)
-    if batch == 1 or jax.default_backend() != "cpu" or not by_pivots or not has_few_rows(qp):
-        result = search_all((qp, tolerance), start)
+    start = initial_result(qp, guess, tolerance)
+    if first_try is None:
+        result = rounds((qp, tolerance), start)
     else:
-        tried = _try_row_space(qp, start, tolerance)
-        result = with_a_few((qp, tolerance), tried, tried.done, search_all, _block())
+        tried = first_try(qp, start, tolerance)
+        result = with_a_few((qp, tolerance), tried, tried.done, rounds)
     # the certificate: no answer without it, however the search ended
     residual = jax.vmap(kkt_residual)(qp, result.x, result.row_multipliers, result.active)
     result = result._replace(residual=residual, optimal=result.optimal & (residual <= kkt_tol))
-    return with_a_few(qp, result, result.optimal | result.infeasible, _fall_back, _block())
-
-
-def _block() -> int:
-    return _BLOCK_ON_CPU if jax.default_backend() == "cpu" else _BLOCK
+    return with_a_few(qp, result, result.optimal | result.infeasible, _fall_back)
 
 
 def _fall_back(qp: QP, result: SearchResult) -> SearchResult:
@@ -133,16 +136,6 @@ def _fall_back(qp: QP, result: SearchResult) -> SearchResult:
     x, y = jax.vmap(projected_gradient)(qp), jnp.zeros_like(result.row_multipliers)
     residual = jax.vmap(kkt_residual)(qp, x, y, inactive)
     return result._replace(x=x, row_multipliers=y, active=inactive, residual=residual)
-
-
-def _try_row_space(qp: QP, start: SearchResult, tolerance: Float[Array, " B"]) -> SearchResult:
-    """Return the answer where the guess is right, for less than a round of the search."""
-    x, y, is_valid = solve_in_row_space(qp, start.active)
-    scales = jax.vmap(constraint_scales)(qp, jax.vmap(lambda one: one.cost.diagonal())(qp), x, y)
-    roundoff = Roundoff(*(tolerance[:, None] * a for a in scales))
-    optimal = is_valid & jax.vmap(is_optimal)(qp, start, x, y, roundoff)
-    end = start._replace(x=x, row_multipliers=y, factorizations=start.factorizations + 1, done=optimal, optimal=optimal)
-    return choose(optimal, end, start)
 
 
 def _search_rounds(
@@ -166,7 +159,7 @@ def _search_rounds(
         result = choose(~result.done, _round(qp, hessian, result, tolerance, max_iterations, by_pivots), result)
         gives_up = (result.infeasible_ends >= MAX_INFEASIBLE) | (rounds + 1 >= MAX_ROUNDS)
         failed = ~(result.done | result.used_newton) & gives_up
-        return with_a_few(qp, result, ~failed, newton, _block()), rounds + 1
+        return with_a_few(qp, result, ~failed, newton), rounds + 1
 
     return jax.lax.while_loop(is_running, body, (start, jnp.asarray(0)))[0]
 
@@ -268,14 +261,25 @@ def usable_guess(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
 def is_optimal(
     qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
 ) -> Bool[Array, ""]:
-    """Check that the minimiser on the active set is the minimiser: constraints hold, multipliers have their signs."""
+    """Check that the minimiser on the active set is the minimiser: constraints hold, multipliers have their signs.
+
+    The arguments are those of ``violated_conditions``.
+    """
     return ~jnp.any(violated_conditions(qp, result, x, y, roundoff))
 
 
 def violated_conditions(
     qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
 ) -> Bool[Array, " m"]:
-    """Return which constraints are violated, inactive equalities, or have a multiplier of the wrong sign."""
+    """Return which constraints are violated, inactive equalities, or have a multiplier of the wrong sign.
+
+    Args:
+        qp: the problem.
+        result: the iterate, of which the active set and the redundant equalities are looked at.
+        x: the minimiser on that active set.
+        y: multipliers of the rows there; those of the box follow from the gradient.
+        roundoff: which violations and multipliers are none.
+    """
     active = result.active
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
     multipliers = jnp.concatenate([gradient, y])

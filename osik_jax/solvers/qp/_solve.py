@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..._errors import OsikValueError
 from ...execution import _rules
-from ...execution._backends import Backend, check_backend, here
+from ...execution._backends import Backend, check_backend, cpu_is_default, here
 from ...numerics._constants import FEASIBILITY, INACTIVE
 from ...numerics._dense import apply
 from .._box import clip_roundoff, ordered_bounds
@@ -20,7 +20,7 @@ from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._dispatch import qp_solver
 from ._implicit_diff import with_derivative
-from ._problem import QP, QPSolution, unpack
+from ._problem import QP, QPSolution, pack, unpack
 from ._search import SearchResult
 
 
@@ -244,7 +244,6 @@ def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
     Valid are numbers without NaN, infinities only as bounds that do not exist, and weights that are not negative. The
     placeholder keeps derivatives finite too.
     """
-    leaves, tree = jax.tree.flatten(qp)
     unbounded = jnp.full_like(qp.upper, jnp.inf)
     if qp.known_equalities is not None:
         unbounded = jnp.where(np.array(qp.known_equalities), 0.0, unbounded)
@@ -256,22 +255,23 @@ def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
         upper=unbounded,
         known_equalities=qp.known_equalities,
     )
-    arrays = [leaves, jax.tree.leaves(placeholder), *_valid_range(qp)]
-    on_cpu = jax.default_backend() == "cpu"
-    if on_cpu:  # one operation for all arrays but the matrix, where each costs as much as its numbers do
-        arrays = [[first, jnp.concatenate([jnp.ravel(a) for a in rest])] for first, *rest in arrays]
+    # on a CPU one operation for all arrays but the matrix, where each costs as much as its numbers do
+    flat = pack if cpu_is_default() else jax.tree.leaves
+    arrays = [flat(each) for each in (qp, placeholder, *_valid_range(qp))]
     in_range = [((lowest <= a) & (a <= highest)).all() for a, _, lowest, highest in zip(*arrays, strict=True)]
     is_valid = jnp.stack(in_range).all()
     safe = [jnp.where(is_valid, a, b) for a, b, *_ in zip(*arrays, strict=True)]
-    if on_cpu:
+    if flat is pack:
         return replace(unpack(qp, *safe), packed=safe[1]), is_valid
-    return jax.tree.unflatten(tree, safe), is_valid
+    return jax.tree.unflatten(jax.tree.structure(qp), safe), is_valid
 
 
-def _valid_range(qp: QP) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the lowest and the highest valid entries of each array."""
+def _valid_range(qp: QP) -> tuple[QP, QP]:
+    """Return the lowest and the highest valid entries of each array, as problems of arrays of NumPy."""
     largest = float(jnp.finfo(qp.lower.dtype).max)
-    finite = [np.full(a.shape, largest) for a in jax.tree.leaves(qp)]
+    leaves, tree = jax.tree.flatten(qp)
+    finite = [np.full(a.shape, largest) for a in leaves]
     infinite = np.full(qp.lower.shape, np.inf)
     *_, rows, compliance, _, upper = finite
-    return [*qp.cost.lowest_valid(-largest), -rows, -compliance, -infinite, -upper], [*finite[:-1], infinite]
+    lowest = [*qp.cost.lowest_valid(-largest), -rows, -compliance, -infinite, -upper]
+    return jax.tree.unflatten(tree, lowest), jax.tree.unflatten(tree, [*finite[:-1], infinite])
