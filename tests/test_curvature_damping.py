@@ -242,12 +242,14 @@ def test_products_as_a_gpu_takes_them_are_the_same(arm, options, monkeypatch):
         found = task.rows(arm, osik.forward_kinematics(arm, q), q)
         return found.error, found.jacobian, found.curvature
 
-    there, slopes = rows(q), jax.jacfwd(rows)(q)
+    def with_slopes():
+        return jax.jit(lambda q: (rows(q), jax.jacfwd(rows)(q)))(q)
+
+    there = with_slopes()
     for module in ("tasks._curvature", "tasks._rotation", "kinematics._forward"):
         monkeypatch.setattr(f"osik_jax.{module}.cuda_is_default", lambda: True)
     same = partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-13)
-    jax.tree.map(same, rows(q), there)
-    jax.tree.map(same, jax.jacfwd(rows)(q), slopes)
+    jax.tree.map(same, with_slopes(), there)
 
 
 @pytest.mark.parametrize("count", [0, 1, 31, 32, 70])

@@ -159,16 +159,16 @@ def test_what_was_once_left_over_is_at_the_planted_optimum(family, seed, lanes):
     assert (beyond < 1e-9 * np.abs(values).max(1)).all()
 
 
-@pytest.mark.parametrize("m", [M, MANY])
-def test_memory_that_was_used_before_says_nothing(m, monkeypatch):
+def test_memory_that_was_used_before_says_nothing(monkeypatch):
     """Whatever the kernel finds in its space and results; ``MANY`` rows are more than variables."""
-    p, found = problems(m=m), []
+    both, found = [problems(m=m) for m in (M, MANY)], []
     for left in (0.0, np.nan, 1e300):
         with used_memory(monkeypatch, left):
-            found.append(candidates(p))
-    assert (found[0].converged != 0).mean() > 0.99 and np.isfinite(found[0].x).all()
-    for other in found[1:]:
-        jax.tree.map(np.testing.assert_array_equal, found[0], other)
+            found.append([candidates(p) for p in both])
+    for first, *others in zip(*found, strict=True):
+        assert (first.converged != 0).mean() > 0.99 and np.isfinite(first.x).all()
+        for other in others:
+            jax.tree.map(np.testing.assert_array_equal, first, other)
 
 
 def test_one_problem_is_a_lane_of_a_batch():

@@ -46,14 +46,14 @@ class QP(eqx.Module):
         return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
 
 
-def arrays(qp: QP) -> tuple[list[Array], Any]:
+def arrays(qp: QP) -> tuple[list[Any], Any]:
     """Return the cost's matrix, then all other arrays in the order in which ``packed`` has them; and their tree."""
     # not by replace: the constructor's annotations are of one problem, and a kernel gets a batch
     return jax.tree.flatten(eqx.tree_at(lambda p: p.packed, qp, None, is_leaf=lambda leaf: leaf is None))
 
 
-def pack(qp: QP) -> tuple[Array, Array]:
-    """Return the cost's matrix and all other arrays as one, as ``unpack`` takes them."""
+def pack(qp: QP) -> tuple[Array | np.ndarray, Array]:
+    """Return the cost's matrix and all other arrays as one, as ``unpack`` takes them; they may be NumPy's."""
     (matrix, *others), _ = arrays(qp)
     return matrix, jnp.concatenate([jnp.ravel(a) for a in others])
 
