@@ -9,10 +9,11 @@ import pytest
 
 from benchmarks import curvature
 from benchmarks.hard import _motion, _page, _results
+from benchmarks.hard._balance import balance
 from benchmarks.hard._cases import BEYOND, CHUNK, Case, cases, directions, without_turning
 from benchmarks.hard._judge import Numbers, judged, worst
 from benchmarks.hard._motion import Entrant, Motion, motions
-from benchmarks.hard._reach import farthest
+from benchmarks.hard._reach import Search, farthest
 from benchmarks.robots import pinocchio_model, workload
 from benchmarks.workload import DT
 
@@ -49,9 +50,7 @@ class TestReach:
 
     def test_a_humanoid_stands_where_it_reaches(self, humanoid):
         """The derivatives of the search are central differences, and the far place is farther than the start."""
-        from benchmarks.hard._reach import _Search
-
-        search = _Search(humanoid, directions(humanoid)[0])
+        search = Search(humanoid, directions(humanoid)[0])
         x, h = np.random.default_rng(0).uniform(-0.2, 0.2, search.model.nv), 1e-6
         eye = h * np.eye(len(x))
         slopes = [(search.slips(x + e) - search.slips(x - e)) / (2.0 * h) for e in eye]
@@ -67,6 +66,20 @@ class TestReach:
         for case, u in zip(found, directions(work), strict=True):
             assert u @ (case.hand[0] - farthest(work, u)) == pytest.approx(BEYOND)
             assert (case.hand == case.hand[0]).all()
+
+
+class TestBalance:
+    def test_nothing_gives_way_to_what_is_in_reach(self, humanoid):
+        assert balance(without_turning(humanoid, posture=False), humanoid.hand_position) == pytest.approx((0, 0, 0))
+
+    def test_heavier_feet_give_way_by_less(self, humanoid):
+        """Once the feet's weight is 16 times as large, they give way to the same pull by about a sixteenth."""
+        work = without_turning(humanoid, posture=True)
+        heavy = dataclasses.replace(work, costs=dataclasses.replace(work.costs, foot=4.0 * work.costs.foot))
+        target = farthest(work, directions(work)[0]) + BEYOND * directions(work)[0]
+        (foot, _, hand), (less, _, _) = balance(work, target), balance(heavy, target)
+        assert hand > 0.2 and 1e-3 < foot < 1e-2
+        assert foot / 20.0 < less < foot / 12.0
 
 
 class TestNumbers:
@@ -147,8 +160,14 @@ class TestResults:
         assert len(set(few)) == len(few) and set(few) < set(many)
         assert {entrant.solver for entrant in few} == {*_motion.SCHEMES, *_motion.PEERS}
         assert not [e for e in many if e.solver in _motion.OF_POSTURES and not e.posture]
+        assert {e.robot for e in many if e.solver == _motion.HARD_FEET} == {"nao", "g1"}
         (one,) = _results.entrants(everything=False, only="g1, hierarchy, float64, no")
         assert one == Entrant("g1", "hierarchy", "float64", False)
+
+    def test_hard_feet_are_constraints(self, humanoid):
+        tasks = _motion.OurLoop(humanoid, _motion.SCHEMES[_motion.HARD_FEET], posture=True)
+        changed = tasks.change(tasks.robot, tasks.tasks)
+        assert {name for name, task in changed.items() if task.hard} == set(humanoid.feet)
 
     def test_rows_survive_their_file(self, tmp_path):
         numbers = Numbers(*np.linspace(0.0, 1.0, len(Numbers._fields)).tolist())

@@ -3,13 +3,15 @@
     python -m benchmarks.hard [results.json] [--all] [--only TEXT] [--python placo=PATH] [--times] [--write]
     python -m benchmarks.hard --film [film.gif]
     python -m benchmarks.hard --settling
+    python -m benchmarks.hard --balance
 
 Pinocchio judges every motion from its configurations alone; docs/hard_work.md says what is asked and what each number
 is. Without ``--all`` it is a selection that takes some minutes; ``--only`` takes those whose names, such as
 "g1, hierarchy, float64, no posture", hold a text. Rows that the file of results has already are not made again.
 ``--write`` puts the tables into the page, ``--times`` adds the time of a step (only on a machine with nothing else to
 do). ``--film`` films a G1 of ours beside mink's, with a target that is out of reach. ``--settling`` looks longer at
-targets out of reach, and puts into the page how the speed falls.
+targets out of reach, and puts into the page how the speed falls. ``--balance`` prints how far feet give way to such a
+target where the weights balance.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from osik_jax.runtime import configure_cpu
 
 from ..processes import PeerUnavailable
 from ..robots import workload
+from ._balance import balances
 from ._cases import cases
 from ._film import FILM, film
 from ._motion import Entrant
@@ -44,6 +47,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--write", action="store_true", help=f"into {PAGE.name}")
     made.add_argument("--film", nargs="?", type=Path, const=FILM, help=f"only the film, by default {FILM.name}")
     made.add_argument("--settling", action="store_true", help="only the table of speeds over 16 s")
+    made.add_argument("--balance", action="store_true", help="only where the weights of feet and hand balance")
     return made
 
 
@@ -82,6 +86,9 @@ def main() -> None:
         return
     if given.settling:
         print(write_settling(settling()))
+        return
+    if given.balance:
+        print("\n".join(map(" | ".join, balances())))
         return
     found = measure(given, console)
     if given.write:

@@ -43,6 +43,21 @@ def _posture_beside(robot: osik.Robot, tasks: Tasks) -> Tasks:
     return tasks | {"posture": osik.PostureTask(robot, **numbers, priority=tasks["hand"].priority)}
 
 
+def _hard_feet(robot: osik.Robot, tasks: Tasks) -> Tasks:
+    """The feet as constraints: where the hand's pull and theirs balance no longer matters."""
+    return {name: _hard(robot, task) if _is_foot(task) else task for name, task in tasks.items()}
+
+
+def _is_foot(task: osik.Task) -> bool:
+    return isinstance(task, osik.FrameTask) and task.priority == 1
+
+
+def _hard(robot: osik.Robot, foot: osik.Task) -> osik.FrameTask:
+    assert isinstance(foot, osik.FrameTask)
+    numbers: dict[str, Any] = dict(target=foot.target, gain=foot.gain)
+    return osik.FrameTask(robot, foot.frame, **numbers, hard=True)
+
+
 class Ours(NamedTuple):
     """A scheme with default numbers, or with what calms it further.
 
@@ -55,6 +70,7 @@ class Ours(NamedTuple):
     change: Callable[[osik.Robot, Tasks], Tasks] = _as_they_are
 
 
+HARD_FEET = "weighted, feet hard"
 OURS: Mapping[str, Ours] = {
     "weighted": Ours(osik.WeightedQP),
     "hierarchy": Ours(osik.HierarchicalQP),
@@ -62,6 +78,7 @@ OURS: Mapping[str, Ours] = {
     "saturated null space": Ours(lambda: osik.NullSpace(method="saturated")),
 }
 REMEDIES: Mapping[str, Ours] = {
+    HARD_FEET: Ours(osik.WeightedQP, _hard_feet),
     "weighted, damping 1e-2": Ours(lambda: osik.WeightedQP(damping=1e-2)),
     "hierarchy, damping 1e-2": Ours(lambda: osik.HierarchicalQP(damping=1e-2)),
     "hierarchy, posture of gain 1": Ours(osik.HierarchicalQP, _slow_posture),
@@ -70,7 +87,7 @@ REMEDIES: Mapping[str, Ours] = {
     "saturated null space, posture beside the hand": Ours(lambda: osik.NullSpace(method="saturated"), _posture_beside),
 }
 """For where the default numbers do not come to rest."""
-OF_POSTURES = frozenset(name for name, ours in REMEDIES.items() if ours.change is not _as_they_are)
+OF_POSTURES = frozenset(name for name, ours in REMEDIES.items() if ours.change in (_slow_posture, _posture_beside))
 """Those that change nothing where there is no posture task."""
 SCHEMES = {**OURS, **REMEDIES}
 PEERS: Mapping[str, tuple[str, Mapping[str, Any]]] = {

@@ -19,7 +19,7 @@ def farthest(work: Workload, direction: np.ndarray) -> np.ndarray:
     Raises:
         RuntimeError: the search has not ended well.
     """
-    search = _Search(work, np.asarray(direction, float))
+    search = Search(work, np.asarray(direction, float))
     found = minimize(
         search.height,
         np.zeros(search.model.nv),
@@ -35,7 +35,7 @@ def farthest(work: Workload, direction: np.ndarray) -> np.ndarray:
     return search.hand(found.x)
 
 
-class _Search:
+class Search:
     """Functions of a step x from the start, and their derivatives."""
 
     def __init__(self, work: Workload, direction: np.ndarray) -> None:
@@ -63,15 +63,23 @@ class _Search:
 
     def slope(self, x: np.ndarray) -> np.ndarray:
         """Derivative of ``height``."""
+        return -self.direction @ self.hand_slopes(x)
+
+    def hand_slopes(self, x: np.ndarray) -> np.ndarray:
+        """Derivative of ``hand``."""
         moved = self._move(x)
-        jacobian = pin.getFrameJacobian(self.model, self.data, self.frames[0], pin.LOCAL_WORLD_ALIGNED)[:3]
-        return -self.direction @ jacobian @ moved
+        return pin.getFrameJacobian(self.model, self.data, self.frames[0], pin.LOCAL_WORLD_ALIGNED)[:3] @ moved
 
     def slips(self, x: np.ndarray) -> np.ndarray:
         """How far the feet and the centre of mass are from their places."""
         self._move(x)
         feet = [pin.log6(place.actInv(self.data.oMf[i])).vector for place, i in self._feet()]
         return np.concatenate([*feet, self.data.com[0] - self.work.com_start])
+
+    def feet_off(self, x: np.ndarray) -> float:
+        """The larger distance of a foot from its place [m]."""
+        self._move(x)
+        return max(float(np.linalg.norm(self.data.oMf[i].translation - place.translation)) for place, i in self._feet())
 
     def slip_slopes(self, x: np.ndarray) -> np.ndarray:
         """Derivative of ``slips``."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..workload import Workload
 from ._cases import Case, without_turning
 from ._judge import Numbers, judged, worst
-from ._motion import GAINS, OF_POSTURES, OURS, PEERS, REMEDIES, Entrant, motions
+from ._motion import GAINS, HARD_FEET, OF_POSTURES, OURS, PEERS, REMEDIES, Entrant, motions
 
 ROBOTS = ("arm7", "nao", "g1")
 PRECISIONS = ("float64", "float32")
@@ -18,6 +18,8 @@ IN_BOTH = ("weighted",)
 """Schemes that run in single precision too where not all is asked for."""
 REMEDIED = "g1"
 """The robot that shows what calms further."""
+ON_FEET = ("nao", "g1")
+"""Robots that show what hard feet do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,12 +43,18 @@ def entrants(*, everything: bool, only: str = "") -> list[Entrant]:
         Entrant(robot, solver, precision, posture)
         for robot in ROBOTS
         for posture in (True, False)
-        for solver in [*OURS, *(REMEDIES if everything or robot == REMEDIED else ()), *PEERS]
+        for solver in [*OURS, *_remedies(robot, everything=everything), *PEERS]
         for precision in PRECISIONS
         if precision == PRECISIONS[0] or (solver not in PEERS and (everything or solver in IN_BOTH))
         if posture or solver not in OF_POSTURES
     ]
     return [entrant for entrant in found if only in str(entrant)]
+
+
+def _remedies(robot: str, *, everything: bool) -> list[str]:
+    """Of this robot; hard feet where it has feet."""
+    shown = REMEDIES if everything or robot == REMEDIED else (HARD_FEET,)
+    return [name for name in shown if name != HARD_FEET or robot in ON_FEET]
 
 
 def rows(entrant: Entrant, work: Workload, cases: Iterable[Case], pythons: Mapping[str, str]) -> Iterator[Row]:
