@@ -152,12 +152,7 @@ def test_an_interrupt_ends_in_one_line(tmp_path, arm_file):
     words = [sys.executable, "-m", "osik_jax.cli", "demo", "--robot", str(arm_file), "--duration", "60", "--out"]
     signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background ignores it
     with subprocess.Popen(
-        [*words, str(tmp_path / "out")],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        bufsize=1,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # or a run in the background ignores it
+        [*words, str(tmp_path / "out")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
     ) as process:
         assert process.stdout is not None and process.stderr is not None
         first = process.stdout.readline()
