@@ -76,12 +76,14 @@ work_size = compiled(row_space_numbers)
 
 @compiled
 def work_at(space, n, M):
-    """Return the space for one problem, in the numbers at an address, which become 0s."""
+    """Return the space for one problem, in the numbers at an address; rows, columns and vectors become 0s."""
     tall, wide = padded(n) + WIDTH, padded(n)
     w = padded(max(n, M))
     side = w + WIDTH
     numbers, each, line = vector(space, work_size(n, M)), 8 * side * side, 8 * side
-    for i in range(len(numbers)):
+    for i in range(3 * side * side, 5 * side * side):  # ``rows``, ``columns``
+        numbers[i] = 0.0
+    for i in range(15 * side * side, len(numbers)):  # vectors
         numbers[i] = 0.0
     at = space + 15 * each
     return Work(
