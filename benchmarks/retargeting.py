@@ -35,6 +35,7 @@ from osik_jax.retargeting import (
     Profile,
     Retargeted,
     Retargeter,
+    guess_profile,
     load_motion,
     load_profile,
     report,
@@ -249,7 +250,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", nargs="+", help="motion files")
     parser.add_argument("--robot", default="g1", help="nao, g1, talos or a URDF")
-    parser.add_argument("--profile", help="a profile's TOML")
+    parser.add_argument(
+        "--profile",
+        default="bundled",
+        help="guess, bundled (that of the package, or a guess where it has none), or a TOML",
+    )
     parser.add_argument("--repeats", type=int, default=5, help="runs of each clip that are timed")
     parser.add_argument("--single", action="store_true", help="in single precision")
     parser.add_argument(
@@ -267,7 +272,8 @@ def main() -> None:
     jax.config.update("jax_enable_x64", not options.single)
     path = described_urdf(options.robot) if options.robot in DESCRIBED else Path(options.robot)
     robot = load_robot("nao") if options.robot == "nao" else Robot.from_urdf(path, floating_base=True)
-    profile = load_profile(options.profile) if options.profile else None
+    made = {"guess": guess_profile, "bundled": lambda _: None}
+    profile = made.get(options.profile, lambda _: load_profile(options.profile))(robot)
     judge = Judge(*options.judge) if options.judge else own_figures
     peers = json.loads(Path(options.peer).read_text(encoding="utf-8")) if options.peer else {}
     motions = [load_motion(path) for path in options.clips]

@@ -1,5 +1,8 @@
 """Readers of motion files beside SciPy's rotations, and what they say of broken files."""
 
+import dataclasses
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +10,7 @@ from hypothesis import strategies as st
 from motion_files import FIGURE, Figure, dancer, write_bvh
 from scipy.spatial.transform import Rotation
 
+from osik_jax import OsikWarning
 from osik_jax.retargeting import (
     HumanMotion,
     RobotMotion,
@@ -309,3 +313,41 @@ def test_a_robots_motion_comes_back_from_both_files(tmp_path):
         load_robot_motion(tmp_path / "motion.csv", joint_names=("hip",), fps=30.0)
     with pytest.raises(ValueError, match="not of unit length in frame 0"):
         RobotMotion(30.0, (), np.ones((1, 7)))
+
+
+def with_first(frames, own=None):
+    """The dancer with frames before it, in which it stands in its rest pose with legs and arms turned by 20 degrees."""
+    own = dancer() if own is None else own
+    pose = np.zeros((frames, *own.angles.shape[1:]))
+    for name in ("LeftUpLeg", "RightArm"):
+        pose[:, [joint for joint, _, _ in own.joints].index(name), 0] = 20.0
+    root = np.tile([1.0, 0.9, 0.5], (frames, 1))
+    return dataclasses.replace(own, angles=np.concatenate([pose, own.angles]), root=np.concatenate([root, own.root]))
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_a_rest_pose_before_the_motion_is_left_out(tmp_path, frames):
+    alone = load_motion(write_bvh(tmp_path / "alone.bvh", dancer()))
+    path = write_bvh(tmp_path / "clip.bvh", with_first(frames))
+    with pytest.warns(OsikWarning, match=f"rest pose \\({frames} of {24 + frames} frames\\)"):
+        motion = load_motion(path)
+    np.testing.assert_array_equal(motion.positions, alone.positions)
+    np.testing.assert_array_equal(known(motion.rotations), known(alone.rotations))
+    assert load_motion(path, trim=False).frames == 24 + frames
+
+
+def test_a_motion_that_begins_in_the_rest_pose_keeps_all_frames(tmp_path):
+    own = dancer()
+    share = np.clip(np.arange(24) / 12.0, 0.0, 1.0)[:, None, None]
+    slowly = dataclasses.replace(own, angles=share * own.angles)  # arms from the sides down, in 0.4 s
+    jump_later = with_first(
+        1, dataclasses.replace(own, angles=own.angles * np.where(np.arange(24) == 12, -1, 1)[:, None, None])
+    )
+    moved = own.angles.copy()
+    moved[0, :, 1] += 90.0  # a jump after the first frame, out of no rest pose
+    jump_from_elsewhere = dataclasses.replace(own, angles=moved)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", OsikWarning)
+        for figure in (slowly, jump_later, jump_from_elsewhere):
+            motion = load_motion(write_bvh(tmp_path / "clip.bvh", figure))
+            assert motion.frames == len(figure.root)

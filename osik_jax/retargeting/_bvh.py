@@ -16,8 +16,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from .._errors import OsikKeyError, OsikValueError
+from .._errors import OsikKeyError, OsikValueError, warn
 from ._motion import HumanMotion
+from ._rest_frames import rest_frames
 from ._rotations import about, continuous, multiply, rotate
 
 Up = Literal["x", "y", "z"]
@@ -79,7 +80,9 @@ class _Lines:
         return values
 
 
-def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None) -> HumanMotion:
+def read_bvh(
+    path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
+) -> HumanMotion:
     """Reads a BVH file.
 
     A joint's rotation is the product of its channels in the order in which the file lists them. The ends of chains
@@ -94,6 +97,9 @@ def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, u
             stands in that.
         up: the file's axis that points up. None: the one along which the head is above the hips in the rest pose, above
             the feet on the mean of all frames where nobody stands in that; y where no joint is called head.
+        trim: leave out frames at the start that are the rest pose and no motion, with an ``OsikWarning``: all joints
+            turned as the root, within 30 degrees, and a jump after them, at more than 5 m/s and three times as far as
+            in any other step.
 
     Raises:
         FileNotFoundError: no such file.
@@ -116,13 +122,21 @@ def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, u
     scale, order = _scale(source, unit, size), list(_TO_Z_UP[up])
     rotations = np.concatenate([rotations[..., :1], rotations[..., 1:][..., order]], -1)
     kept = [i for i, joint in enumerate(joints) if not joint.is_end or joint.offset.any()]
-    return HumanMotion(
+    motion = HumanMotion(
         name=Path(path).stem,
         fps=fps,
         joint_names=tuple(joints[i].name for i in kept),
         positions=scale * positions[:, kept][..., order],
         rotations=continuous(rotations[:, kept]),
         rest_positions=scale * rest[kept][:, order] if stands else None,
+    )
+    count = rest_frames(motion) if trim else 0
+    if not count:
+        return motion
+    warn(f"{source} begins with its rest pose ({count} of {motion.frames} frames), left out; trim=False keeps it")
+    turns = motion.rotations
+    return dataclasses.replace(
+        motion, positions=motion.positions[count:], rotations=None if turns is None else continuous(turns[count:])
     )
 
 

@@ -13,13 +13,16 @@ from ._motion import HumanMotion
 ENDINGS = (".bvh", ".npz", ".csv")
 
 
-def load_motion(path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None) -> HumanMotion:
+def load_motion(
+    path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
+) -> HumanMotion:
     """Reads a person's motion: BVH, or keypoints as ``.npz`` or ``.csv``, told apart by the file's ending.
 
     Args:
         path: the file.
         unit: of a BVH, see ``read_bvh``.
         up: of a BVH, see ``read_bvh``.
+        trim: of a BVH, see ``read_bvh``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -29,7 +32,7 @@ def load_motion(path: str | os.PathLike[str], *, unit: str | float | None = None
     """
     ending = Path(path).suffix.lower()
     if ending == ".bvh":
-        return read_bvh(path, unit=unit, up=up)
+        return read_bvh(path, unit=unit, up=up, trim=trim)
     if ending not in ENDINGS:
         if not ending and not Path(path).exists():  # perhaps a folder's name with a letter wrong
             raise FileNotFoundError(f"no such file: {path}")
