@@ -683,6 +683,28 @@ def test_guessed_capsules_cover_the_meshes_of_limbs(name):
     assert 1e3 * np.concatenate(outside).mean() < {"g1": 0.3, "talos": 3.0}[name]
 
 
+@pytest.mark.parametrize("part", ["rubber_hand", "wrist_yaw_link"])
+def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
+    """The vertices of a G1's hands as they look; the hand is fixed to a wrist that is too light for a capsule."""
+    path = described_urdf("g1")
+    g1 = osik.Robot.from_urdf(path, floating_base=True)
+    profile, places = guess_profile(g1), home_kinematics(g1)
+    for side in SIDES:
+        raw = (path.parents[1] / f"meshes/{side}_{part}.STL").read_bytes()
+        faces = np.frombuffer(raw[84:], np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")]))
+        position, rotation = (np.asarray(x) for x in places.frame_pose(g1, f"{side}_{part}"))
+        at = position + faces["corners"].reshape(-1, 3) @ rotation.T
+        hands = [capsule for capsule in profile.capsules if capsule.frame == f"{side}_rubber_hand"]
+        position, rotation = (np.asarray(x) for x in places.frame_pose(g1, f"{side}_rubber_hand"))
+        outside = []
+        for capsule in hands:
+            a, b = position + np.array([capsule.start, capsule.end]) @ rotation.T
+            share = np.clip((at - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
+            outside.append(np.linalg.norm(at - a - share[:, None] * (b - a), axis=-1) - capsule.radius)
+        most = 1e3 * np.min(outside, 0).max()
+        assert most < {"rubber_hand": 6.0, "wrist_yaw_link": 0.0}[part]  # 22 and 30 mm when hands were as limbs
+
+
 def test_links_without_a_size_get_no_capsule():
     path = described_urdf("g1").parents[2] / "icub_description/robots/icub_reduced.urdf"
     icub = osik.Robot.from_urdf(path, floating_base=True)

@@ -191,7 +191,8 @@ def _pair(points: np.ndarray) -> tuple[Point, Point]:
 
 def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[Capsule, ...]:
     """Links as their masses show them; limbs whose links say nothing as capsules from joint to joint."""
-    seen, tree = _massive(robot, (profile.pelvis, profile.torso)), robot.tree
+    tree = robot.tree
+    seen = _massive(robot, (profile.pelvis, profile.torso), _frames_of_hands(robot, profile))
     bodies = {tree.frame_bodies[tree.frame(capsule.frame)] for capsule in seen}
 
     def is_seen(frame: str, end: str | None) -> bool:
@@ -244,18 +245,29 @@ def _between(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> floa
     return float(np.linalg.norm(first[:, None] - second[None], axis=-1).min())
 
 
-def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
+def _frames_of_hands(robot: Robot, profile: Profile) -> set[str]:
+    """What the wrists' last joints turn."""
+    tree = robot.tree
+    wrists = [tree.frame_bodies[tree.frame(profile.keypoints[f"{side}_wrist"][0])] for side in SIDES]
+    turned = set(np.flatnonzero(tree.descendants[wrists].any(0)).tolist())
+    return {name for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body in turned}
+
+
+def _massive(robot: Robot, trunk: tuple[str | None, ...], hands: set[str]) -> list[Capsule]:
     """Each link as the solid ellipsoid of its inertia, and that as one capsule; a wide trunk as two side by side.
 
-    Wider than the ellipsoid, for a link's mass is inside its shell: a G1's thighs are by 11 %, its hands by 30.
+    Wider than the ellipsoid, for a link's mass is inside its shell: a G1's thighs are by 11 %, its hands by 30. Links
+    are as wide as the mean of their ellipsoids' widths and thicknesses, hands as the widths: they are flat, and touch
+    each other with thumbs and fingers. Two thin capsules side by side cover them less well, and such hands slip past
+    each other: plans stay where they cross.
     An ellipsoid of semi-axes a, b, c and mass m turns about the first with ``m (b^2 + c^2) / 5``.
     """
     model, out = robot.mj_model, []
-    names = set(robot.frame_names)
+    names, least = set(robot.frame_names), _LEAST_MASS * float(robot.mj_model.body_mass.sum())
     for body in range(1, model.nbody):
         mass, inertia = float(model.body_mass[body]), model.body_inertia[body]
         name = str(model.body(body).name)
-        if name not in names or not mass > _LEAST_MASS * float(model.body_mass.sum()):
+        if name not in names or not mass > least:
             continue
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_iquat[body])
@@ -265,12 +277,13 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...]) -> list[Capsule]:
         if not axes[thin] > max(_LEAST_SIZE, _THINNEST * axes[long]):
             continue
         apart = name in trunk and axes[wide] > _WIDE * axes[thin]
-        radius = _SHELL * float(axes[thin] if apart else 0.5 * (axes[wide] + axes[thin]))
+        across = axes[wide] if name in hands else 0.5 * (axes[wide] + axes[thin])
+        radius = _SHELL * float(axes[thin] if apart else across)
         along, aside = turn.reshape(3, 3)[:, long], turn.reshape(3, 3)[:, wide]
         reach = max(_LONG * axes[long] - radius, 0.05 * radius)
         spans = [-reach, reach]
         if name not in trunk:
-            spans += _spanned(model, body, along, radius)
+            spans += _spanned(model, body, along, radius, least)
         spans = _between_joints(model, body, along, radius, spans)
         aside_by = _SHELL * axes[wide] - radius
         for shift in (aside_by, -aside_by) if apart else (0.0,):
@@ -306,17 +319,32 @@ def _between_joints(
     return [float(x) for x in np.clip(spans, min(ends) - room, max(ends) + room)]
 
 
-def _spanned(model: mujoco.MjModel, body: int, along: np.ndarray, radius: float) -> list[float]:
-    """How far a capsule goes from a body's centre of mass: to its own joint, and until it ends at its children's.
+def _spanned(model: mujoco.MjModel, body: int, along: np.ndarray, radius: float, least: float) -> list[float]:
+    """How far a capsule goes from a body's centre of mass: to the joint that moves it, and to its children's.
 
     The housing around a joint belongs to the body that it moves, and weighs too little beside a motor at the other end
-    to be seen in an ellipsoid.
+    to be seen in an ellipsoid. Of a body that is fixed to one of less than ``least`` [kg], which gets no capsule, it is
+    that one's joint.
     """
-    own = [-model.body_ipos[body]] * bool(model.body_jntnum[body])
+    own = [joint - model.body_ipos[body] for joint in _own_joint(model, body, least)]
     children = [c for c in range(1, model.nbody) if model.body_parentid[c] == body and model.body_jntnum[c]]
     ends = [float((model.body_pos[child] - model.body_ipos[body]) @ along) for child in children]
     short = [float(np.copysign(max(abs(end) - radius, 0.0), end)) for end in ends]
     return [float(anchor @ along) for anchor in own] + short
+
+
+def _own_joint(model: mujoco.MjModel, body: int, least: float) -> list[np.ndarray]:
+    """Where the joint is that moves a body, in its frame [m]; none where it is fixed to a body that is not light."""
+    at, turn, fixed = np.zeros(3), np.eye(3), body
+    while not model.body_jntnum[fixed]:
+        parent, own = int(model.body_parentid[fixed]), np.zeros(9)
+        if not parent or model.body_mass[parent] > least:
+            return []
+        mujoco.mju_quat2Mat(own, model.body_quat[fixed])
+        turn = turn @ own.reshape(3, 3).T
+        at = at - turn @ model.body_pos[fixed]
+        fixed = parent
+    return [at]
 
 
 def _plain_capsules(kinematics: Kinematics, profile: Profile, robot: Robot) -> list[tuple[Capsule, str | None]]:
