@@ -5,12 +5,13 @@ import os
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import version
+from importlib.metadata import distribution, version
 from pathlib import Path
 
 import pytest
 
 from osik_jax.execution._cpu_settings import _UNTRIED_JAXLIB
+from osik_jax.execution._workers import jaxlib_version, splits
 from osik_jax.runtime import configure_cpu
 
 OURS = "PJRT_NPROC", "OPENBLAS_NUM_THREADS", "XLA_FLAGS", "JAX_CPU_ENABLE_ASYNC_DISPATCH"
@@ -198,8 +199,19 @@ print(alone, [str(w.message) for w in seen if "configure_cpu" in str(w.message)]
 
 @pytest.mark.slow
 def test_batches_on_few_cores_that_are_not_configured_are_warned_of_once():
-    assert in_a_process(WARNED).stdout.strip() == "0 1"
+    assert in_a_process(WARNED).stdout.strip() == f"0 {int(splits(jaxlib_version()))}"
     assert in_a_process(WARNED, PJRT_NPROC="8").stdout.strip() == "0 0"
+
+
+def test_releases_of_jaxlib_that_wait():
+    """As their wheels have it: those that wait name absl's BlockingCounter in jaxlib/cpu/_lapack.so."""
+    assert all(map(splits, [(0, 10, 0), (0, 10, 2), (0, 11, 0)]))
+    assert not any(map(splits, [(0, 8, 0), (0, 9, 2), (0, 11, 1), (0, 11, 2), (0, 12, 0)]))
+
+
+def test_this_jaxlib_waits_where_it_is_said_to():
+    library = Path(str(distribution("jaxlib").locate_file("jaxlib/cpu/_lapack.so")))
+    assert (b"BlockingCounter" in library.read_bytes()) == splits(jaxlib_version())
 
 
 def test_flags_are_set_for_every_jax_that_may_be_installed():
