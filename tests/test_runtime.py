@@ -220,3 +220,53 @@ def test_flags_are_set_for_every_jax_that_may_be_installed():
     (bounds,) = [d.removeprefix("jax").split(",") for d in project["dependencies"] if d.startswith("jax>")]
     major, minor = _UNTRIED_JAXLIB
     assert f"<{major}.{minor}" in bounds
+
+
+WHOLE = """
+import os
+os.sched_getaffinity = lambda _: {0, 1}
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from osik_jax.execution._lapack import lapack_calls
+from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp
+def qp(A, b):
+    return solve_least_squares_qp(A, b, np.ones(48), -np.ones(48), np.ones(48), backend="jax").x
+def hqp(A, b):
+    return solve_hqp([Level(A[:24], b[:24]), Level(A[24:], b[24:])], -np.ones(48), np.ones(48), backend="jax").x
+A, b = np.random.default_rng(0).normal(size=(64, 48, 48)), np.ones((64, 48))
+for solve in qp, hqp:
+    calls = lapack_calls(jax.vmap(solve), A, b)
+    print(len(calls) > 0, sum(call.is_split() for call in calls) > 0)
+"""
+
+
+@pytest.mark.slow
+def test_searches_on_few_workers_have_no_call_that_is_split():
+    """With a pool that is wide enough they have: there, blocks are as long as the cache likes them."""
+    few = in_a_process(WHOLE).stdout.split()
+    assert few == ["True", "False"] * 2 if splits(jaxlib_version()) else ["True", "True"] * 2
+    assert in_a_process(WHOLE, PJRT_NPROC="8").stdout.split() == ["True", "True"] * 2
+
+
+SIDE_BY_SIDE = """
+import os
+os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from osik_jax.solvers import solve_least_squares_qp
+def solve(A, b):
+    return solve_least_squares_qp(A, b, np.ones(48), -np.ones(48), np.ones(48), backend="jax").x
+def again(_, state):
+    A, u, v = state
+    x, y = jax.vmap(solve)(A, u), jax.vmap(solve)(2.0 * A, v)
+    return A, u + 0.0 * x, v + 0.0 * y
+A, b = np.random.default_rng(0).normal(size=(64, 48, 48)), np.ones((64, 48))
+jax.block_until_ready(jax.jit(lambda *s: jax.lax.fori_loop(0, 20, again, s))(A, b, 2.0 * b))
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_batches_of_qps_side_by_side_come_to_an_end():
+    """Two cores, nothing configured, plain JAX: in blocks of 16 lanes they wait for ever (jaxlib 0.10.2)."""
+    assert in_a_process(SIDE_BY_SIDE).stdout == "done\n"
