@@ -5,12 +5,13 @@ import os
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import version
+from importlib.metadata import distribution, version
 from pathlib import Path
 
 import pytest
 
 from osik_jax.execution._cpu_settings import _UNTRIED_JAXLIB
+from osik_jax.execution._workers import jaxlib_version, splits
 from osik_jax.runtime import configure_cpu
 
 OURS = "PJRT_NPROC", "OPENBLAS_NUM_THREADS", "XLA_FLAGS", "JAX_CPU_ENABLE_ASYNC_DISPATCH"
@@ -198,8 +199,19 @@ print(alone, [str(w.message) for w in seen if "configure_cpu" in str(w.message)]
 
 @pytest.mark.slow
 def test_batches_on_few_cores_that_are_not_configured_are_warned_of_once():
-    assert in_a_process(WARNED).stdout.strip() == "0 1"
+    assert in_a_process(WARNED).stdout.strip() == f"0 {int(splits(jaxlib_version()))}"
     assert in_a_process(WARNED, PJRT_NPROC="8").stdout.strip() == "0 0"
+
+
+def test_releases_of_jaxlib_that_wait():
+    """As their wheels have it: those that wait name absl's BlockingCounter in jaxlib/cpu/_lapack.so."""
+    assert all(map(splits, [(0, 10, 0), (0, 10, 2), (0, 11, 0)]))
+    assert not any(map(splits, [(0, 8, 0), (0, 9, 2), (0, 11, 1), (0, 11, 2), (0, 12, 0)]))
+
+
+def test_this_jaxlib_waits_where_it_is_said_to():
+    library = Path(str(distribution("jaxlib").locate_file("jaxlib/cpu/_lapack.so")))
+    assert (b"BlockingCounter" in library.read_bytes()) == splits(jaxlib_version())
 
 
 def test_flags_are_set_for_every_jax_that_may_be_installed():
@@ -208,3 +220,53 @@ def test_flags_are_set_for_every_jax_that_may_be_installed():
     (bounds,) = [d.removeprefix("jax").split(",") for d in project["dependencies"] if d.startswith("jax>")]
     major, minor = _UNTRIED_JAXLIB
     assert f"<{major}.{minor}" in bounds
+
+
+WHOLE = """
+import os
+os.sched_getaffinity = lambda _: {0, 1}
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from osik_jax.execution._lapack import lapack_calls
+from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp
+def qp(A, b):
+    return solve_least_squares_qp(A, b, np.ones(48), -np.ones(48), np.ones(48), backend="jax").x
+def hqp(A, b):
+    return solve_hqp([Level(A[:24], b[:24]), Level(A[24:], b[24:])], -np.ones(48), np.ones(48), backend="jax").x
+A, b = np.random.default_rng(0).normal(size=(64, 48, 48)), np.ones((64, 48))
+for solve in qp, hqp:
+    calls = lapack_calls(jax.vmap(solve), A, b)
+    print(len(calls) > 0, sum(call.is_split() for call in calls) > 0)
+"""
+
+
+@pytest.mark.slow
+def test_searches_on_few_workers_have_no_call_that_is_split():
+    """With a pool that is wide enough they have: there, blocks are as long as the cache likes them."""
+    few = in_a_process(WHOLE).stdout.split()
+    assert few == ["True", "False"] * 2 if splits(jaxlib_version()) else ["True", "True"] * 2
+    assert in_a_process(WHOLE, PJRT_NPROC="8").stdout.split() == ["True", "True"] * 2
+
+
+SIDE_BY_SIDE = """
+import os
+os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from osik_jax.solvers import solve_least_squares_qp
+def solve(A, b):
+    return solve_least_squares_qp(A, b, np.ones(48), -np.ones(48), np.ones(48), backend="jax").x
+def again(_, state):
+    A, u, v = state
+    x, y = jax.vmap(solve)(A, u), jax.vmap(solve)(2.0 * A, v)
+    return A, u + 0.0 * x, v + 0.0 * y
+A, b = np.random.default_rng(0).normal(size=(64, 48, 48)), np.ones((64, 48))
+jax.block_until_ready(jax.jit(lambda *s: jax.lax.fori_loop(0, 20, again, s))(A, b, 2.0 * b))
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_batches_of_qps_side_by_side_come_to_an_end():
+    """Two cores, nothing configured, plain JAX: in blocks of 16 lanes they wait for ever (jaxlib 0.10.2)."""
+    assert in_a_process(SIDE_BY_SIDE).stdout == "done\n"

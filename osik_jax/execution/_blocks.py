@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from ._backends import cpu_is_default
-from ._workers import warn_of_few_workers
+from ._lapack import lanes_in_one
+from ._workers import too_few_workers, warn_of_few_workers
 
 BLOCK = 16
 """Lanes that a CPU core takes through a step at a time, so that what they need stays in its second cache.
@@ -24,11 +25,13 @@ def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) ->
     Args:
         function: takes and returns pytrees whose arrays have a leading axis, the lanes.
         args: what it is called with.
-        size: lanes in a block; the last block is filled up with copies of the first lane.
+        size: lanes in a block; the last block is filled up with copies of the first lane. Fewer where a LAPACK call of
+            so many would be split among workers that are too few.
     """
     count = jax.tree.leaves(args)[0].shape[0]
-    if count > 1:
+    if count > 1 and too_few_workers():
         warn_of_few_workers()
+        size = lanes_in_one(function, args, min(size, count))
     if count <= size or not cpu_is_default():
         return function(*args)
     blocks = -(-count // size)

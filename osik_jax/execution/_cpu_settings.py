@@ -9,7 +9,7 @@ from importlib.metadata import version
 import jax
 
 from .._errors import OsikValueError
-from ._workers import ENOUGH, cores
+from ._workers import ENOUGH, cores, jaxlib_version
 
 _UNTRIED_JAXLIB = (0, 13)  # the same bound as that of jax in pyproject.toml
 _SCHEDULER = "xla_cpu_enable_concurrency_optimized_scheduler"
@@ -56,7 +56,7 @@ def configure_cpu(
     for name, value in (("workers", workers), ("lapack_threads", lapack_threads)):
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise OsikValueError(f"{name} is {value!r}; it is an integer, at least 1")
-    if older_fusions and _jaxlib() >= _NO_FUSION_FLAG:
+    if older_fusions and jaxlib_version() >= _NO_FUSION_FLAG:
         raise OsikValueError(f"older_fusions needs a jaxlib before 0.11; this is {version('jaxlib')}")
     changes = _environment(workers, side_by_side, older_fusions)
     dispatch = _dispatch(asynchronous)
@@ -78,17 +78,12 @@ def _environment(workers: int, side_by_side: bool, older_fusions: bool) -> dict[
     if "PJRT_NPROC" not in os.environ and workers > cores():
         changes["PJRT_NPROC"] = str(workers)
     flags = os.environ.get("XLA_FLAGS", "")
-    wanted = {_SCHEDULER: side_by_side} if _jaxlib() < _UNTRIED_JAXLIB else {}
+    wanted = {_SCHEDULER: side_by_side} if jaxlib_version() < _UNTRIED_JAXLIB else {}
     wanted |= {_FUSION: False} if older_fusions else {}
     added = [f"--{name}={str(value).lower()}" for name, value in wanted.items() if name not in flags]
     if added:
         changes["XLA_FLAGS"] = " ".join([flags, *added]).strip()
     return changes
-
-
-def _jaxlib() -> tuple[int, ...]:
-    """Return jaxlib's version, without the last part."""
-    return tuple(map(int, version("jaxlib").split(".")[:2]))
 
 
 def _dispatch(asynchronous: bool) -> bool:

@@ -17,6 +17,8 @@ from jaxtyping import Array, Bool
 
 from ._backends import cpu_is_default
 from ._blocks import BLOCK, first_axes_as_one, in_blocks
+from ._lapack import lanes_in_one
+from ._workers import too_few_workers
 
 FEW_ON_CPU, FEW = 4, 256
 """Lanes that are worked on together where most are done."""
@@ -110,6 +112,8 @@ def with_a_few(
     """
     lanes = len(done)
     block = (FEW_ON_CPU if cpu_is_default() else FEW) if block is None else block
+    if lanes > 1 and too_few_workers():
+        block = lanes_in_one(again, (data, state), min(block, lanes))
 
     def gathered(at: Array, state: Any) -> Any:
         return again(*jax.tree.map(lambda a: a[at], (data, state)))

@@ -1,0 +1,86 @@
+"""LAPACK calls in a program: which of them a jaxlib splits, and how many lanes keep them whole.
+
+Where calls that are split can wait for ever is said in ``_workers.py``. A call is split where its batch times the
+operations for one matrix reaches a number; a batch of 1 never is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from math import prod
+from typing import Any, NamedTuple
+
+import jax
+
+SPLIT = 200_000
+"""Operations from which on jaxlib 0.10.2 splits a call."""
+
+
+class Call(NamedTuple):
+    """A batched call: how many matrices, and operations for one of them."""
+
+    batch: int
+    operations: int
+
+    def is_split(self) -> bool:
+        """Return whether it is split into tasks."""
+        return self.batch > 1 and self.batch * self.operations >= SPLIT
+
+
+def lapack_calls(function: Callable[..., Any], *args: Any) -> list[Call]:
+    """Return the LAPACK calls in the program of ``function(*args)``, of arrays or their shapes; nothing is run."""
+    return list(_calls(jax.make_jaxpr(function)(*args).jaxpr))
+
+
+def lanes_in_one(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> int:
+    """Return the most lanes, up to ``size``, of which no call is split, at least 1.
+
+    Args:
+        function: takes pytrees whose arrays have a leading axis, the lanes.
+        args: what it is called with, or the shapes of that.
+        size: lanes, at least 1.
+    """
+    block = jax.tree.map(lambda a: jax.ShapeDtypeStruct((size, *a.shape[1:]), a.dtype), args)
+    # a call has so many matrices a lane, or those of a few lanes
+    split = [call.operations * max(1, call.batch // size) for call in lapack_calls(function, *block) if call.is_split()]
+    return min([size, *(max(1, (SPLIT - 1) // operations) for operations in split)])
+
+
+def _calls(jaxpr: Any) -> Iterator[Call]:
+    for equation in jaxpr.eqns:
+        count = _OPERATIONS.get(equation.primitive.name)
+        if count:
+            shapes = [v.aval.shape for v in equation.invars]
+            yield Call(prod(shapes[0][:-2]), count(*(shape[-2:] for shape in shapes[:2])))
+        for parameter in jax.tree.leaves(list(equation.params.values()), is_leaf=_has_jaxpr):
+            if _has_jaxpr(parameter):
+                yield from _calls(getattr(parameter, "jaxpr", parameter))
+
+
+def _has_jaxpr(parameter: Any) -> bool:
+    return hasattr(getattr(parameter, "jaxpr", parameter), "eqns")
+
+
+def _reflections(matrix: tuple[int, int], *_: Any) -> int:
+    return 2 * prod(matrix) * min(matrix)
+
+
+def _rotations(matrix: tuple[int, int], *_: Any) -> int:
+    return 9 * prod(matrix) * min(matrix)
+
+
+_OPERATIONS: dict[str, Callable[..., int]] = {
+    "cholesky": lambda matrix: matrix[0] ** 3 // 3,
+    "triangular_solve": lambda matrix, right: matrix[0] * prod(right),
+    "lu": lambda matrix: prod(matrix) * min(matrix),
+    "qr": _reflections,
+    "geqrf": _reflections,
+    "geqp3": _reflections,
+    "householder_product": _reflections,
+    "svd": _rotations,
+    "eigh": _rotations,
+}
+"""For one matrix; at least what jaxlib counts, as far as it was measured (jaxlib 0.10.2).
+
+Not among them are operations that the solvers do not use, such as eigenvalues of matrices without symmetry.
+"""
