@@ -1,6 +1,7 @@
 """What the linear model leaves out, damped: bounds against MuJoCo, calm out of reach, exact inside, differentiable."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -235,7 +236,7 @@ def test_products_as_a_gpu_takes_them_are_the_same(arm, monkeypatch):
     """Small products are written out where JAX's default is a GPU; here that is only said."""
     q = bent(arm)
     p, turn = kinematics_at(arm, q).frame_pose(arm, "hand")
-    kinds = dict(), dict(rows="position", axes="frame"), dict(error="se3")
+    kinds: tuple[dict[str, Any], ...] = {}, {"rows": "position", "axes": "frame"}, {"error": "se3"}
     tasks = [osik.FrameTask(arm, "hand", target=(p + 0.3, turn.T), weight=2.0, **options) for options in kinds]
 
     def rows(q):
