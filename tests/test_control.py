@@ -346,7 +346,7 @@ class TestDerivatives:
         }
         return f, x
 
-    @pytest.mark.variants(slow=["weighted"])
+    @pytest.mark.variants(slow=["null-space"])
     @pytest.mark.parametrize("name", ["weighted", "null-space"])
     def test_one_step_in_both_modes(self, arm, home, limits, name):
         f, x = self.cost(arm, home, limits, name)
