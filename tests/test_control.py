@@ -143,6 +143,7 @@ class TestRollout:
         for run in runs[1:]:
             np.testing.assert_array_equal(run.q, runs[0].q)
 
+    @pytest.mark.variants(slow=["hierarchical"])
     @all_schemes
     def test_a_joint_far_outside_its_range_comes_back(self, arm, tasks, limits, name):
         """At full speed where the box is hard; the null space has none."""
@@ -232,6 +233,7 @@ def stack(lanes):
 
 
 class TestBatches:
+    @pytest.mark.variants(slow=["hierarchical"])
     @all_schemes
     def test_vmap_over_everything_equals_a_loop(self, arm, home, name):
         """Configurations, targets, weights, gains, bounds, limits, dt, link lengths and the scheme's own numbers."""

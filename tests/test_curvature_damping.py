@@ -1,6 +1,7 @@
 """What the linear model leaves out, damped: bounds against MuJoCo, calm out of reach, exact inside, differentiable."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -231,16 +232,17 @@ def test_its_share_is_traced(arm):
     assert len(traces) == 1
 
 
-@pytest.mark.parametrize("options", [dict(), dict(rows="position", axes="frame"), dict(error="se3")])
-def test_products_as_a_gpu_takes_them_are_the_same(arm, options, monkeypatch):
+def test_products_as_a_gpu_takes_them_are_the_same(arm, monkeypatch):
     """Small products are written out where JAX's default is a GPU; here that is only said."""
     q = bent(arm)
-    p, turn = osik.forward_kinematics(arm, q).frame_pose(arm, "hand")
-    task = osik.FrameTask(arm, "hand", target=(p + 0.3, turn.T), weight=2.0, **options)
+    p, turn = kinematics_at(arm, q).frame_pose(arm, "hand")
+    kinds: tuple[dict[str, Any], ...] = {}, {"rows": "position", "axes": "frame"}, {"error": "se3"}
+    tasks = [osik.FrameTask(arm, "hand", target=(p + 0.3, turn.T), weight=2.0, **options) for options in kinds]
 
     def rows(q):
-        found = task.rows(arm, osik.forward_kinematics(arm, q), q)
-        return found.error, found.jacobian, found.curvature
+        kinematics = osik.forward_kinematics(arm, q)
+        found = [task.rows(arm, kinematics, q) for task in tasks]
+        return [(each.error, each.jacobian, each.curvature) for each in found]
 
     def with_slopes():
         return jax.jit(lambda q: (rows(q), jax.jacfwd(rows)(q)))(q)
