@@ -122,7 +122,7 @@ print("done")
 
 
 def test_batches_of_factorisations_side_by_side_come_to_an_end():
-    """Without ``configure_cpu`` the same program waits for ever on two cores (jaxlib 0.10.2)."""
+    """Without ``configure_cpu`` the same program may wait for ever on two cores (jaxlib 0.10.2)."""
     env = {k: v for k, v in os.environ.items() if k not in OURS}
     done = subprocess.run(
         [sys.executable, "-c", LOCKED, "configured"], env=env, capture_output=True, text=True, timeout=300
@@ -155,7 +155,7 @@ print("done")
 @pytest.mark.variants(release=["hqp"])
 @pytest.mark.parametrize("solver", ["nullspace", "hqp"])
 def test_kernels_wait_for_no_workers(solver):
-    """Two batches side by side on two cores, nothing configured: with ``backend="jax"`` they wait for ever."""
+    """Two batches side by side on two cores, nothing configured: null spaces with ``backend="jax"`` wait for ever."""
     pytest.importorskip("numba")
     assert in_a_process(f"SOLVER = {solver!r}\n{BY_KERNELS}").stdout == "done\n"
 
@@ -268,5 +268,5 @@ print("done")
 
 @pytest.mark.slow
 def test_batches_of_qps_side_by_side_come_to_an_end():
-    """Two cores, nothing configured, plain JAX: in blocks of 16 lanes they wait for ever (jaxlib 0.10.2)."""
+    """Two cores, nothing configured, plain JAX: in blocks of 16 lanes they can wait for ever (jaxlib 0.10.2)."""
     assert in_a_process(SIDE_BY_SIDE).stdout == "done\n"
