@@ -652,6 +652,17 @@ def test_talos_dances_with_its_feet_where_they_are(dance):
     assert figures["tracking"]["segment_angle_deg_mean"] < 2.0
 
 
+def outside_capsules(robot, capsules, points):
+    """How far points of the world are outside the nearest capsule of a robot at home, negative inside [m]."""
+    places, distances = home_kinematics(robot), []
+    for capsule in capsules:
+        position, rotation = (np.asarray(x) for x in places.frame_pose(robot, capsule.frame))
+        a, b = position + np.array([capsule.start, capsule.end]) @ rotation.T
+        share = np.clip((points - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
+        distances.append(np.linalg.norm(points - a - share[:, None] * (b - a), axis=-1) - capsule.radius)
+    return np.min(distances, 0)
+
+
 @pytest.mark.parametrize("name", ["g1", "talos"])
 def test_guessed_capsules_cover_the_meshes_of_limbs(name):
     """The vertices of the collision meshes that MuJoCo reads, beside capsules out of masses alone."""
@@ -659,13 +670,7 @@ def test_guessed_capsules_cover_the_meshes_of_limbs(name):
         osik.Robot.from_urdf(described_urdf(name), floating_base=True, collision_meshes=meshes)
         for meshes in (False, True)
     )
-    capsules = guess_profile(plain).capsules
-    places = home_kinematics(plain)
-    ends = [
-        [np.asarray(p) + np.asarray(R) @ np.array(x) for x in (c.start, c.end)]
-        for c, (p, R) in zip(capsules, (places.frame_pose(plain, c.frame) for c in capsules), strict=True)
-    ]
-    model, outside = meshed.mj_model, []
+    model, vertices = meshed.mj_model, []
     data = mujoco.MjData(model)
     data.qpos[:] = np.asarray(meshed.mujoco_qpos(meshed.q0))
     mujoco.mj_kinematics(model, data)
@@ -674,13 +679,10 @@ def test_guessed_capsules_cover_the_meshes_of_limbs(name):
             continue  # feet have their corners, and fingers are too light
         mesh = model.geom_dataid[geom]
         first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        at = model.mesh_vert[first : first + count] @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-        depth = []
-        for (a, b), capsule in zip(ends, capsules, strict=True):
-            share = np.clip((at - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
-            depth.append(np.linalg.norm(at - a - share[:, None] * (b - a), axis=-1) - capsule.radius)
-        outside.append(np.maximum(np.min(depth, 0), 0.0))
-    assert 1e3 * np.concatenate(outside).mean() < {"g1": 0.3, "talos": 3.0}[name]
+        turn = data.geom_xmat[geom].reshape(3, 3)
+        vertices.append(model.mesh_vert[first : first + count] @ turn.T + data.geom_xpos[geom])
+    outside = np.maximum(outside_capsules(plain, guess_profile(plain).capsules, np.concatenate(vertices)), 0.0)
+    assert 1e3 * outside.mean() < {"g1": 0.3, "talos": 3.0}[name]
 
 
 @pytest.mark.parametrize("part", ["rubber_hand", "wrist_yaw_link"])
@@ -695,13 +697,7 @@ def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
         position, rotation = (np.asarray(x) for x in places.frame_pose(g1, f"{side}_{part}"))
         at = position + faces["corners"].reshape(-1, 3) @ rotation.T
         hands = [capsule for capsule in profile.capsules if capsule.frame == f"{side}_rubber_hand"]
-        position, rotation = (np.asarray(x) for x in places.frame_pose(g1, f"{side}_rubber_hand"))
-        outside = []
-        for capsule in hands:
-            a, b = position + np.array([capsule.start, capsule.end]) @ rotation.T
-            share = np.clip((at - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
-            outside.append(np.linalg.norm(at - a - share[:, None] * (b - a), axis=-1) - capsule.radius)
-        most = 1e3 * np.min(outside, 0).max()
+        most = 1e3 * outside_capsules(g1, hands, at).max()
         assert most < {"rubber_hand": 6.0, "wrist_yaw_link": 0.0}[part]  # 22 and 30 mm when hands were as limbs
 
 

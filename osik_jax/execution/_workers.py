@@ -28,6 +28,12 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@cache
+def jaxlib_version() -> tuple[int, ...]:
+    """Return jaxlib's version."""
+    return tuple(int(part) for part in version("jaxlib").split(".")[:3] if part.isdigit())
+
+
 def too_few_workers() -> bool:
     """Return whether calls of LAPACK that are split can wait for ever: a pool of few, whose size nobody has chosen."""
     return "PJRT_NPROC" not in os.environ and 1 < cores() < ENOUGH and splits(jaxlib_version()) and cpu_is_default()
@@ -40,9 +46,9 @@ def splits(jaxlib: tuple[int, ...]) -> bool:
 
 
 def warn_of_few_workers() -> None:
-    """Warn, once, where a batch is about to be solved by a pool whose size nobody has chosen."""
+    """Warn, once, where a batch is about to be solved by too few workers."""
     global _warned
-    if _warned or not too_few_workers():
+    if _warned:
         return
     _warned = True
     warn(
@@ -53,9 +59,3 @@ def warn_of_few_workers() -> None:
 
 
 _warned = False
-
-
-@cache
-def jaxlib_version() -> tuple[int, ...]:
-    """Return jaxlib's version."""
-    return tuple(int(part) for part in version("jaxlib").split(".")[:3] if part.isdigit())
