@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import zipfile
+import zlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -20,12 +22,20 @@ def open_npz(path: str | os.PathLike[str]) -> Iterator[NpzFile]:
 
     Raises:
         OSError: it is not there, or may not be read.
-        ValueError: it holds one array, or objects.
-        zipfile.BadZipFile, EOFError: it is damaged; reading an array may raise these as well.
+        ValueError: it is another kind of file, holds one array or objects, or is damaged, which may show only when an
+            array is read.
     """
+    name = os.fspath(path)
     with open(path, "rb") as source:
-        file = np.load(source, allow_pickle=False)
-        if not isinstance(file, NpzFile):
-            raise OsikValueError(f"{os.fspath(path)} holds one array and not several by name")
-        with file:
-            yield file
+        try:
+            file = np.load(source, allow_pickle=False)
+            if not isinstance(file, NpzFile):
+                raise OsikValueError(f"{name} holds one array and not several by name")
+            with file:
+                yield file
+        except OsikValueError:  # of the block, too
+            raise
+        except (ValueError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+            # NumPy takes what it does not know for a pickle, and says how to allow these
+            why = "it is none, or holds objects" if "pickle" in str(error) else error
+            raise OsikValueError(f"{name} cannot be read as an .npz of plain arrays: {why}") from error

@@ -97,6 +97,16 @@ def bent_forward(motion: HumanMotion, most: float = 70.0) -> HumanMotion:
     return dataclasses.replace(motion, positions=positions, rotations=None)
 
 
+def with_first(frames: int, own: Figure | None = None) -> Figure:
+    """The dancer with frames before it, in which it stands in its rest pose with legs and arms turned by 20 degrees."""
+    own = dancer() if own is None else own
+    pose = np.zeros((frames, *own.angles.shape[1:]))
+    for name in ("LeftUpLeg", "RightArm"):
+        pose[:, [joint for joint, _, _ in own.joints].index(name), 0] = 20.0
+    root = np.tile([1.0, 0.9, 0.5], (frames, 1))
+    return dataclasses.replace(own, angles=np.concatenate([pose, own.angles]), root=np.concatenate([root, own.root]))
+
+
 def write_bvh(path: Path, figure: Figure, unit: float = 1.0) -> Path:
     """A BVH file of a figure, lengths in ``unit`` metres; a joint without children gets an End Site."""
     children = [[j for j, (_, parent, _) in enumerate(figure.joints) if parent == i] for i in range(len(figure.joints))]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from motion_files import FIGURE, Figure, dancer, write_bvh
+from motion_files import FIGURE, Figure, dancer, with_first, write_bvh
 from scipy.spatial.transform import Rotation
 
 from osik_jax import OsikWarning
@@ -313,16 +313,6 @@ def test_a_robots_motion_comes_back_from_both_files(tmp_path):
         load_robot_motion(tmp_path / "motion.csv", joint_names=("hip",), fps=30.0)
     with pytest.raises(ValueError, match="not of unit length in frame 0"):
         RobotMotion(30.0, (), np.ones((1, 7)))
-
-
-def with_first(frames, own=None):
-    """The dancer with frames before it, in which it stands in its rest pose with legs and arms turned by 20 degrees."""
-    own = dancer() if own is None else own
-    pose = np.zeros((frames, *own.angles.shape[1:]))
-    for name in ("LeftUpLeg", "RightArm"):
-        pose[:, [joint for joint, _, _ in own.joints].index(name), 0] = 20.0
-    root = np.tile([1.0, 0.9, 0.5], (frames, 1))
-    return dataclasses.replace(own, angles=np.concatenate([pose, own.angles]), root=np.concatenate([root, own.root]))
 
 
 @pytest.mark.parametrize("frames", [1, 4])

@@ -8,6 +8,7 @@ import pytest
 import osik_jax as osik
 from osik_jax import cli, reachability
 from osik_jax.reachability import _reachability_map
+from osik_jax.viewer.live._open import is_map
 
 UPPER, FORE, HAND = 0.5, 0.4, 0.2
 PLANAR = f"""<mujoco><worldbody><body name="a"><joint name="j1" axis="0 0 1" range="-100 120"/>
@@ -210,6 +211,16 @@ def test_a_file_keeps_it(planar_map, tmp_path):
         np.save(file, np.zeros(3))
     with pytest.raises(ValueError, match=r"single\.npz holds one array and not several by name"):
         reachability.load_map(tmp_path / "single.npz")
+
+
+def test_a_file_that_was_cut_off_is_told(planar_map, tmp_path):
+    planar_map.save(tmp_path / "map.npz")
+    content = (tmp_path / "map.npz").read_bytes()
+    for kept in (0, 3, len(content) // 2, len(content) - 5):
+        (tmp_path / "map.npz").write_bytes(content[:kept])
+        with pytest.raises(ValueError, match=r"map\.npz cannot be read as an \.npz of plain arrays"):
+            reachability.load_map(tmp_path / "map.npz")
+        assert not is_map(tmp_path / "map.npz")
 
 
 def test_the_picture_shows_the_slice(planar_map, tmp_path):

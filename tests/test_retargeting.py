@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from emulated_warp import emulated, needs_compiler
-from motion_files import bent_forward, dancer, write_bvh
+from motion_files import bent_forward, dancer, with_first, write_bvh
 from other_processes import finish, start
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -452,6 +452,13 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     table = load_robot_motion(out / "motion.csv", joint_names=motion.joint_names, fps=motion.fps)
     np.testing.assert_allclose(table.qpos, motion.qpos, atol=1e-8)
     assert load_profile(out / "profile.toml").keypoints == load_profile("nao").keypoints
+
+
+def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
+    clip = write_bvh(tmp_path / "clip.bvh", with_first(2, dancer(30)))
+    out = tmp_path / "out"
+    assert cli.main(["retarget", str(clip), "--no-trim", "--no-animation", "--out", str(out)]) == 0
+    assert len(load_robot_motion(out / "motion.npz").qpos) == 32
 
 
 @pytest.mark.parametrize(

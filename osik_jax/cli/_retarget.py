@@ -65,6 +65,8 @@ class Retarget:
     """Of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
     up: Literal["x", "y", "z"] | None = None
     """Of a BVH: the axis that points up. Default: found from the skeleton."""
+    trim: bool = True
+    """Of a BVH: leave out its rest pose, where it begins with one from which it jumps."""
     animation: bool = True
     """Write the film (motion.gif); of a folder none is written."""
     fit: Path | None = None
@@ -95,7 +97,7 @@ class Retarget:
         console = Console()
         with told():
             unit = None if self.unit is None else _number_or_name(self.unit)
-            motion = retargeting.load_motion(self.clip, unit=unit, up=self.up)
+            motion = retargeting.load_motion(self.clip, unit=unit, up=self.up, trim=self.trim)
             retargeter = _retargeter(self)
             mapping = _mapping(self.mapping)
             console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
@@ -127,6 +129,7 @@ def _fit(command: Retarget, file: Path) -> None:
             acceleration=command.acceleration,
             unit=None if command.unit is None else _number_or_name(command.unit),
             up=command.up,
+            trim=command.trim,
         )
     step, losses = found.step, found.losses
     said = f"step {step} of {len(losses) - 1}: the loss of {learned} clips is {losses[step]:.3f} times what it was"
@@ -164,6 +167,7 @@ def _retarget_folder(command: Retarget) -> int:
             fps=command.fps,
             unit=None if command.unit is None else _number_or_name(command.unit),
             up=command.up,
+            trim=command.trim,
         )
     failed: dict[str, str] = summary["failed"]
     console = Console()
@@ -233,7 +237,7 @@ def _retarget_live(command: Retarget) -> None:
             stream(make, sys.stdin, sys.stdout)
             return
         unit = None if command.unit is None else _number_or_name(command.unit)
-        motion = retargeting.load_motion(command.clip, unit=unit, up=command.up)
+        motion = retargeting.load_motion(command.clip, unit=unit, up=command.up, trim=command.trim)
         motion = motion if command.fps is None else motion.resampled(command.fps)
         command.out.mkdir(parents=True, exist_ok=True)
         console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")

@@ -57,6 +57,7 @@ def fit_to_file(
     acceleration: float,
     unit: str | float | None,
     up: Up | None,
+    trim: bool,
 ) -> tuple[Fit, int, int]:
     """Finds a profile by the clips of a folder (``fit``) and writes it.
 
@@ -72,7 +73,7 @@ def fit_to_file(
     motions = []
     for name, path in clips_in(folder).items():
         try:
-            motions.append(load_clip(path, unit, up))
+            motions.append(load_clip(path, unit, up, trim))
         except (ValueError, KeyError) as error:
             raise type(error)(f"{name}: {error.args[0]}") from error
     held_out = motions[_HELD_OUT - 1 :: _HELD_OUT]

@@ -55,6 +55,7 @@ def retarget_folder(
     fps: float | None = None,
     unit: str | float | None = None,
     up: Up | None = None,
+    trim: bool = True,
     chunk: int = 32,
     progress: Progress = True,
 ) -> dict[str, Any]:
@@ -73,6 +74,7 @@ def retarget_folder(
         fps: as of ``Retargeter.retarget``, the same for all.
         unit: of the BVH files among them, as of ``load_motion``.
         up: of the BVH files among them, as of ``load_motion``.
+        trim: of the BVH files among them, as of ``load_motion``.
         chunk: clips that a GPU works on at once; on a CPU each core works on one.
         progress: whether to show a bar; or a function of the number of clips that are done and of all.
 
@@ -86,7 +88,7 @@ def retarget_folder(
         OSError: something cannot be written.
     """
     files = clips_in(folder)
-    job = _job(retargeter, {"mapping": mapping, "fps": fps, "unit": unit, "up": up})
+    job = _job(retargeter, {"mapping": mapping, "fps": fps, "unit": unit, "up": up, "trim": trim})
     with only_job(out):
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
@@ -95,7 +97,7 @@ def retarget_folder(
             # the longest first: what is compiled for them does for shorter ones too
             todo = [name for name in files if name not in work.found]
             for name in sorted(todo, key=lambda name: -files[name].stat().st_size):
-                advance(work.add(name, partial(load_clip, files[name], unit, up), mapping, fps))
+                advance(work.add(name, partial(load_clip, files[name], unit, up, trim), mapping, fps))
             for done in work.rest():
                 advance(done)
         summary = _summary(work.found, work.failed, [*files])

@@ -42,10 +42,10 @@ def load_motion(
     return read_keypoints(path)
 
 
-def load_clip(path: Path, unit: str | float | None, up: Up | None) -> HumanMotion:
+def load_clip(path: Path, unit: str | float | None, up: Up | None, trim: bool) -> HumanMotion:
     """A clip; unit and axis go with BVH files alone."""
     bvh = path.suffix.lower() == ".bvh"
-    return load_motion(path, unit=unit if bvh else None, up=up if bvh else None)
+    return load_motion(path, unit=unit if bvh else None, up=up if bvh else None, trim=trim)
 
 
 def clips_in(folder: Path) -> dict[str, Path]:
