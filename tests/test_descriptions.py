@@ -125,6 +125,12 @@ def test_without_the_package(monkeypatch: pytest.MonkeyPatch):
         osik.load_robot("nau")
 
 
+@pytest.mark.parametrize("path", ["robot.urdf", "models/robot", "Robot.XML"])
+def test_a_path_is_told_what_reads_files(path: str):
+    with pytest.raises(KeyError, match=rf"no robot '{path}': .*nao, arm7.*Robot\.from_urdf\(path\)"):
+        osik.load_robot(path)
+
+
 def test_the_command_line_takes_their_names():
     assert read_robot("toy_mj_description").nv == 7
     assert read_robot("toy_description", base="fixed").nv == 1

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 
-from .._errors import OsikTypeError
+from .._errors import OsikKeyError, OsikTypeError
 from . import loading
 from ._home_configuration import Home
 from ._robot import Robot
 from .loading import LoadOptions, LockedJoints, PositionLimits
+
+_OF_FILES = (".urdf", ".xml", ".mjcf")
+"""How names end that are paths."""
 
 
 def load_robot(
@@ -35,7 +39,8 @@ def load_robot(
         home: likewise.
 
     Raises:
-        KeyError: no such robot; the message lists those with names like it. No such joint or keyframe.
+        KeyError: no such robot; the message lists those with names like it, and of a path says what reads files. No
+            such joint or keyframe.
         ImportError: the robot is one of robot_descriptions, which is not installed.
         ValueError: the robot comes as xacro alone, its file cannot be read, or ``home`` does not fit.
 
@@ -44,6 +49,11 @@ def load_robot(
     """
     if not isinstance(name, str):
         raise OsikTypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, loading.ROBOTS))}")
+    if os.sep in name or name.lower().endswith(_OF_FILES):
+        raise OsikKeyError(
+            f"no robot {name!r}: load_robot takes names ({', '.join(loading.ROBOTS)}, or one of robot_descriptions); "
+            "files are read by Robot.from_urdf(path) and Robot.from_mjcf(path)"
+        )
     load = loading.embedded if name in loading.ROBOTS else loading.described
     options = LoadOptions(
         floating_base=floating_base,
