@@ -26,7 +26,7 @@ auto begin_search = [&](const double* target) {
 };
 // finds `now`, inside its box, and returns whether it has; a combination with parts below `least` depends on others
 auto search = [&](const double* target, double least) {
-  int entering = -1;
+  int entering = -1, crossings = 0;                   // crossings: exchanges at this scale for this joint
   double sign = 1.0, push = 0.0, stop_rate = 0.0;
   bool dropping = false, going = true;
   begin_search(target);
@@ -47,7 +47,7 @@ auto search = [&](const double* target, double least) {
       going = entering >= 0;
       if (!going) break;
       sign = low[entering] - now[entering] >= now[entering] - high[entering] ? 1.0 : -1.0;
-      push = 0.0;
+      push = 0.0, crossings = 0;
     }
     const int k = entering, label = sign > 0.0 ? -1 : 1;
     ++changes;
@@ -61,6 +61,7 @@ auto search = [&](const double* target, double least) {
     if (leaving < 0 && full == INFINITY) {
       const int out = first_to_cross(sign, least * largest);
       if (out >= 0) {
+        if (++crossings > count) break;               // rounding has them go round
         ++changes;
         stop = exchange(out, stop), push = 0.0;
         settle();
