@@ -9,7 +9,7 @@ auto set_gram = [&]() {
     if (b < a) continue;
     double total = 0.0;
     if (counts[a] != 0 && counts[b] != 0) {
-#pragma unroll 8
+#pragma unroll 4
       for (int j = first; j < N; ++j) total += beside[j * BD + a] * beside[j * BD + b];
       if (a == b) trace += total;
     } else if (a == b) {
@@ -39,7 +39,7 @@ auto missed_with = [&](double ridge) {                // norm of what the damped
   __syncwarp();
   for (int a = lane; a < m; a += 32) {
     double after = value[a];
-#pragma unroll 8
+#pragma unroll 4
     for (int j = first; j < N; ++j) after += beside[j * BD + a] * place[j];
     const double off = distance(a, after);
     total += off * off;
@@ -49,11 +49,7 @@ auto missed_with = [&](double ridge) {                // norm of what the damped
 auto compute_damping = [&]() {
   damping = constant;
   if (unmet != 0.0) {
-    for (int j = first + lane; j < N; j += 32) {
-      place[j] = 0.0;
-#pragma unroll 8
-      for (int i = 0; i < N; ++i) place[j] += turned[j * D + i] * x[i];
-    }
+    for (int j = first + lane; j < N; j += 32) place[j] = coordinate_times(j, x);
     __syncwarp();
     for (int i = lane; i < N; i += 32) now[i] = x[i] - column_times(place, i, first, N);
     look(now);

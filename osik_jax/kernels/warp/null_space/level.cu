@@ -8,13 +8,19 @@ double longest = 0.0, frobenius = 0.0;                // the longest row, square
 // `v` times column i of the coordinates from `from` on
 auto column_times = [&](const double* v, int i, int from, int to) {
   double total = 0.0;
-#pragma unroll 8
+#pragma unroll 4
   for (int j = from; j < to; ++j) total += v[j] * turned[j * D + i];
+  return total;
+};
+auto coordinate_times = [&](int j, const double* v) { // coordinate j of v, of the joints
+  double total = 0.0;
+#pragma unroll 4
+  for (int i = 0; i < N; ++i) total += turned[j * D + i] * v[i];
   return total;
 };
 auto row_times = [&](int a, const double* v) {        // row a of the level times v, of the joints
   double total = 0.0;
-#pragma unroll 8
+#pragma unroll 4
   for (int i = 0; i < N; ++i) total += A[i * M + a] * v[i];
   return total;
 };
@@ -28,7 +34,7 @@ auto load_level = [&]() {
   longest = 0.0;
   for (int a = lane; a < M; a += 32) {
     row_square[a] = 0.0;
-#pragma unroll 8
+#pragma unroll 4
     for (int i = 0; i < N; ++i) row_square[a] += A[i * M + a] * A[i * M + a];
     const size_t at = here * M + a;
     const bool is_bounded = rows_lower.data[at] > -INFINITY || rows_upper.data[at] < INFINITY;

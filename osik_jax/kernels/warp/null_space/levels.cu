@@ -63,7 +63,7 @@ for (int i = lane; i < N; i += 32) {
 for (int i = 0; i < N; ++i)
   for (int k = lane; k < N; k += 32) {
     double total = 0.0;
-#pragma unroll 8
+#pragma unroll 4
     for (int j = first; j < N; ++j) total += turned[j * D + i] * turned[j * D + k];
     projectors.data[(problem * N + i) * N + k] = total;
   }

@@ -10,7 +10,7 @@ auto reflect = [&](int head, double norm, int from, int to) {
   for (int i = lane; i < N; i += 32) {
     along[i] += by * turned[head * D + i];
     const double part = weight * along[i];
-#pragma unroll 8
+#pragma unroll 4
     for (int j = from; j < to; ++j) turned[j * D + i] -= turn[j] * part;
   }
   __syncwarp();
@@ -23,7 +23,7 @@ auto take_row_space = [&](int columns, double cutoff) {
   __syncwarp();
   for (int a = lane; a < columns; a += 32) {
     double total = 0.0;
-#pragma unroll 8
+#pragma unroll 4
     for (int j = first; j < N; ++j) total += beside[j * BD + a] * beside[j * BD + a];
     square[a] = total;
   }
@@ -42,10 +42,10 @@ auto take_row_space = [&](int columns, double cutoff) {
     const double weight = reflect(at, norm, at, N);
     for (int a = lane; a < columns; a += 32) {
       double product = 0.0, left = 0.0;
-#pragma unroll 8
+#pragma unroll 4
       for (int j = at; j < N; ++j) product += turn[j] * beside[j * BD + a];
       product *= weight;
-#pragma unroll 8
+#pragma unroll 4
       for (int j = at; j < N; ++j) {
         beside[j * BD + a] -= turn[j] * product;
         if (j > at) left += beside[j * BD + a] * beside[j * BD + a];

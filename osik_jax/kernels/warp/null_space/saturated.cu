@@ -6,7 +6,7 @@ auto bound = [&](int i) { return at_bound[i] > 0 ? high[i] : low[i]; };
 auto bound_passed = [&](int i) { return passed[i] < 0 ? low[i] : high[i]; };
 auto dual_times = [&](int a, const double* v) {       // the dual of a saturated joint times v, of the coordinates
   double total = 0.0;
-#pragma unroll 8
+#pragma unroll 4
   for (int j = first; j < first + count; ++j) total += duals[a * D + j] * v[j];
   return total;
 };
@@ -21,7 +21,7 @@ auto settle = [&]() {
     __syncwarp();
     for (int j = first + lane; j < first + count; j += 32) {
       double total = 0.0;
-#pragma unroll 8
+#pragma unroll 4
       for (int a = 0; a < count; ++a) total += gap[a] * duals[a * D + j];
       place[j] = total;
     }
@@ -68,7 +68,7 @@ auto release = [&](int a, bool moves) {
   __syncwarp();
   for (int j = first + lane; j < end; j += 32) {      // once more, for rounding
     double more = 0.0;
-#pragma unroll 8
+#pragma unroll 4
     for (int b = 0; b < count; ++b) more += rate[b] * duals[b * D + j];
     own[j] += more;
     turn[j] = own[j], total += own[j] * own[j];
@@ -91,7 +91,7 @@ auto release = [&](int a, bool moves) {
   __syncwarp();
   for (int b = lane; b < count - 1; b += 32) {
     const double part = weight * dual_times(b, turn);
-#pragma unroll 8
+#pragma unroll 4
     for (int j = first; j < last; ++j) duals[b * D + j] -= part * turn[j];
     duals[b * D + last] = turned[last * D + who[b]] = 0.0;
   }

@@ -6,7 +6,7 @@ auto scale_of = [&](int k, int label, double least, double& its_rate) {
   __syncwarp();
   for (int j = first + lane; j < first + count; j += 32) {  // the rates once more, for rounding
     double total = 0.0;
-#pragma unroll 8
+#pragma unroll 4
     for (int a = 0; a < count; ++a) total += rate[a] * turned[j * D + who[a]];
     turn[j] -= total;
   }
@@ -34,22 +34,12 @@ auto stop_by = [&](int k, int label) {
   stop = k;
   __syncwarp();
 };
-// saturates a joint that stops the motion beside the saturated ones in place of one of these, which is returned
-auto exchange = [&](int a, int joint) {
-  const int other = who[a], label = at_bound[other], its_label = passed[joint];
-  release(a, false);
-  const double length_squared = look_along(joint);
-  saturate(joint, length_squared, its_label, 0.0, 1);
-  if (lane == 0) passed[joint] = 0, passed[other] = label;
-  __syncwarp();
-  return other;
-};
-// settles, at the scale near this one that puts the joint that stops the motion on its bound
-auto settle_stopped = [&](double its_rate) {
-  for (int pass = 0; pass < 3; ++pass) {
+// settles, at the scale near this one that puts the joint that stops the motion on its bound, so many times at most
+auto settle_stopped = [&](int passes, double its_rate) {
+  while (passes > 0) {
     settle();
     const double off = stop < 0 ? 0.0 : bound_passed(stop) - now[stop];
-    if (off == 0.0 || pass == 2) break;
+    if (off == 0.0 || --passes == 0) break;
     scale = clip(scale + off / its_rate, 0.0, 1.0);
   }
 };
