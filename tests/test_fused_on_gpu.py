@@ -13,7 +13,7 @@ import pytest
 import test_saturation
 from null_space_families import FAMILIES
 from problem_families import WHOLE_BODY_DAMPING, whole_body
-from recorded import QP_DAMPING, recorded_qps
+from recorded import QP_DAMPING, check_recorded_saturated, recorded_qps, recorded_saturated
 
 from osik_jax.execution import _backends
 from osik_jax.solvers import Damping, Level, Status, solve_least_squares_qp, solve_nullspace
@@ -228,6 +228,12 @@ def test_saturation_leaves_nothing_to_the_search(rng):
     found = jax.jit(lambda p: null_space_kernel.solve(jax.vmap(padded)(p), 120))(p)
     assert found.done.all()
     assert (jnp.abs(found.x - test_saturation.solve_by(p, backend="jax").x) < 1e-8).all()
+
+
+def test_recorded_saturated_problems_whatever_rounding_does():
+    copies = 256
+    p = recorded_saturated(copies)
+    check_recorded_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, copies)
 
 
 def test_derivatives_of_saturation(rng):

@@ -11,12 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from null_space_families import FAMILIES, LANES, Problems, random_problems
+from recorded import check_recorded_saturated, recorded_saturated
 from used_memory import used_memory
 
 import osik_jax as osik
 from osik_jax.execution import _backends
 from osik_jax.solvers import Backend, Damping, Level, Status, solve_nullspace
 from osik_jax.solvers._row_factors import row_factors
+from osik_jax.solvers.null_space import _saturation
 
 pytest.importorskip("numba")
 METHODS = {"forward": {}, "reverse": dict(order="reverse"), "saturated": dict(lower=-0.4, upper=0.4)}
@@ -127,6 +129,13 @@ def test_saturation_lane_by_lane_as_the_plain_method(name):
         np.testing.assert_allclose(found.scales, expected.scales, rtol=0, atol=1e-8)
     np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(found.active, expected.active)
+
+
+def test_saturation_of_recorded_problems_whatever_rounding_does():
+    """Without the end of searches that go round, 1 in 20 copies of one of them would not end."""
+    copies = 64
+    p = recorded_saturated(copies)
+    check_recorded_saturated(jax.jit(lambda p: _saturation._by_numba(p, 330))(p), p, copies)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-4, 1.0])

@@ -108,8 +108,8 @@ def test_the_damping_of_a_level(far, in_saturation):
     changed = dict(rows_lower=low, rows_upper=wanted, rows_equal=equal, dampings=np.array([terms[:3], (0.0,) * 3]).T)
     found = run_them("damping", "compute_damping(); if (lane == 0) result.data[0] = damping;", 1, **changed)
     level = Level(data["rows"][0], low[0], wanted[0]).scaled()
-    x, P = map(jnp.asarray, start(data))
-    expected = level_damping(Damping(*map(jnp.asarray, terms)), level, x, P, jnp.full(N, -jnp.inf), jnp.full(N, jnp.inf))
+    (x, P), far = map(jnp.asarray, start(data)), jnp.full(N, jnp.inf)
+    expected = level_damping(Damping(*map(jnp.asarray, terms)), level, x, P, -far, far)
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     assert 1e-3 < expected < 0.801
 
@@ -174,7 +174,7 @@ def test_the_scale_that_a_combination_of_joints_allows(in_saturation, rng):
 
 def test_the_joint_whose_saturation_costs_most_enters(in_saturation, rng):
     """Not one that is saturated already."""
-    run_them, data = in_saturation
+    run_them, _ = in_saturation
     at = rng.normal(size=N)
     at[[8, 20, PINNED]] = 5.0, 4.0, 0.1
     statements = """enters(8, 1);

@@ -1,8 +1,8 @@
 """The CUDA kernel of saturation in the null space: a Warp native function, called from JAX through Warp's FFI.
 
 One warp of 32 threads goes through all levels of one problem, in double precision. The text in
-``kernels/warp/null_space`` is compiled for the number of variables, levels and rows of the longest level, once a process
-(and once for all in Warp's cache on disk).
+``kernels/warp/null_space`` is compiled for the number of variables, of levels and of rows of the longest level, once a
+process (and once for all in Warp's cache on disk).
 """
 
 from __future__ import annotations
