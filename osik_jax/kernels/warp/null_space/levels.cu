@@ -1,6 +1,6 @@
 // Saturation in the null space, all levels of a problem by one warp in double precision. The problem is the one that
-// solvers/null_space/_saturation.py states; the method is that of Numba's kernel (kernels/numba/_saturation.py), part by
-// part: the motion of a level in coordinates of the null space, then joints put on their bounds by a dual method in
+// solvers/null_space/_saturation.py states; the method is that of Numba's kernel (kernels/numba/_saturation.py), part
+// by part: the motion of a level in coordinates of the null space, then joints put on their bounds by a dual method in
 // these coordinates, and the joints that stop the level taken off them.
 //
 // The motion has one way where Numba's kernel has quicker ones beside it: reflections that bring the level's row space

@@ -1,7 +1,7 @@
 // The saturated joints and the largest scale of a level's motion, by the dual method that
-// kernels/numba/_saturation_search.py describes. One loop goes from step to step, so that each function that changes the
-// coordinates has one place in the program: a joint that is exchanged for another leaves in one step and is followed in
-// the next.
+// kernels/numba/_saturation_search.py describes. One loop goes from step to step, so that each function that changes
+// the coordinates has one place in the program: a joint that is exchanged for another leaves in one step and is followed
+// in the next.
 constexpr int CHOOSE = 0, REPLACE = 1, STOP = 2;      // a joint that leaves or enters; one in place of another; a stop
 int changes = 0, step = CHOOSE;                       // changes: of the active set, in the search of this level
 int entering = -1, joint = -1, label = 0;             // the joint that enters, the one of this step, and its bound

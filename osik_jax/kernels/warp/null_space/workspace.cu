@@ -1,8 +1,8 @@
 // Sizes and shared memory of one warp: the coordinates, the rows of a level in them, and vectors to work with.
 //
 // Joint i belongs to lane i % 32, and so do coordinate i, saturated joint i and row i of the level. Constants from
-// _warp.py: N joints, LEVELS, M rows of the longest level, WARPS of a block, and those of numerics/_constants.py that it
-// shares with Numba's kernel.
+// _warp.py: N joints, LEVELS, M rows of the longest level, WARPS of a block, and those of numerics/_constants.py that
+// it shares with Numba's kernel.
 constexpr int WIDE = N > M ? N : M;
 constexpr int D = N | 1, BD = WIDE | 1, VD = M | 1;   // row lengths in shared memory: odd, to meet every bank
 constexpr int G = (M + 31) / 32;                      // rows of a lane
