@@ -6,7 +6,13 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+from osik_jax.solvers import Damping
+from osik_jax.solvers.null_space._implicit_diff import SaturatedResult
+from osik_jax.solvers.null_space._padding import PaddedLevel, Problem
 
 DATA = Path(__file__).parent / "data"
 FULL = os.environ.get("OSIK_REFERENCE")
@@ -59,3 +65,27 @@ def recorded_hierarchies(unit_rows: bool) -> RecordedHierarchies:
         levels.append((A / length[..., None], z[f"lower{k}"] / length, z[f"upper{k}"] / length))
     norm = z["residual_norm_unit_rows" if unit_rows else "residual_norm"]
     return RecordedHierarchies(levels, z["lb"], z["ub"], norm, z["kind"])
+
+
+def recorded_saturated(copies: int) -> Problem:
+    """Eight steps of NAO towards targets that had jumped, in single precision, whose levels need most changes.
+
+    Joints there depend on each other but for the rounding of the data. Each is there so many times, its rows perturbed
+    by rounding of double precision, which decides how the search goes.
+    """
+    with np.load(DATA / "saturated_nao.npz") as z:
+        parts = [np.repeat(z[name], copies, 0) for name in z.files]
+    levels, *rest = (jnp.asarray(a if a.dtype == bool else a.astype(float)) for a in parts)
+    levels *= 1.0 + 1e-15 * np.random.default_rng(0).normal(size=levels.shape)
+    return Problem(PaddedLevel(levels, *rest[:3]), Damping(*rest[3:7]), *rest[7:])
+
+
+def check_recorded_saturated(found: SaturatedResult, problem: Problem, copies: int) -> None:
+    """All copies are solved, inside their box, and have the same answer."""
+    found = jax.tree.map(np.asarray, found)
+    assert found.done.all()
+    assert ((found.x >= problem.lower) & (found.x <= problem.upper)).all()
+    for numbers, atol in ((found.x, 1e-9), (found.scales, 1e-11)):
+        of_one = numbers.reshape(-1, copies, numbers.shape[-1])
+        np.testing.assert_allclose(of_one, np.broadcast_to(of_one[:, :1], of_one.shape), rtol=0, atol=atol)
+    assert (found.scales < 1.0).any(1).all()

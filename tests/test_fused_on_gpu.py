@@ -1,4 +1,7 @@
-"""The CUDA kernel, where there is a CUDA device: recorded and random QPs against float64 answers and the XLA route."""
+"""The CUDA kernels, where there is a CUDA device, against float64 answers and the XLA route.
+
+Recorded and random QPs, and saturation in the null space.
+"""
 
 from functools import partial
 from typing import Any
@@ -7,11 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import test_saturation
+from null_space_families import FAMILIES
 from problem_families import WHOLE_BODY_DAMPING, whole_body
-from recorded import QP_DAMPING, recorded_qps
+from recorded import QP_DAMPING, check_recorded_saturated, recorded_qps, recorded_saturated
 
 from osik_jax.execution import _backends
-from osik_jax.solvers import Status, solve_least_squares_qp
+from osik_jax.solvers import Damping, Level, Status, solve_least_squares_qp, solve_nullspace
+from osik_jax.solvers.null_space import _warp as null_space_kernel
+from osik_jax.solvers.null_space._padding import pad_levels
 from osik_jax.solvers.qp import _warp
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
@@ -166,3 +173,100 @@ def test_the_kernel_settles_alone(rng):
     cold = kernel(qp, jnp.zeros_like(guess), tolerance)
     assert cold.converged.all()
     assert off(p.A, cold.x, p.solution, p.b).max() < 1e-5
+
+
+@partial(jax.jit, static_argnames="backend")
+def saturated(p, *, backend):
+    """A batch of a family, between -0.4 and 0.4."""
+
+    def one(p):
+        bound = jnp.full_like(p.secondary, 0.4)
+        levels, damping = [Level(*level) for level in p.levels], [Damping(*d) for d in p.damping]
+        return solve_nullspace(levels, -bound, bound, secondary=p.secondary, damping=damping, backend=backend)
+
+    return jax.vmap(one)(p)
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("name", ["damped inequalities", "dependent", "nothing left", "a humanoid's"])
+def test_saturation_lane_by_lane_as_the_plain_method(name, precision):
+    p = jax.tree.map(lambda a: jnp.asarray(a, precision), FAMILIES[name])
+    found, expected = (saturated(p, backend=backend) for backend in ("warp", "jax"))
+    assert (found.status == Status.SOLVED).all() and (expected.status == Status.SOLVED).all()
+    atol = 1e-8 if precision == "float64" else 1e-6
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=atol)
+    np.testing.assert_allclose(found.scales, expected.scales, rtol=0, atol=atol)
+    np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=atol)
+    np.testing.assert_array_equal(found.active, expected.active)
+
+
+@pytest.mark.parametrize("number", range(len(test_saturation.FAMILIES)), ids=test_saturation.FAMILIES)
+def test_saturation_decides_as_the_plain_method(number):
+    """And as a loop over the problems."""
+    p = test_saturation.family(test_saturation.FAMILIES[number], np.random.default_rng(100 + number))
+    found, expected = (test_saturation.solve_by(p, backend=backend) for backend in ("warp", "jax"))
+    assert (found.status == Status.SOLVED).all()
+    assert ((found.x >= p.lower) & (found.x <= p.upper)).all()
+    size = 1.0 + np.abs(expected.x).max(1)
+    assert (np.abs(found.x - expected.x).max(1) < 1e-8 * size).all()
+    np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-9)
+    for lane in (0, 99, 199):
+        alone = test_saturation.solve_by(jax.tree.map(lambda a, i=lane: a[i : i + 1], p), backend="warp")
+        np.testing.assert_allclose(alone.x[0], found.x[lane], rtol=0, atol=1e-12 * size[lane])
+
+
+def test_saturation_leaves_nothing_to_the_search(rng):
+    """Of random problems the kernel answers all."""
+    p = test_saturation.drawn(rng, 5000)
+
+    def padded(p):
+        zero = jnp.zeros(())
+        damping = [Damping(zero, zero, zero, jnp.zeros(test_saturation.N))] * len(p.levels)
+        levels = [level.scaled() for level in test_saturation.as_levels(p.levels)]
+        return pad_levels(levels, p.lower, p.upper, p.secondary, damping, 1e-10)
+
+    found = jax.jit(lambda p: null_space_kernel.solve(jax.vmap(padded)(p), 120))(p)
+    assert found.done.all()
+    assert (jnp.abs(found.x - test_saturation.solve_by(p, backend="jax").x) < 1e-8).all()
+
+
+def test_recorded_saturated_problems_whatever_rounding_does():
+    copies = 256
+    p = recorded_saturated(copies)
+    check_recorded_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, copies)
+
+
+def test_derivatives_of_saturation(rng):
+    """Those of plain JAX, in both modes, along a motion of all numbers."""
+    p = FAMILIES["damped inequalities"]
+    way = jax.tree.map(lambda a: 0.1 * rng.normal(size=a.shape) * np.abs(a), p)
+    weights = rng.normal(size=p.secondary.shape)
+
+    def rates(backend):
+        def at(t):
+            return saturated(jax.tree.map(lambda a, d: a + t * d, p, way), backend=backend).x
+
+        return jax.jvp(at, (0.0,), (1.0,))[1], jax.grad(lambda t: jnp.sum(weights * at(t)))(0.0)
+
+    found, expected = rates("warp"), rates("jax")
+    size = 1.0 + np.abs(expected[0]).max()
+    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-6 * size)
+    np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-6 * size * np.abs(weights).sum())
+
+
+def test_a_bad_lane_of_saturation_disturbs_no_other():
+    p = jax.tree.map(np.copy, test_saturation.family("tight", np.random.default_rng(1)))
+    good = test_saturation.solve_by(p, backend="warp")
+    p.levels[1][0][3, 0, 0] = np.nan
+    bad = test_saturation.solve_by(p, backend="warp")
+    others = np.arange(len(p.lower)) != 3
+    assert bad.status[3] == Status.NUMERICAL_ERROR and np.isfinite(bad.x[3]).all()
+    np.testing.assert_array_equal(np.asarray(bad.x)[others], np.asarray(good.x)[others])
+
+
+def test_problems_that_do_not_fit_have_no_kernel_of_saturation():
+    """Without bounds too there is none: the projection is a formula."""
+    level = [Level(np.ones((1, 70)), np.ones(1))]
+    for bounds in ((-np.ones(70), np.ones(70)), ()):
+        with pytest.raises(ValueError, match="backend='warp' has no kernel"):
+            solve_nullspace(level, *bounds, backend="warp")

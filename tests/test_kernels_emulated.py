@@ -1,20 +1,25 @@
 """The CUDA kernels on a CPU, thread by thread: certified answers, no races, and nothing left to XLA."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import test_saturation
 from emulated_warp import emulated, needs_compiler
 from hierarchy_families import SMALL
 from lexicographic import certificate
-from recorded import QP_DAMPING, recorded_hierarchies, recorded_qps
+from null_space_families import FAMILIES
+from recorded import QP_DAMPING, check_recorded_saturated, recorded_hierarchies, recorded_qps, recorded_saturated
 
+import osik_jax as osik
 from osik_jax.execution import _backends
-from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp
+from osik_jax.solvers import Damping, Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace
 from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
 from osik_jax.solvers.hqp import _warp as hqp_kernel
+from osik_jax.solvers.null_space import _saturation
+from osik_jax.solvers.null_space import _warp as null_space_kernel
 from osik_jax.solvers.qp import _dispatch as qp_dispatch
 from osik_jax.solvers.qp import _warp as qp_kernel
 
@@ -48,11 +53,12 @@ def on_emulated_gpu(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_backends, "cuda_is_default", lambda: True)
         patch.setattr(_backends, "installed", lambda name: name == "warp")
-        patch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
-        for module in (hqp_kernel, qp_kernel):
+        patch.setattr(jax.lax, "platform_dependent", lambda *args, default, cuda=None, **_: (cuda or default)(*args))
+        for module in (hqp_kernel, qp_kernel, null_space_kernel):
             patch.setattr(module, "_kernel", fake(module))
         for module in (hqp_dispatch, qp_dispatch):
             patch.setattr(module, "with_the_rest", nothing_for_the_rest)
+        patch.setattr(_saturation, "with_a_few", lambda _, *rest: nothing_for_the_rest(*rest))
         hqp_dispatch.hierarchy_solver.cache_clear()
         qp_dispatch.qp_solver.cache_clear()
         jax.clear_caches()
@@ -151,3 +157,129 @@ def test_derivatives_of_recorded_qps(soft, on_emulated_gpu, rng):
         size = np.abs(expected).reshape(count, -1).max(1)
         off = np.abs(np.asarray(ours, float) - expected).reshape(count, -1).max(1)
         assert (off <= 1e-3 * size)[answered].all()
+
+
+@partial(jax.jit, static_argnames="backend")
+def saturated(p, *, backend="auto"):
+    """A batch of a family, between -0.4 and 0.4."""
+
+    def one(p):
+        bound = jnp.full_like(p.secondary, 0.4)
+        levels, damping = [Level(*level) for level in p.levels], [Damping(*d) for d in p.damping]
+        return solve_nullspace(levels, -bound, bound, secondary=p.secondary, damping=damping, backend=backend)
+
+    return jax.vmap(one)(p)
+
+
+QUICK = ("damped inequalities", "repeated and damped", "a humanoid's")
+OTHERS = ("damped, more rows", "nothing left", "one variable", "level without rows", "dependent", "huge", "zeros")
+
+
+@pytest.mark.variants(release=[f"{way}-{name}" for way in ("forwards", "backwards") for name in OTHERS])
+@pytest.mark.parametrize("name", [*QUICK, *OTHERS])
+def test_saturation_lane_by_lane_as_the_plain_method(name, on_emulated_gpu):
+    found, expected = saturated(FAMILIES[name]), saturated(FAMILIES[name], backend="jax")
+    np.testing.assert_array_equal(found.status, Status.SOLVED)
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-8)
+    if "repeated" not in name:  # what a level asks for that has been met is rounding, and has any scale
+        np.testing.assert_allclose(found.scales, expected.scales, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(found.active, expected.active)
+
+
+@pytest.mark.parametrize("number", range(len(test_saturation.FAMILIES)), ids=test_saturation.FAMILIES)
+def test_saturation_decides_as_the_plain_method(number, on_emulated_gpu):
+    """Where Numba's kernel does too (``tests/test_saturation.py``): infinite bounds, pinned joints, conflicts, ties."""
+    name = test_saturation.FAMILIES[number]
+    p = test_saturation.family(name, np.random.default_rng(100 + number))
+    found, expected = (test_saturation.solve_by(p, backend=backend) for backend in ("auto", "jax"))
+    np.testing.assert_array_equal(found.status, Status.SOLVED)
+    assert ((found.x >= p.lower) & (found.x <= p.upper)).all()
+    size = 1.0 + np.abs(expected.x).max(1)
+    assert (np.abs(found.x - expected.x).max(1) < 1e-8 * size).all()
+    near = np.abs(found.scales - expected.scales) < 1e-9
+    assert near.all() or (name == "ties" and near.mean() > 0.99)
+    np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-9)
+    for mine, other in ((found, expected), (expected, found)):
+        bound = np.where(mine.active > 0, p.upper, p.lower)
+        assert (np.abs(other.x - bound) < 1e-8 * size[:, None])[np.asarray(mine.active) != 0].all()
+
+
+def test_saturation_that_is_cut_short(on_emulated_gpu):
+    """Levels that were not finished do nothing; those before them stay."""
+    p = test_saturation.family("tight", np.random.default_rng(4))
+
+    @jax.jit
+    @jax.vmap
+    def solve(p):
+        levels = test_saturation.as_levels(p.levels[:2])
+        first, both = solve_nullspace(levels[:1], p.lower, p.upper), partial(solve_nullspace, levels, p.lower, p.upper)
+        return first, both(max_iterations=6)
+
+    first, cut = solve(p)
+    unfinished = np.asarray(cut.status) == Status.MAX_ITERATIONS
+    assert 20 < unfinished.sum() < len(unfinished)
+    np.testing.assert_array_equal(cut.status[~unfinished], Status.SOLVED)
+    assert ((cut.x >= p.lower) & (cut.x <= p.upper)).all()
+    alone = unfinished & (np.asarray(cut.scales)[:, 0] > 0.0) & (np.asarray(cut.scales)[:, 1:] == 0.0).all(1)
+    assert alone.any()
+    np.testing.assert_allclose(cut.x[alone], first.x[alone], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["damped inequalities", "a humanoid's"])
+def test_saturation_in_single_precision_is_double_inside(name, on_emulated_gpu):
+    """As near to the answer in double precision as its rounded data can be."""
+    single = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), FAMILIES[name])
+    found = saturated(single)
+    expected = saturated(jax.tree.map(lambda a: np.asarray(a, float), single), backend="jax")
+    assert found.x.dtype == found.projector.dtype == jnp.float32
+    np.testing.assert_array_equal(found.status, Status.SOLVED)
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-5)
+
+
+def test_saturation_of_a_robot_whose_target_is_far(on_emulated_gpu):
+    """NAO on both feet, a hand pulled away in many directions, slow joints: the velocities of plain JAX."""
+    robot = osik.load_robot("nao")
+    tasks = {foot: osik.FrameTask(robot, foot, weight=100.0, priority=1) for foot in ("l_sole", "r_sole")}
+    hand = osik.FrameTask(robot, "l_gripper", rows="position", priority=2)
+    tasks |= {"hand": hand, "posture": osik.PostureTask(robot, weight=1e-3, gain=1.0, priority=3)}
+    limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot, velocity={"*": 0.3})
+    away = np.random.default_rng(1).normal(size=(COUNT, 3))
+    points = hand.target[0] + 0.3 * away / np.linalg.norm(away, axis=1, keepdims=True)
+
+    def step(backend, point):
+        given = tasks | {"hand": hand.replace(target=(point, hand.target[1]))}
+        scheme = osik.NullSpace(method="saturated", backend=backend)
+        solution = osik.solve(robot, robot.q0, given, scheme=scheme, limits=limits, dt=0.005)
+        return solution.velocity, solution.status, solution.box_violation
+
+    found, expected = (jax.jit(jax.vmap(partial(step, backend)))(points) for backend in ("auto", "jax"))
+    np.testing.assert_array_equal(found[1], Status.SOLVED)
+    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(found[2], 0.0)
+    assert (np.abs(found[0]) > 0.3 - 1e-9).sum() > 2 * COUNT
+
+
+def test_recorded_saturated_problems_whatever_rounding_does(on_emulated_gpu):
+    copies = 16
+    p = recorded_saturated(copies)
+    check_recorded_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, copies)
+
+
+def test_derivatives_of_saturation(on_emulated_gpu, rng):
+    """Those of plain JAX, in both modes: of the answer along a motion of all numbers."""
+    p = FAMILIES["damped inequalities"]
+    way = jax.tree.map(lambda a: 0.1 * rng.normal(size=a.shape) * np.abs(a), p)
+    weights = rng.normal(size=p.secondary.shape)
+
+    def rates(backend):
+        def at(t):
+            return saturated(jax.tree.map(lambda a, d: a + t * d, p, way), backend=backend).x
+
+        return jax.jvp(at, (0.0,), (1.0,))[1], jax.grad(lambda t: jnp.sum(weights * at(t)))(0.0)
+
+    found, expected = rates("auto"), rates("jax")
+    size = 1.0 + np.abs(expected[0]).max()
+    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-6 * size)
+    np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-6 * size * np.abs(weights).sum())
+    assert np.abs(expected[0]).max() > 0.01

@@ -8,8 +8,8 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
 (``_computed.py``).
 
     backend   weighted QP                          hierarchy                           null space
-    "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    none
-              hard rows, n <= 64, <= 32 soft rows  fit into shared memory
+    "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    CUDA: with bounds, any
+              hard rows, n <= 64, <= 32 soft rows  fit into shared memory              precision, levels that fit
     "numba"   CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
                                                                                        any shape
     "jax"     none: plain JAX alone, on any platform

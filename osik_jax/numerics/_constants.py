@@ -2,8 +2,9 @@
 
 Where data in single precision take another number, there is one for each precision. Most are relative: to machine
 epsilon, to roundoff (a tolerance times the scale of a constraint, ``constraint_scales``), or to what their line says.
-Kernels for CPUs have them compiled in, and texts for CUDA get them as constants (``solvers/qp/_warp.py`` and
-``solvers/hqp/_warp.py``), so that methods in plain JAX and their kernels decide alike: neither imports the other.
+Kernels for CPUs have them compiled in, and texts for CUDA get them as constants (``_warp.py`` in ``solvers/qp``,
+``solvers/hqp`` and ``solvers/null_space``), so that methods in plain JAX and their kernels decide alike: neither
+imports the other.
 
 Not here, because they are no tolerances of a solver:
 
@@ -58,12 +59,12 @@ BOUND_DISTANCE = 1e-9
 SATURATION_RESIDUAL = 2e-9
 """Relative to the terms that x is made of: the largest residual of the active bounds with which an answer is taken."""
 SATURATION_RANK = 1e-9
-"""In a kernel: the part of a joint's unit vector in the null space and outside the span of saturated ones, with less of
+"""In kernels: the part of a joint's unit vector in the null space and outside the span of saturated ones, with less of
 which it depends on them; of the largest in a combination, with less of which a joint does not stop the motion."""
 LOOSE_SATURATION_RANK = 1e-6
 """The same for a second attempt, where the answer of the first does not hold: joints nearly depended on each other."""
 LARGEST_RATE = 10.0
-"""In a kernel, in units of what the entering joint has in a combination: a joint with more is what the others say most
+"""In kernels, in units of what the entering joint has in a combination: a joint with more is what the others say most
 about, and takes the entering one's place."""
 
 # ---- answers and certificates

@@ -322,7 +322,7 @@ def search(W, S, start, target, first, most, least):
     begin_search(W, S, start, target, first)
     settle(W, S, start, scale, first, count)
     whole = size(W, S, start, target, scale, count)
-    dropping, going = False, True
+    dropping, going, crossings = False, True, 0
     while going and changes < most:
         if dropping:
             wrong = most_wrong(S, count, SATURATION_ROUNDOFF * whole)
@@ -337,7 +337,7 @@ def search(W, S, start, target, first, most, least):
                 going = False
                 break
             sign = 1.0 if W.low[entering] - S.x[entering] >= S.x[entering] - W.high[entering] else -1.0
-            push = 0.0
+            push, crossings = 0.0, 0
         k, changes = entering, changes + 1
         square = look_along(W, S, first, count, k)
         full, largest = np.inf, 1.0
@@ -349,6 +349,9 @@ def search(W, S, start, target, first, most, least):
         if leaving < 0 and full == np.inf:
             out = first_to_cross(S, count, sign, least * largest)
             if out >= 0:
+                crossings += 1
+                if crossings > n:  # by rounding they go round
+                    break
                 changes += 1
                 stop, push = exchange(W, S, first, count, out, stop), 0.0
                 settle(W, S, start, scale, first, count)

@@ -6,6 +6,7 @@ the problem's shape stand before them as constants. ``tests/emulated_warp.py`` r
 the function that is tested, on a CPU.
 """
 
+import re
 from importlib.resources import files
 
 
@@ -13,7 +14,23 @@ def text(folder: str, parts: tuple[str, ...]) -> str:
     """Return the files of a folder as one text.
 
     Args:
-        folder: "qp" or "hqp".
-        parts: names of the files, without their ending, in their order.
+        folder: "qp", "hqp" or "null_space".
+        parts: names of the files, without their ending, in their order; "hqp/reductions" is one of another folder.
     """
-    return "\n".join(files(__name__).joinpath(folder, f"{part}.cu").read_text() for part in parts)
+    paths = (f"{part if '/' in part else f'{folder}/{part}'}.cu".split("/") for part in parts)
+    return "\n".join(files(__name__).joinpath(*path).read_text() for path in paths)
+
+
+def rolled(text: str) -> str:
+    """Return CUDA text whose loops stay loops, except for those that ask to be unrolled.
+
+    With all loops unrolled the kernel is several times as long as the instruction caches, which then decide its speed.
+    """
+    lines = text.splitlines(keepends=True)
+    is_plain_loop = [
+        re.match(r"\s*(for|while) \(", line) and not before.startswith("#pragma")
+        for before, line in zip(["", *lines], lines, strict=False)
+    ]
+    return "".join(
+        "#pragma unroll 1\n" + line if plain else line for line, plain in zip(lines, is_plain_loop, strict=True)
+    )

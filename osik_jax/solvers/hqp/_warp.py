@@ -6,7 +6,6 @@ compiled for the layout of the hierarchy, once a process (and once for all in Wa
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ...kernels.warp import text
+from ...kernels.warp import rolled, text
 from ...numerics._constants import (
     COST_FRACTION,
     DAMPING_ITERATIONS,
@@ -228,18 +227,3 @@ def source(shape: Shape, parts: tuple[str, ...] = PARTS) -> str:
     head += [f"constexpr double {name} = {value!r};" for name, value in constants.items()]
     head += [f"const int {name}[] = {{{', '.join(map(str, values))}}};" for name, values in lists.items()]
     return "\n".join(head) + "\n" + rolled(text("hqp", parts))
-
-
-def rolled(text: str) -> str:
-    """Return CUDA text whose loops stay loops, except for those that ask to be unrolled.
-
-    With all loops unrolled the kernel is several times as long as the instruction caches, which then decide its speed.
-    """
-    lines = text.splitlines(keepends=True)
-    is_plain_loop = [
-        re.match(r"\s*(for|while) \(", line) and not before.startswith("#pragma")
-        for before, line in zip(["", *lines], lines, strict=False)
-    ]
-    return "".join(
-        "#pragma unroll 1\n" + line if plain else line for line, plain in zip(lines, is_plain_loop, strict=True)
-    )

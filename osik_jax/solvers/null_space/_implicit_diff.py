@@ -32,6 +32,18 @@ class ActiveJoints(NamedTuple):
     blocker: Int[Array, ""]  # the one of them that the others determine
 
 
+class SaturatedResult(NamedTuple):
+    """The answer of all levels, and the active set of each."""
+
+    x: Float[Array, " n"]
+    projector: Float[Array, "n n"]
+    scales: Float[Array, " L"]
+    active_joints: ActiveJoints  # with a leading axis of levels
+    active: Int[Array, " n"]
+    iterations: Int[Array, ""]
+    done: Bool[Array, ""]
+
+
 Answer = tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, " L"]]
 """x, the projector, and the scales."""
 

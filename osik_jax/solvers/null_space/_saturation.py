@@ -14,8 +14,9 @@ no admissible scale, and then drops the whole task. The motion d always has one.
 joints that block it can move no more whatever comes after: they are removed from the null space of the levels below,
 whose scale would otherwise be 0.
 
-On a CPU a kernel takes one problem after another through all levels (``kernels/numba/_saturation.py``); problems
-without an answer of it are searched here, which is the definition, what runs elsewhere, and the derivative.
+Kernels take a problem through all levels, on CPUs one after another (``kernels/numba/_saturation.py``), on CUDA devices
+by a warp of threads each (``kernels/warp/null_space``); problems without an answer of theirs are searched here, which
+is the definition, what runs elsewhere, and the derivative.
 
 When not to use it: where a large motion along a wrong direction is better than a small one along the right, and where
 rows are inequalities. One unreachable row scales its whole level down; ``solve_hqp`` fits it by least squares.
@@ -23,7 +24,7 @@ rows are inequalities. One unreachable row scales its whole level down; ``solve_
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -44,7 +45,8 @@ from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
-from ._implicit_diff import ActiveJoints, with_derivative
+from . import _warp
+from ._implicit_diff import ActiveJoints, SaturatedResult, with_derivative
 from ._padding import PaddedLevel, Problem, initial_point, pad_levels
 from ._projection import damped_step_length, level_motion
 from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
@@ -93,18 +95,6 @@ def solve_saturated(
     return BoundedAnswer(x, projector, scales[: len(levels)], end.active, end.iterations, end.done)
 
 
-class _Result(NamedTuple):
-    """The answer of all levels, and the active set of each."""
-
-    x: Float[Array, " n"]
-    projector: Float[Array, "n n"]
-    scales: Float[Array, " L"]
-    active_joints: ActiveJoints  # with a leading axis of levels
-    active: Int[Array, " n"]
-    iterations: Int[Array, ""]
-    done: Bool[Array, ""]
-
-
 class _State(NamedTuple):
     """What the levels so far have determined."""
 
@@ -119,23 +109,36 @@ class _State(NamedTuple):
     done: Bool[Array, ""]
 
 
-def _solve_on_platform(max_iterations: int, backend: Backend, problem: Problem) -> _Result:
+def _solve_on_platform(max_iterations: int, backend: Backend, problem: Problem) -> SaturatedResult:
     search = partial(_solve_levels, max_iterations, backend)
-    if not takes(backend, "numba", fits=True):
-        return search(problem)
+    kernels = {}
+    if takes(backend, "warp", fits=_warp.Shape.of(problem).warps > 0):
+        kernels["warp"] = _kernel_candidates(max_iterations, search, _warp.solve, None)
+    if takes(backend, "numba", fits=True):
+        kernels["numba"] = _kernel_candidates(max_iterations, search, _by_numba, BLOCK)
+    return certified_or_searched(kernels, search, problem)
 
-    def certified(problem: Problem) -> tuple[_Result, Array]:
-        result = _by_numba(max_iterations, problem)
+
+def _kernel_candidates(
+    max_iterations: int,
+    search: Callable[[Problem], SaturatedResult],
+    solve: Callable[[Problem, int], SaturatedResult],
+    block: int | None,
+) -> Candidates:
+    """Return how a kernel is used, which judges its own answers; the rest is searched, so many lanes at a time."""
+
+    def certified(problem: Problem) -> tuple[SaturatedResult, Array]:
+        result = solve(problem, max_iterations)
         return result, result.done | (result.iterations >= max_iterations)
 
-    def search_rest(candidates: tuple[_Result, Array], problem: Problem) -> _Result:
+    def search_rest(candidates: tuple[SaturatedResult, Array], problem: Problem) -> SaturatedResult:
         result, is_final = candidates
-        return with_a_few(problem, result, is_final, lambda problem, _: search(problem), BLOCK)
+        return with_a_few(problem, result, is_final, lambda problem, _: search(problem), block)
 
-    return certified_or_searched({"numba": Candidates(certified, search_rest)}, search, problem)
+    return Candidates(certified, search_rest)
 
 
-def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> _Result:
+def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> SaturatedResult:
     """Solve all levels of a batch in plain JAX; every array has a leading axis of problems, then perhaps of levels."""
     x, projector = jax.vmap(initial_point)(problem)
     fixed = jnp.where(problem.lower == problem.upper, 2, 0)
@@ -160,10 +163,10 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> _R
     bound = jnp.where(end.active < 0, problem.lower, problem.upper)
     away = (jnp.abs(end.active) == 1) & (jnp.abs(end.x - bound) > BOUND_DISTANCE * (1.0 + jnp.abs(bound)))
     active = jnp.where(away, 0, end.active)
-    return _Result(end.x, end.projector, scales, joints, active, end.iterations, end.done)
+    return SaturatedResult(end.x, end.projector, scales, joints, active, end.iterations, end.done)
 
 
-def _by_numba(max_iterations: int, problem: Problem) -> _Result:
+def _by_numba(problem: Problem, max_iterations: int) -> SaturatedResult:
     """Return the kernel's answers, ``done`` where it has one."""
     batch, count, m, n = problem.levels.matrix.shape
     space = row_space_numbers(n, m) + saturation_numbers(n)
@@ -176,7 +179,7 @@ def _by_numba(max_iterations: int, problem: Problem) -> _Result:
         np.array([max_iterations], np.int32),
     )
     joints = ActiveJoints(done != 0, at_bound, blocking, blocker)
-    return _Result(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)
+    return SaturatedResult(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)
 
 
 def _level_problem(

@@ -68,14 +68,15 @@ def solve_nullspace(
             rank 0, not the rank of its rounding.
         max_iterations: limit on the search for the saturated joints, for each level (static); default 10 (n + 2).
         backend: whose kernels compute (static): "auto" for those that are there for the platform, "jax" for none,
-            "numba" (CPUs) for those or an error. It changes the time, not the answer.
+            "numba" (CPUs) or, with bounds, "warp" (CUDA) for those or an error. It changes the time, not the answer.
 
     Raises:
         ValueError: an order that does not exist, bounds in reverse order, a damping too many or few, or a backend that
             has no kernels for this.
     """
     backend = here(check_backend(backend))
-    takes(backend, "warp", fits=False)
+    if lower is None and upper is None:
+        takes(backend, "warp", fits=False)
     n = levels[0].matrix.shape[1]
     dtype = jnp.result_type(*(level.matrix for level in levels))
     box = _bounds(lower, upper, n, dtype)

@@ -15,6 +15,5 @@ auto warp_argmax = [&](double& a, int& which) {       // in all lanes, with the 
   }
 };
 auto any = [&](bool a) { return __any_sync(ALL, a) != 0; };
-auto is = [&](int h, int row) { return exists[h] && lane + 32 * h == row; };  // a row of the box, of this lane
 auto is_finite = [](double a) { return fabs(a) <= 1.7e308; };
 auto clip = [](double a, double low, double high) { return fmin(fmax(a, low), high); };

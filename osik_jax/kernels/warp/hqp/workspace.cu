@@ -19,6 +19,7 @@ const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
 bool exists[H];
 #pragma unroll
 for (int h = 0; h < H; ++h) exists[h] = lane + 32 * h < N;
+auto is = [&](int h, int row) { return exists[h] && lane + 32 * h == row; };  // a row of the box, of this lane
 double* const Z = shared_doubles[warp];               // row i: variable i
 double* const V = Z + N * ZD;                         // row k: reflector k of the level's factor, over its rows
 double* const R = V + N * VD;                         // row k: row k of the triangle, over the columns of Z
