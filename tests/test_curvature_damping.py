@@ -14,6 +14,8 @@ import osik_jax as osik
 from osik_jax.numerics._dense import short_sum
 
 DT = 0.005
+KAPPA = 25.0
+"""With which the whole bound is damped far out of reach, where the default damps a 25th of it."""
 SCHEMES = {
     "weighted": osik.WeightedQP,
     "hierarchical": osik.HierarchicalQP,
@@ -175,13 +177,15 @@ def test_derivatives_where_little_room_is_left(scheme, arm):
     hand = osik.FrameTask(arm, "hand", rows="position", target=(away, rotation), gain=10.0)
     posture = osik.PostureTask(arm, target=q0, gain=10.0, priority=2, weight=1.0)
     tasks = {"hand": hand, "posture": posture}
-    path = jax.jit(lambda q: osik.rollout(arm, q, tasks, scheme=make(), dt=DT, steps=220).q[-1])(q0)
+    path = jax.jit(lambda q: osik.rollout(arm, q, tasks, scheme=make(curvature_damping=KAPPA), dt=DT, steps=220).q[-1])(
+        q0
+    )
 
     @jax.jit
     def velocity(t):
         aimed = tasks | {"hand": hand.replace(target=(away + jnp.array([0.0, 0.0, t]), rotation), gain=10.0 + t)}
         q = path + 0.01 * t * jnp.arange(7.0)
-        return osik.solve(arm, q, aimed, scheme=make(curvature_damping=1.0 + t), dt=DT).velocity
+        return osik.solve(arm, q, aimed, scheme=make(curvature_damping=KAPPA * (1.0 + t)), dt=DT).velocity
 
     h = 2e-5
     near, far = velocity(h) - velocity(-h), velocity(2.0 * h) - velocity(-2.0 * h)
@@ -206,10 +210,13 @@ def test_a_posture_makes_up_for_it_in_a_weighted_program(arm, posture, error):
     found = osik.solve(arm, q, {"hand": hand, "posture": still}, scheme=osik.WeightedQP(damping), limits=(), dt=DT)
 
     rows, ask = hand.rows(arm, kinematics, q), still.rows(arm, kinematics, q)
-    bend = kappa * DT * float(rows.curvature)
-    held = damping + posture
-    held += bend**2 / (bend + 30.0 * held)
     J, n = np.asarray(rows.jacobian), arm.nv
+    bend = DT * float(rows.curvature)
+    arms = 0.0 if error == 0.0 else error * 4.0 * 10.0 * error / float(rows.curvature)
+    far, stiffness = arms**2 / (0.06**2 + arms**2), 4.0 * (J**2).sum()
+    added = kappa * bend * (1.0 - 0.96 * far * 2.0 * stiffness / (bend + 2.0 * stiffness))
+    held = damping + posture
+    held += added * kappa * bend / (kappa * bend + 30.0 * held)
     right = 4.0 * J.T @ np.asarray(rows.lower) + posture * np.asarray(ask.lower)
     expected = np.linalg.solve(4.0 * J.T @ J + held * np.eye(n), right)
     np.testing.assert_allclose(found.velocity, expected, rtol=0, atol=1e-9 * np.abs(expected).max() + 1e-12)

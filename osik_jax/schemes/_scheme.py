@@ -20,7 +20,7 @@ from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
-from ..tasks._curvature import length, row_sums
+from ..tasks._curvature import length, row_sums, share_to_damp
 
 _BELOW_OTHERS = 2.0
 """Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it
@@ -68,13 +68,39 @@ class VelocityProblem(eqx.Module):
         return [[name for name, own in ranked if own == rank] for rank in sorted({rank for _, rank in ranked})]
 
     def curvature(self, names: Iterable[str]) -> Float[Array, ""]:
-        """Damping of the velocity that makes up for what the linear model of these tasks leaves out.
+        """Bound on what the linear model of these tasks leaves out, as a damping of the velocity.
 
         A step leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
         different chains, so their parts add up like the sides of a right angle.
         """
-        bends = [self.rows[name].curvature for name in names]  # none where all tasks are hard
-        return self.dt * length(jnp.stack([jnp.zeros_like(self.dt), *bends]))
+        return length(self._bounds([self.rows[name] for name in names]))
+
+    def curvature_damping(self, names: Iterable[str]) -> Float[Array, ""]:
+        """Damping of the velocity that makes up for what the linear model of these tasks leaves out.
+
+        It is the part of ``curvature`` that the tasks' own rows do not hold (``share_to_damp``); of inequality tasks,
+        whose rows may be inactive, all of it.
+        """
+        rows = [self.rows[name] for name in names]
+        rest = [own for own in rows if not own.is_equality]
+        equal = [own for own in rows if own.is_equality and own.dofs is None]  # rows on single dofs bend nothing
+        if not equal:
+            return length(self._bounds(rest))
+        bent = jnp.stack([own.curvature for own in equal])
+        of_row = np.repeat(np.arange(len(equal)), [len(own.error) for own in equal])
+        weight, pull, error = (
+            jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "pull", "error")
+        )
+        along = error * (weight * pull / jnp.where(bent > 0.0, bent, 1.0)[of_row])
+        distance = jnp.sum(jnp.where(of_row == np.arange(len(equal))[:, None], along, 0.0), axis=1)
+        arms = jnp.stack([jnp.broadcast_to(own.levers, self.lower.shape) for own in equal])
+        bounds = self._bounds(equal)
+        share = share_to_damp(bounds, distance, jnp.sum(arms**2, axis=1))
+        return length(jnp.concatenate([self._bounds(rest), share * bounds]))
+
+    def _bounds(self, rows: Sequence[TaskRows]) -> Float[Array, " k"]:
+        """dt times the curvature of each, none where all tasks are hard."""
+        return self.dt * jnp.stack([own.curvature for own in rows]) if rows else jnp.zeros(0, self.dt.dtype)
 
     def dampings(
         self,
@@ -101,7 +127,7 @@ class VelocityProblem(eqx.Module):
             found.append(
                 Damping(
                     constant,
-                    factor * self.curvature(names),
+                    factor * self.curvature_damping(names),
                     length(jnp.concatenate(residuals)),
                     factor * self.bends(names),
                 )

@@ -59,14 +59,19 @@ class WeightedQP(Scheme):
         """Return the velocity of one step; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
-        added = self.curvature_damping * problem.curvature(problem.soft())
+        bound, added = problem.curvature(problem.soft()), problem.curvature_damping(problem.soft())
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
             problem.upper,
             **_rows(intervals, problem.constraints()),
             **_diagonal_terms(
-                [rows for rows in equalities if rows.dofs is not None], problem, self.damping, added, self.backend
+                [rows for rows in equalities if rows.dofs is not None],
+                problem,
+                self.damping,
+                self.curvature_damping * bound,
+                self.curvature_damping * added,
+                self.backend,
             ),
             warm_start=warm_start,
             max_iterations=self.max_iterations,
@@ -93,14 +98,15 @@ def _diagonal_terms(
     single_dof: list[TaskRows],
     problem: VelocityProblem,
     damping: Float[Array, ""],
+    bound: Float[Array, ""],
     added: Float[Array, ""],
     backend: Backend,
 ) -> dict[str, Array]:
     """Return the cost ``1/2 sum_i d_i (v_i - center_i)^2`` of the damping and of rows on one dof each.
 
-    Of the curvature damping c, ``added``, a dof whose other terms are d takes ``c^2 / (c + 30 d)``: all of it out of
-    reach, and next to none beside a posture that is strong enough to calm what is left of an error (docs/paper.md,
-    "Curvature damping").
+    Of the curvature damping, ``added``, a dof whose other terms are d takes ``b / (b + 30 d)``, with b the ``bound`` on
+    the curvature: all of it out of reach, and next to none beside a posture that is strong enough to calm what is left
+    of an error (docs/paper.md, "Curvature damping").
     """
     n = problem.lower.shape[0]
     diagonal, weighted = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)
@@ -110,8 +116,8 @@ def _diagonal_terms(
         usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of 0 is NaN
         weight, wanted = (jnp.append(a, 0.0)[row_of_dof] for a in (usable, usable * rows.lower))
         diagonal, weighted = diagonal + weight, weighted + wanted
-    total = added + _CALM_RATIO * diagonal
-    diagonal = diagonal + added * (added / jnp.where(total > 0.0, total, 1.0))  # c^2 of a far target overflows
+    total = bound + _CALM_RATIO * diagonal
+    diagonal = diagonal + added * (bound / jnp.where(total > 0.0, total, 1.0))  # b^2 of a far target overflows
     least = _least_damping(problem, backend)
     diagonal = jnp.where(diagonal < least, least, diagonal)
     center = weighted / diagonal

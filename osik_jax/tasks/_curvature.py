@@ -16,6 +16,9 @@ them twice, and its Frobenius norm costs two 3 x 3 products. Over the root of 2 
 greatest eigenvalue, and not far under it (``python -m benchmarks.curvature`` tells how far in random configurations). A
 step is stable from half of that eigenvalue on. The norms of single columns of J are too small: the entries off the
 diagonal count.
+
+Not all of the bound has to be damped: where a task bends most its frame moves across the pull, and there its own rows
+hold it (``share_to_damp``).
 """
 
 from __future__ import annotations
@@ -33,6 +36,13 @@ from ._rotation import dot
 
 _MOVES = 1e-6
 """Of the longest lever, one that is shorter may be rounding of none."""
+_UNHELD = 0.04
+"""Share of the bound for what bends where the frame does not move across its pull."""
+_NEAR = 0.06
+"""Of the lever arm: an error below which the whole bound is damped, so that a stretched arm leaves its boundary and
+comes back to it calmly."""
+_FARTHEST = 1e6
+"""Of that error; farther makes no difference."""
 
 
 def pose_curvature(
@@ -91,6 +101,27 @@ def _largest(pull: Float[Array, " m"]) -> Float[Array, ""]:
 def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"]) -> Float[Array, ""]:
     """Bound for any rows: the pull's length times the Frobenius norm of their Jacobian, or of one that they combine."""
     return length(pull) * safe_norm(jacobian.ravel())
+
+
+def share_to_damp(
+    bound: Float[Array, " k"], distance: Float[Array, " k"], stiffness: Float[Array, " k"]
+) -> Float[Array, " k"]:
+    """Share of the bounds on some tasks' curvature that has to be damped; the tasks' own rows hold the rest.
+
+    Rows resist a motion v with ``1/2 v'J'W J v`` and leave out ``1/2 dt p . (grad^2 e)[v, v]``, which is large where
+    the frame moves across p. There it is up to b, the resistance up to g, and b / (b + 2 g) of the bound is enough.
+    What bends elsewhere is a small share of it (docs/derivations.md, "Curvature damping").
+
+    Args:
+        bound: dt times the curvature, b. (k,)
+        distance: the error, in lever arms: its product with the weighted pull over the curvature. (k,)
+        stiffness: squared Frobenius norm of the Jacobian, its weights' roots multiplied in, g. (k,)
+    """
+    ratio = jnp.clip(distance / _NEAR, 0.0, _FARTHEST)
+    far = ratio**2 / (1.0 + ratio**2)
+    total = 0.5 * bound + stiffness
+    held = stiffness / jnp.where(total > 0.0, total, 1.0)
+    return 1.0 - (1.0 - _UNHELD) * far * held
 
 
 def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:
