@@ -1,7 +1,7 @@
 """Numba's kernel of retargeting's plans on a CPU: beside the plain method, which it follows iteration by iteration."""
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,7 @@ def clip_of(robot, motion, balance=None):
     return jax.tree.map(jnp.asarray, lane), jnp.asarray(q)
 
 
+@cache
 def compiled(until):
     return [jax.jit(partial(function, until=until)) for function in (_descended, _descended_plain)]
 
