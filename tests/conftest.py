@@ -76,6 +76,11 @@ def pytest_collection_finish(session: pytest.Session) -> None:
             register(name)
 
 
+def pytest_sessionfinish() -> None:
+    """Has nobody look for garbage among all that there is when it goes anyway."""
+    gc.freeze()
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20240229)
