@@ -110,7 +110,7 @@ def test_a_batch_is_what_each_clip_is_alone(nao, motion):
 
 
 def test_what_cannot_be_solved_moves_nothing(nao, motion):
-    clip, q = clip_of(nao, motion)
+    clip, q = clip_of(nao, motion, 0.02)
     wrong = clip._replace(bounds=clip.bounds._replace(lower=jnp.full_like(clip.bounds.lower, jnp.nan)))
     for function in compiled("spent"):
         found = function(wrong, q, jnp.array(2))
