@@ -138,16 +138,18 @@ def test_saturation_of_recorded_problems_whatever_rounding_does():
     check_recorded_saturated(jax.jit(lambda p: _saturation._by_numba(p, 330))(p), p, copies)
 
 
+@jax.jit
+@partial(jax.vmap, in_axes=(0, None, None))
+def factored(A, tolerance, damping):
+    return row_factors(A, tolerance, damping, "numba")
+
+
 @pytest.mark.parametrize("damping", [0.0, 1e-4, 1.0])
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
 @pytest.mark.parametrize(("m", "n", "rank"), [(5, 9, 5), (5, 9, 2), (9, 5, 5), (4, 4, 0), (1, 1, 1)])
 def test_factors_of_rows(rng, m, n, rank, scale, damping):
     A = scale * rng.normal(size=(LANES, m, rank)) @ rng.normal(size=(LANES, rank, n))
-
-    def factored(a):
-        return row_factors(a, jnp.asarray(1e-10 * scale), jnp.asarray(damping * scale**2), "numba")
-
-    basis, outer, triangle = map(np.asarray, jax.jit(jax.vmap(factored))(A))
+    basis, outer, triangle = map(np.asarray, factored(A, 1e-10 * scale, damping * scale**2))
     some, none = np.eye(m) * (np.arange(m) < rank), np.arange(m) >= rank
     np.testing.assert_allclose(basis @ np.swapaxes(basis, 1, 2), np.broadcast_to(some, (LANES, m, m)), atol=1e-13)
     np.testing.assert_allclose(np.swapaxes(outer, 1, 2) @ outer, np.broadcast_to(some, (LANES, m, m)), atol=1e-13)

@@ -1,7 +1,7 @@
 """Numba's kernel of retargeting's plans on a CPU: beside the plain method, which it follows iteration by iteration."""
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,7 @@ def clip_of(robot, motion, balance=None):
     return jax.tree.map(jnp.asarray, lane), jnp.asarray(q)
 
 
+@cache
 def compiled(until):
     return [jax.jit(partial(function, until=until)) for function in (_descended, _descended_plain)]
 
@@ -109,7 +110,7 @@ def test_a_batch_is_what_each_clip_is_alone(nao, motion):
 
 
 def test_what_cannot_be_solved_moves_nothing(nao, motion):
-    clip, q = clip_of(nao, motion)
+    clip, q = clip_of(nao, motion, 0.02)
     wrong = clip._replace(bounds=clip.bounds._replace(lower=jnp.full_like(clip.bounds.lower, jnp.nan)))
     for function in compiled("spent"):
         found = function(wrong, q, jnp.array(2))

@@ -21,15 +21,19 @@ from osik_jax.solvers.qp._problem import QP
 COUNT = 200
 
 
-@partial(jax.jit, static_argnames="backend")
 def solved(p: Problems, backend="numba", warm_start=None):
+    none = np.zeros((len(p.target), N + P), np.int32)
+    return solved_from(p, none if warm_start is None else warm_start, backend=backend)
+
+
+@partial(jax.jit, static_argnames="backend")
+def solved_from(p: Problems, warm_start, *, backend):
     def one(p: Problems, warm_start):
         *given, compliance, damping = p
         options = dict(rows_compliance=compliance, damping=damping, warm_start=warm_start)
         return solve_least_squares_qp(*given, **options, backend=backend)
 
-    none = jnp.zeros((len(p.target), N + P), int)
-    return jax.vmap(one)(p, none if warm_start is None else warm_start)
+    return jax.vmap(one)(p, warm_start)
 
 
 def candidates(p: Problems):

@@ -22,7 +22,8 @@ from scipy.optimize import lsq_linear
 from osik_jax.solvers import Status, solve_least_squares_qp, solve_qp
 
 COUNT = 1000
-batched_qp = jax.jit(jax.vmap(solve_qp))
+# with XLA's optimiser, for this runs longer than that takes
+batched_qp = jax.jit(jax.vmap(solve_qp), compiler_options={"xla_backend_optimization_level": 2})
 batched_least_squares = jax.jit(
     jax.vmap(lambda A, b, w, lo, hi: solve_least_squares_qp(A, b, w, lo, hi, damping=WHOLE_BODY_DAMPING))
 )
