@@ -204,14 +204,14 @@ def test_saturation_lane_by_lane_as_the_plain_method(name, precision):
 def test_saturation_decides_as_the_plain_method(number):
     """And as a loop over the problems."""
     p = test_saturation.family(test_saturation.FAMILIES[number], np.random.default_rng(100 + number))
-    found, expected = (test_saturation.solve_by(p, backend=backend) for backend in ("warp", "jax"))
+    found, expected = (test_saturation.solve_full(p, backend=backend) for backend in ("warp", "jax"))
     assert (found.status == Status.SOLVED).all()
     assert ((found.x >= p.lower) & (found.x <= p.upper)).all()
     size = 1.0 + np.abs(expected.x).max(1)
     assert (np.abs(found.x - expected.x).max(1) < 1e-8 * size).all()
     np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-9)
     for lane in (0, 99, 199):
-        alone = test_saturation.solve_by(jax.tree.map(lambda a, i=lane: a[i : i + 1], p), backend="warp")
+        alone = test_saturation.solve_full(jax.tree.map(lambda a, i=lane: a[i : i + 1], p), backend="warp")
         np.testing.assert_allclose(alone.x[0], found.x[lane], rtol=0, atol=1e-12 * size[lane])
 
 
@@ -227,7 +227,7 @@ def test_saturation_leaves_nothing_to_the_search(rng):
 
     found = jax.jit(lambda p: null_space_kernel.solve(jax.vmap(padded)(p), 120))(p)
     assert found.done.all()
-    assert (jnp.abs(found.x - test_saturation.solve_by(p, backend="jax").x) < 1e-8).all()
+    assert (jnp.abs(found.x - test_saturation.solve_full(p, backend="jax").x) < 1e-8).all()
 
 
 def test_recorded_saturated_problems_whatever_rounding_does():
@@ -256,9 +256,9 @@ def test_derivatives_of_saturation(rng):
 
 def test_a_bad_lane_of_saturation_disturbs_no_other():
     p = jax.tree.map(np.copy, test_saturation.family("tight", np.random.default_rng(1)))
-    good = test_saturation.solve_by(p, backend="warp")
+    good = test_saturation.solve_full(p, backend="warp")
     p.levels[1][0][3, 0, 0] = np.nan
-    bad = test_saturation.solve_by(p, backend="warp")
+    bad = test_saturation.solve_full(p, backend="warp")
     others = np.arange(len(p.lower)) != 3
     assert bad.status[3] == Status.NUMERICAL_ERROR and np.isfinite(bad.x[3]).all()
     np.testing.assert_array_equal(np.asarray(bad.x)[others], np.asarray(good.x)[others])

@@ -20,7 +20,7 @@ from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
-from ..tasks._curvature import length, row_sums, share_to_damp
+from ..tasks._curvature import in_lever_arms, length, row_sums, share_to_damp
 
 _BELOW_OTHERS = 2.0
 """Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it
@@ -86,13 +86,7 @@ class VelocityProblem(eqx.Module):
         equal = [own for own in rows if own.is_equality and own.dofs is None]  # rows on single dofs bend nothing
         if not equal:
             return length(self._bounds(rest))
-        bent = jnp.stack([own.curvature for own in equal])
-        of_row = np.repeat(np.arange(len(equal)), [len(own.error) for own in equal])
-        weight, pull, error = (
-            jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "pull", "error")
-        )
-        along = error * (weight * pull / jnp.where(bent > 0.0, bent, 1.0)[of_row])
-        distance = jnp.sum(jnp.where(of_row == np.arange(len(equal))[:, None], along, 0.0), axis=1)
+        distance = jnp.stack([in_lever_arms(own.error, own.weight * own.pull, own.curvature) for own in equal])
         arms = jnp.stack([jnp.broadcast_to(own.levers, self.lower.shape) for own in equal])
         bounds = self._bounds(equal)
         share = share_to_damp(bounds, distance, jnp.sum(arms**2, axis=1))
