@@ -1,5 +1,6 @@
 """The CUDA kernels on a CPU, thread by thread: certified answers, no races, and nothing left to XLA."""
 
+import inspect
 from functools import cache, partial
 
 import jax
@@ -192,7 +193,7 @@ def test_saturation_decides_as_the_plain_method(number, on_emulated_gpu):
     """Where Numba's kernel does too (``tests/test_saturation.py``): infinite bounds, pinned joints, conflicts, ties."""
     name = test_saturation.FAMILIES[number]
     p = test_saturation.family(name, np.random.default_rng(100 + number))
-    found = test_saturation.solve_full.__wrapped__(p)  # traced here, where a GPU seems to be
+    found = inspect.unwrap(test_saturation.solve_full)(p)  # traced here, where a GPU seems to be
     expected = test_saturation.solve_full(p, backend="jax")
     np.testing.assert_array_equal(found.status, Status.SOLVED)
     assert ((found.x >= p.lower) & (found.x <= p.upper)).all()

@@ -103,9 +103,7 @@ def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"])
     return length(pull) * safe_norm(jacobian.ravel())
 
 
-def in_lever_arms(
-    error: Float[Array, " m"], pull: Float[Array, " m"], curvature: Float[Array, ""]
-) -> Float[Array, ""]:
+def in_lever_arms(error: Float[Array, " m"], pull: Float[Array, " m"], curvature: Float[Array, ""]) -> Float[Array, ""]:
     """How large an error is in lever arms, from its weighted pull and the bound for that; 0 where nothing bends."""
     return short_sum(error * (pull / jnp.where(curvature > 0.0, curvature, 1.0)))
 
