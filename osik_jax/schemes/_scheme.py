@@ -15,12 +15,12 @@ from .._errors import OsikValueError
 from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
 from ..numerics._constants import CONSTRAINT_TOL, STANDING_SPEED
-from ..numerics._dense import apply
+from ..numerics._dense import apply, short_sum
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
-from ..tasks._curvature import in_lever_arms, length, row_sums, share_to_damp
+from ..tasks._curvature import length, row_sums, share_to_damp
 
 _BELOW_OTHERS = 2.0
 """Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it
@@ -86,10 +86,17 @@ class VelocityProblem(eqx.Module):
         equal = [own for own in rows if own.is_equality and own.dofs is None]  # rows on single dofs bend nothing
         if not equal:
             return length(self._bounds(rest))
-        distance = jnp.stack([in_lever_arms(own.error, own.weight * own.pull, own.curvature) for own in equal])
-        arms = jnp.stack([jnp.broadcast_to(own.levers, self.lower.shape) for own in equal])
+        bent = [jnp.where(own.curvature > 0.0, own.curvature, 1.0) for own in equal]
+        # of each row, what it adds to its task's distance and stiffness; few operations whatever the number of tasks
+        away = [own.error * (own.weight * own.pull / bend) for own, bend in zip(equal, bent, strict=True)]
+        stiff = jnp.concatenate([own.weight for own in equal]) * short_sum(
+            jnp.concatenate([own.jacobian for own in equal]) ** 2
+        )
+        of_task = np.repeat(np.eye(len(equal), dtype=bool), [len(own.error) for own in equal], axis=1)
+        parts = jnp.stack([jnp.concatenate(away), stiff])
+        distance, stiffness = jnp.sum(jnp.where(of_task, parts[:, None], 0.0), axis=2)
         bounds = self._bounds(equal)
-        share = share_to_damp(bounds, distance, jnp.sum(arms**2, axis=1))
+        share = share_to_damp(bounds, distance, stiffness)
         return length(jnp.concatenate([self._bounds(rest), share * bounds]))
 
     def _bounds(self, rows: Sequence[TaskRows]) -> Float[Array, " k"]:

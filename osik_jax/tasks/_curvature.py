@@ -103,11 +103,6 @@ def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"])
     return length(pull) * safe_norm(jacobian.ravel())
 
 
-def in_lever_arms(error: Float[Array, " m"], pull: Float[Array, " m"], curvature: Float[Array, ""]) -> Float[Array, ""]:
-    """How large an error is in lever arms, from its weighted pull and the bound for that; 0 where nothing bends."""
-    return short_sum(error * (pull / jnp.where(curvature > 0.0, curvature, 1.0)))
-
-
 def share_to_damp(
     bound: Float[Array, " k"], distance: Float[Array, " k"], stiffness: Float[Array, " k"]
 ) -> Float[Array, " k"]:
@@ -119,7 +114,7 @@ def share_to_damp(
 
     Args:
         bound: dt times the curvature, b. (k,)
-        distance: the errors, in lever arms. (k,)
+        distance: the errors, in lever arms: times their weighted pulls, over the curvatures. (k,)
         stiffness: squared Frobenius norm of the Jacobian, its weights' roots multiplied in, g. (k,)
     """
     ratio = jnp.clip(distance / _NEAR, 0.0, _FARTHEST)
