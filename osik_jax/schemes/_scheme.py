@@ -86,14 +86,17 @@ class VelocityProblem(eqx.Module):
         equal = [own for own in rows if own.is_equality and own.dofs is None]  # rows on single dofs bend nothing
         if not equal:
             return length(self._bounds(rest))
+        # of each row, what it adds to its task's distance and stiffness: few operations whatever the number of tasks;
+        # weights and Jacobians are NaN where the step is not valid, and times NaN a derivative of 0 is NaN
         bent = [jnp.where(own.curvature > 0.0, own.curvature, 1.0) for own in equal]
-        # of each row, what it adds to its task's distance and stiffness; few operations whatever the number of tasks
-        away = [own.error * (own.weight * own.pull / bend) for own, bend in zip(equal, bent, strict=True)]
-        stiff = jnp.concatenate([own.weight for own in equal]) * short_sum(
-            jnp.concatenate([own.jacobian for own in equal]) ** 2
+        pulls = jnp.concatenate([own.pull / bend for own, bend in zip(equal, bent, strict=True)])
+        weight, error, jacobian = (
+            jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "error", "jacobian")
         )
+        squared = short_sum(jacobian**2)
+        weight, squared = (jnp.where(jnp.isnan(a), 0.0, a) for a in (weight, squared))
+        parts = jnp.stack([error * (weight * pulls), weight * squared])
         of_task = np.repeat(np.eye(len(equal), dtype=bool), [len(own.error) for own in equal], axis=1)
-        parts = jnp.stack([jnp.concatenate(away), stiff])
         distance, stiffness = jnp.sum(jnp.where(of_task, parts[:, None], 0.0), axis=2)
         bounds = self._bounds(equal)
         share = share_to_damp(bounds, distance, stiffness)
