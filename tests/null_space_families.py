@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+from osik_jax.solvers import Backend, Damping, Level, NullSpaceSolution, solve_nullspace
 
 LANES = 12
 
@@ -80,3 +85,34 @@ FAMILIES = {
     "zeros": random_problems(16, 8, (3, 4, 5), scale=0.0),
     "as many zero rows as are left": with_zero_rows(random_problems(17, 6, (2, 5, 2))),
 }
+
+
+@partial(jax.jit, static_argnames="backend")
+def saturated(p: Problems, *, backend: Backend = "auto") -> NullSpaceSolution:
+    """Answers of a batch of a family, between -0.4 and 0.4."""
+
+    def one(p: Problems) -> NullSpaceSolution:
+        bound = jnp.full_like(p.secondary, 0.4)
+        levels, damping = [Level(*level) for level in p.levels], [Damping(*d) for d in p.damping]
+        return solve_nullspace(levels, -bound, bound, secondary=p.secondary, damping=damping, backend=backend)
+
+    return jax.vmap(one)(p)
+
+
+def check_derivatives_of_saturation(rng: np.random.Generator, backend: Backend) -> None:
+    """They are those of plain JAX, in both modes: of the answer along a motion of all numbers."""
+    p = FAMILIES["damped inequalities"]
+    way = jax.tree.map(lambda a: 0.1 * rng.normal(size=a.shape) * np.abs(a), p)
+    weights = rng.normal(size=p.secondary.shape)
+
+    def rates(backend: Backend):
+        def at(t):
+            return saturated(jax.tree.map(lambda a, d: a + t * d, p, way), backend=backend).x
+
+        return jax.jvp(at, (0.0,), (1.0,))[1], jax.grad(lambda t: jnp.sum(weights * at(t)))(0.0)
+
+    found, expected = rates(backend), rates("jax")
+    size = 1.0 + np.abs(expected[0]).max()
+    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-6 * size)
+    np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-6 * size * np.abs(weights).sum())
+    assert np.abs(expected[0]).max() > 0.01

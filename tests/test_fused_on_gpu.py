@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import test_saturation
-from null_space_families import FAMILIES
+from null_space_families import FAMILIES, check_derivatives_of_saturation, saturated
 from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, check_recorded_saturated, recorded_qps, recorded_saturated
 
@@ -175,18 +175,6 @@ def test_the_kernel_settles_alone(rng):
     assert off(p.A, cold.x, p.solution, p.b).max() < 1e-5
 
 
-@partial(jax.jit, static_argnames="backend")
-def saturated(p, *, backend):
-    """A batch of a family, between -0.4 and 0.4."""
-
-    def one(p):
-        bound = jnp.full_like(p.secondary, 0.4)
-        levels, damping = [Level(*level) for level in p.levels], [Damping(*d) for d in p.damping]
-        return solve_nullspace(levels, -bound, bound, secondary=p.secondary, damping=damping, backend=backend)
-
-    return jax.vmap(one)(p)
-
-
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("name", ["damped inequalities", "dependent", "nothing left", "a humanoid's"])
 def test_saturation_lane_by_lane_as_the_plain_method(name, precision):
@@ -237,21 +225,7 @@ def test_recorded_saturated_problems_whatever_rounding_does():
 
 
 def test_derivatives_of_saturation(rng):
-    """Those of plain JAX, in both modes, along a motion of all numbers."""
-    p = FAMILIES["damped inequalities"]
-    way = jax.tree.map(lambda a: 0.1 * rng.normal(size=a.shape) * np.abs(a), p)
-    weights = rng.normal(size=p.secondary.shape)
-
-    def rates(backend):
-        def at(t):
-            return saturated(jax.tree.map(lambda a, d: a + t * d, p, way), backend=backend).x
-
-        return jax.jvp(at, (0.0,), (1.0,))[1], jax.grad(lambda t: jnp.sum(weights * at(t)))(0.0)
-
-    found, expected = rates("warp"), rates("jax")
-    size = 1.0 + np.abs(expected[0]).max()
-    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-6 * size)
-    np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-6 * size * np.abs(weights).sum())
+    check_derivatives_of_saturation(rng, "warp")
 
 
 def test_a_bad_lane_of_saturation_disturbs_no_other():

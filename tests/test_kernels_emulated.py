@@ -11,12 +11,12 @@ import test_saturation
 from emulated_warp import emulated, needs_compiler
 from hierarchy_families import SMALL
 from lexicographic import certificate
-from null_space_families import FAMILIES
+from null_space_families import FAMILIES, check_derivatives_of_saturation, saturated
 from recorded import QP_DAMPING, check_recorded_saturated, recorded_hierarchies, recorded_qps, recorded_saturated
 
 import osik_jax as osik
 from osik_jax.execution import _backends
-from osik_jax.solvers import Damping, Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace
+from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace
 from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
 from osik_jax.solvers.hqp import _warp as hqp_kernel
 from osik_jax.solvers.null_space import _saturation
@@ -160,18 +160,6 @@ def test_derivatives_of_recorded_qps(soft, on_emulated_gpu, rng):
         assert (off <= 1e-3 * size)[answered].all()
 
 
-@partial(jax.jit, static_argnames="backend")
-def saturated(p, *, backend="auto"):
-    """A batch of a family, between -0.4 and 0.4."""
-
-    def one(p):
-        bound = jnp.full_like(p.secondary, 0.4)
-        levels, damping = [Level(*level) for level in p.levels], [Damping(*d) for d in p.damping]
-        return solve_nullspace(levels, -bound, bound, secondary=p.secondary, damping=damping, backend=backend)
-
-    return jax.vmap(one)(p)
-
-
 QUICK = ("damped inequalities", "repeated and damped", "a humanoid's")
 OTHERS = ("damped, more rows", "nothing left", "one variable", "level without rows", "dependent", "huge", "zeros")
 
@@ -269,19 +257,4 @@ def test_recorded_saturated_problems_whatever_rounding_does(on_emulated_gpu):
 
 
 def test_derivatives_of_saturation(on_emulated_gpu, rng):
-    """Those of plain JAX, in both modes: of the answer along a motion of all numbers."""
-    p = FAMILIES["damped inequalities"]
-    way = jax.tree.map(lambda a: 0.1 * rng.normal(size=a.shape) * np.abs(a), p)
-    weights = rng.normal(size=p.secondary.shape)
-
-    def rates(backend):
-        def at(t):
-            return saturated(jax.tree.map(lambda a, d: a + t * d, p, way), backend=backend).x
-
-        return jax.jvp(at, (0.0,), (1.0,))[1], jax.grad(lambda t: jnp.sum(weights * at(t)))(0.0)
-
-    found, expected = rates("auto"), rates("jax")
-    size = 1.0 + np.abs(expected[0]).max()
-    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-6 * size)
-    np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-6 * size * np.abs(weights).sum())
-    assert np.abs(expected[0]).max() > 0.01
+    check_derivatives_of_saturation(rng, "auto")

@@ -37,7 +37,7 @@ class TaskRows(eqx.Module):
         upper: the same as ``lower`` for an equality; inequality: ``gain (upper - x) + x*'``. (m,)
         weight: of the square of each row's residual. (m,)
         curvature: bound on the second derivative of the task's error along its own pull, ``|sum_i weight_i gain e_i
-            grad^2 e_i|``: times dt, the damping that the schemes add for it (``_curvature.py``). 0 where the task is
+            grad^2 e_i|``: times dt, the most damping that a scheme adds for it (``_curvature.py``). 0 where the task is
             met, or linear in the joints. ()
         pull: ``gain e`` of each row, without the target's own velocity; of an inequality, what it is outside by. (m,)
         levers: how far each dof moves the rows, their weights' roots multiplied in; 0 for a dof that they are linear
