@@ -89,7 +89,9 @@ class VelocityProblem(eqx.Module):
         # of each row, what it adds to its task's distance and stiffness: few operations whatever the number of tasks;
         # weights and Jacobians are NaN where the step is not valid, and times NaN a derivative of 0 is NaN
         bent = [jnp.where(own.curvature > 0.0, own.curvature, 1.0) for own in equal]
-        pulls = jnp.concatenate([own.pull / bend for own, bend in zip(equal, bent, strict=True)])
+        pulls = jnp.concatenate(
+            [jnp.broadcast_to(own.pull / bend, own.error.shape) for own, bend in zip(equal, bent, strict=True)]
+        )
         weight, error, jacobian = (
             jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "error", "jacobian")
         )
