@@ -207,7 +207,7 @@ def test_a_bad_lane_leaves_its_neighbours_alone(recorded):
 
 
 @pytest.mark.parametrize("solver", [solve_hqp, solve_nullspace])
-def test_crossed_bounds_are_infeasible_and_their_middle_stands_for_them(solver):
+def test_unordered_bounds_are_infeasible_and_their_middle_stands_for_them(solver):
     def solve(lower, upper, low, high):
         levels = [Level(jnp.array([[1.0, 1.0]]), lower[None], upper[None]), Level(jnp.eye(2), jnp.array([0.5, 0.0]))]
         return solver(levels, low, high)

@@ -116,7 +116,7 @@ def test_a_warm_start_costs_one_factorization():
 
 
 def test_lanes_that_are_left_to_the_search():
-    """Rows that cannot hold, numbers that are none, crossed bounds, beside lanes that are as they were alone."""
+    """Rows that cannot hold, numbers that are none, unordered bounds, beside lanes that are as they were alone."""
     p = problems(seed=4)
     alone = solved(p)
     rows, low, high = p.rows.copy(), p.rows_lower.copy(), p.rows_upper.copy()

@@ -184,7 +184,7 @@ def test_a_bad_number_in_factored_form(argument):
         np.testing.assert_array_equal(np.asarray(mine)[others], np.asarray(before)[others])
 
 
-def test_crossed_bounds_are_infeasible_and_finite():
+def test_unordered_bounds_are_infeasible_and_finite():
     p = boxes(np.random.default_rng(7), COUNT)
     lower, upper = p.lower.copy(), p.upper.copy()
     lower[::2, 4], upper[::2, 4] = 1.0, -1.0

@@ -208,7 +208,7 @@ def test_the_distance_from_the_edge_of_the_feet_and_its_derivative():
         found = overhang(jnp.asarray(center), jnp.asarray(corners), jnp.asarray(stands))
         assert found.distance == pytest.approx(edge_distance(center, corners[stands > 0]), abs=1e-12)
         ends = [edge_distance(center + s * moves[8], (corners + s * moves[:8])[stands > 0]) for s in (step, -step)]
-        slope = found.direction @ (moves[8] - found.shares @ moves[:8])
+        slope = found.direction @ (moves[8] - found.coefficients @ moves[:8])
         assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), abs=1e-6)
         turns = np.linspace(0.0, np.pi, 20_000)
         across = corners[stands > 0] @ np.stack([np.cos(turns), np.sin(turns)])

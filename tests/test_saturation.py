@@ -356,8 +356,8 @@ class TestByHand:
 
     def test_one_sided_bounds(self):
         level = [Level([[1.0, 1.0]], [-4.0])]
-        np.testing.assert_allclose(solve_nullspace(level, lower=[-1.0, -9.0]).x, [-1.0, -3.0], rtol=0, atol=1e-14)
-        np.testing.assert_allclose(solve_nullspace(level, upper=[1.0, -3.0]).x, [-1.0, -3.0], rtol=0, atol=1e-14)
+        for bound in (dict(lower=np.array([-1.0, -9.0])), dict(upper=np.array([1.0, -3.0]))):
+            np.testing.assert_allclose(solve_nullspace(level, **bound).x, [-1.0, -3.0], rtol=0, atol=1e-14)
 
     def test_the_secondary_motion_goes_as_far_as_bounds_and_levels_allow(self):
         answer = solve_nullspace(

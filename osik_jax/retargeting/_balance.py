@@ -29,45 +29,49 @@ class Overhang(NamedTuple):
     Attributes:
         distance: from the edge, positive outside, -inf where nothing stands [m].
         direction: in which that grows, a unit vector. (2,)
-        shares: of each corner in the point of the edge that is nearest; the distance is that along the direction. (8,)
+        coefficients: of the corners in the nearest point of the edge, which is their convex combination. The distance
+            is from that point, along the direction. (8,)
         width: of the hull where it is narrowest [m]. A third of it, a point can always be inside.
     """
 
     distance: Float[Array, ""]
     direction: Float[Array, "2"]
-    shares: Float[Array, "8"]
+    coefficients: Float[Array, "8"]
     width: Float[Array, ""]
 
 
 def overhang(center: Float[Array, "2"], corners: Float[Array, "8 2"], stands: Float[Array, "8"]) -> Overhang:
-    """How far a point is beyond the edge of the hull of those corners that stand (1; others 0)."""
-    edge, length = _way(corners[_FIRST], corners[_SECOND])
-    off, far = _way(corners, jnp.broadcast_to(center, corners.shape))
-    across = jnp.stack([edge[:, 1], -edge[:, 0]], -1)
-    directions = jnp.concatenate([across, -across, off])
+    """Return how far a point is beyond the edge of the hull of those corners that stand (1; others 0)."""
+    edge, length = _unit_and_length(corners[_SECOND] - corners[_FIRST])
+    from_corner, distance = _unit_and_length(center - corners)
+    normal = jnp.stack([edge[:, 1], -edge[:, 0]], -1)
+    directions = jnp.concatenate([normal, -normal, from_corner])
+    # where on each line its nearest point is: 0 at the first corner, 1 at the second
     along = jnp.sum(edge * (center - corners[_FIRST]), -1)
-    share = jnp.clip(along / jnp.maximum(length, _SHORTEST), 0.0, 1.0)
-    a, b, share = (jnp.concatenate(parts) for parts in ((_FIRST, _FIRST, _POINTS), (_SECOND, _SECOND, _POINTS),
-                                                        (share, share, jnp.zeros_like(far))))  # fmt: skip
-    there = jnp.concatenate([length, length, far]) > _SHORTEST
-    there &= stands[a] * stands[b] > 0.5
-    reach = jnp.where(stands > 0.5, product(directions, corners.T), -jnp.inf).max(-1)
-    distances = jnp.where(there, directions @ center - reach, -jnp.inf)
+    on_line = jnp.clip(along / jnp.maximum(length, _SHORTEST), 0.0, 1.0)
+    first = jnp.concatenate([_FIRST, _FIRST, _POINTS])
+    second = jnp.concatenate([_SECOND, _SECOND, _POINTS])
+    ratio = jnp.concatenate([on_line, on_line, jnp.zeros_like(distance)])
+    exists = jnp.concatenate([length, length, distance]) > _SHORTEST
+    exists &= stands[first] * stands[second] > 0.5
+    # the support function of the hull, in each direction
+    support = jnp.where(stands > 0.5, product(directions, corners.T), -jnp.inf).max(-1)
+    distances = jnp.where(exists, directions @ center - support, -jnp.inf)
     best = jnp.argmax(distances)
-    there, both_ways = there[: 2 * len(edge)].reshape(2, -1), reach[: 2 * len(edge)].reshape(2, -1).sum(0)
-    width = jnp.where(there[0], both_ways, jnp.inf).min()
-    shares = jnp.zeros(8).at[a[best]].add(1.0 - share[best]).at[b[best]].add(share[best])
-    return Overhang(distances[best], directions[best], shares, width)
+    # along a normal the hull is as wide as its support there and in the opposite direction together
+    lines = len(edge)
+    width = jnp.where(exists[:lines], support[:lines] + support[lines : 2 * lines], jnp.inf).min()
+    coefficients = jnp.zeros(8).at[first[best]].add(1.0 - ratio[best]).at[second[best]].add(ratio[best])
+    return Overhang(distances[best], directions[best], coefficients, width)
 
 
-def _way(start: Float[Array, "k 2"], end: Float[Array, "k 2"]) -> tuple[Float[Array, "k 2"], Float[Array, " k"]]:
-    """Unit vectors from points to others, and how long the ways are."""
-    way = end - start
-    square = jnp.sum(way**2, -1)
+def _unit_and_length(vectors: Float[Array, "k 2"]) -> tuple[Float[Array, "k 2"], Float[Array, " k"]]:
+    """Return vectors at unit length, and their lengths [m]; with derivatives at 0 too."""
+    square = jnp.sum(vectors**2, -1)
     length = jnp.sqrt(jnp.where(square > 0.0, square, 1.0)) * (square > 0.0)
-    return way / jnp.maximum(length, _SHORTEST)[:, None], length
+    return vectors / jnp.maximum(length, _SHORTEST)[:, None], length
 
 
-def mass_shares(robot: Robot) -> Float[Array, "*B nbody"]:
-    """Of each body, its share in the robot's mass."""
+def mass_fractions(robot: Robot) -> Float[Array, "*B nbody"]:
+    """Return the fraction of the robot's mass that each body has."""
     return robot.body_mass / robot.body_mass.sum(-1, keepdims=True)

@@ -15,7 +15,7 @@ from ..kinematics._kernels import dof_columns
 from ..kinematics._manifold import layout
 from ..numerics._dense import product
 from ..robot._joint_selection import scalar_layout
-from ._balance import mass_shares
+from ._balance import mass_fractions
 from ._goals import Goals, Weights
 from ._person import LIMBS
 from ._terms import CLEARANCE, PAIRS, SHORTEST, SWINGING, Body, Bounds
@@ -106,7 +106,7 @@ def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"
         robot.tree.qpos_source[1][None], robot.qpos_offset, robot.joint_reference, robot.body_position,
         robot.body_quaternion, robot.joint_position, robot.joint_axis, dof_columns(robot.tree)[1][None], points,
         rotations[:, turned], body.home, body.radii, bounds.lower, bounds.upper,
-        robot.q0[:, scalar_layout(robot)[1]], bounds.step, bounds.change, mass_shares(robot),
+        robot.q0[:, scalar_layout(robot)[1]], bounds.step, bounds.change, mass_fractions(robot),
         robot.body_com, w.limb, w.pelvis, w.torso, w.root, w.foot,
         w.posture, w.stance, w.apart, w.limit, w.margin, np.array([[0.0, CLEARANCE, SWINGING, SHORTEST]]), w.smooth,
         w.smooth_base, w.speed, *balance,

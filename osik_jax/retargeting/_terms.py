@@ -19,7 +19,7 @@ from ..kinematics._rigid import cross, rotate
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ..tasks._rotation import dot, rotation_log
-from ._balance import mass_shares, overhang
+from ._balance import mass_fractions, overhang
 from ._goals import Goals, Weights
 from ._person import LIMBS
 from ._profile import Place, Profile
@@ -301,17 +301,18 @@ def _balanced(
 
     The direction changes too, but the distance does not by that: along any other it is less.
     """
-    share = mass_shares(robot)[:, None]
+    fractions = mass_fractions(robot)[:, None]
     centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
-    at, both = jnp.sum(share * centers, 0), jnp.max(contact[:2]) * jnp.max(contact[2:]) > 0.5
+    at, both = jnp.sum(fractions * centers, 0), jnp.max(contact[:2]) * jnp.max(contact[2:]) > 0.5
     # beside a row that does not count, a polygon that is one: its numbers are finite
     stands = jnp.where(both, jnp.repeat(contact > 0.5, 2), 1.0)
     found = overhang(at[:2], place.points[corners][:, :2], stands)
     direction = jnp.append(found.direction, 0.0)
-    pulls = [place.motion.rates(robot.tree.moves, share * direction, centers)]
-    pulls.append(place.motion.rates(place.moves[corners], -found.shares[:, None] * direction, place.points[corners]))
+    parts = [place.motion.rates(robot.tree.moves, fractions * direction, centers)]
+    coefficients = found.coefficients[:, None]
+    parts.append(place.motion.rates(place.moves[corners], -coefficients * direction, place.points[corners]))
     gap = found.distance + jnp.minimum(inside, found.width / 3.0)
-    rates = jnp.concatenate(pulls).sum(0, keepdims=True)
+    rates = jnp.concatenate(parts).sum(0, keepdims=True)
     return _Rows(gap[None], rates, jnp.where(both & (gap > 0.0), weight, 0.0)[None])
 
 

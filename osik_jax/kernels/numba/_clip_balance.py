@@ -44,7 +44,7 @@ def flat(vector):
 
 @lean
 def find_overhang(K, V, W, contact, center):
-    """As ``overhang``; for the shares, both corners and the ratio of the edge at which the nearest point is."""
+    """As ``overhang``; for the coefficients, both corners of the edge and the ratio at which its nearest point is."""
     first, shortest = K.counts[KEYS] + 4, V.wishes[SHORTEST]
     most, direction, a, b, ratio, width = -np.inf, (0.0, 0.0, 0.0), 0, 0, 0.0, np.inf
     for i in range(CORNERS):

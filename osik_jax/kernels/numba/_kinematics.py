@@ -50,35 +50,35 @@ def place_bodies(parents, kinds, owners, value, reference, at, along, joint_at, 
     nothing = 0.0, 0.0, 0.0
     put(P, 0, nothing)
     put_turning(R, 0, (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
-    joint, place, dof = 0, 0, 0
+    joint, entry, dof = 0, 0, 0  # of the next joint: its first entry in the configuration, its first dof
     for body in range(1, len(parents)):
         there, frame = triple(P, parents[body]), turning(R, parents[body])
         pos, quat = triple(at, body), (along[body, 0], along[body, 1], along[body, 2], along[body, 3])
         while joint < len(owners) and owners[joint] == body:
             kind, fixed = kinds[joint], triple(joint_at, joint)
             if kind == FREE:
-                pos = value[place], value[place + 1], value[place + 2]
-                quat = normalized((value[place + 3], value[place + 4], value[place + 5], value[place + 6]))
+                pos = value[entry], value[entry + 1], value[entry + 2]
+                quat = normalized((value[entry + 3], value[entry + 4], value[entry + 5], value[entry + 6]))
                 for k in range(6):
                     put(lin, dof + k, nothing)
                     put(ang, dof + k, nothing)
                     put(anchors, dof + k, plus(there, rotated(frame, pos)))
                 for k in range(3):
                     lin[dof + k, k] = 1.0
-                joint, place, dof = joint + 1, place + 7, dof + 6
+                joint, entry, dof = joint + 1, entry + 7, dof + 6
                 continue
             anchor = plus(carried(quat, fixed), pos)
             seen, axis = plus(there, rotated(frame, anchor)), carried(quat, triple(joint_along, joint))
             if kind == BALL:
-                own = normalized((value[place], value[place + 1], value[place + 2], value[place + 3]))
+                own = normalized((value[entry], value[entry + 1], value[entry + 2], value[entry + 3]))
                 quat = multiplied(quat, own)
                 pos = minus(anchor, carried(quat, fixed))
                 for k in range(3):
                     put(lin, dof + k, nothing)
                     put(anchors, dof + k, seen)
-                joint, place, dof = joint + 1, place + 4, dof + 3
+                joint, entry, dof = joint + 1, entry + 4, dof + 3
                 continue
-            displacement = value[place] - reference[place]
+            displacement = value[entry] - reference[entry]
             put(anchors, dof, seen)
             if kind == SLIDE:
                 pos = plus(pos, (displacement * axis[0], displacement * axis[1], displacement * axis[2]))
@@ -91,7 +91,7 @@ def place_bodies(parents, kinds, owners, value, reference, at, along, joint_at, 
                 pos = minus(anchor, carried(quat, fixed))
                 put(lin, dof, nothing)
                 put(ang, dof, rotated(frame, axis))
-            joint, place, dof = joint + 1, place + 1, dof + 1
+            joint, entry, dof = joint + 1, entry + 1, dof + 1
         put(P, body, plus(there, rotated(frame, pos)))
         put_turning(R, body, composed(frame, rotation_of(quat)))
 

@@ -50,32 +50,39 @@ def first_working_sets(hierarchy: PaddedHierarchy, warm_start: WorkingSet | None
     return zeros if warm_start is None else warm_start
 
 
-def result_of_kernel(
-    x: Array,
-    multipliers: Array,
-    slack_norms: Array,
-    dampings: Array,
-    residual: Array,
-    active_bounds: Array,
-    active: Array,
-    frozen: Array,
-    in_cost: Array,
-    own: Array,
-    ranks: Array,
-    report: Array,
-) -> CascadeResult:
-    """Return a kernel's answers for a batch; ``report`` (B, 3) has whether it ended, iterations and factorisations."""
+class KernelAnswers(NamedTuple):
+    """What a kernel writes for a batch of hierarchies, of L levels with m rows each and h hard rows."""
+
+    x: Float[Array, "B n"]
+    multipliers: Float[Array, "B L h"]
+    slack_norms: Float[Array, "B L"]
+    dampings: Float[Array, "B L"]
+    residual: Float[Array, " B"]
+    active_bounds: Int[Array, "B n"]
+    active: Int[Array, "B L h"]
+    frozen: Int[Array, "B L h"]
+    in_cost: Int[Array, "B L m"]
+    own: Int[Array, "B L m"]
+    ranks: Int[Array, "B L"]
+    report: Int[Array, "B 3"]  # whether it ended, iterations, factorisations
+
+
+def result_of_kernel(answers: KernelAnswers) -> CascadeResult:
+    """Return a kernel's answers as those of a search, not yet certified."""
+    is_damped = answers.dampings[:, :, None] > 0.0
+    # the derivative keeps rows that a damped level has at their bounds, frozen or not
+    kept = jnp.where(is_damped, answers.active, answers.frozen)
     return CascadeResult(
-        x=x,
-        active_bounds=active_bounds,
-        active_sets=ActiveSets(jnp.where(dampings[:, :, None] > 0.0, active, frozen), frozen, in_cost, ranks),
-        working_sets=WorkingSet(active, own),
-        multipliers=multipliers,
-        slack_norms=slack_norms,
-        residual=residual,
-        iterations=report[:, 1],
-        factorizations=report[:, 2],
-        done=report[:, 0] != 0,
+        x=answers.x,
+        active_bounds=answers.active_bounds,
+        active_sets=ActiveSets(kept, answers.frozen, answers.in_cost, answers.ranks),
+        working_sets=WorkingSet(answers.active, answers.own),
+        multipliers=answers.multipliers,
+        slack_norms=answers.slack_norms,
+        residual=answers.residual,
+        iterations=answers.report[:, 1],
+        factorizations=answers.report[:, 2],
+        done=answers.report[:, 0] != 0,
     )
 
 

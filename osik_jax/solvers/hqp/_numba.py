@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...kernels.numba import _target
-from ._cascade import CascadeResult, first_working_sets, result_of_kernel
+from ._cascade import CascadeResult, KernelAnswers, first_working_sets, result_of_kernel
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
@@ -43,5 +43,4 @@ def solve(
         *(jnp.stack(tolerances, -1), hierarchy.is_equality, hierarchy.hard_is_equality, *guess),
         *(np.array(a, np.int32) for a in (layout.row_counts, layout.level_of_hard, row_of_hard, [max_iterations])),
     )
-    names = (*floats, *ints)
-    return result_of_kernel(**dict(zip(names, results, strict=True)))
+    return result_of_kernel(KernelAnswers(**dict(zip((*floats, *ints), results, strict=True))))

@@ -28,7 +28,7 @@ from ...numerics._constants import (
     NEGLIGIBLE_DAMPING,
     STATIONARITY_TOL,
 )
-from ._cascade import CascadeResult, first_working_sets, result_of_kernel
+from ._cascade import CascadeResult, KernelAnswers, first_working_sets, result_of_kernel
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
@@ -139,18 +139,20 @@ def solve(
     active, frozen, multipliers = (a.reshape(batch, count, h) for a in (active, frozen, multipliers))
     in_cost, own = (a.reshape(batch, count, m) for a in (in_cost, own))
     return result_of_kernel(
-        x,
-        multipliers,
-        slack_norms,
-        dampings,
-        residual[:, 0],
-        active_bounds,
-        active,
-        frozen,
-        in_cost,
-        own,
-        ranks,
-        report,
+        KernelAnswers(
+            x=x,
+            multipliers=multipliers,
+            slack_norms=slack_norms,
+            dampings=dampings,
+            residual=residual[:, 0],
+            active_bounds=active_bounds,
+            active=active,
+            frozen=frozen,
+            in_cost=in_cost,
+            own=own,
+            ranks=ranks,
+            report=report,
+        )
     )
 
 
