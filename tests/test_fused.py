@@ -10,7 +10,7 @@ import pytest
 from recorded import QP_DAMPING, recorded_qps
 
 from osik_jax.execution import _backends
-from osik_jax.execution._lanes import with_the_rest
+from osik_jax.execution._lanes import first_set, with_the_rest
 from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp import _dispatch, _search, _warp
 from osik_jax.solvers.qp._candidate import Candidate
@@ -237,6 +237,16 @@ def test_what_the_text_is_compiled_for(shape):
     n, m, p = shape
     assert first == f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};"
     assert Shape(65, 10, 0).warps == Shape(64, 1000, 0).warps == Shape(10, 10, 33).warps == 0
+
+
+@pytest.mark.parametrize("set_", [[], [0], [6], [1, 4], [0, 1, 2, 3, 4, 5, 6]])
+@pytest.mark.parametrize("size", [1, 3, 7])
+def test_the_first_flags_that_are_set(set_, size):
+    flags = np.zeros(7, bool)
+    flags[set_] = True
+    np.testing.assert_array_equal(
+        first_set(jnp.asarray(flags), size), (np.flatnonzero(flags).tolist() + [7] * 7)[:size]
+    )
 
 
 @pytest.mark.parametrize("lanes", [1, 4])

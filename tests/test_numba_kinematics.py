@@ -161,8 +161,6 @@ def _total(a):
 
 def test_single_precision():
     """Data and results are single, the arithmetic is not."""
-    if jax.__version_info__ >= (0, 12):
-        pytest.skip("no kernel for CPUs in a program whose default is single")
     configuration = random_configurations(make("toy"), 4, 1)[0]
     with jax.enable_x64(False):
         robot, q = make("toy"), jnp.asarray(configuration, jnp.float32)

@@ -53,6 +53,26 @@ def test_recorded_qps_in_both_forms(robot):
         assert (np.asarray(s.iterations)[p.regime == 0] == 0).all()  # no active bound: the first guess is the answer
 
 
+@pytest.mark.parametrize("backend", ["auto", "jax"])
+def test_a_long_batch_in_a_program_of_single_precision(backend):
+    """Lanes that are left are gathered inside of the search's double precision, in both forms and on every JAX."""
+    p = recorded_qps("nao")
+    at_bound = np.flatnonzero(p.regime != 0)[:20]  # more than a block, and none is solved without a search
+    assert len(at_bound) == 20
+    A, b, lower, upper = (a[at_bound] for a in (p.A, p.b, p.lower, p.upper))
+
+    def solve(*data):
+        return solve_least_squares_qp(*data, damping=QP_DAMPING, backend=backend)
+
+    with jax.enable_x64(False):
+        s = jax.device_get(
+            jax.vmap(solve)(*(jnp.asarray(a, jnp.float32) for a in (A, b, np.ones_like(b), lower, upper)))
+        )
+    assert s.x.dtype == np.float32 and (s.status == Status.SOLVED).all()
+    off = np.abs(np.einsum("bmn,bn->bm", A, s.x - p.solution[at_bound])).max(1)
+    assert (off / np.abs(b).max(1)).max() < 1e-5
+
+
 def planted(rng, n, p, equalities):
     """A strictly convex QP whose solution and multipliers are drawn first."""
     B = rng.normal(size=(n, n))

@@ -34,7 +34,6 @@ from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import jax
-import jax.numpy as jnp
 
 from .._errors import OsikValueError
 
@@ -46,10 +45,6 @@ _MISSING = {
     "numba": "backend='numba' needs Numba: pip install 'osik-jax[numba]'",
     "warp": "backend='warp' needs Warp: pip install 'osik-jax[cuda]'",
 }
-
-
-_LOWERS_NO_DOUBLE = (0, 12)
-_WITHOUT_NUMBA = "auto without numba"
 
 
 def check_backend(backend: Any) -> Backend:
@@ -67,23 +62,6 @@ def check_backend(backend: Any) -> Backend:
     if backend == "warp" and not cuda_is_default():
         raise RuntimeError("backend='warp' needs a CUDA device, and JAX's default device is none (jax.devices())")
     return backend
-
-
-def here(backend: Backend) -> Any:
-    """Return the backend for the precision that JAX is set to: in single, JAX 0.12 lowers no kernel for CPUs.
-
-    It lowers double precision inside such a program wrongly where platforms differ, so "auto" takes the search there.
-
-    Raises:
-        RuntimeError: "numba" was asked for where that is so.
-    """
-    if jnp.result_type(float) == jnp.float64 or jax.__version_info__ < _LOWERS_NO_DOUBLE:
-        return backend
-    if backend == "numba":
-        raise RuntimeError(
-            f"backend='numba' needs jax_enable_x64 with jax {jax.__version__}, or a jax before 0.12; take 'auto'"
-        )
-    return _WITHOUT_NUMBA if backend == "auto" else backend
 
 
 def installed(package: str) -> bool:

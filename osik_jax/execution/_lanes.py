@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from ._backends import cpu_is_default
 from ._blocks import BLOCK, first_axes_as_one, in_blocks
@@ -90,12 +90,22 @@ def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, A
 
     def body(carry: tuple[Any, Array]) -> tuple[Any, Array]:
         state, done = carry
-        (at,) = jnp.nonzero(~done, size=block, fill_value=lanes)
+        at = first_set(~done, block)
         end = again(jnp.minimum(at, lanes - 1), state)
         state = jax.tree.map(lambda all_, new: all_.at[at].set(new, mode="drop"), state, end)
         return state, done.at[at].set(True, mode="drop")
 
     return jax.lax.while_loop(lambda carry: ~jnp.all(carry[1]), body, (state, done))[0]
+
+
+def first_set(flags: Bool[Array, " B"], size: int) -> Int[Array, " size"]:
+    """Return the numbers of the first flags that are set, and the count of flags where there are no more of them.
+
+    ``jnp.nonzero`` does not compile in double precision in a program whose default is single, from JAX 0.12 on.
+    """
+    slot = jnp.where(flags, jnp.cumsum(flags, dtype=jnp.int32) - 1, size)
+    numbers = jax.lax.iota(jnp.int32, len(flags))
+    return jnp.full(size, len(flags), jnp.int32).at[slot].set(numbers, mode="drop")
 
 
 def with_a_few(

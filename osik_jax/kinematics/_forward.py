@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from ..execution._backends import Backend, cuda_is_default, here, takes
+from ..execution._backends import Backend, cuda_is_default, takes
 from ..execution._computed import by_numba
 from ..robot import Robot
 from ..robot._made_for import check_robot
@@ -112,7 +112,7 @@ def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kin
     Raises:
         ModuleNotFoundError: the backend's package is not installed.
     """
-    if not takes(here(backend), "numba", fits=True) or cuda_is_default():
+    if not takes(backend, "numba", fits=True) or cuda_is_default():
         return forward_kinematics(robot, q)
     robot.check_configuration(q)
     return Kinematics(*_bodies(robot, q), backend=backend)

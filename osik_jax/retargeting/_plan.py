@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..execution._backends import here, takes
+from ..execution._backends import takes
 from ..execution._computed import by_numba
 from ..kinematics import difference, integrate
 from ..numerics._dense import product
@@ -216,7 +216,7 @@ def _descended(clip: _Clip, q: Float[Array, "F nq"], most: Int[Array, ""] | int,
         most: iterations, at most.
         until: what ends them before: bounds that are ready to get stiffer, steps that gain little, or nothing (static).
     """
-    descended = _by_kernel if takes(here("auto"), "numba", fits=True) else _descended_plain
+    descended = _by_kernel if takes("auto", "numba", fits=True) else _descended_plain
     return descended(clip, q, jnp.asarray(most), until=until)
 
 

@@ -167,48 +167,37 @@ def _drop_wrong_sign(constraints: Constraints, s: DualState) -> DualState:
     return s._replace(step=step, iterations=s.iterations + moves, searching=moves)
 
 
+class _Entering(NamedTuple):
+    """The violated constraint that a dual step goes towards."""
+
+    index: Int[Array, ""]
+    exists: Bool[Array, ""]
+    below: Bool[Array, ""]  # its lower bound is violated, not its upper one
+    gap: Float[Array, ""]  # how far it is outside its interval
+
+
 def _add_violated(constraints: Constraints, s: DualState) -> DualState:
     """Decide on one dual step towards a violated constraint, which stays until it holds (GI, step 1).
 
     Equalities come first.
     """
-    eps = jnp.finfo(s.value.dtype).eps
-    below_by, above_by = constraints.lower - s.value, s.value - constraints.upper
-    violation = jnp.maximum(below_by, above_by)
+    entering = _entering_constraint(constraints, s)
+    k, enters = entering.index, entering.exists
     is_active = s.active != INACTIVE
-    candidate = ~is_active & ~s.redundant & ((violation > constraints.roundoff.value) | constraints.equality)
-    # a full step to s_k = bound raises the dual objective by half of violation^2 / T_kk
-    gain = jnp.maximum(violation, 0.0) ** 2 / jnp.maximum(jnp.diagonal(s.tableau), eps * constraints.scale)
-    gain = jnp.where(candidate, jnp.where(constraints.equality, jnp.inf, gain), -1.0)
-    best = first_smallest(-gain)
-    is_pending = s.entering >= 0
-    k = jnp.where(is_pending, s.entering, best)
-    enters = s.searching & (is_pending | (gain[best] >= 0.0))
-
-    # the full (primal) step length t2 of GI, infinite where the active constraints determine constraint k
     row = s.tableau[k]
     column = jnp.where(is_active, -row, row)
-    below = below_by[k] >= above_by[k]  # not > 0: on its way, rounding may have taken it over its bound
-    sign = jnp.where(below, 1.0, -1.0).astype(row.dtype)
-    gap = jnp.maximum(below_by[k], above_by[k])
-    independent = row[k] > DEPENDENCE_TOL * eps * constraints.scale[k]
-    full = jnp.where(independent, jnp.maximum(gap, 0.0) / jnp.where(independent, row[k], 1.0), jnp.inf)
-
-    # the partial (dual) step length t1 of GI: the first multiplier of an active inequality that reaches 0
-    side = jnp.where(s.active == AT_LOWER, 1.0, jnp.where(s.active == AT_UPPER, -1.0, 0.0)).astype(row.dtype)
-    rate = side * sign * column
-    blocks = rate < 0.0
-    steps = jnp.where(blocks, jnp.maximum(side * s.multiplier, 0.0) / jnp.where(blocks, -rate, 1.0), jnp.inf)
-    leaving = first_smallest(steps)
+    sign = jnp.where(entering.below, 1.0, -1.0).astype(row.dtype)
+    full = _full_step(constraints, row, entering)
+    partial, leaving = _partial_step(s, sign, column)
 
     # t = min(t1, t2) (GI, step 2): constraint ``leaving`` is dropped or constraint k is added; infeasible if infinite
-    drops = steps[leaving] < full
-    length = jnp.minimum(steps[leaving], full)
+    drops = partial < full
+    length = jnp.minimum(partial, full)
     stuck = jnp.isinf(length)
     moves = enters & ~stuck
-    is_redundant = gap <= REDUNDANCY_TOL[row.dtype] * constraints.roundoff.value[k]
+    is_redundant = entering.gap <= REDUNDANCY_TOL[row.dtype] * constraints.roundoff.value[k]
     pivot = jnp.where(drops, leaving, k)
-    at_bound = jnp.where(constraints.equality[k], EQUALITY, jnp.where(below, AT_LOWER, AT_UPPER))
+    at_bound = jnp.where(constraints.equality[k], EQUALITY, jnp.where(entering.below, AT_LOWER, AT_UPPER))
     label = jnp.where(drops, INACTIVE, at_bound)
     step = Step(
         k,
@@ -226,6 +215,49 @@ def _add_violated(constraints: Constraints, s: DualState) -> DualState:
         iterations=s.iterations + enters,
         searching=enters & (moves | is_redundant),
     )
+
+
+def _entering_constraint(constraints: Constraints, s: DualState) -> _Entering:
+    """Return the constraint being activated, or else the one whose activation raises the dual objective most."""
+    eps = jnp.finfo(s.value.dtype).eps
+    below_by, above_by = constraints.lower - s.value, s.value - constraints.upper
+    violation = jnp.maximum(below_by, above_by)
+    is_violated = (violation > constraints.roundoff.value) | constraints.equality
+    may_enter = (s.active == INACTIVE) & ~s.redundant & is_violated
+    # a full step to s_k = bound raises the dual objective by half of violation^2 / T_kk
+    gain = jnp.maximum(violation, 0.0) ** 2 / jnp.maximum(jnp.diagonal(s.tableau), eps * constraints.scale)
+    gain = jnp.where(may_enter, jnp.where(constraints.equality, jnp.inf, gain), -1.0)
+    best = first_smallest(-gain)
+    is_pending = s.entering >= 0
+    k = jnp.where(is_pending, s.entering, best)
+    exists = s.searching & (is_pending | (gain[best] >= 0.0))
+    # which bound is the nearer, not which is violated: on its way, rounding may have taken it over its bound
+    return _Entering(k, exists, below_by[k] >= above_by[k], jnp.maximum(below_by[k], above_by[k]))
+
+
+def _full_step(constraints: Constraints, row: Float[Array, " m"], entering: _Entering) -> Float[Array, ""]:
+    """Return the full (primal) step length t2 of GI, infinite where the active constraints determine constraint k."""
+    k, eps = entering.index, jnp.finfo(row.dtype).eps
+    independent = row[k] > DEPENDENCE_TOL * eps * constraints.scale[k]
+    return jnp.where(independent, jnp.maximum(entering.gap, 0.0) / jnp.where(independent, row[k], 1.0), jnp.inf)
+
+
+def _partial_step(
+    s: DualState, sign: Float[Array, ""], column: Float[Array, " m"]
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Return the partial (dual) step length t1 of GI, and the active inequality whose multiplier is 0 there first.
+
+    Args:
+        s: the iterate.
+        sign: of the entering constraint's multiplier.
+        column: of the tableau, how all else follows that multiplier.
+    """
+    bound_sign = jnp.where(s.active == AT_LOWER, 1.0, jnp.where(s.active == AT_UPPER, -1.0, 0.0)).astype(column.dtype)
+    rate = bound_sign * sign * column
+    blocks = rate < 0.0
+    steps = jnp.where(blocks, jnp.maximum(bound_sign * s.multiplier, 0.0) / jnp.where(blocks, -rate, 1.0), jnp.inf)
+    leaving = first_smallest(steps)
+    return steps[leaving], leaving
 
 
 def principal_pivot(

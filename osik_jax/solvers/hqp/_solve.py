@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ...execution import _rules
-from ...execution._backends import Backend, check_backend, here
+from ...execution._backends import Backend, check_backend
 from ...numerics._constants import HIERARCHY_RANK, SINGULAR_TOL, ZERO_PIVOT
 from .._box import clip_roundoff, ordered_bounds
 from .._damping import Damping, per_level
@@ -87,7 +87,7 @@ def solve_hqp(
     )
     layout, hierarchy = pad_hierarchy(scaled, is_equality, low, high, (lower >= upper) & is_finite, dampings)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
-    solve = hierarchy_solver(layout, max_iterations, here(check_backend(backend)))
+    solve = hierarchy_solver(layout, max_iterations, check_backend(backend))
     result = _rules.found(solve(*jax.lax.stop_gradient((hierarchy, traced, warm_start))))
     # the derivative is computed in the precision of the data: no singular value below its roundoff is inverted
     singular_tol = jnp.maximum(ZERO_PIVOT * traced.rank, SINGULAR_TOL * jnp.finfo(dtype).eps)

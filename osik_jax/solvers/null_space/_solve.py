@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._errors import OsikValueError
-from ...execution._backends import Backend, check_backend, here, takes
+from ...execution._backends import Backend, check_backend, takes
 from ...numerics._constants import NULL_SPACE_RANK
 from .._box import clip_to_box, ordered_bounds
 from .._damping import Damping, per_level
@@ -74,7 +74,7 @@ def solve_nullspace(
         ValueError: an order that does not exist, bounds in reverse order, a damping too many or few, or a backend that
             has no kernels for this.
     """
-    backend = here(check_backend(backend))
+    backend = check_backend(backend)
     if lower is None and upper is None:
         takes(backend, "warp", fits=False)
     n = levels[0].matrix.shape[1]

@@ -30,7 +30,7 @@ from ...numerics._constants import (
 )
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
-from ._kkt_solve import factorize, solve_on_active_set
+from ._kkt_solve import KKTFactor, factorize, solve_on_active_set
 from ._problem import QP, constraint_scales, kkt_residual
 from ._projected_gradient import projected_gradient
 from ._projected_newton import projected_newton
@@ -187,6 +187,17 @@ def _by_newton(qp: QP, result: SearchResult, *, kkt_tol: float, max_iterations: 
     )
 
 
+class _Minimizers(NamedTuple):
+    """The minimisers of a batch on its active sets, and what the optimality conditions say of them."""
+
+    factor: KKTFactor
+    x: Float[Array, "B n"]
+    row_multipliers: Float[Array, "B p"]
+    roundoff: Roundoff
+    optimal: Bool[Array, " B"]
+    nearly_optimal: Bool[Array, " B"]  # within relaxed tolerances
+
+
 def _round(
     qp: QP,
     hessian: Float[Array, "B n n"],
@@ -196,43 +207,19 @@ def _round(
     by_pivots: bool,
 ) -> SearchResult:
     """Solve on the active set, check, and run the dual method where the check fails, or give up without it."""
-    # the minimiser on the active set, by fresh factors
-    factor = jax.vmap(factorize)(qp, hessian, result.active)
-    x, y = solve_on_active_set(qp, factor, result.active)
-    # the optimality conditions, within roundoff and with relaxed tolerances
-    scales = jax.vmap(constraint_scales)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
-    roundoff = Roundoff(*(tolerance[:, None] * a for a in scales))
-    optimal = jax.vmap(is_optimal)(qp, result, x, y, roundoff)
-    relaxed = Roundoff(*(RELAXED[hessian.dtype] * a for a in roundoff))
-    nearly_optimal = jax.vmap(is_optimal)(qp, result, x, y, relaxed)
+    end = _minimize(qp, hessian, result, tolerance)
     exhausted = result.iterations >= max_iterations
-    searching = ~(result.done | optimal | exhausted | result.used_newton)
-
-    def by_dual_method() -> SearchResult:
-        end = find_active_set(
-            *(qp, hessian, factor, result.active, roundoff, x, y),
-            searching=searching,
-            iterations=result.iterations,
-            max_iterations=max_iterations,
-        )
-        unchanged = jnp.all(end.active == result.active, 1)
-        return result._replace(
-            active=end.active,
-            redundant=end.redundant,
-            iterations=end.iterations,
-            infeasible_ends=result.infeasible_ends
-            + jnp.where(
-                unchanged & (end.infeasible | ~nearly_optimal), MAX_INFEASIBLE, end.infeasible.astype(jnp.int32)
-            ),
-        )
-
+    searching = ~(result.done | end.optimal | exhausted | result.used_newton)
+    nearly_optimal = end.nearly_optimal
     if by_pivots:
+        by_dual_method = partial(_by_dual_method, qp, hessian, result, end, searching, max_iterations)
         after = jax.lax.cond(jnp.any(searching), lambda: choose(searching, by_dual_method(), result), lambda: result)
     else:
         after = result._replace(infeasible_ends=jnp.where(searching, MAX_INFEASIBLE, result.infeasible_ends))
-        nearly_optimal &= optimal | result.used_newton
+        nearly_optimal &= end.optimal | result.used_newton
     # an active set that the dual method confirms is accepted with relaxed tolerances: what is left is roundoff
     unchanged = jnp.all(after.active == result.active, 1)
+    x, y = end.x, end.row_multipliers
     is_finite = jax.vmap(lambda x, y: jnp.isfinite(x).all() & jnp.isfinite(y).all())(x, y)
     accepted = nearly_optimal & unchanged & is_finite
     failed = after.infeasible_ends >= MAX_INFEASIBLE
@@ -244,6 +231,47 @@ def _round(
         factorizations=result.factorizations + 1,
         done=exhausted | result.used_newton | (accepted & (no_new_end | failed)),
         optimal=accepted | result.used_newton,
+    )
+
+
+def _minimize(
+    qp: QP, hessian: Float[Array, "B n n"], result: SearchResult, tolerance: Float[Array, " B"]
+) -> _Minimizers:
+    """Return the minimisers on the active sets, by fresh factors, checked within roundoff and relaxed tolerances."""
+    factor = jax.vmap(factorize)(qp, hessian, result.active)
+    x, y = solve_on_active_set(qp, factor, result.active)
+    scales = jax.vmap(constraint_scales)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
+    roundoff = Roundoff(*(tolerance[:, None] * a for a in scales))
+    optimal = jax.vmap(is_optimal)(qp, result, x, y, roundoff)
+    relaxed = Roundoff(*(RELAXED[hessian.dtype] * a for a in roundoff))
+    nearly_optimal = jax.vmap(is_optimal)(qp, result, x, y, relaxed)
+    return _Minimizers(factor, x, y, roundoff, optimal, nearly_optimal)
+
+
+def _by_dual_method(
+    qp: QP,
+    hessian: Float[Array, "B n n"],
+    result: SearchResult,
+    at: _Minimizers,
+    searching: Bool[Array, " B"],
+    max_iterations: int,
+) -> SearchResult:
+    """Go on from the minimisers by the dual method, which may confirm their active sets, change them or end."""
+    end = find_active_set(
+        *(qp, hessian, at.factor, result.active, at.roundoff, at.x, at.row_multipliers),
+        searching=searching,
+        iterations=result.iterations,
+        max_iterations=max_iterations,
+    )
+    unchanged = jnp.all(end.active == result.active, 1)
+    # from an active set that it confirms though the minimiser is none, it would go nowhere in the next round either
+    hopeless = unchanged & (end.infeasible | ~at.nearly_optimal)
+    ends = jnp.where(hopeless, MAX_INFEASIBLE, end.infeasible.astype(jnp.int32))
+    return result._replace(
+        active=end.active,
+        redundant=end.redundant,
+        iterations=end.iterations,
+        infeasible_ends=result.infeasible_ends + ends,
     )
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..._errors import OsikValueError
 from ...execution import _rules
-from ...execution._backends import Backend, check_backend, cpu_is_default, here
+from ...execution._backends import Backend, check_backend, cpu_is_default
 from ...numerics._constants import FEASIBILITY, INACTIVE
 from ...numerics._dense import apply
 from .._box import clip_roundoff, ordered_bounds
@@ -193,18 +193,10 @@ def _solve(
     safe, is_valid = _with_placeholder(replace(qp, lower=low, upper=high))
     start = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
     limit = 20 * m if max_iterations is None else max_iterations
-    solve = qp_solver(limit, has_soft_rows, here(check_backend(backend)))
+    solve = qp_solver(limit, has_soft_rows, check_backend(backend))
     # the search is not differentiated: its answer is, at the active set that was found
     result = _rules.found(solve(*jax.lax.stop_gradient((safe, start, tolerance))))
-    # the derivative is that of the problem which x solves: with infeasible hard rows, the softened one
-    compliance = jnp.where(result.infeasible, result.compliance, safe.compliance)
-    solved = replace(safe, packed=None, compliance=compliance)
-    has_answer = result.optimal | result.infeasible
-    differentiable = with_derivative(backend)(result.x, result.row_multipliers, result.active, solved)
-    constant = result.x, result.row_multipliers
-    x, y = (jnp.where(has_answer, a, b) for a, b in zip(differentiable, constant, strict=True))
-    is_finite = is_valid & jnp.isfinite(x).all() & jnp.isfinite(y).all()
-    x, y = jnp.where(is_finite, x, 0.0), jnp.where(is_finite, y, 0.0)
+    x, y, is_finite = _differentiable(safe, result, is_valid, backend)
     # at the end x is inside the box that was given, to the last bit
     box = (jnp.where(is_valid, b, given)[:n] for b, given in ((safe.lower, qp.lower), (safe.upper, qp.upper)))
     x = clip_roundoff(x, *box)
@@ -223,6 +215,29 @@ def _solve(
         row_multipliers=y,
         active=result.active,
     )
+
+
+def _differentiable(
+    safe: QP, result: SearchResult, is_valid: Bool[Array, ""], backend: Backend
+) -> tuple[Float[Array, " n"], Float[Array, " p"], Bool[Array, ""]]:
+    """Return x and the row multipliers with their derivatives where there is an answer; 0 where they are not finite.
+
+    The derivative is that of the problem which x solves: with infeasible hard rows, the softened one.
+
+    Args:
+        safe: the problem, or a placeholder.
+        result: of the search.
+        is_valid: whether the numbers that were given are valid.
+        backend: whose kernels solve for the derivative.
+    """
+    compliance = jnp.where(result.infeasible, result.compliance, safe.compliance)
+    solved = replace(safe, packed=None, compliance=compliance)
+    has_answer = result.optimal | result.infeasible
+    constant = result.x, result.row_multipliers
+    differentiable = with_derivative(backend)(*constant, result.active, solved)
+    x, y = (jnp.where(has_answer, a, b) for a, b in zip(differentiable, constant, strict=True))
+    is_finite = is_valid & jnp.isfinite(x).all() & jnp.isfinite(y).all()
+    return jnp.where(is_finite, x, 0.0), jnp.where(is_finite, y, 0.0), is_finite
 
 
 def _upper(qp: QP) -> Float[Array, " n_and_p"]:
