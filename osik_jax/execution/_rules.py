@@ -49,8 +49,7 @@ def custom_jvp(function: Callable[..., Any]) -> Ruled:
 def blocked(size: int) -> Callable[[Callable[..., Any]], Ruled]:
     """Return the function as it is, which on a CPU takes this many lanes of a ``vmap`` at a time.
 
-    Its derivatives run on all lanes at once: in blocks, those of a step of G1 would be a fifth faster in a batch of
-    1,024 and take half as long again to compile.
+    Its derivatives run on all lanes at once: in blocks they would be somewhat faster, and compile much longer.
     """
 
     def decorate(function: Callable[..., Any]) -> Ruled:

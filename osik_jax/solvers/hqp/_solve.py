@@ -64,7 +64,7 @@ def solve_hqp(
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
 
-    When not to use it: one level (``solve_least_squares_qp`` is several times faster).
+    When not to use it: of one level, for which ``solve_least_squares_qp`` has less to do.
     """
     lower, upper = jnp.asarray(lower), jnp.asarray(upper)
     dtype = jnp.result_type(lower, *(level.matrix for level in levels))
