@@ -130,7 +130,8 @@ def best_scale(W, S, level, x, damping, first, count):
     gain, cost = 0.0, 0.0
     for i in range(n):
         along = S.x[i] - S.begin[i]
-        gain, cost = gain - damping * (S.begin[i] - x[i]) * along, cost + damping * along * along
+        gain -= damping * (S.begin[i] * along - x[i] * W.motion[i])
+        cost += damping * along * along
     for i in range(m):
         if counts(W, level, i):
             moved = dot(level.A[i], W.motion, 0, n)

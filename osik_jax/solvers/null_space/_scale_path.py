@@ -5,10 +5,12 @@ a set of saturated joints x(s) is linear in s. Bounds may ask far larger motions
 of the rows: near the largest scale of a level that is out of reach nearly all joints are saturated, and which way
 they go there jumps from step to step. A damped level goes to the scale at which
 
-    1/2 |s A motion - error|^2 + 1/2 damping |x(s) - start|^2
+    1/2 |s A motion - error|^2 + 1/2 damping |x(s)|^2 - damping s start . motion
 
 is least along that path, and not to a part of the straight way to its end: where joints at the ends of their ranges
-leave nothing to gain, nothing moves, as in a hierarchy. Without bounds the optimum is the motion itself, s = 1.
+leave nothing to gain, nothing moves, as in a hierarchy. Without bounds the optimum is the motion itself, s = 1; the
+last term is 0 but for joints that levels above have saturated. The cost is convex along the path, with a slope that
+does not jump where joints saturate, for x(s) is the smallest.
 
 With the saturated joints of the point where it ends, that scale is a quotient of two sums, and so are its derivatives.
 """
@@ -104,7 +106,7 @@ def best_scale(
     task = ActiveTask.at(level, problem.start, rank_tol)
     change = apply(task.rows, problem.motion)
     cost = jnp.sum(change**2) + damping * jnp.sum(along**2)
-    gain = jnp.sum(change * task.error) - damping * jnp.sum((begin - problem.start) * along)
+    gain = jnp.sum(change * task.error) - damping * jnp.sum(begin * along - problem.start * problem.motion)
     moves = cost > 0.0
     return jnp.where(moves, gain / jnp.where(moves, cost, 1.0), 1.0)
 

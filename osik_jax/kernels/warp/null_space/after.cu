@@ -70,7 +70,7 @@ auto best_scale = [&]() {
   double gain = 0.0, cost = 0.0;
   for (int i = lane; i < N; i += 32) {
     const double forward = now[i] - begin[i];
-    gain -= damping * (begin[i] - x[i]) * forward, cost += damping * forward * forward;
+    gain -= damping * (begin[i] * forward - x[i] * motion[i]), cost += damping * forward * forward;
   }
   for (int a = lane; a < m; a += 32) {
     if (counts[a] == 0) continue;
