@@ -51,6 +51,13 @@ NEGLIGIBLE_STEP = 1e-11
 """Relative to the norm of the point where it begins: a shorter step counts as none."""
 FULL_STEP = 1.0 - 1e-9
 """Step lengths from here on are a full step but for roundoff."""
+PART = 2
+"""In what a kernel reports of a level: done, but with a part of its motion, where its damped cost is least. 1 is done
+without, 0 is not."""
+PATH_SEARCHES = 6
+"""Searches at most for the scale at which a level's damped cost is least; two or three are the rule."""
+PATH_STEP = 1e-9
+"""Relative to that scale: a smaller correction is the last."""
 BLOCKING_RANK = 1e-6
 """The part of a blocking joint's unit vector in the null space outside the span of others; with less it depends on
 them."""

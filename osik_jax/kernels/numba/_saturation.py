@@ -15,6 +15,9 @@ from ...numerics._constants import (
     FULL_STEP,
     LOOSE_SATURATION_RANK,
     NEGLIGIBLE_STEP,
+    PART,
+    PATH_SEARCHES,
+    PATH_STEP,
     SATURATION_RANK,
     SATURATION_RESIDUAL,
 )
@@ -31,7 +34,7 @@ from ._projection import (
 )
 from ._row_space import set_beside, take_row_space
 from ._row_space_workspace import work_at, work_size
-from ._saturation_search import Search, bound, search, size
+from ._saturation_search import Search, bound, search, settle, size
 from ._vectors import add, dot
 
 
@@ -98,19 +101,42 @@ def put_on_bounds(W, S, count, stop):
 
 
 @lean
-def attempt(W, S, x, target, first, most, least):
-    """Search, and accept where the answer holds; where it does not, put the coordinates back."""
+def attempt(W, S, x, target, first, scale, most, least):
+    """Search, and accept where the answer holds; where it does not, put the coordinates back.
+
+    The scale, how many joints are saturated, the one that stops the motion, changes, and whether the answer holds.
+    """
     n = len(x)
     for j in range(first, n):
         for i in range(n):
             S.before[j, i] = W.turned[j, i]
-    scale, count, stop, changes, done = search(W, S, x, target, first, most, least)
+    scale, count, stop, changes, done = search(W, S, x, target, first, scale, most, least)
     done = done and put_on_bounds(W, S, count, stop) <= SATURATION_RESIDUAL * size(W, S, x, target, scale, count)
     if not done:
         for j in range(first, n):
             for i in range(n):
                 W.turned[j, i] = S.before[j, i]
-    return scale, stop, changes, done
+    return scale, count, stop, changes, done
+
+
+@lean
+def best_scale(W, S, level, x, damping, first, count):
+    """Return the scale at which the damped cost of the level is least, with the saturated joints on their bounds."""
+    m, n = level.A.shape
+    settle(W, S, x, 0.0, first, count)
+    for i in range(n):
+        S.begin[i] = S.x[i]
+    settle(W, S, x, 1.0, first, count)
+    gain, cost = 0.0, 0.0
+    for i in range(n):
+        along = S.x[i] - S.begin[i]
+        gain -= damping * (S.begin[i] * along - x[i] * W.motion[i])
+        cost += damping * along * along
+    for i in range(m):
+        if counts(W, level, i):
+            moved = dot(level.A[i], W.motion, 0, n)
+            gain, cost = gain + moved * W.wanted[i], cost + moved * moved
+    return gain / cost if cost > 0.0 else 1.0
 
 
 @lean
@@ -128,6 +154,53 @@ def label_joints(S, stop, at_bound, blocking):
         at_bound[stop] = S.passed[stop]
         at_bound[blocker] = 0
     return blocker
+
+
+@lean
+def move(W, S, level, x, target, damping, first, most, at_bound, blocking):
+    """Find the end of the level's motion, or what comes before it where that has the least damped cost.
+
+    The latter as ``solvers/null_space/_scale_path.py`` has it: a search for each scale that is tried, from a part of
+    the straight way to the end on. All searches are one call, for there is much to compile in it.
+
+    Returns:
+        The scale, the blocker, changes of the active set, and what ``solve_level`` says of the end. ``S.kept`` is where
+        joints are.
+    """
+    n, at, least, low, high, scale = len(x), 1.0, SATURATION_RANK, 0.0, 1.0, 0.0
+    blocker, changes, ended, searches = 0, 0, 0, 0
+    while searches < PATH_SEARCHES and changes < most:
+        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, most, least)
+        changes += more
+        if ended == 0:  # the whole motion
+            if not done:
+                if least == LOOSE_SATURATION_RANK:
+                    break
+                least = LOOSE_SATURATION_RANK
+                continue
+            blocker, ended = label_joints(S, stop, at_bound, blocking), 1
+            part = damped_part(W, S, level, x, damping)
+            scale, high, at = part * its_scale, its_scale, part * its_scale
+            for i in range(n):
+                S.kept[i] = S.x[i] if part == 1.0 else x[i] + part * (S.x[i] - x[i])
+            if part == 1.0 or not at > 0.0:
+                break
+            continue
+        searches += 1
+        if not done or stop >= 0:
+            break
+        ended, scale = PART, its_scale
+        for i in range(n):
+            S.kept[i], at_bound[i] = S.x[i], S.at_bound[i]
+        best = best_scale(W, S, level, x, damping, first, count)
+        if abs(best - at) <= PATH_STEP * at:
+            break
+        if best > at:
+            low = at
+        else:
+            high = at
+        at = best if low < best < high else 0.5 * (low + high)
+    return scale, blocker, changes, ended
 
 
 @lean
@@ -154,7 +227,8 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, at_b
     """Move x as the level asks.
 
     Returns:
-        The coordinates that it takes, its scale, the blocker, changes of the active set, whether the search ended.
+        The coordinates that it takes, its scale, the blocker, changes of the active set, and 1 where the search has
+        ended, ``PART`` where that is before the end of its motion, for its cost.
     """
     n = len(x)
     load(W, level)
@@ -163,21 +237,16 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, at_b
     damping = damping_of(W, S, level, x, first, longest)
     look(W, level, x)
     rank = find_motion(W, level, first, damping, rank_tolerance, plain)
-    scale, stop, changes, done = attempt(W, S, x, target, first + rank, most, SATURATION_RANK)
-    if not done and changes < most:
-        scale, stop, more, done = attempt(W, S, x, target, first + rank, most, LOOSE_SATURATION_RANK)
-        changes += more
-    blocker = label_joints(S, stop, at_bound, blocking)
-    if not done:
+    scale, blocker, changes, ended = move(W, S, level, x, target, damping, first + rank, most, at_bound, blocking)
+    if ended == 0:
         fill(at_bound, 0)
         fill(blocking, 0)
         narrow(W, level, x, longest, whole)
-        return rank, 0.0, blocker, changes, False
-    part = damped_part(W, S, level, x, damping)
+        return rank, 0.0, blocker, changes, 0
     for i in range(n):
-        x[i] = S.x[i] if part == 1.0 else x[i] + part * (S.x[i] - x[i])
+        x[i] = S.kept[i]
     narrow(W, level, x, longest, whole)
-    return rank + take_off_stops(W, first + rank, blocking), part * scale, blocker, changes, True
+    return rank + take_off_stops(W, first + rank, blocking), scale, blocker, changes, ended
 
 
 @lean
@@ -221,7 +290,8 @@ def handle(frame):
     S = Search(
         duals, before, vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n),
         vector(at + 4 * line, n), vector(at + 5 * line, n), vector(at + 6 * line, n), vector(at + 7 * line, n),
-        vector(at + 8 * line, n), whole_numbers(marks, n), whole_numbers(marks + 4 * n, n),
+        vector(at + 8 * line, n), vector(at + 9 * line, n), vector(at + 10 * line, n),
+        whole_numbers(marks, n), whole_numbers(marks + 4 * n, n),
         whole_numbers(marks + 8 * n, n), whole_numbers(marks + 12 * n, n),
     )  # fmt: skip
     fixed = whole_numbers(marks + 16 * n, n)
@@ -259,7 +329,7 @@ def handle(frame):
             for i in range(n):
                 fixed[i] = blocking[i] if fixed[i] == 0 else fixed[i]
                 active[i] = fixed[i] if fixed[i] != 0 else at_bound[i]
-            report[0], report[1] = report[0] != 0 and done, report[1] + changes
+            report[0], report[1] = report[0] != 0 and done != 0, report[1] + changes
         for i in range(n):
             its_bound = low[i] if active[i] < 0 else high[i]
             if abs(active[i]) == 1 and abs(x[i] - its_bound) > BOUND_DISTANCE * (1.0 + abs(its_bound)):

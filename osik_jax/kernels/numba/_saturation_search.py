@@ -45,8 +45,9 @@ class Search(NamedTuple):
     a column they make up; ``who`` they are; ``stays``, whether they stop the motion. Of all joints: ``x``; ``free``,
     the squared length of what is left of their columns; ``along``, a direction of theirs; ``normal``, the combination
     that stops the motion; ``target_part``, of x; ``at_bound``, the label of each; ``passed``, the labels of free ones
-    that the saturated ones put on their bounds. In coordinates: ``place`` and ``turn``; ``before`` (n, n) has them as
-    they were.
+    that the saturated ones put on their bounds; ``begin`` and ``kept``, where they are at the scale 0, and where they
+    were at the last scale that was accepted. In coordinates: ``place`` and ``turn``; ``before`` (n, n) has them as they
+    were.
     """
 
     duals: np.ndarray
@@ -60,6 +61,8 @@ class Search(NamedTuple):
     target_part: np.ndarray
     place: np.ndarray
     turn: np.ndarray
+    begin: np.ndarray
+    kept: np.ndarray
     who: np.ndarray
     stays: np.ndarray
     at_bound: np.ndarray
@@ -312,13 +315,13 @@ def begin_search(W, S, start, target, first):
 
 
 @lean
-def search(W, S, start, target, first, most, least):
+def search(W, S, start, target, first, scale, most, least):
     """Return the scale, how many joints are saturated, the one that stops the motion, changes, and whether it is done.
 
-    ``S.x`` is the answer, inside its box.
+    ``S.x`` is the answer, inside its box; ``scale`` is the largest that is asked for.
     """
     n = len(start)
-    count, stop, scale, rate, changes, entering, sign, push = 0, -1, 1.0, 0.0, 0, -1, 1.0, 0.0
+    count, stop, rate, changes, entering, sign, push = 0, -1, 0.0, 0, -1, 1.0, 0.0
     begin_search(W, S, start, target, first)
     settle(W, S, start, scale, first, count)
     whole = size(W, S, start, target, scale, count)

@@ -7,6 +7,8 @@ factorisations a level solve them, whose derivatives are known in closed form; t
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,11 +17,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._backends import Backend
 from ...execution._rules import custom_jvp
-from ...numerics._constants import DERIVATIVE_RANK
 from ...numerics._dense import apply, product
 from .._damping import narrow_box
 from ._padding import Problem, initial_point
 from ._projection import damped_step_length, level_motion
+from ._scale_path import at_bounds, best_scale, dual_basis
 from ._scaled_motion import ScaledMotion, blocked_scale
 
 
@@ -30,6 +32,7 @@ class ActiveJoints(NamedTuple):
     active: Int[Array, " n"]  # -1 saturated at the lower bound, 1 at the upper, 0 free
     blocking: Int[Array, " n"]  # the joints that limit the level's scale, likewise
     blocker: Int[Array, ""]  # the one of them that the others determine
+    is_part: Bool[Array, ""]  # whether the level ends before them, where its damped cost is least
 
 
 class SaturatedResult(NamedTuple):
@@ -80,8 +83,11 @@ def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend
         joints, level, damping, target = each
         start, projector, lower, upper, curvature = state
         motion, projector, total = level_motion(level, start, projector, damping, problem.rank_tol, backend)
-        x, projector, scale = _level(joints, ScaledMotion(start, motion, target, projector, lower, upper))
+        way = ScaledMotion(start, motion, target, projector, lower, upper)
+        best = partial(best_scale, way, level, total, problem.rank_tol, joints.active)
+        x, projector, scale = _level(joints, way, best)
         length = damped_step_length(level, start, x, total, problem.rank_tol)
+        length = jnp.where(joints.is_part, 1.0, length)
         x, scale = start + length * (x - start), length * scale
         return (x, projector, *narrow_box(damping, level, curvature, x, lower, upper)), scale
 
@@ -92,14 +98,15 @@ def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend
 
 
 def _level(
-    joints: ActiveJoints, problem: ScaledMotion
+    joints: ActiveJoints, problem: ScaledMotion, best: Callable[[Float[Array, "n n"]], Float[Array, ""]]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
-    """Return x, the projector, and the scale of one level."""
+    """Return x, the projector, and the scale of one level; ``best`` is its scale if that is where its cost is least."""
     scale, projector = _scale_and_projector(problem, joints)
     # one factorisation after another: see docs/installation.md
     scale, active = jax.lax.optimization_barrier((scale, joints.active))
-    dual = _dual_basis(problem.projector, active)
-    x = jnp.where(active != 0, problem.bound(active), _at_bounds(problem, scale, active, dual))
+    dual = dual_basis(problem.projector, active)
+    scale = jnp.where(joints.is_part, best(dual), scale)
+    x = jnp.where(active != 0, problem.bound(active), at_bounds(problem, scale, active, dual))
     return jnp.where(joints.done, x, problem.start), projector, jnp.where(joints.done, scale, 0.0)
 
 
@@ -112,7 +119,7 @@ def _scale_and_projector(problem: ScaledMotion, joints: ActiveJoints) -> tuple[F
     blocking, blocker = joints.blocking, joints.blocker
     # normal: the combination of the blocking joints that the null space does not change
     others = blocking.at[blocker].set(0)
-    dual = _dual_basis(problem.projector, others)
+    dual = dual_basis(problem.projector, others)
     coefficients = apply(dual, problem.projector[:, blocker])
     normal = (-coefficients).at[blocker].set(1.0)
     is_blocked = (blocking != 0).any()
@@ -122,46 +129,6 @@ def _scale_and_projector(problem: ScaledMotion, joints: ActiveJoints) -> tuple[F
     reduced = problem.projector - product(problem.projector, product(product(columns, dual), problem.projector))
     keep = (blocking == 0)[:, None] & (blocking == 0)[None, :]
     return scale, jnp.where(keep, _purified(reduced), 0.0)
-
-
-@custom_jvp
-def _dual_basis(projector: Float[Array, "n n"], active: Int[Array, " n"]) -> Float[Array, "n n"]:
-    """Return C, the pseudo-inverse of the projector's columns of the active joints, with rows of 0 for the others.
-
-    C' (bound - x) brings the active joints to their bounds, by the smallest step in the projector's range.
-    """
-    # QR of the columns of the active joints, these first; dependent ones are left out
-    order = jnp.argsort(active == 0, stable=True)
-    valid = active[order] != 0
-    basis, triangle = jnp.linalg.qr(jnp.where(valid, projector[:, order], 0.0))
-    eye = jnp.eye(len(active), dtype=projector.dtype)
-    valid = valid & (jnp.abs(jnp.diagonal(triangle)) > DERIVATIVE_RANK)
-    both = valid[:, None] & valid[None, :]
-    inverse = jax.scipy.linalg.solve_triangular(jnp.where(both, triangle, eye), eye)
-    # C = R^-1 Q'
-    dual = product(jnp.where(both, inverse, 0.0), jnp.where(valid, basis, 0.0).T)
-    return jnp.zeros_like(dual).at[order].set(dual)
-
-
-@_dual_basis.defjvp
-def _dual_basis_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
-    """Differentiate as Golub and Pereyra (``solvers/_inverses.py``), a matrix of full column rank."""
-    projector, active = primals
-    dual = _dual_basis(projector, active)
-    columns, moved = (jnp.where(active != 0, matrix, 0.0) for matrix in (projector, tangents[0]))
-    rest = moved.T - product(product(moved.T, columns), dual)
-    return dual, product(dual, product(dual.T, rest)) - product(dual, product(moved, dual))
-
-
-def _at_bounds(
-    problem: ScaledMotion, scale: Array, active: Int[Array, " n"], dual: Float[Array, "n n"]
-) -> Float[Array, " n"]:
-    """Return x with the active joints at their bounds, refined once."""
-    x = problem.unbounded(scale)
-    for _ in range(2):
-        step = apply(dual.T, jnp.where(active != 0, problem.bound(active) - x, 0.0))
-        x = x + apply(problem.projector, step)
-    return x
 
 
 def _purified(projector: Float[Array, "n n"]) -> Float[Array, "n n"]:

@@ -41,14 +41,15 @@ from ...execution._lanes import in_lanes, with_a_few
 from ...execution._rules import found as kept
 from ...kernels.numba import _target
 from ...kernels.numba._sizes import row_space_numbers, saturation_numbers
-from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
+from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE, PART
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
 from . import _warp
 from ._implicit_diff import ActiveJoints, SaturatedResult, with_derivative
 from ._padding import PaddedLevel, Problem, initial_point, pad_levels
-from ._projection import damped_step_length, level_motion
+from ._projection import level_motion
+from ._scale_path import least_cost
 from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
 
 
@@ -150,9 +151,9 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> Sa
         # eq. 7 without bounds, then the largest scale of that motion in the box
         motion, damping = jax.vmap(partial(_level_problem, backend))(problem, state, *each)
         result = solve_scaled_motion(motion, max_iterations)
-        # bounds may make the damped motion too dear: a part of the step is then the optimum
-        length = jax.vmap(damped_step_length)(each[0], state.x, result.x, damping, problem.rank_tol)
-        after, joints = jax.vmap(partial(_after_level, backend))(state, motion, result, length, *each[:2])
+        # bounds may make the damped motion too dear: a part of it is then the optimum
+        result, is_part, length = least_cost(motion, result, each[0], damping, problem.rank_tol, max_iterations)
+        after, joints = jax.vmap(partial(_after_level, backend))(state, motion, result, is_part, length, *each[:2])
         return after, (jnp.where(result.done, length * result.scale, 0.0), joints)
 
     start = _State(x, problem.lower, problem.upper, jnp.zeros_like(x), projector, fixed, fixed, zeros, zeros == 0)
@@ -178,7 +179,7 @@ def _by_numba(problem: Problem, max_iterations: int) -> SaturatedResult:
         *(*problem.levels, *problem.damping, problem.targets, problem.lower, problem.upper, problem.rank_tol),
         np.array([max_iterations], np.int32),
     )
-    joints = ActiveJoints(done != 0, at_bound, blocking, blocker)
+    joints = ActiveJoints(done != 0, at_bound, blocking, blocker, done == PART)
     return SaturatedResult(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)
 
 
@@ -197,6 +198,7 @@ def _after_level(
     state: _State,
     motion: ScaledMotion,
     result: SaturationResult,
+    is_part: Array,
     length: Array,
     level: PaddedLevel,
     damping: Damping,
@@ -227,4 +229,4 @@ def _after_level(
         iterations=state.iterations + result.iterations,
         done=state.done & result.done,
     )
-    return after, ActiveJoints(result.done, active, blocking, result.blocker)
+    return after, ActiveJoints(result.done, active, blocking, result.blocker, result.done & is_part)

@@ -57,6 +57,29 @@ auto damped_part = [&]() {
   const double part = gain / (cost > 0.0 ? cost : 1.0);
   return cost > 0.0 && part < FULL_STEP ? fmax(part, 0.0) : 1.0;
 };
+// the scale at which the damped cost of the level is least, with the saturated joints on their bounds; `now`, `scale`
+// and `normal` are then others
+auto best_scale = [&]() {
+  double* const begin = normal;
+  for (int end = 0; end < 2; ++end) {                 // at the scales 0 and 1
+    scale = end;
+    settle();
+    if (end == 0)
+      for (int i = lane; i < N; i += 32) begin[i] = now[i];
+  }
+  double gain = 0.0, cost = 0.0;
+  for (int i = lane; i < N; i += 32) {
+    const double forward = now[i] - begin[i];
+    gain -= damping * (begin[i] * forward - x[i] * motion[i]), cost += damping * forward * forward;
+  }
+  for (int a = lane; a < m; a += 32) {
+    if (counts[a] == 0) continue;
+    const double moved = row_times(a, motion);
+    gain += moved * wanted[a], cost += moved * moved;
+  }
+  gain = warp_sum(gain), cost = warp_sum(cost);
+  return cost > 0.0 ? gain / cost : 1.0;
+};
 // the box of the levels below (narrow_box of _damping.py): what they may spend of what a level out of reach has gained
 auto narrow_box = [&]() {
   const double least = NEGLIGIBLE_DAMPING * longest;

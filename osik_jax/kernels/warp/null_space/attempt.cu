@@ -15,12 +15,12 @@ auto put_on_bounds = [&]() {
   return warp_max(off);
 };
 // searches and returns whether the answer is accepted
-auto attempt = [&](double least) {
+auto attempt = [&](double most, double least) {
   const double* const target = targets.data + here * N;
   double* const before = projectors.data + problem * (N * N);  // which is written last
   for (int j = first; j < N; ++j)
     for (int i = lane; i < N; i += 32) before[j * N + i] = turned[j * D + i];
-  bool done = search(target, least);
+  bool done = search(target, most, least);
   if (done) {
     const double off = put_on_bounds();
     done = off < INFINITY && off <= SATURATION_RESIDUAL * size_of_numbers(target);

@@ -9,30 +9,66 @@
 // This is the end of the body of one function: the other files of this folder stand before it, in the order that
 // solvers/null_space/_warp.py says. Where its variables are declared: workspace.cu, problem.cu, level.cu, saturated.cu.
 
+// finds the end of the level's motion, or what comes before it where that has the least damped cost, from a part of the
+// straight way to the end on; returns the scale. `ended`: 0 where the search has not, PART where it is before the end
+auto move = [&](int& ended, int& blocker, int& its_changes) {
+  double* const kept = solution.data + problem * N;   // which is written last, and so are the labels
+  int* const kept_labels = joints_at_bounds.data + here * N;
+  double at = 1.0, least = SATURATION_RANK, below = 0.0, above = 1.0, its_scale = 0.0;
+  ended = blocker = its_changes = 0;
+  for (int searches = 0; searches < PATH_SEARCHES && its_changes < max_iterations;) {
+    const bool done = attempt(at, least);             // one place in the program for all
+    its_changes += changes;
+    double part = 1.0;
+    if (ended == 0) {                                 // the whole motion
+      if (!done && least == LOOSE_SATURATION_RANK) break;
+      if (!done) {
+        least = LOOSE_SATURATION_RANK;
+        continue;
+      }
+      blocker = label_joints(), ended = 1;
+      part = damped_part();
+      above = scale, its_scale = part * scale;
+    } else {
+      ++searches;
+      if (!done || stop >= 0) break;
+      ended = PART, its_scale = scale;
+    }
+    for (int i = lane; i < N; i += 32) {
+      kept[i] = part == 1.0 ? now[i] : x[i] + part * (now[i] - x[i]);
+      kept_labels[i] = at_bound[i];
+    }
+    if (ended == 1) {
+      at = its_scale;
+      if (part == 1.0 || !(at > 0.0)) break;
+      continue;
+    }
+    const double best = best_scale();
+    if (fabs(best - at) <= PATH_STEP * at) break;
+    if (best > at) below = at;
+    else above = at;
+    at = below < best && best < above ? best : 0.5 * (below + above);
+  }
+  for (int i = lane; i < N; i += 32) {
+    if (ended == 0) blocking[i] = 0;
+    else x[i] = kept[i];
+    at_bound[i] = ended == 0 ? 0 : kept_labels[i];
+  }
+  __syncwarp();
+  return its_scale;
+};
 // moves x as the level asks and returns the scale; what it takes are the coordinates before `first`
-auto solve_level = [&](bool& done, int& blocker, int& its_changes) {
+auto solve_level = [&](int& ended, int& blocker, int& its_changes) {
   load_level();
   set_beside();
   compute_damping();
   look(x);
   find_motion();
   first += rank;
-  done = false, its_changes = 0;
-  for (int pass = 0; pass < 2 && !done && (pass == 0 || its_changes < max_iterations); ++pass) {
-    done = attempt(pass == 0 ? SATURATION_RANK : LOOSE_SATURATION_RANK);
-    its_changes += changes;
-  }
-  blocker = label_joints();
-  if (!done) {
-    for (int i = lane; i < N; i += 32) at_bound[i] = blocking[i] = 0;
-    narrow_box();
-    return 0.0;
-  }
-  const double part = damped_part();
-  for (int i = lane; i < N; i += 32) x[i] = part == 1.0 ? now[i] : x[i] + part * (now[i] - x[i]);
+  const double its_scale = move(ended, blocker, its_changes);
   narrow_box();
-  take_off_stops();
-  return part * scale;
+  if (ended != 0) take_off_stops();
+  return its_scale;
 };
 
 bool all_done = true;
@@ -40,15 +76,14 @@ int all_changes = 0;
 for (level = 0; level < LEVELS; ++level) {
   here = problem * LEVELS + level;
   A = matrix.data + here * (N * M);
-  bool done;
-  int blocker, its_changes;
-  const double its_scale = solve_level(done, blocker, its_changes);
-  all_done = all_done && done, all_changes += its_changes;
+  int ended, blocker, its_changes;
+  const double its_scale = solve_level(ended, blocker, its_changes);
+  all_done = all_done && ended != 0, all_changes += its_changes;
   for (int i = lane; i < N; i += 32) {
     fixed[i] = fixed[i] == 0 ? blocking[i] : fixed[i];
     joints_at_bounds.data[here * N + i] = at_bound[i], joints_blocking.data[here * N + i] = blocking[i];
   }
-  if (lane == 0) scales.data[here] = its_scale, dones.data[here] = done, blockers.data[here] = blocker;
+  if (lane == 0) scales.data[here] = its_scale, dones.data[here] = ended, blockers.data[here] = blocker;
   __syncwarp();
 }
 

@@ -11,8 +11,8 @@ double sign = 1.0, push = 0.0, stop_rate = 0.0;       // of the entering joint, 
 bool dropping = false, crossing = false, is_known = false;
 
 // no joint is saturated; what the null space makes of the target
-auto begin_search = [&](const double* target) {
-  count = 0, stop = -1, scale = 1.0;
+auto begin_search = [&](const double* target, double most) {
+  count = 0, stop = -1, scale = most;
   changes = 0, step = CHOOSE, entering = -1, leaving = -1, passes = 1;
   crossings = 0, dropping = crossing = is_known = false;
   __syncwarp();
@@ -100,11 +100,12 @@ auto enter = [&](double length_squared) {
   }
   __syncwarp();
 };
-// finds `now`, inside its box, and returns whether it has; a combination with parts below `least` depends on others
-auto search = [&](const double* target, double least) {
+// finds `now`, inside its box and at a scale of at most `most`, and returns whether it has; a combination with parts
+// below `least` depends on others
+auto search = [&](const double* target, double most, double least) {
   double whole = 0.0;
   bool done = false, ended = false;
-  begin_search(target);
+  begin_search(target, most);
   for (;;) {
     if (passes > 0) {
       settle_stopped(passes, stop_rate);

@@ -1,0 +1,151 @@
+"""The scale of a damped level's motion at which its damped cost is least, where bounds make the whole of it too dear.
+
+Of all x whose rows move by s times the motion of a level, the search finds the smallest, x(s), and the largest s. On
+a set of saturated joints x(s) is linear in s. Bounds may ask far larger motions of the other joints for the same motion
+of the rows: near the largest scale of a level that is out of reach nearly all joints are saturated, and which way
+they go there jumps from step to step. A damped level goes to the scale at which
+
+    1/2 |s A motion - error|^2 + 1/2 damping |x(s)|^2 - damping s start . motion
+
+is least along that path, and not to a part of the straight way to its end: where joints at the ends of their ranges
+leave nothing to gain, nothing moves, as in a hierarchy. Without bounds the optimum is the motion itself, s = 1; the
+last term is 0 but for joints that levels above have saturated. The cost is convex along the path, with a slope that
+does not jump where joints saturate, for x(s) is the smallest.
+
+With the saturated joints of the point where it ends, that scale is a quotient of two sums, and so are its derivatives.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...execution._lanes import choose
+from ...execution._rules import custom_jvp
+from ...numerics._constants import DERIVATIVE_RANK, PATH_SEARCHES, PATH_STEP
+from ...numerics._dense import apply, product
+from ._padding import PaddedLevel
+from ._problem import ActiveTask
+from ._projection import damped_step_length
+from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
+
+
+def least_cost(
+    problem: ScaledMotion,
+    end: SaturationResult,
+    level: PaddedLevel,
+    damping: Float[Array, " B"],
+    rank_tol: Float[Array, " B"],
+    max_iterations: int,
+) -> tuple[SaturationResult, Bool[Array, " B"], Float[Array, " B"]]:
+    """Return where damped levels end, whether it is before the end of their path, and the part of a chord.
+
+    Where the searches on the way fail, it is a part of the straight way to the end of the path; else that part is 1.
+
+    Args:
+        problem: the motions; every array has a leading axis of problems, as have the following.
+        end: the largest scale.
+        level: the levels, A the rows of each that take part at ``start``.
+        damping: of each, in squared singular values.
+        rank_tol: as in ``level_motion``.
+        max_iterations: limit on the changes of the active set (static).
+    """
+    chord = jax.vmap(damped_step_length)(level, problem.start, end.x, damping, rank_tol)
+    wanted = end.done & (chord < 1.0)
+    first = end.scale * chord
+
+    def is_running(carry: tuple[Any, ...]) -> Array:
+        return (carry[0] < PATH_SEARCHES) & jnp.any(carry[1])
+
+    def search(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        number, running, scale, low, high, before, found = carry
+        result = solve_scaled_motion(problem._replace(motion=scale[:, None] * problem.motion), max_iterations)
+        result = result._replace(scale=scale * result.scale)
+        holds = running & result.done & ~(result.blocking != 0).any(-1)
+        best = jax.vmap(best_scale)(problem, level, damping, rank_tol, result.active)
+        low, high = jnp.where(best > scale, scale, low), jnp.where(best > scale, high, scale)
+        now = choose(holds, result._replace(iterations=before.iterations + result.iterations), before)
+        is_there = jnp.abs(best - scale) <= PATH_STEP * scale
+        inside = (best > low) & (best < high)
+        scale = jnp.where(inside, best, 0.5 * (low + high))
+        return number + 1, holds & ~is_there, scale, low, high, now, found | holds
+
+    nothing, zeros = jnp.zeros(len(wanted), bool), jnp.zeros_like(first)
+    start: tuple[Any, ...] = (jnp.zeros((), jnp.int32), wanted & (first > 0.0), first, zeros, end.scale, end, nothing)
+    *_, result, found = jax.lax.while_loop(is_running, search, start)
+    # joints that stop the whole motion can move no more, as if all of it were done
+    result = result._replace(blocking=end.blocking, blocker=end.blocker)
+    return result, found, jnp.where(wanted & ~found, chord, 1.0)
+
+
+def best_scale(
+    problem: ScaledMotion,
+    level: PaddedLevel,
+    damping: Float[Array, ""],
+    rank_tol: Array | float,
+    active: Int[Array, " n"],
+    dual: Float[Array, "n n"] | None = None,
+) -> Float[Array, ""]:
+    """Return the scale at which the damped cost is least, with these joints at their bounds; 1 where nothing moves.
+
+    Args:
+        problem: the motion of the level.
+        level: the level.
+        damping: of the level.
+        rank_tol: as in ``level_motion``.
+        active: the saturated joints.
+        dual: their ``dual_basis``, where it is known.
+    """
+    known = dual_basis(problem.projector, active) if dual is None else dual
+    none = jnp.zeros((), problem.start.dtype)
+    begin = at_bounds(problem, none, active, known)
+    along = at_bounds(problem, none + 1.0, active, known) - begin
+    task = ActiveTask.at(level, problem.start, rank_tol)
+    change = apply(task.rows, problem.motion)
+    cost = jnp.sum(change**2) + damping * jnp.sum(along**2)
+    gain = jnp.sum(change * task.error) - damping * jnp.sum(begin * along - problem.start * problem.motion)
+    moves = cost > 0.0
+    return jnp.where(moves, gain / jnp.where(moves, cost, 1.0), 1.0)
+
+
+def at_bounds(
+    problem: ScaledMotion, scale: Array, active: Int[Array, " n"], dual: Float[Array, "n n"]
+) -> Float[Array, " n"]:
+    """Return x with the active joints at their bounds, refined once."""
+    x = problem.unbounded(scale)
+    for _ in range(2):
+        step = apply(dual.T, jnp.where(active != 0, problem.bound(active) - x, 0.0))
+        x = x + apply(problem.projector, step)
+    return x
+
+
+@custom_jvp
+def dual_basis(projector: Float[Array, "n n"], active: Int[Array, " n"]) -> Float[Array, "n n"]:
+    """Return C, the pseudo-inverse of the projector's columns of the active joints, with rows of 0 for the others.
+
+    C' (bound - x) brings the active joints to their bounds, by the smallest step in the projector's range.
+    """
+    # QR of the columns of the active joints, these first; dependent ones are left out
+    order = jnp.argsort(active == 0, stable=True)
+    valid = active[order] != 0
+    basis, triangle = jnp.linalg.qr(jnp.where(valid, projector[:, order], 0.0))
+    eye = jnp.eye(len(active), dtype=projector.dtype)
+    valid = valid & (jnp.abs(jnp.diagonal(triangle)) > DERIVATIVE_RANK)
+    both = valid[:, None] & valid[None, :]
+    inverse = jax.scipy.linalg.solve_triangular(jnp.where(both, triangle, eye), eye)
+    # C = R^-1 Q'
+    dual = product(jnp.where(both, inverse, 0.0), jnp.where(valid, basis, 0.0).T)
+    return jnp.zeros_like(dual).at[order].set(dual)
+
+
+@dual_basis.defjvp
+def _dual_basis_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
+    """Differentiate as Golub and Pereyra (``solvers/_inverses.py``), a matrix of full column rank."""
+    projector, active = primals
+    dual = dual_basis(projector, active)
+    columns, moved = (jnp.where(active != 0, matrix, 0.0) for matrix in (projector, tangents[0]))
+    rest = moved.T - product(product(moved.T, columns), dual)
+    return dual, product(dual, product(dual.T, rest)) - product(dual, product(moved, dual))
