@@ -20,6 +20,8 @@ from ...numerics._constants import (
     PATH_STEP,
     SATURATION_RANK,
     SATURATION_RESIDUAL,
+    STRAIGHT,
+    WHOLE,
 )
 from ._dense import fill
 from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
@@ -157,7 +159,7 @@ def label_joints(S, stop, at_bound, blocking):
 
 
 @lean
-def move(W, S, level, x, target, damping, first, most, at_bound, blocking):
+def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
     """Find the end of the level's motion, or what comes before it where that has the least damped cost.
 
     The latter as ``solvers/null_space/_scale_path.py`` has it: a search for each scale that is tried, from a part of
@@ -168,31 +170,40 @@ def move(W, S, level, x, target, damping, first, most, at_bound, blocking):
         joints are.
     """
     n, at, least, low, high, scale = len(x), 1.0, SATURATION_RANK, 0.0, 1.0, 0.0
-    blocker, changes, ended, searches = 0, 0, 0, 0
-    while searches < PATH_SEARCHES and changes < most:
+    blocker, changes, ended, searches, whole, part = 0, 0, 0, 0, 1.0, 1.0
+    while searches <= PATH_SEARCHES and changes < most:
         its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, most, least)
         changes += more
-        if ended == 0:  # the whole motion
+        if ended == 0:  # the end of the path
             if not done:
                 if least == LOOSE_SATURATION_RANK:
                     break
                 least = LOOSE_SATURATION_RANK
                 continue
-            blocker, ended = label_joints(S, stop, at_bound, blocking), 1
+            blocker, ended = label_joints(S, stop, at_bound, blocking), STRAIGHT
             part = damped_part(W, S, level, x, damping)
-            scale, high, at = part * its_scale, its_scale, part * its_scale
+            scale, whole, high, at = part * its_scale, its_scale, its_scale, part * its_scale
             for i in range(n):
                 S.kept[i] = S.x[i] if part == 1.0 else x[i] + part * (S.x[i] - x[i])
             if part == 1.0 or not at > 0.0:
                 break
             continue
         searches += 1
+        if at == 1.0:  # the end once more
+            if done:
+                blocker, ended, scale = label_joints(S, stop, at_bound, blocking), WHOLE, its_scale
+                for i in range(n):
+                    S.kept[i] = S.x[i]
+            break
         if not done or stop >= 0:
             break
         ended, scale = PART, its_scale
         for i in range(n):
             S.kept[i], at_bound[i] = S.x[i], S.at_bound[i]
         best = best_scale(W, S, level, x, damping, first, count)
+        if best >= whole * (1.0 - PATH_STEP) and high == whole:
+            at = 1.0
+            continue
         if abs(best - at) <= PATH_STEP * at:
             break
         if best > at:
@@ -227,8 +238,8 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, at_b
     """Move x as the level asks.
 
     Returns:
-        The coordinates that it takes, its scale, the blocker, changes of the active set, and 1 where the search has
-        ended, ``PART`` where that is before the end of its motion, for its cost.
+        The coordinates that it takes, its scale, the blocker, changes of the active set, and how it ended
+        (``STRAIGHT``, ``PART``, ``WHOLE``; 0 where the search has not).
     """
     n = len(x)
     load(W, level)
@@ -237,7 +248,7 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, at_b
     damping = damping_of(W, S, level, x, first, longest)
     look(W, level, x)
     rank = find_motion(W, level, first, damping, rank_tolerance, plain)
-    scale, blocker, changes, ended = move(W, S, level, x, target, damping, first + rank, most, at_bound, blocking)
+    scale, blocker, changes, ended = go_along(W, S, level, x, target, damping, first + rank, most, at_bound, blocking)
     if ended == 0:
         fill(at_bound, 0)
         fill(blocking, 0)

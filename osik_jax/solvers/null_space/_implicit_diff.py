@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._backends import Backend
 from ...execution._rules import custom_jvp
+from ...numerics._constants import PART, STRAIGHT
 from ...numerics._dense import apply, product
 from .._damping import narrow_box
 from ._padding import Problem, initial_point
@@ -32,7 +33,7 @@ class ActiveJoints(NamedTuple):
     active: Int[Array, " n"]  # -1 saturated at the lower bound, 1 at the upper, 0 free
     blocking: Int[Array, " n"]  # the joints that limit the level's scale, likewise
     blocker: Int[Array, ""]  # the one of them that the others determine
-    is_part: Bool[Array, ""]  # whether the level ends before them, where its damped cost is least
+    ending: Int[Array, ""]  # STRAIGHT, PART or WHOLE
 
 
 class SaturatedResult(NamedTuple):
@@ -87,7 +88,7 @@ def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend
         best = partial(best_scale, way, level, total, problem.rank_tol, joints.active)
         x, projector, scale = _level(joints, way, best)
         length = damped_step_length(level, start, x, total, problem.rank_tol)
-        length = jnp.where(joints.is_part, 1.0, length)
+        length = jnp.where(joints.ending == STRAIGHT, length, 1.0)
         x, scale = start + length * (x - start), length * scale
         return (x, projector, *narrow_box(damping, level, curvature, x, lower, upper)), scale
 
@@ -105,7 +106,7 @@ def _level(
     # one factorisation after another: see docs/installation.md
     scale, active = jax.lax.optimization_barrier((scale, joints.active))
     dual = dual_basis(problem.projector, active)
-    scale = jnp.where(joints.is_part, best(dual), scale)
+    scale = jnp.where(joints.ending == PART, best(dual), scale)
     x = jnp.where(active != 0, problem.bound(active), at_bounds(problem, scale, active, dual))
     return jnp.where(joints.done, x, problem.start), projector, jnp.where(joints.done, scale, 0.0)
 

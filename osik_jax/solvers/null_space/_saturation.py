@@ -41,7 +41,7 @@ from ...execution._lanes import in_lanes, with_a_few
 from ...execution._rules import found as kept
 from ...kernels.numba import _target
 from ...kernels.numba._sizes import row_space_numbers, saturation_numbers
-from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE, PART
+from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
@@ -152,8 +152,8 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> Sa
         motion, damping = jax.vmap(partial(_level_problem, backend))(problem, state, *each)
         result = solve_scaled_motion(motion, max_iterations)
         # bounds may make the damped motion too dear: a part of it is then the optimum
-        result, is_part, length = least_cost(motion, result, each[0], damping, problem.rank_tol, max_iterations)
-        after, joints = jax.vmap(partial(_after_level, backend))(state, motion, result, is_part, length, *each[:2])
+        result, ending, length = least_cost(motion, result, each[0], damping, problem.rank_tol, max_iterations)
+        after, joints = jax.vmap(partial(_after_level, backend))(state, motion, result, ending, length, *each[:2])
         return after, (jnp.where(result.done, length * result.scale, 0.0), joints)
 
     start = _State(x, problem.lower, problem.upper, jnp.zeros_like(x), projector, fixed, fixed, zeros, zeros == 0)
@@ -179,7 +179,7 @@ def _by_numba(problem: Problem, max_iterations: int) -> SaturatedResult:
         *(*problem.levels, *problem.damping, problem.targets, problem.lower, problem.upper, problem.rank_tol),
         np.array([max_iterations], np.int32),
     )
-    joints = ActiveJoints(done != 0, at_bound, blocking, blocker, done == PART)
+    joints = ActiveJoints(done != 0, at_bound, blocking, blocker, done)
     return SaturatedResult(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)
 
 
@@ -198,7 +198,7 @@ def _after_level(
     state: _State,
     motion: ScaledMotion,
     result: SaturationResult,
-    is_part: Array,
+    ending: Array,
     length: Array,
     level: PaddedLevel,
     damping: Damping,
@@ -229,4 +229,4 @@ def _after_level(
         iterations=state.iterations + result.iterations,
         done=state.done & result.done,
     )
-    return after, ActiveJoints(result.done, active, blocking, result.blocker, result.done & is_part)
+    return after, ActiveJoints(result.done, active, blocking, result.blocker, ending)

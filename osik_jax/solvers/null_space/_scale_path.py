@@ -21,11 +21,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ...execution._lanes import choose
 from ...execution._rules import custom_jvp
-from ...numerics._constants import DERIVATIVE_RANK, PATH_SEARCHES, PATH_STEP
+from ...numerics._constants import DERIVATIVE_RANK, PART, PATH_SEARCHES, PATH_STEP, STRAIGHT, WHOLE
 from ...numerics._dense import apply, product
 from ._padding import PaddedLevel
 from ._problem import ActiveTask
@@ -40,10 +40,10 @@ def least_cost(
     damping: Float[Array, " B"],
     rank_tol: Float[Array, " B"],
     max_iterations: int,
-) -> tuple[SaturationResult, Bool[Array, " B"], Float[Array, " B"]]:
-    """Return where damped levels end, whether it is before the end of their path, and the part of a chord.
+) -> tuple[SaturationResult, Int[Array, " B"], Float[Array, " B"]]:
+    """Return where damped levels end, how (``STRAIGHT``, ``PART``, ``WHOLE``), and which part of the way there they go.
 
-    Where the searches on the way fail, it is a part of the straight way to the end of the path; else that part is 1.
+    Where the searches fail, that is a part of the straight way to the end of the path; else it is 1.
 
     Args:
         problem: the motions; every array has a leading axis of problems, as have the following.
@@ -54,31 +54,32 @@ def least_cost(
         max_iterations: limit on the changes of the active set (static).
     """
     chord = jax.vmap(damped_step_length)(level, problem.start, end.x, damping, rank_tol)
-    wanted = end.done & (chord < 1.0)
-    first = end.scale * chord
+    wanted = end.done & (chord < 1.0) & (chord * end.scale > 0.0)
 
     def is_running(carry: tuple[Any, ...]) -> Array:
         return (carry[0] < PATH_SEARCHES) & jnp.any(carry[1])
 
     def search(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        number, running, scale, low, high, before, found = carry
+        number, running, scale, low, high, before, ending = carry
         result = solve_scaled_motion(problem._replace(motion=scale[:, None] * problem.motion), max_iterations)
-        result = result._replace(scale=scale * result.scale)
+        result = result._replace(scale=scale * result.scale, iterations=before.iterations + result.iterations)
         holds = running & result.done & ~(result.blocking != 0).any(-1)
         best = jax.vmap(best_scale)(problem, level, damping, rank_tol, result.active)
+        is_whole = holds & (best >= end.scale * (1.0 - PATH_STEP)) & (high == end.scale)
+        now = choose(is_whole, end._replace(iterations=result.iterations), choose(holds, result, before))
+        ending = jnp.where(is_whole, WHOLE, jnp.where(holds, PART, ending))
+        running = holds & ~is_whole & (jnp.abs(best - scale) > PATH_STEP * scale)
         low, high = jnp.where(best > scale, scale, low), jnp.where(best > scale, high, scale)
-        now = choose(holds, result._replace(iterations=before.iterations + result.iterations), before)
-        is_there = jnp.abs(best - scale) <= PATH_STEP * scale
         inside = (best > low) & (best < high)
-        scale = jnp.where(inside, best, 0.5 * (low + high))
-        return number + 1, holds & ~is_there, scale, low, high, now, found | holds
+        return number + 1, running, jnp.where(inside, best, 0.5 * (low + high)), low, high, now, ending
 
-    nothing, zeros = jnp.zeros(len(wanted), bool), jnp.zeros_like(first)
-    start: tuple[Any, ...] = (jnp.zeros((), jnp.int32), wanted & (first > 0.0), first, zeros, end.scale, end, nothing)
-    *_, result, found = jax.lax.while_loop(is_running, search, start)
+    first, straight = jnp.where(wanted, end.scale * chord, 0.0), jnp.full(len(wanted), STRAIGHT)
+    nothing = jnp.zeros_like(first)
+    start: tuple[Any, ...] = (jnp.zeros((), jnp.int32), wanted, first, nothing, end.scale, end, straight)
+    *_, result, ending = jax.lax.while_loop(is_running, search, start)
     # joints that stop the whole motion can move no more, as if all of it were done
     result = result._replace(blocking=end.blocking, blocker=end.blocker)
-    return result, found, jnp.where(wanted & ~found, chord, 1.0)
+    return result, ending, jnp.where(ending == STRAIGHT, chord, 1.0)
 
 
 def best_scale(

@@ -35,7 +35,7 @@ _OUTPUTS = (
     dict(solution="double", projectors="double", scales="double", dones="int", joints_at_bounds="int")
     | dict(joints_blocking="int", blockers="int", active_joints="int", report="int")
 )  # fmt: skip
-_WHOLE = ("DAMPING_ITERATIONS", "PART", "PATH_SEARCHES")
+_WHOLE = ("DAMPING_ITERATIONS", "PART", "PATH_SEARCHES", "STRAIGHT", "WHOLE")
 _NUMBERS = (
     *("BLOCKING_RANK", "BOUND_DISTANCE", "COST_FRACTION", "DAMPING_RIDGE", "FULL_STEP", "LARGEST_RATE"),
     *("LOOSE_SATURATION_RANK", "MIN_RADIUS", "NEGLIGIBLE_CURVATURE", "NEGLIGIBLE_DAMPING", "NEGLIGIBLE_STEP"),
@@ -94,7 +94,7 @@ def solve(problem: Problem, max_iterations: int) -> SaturatedResult:
     )
     projector = projector.reshape(batch, n, n)
     at_bound, blocking = (a.reshape(batch, count, n) for a in (at_bound, blocking))
-    joints = ActiveJoints(dones != 0, at_bound, blocking, blocker, dones == _constants.PART)
+    joints = ActiveJoints(dones != 0, at_bound, blocking, blocker, dones)
     return SaturatedResult(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)
 
 

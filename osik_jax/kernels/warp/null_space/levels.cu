@@ -10,25 +10,29 @@
 // solvers/null_space/_warp.py says. Where its variables are declared: workspace.cu, problem.cu, level.cu, saturated.cu.
 
 // finds the end of the level's motion, or what comes before it where that has the least damped cost, from a part of the
-// straight way to the end on; returns the scale. `ended`: 0 where the search has not, PART where it is before the end
-auto move = [&](int& ended, int& blocker, int& its_changes) {
+// straight way to the end on; returns the scale. `ended`: how (STRAIGHT, PART, WHOLE),
+// 0 where the search has not
+auto go_along = [&](int& ended, int& blocker, int& its_changes) {
   double* const kept = solution.data + problem * N;   // which is written last, and so are the labels
   int* const kept_labels = joints_at_bounds.data + here * N;
-  double at = 1.0, least = SATURATION_RANK, below = 0.0, above = 1.0, its_scale = 0.0;
+  double at = 1.0, least = SATURATION_RANK, below = 0.0, above = 1.0, whole = 1.0, its_scale = 0.0;
   ended = blocker = its_changes = 0;
-  for (int searches = 0; searches < PATH_SEARCHES && its_changes < max_iterations;) {
+  for (int searches = 0; searches <= PATH_SEARCHES && its_changes < max_iterations;) {
     const bool done = attempt(at, least);             // one place in the program for all
     its_changes += changes;
     double part = 1.0;
-    if (ended == 0) {                                 // the whole motion
+    if (ended == 0) {                                 // the end of the path
       if (!done && least == LOOSE_SATURATION_RANK) break;
       if (!done) {
         least = LOOSE_SATURATION_RANK;
         continue;
       }
-      blocker = label_joints(), ended = 1;
+      blocker = label_joints(), ended = STRAIGHT;
       part = damped_part();
-      above = scale, its_scale = part * scale;
+      above = whole = scale, its_scale = part * scale;
+    } else if (at == 1.0) {                           // the end once more
+      if (!done) break;
+      blocker = label_joints(), ended = WHOLE, its_scale = scale;
     } else {
       ++searches;
       if (!done || stop >= 0) break;
@@ -38,12 +42,17 @@ auto move = [&](int& ended, int& blocker, int& its_changes) {
       kept[i] = part == 1.0 ? now[i] : x[i] + part * (now[i] - x[i]);
       kept_labels[i] = at_bound[i];
     }
-    if (ended == 1) {
+    if (ended == WHOLE) break;
+    if (ended == STRAIGHT) {
       at = its_scale;
       if (part == 1.0 || !(at > 0.0)) break;
       continue;
     }
     const double best = best_scale();
+    if (best >= whole * (1.0 - PATH_STEP) && above == whole) {
+      at = 1.0;
+      continue;
+    }
     if (fabs(best - at) <= PATH_STEP * at) break;
     if (best > at) below = at;
     else above = at;
@@ -65,7 +74,7 @@ auto solve_level = [&](int& ended, int& blocker, int& its_changes) {
   look(x);
   find_motion();
   first += rank;
-  const double its_scale = move(ended, blocker, its_changes);
+  const double its_scale = go_along(ended, blocker, its_changes);
   narrow_box();
   if (ended != 0) take_off_stops();
   return its_scale;
