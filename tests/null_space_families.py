@@ -99,6 +99,15 @@ def saturated(p: Problems, *, backend: Backend = "auto") -> NullSpaceSolution:
     return jax.vmap(one)(p)
 
 
+def check_active(found: NullSpaceSolution, expected: NullSpaceSolution) -> None:
+    """They are the same; where joints on their bounds keep a level from beginning, any of them may be said to."""
+    differs = np.asarray(found.active != expected.active)
+    assert (expected.scales == 0.0).any(1)[differs.any(1)].all()
+    for mine, other in ((found, expected), (expected, found)):
+        on = differs & np.asarray(mine.active != 0)
+        np.testing.assert_allclose(np.asarray(other.x)[on], 0.4 * np.asarray(mine.active)[on], rtol=1e-12)
+
+
 def check_derivatives_of_saturation(rng: np.random.Generator, backend: Backend) -> None:
     """They are those of plain JAX, in both modes: of the answer along a motion of all numbers."""
     p = FAMILIES["damped inequalities"]
