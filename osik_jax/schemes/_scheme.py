@@ -14,17 +14,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .._errors import OsikValueError
 from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
-from ..numerics._constants import CONSTRAINT_TOL, STANDING_SPEED
+from ..numerics._constants import BELOW_OTHERS, CONSTRAINT_TOL, STANDING_SPEED
 from ..numerics._dense import apply, short_sum
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
 from ..tasks._curvature import length, row_sums, share_to_damp
-
-_BELOW_OTHERS = 2.0
-"""Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it
-cannot meet."""
 
 
 class VelocityProblem(eqx.Module):
@@ -129,7 +125,7 @@ class VelocityProblem(eqx.Module):
             found.append(Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping())
         for names in self.by_priority():
             residuals = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
-            factor = (_BELOW_OTHERS if below_others and found else 1.0) * curvature
+            factor = (BELOW_OTHERS if below_others and found else 1.0) * curvature
             found.append(
                 Damping(
                     constant,

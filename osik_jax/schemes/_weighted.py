@@ -13,14 +13,11 @@ from jaxtyping import Array, Float, Int
 from .._errors import OsikValueError
 from ..execution._backends import check_backend, takes
 from ..numerics._arguments import concrete
-from ..numerics._constants import SINGLE_DAMPING
+from ..numerics._constants import CALM_RATIO, SINGLE_DAMPING
 from ..numerics._dense import short_sum
 from ..solvers import Backend, Level, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iterations
-
-_CALM_RATIO = 30.0
-"""Little of the curvature damping is added where it is below this many times a dof's other diagonal terms."""
 
 
 class WeightedQP(Scheme):
@@ -116,7 +113,7 @@ def _diagonal_terms(
         usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of 0 is NaN
         weight, wanted = (jnp.append(a, 0.0)[row_of_dof] for a in (usable, usable * rows.lower))
         diagonal, weighted = diagonal + weight, weighted + wanted
-    total = bound + _CALM_RATIO * diagonal
+    total = bound + CALM_RATIO * diagonal
     diagonal = diagonal + added * (bound / jnp.where(total > 0.0, total, 1.0))  # b^2 of a far target overflows
     least = _least_damping(problem, backend)
     diagonal = jnp.where(diagonal < least, least, diagonal)

@@ -30,19 +30,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..execution._backends import cuda_is_default
+from ..numerics._constants import FARTHEST_ERROR, LEVER_ROUNDOFF, NEAR_ERROR, UNHELD_PART
 from ..numerics._dense import short_sum
 from ._gain import safe_norm
 from ._rotation import dot
-
-_MOVES = 1e-6
-"""Of the longest lever, one that is shorter may be rounding of none."""
-_UNHELD = 0.04
-"""Share of the bound for what bends where the frame does not move across its pull."""
-_NEAR = 0.06
-"""Of the lever arm: an error below which the whole bound is damped, so that a stretched arm leaves its boundary and
-comes back to it calmly."""
-_FARTHEST = 1e6
-"""Of that error; farther makes no difference."""
 
 
 def pose_curvature(
@@ -117,11 +108,11 @@ def share_to_damp(
         distance: the errors, in lever arms: times their weighted pulls, over the curvatures. (k,)
         stiffness: squared Frobenius norm of the Jacobian, its weights' roots multiplied in, g. (k,)
     """
-    ratio = jnp.clip(distance / _NEAR, 0.0, _FARTHEST)
+    ratio = jnp.clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR)
     far = ratio**2 / (1.0 + ratio**2)
     total = 0.5 * bound + stiffness
     held = stiffness / jnp.where(total > 0.0, total, 1.0)
-    return 1.0 - (1.0 - _UNHELD) * far * held
+    return 1.0 - (1.0 - UNHELD_PART) * far * held
 
 
 def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:
@@ -142,7 +133,7 @@ def row_sums(levers: Float[Array, " nv"]) -> Float[Array, " nv"]:
     The entry of dofs i and j is at most the lever of the one that is farther from the root, and dofs stand in the order
     of the tree. So a motion d costs at most ``1/2 sum_j row_sums_j d_j^2`` at second order.
     """
-    moves = levers > _MOVES * jnp.max(levers, initial=0.0)
+    moves = levers > LEVER_ROUNDOFF * jnp.max(levers, initial=0.0)
     counted = jnp.where(moves, levers, 0.0)
     before = jnp.cumsum(moves) - moves
     return jnp.where(moves, jnp.cumsum(counted[::-1])[::-1], 0.0) + counted * before

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from ..numerics._constants import POINTING_SINE_SQUARED
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._framed import FramedTask
@@ -21,7 +22,6 @@ from ._leaves import as_scalar, as_vector, concrete
 from ._rotation import dot
 from ._task import TaskRows, check_priority, task_rows
 
-_SMALL_SINE_SQUARED = 1e-3
 _BEHIND = -0.5
 """Cosine below which a direction counts as behind: there the formulas divide by it, in front by one plus it."""
 _LEAST_SINE = 0.1
@@ -162,7 +162,7 @@ def _in_front(
     ``D = -(k I + g y y') (B' - y a' / (1 + cos t))``.
     """
     squared = jnp.sum(beside**2)
-    small = (squared < _SMALL_SINE_SQUARED) & (cosine > 0.0)
+    small = (squared < POINTING_SINE_SQUARED) & (cosine > 0.0)
     safe = jnp.where(small, 1.0, squared)
     sine = jnp.sqrt(safe)
     series = 1 / 6 + squared * (3 / 40 + squared * (5 / 112 + squared * (35 / 1152 + squared * 63 / 2816)))

@@ -8,9 +8,7 @@ from jaxtyping import Array, Float
 
 from ..execution._backends import cuda_is_default
 from ..kinematics._rigid import compose, rotate
-
-_SMALL_SINE_SQUARED = 1e-6
-_SMALL_ANGLE_SQUARED = 1e-2
+from ..numerics._constants import SMALL_ANGLE_SQUARED, SMALL_SINE_SQUARED
 
 
 def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -24,7 +22,7 @@ def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     wxyz = jnp.where(wxyz[0] < 0.0, -wxyz, wxyz)
     cosine, vector = wxyz[0], wxyz[1:]
     sine_squared = jnp.sum(vector**2)
-    small = sine_squared < _SMALL_SINE_SQUARED
+    small = sine_squared < SMALL_SINE_SQUARED
     sine = jnp.sqrt(jnp.where(small, 1.0, sine_squared))
     safe_cosine = jnp.where(small, cosine, 1.0)
     tangent_squared = sine_squared / safe_cosine**2
@@ -40,7 +38,7 @@ def inverse_left_jacobian(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     ``c = (1 - (angle/2) cot(angle/2)) / angle^2``, which is 1/12 at 0 and 1/pi^2 at pi.
     """
     squared = jnp.sum(vector**2)
-    small = squared < _SMALL_ANGLE_SQUARED
+    small = squared < SMALL_ANGLE_SQUARED
     safe = jnp.where(small, 1.0, squared)
     half = 0.5 * jnp.sqrt(safe)
     exact = (1.0 - half * jnp.cos(half) / jnp.sin(half)) / safe
