@@ -269,7 +269,7 @@ CONSTRAINT_TOL = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 """Relative to what its numbers amount to: a hard row that is missed by less holds."""
 STANDING_SPEED = 1e-4
 """Speed [rad/s or m/s] that counts at least: of a robot at rest, roundoff is all that there is."""
-CALM_RATIO = 30.0
+DIAGONAL_RATIO = 30.0
 """Little of the curvature damping is added where it is below this many times a dof's other diagonal terms."""
 BELOW_OTHERS = 2.0
 """Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it

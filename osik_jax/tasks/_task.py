@@ -182,16 +182,16 @@ def task_rows(
     shift = jnp.zeros_like(error) if feedforward is None else feedforward
     linear = dofs is not None or curvature is no_curvature
     arms = jnp.zeros_like(jacobian[0]) if linear else levers(weight, jacobian)
-    bend = curvature or (no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian))
+    curvature_of = curvature or (no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian))
     if lower is None or upper is None:
         pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
         wanted = shift - pull
-        return TaskRows(error, jacobian, wanted, wanted, weight, bend(weight * pull), pull, arms, dofs)
+        return TaskRows(error, jacobian, wanted, wanted, weight, curvature_of(weight * pull), pull, arms, dofs)
     outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
     rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
     low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
     pull = rate * outside
-    return TaskRows(error, jacobian, low, high, weight, bend(weight * pull), pull, arms, dofs)
+    return TaskRows(error, jacobian, low, high, weight, curvature_of(weight * pull), pull, arms, dofs)
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
