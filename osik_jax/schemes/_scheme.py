@@ -142,7 +142,7 @@ class VelocityProblem(eqx.Module):
         return found
 
     def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
-        """Return what a motion of each dof costs these tasks at second order, for a residual of length 1 (``row_sums``).
+        """Return what a motion of each dof costs these tasks at second order, for a unit residual (``row_sums``).
 
         It is 0 for the dofs of ball and free joints: a box for the components of a turn would depend on where the
         world's axes point. Where a robot stands, its legs keep its base from turning.
