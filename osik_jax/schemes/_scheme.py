@@ -254,5 +254,5 @@ def as_max_iterations(value: Any) -> int | None:
 
 
 def as_leaf(name: str) -> Callable[[ArrayLike | Array], Float[Array, ""]]:
-    """Converter of a scheme's number to a traced leaf; negative or not finite raises ValueError with its name."""
+    """Return a converter of a scheme's number to a traced leaf, which names it where it is negative or not finite."""
     return lambda value: as_scalar(value, name)
