@@ -106,7 +106,7 @@ class ComTask(Task):
             mass = body_masses(robot, self.subtree)
             alike = eqx.tree_at(lambda robot: robot.body_mass, robot, mass), replace(kinematics, backend="jax")
             error, rows, wanted, weight, bound, pull, arms = _by_kernel(self, *alike)
-            return TaskRows(error, rows, wanted, wanted, weight, bound, pull, arms)
+            return TaskRows(error, rows, wanted, wanted, weight, bound, pull, arms, is_equality=True)
         return self._plain_rows(robot, kinematics)
 
     def _plain_rows(self, robot: Robot, kinematics: Kinematics) -> TaskRows:

@@ -45,7 +45,7 @@ class KineticEnergyTask(Task):
         del q
         root = _root(mass_matrix(robot, kinematics))
         zero = jnp.zeros(robot.nv, root.dtype)
-        return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape))
+        return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape), is_equality=True)
 
     @property
     def replaceable(self) -> tuple[str, ...]:
