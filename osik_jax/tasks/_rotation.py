@@ -58,8 +58,8 @@ def cross_matrix(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def dot(a: Array, b: Array) -> Array:
     """The matrix product, in full precision on every device.
 
-    Sums of three are written out where JAX's default is a GPU, whose library takes nine times as long for a batch of
-    them. On a CPU they make a gradient a sixth slower.
+    Sums of three are written out where JAX's default is a GPU, whose library is slow with batches of them. On a CPU
+    gradients would be slower for it.
     """
     if cuda_is_default() and a.ndim == 2 and a.shape[1] == 3:
         return compose(a, b) if b.ndim == 2 else rotate(a, b)
