@@ -74,3 +74,23 @@ def later():
 def test_a_circle_is_seen() -> None:
     with pytest.raises(CycleError):
         list(TopologicalSorter({"robot": {"kinematics"}, "kinematics": {"robot"}}).static_order())
+
+
+def modules(folder: Path) -> dict[Path, set[Path]]:
+    """Of each module of a folder, those of the folder that it imports from, for types too."""
+    edges: dict[Path, set[Path]] = {}
+    for path in folder.rglob("*.py"):
+        edges[path] = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+                for place in [base] if node.module else [base / alias.name for alias in node.names]:
+                    edges[path] |= {file for file in (place.with_suffix(".py"), place / "__init__.py") if file.exists()}
+    return {path: {file for file in edges[path] if file in edges} for path in edges}
+
+
+def test_no_two_modules_of_the_robot_know_each_other() -> None:
+    edges = modules(PACKAGE / "robot")
+    robot = PACKAGE / "robot"
+    assert {robot / "_model.py", robot / "loading" / "__init__.py"} <= edges[robot / "_robot.py"]
+    list(TopologicalSorter(edges).static_order())

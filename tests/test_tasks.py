@@ -255,6 +255,41 @@ def test_an_own_task(arm):
         task.replace(body="link1")
 
 
+class Height(osik.Task):
+    """The same rows, made in the ways that ``form`` names."""
+
+    form: str = eqx.field(static=True, default="one array")
+
+    def rows(self, robot, kinematics, q):
+        rows = osik.FrameTask(robot, "hand", target=([0, 0, 1.0], np.eye(3)), rows="position").rows(
+            robot, kinematics, q
+        )
+        upper = rows.lower if self.form in ("one array", "said to be an interval") else rows.lower + 0.0
+        said = {"said to be an equality": True, "said to be an interval": False}.get(self.form)
+        return osik.TaskRows(rows.error, rows.jacobian, rows.lower, upper, rows.weight, is_equality=said)
+
+
+FORMS = {"one array": True, "two arrays": False, "said to be an equality": True, "said to be an interval": False}
+
+
+@pytest.mark.parametrize(
+    "scheme", [osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace()], ids=lambda s: type(s).__name__
+)
+def test_rows_are_equalities_where_they_say_so_or_have_one_array_as_both_bounds(arm, scheme):
+    limits = (osik.VelocityLimit(arm, velocity=np.ones(7)),)
+    velocities = []
+    for form, is_equality in FORMS.items():
+        task = Height(form=form)
+        rows = rows_of_each(arm, {"hand": task}, arm.q0)["hand"]
+        assert rows.is_equality == jax.jit(lambda a: a)(rows).is_equality == is_equality, form
+        answer = osik.solve(arm, arm.q0, {"hand": task}, scheme=scheme, limits=limits)
+        assert answer.status == osik.Status.SOLVED, form
+        velocities.append(answer.velocity)
+    assert np.max(np.abs(velocities[0])) > 0.5
+    for velocity in velocities[1:]:
+        np.testing.assert_allclose(velocity, velocities[0], atol=1e-8)
+
+
 class TestMistakes:
     def test_unknown_names(self, nao):
         with pytest.raises(KeyError, match="did you mean 'l_sole'"):

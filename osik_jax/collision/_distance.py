@@ -18,9 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..kinematics._rigid import cross
-
-_PARALLEL = 1e-6
-"""Squared sine of the angle under which segments count as parallel."""
+from ..numerics._constants import PARALLEL
 
 _MOST_ITERATIONS = 48
 _SEGMENTS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)], np.int32)  # in either precision
@@ -166,7 +164,7 @@ def _segment_parameters(
 def _parameters(aa: Array, bb: Array, ab: Array, ao: Array, bo: Array) -> tuple[Array, Array]:
     """The same of any number of pairs, from the products of the two and of each with the offset."""
     square = aa * bb - ab * ab
-    parallel = square <= _PARALLEL * aa * bb
+    parallel = square <= PARALLEL * aa * bb
     crossing = jnp.clip(_over(ab * bo - ao * bb, jnp.where(parallel, 0.0, square)), 0.0, 1.0)
     ends = jnp.clip(_over(-ao, aa), 0.0, 1.0), jnp.clip(_over(ab - ao, aa), 0.0, 1.0)
     s = jnp.where(parallel, 0.5 * (ends[0] + ends[1]), crossing)
@@ -188,7 +186,7 @@ def _axes(a: Core, b: Core) -> Float[Array, "k 3"]:
     """Directions, or their opposites, along which convex polytopes that do not overlap are apart; some may be 0."""
     crossed = cross(a.edges[:, None], b.edges[None]).reshape(-1, 3)
     lengths = jax.vmap(_length)(a.edges)[:, None] * jax.vmap(_length)(b.edges)
-    tiny = jax.vmap(_length)(crossed) <= _PARALLEL * lengths.reshape(-1)
+    tiny = jax.vmap(_length)(crossed) <= PARALLEL * lengths.reshape(-1)
     unit = jax.vmap(_unit)(crossed, jnp.zeros_like(crossed))
     return jnp.concatenate([a.normals, b.normals, jnp.where(tiny[:, None], 0.0, unit)])
 

@@ -31,8 +31,8 @@ def configure_cpu(
 
     Call it once, in a program and not in a library. What you have set already stays: ``PJRT_NPROC``, these flags
     in ``XLA_FLAGS``, ``OPENBLAS_NUM_THREADS``, ``JAX_CPU_ENABLE_ASYNC_DISPATCH``. Calling it again with the same
-    arguments does nothing. Without it every answer is the same; one robot's control step takes about twice as long, and
-    two batches of factorisations at once in one program can wait for each other for ever where there are few cores.
+    arguments does nothing. Without it every answer is the same; one robot's control step takes longer, and two
+    batches of factorisations at once in one program can wait for each other for ever where there are few cores.
 
     Args:
         workers: threads in XLA's pool, at least (``PJRT_NPROC``); never fewer than there are cores. More than batched
@@ -43,9 +43,9 @@ def configure_cpu(
             not know ends the process.
         asynchronous: whether a program of one CPU device is handed to another thread instead of being run in the one
             that calls it (``jax_cpu_enable_async_dispatch``).
-        older_fusions: whether XLA fuses operations as it did before its fusion emitters: programs compile in three
-            fifths of the time and run as fast, with a jaxlib before 0.11, which has both ways. Try your program with
-            it: together with XLA's optimiser switched off, loops in loops were seen to go on for ever.
+        older_fusions: whether XLA fuses operations as it did before its fusion emitters: programs compile
+            sooner and run as fast, with a jaxlib before 0.11, which has both ways. Try your program with it: together
+            with XLA's optimiser switched off, loops in loops were seen to go on for ever.
 
     Raises:
         ValueError: ``workers`` or ``lapack_threads`` is no integer from 1 up; ``older_fusions`` with a jaxlib that has

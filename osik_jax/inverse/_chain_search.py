@@ -18,7 +18,7 @@ from ._pool import Errors
 from ._seeds import unit_points
 
 _DAMPING = 0.03
-"""Of the squared error: with less, steps from afar go too far; with more, they are short (measured on two arms)."""
+"""Of the squared error: with less, steps from afar go too far; with more, they are short."""
 _LEAST_DAMPING = 1e-5
 """Of the squared length that a radian counts as: keeps singular arms from long steps where the error is small."""
 

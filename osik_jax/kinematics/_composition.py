@@ -64,7 +64,7 @@ def _in_a_loop(position: Array, rotation: Array, rounds: Array) -> Poses:
 
 
 def _one_by_one(position: Array, rotation: Array, rounds: Array) -> Poses:
-    """For GPUs, as it always was there: the loop looked slower, 12.0 for 13.6 million steps/s of 16,384 G1s."""
+    """Return what ``_in_a_loop`` does, its rounds written out: on a GPU, each round of a loop is launched anew."""
     poses = position, rotation
     for i in range(len(rounds)):
         poses = _doubled(jax.lax.optimization_barrier(poses), rounds[i])  # or XLA recomputes all rounds before

@@ -103,8 +103,8 @@ def limit_box(
 
 def _a_little_below(upper: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """By a few roundings: XLA may compute a bound twice, in two roundings, and bounds that are one would then cross."""
-    share = _ROUNDINGS * jnp.finfo(upper.dtype).eps
-    return jnp.where(upper > 0.0, upper * (1.0 - share), upper * (1.0 + share))
+    fraction = _ROUNDINGS * jnp.finfo(upper.dtype).eps
+    return jnp.where(upper > 0.0, upper * (1.0 - fraction), upper * (1.0 + fraction))
 
 
 def limit_rows(

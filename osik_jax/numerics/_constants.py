@@ -1,4 +1,4 @@
-"""The one table of tolerances and other numbers that the solvers are tuned by, each with its reason.
+"""The one table of tolerances and other numbers that solvers, schemes and tasks are tuned by, each with its reason.
 
 Where data in single precision take another number, there is one for each precision. Most are relative: to machine
 epsilon, to roundoff (a tolerance times the scale of a constraint, ``constraint_scales``), or to what their line says.
@@ -12,9 +12,11 @@ Not here, because they are no tolerances of a solver:
 - guards against division by 0 (1e-300, 1e-37, ``finfo.tiny``), and limits on iterations in proportion to a problem's
   size: what they are is what the line that has them says, and for the limits the docstring of the public function;
 - what a user may set: defaults of solvers and schemes, such as ``damping``, stand in their signatures;
-- parts of a scheme's model, such as how much curvature damping a level gets (``schemes/_scheme.py``, ``_weighted.py``);
-- robots, tasks, limits and collisions (a sine that is too small for a formula, a unit quaternion), and searches that
-  use the solvers: ``inverse/``, ``retargeting/``.
+- parts of a task's own formula, with a unit and a meaning there: the cone's rounded tip or the cosine that counts as
+  behind (``tasks/_pointing.py``), the least distance of a look-at task, the default weight of a posture;
+- what a robot, a task, a limit or a shape is accepted with when it is made (a unit quaternion, collinear corners), and
+  how far limits stay clear of their bounds (``limits/``);
+- searches that use the solvers: ``inverse/``, ``retargeting/``.
 """
 
 import jax.numpy as jnp
@@ -267,6 +269,40 @@ CONSTRAINT_TOL = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
 """Relative to what its numbers amount to: a hard row that is missed by less holds."""
 STANDING_SPEED = 1e-4
 """Speed [rad/s or m/s] that counts at least: of a robot at rest, roundoff is all that there is."""
+DIAGONAL_RATIO = 30.0
+"""Little of the curvature damping is added where it is below this many times a dof's other diagonal terms."""
+BELOW_OTHERS = 2.0
+"""Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it
+cannot meet."""
 SINGLE_DAMPING = 4.0
 """In units of epsilon times the largest weight times row norm squared: a kernel in single precision gets no weaker
 damping, which would be lost in the Hessian's roundoff."""
+
+# ---- tasks, shared with kernels
+
+SMALL_SINE_SQUARED = 1e-6
+"""Squared sine of half an angle below which a series for the logarithm of a rotation is exact to roundoff."""
+SMALL_ANGLE_SQUARED = 1e-2
+"""Squared angle [rad^2] below which a series for the derivative of that logarithm is exact to roundoff."""
+SMALL_TURN_SQUARED = 1e-6
+"""Squared angle [rad^2] below which a kernel moves along a rotation by a series."""
+PARALLEL = 1e-6
+"""Squared sine of the angle under which segments count as parallel."""
+
+# ---- tasks
+
+POINTING_SINE_SQUARED = 1e-3
+"""Squared sine of the angle from an axis to a direction, below which a series for angle over sine is exact."""
+LEVER_ROUNDOFF = 1e-6
+"""Relative to the longest lever: a shorter one may be roundoff of none."""
+UNHELD_PART = 0.04
+"""Of the bound on a task's curvature: the part for what bends where the frame does not move across its pull."""
+NEAR_ERROR = 0.06
+"""In lever arms: an error below which the whole bound is damped, so that a stretched arm leaves its boundary and comes
+back to it calmly."""
+FARTHEST_ERROR = 1e6
+"""In units of ``NEAR_ERROR``: farther makes no difference."""
+ROW_ROUNDOFF = 10.0
+"""In units of machine epsilon for each dof: a row of a Jacobian of which those before it leave less depends on them."""
+INERTIA_ROUNDOFF = 4.0
+"""In units of machine epsilon for each dof: what a motion without inertia counts as, of the inertia of its dofs."""

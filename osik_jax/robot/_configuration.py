@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,16 +10,14 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Num
 
 from .._errors import OsikValueError
+from ._model import RobotModel
 from ._tree import BALL, FREE, QPOS_WIDTH
-
-if TYPE_CHECKING:
-    from ._robot import Robot
 
 _LEAST_QUATERNION = 1e-8
 """A quaternion that is not longer has no direction, so it counts as zero."""
 
 
-def with_joints(robot: Robot, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
+def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
     """See ``Robot.configuration``."""
     q = jnp.asarray(robot.q0 if base is None else base)
     coefficient = robot.tree.qpos_source[1]
@@ -36,7 +33,7 @@ def with_joints(robot: Robot, joints: Mapping[str, float], base: Num[ArrayLike, 
     return q
 
 
-def check_configuration(robot: Robot, q: Num[ArrayLike, " nq"], name: str) -> None:
+def check_configuration(robot: RobotModel, q: Num[ArrayLike, " nq"], name: str) -> None:
     """See ``Robot.check_configuration``."""
     tree, shape = robot.tree, jnp.shape(q)
     if shape != (tree.nq,):

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from jax.core import Tracer
 
-if TYPE_CHECKING:
-    from ._robot import Robot
+from ._model import RobotModel
 
 _NAMES_SHOWN = 4
 
 
-def described(robot: Robot) -> str:
+def described(robot: RobotModel) -> str:
     """Name, sizes and base; joints; frames; masses; limits. Numbers that are traced or batched are left out."""
     tree = robot.tree
     base = "floating base" if robot.floating_base else "fixed base"
@@ -29,7 +26,7 @@ def described(robot: Robot) -> str:
     return "\n  ".join(lines)
 
 
-def model_name(robot: Robot) -> str:
+def model_name(robot: RobotModel) -> str:
     """What the file calls the robot; empty where it does not."""
     return robot.mj_model.names.split(b"\0")[0].decode(errors="replace")
 
@@ -38,18 +35,18 @@ def _some(names: tuple[str, ...]) -> str:
     return ", ".join(names[:_NAMES_SHOWN]) + (", ..." if len(names) > _NAMES_SHOWN else "")
 
 
-def _not_free(robot: Robot) -> str:
+def _not_free(robot: RobotModel) -> str:
     counts = {"mimic": len(robot.mimic_joints), "locked": len(robot.locked_joints)}
     return "".join(f"; {count} {kind}" for kind, count in counts.items() if count)
 
 
-def _mass(robot: Robot) -> str:
+def _mass(robot: RobotModel) -> str:
     if isinstance(robot.body_mass, Tracer) or np.ndim(robot.body_mass) > 1:
         return "of each robot its own"
     return f"{np.sum(np.asarray(robot.body_mass)[1:]):.4g} kg"
 
 
-def _limited(robot: Robot) -> str:
+def _limited(robot: RobotModel) -> str:
     """Of the dofs of joints, how many have a range and how many a greatest speed."""
     own = (robot.position_lower, robot.position_upper, robot.velocity_limit)
     if any(isinstance(array, Tracer) or np.ndim(array) > 1 for array in own):

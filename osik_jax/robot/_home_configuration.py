@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import mujoco
@@ -13,10 +13,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name
+from ._configuration import check_configuration, with_joints
+from ._model import RobotModel
 from ._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
-
-if TYPE_CHECKING:
-    from ._robot import Robot
 
 Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
 """A keyframe's name or number, a mapping from joint names to values, or a configuration (nq,)."""
@@ -25,7 +24,7 @@ _OUTSIDE = 1e-6
 """A value that is further out of its joint's range is refused [rad or m]; less is the rounding of a file."""
 
 
-def home_configuration(robot: Robot, home: Home) -> Float[Array, " nq"]:
+def home_configuration(robot: RobotModel, home: Home) -> Float[Array, " nq"]:
     """The configuration that is meant, checked and with unit quaternions.
 
     Raises:
@@ -39,7 +38,7 @@ def home_configuration(robot: Robot, home: Home) -> Float[Array, " nq"]:
         q = _with_joints(robot, home)
     else:
         q = _as_array(home, robot.q0.dtype)
-    robot.check_configuration(q, "home")
+    check_configuration(robot, q, "home")
     q = _with_unit_quaternions(robot, jnp.asarray(q, robot.q0.dtype))
     return q if isinstance(q, Tracer) else _inside(robot, np.asarray(q))
 
@@ -58,7 +57,7 @@ def _as_array(home: Any, dtype: Any) -> Array:
         ) from None
 
 
-def _keyframe(robot: Robot, home: Any) -> np.ndarray:
+def _keyframe(robot: RobotModel, home: Any) -> np.ndarray:
     """The independent entries of a keyframe of the MuJoCo model."""
     model = robot.mj_model
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or str(k) for k in range(model.nkey)]
@@ -75,7 +74,7 @@ def _keyframe(robot: Robot, home: Any) -> np.ndarray:
     return q
 
 
-def _with_joints(robot: Robot, values: Mapping[str, Any]) -> Array:
+def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Array:
     """``q0`` with the named joints set: a number each, or all entries of a free (7) or ball joint (4)."""
     single: dict[str, Any] = {}
     several: dict[str, Any] = {}
@@ -83,7 +82,7 @@ def _with_joints(robot: Robot, values: Mapping[str, Any]) -> Array:
         turning = robot.tree.joint_types[robot.tree.joint(name)] in (FREE, BALL)
         (several if turning else single)[name] = value
     numbers: Any = {name: _as_array(value, robot.q0.dtype) for name, value in single.items()}
-    q = robot.configuration(numbers)
+    q = with_joints(robot, numbers, None)
     for name, value in several.items():
         start, width = robot.joint_qpos_index(name), QPOS_WIDTH[robot.tree.joint_types[robot.tree.joint(name)]]
         entries = _as_array(value, q.dtype)
@@ -94,7 +93,7 @@ def _with_joints(robot: Robot, values: Mapping[str, Any]) -> Array:
     return q
 
 
-def _with_unit_quaternions(robot: Robot, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
+def _with_unit_quaternions(robot: RobotModel, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
     for joint, start in robot.tree.qpos_address.items():
         kind = robot.tree.joint_types[joint]
         if kind in (FREE, BALL):
@@ -103,7 +102,7 @@ def _with_unit_quaternions(robot: Robot, q: Float[Array, " nq"]) -> Float[Array,
     return q
 
 
-def _inside(robot: Robot, q: np.ndarray) -> Float[Array, " nq"]:
+def _inside(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
     """The configuration with roundings beyond a range taken off; ValueError where a joint is further out."""
     if isinstance(robot.position_lower, Tracer):
         return jnp.asarray(q)

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError, unknown_name
+from ._model import RobotModel
 from ._tree import KinematicTree
-
-if TYPE_CHECKING:
-    from ._robot import Robot
 
 Factors = Mapping[str, Float[Array, ""] | float] | Float[Array, ""] | float
 
 
-def scaled_leaves(robot: Robot, length: Factors, mass: Factors) -> dict[str, Array]:
+def scaled_leaves(robot: RobotModel, length: Factors, mass: Factors) -> dict[str, Array]:
     """The leaves of a robot that other lengths and masses change, by field."""
     tree, dtype = robot.tree, robot.body_position.dtype
     longer, heavier = _factors(tree, length, "length", dtype), _factors(tree, mass, "mass", dtype)

@@ -61,4 +61,4 @@ def load_robot(
         position_limits=position_limits,
         locked_joints=locked_joints,
     )
-    return Robot._at_home(load(name, options), home)
+    return Robot._of(load(name, options), home)

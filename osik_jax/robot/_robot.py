@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, ArrayLike, DTypeLike, Float, Num
+from jaxtyping import Array, ArrayLike, DTypeLike, Num
 
 from ..numerics._arguments import float_dtype
 from . import loading
@@ -19,11 +19,11 @@ from ._configuration import check_configuration, with_joints
 from ._describe import described
 from ._home_configuration import Home, home_configuration
 from ._links import Factors, scaled_leaves
-from ._tree import FREE, KinematicTree, ModelHolder
+from ._model import RobotModel
 from .loading import LoadOptions, LockedJoints, PositionLimits
 
 
-class Robot(eqx.Module):
+class Robot(RobotModel):
     """A robot's geometry, masses and limits.
 
     Configurations ``q`` (nq,) are in MuJoCo's qpos layout (a free joint is a position in the world and a unit
@@ -56,28 +56,6 @@ class Robot(eqx.Module):
         velocity_limit: greatest joint speeds [rad/s or m/s], inf where free. (nv,)
         q0: the robot's home configuration. (nq,)
     """
-
-    tree: KinematicTree = eqx.field(static=True)
-    body_position: Float[Array, "nbody 3"]
-    body_quaternion: Float[Array, "nbody 4"]
-    body_mass: Float[Array, " nbody"]
-    body_com: Float[Array, "nbody 3"]
-    body_inertia: Float[Array, "nbody 3 3"]
-    joint_position: Float[Array, "njoint 3"]
-    joint_axis: Float[Array, "njoint 3"]
-    dof_armature: Float[Array, " nvfull"]
-    joint_reference: Float[Array, " nqfull"]
-    frame_position: Float[Array, "nframe 3"]
-    frame_rotation: Float[Array, "nframe 3 3"]
-    geom_position: Float[Array, "ngeom 3"]
-    geom_rotation: Float[Array, "ngeom 3 3"]
-    geom_size: Float[Array, "ngeom 3"]
-    qpos_offset: Float[Array, " nqfull"]
-    position_lower: Float[Array, " nv"]
-    position_upper: Float[Array, " nv"]
-    velocity_limit: Float[Array, " nv"]
-    q0: Float[Array, " nq"]
-    holder: ModelHolder = eqx.field(static=True, repr=False)
 
     @classmethod
     def from_urdf(
@@ -138,7 +116,7 @@ class Robot(eqx.Module):
             collision_meshes=collision_meshes,
             package_dirs=package_dirs,
         )
-        return cls._at_home(loading.from_urdf(urdf, options), home)
+        return cls._of(loading.from_urdf(urdf, options), home)
 
     @classmethod
     def from_mjcf(
@@ -186,7 +164,7 @@ class Robot(eqx.Module):
             position_limits=position_limits,
             locked_joints=locked_joints,
         )
-        return cls._at_home(loading.from_mjcf(mjcf, options), home)
+        return cls._of(loading.from_mjcf(mjcf, options), home)
 
     @classmethod
     def from_mjmodel(
@@ -220,84 +198,17 @@ class Robot(eqx.Module):
         options = LoadOptions(
             velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked_joints
         )
-        return cls._at_home(loading.from_mjmodel(model, options), home)
+        return cls._of(loading.from_mjmodel(model, options), home)
 
     @classmethod
-    def _at_home(cls, fields: Mapping[str, Any], home: Home | None) -> Self:
-        """The robot with these fields, and with another ``q0`` where one is given."""
-        robot = cls(**fields)
+    def _of(cls, model: RobotModel, home: Home | None) -> Self:
+        """The robot with the names and numbers that were read, and with another ``q0`` where one is given."""
+        robot = cls(*(getattr(model, field.name) for field in dataclasses.fields(RobotModel)))
         return robot if home is None else robot.with_home(home)
 
     def __repr__(self) -> str:
         """The robot in five lines."""
         return described(self)
-
-    @property
-    def nq(self) -> int:
-        """Length of q."""
-        return self.tree.nq
-
-    @property
-    def nv(self) -> int:
-        """Length of v."""
-        return self.tree.nv
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Independent joints in the order of v, free joints left out."""
-        return tuple(self.tree.joint_names[j] for j in self.tree.independent if self.tree.joint_types[j] != FREE)
-
-    @property
-    def body_names(self) -> tuple[str, ...]:
-        """Moving bodies, in the order of ``body_mass`` and the other arrays over bodies, whose entry 0 is the world."""
-        return self.tree.body_names[1:]
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Every frame that can be asked for by name: bodies, URDF links (fused or not), sites, geoms."""
-        return self.tree.frame_names
-
-    @property
-    def mimic_joints(self) -> dict[str, tuple[str, float]]:
-        """Followers: name to (leader, multiplier)."""
-        names = self.tree.joint_names
-        return {names[f]: (names[leader], m) for f, leader, m in self.tree.followers}
-
-    @property
-    def locked_joints(self) -> tuple[str, ...]:
-        """Names of the joints frozen at load time."""
-        return tuple(self.tree.joint_names[j] for j in self.tree.locked)
-
-    @property
-    def floating_base(self) -> bool:
-        """Whether the robot has a free joint that is not locked."""
-        return any(self.tree.joint_types[j] == FREE for j in self.tree.independent)
-
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """The MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations."""
-        return self.holder.model
-
-    def joint_qpos_index(self, name: str) -> int:
-        """Where a joint's values start in q; a follower sits where its leader sits.
-
-        Raises:
-            KeyError: no such joint, or it is locked.
-        """
-        return self.tree.qpos_address[self.tree.owner(name)]
-
-    def joint_dof_index(self, name: str) -> int:
-        """Where a joint's velocities start in v; a follower sits where its leader sits.
-
-        Raises:
-            KeyError: no such joint, or it is locked.
-        """
-        return self.tree.dof_address[self.tree.owner(name)]
-
-    def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
-        """The configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
-        index, coefficient = self.tree.qpos_source
-        return jnp.asarray(q)[index] * coefficient + self.qpos_offset
 
     def configuration(self, joints: Mapping[str, float], *, base: Num[ArrayLike, " nq"] | None = None) -> Array:
         """``q0`` (or ``base``) with the named hinge and slide joints set; setting a follower moves its leader. (nq,).

@@ -24,7 +24,7 @@ class HierarchicalQP(Scheme):
 
     Attributes:
         damping: of the velocity at each priority, in the units of weight times J^2; >= 0.
-        curvature_damping: kappa, the share of what each priority's linear model leaves out that is added to its
+        curvature_damping: kappa, the fraction of what each priority's linear model leaves out that is added to its
             damping, twice that below others; 0 for none. What is added vanishes where the tasks are met
             (``TaskRows.curvature``).
         max_iterations: limit on the active-set iterations of one level (static).

@@ -40,13 +40,13 @@ class NullSpace(Scheme):
     Attributes:
         method: "classical", from the first priority down; "reverse"; or "saturated" (static).
         damping: of each priority's motion: s / (s^2 + damping) stands for 1 / s; 0 allowed.
-        curvature_damping: kappa, the share of what each priority's linear model leaves out that is added to its
+        curvature_damping: kappa, the fraction of what each priority's linear model leaves out that is added to its
             damping, twice that below others; 0 for none. What is added vanishes where the tasks are met
             (``TaskRows.curvature``).
         potential_gain: alpha [rad^2/s]; 0 turns the potential off. It needs a ``ConfigurationLimit`` among the limits.
-        margin: joints are taken to be at least this share of their range away from either limit.
-        rank_tolerance: rows that stand out of the span of others by less than this share of the size (Frobenius norm)
-            of their level's weighted rows count as dependent on them.
+        margin: joints are taken to be at least this fraction of their range away from either limit.
+        rank_tolerance: rows that stand out of the span of others by less than this fraction of the size (Frobenius
+            norm) of their level's weighted rows count as dependent on them.
         backend: whose kernels compute, as in ``solve_nullspace`` (static).
     """
 

@@ -14,17 +14,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .._errors import OsikValueError
 from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
-from ..numerics._constants import CONSTRAINT_TOL, STANDING_SPEED
+from ..numerics._constants import BELOW_OTHERS, CONSTRAINT_TOL, STANDING_SPEED
 from ..numerics._dense import apply, short_sum
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
-from ..tasks._curvature import length, row_sums, share_to_damp
-
-_BELOW_OTHERS = 2.0
-"""Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it
-cannot meet."""
+from ..tasks._curvature import fraction_to_damp, length, row_sums
 
 
 class VelocityProblem(eqx.Module):
@@ -59,16 +55,16 @@ class VelocityProblem(eqx.Module):
     scalar: Bool[Array, " nv"] = eqx.field(default=True, converter=jnp.asarray)
 
     def soft(self) -> dict[str, TaskRows]:
-        """Rows of the tasks that are no constraints."""
+        """Return the rows of the tasks that are no constraints."""
         return {name: rows for name, rows in self.rows.items() if name not in self.hard}
 
     def by_priority(self) -> list[list[str]]:
-        """Names of the tasks of each priority, most important first; without those that are constraints."""
+        """Return the names of the tasks of each priority, most important first; without those that are constraints."""
         ranked = [(name, rank) for name, rank in self.priorities if name not in self.hard]
         return [[name for name, own in ranked if own == rank] for rank in sorted({rank for _, rank in ranked})]
 
     def curvature(self, names: Iterable[str]) -> Float[Array, ""]:
-        """Bound on what the linear model of these tasks leaves out, as a damping of the velocity.
+        """Return a bound on what the linear model of these tasks leaves out, as a damping of the velocity.
 
         A step leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
         different chains, so their parts add up like the sides of a right angle.
@@ -76,36 +72,39 @@ class VelocityProblem(eqx.Module):
         return length(self._bounds([self.rows[name] for name in names]))
 
     def curvature_damping(self, names: Iterable[str]) -> Float[Array, ""]:
-        """Damping of the velocity that makes up for what the linear model of these tasks leaves out.
+        """Return the damping of the velocity that makes up for what the linear model of these tasks leaves out.
 
-        It is the part of ``curvature`` that the tasks' own rows do not hold (``share_to_damp``); of inequality tasks,
-        whose rows may be inactive, all of it.
+        It is the part of ``curvature`` that the tasks' own rows do not resist (``fraction_to_damp``); of inequality
+        tasks, whose rows may be inactive, all of it.
         """
         rows = [self.rows[name] for name in names]
         rest = [own for own in rows if not own.is_equality]
         equal = [own for own in rows if own.is_equality and own.dofs is None]  # rows on single dofs bend nothing
         if not equal:
             return length(self._bounds(rest))
-        # of each row, what it adds to its task's distance and stiffness: few operations whatever the number of tasks;
+        # what each row adds to its task's distance and stiffness: few operations whatever the number of tasks;
         # weights and Jacobians are NaN where the step is not valid, and times NaN a derivative of 0 is NaN
-        bent = [jnp.where(own.curvature > 0.0, own.curvature, 1.0) for own in equal]
-        pulls = jnp.concatenate(
-            [jnp.broadcast_to(own.pull / bend, own.error.shape) for own, bend in zip(equal, bent, strict=True)]
+        divisors = [jnp.where(own.curvature > 0.0, own.curvature, 1.0) for own in equal]
+        pull_per_curvature = jnp.concatenate(
+            [
+                jnp.broadcast_to(own.pull / divisor, own.error.shape)
+                for own, divisor in zip(equal, divisors, strict=True)
+            ]
         )
         weight, error, jacobian = (
             jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "error", "jacobian")
         )
         squared = short_sum(jacobian**2)
         weight, squared = (jnp.where(jnp.isnan(a), 0.0, a) for a in (weight, squared))
-        parts = jnp.stack([error * (weight * pulls), weight * squared])
+        parts = jnp.stack([error * (weight * pull_per_curvature), weight * squared])
         of_task = np.repeat(np.eye(len(equal), dtype=bool), [len(own.error) for own in equal], axis=1)
         distance, stiffness = jnp.sum(jnp.where(of_task, parts[:, None], 0.0), axis=2)
         bounds = self._bounds(equal)
-        share = share_to_damp(bounds, distance, stiffness)
-        return length(jnp.concatenate([self._bounds(rest), share * bounds]))
+        fraction = fraction_to_damp(bounds, distance, stiffness)
+        return length(jnp.concatenate([self._bounds(rest), fraction * bounds]))
 
     def _bounds(self, rows: Sequence[TaskRows]) -> Float[Array, " k"]:
-        """dt times the curvature of each, none where all tasks are hard."""
+        """Return dt times the curvature of each; no number where all tasks are hard."""
         return self.dt * jnp.stack([own.curvature for own in rows]) if rows else jnp.zeros(0, self.dt.dtype)
 
     def dampings(
@@ -116,7 +115,9 @@ class VelocityProblem(eqx.Module):
         *,
         below_others: bool = True,
     ) -> list[Damping]:
-        """Of each level of ``levels``: the constraints bend, but damping would let them off a part of what they ask.
+        """Return the damping of each level of ``levels``.
+
+        The constraints get none, though they bend too: with damping, they would be missed.
 
         Args:
             constraints: as ``constraints`` has them.
@@ -129,7 +130,7 @@ class VelocityProblem(eqx.Module):
             found.append(Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping())
         for names in self.by_priority():
             residuals = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
-            factor = (_BELOW_OTHERS if below_others and found else 1.0) * curvature
+            factor = (BELOW_OTHERS if below_others and found else 1.0) * curvature
             found.append(
                 Damping(
                     constant,
@@ -141,17 +142,17 @@ class VelocityProblem(eqx.Module):
         return found
 
     def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
-        """What a motion of each dof costs these tasks at second order, along a residual of length 1 (``row_sums``).
+        """Return what a motion of each dof costs these tasks at second order, for a unit residual (``row_sums``).
 
-        0 for those of ball and free joints: a box for the components of a turn would depend on where the world's axes
-        point. Where a robot stands, its legs keep its base from turning.
+        It is 0 for the dofs of ball and free joints: a box for the components of a turn would depend on where the
+        world's axes point. Where a robot stands, its legs keep its base from turning.
         """
         arms = [jnp.broadcast_to(self.rows[name].levers, self.lower.shape) for name in names]
         farthest = jnp.max(jnp.stack(arms), axis=0)
         return jnp.where(self.scalar, self.dt * row_sums(jnp.where(self.turning, farthest, 0.0)), 0.0)
 
     def level(self, names: Sequence[str]) -> Level:
-        """The rows of some tasks as one level."""
+        """Return the rows of some tasks as one level."""
         rows = [self.rows[name] for name in names]
         matrix, lower, upper, weight = (
             jnp.concatenate([getattr(r, field) for r in rows]) for field in ("jacobian", "lower", "upper", "weight")
@@ -159,7 +160,7 @@ class VelocityProblem(eqx.Module):
         return Level(matrix, lower, upper, weight, [r.is_equality for r in rows for _ in r.error])
 
     def constraints(self) -> Level | None:
-        """What has to hold beside the box, as the first level: hard tasks, then the rows of limits; None for none."""
+        """Return what has to hold beside the box as one level, hard tasks and then rows of limits; None for none."""
         if self.limit_rows is None:
             return self.level(self.hard) if self.hard else None
         limit = self.limit_rows
@@ -167,12 +168,12 @@ class VelocityProblem(eqx.Module):
         return _joined(self.level(self.hard), rows) if self.hard else rows
 
     def levels(self, constraints: Level | None) -> list[Level]:
-        """The constraints, if there are any, and the priorities."""
+        """Return the constraints, if there are any, and the priorities."""
         ranked = [self.level(names) for names in self.by_priority()]
         return ranked if constraints is None else [constraints, *ranked]
 
     def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
-        """Of each task, J v minus the nearest point of its interval."""
+        """Return J v minus the nearest point of the interval, of each task."""
         dense = {name: rows for name, rows in self.rows.items() if rows.dofs is None}
         values = {name: velocity[np.array(rows.dofs, int)] for name, rows in self.rows.items() if name not in dense}
         if dense:
@@ -193,7 +194,7 @@ def _joined(first: Level, second: Level) -> Level:
 def status_with(
     constraints: Level, status: Int[Array, ""], velocity: Float[Array, " nv"], *, start: Array | None = None
 ) -> Int[Array, ""]:
-    """INFEASIBLE in the place of SOLVED where the velocity misses a constraint.
+    """Return INFEASIBLE in the place of SOLVED where the velocity misses a constraint.
 
     With a ``start`` only those count that are equalities or violated there (what a projection looks at). (nv,)
     """
@@ -227,7 +228,7 @@ class Scheme(Replaceable):
 
     @abc.abstractmethod
     def solve(self, problem: VelocityProblem, warm_start: Any = None) -> SchemeAnswer:
-        """The velocity of one step.
+        """Return the velocity of one step.
 
         Args:
             problem: the step.
@@ -253,5 +254,5 @@ def as_max_iterations(value: Any) -> int | None:
 
 
 def as_leaf(name: str) -> Callable[[ArrayLike | Array], Float[Array, ""]]:
-    """Converter of a scheme's number to a traced leaf; negative or not finite raises ValueError with its name."""
+    """Return a converter of a scheme's number to a traced leaf, which names it where it is negative or not finite."""
     return lambda value: as_scalar(value, name)

@@ -13,14 +13,11 @@ from jaxtyping import Array, Float, Int
 from .._errors import OsikValueError
 from ..execution._backends import check_backend, takes
 from ..numerics._arguments import concrete
-from ..numerics._constants import SINGLE_DAMPING
+from ..numerics._constants import DIAGONAL_RATIO, SINGLE_DAMPING
 from ..numerics._dense import short_sum
 from ..solvers import Backend, Level, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iterations
-
-_CALM_RATIO = 30.0
-"""Little of the curvature damping is added where it is below this many times a dof's other diagonal terms."""
 
 
 class WeightedQP(Scheme):
@@ -35,9 +32,9 @@ class WeightedQP(Scheme):
         damping: of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, the diagonal
             term of a dof, its damping and its posture together, is at least 4 epsilon times the largest weight times
             row norm squared.
-        curvature_damping: kappa, the share of what the linear model leaves out that is added to the damping; 0 for
-            none. What is added vanishes where the tasks are met (``TaskRows.curvature``), with the square of their
-            error where a posture or the damping is strong enough by itself.
+        curvature_damping: kappa, the fraction of what the linear model leaves out that is added to the damping; 0 for
+            none. What is added vanishes where the tasks are met (``TaskRows.curvature``); where the damping and the
+            posture are strong enough by themselves, it vanishes with the square of the tasks' error.
         max_iterations: limit on changes of the active set (static).
         backend: whose candidates for the answer are taken, as in ``solve_least_squares_qp`` (static).
     """
@@ -51,15 +48,15 @@ class WeightedQP(Scheme):
         self._check()
 
     def _check(self) -> None:
-        seen = concrete(self.damping)
-        if seen is not None and not (seen > 0.0).all():
-            raise OsikValueError(f"damping is {seen}; a WeightedQP needs it positive, or the velocity is not unique")
+        damping = concrete(self.damping)
+        if damping is not None and not (damping > 0.0).all():
+            raise OsikValueError(f"damping is {damping}; a WeightedQP needs it positive, or the velocity is not unique")
 
     def solve(self, problem: VelocityProblem, warm_start: Int[Array, " m"] | None = None) -> SchemeAnswer:
         """Return the velocity of one step; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
-        bound, added = problem.curvature(problem.soft()), problem.curvature_damping(problem.soft())
+        curvature, damping = problem.curvature(problem.soft()), problem.curvature_damping(problem.soft())
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
@@ -69,8 +66,8 @@ class WeightedQP(Scheme):
                 [rows for rows in equalities if rows.dofs is not None],
                 problem,
                 self.damping,
-                self.curvature_damping * bound,
-                self.curvature_damping * added,
+                self.curvature_damping * curvature,
+                self.curvature_damping * damping,
                 self.backend,
             ),
             warm_start=warm_start,
@@ -88,36 +85,44 @@ def _least_damping(problem: VelocityProblem, backend: Backend) -> Float[Array, "
     dtype = problem.lower.dtype
     if dtype != jnp.float32 or not rows or not takes(backend, "warp", fits=True):
         return jnp.zeros((), dtype)
-    # a row of one dof asks for its velocity as it is: of length 1
+    # a row on one dof is a row of the identity, of length 1
     squared = [1.0 if r.dofs is not None else short_sum(r.jacobian**2) for r in rows]
-    steepest = [jnp.max(r.weight * length, initial=0.0) for r, length in zip(rows, squared, strict=True)]
-    return jax.lax.stop_gradient(SINGLE_DAMPING * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(steepest)))
+    largest = [jnp.max(r.weight * length, initial=0.0) for r, length in zip(rows, squared, strict=True)]
+    return jax.lax.stop_gradient(SINGLE_DAMPING * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(largest)))
 
 
 def _diagonal_terms(
     single_dof: list[TaskRows],
     problem: VelocityProblem,
     damping: Float[Array, ""],
-    bound: Float[Array, ""],
-    added: Float[Array, ""],
+    curvature: Float[Array, ""],
+    curvature_damping: Float[Array, ""],
     backend: Backend,
 ) -> dict[str, Array]:
     """Return the cost ``1/2 sum_i d_i (v_i - center_i)^2`` of the damping and of rows on one dof each.
 
-    Of the curvature damping, ``added``, a dof whose other terms are d takes ``b / (b + 30 d)``, with b the ``bound`` on
-    the curvature: all of it out of reach, and next to none beside a posture that is strong enough to calm what is left
-    of an error (docs/paper.md, "Curvature damping").
+    With b the bound on the tasks' curvature, a dof whose terms are d gets the fraction ``b / (b + 30 d)`` of the
+    curvature damping: nearly all of it where a target is far out of reach, and next to none where its damping or its
+    posture damps it enough already (docs/paper.md, "Curvature damping").
+
+    Args:
+        single_dof: rows of tasks that ask for the velocity of one dof each.
+        problem: the step.
+        damping: of every dof.
+        curvature: b, kappa times the bound on the tasks' curvature.
+        curvature_damping: kappa times what the tasks' own rows do not resist.
+        backend: of the solver.
     """
     n = problem.lower.shape[0]
     diagonal, weighted = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)
     for rows in single_dof:
         row_of_dof = np.full(n, len(rows.dofs or ()))
         row_of_dof[np.array(rows.dofs, int)] = np.arange(len(rows.dofs or ()))
-        usable = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of 0 is NaN
-        weight, wanted = (jnp.append(a, 0.0)[row_of_dof] for a in (usable, usable * rows.lower))
+        finite = jnp.where(jnp.isnan(rows.weight), 1.0, rows.weight)  # times NaN, a derivative of 0 is NaN
+        weight, wanted = (jnp.append(a, 0.0)[row_of_dof] for a in (finite, finite * rows.lower))
         diagonal, weighted = diagonal + weight, weighted + wanted
-    total = bound + _CALM_RATIO * diagonal
-    diagonal = diagonal + added * (bound / jnp.where(total > 0.0, total, 1.0))  # b^2 of a far target overflows
+    total = curvature + DIAGONAL_RATIO * diagonal
+    diagonal = diagonal + curvature_damping * (curvature / jnp.where(total > 0.0, total, 1.0))  # b^2 overflows
     least = _least_damping(problem, backend)
     diagonal = jnp.where(diagonal < least, least, diagonal)
     center = weighted / diagonal

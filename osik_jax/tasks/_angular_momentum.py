@@ -79,9 +79,9 @@ class AngularMomentumTask(Task):
         weight = jnp.broadcast_to(self.weight, (len(kept),))
         error = jnp.zeros(len(kept), jacobian.dtype)
         if self.lower is not None and self.upper is not None:
-            return TaskRows(error, jacobian, self.lower, self.upper, weight)
+            return TaskRows(error, jacobian, self.lower, self.upper, weight, is_equality=False)
         wanted = error if self.target is None else self.target
-        return TaskRows(error, jacobian, wanted, wanted, weight)
+        return TaskRows(error, jacobian, wanted, wanted, weight, is_equality=True)
 
     @property
     def replaceable(self) -> tuple[str, ...]:

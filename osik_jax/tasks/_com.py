@@ -105,15 +105,15 @@ class ComTask(Task):
         if kinematics.backend != "jax" and self.target is not None and not isinstance(self.gain, AdaptiveGain):
             mass = body_masses(robot, self.subtree)
             alike = eqx.tree_at(lambda robot: robot.body_mass, robot, mass), replace(kinematics, backend="jax")
-            error, rows, wanted, weight, bend, pull, arms = _by_kernel(self, *alike)
-            return TaskRows(error, rows, wanted, wanted, weight, bend, pull, arms)
+            error, rows, wanted, weight, bound, pull, arms = _by_kernel(self, *alike)
+            return TaskRows(error, rows, wanted, wanted, weight, bound, pull, arms, is_equality=True)
         return self._plain_rows(robot, kinematics)
 
     def _plain_rows(self, robot: Robot, kinematics: Kinematics) -> TaskRows:
         point, jacobian = moving_center(robot, kinematics, self.subtree)
-        bend = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
+        bound = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
         if self.polygon is not None:
-            return self._polygon_rows(self.polygon, point, jacobian, bend)
+            return self._polygon_rows(self.polygon, point, jacobian, bound)
         axes = axis_numbers(self.axes)
         value = point[axes] if self.target is None else point[axes] - self.target
         return task_rows(
@@ -124,11 +124,11 @@ class ComTask(Task):
             lower=self.lower,
             upper=self.upper,
             feedforward=self.target_velocity,
-            curvature=bend,
+            curvature=bound,
         )
 
     def _polygon_rows(
-        self, polygon: SupportPolygon, point: Array, jacobian: Array, bend: Callable[[Array], Array]
+        self, polygon: SupportPolygon, point: Array, jacobian: Array, bound: Callable[[Array], Array]
     ) -> TaskRows:
         value = jnp.matmul(polygon.normals, point[:2], precision="highest")
         return task_rows(
@@ -138,7 +138,7 @@ class ComTask(Task):
             upper=polygon.offsets,
             gain=self.gain,
             weight=jnp.broadcast_to(self.weight, value.shape),
-            curvature=bend,
+            curvature=bound,
         )
 
     @property

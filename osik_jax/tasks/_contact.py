@@ -134,13 +134,13 @@ class ContactTask(PlaneTask):
             tilt, spin = self._tilt(self.axis, turn, axes)
             error, jacobian = jnp.concatenate([error, tilt]), jnp.concatenate([jacobian, dot(spin, jacobians[0, 3:])])
 
-        def bend(pull: Float[Array, " m"]) -> Float[Array, ""]:
+        def bound(pull: Float[Array, " m"]) -> Float[Array, ""]:
             force, tilts = pull[: len(held)], pull[len(held) :]
-            bent = pose_curvature(dot(force, held), jnp.zeros(3, pull.dtype), moves)
-            return bent + jacobian_curvature(tilts, jacobians[0, 3:])
+            of_position = pose_curvature(dot(force, held), jnp.zeros(3, pull.dtype), moves)
+            return of_position + jacobian_curvature(tilts, jacobians[0, 3:])
 
         weight = jnp.broadcast_to(self.weight, error.shape)
-        return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bend)
+        return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
 
     def _place(self, point: Float[Array, "3"], axes: Float[Array, "3 3"]) -> Float[Array, "3"]:
         """Along the plane from the anchor, and above the plane."""
@@ -153,15 +153,15 @@ class ContactTask(PlaneTask):
     def _tilt(
         self, axis: Float[Array, "3"], turn: Float[Array, "3 3"], axes: Float[Array, "3 3"]
     ) -> tuple[Float[Array, " m"], Float[Array, "m 3"]]:
-        """Sines of the tilts, and of the turn where it is held, with their slopes over the angular velocity."""
+        """Sines of the tilts, and of the turn where it is held, with their derivatives over the angular velocity."""
         standing = dot(turn, axis)
-        error, slope = dot(axes[:2], standing), cross(standing, axes[:2])
+        error, derivative = dot(axes[:2], standing), cross(standing, axes[:2])
         if self.anchor is None:
-            return error, slope
+            return error, derivative
         beside = across(axis)[0]
         ahead = dot(turn, beside)
         wanted = cross(axes[2], unit(self._along(dot(self.anchor[1], beside), axes[2])))
-        return jnp.append(error, dot(wanted, ahead)), jnp.concatenate([slope, cross(ahead, wanted)[None]])
+        return jnp.append(error, dot(wanted, ahead)), jnp.concatenate([derivative, cross(ahead, wanted)[None]])
 
     @staticmethod
     def _along(direction: Float[Array, "3"], normal: Float[Array, "3"]) -> Float[Array, "3"]:

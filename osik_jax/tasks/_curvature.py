@@ -1,4 +1,4 @@
-"""How much a task bends: bounds on the second derivative of its error along its own pull.
+"""How much a task bends: bounds on the second derivative of its error along its own pull, the feedback ``gain e``.
 
 A step of dt changes the error by ``dt J v + dt^2/2 (grad^2 e)[v, v] + ...``, and a solver minimises
 ``1/2 w |J v + gain e|^2`` as if the second term were not there. What it leaves out of the cost is, to first order,
@@ -18,7 +18,7 @@ step is stable from half of that eigenvalue on. The norms of single columns of J
 diagonal count.
 
 Not all of the bound has to be damped: where a task bends most its frame moves across the pull, and there its own rows
-hold it (``share_to_damp``).
+resist the motion (``fraction_to_damp``).
 """
 
 from __future__ import annotations
@@ -30,28 +30,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..execution._backends import cuda_is_default
+from ..numerics._constants import FARTHEST_ERROR, LEVER_ROUNDOFF, NEAR_ERROR, UNHELD_PART
 from ..numerics._dense import short_sum
 from ._gain import safe_norm
 from ._rotation import dot
-
-_MOVES = 1e-6
-"""Of the longest lever, one that is shorter may be rounding of none."""
-_UNHELD = 0.04
-"""Share of the bound for what bends where the frame does not move across its pull."""
-_NEAR = 0.06
-"""Of the lever arm: an error below which the whole bound is damped, so that a stretched arm leaves its boundary and
-comes back to it calmly."""
-_FARTHEST = 1e6
-"""Of that error; farther makes no difference."""
 
 
 def pose_curvature(
     pull: Float[Array, "3"], torque: Float[Array, "3"], jacobian: Float[Array, "6 nv"]
 ) -> Float[Array, ""]:
-    """Bound for a frame that is pulled at its origin and turned, both in the axes of its Jacobian [linear; angular].
+    """Return the bound for a frame that is pulled at its origin and turned, in the axes of its Jacobian.
 
-    A position bends by ``w_i x J_j``, an orientation by ``1/2 w_i x w_j``. Columns that turn nothing are left out: a
-    base or a carriage that only translates bends no path.
+    Rows of the Jacobian are [linear; angular]. A position bends by ``w_i x J_j``, an orientation by ``1/2 w_i x w_j``.
+    Columns that turn nothing are left out: a base or a carriage that only translates bends no path.
     """
     linear, angular = jacobian[:3], jacobian[3:]
     turns = jnp.any(angular != 0.0, axis=0)
@@ -60,12 +51,12 @@ def pose_curvature(
 
 
 def _gram(rows: Float[Array, "3 n"]) -> Float[Array, "3 3"]:
-    """Products of the rows with each other; as sums on a GPU, whose library takes five times as long for a batch."""
+    """Return the products of the rows with each other; on a GPU as sums, as its library is slow with these."""
     return short_sum(rows[:, None] * rows[None]) if cuda_is_default() else dot(rows, rows.T)
 
 
 def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 3"], arms: Float[Array, "3 3"]) -> Float[Array, ""]:
-    """Frobenius norm of the matrix with the entries ``pull . (axis_i x arm_j)``; its gradient at 0 is 0.
+    """Return the Frobenius norm of the matrix with the entries ``pull . (axis_i x arm_j)``; its gradient at 0 is 0.
 
     The square of that norm is the sum of the products of two 3 x 3 matrices, entry by entry: those of
     ``pull x axis_i`` with each other, which are the axes' own between two cross products, and those of the arms.
@@ -87,62 +78,65 @@ def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 3"], arms: Float[Arra
 
 
 def length(pull: Float[Array, " m"]) -> Float[Array, ""]:
-    """Euclidean norm, of whatever size; its gradient at 0 is 0."""
+    """Return the Euclidean norm, which does not overflow; its gradient at 0 is 0."""
     size = _largest(pull)
     return size * safe_norm(pull / size)
 
 
 def _largest(pull: Float[Array, " m"]) -> Float[Array, ""]:
-    """Of the absolute entries, 1 where all are 0; a constant for derivatives."""
+    """Return the largest absolute entry, 1 where all are 0; a constant for derivatives."""
     largest = jnp.max(jnp.abs(jax.lax.stop_gradient(pull)), initial=0.0)
     return jnp.where(largest > 0.0, largest, 1.0)
 
 
 def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"]) -> Float[Array, ""]:
-    """Bound for any rows: the pull's length times the Frobenius norm of their Jacobian, or of one that they combine."""
+    """Return the bound for any rows: the pull's length times the Frobenius norm of their Jacobian.
+
+    Instead of their own, it may be a Jacobian that the rows combine.
+    """
     return length(pull) * safe_norm(jacobian.ravel())
 
 
-def share_to_damp(
+def fraction_to_damp(
     bound: Float[Array, " k"], distance: Float[Array, " k"], stiffness: Float[Array, " k"]
 ) -> Float[Array, " k"]:
-    """Share of the bounds on some tasks' curvature that has to be damped; the tasks' own rows hold the rest.
+    """Return which fraction of the bound on each task's curvature has to be damped; its own rows resist the rest.
 
     Rows resist a motion v with ``1/2 v'J'W J v`` and leave out ``1/2 dt p . (grad^2 e)[v, v]``, which is large where
     the frame moves across p. There it is up to b, the resistance up to g, and b / (b + 2 g) of the bound is enough.
-    What bends elsewhere is a small share of it (docs/derivations.md, "Curvature damping").
+    What bends elsewhere is a small part of it (docs/derivations.md, "Curvature damping").
 
     Args:
         bound: dt times the curvature, b. (k,)
         distance: the errors, in lever arms: times their weighted pulls, over the curvatures. (k,)
         stiffness: squared Frobenius norm of the Jacobian, its weights' roots multiplied in, g. (k,)
     """
-    ratio = jnp.clip(distance / _NEAR, 0.0, _FARTHEST)
+    ratio = jnp.clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR)
     far = ratio**2 / (1.0 + ratio**2)
     total = 0.5 * bound + stiffness
-    held = stiffness / jnp.where(total > 0.0, total, 1.0)
-    return 1.0 - (1.0 - _UNHELD) * far * held
+    resisted = stiffness / jnp.where(total > 0.0, total, 1.0)
+    return 1.0 - (1.0 - UNHELD_PART) * far * resisted
 
 
 def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:
-    """Of rows that are linear in the joints."""
+    """Return the bound for rows that are linear in the joints: 0."""
     return jnp.zeros((), pull.dtype)
 
 
 def levers(weight: Float[Array, " m"], jacobian: Float[Array, "m nv"]) -> Float[Array, " nv"]:
-    """How far each dof moves the rows: the length of its weighted column; the gradient at 0 is 0."""
+    """Return how far each dof moves the rows: the length of its weighted column; the gradient at 0 is 0."""
     squared = jnp.sum(weight[:, None] * jacobian**2, axis=0)
     positive = squared > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
 def row_sums(levers: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Of each dof, a bound on the sum of the absolute entries of its row in the second derivative along a unit pull.
+    """Return a bound on the sum of the absolute entries of each dof's row in the second derivative along a unit pull.
 
     The entry of dofs i and j is at most the lever of the one that is farther from the root, and dofs stand in the order
     of the tree. So a motion d costs at most ``1/2 sum_j row_sums_j d_j^2`` at second order.
     """
-    moves = levers > _MOVES * jnp.max(levers, initial=0.0)
+    moves = levers > LEVER_ROUNDOFF * jnp.max(levers, initial=0.0)
     counted = jnp.where(moves, levers, 0.0)
     before = jnp.cumsum(moves) - moves
     return jnp.where(moves, jnp.cumsum(counted[::-1])[::-1], 0.0) + counted * before

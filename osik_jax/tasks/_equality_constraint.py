@@ -117,8 +117,8 @@ class EqualityConstraintTask(Task):
         error, jacobian = (jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
         counts = np.array([len(own) for own, _ in parts])
         weight = jnp.broadcast_to(self.weight, counts.shape)[np.repeat(np.arange(len(counts)), counts)]
-        bend = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
-        return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bend)
+        bound = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
+        return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
 
     @property
     def _weight_rows(self) -> int:
@@ -163,8 +163,8 @@ class EqualityConstraintTask(Task):
             for other in leader:
                 x = qpos[_qpos(tree, other)]
                 error = error - sum(c * x ** (k + 1) for k, c in enumerate(higher))
-                slope = sum((k + 1) * c * x**k for k, c in enumerate(higher))
-                jacobian = jacobian - slope * _column(tree, other, q.dtype)
+                derivative = sum((k + 1) * c * x**k for k, c in enumerate(higher))
+                jacobian = jacobian - derivative * _column(tree, other, q.dtype)
             rows.append((error[None], independent_columns(tree, jacobian)[None]))
         return rows
 

@@ -53,6 +53,7 @@ class VelocityTask(Task):
             upper=wanted,
             weight=jnp.broadcast_to(self.weight, wanted.shape),
             dofs=tuple(dofs),
+            is_equality=True,
         )
 
     @property

@@ -8,12 +8,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..kinematics import Kinematics, mass_matrix
+from ..numerics._constants import INERTIA_ROUNDOFF
 from ..robot import Robot
 from ._leaves import as_scalar
 from ._task import Task, TaskRows, check_priority
-
-_NOISE = 4.0
-"""Roundings for each dof; where motions have less inertia than this share of their dofs', the root is finite."""
 
 
 class KineticEnergyTask(Task):
@@ -47,7 +45,7 @@ class KineticEnergyTask(Task):
         del q
         root = _root(mass_matrix(robot, kinematics))
         zero = jnp.zeros(robot.nv, root.dtype)
-        return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape))
+        return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape), is_equality=True)
 
     @property
     def replaceable(self) -> tuple[str, ...]:
@@ -61,6 +59,6 @@ def _root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     moves = inertia > 0.0
     scale = jnp.where(moves, jnp.sqrt(jnp.where(moves, inertia, 1.0)), 0.0)
     unit = jnp.where(moves, scale, 1.0)
-    noise = _NOISE * len(inertia) * jnp.finfo(matrix.dtype).eps
-    lift = jnp.diag(jnp.where(moves, noise, 1.0))
+    roundoff = INERTIA_ROUNDOFF * len(inertia) * jnp.finfo(matrix.dtype).eps
+    lift = jnp.diag(jnp.where(moves, roundoff, 1.0))
     return jax.lax.linalg.cholesky(matrix / (unit[:, None] * unit) + lift, symmetrize_input=False).T * scale

@@ -73,6 +73,7 @@ class LimitTask(Task):
             upper=upper,
             weight=jnp.broadcast_to(self.weight, lower.shape),
             dofs=tuple(range(robot.nv)) if own is None else None,
+            is_equality=False,
         )
 
     def during(self, dt: Float[Array, ""] | float) -> Self:

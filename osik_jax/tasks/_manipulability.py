@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics import Kinematics, forward_kinematics, frame_jacobian, integrate
+from ..numerics._constants import ROW_ROUNDOFF
 from ..robot import Robot
 from ..robot._joint_selection import select_all
 from ..robot._tree import DOF_WIDTH, KinematicTree
@@ -21,10 +22,6 @@ from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
 from ._pose import option, row_mask
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
-
-_NOISE = 10.0
-"""Roundings for each dof; a row of the Jacobian that the rows before it leave less of itself than this depends on
-them."""
 
 
 class ManipulabilityTask(Task):
@@ -176,11 +173,11 @@ def volume(rows: Float[Array, "m n"], *, log: bool) -> Float[Array, ""]:
     By Gram and Schmidt's method, so that small values keep their digits, which determinants of products lose.
     """
     m, n = rows.shape
-    noise = (_NOISE * n * jnp.finfo(rows.dtype).eps) ** 2
+    roundoff = (ROW_ROUNDOFF * n * jnp.finfo(rows.dtype).eps) ** 2
     squares, singular, product = jnp.sum(rows**2, 1), jnp.asarray(False), jnp.ones((), rows.dtype)
     for k in range(m):
         square = jnp.sum(rows[k] ** 2)
-        depends = square <= noise * squares[k]
+        depends = square <= roundoff * squares[k]
         length = jnp.sqrt(jnp.where(depends, 1.0, square))
         direction = rows[k] / length
         rows = rows - jnp.matmul(rows, direction, precision="highest")[:, None] * direction

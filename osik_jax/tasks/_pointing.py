@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from ..numerics._constants import POINTING_SINE_SQUARED
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._framed import FramedTask
@@ -21,7 +22,6 @@ from ._leaves import as_scalar, as_vector, concrete
 from ._rotation import dot
 from ._task import TaskRows, check_priority, task_rows
 
-_SMALL_SINE_SQUARED = 1e-3
 _BEHIND = -0.5
 """Cosine below which a direction counts as behind: there the formulas divide by it, in front by one plus it."""
 _LEAST_SINE = 0.1
@@ -91,19 +91,19 @@ class PointingTask(FramedTask):
         self, direction: Float[Array, "3"], jacobian: Float[Array, "3 nv"], drift: Float[Array, "3"]
     ) -> TaskRows:
         """The rows from d, a unit vector in the frame's axes, whose rate there is ``jacobian v + drift``."""
-        error, slope = deviation(unit(self.axis), direction)
+        error, derivative = deviation(unit(self.axis), direction)
         upper = None
         if self.half_angle is not None:
-            slope = dot(error, slope)[None] / jnp.maximum(safe_norm(error), _TIP)
+            derivative = dot(error, derivative)[None] / jnp.maximum(safe_norm(error), _TIP)
             error, upper = _rounded(jnp.sum(error**2))[None], _rounded(self.half_angle**2)[None]
         return task_rows(
             error,
-            dot(slope, jacobian),
+            dot(derivative, jacobian),
             gain=self.gain,
             weight=jnp.broadcast_to(self.weight, error.shape),
             lower=None if upper is None else jnp.full_like(upper, -jnp.inf),
             upper=upper,
-            feedforward=-dot(slope, drift),
+            feedforward=-dot(derivative, drift),
             curvature=partial(jacobian_curvature, jacobian=jacobian),
         )
 
@@ -156,26 +156,26 @@ def deviation(axis: Float[Array, "3"], direction: Float[Array, "3"]) -> tuple[Fl
 def _in_front(
     axis: Array, basis: Array, cosine: Float[Array, ""], beside: Float[Array, "2"]
 ) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
-    """Error and slope where the two are at most 120 degrees apart: a rate is carried from d to a, then stretched.
+    """Return e and D at most 120 degrees apart: a rate is carried from d to a, then stretched.
 
     With s the sine, ``k = t / s`` and ``g = (1 - k) / s^2``, which is -1/6 at 0: ``e = -k y``, ``y = B' d``, and
     ``D = -(k I + g y y') (B' - y a' / (1 + cos t))``.
     """
     squared = jnp.sum(beside**2)
-    small = (squared < _SMALL_SINE_SQUARED) & (cosine > 0.0)
+    small = (squared < POINTING_SINE_SQUARED) & (cosine > 0.0)
     safe = jnp.where(small, 1.0, squared)
     sine = jnp.sqrt(safe)
     series = 1 / 6 + squared * (3 / 40 + squared * (5 / 112 + squared * (35 / 1152 + squared * 63 / 2816)))
-    bend = jnp.where(small, -series, (1.0 - jnp.arctan2(sine, cosine) / sine) / safe)
-    ratio = 1.0 - bend * squared
+    growth = jnp.where(small, -series, (1.0 - jnp.arctan2(sine, cosine) / sine) / safe)
+    ratio = 1.0 - growth * squared
     carried = basis - jnp.outer(beside, axis) / (1.0 + cosine)
-    return -ratio * beside, -(ratio * carried + bend * jnp.outer(beside, dot(beside, carried)))
+    return -ratio * beside, -(ratio * carried + growth * jnp.outer(beside, dot(beside, carried)))
 
 
 def _behind(
     basis: Array, cosine: Float[Array, ""], beside: Float[Array, "2"]
 ) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
-    """Error and slope behind: ``e = -t u`` and ``D = -(k I + (1 / cos t - k) u u') B'``."""
+    """Return e and D behind: ``e = -t u`` and ``D = -(k I + (1 / cos t - k) u u') B'``."""
     squared = jnp.sum(beside**2)
     clear = squared > jnp.finfo(squared.dtype).eps ** 2
     sine = jnp.sqrt(jnp.where(clear, squared, 1.0))

@@ -119,7 +119,7 @@ class PoseTask(FramedTask):
         """
         if backend != "jax" and not (self.coupled or self.bounded or isinstance(self.gain, AdaptiveGain)):
             error, rows, wanted, weight, curvature, pull, arms = _by_kernel(self, position, rotation, jacobian)
-            return TaskRows(error, rows, wanted, wanted, weight, curvature, pull, arms)
+            return TaskRows(error, rows, wanted, wanted, weight, curvature, pull, arms, is_equality=True)
         return self._plain_rows(position, rotation, jacobian)
 
     def _plain_rows(

@@ -8,9 +8,7 @@ from jaxtyping import Array, Float
 
 from ..execution._backends import cuda_is_default
 from ..kinematics._rigid import compose, rotate
-
-_SMALL_SINE_SQUARED = 1e-6
-_SMALL_ANGLE_SQUARED = 1e-2
+from ..numerics._constants import SMALL_ANGLE_SQUARED, SMALL_SINE_SQUARED
 
 
 def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -24,7 +22,7 @@ def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     wxyz = jnp.where(wxyz[0] < 0.0, -wxyz, wxyz)
     cosine, vector = wxyz[0], wxyz[1:]
     sine_squared = jnp.sum(vector**2)
-    small = sine_squared < _SMALL_SINE_SQUARED
+    small = sine_squared < SMALL_SINE_SQUARED
     sine = jnp.sqrt(jnp.where(small, 1.0, sine_squared))
     safe_cosine = jnp.where(small, cosine, 1.0)
     tangent_squared = sine_squared / safe_cosine**2
@@ -40,7 +38,7 @@ def inverse_left_jacobian(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     ``c = (1 - (angle/2) cot(angle/2)) / angle^2``, which is 1/12 at 0 and 1/pi^2 at pi.
     """
     squared = jnp.sum(vector**2)
-    small = squared < _SMALL_ANGLE_SQUARED
+    small = squared < SMALL_ANGLE_SQUARED
     safe = jnp.where(small, 1.0, squared)
     half = 0.5 * jnp.sqrt(safe)
     exact = (1.0 - half * jnp.cos(half) / jnp.sin(half)) / safe
@@ -60,8 +58,8 @@ def cross_matrix(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def dot(a: Array, b: Array) -> Array:
     """The matrix product, in full precision on every device.
 
-    Sums of three are written out where JAX's default is a GPU, whose library takes nine times as long for a batch of
-    them. On a CPU they make a gradient a sixth slower.
+    Sums of three are written out where JAX's default is a GPU, whose library is slow with batches of them. On a CPU
+    gradients would be slower for it.
     """
     if cuda_is_default() and a.ndim == 2 and a.shape[1] == 3:
         return compose(a, b) if b.ndim == 2 else rotate(a, b)

@@ -44,8 +44,11 @@ class TaskRows(eqx.Module):
             in. (nv,)
         dofs: where each row asks for one dof's velocity as it is, those dofs (static): ``jacobian`` is then those rows
             of the identity, which a scheme may use to save work. None elsewhere.
-        is_equality: whether all rows are equalities, for which only ``lower`` counts (static). Default: whether both
-            bounds are one and the same array.
+        is_equality: whether all rows are equalities, for which only ``lower`` counts (static). Where it is not said,
+            rows are equalities if ``upper`` was given as the very array that is ``lower`` (``TaskRows(error, jacobian,
+            wanted, wanted, weight)``). Other arrays of equal numbers are an interval of width 0, and so are those that
+            came out of ``jit``, which returns a copy of each: schemes then find the same velocity with more work, but
+            for the curvature damping, of which inequality rows get all.
     """
 
     error: Float[Array, " m"]
@@ -57,7 +60,7 @@ class TaskRows(eqx.Module):
     pull: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     levers: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
-    is_equality: bool = eqx.field(default=None, static=True)  # pyright: ignore[reportAssignmentType]  # set below
+    is_equality: bool = eqx.field(default=None, static=True)  # pyright: ignore[reportAssignmentType]  # None: not said
 
     def __post_init__(self) -> None:
         if self.is_equality is None:
@@ -182,16 +185,20 @@ def task_rows(
     shift = jnp.zeros_like(error) if feedforward is None else feedforward
     linear = dofs is not None or curvature is no_curvature
     arms = jnp.zeros_like(jacobian[0]) if linear else levers(weight, jacobian)
-    bend = curvature or (no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian))
+    curvature_of = curvature or (no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian))
     if lower is None or upper is None:
         pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
         wanted = shift - pull
-        return TaskRows(error, jacobian, wanted, wanted, weight, bend(weight * pull), pull, arms, dofs)
+        return TaskRows(
+            error, jacobian, wanted, wanted, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=True
+        )
     outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
     rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
     low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
     pull = rate * outside
-    return TaskRows(error, jacobian, low, high, weight, bend(weight * pull), pull, arms, dofs)
+    return TaskRows(
+        error, jacobian, low, high, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=False
+    )
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:

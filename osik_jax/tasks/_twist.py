@@ -24,9 +24,9 @@ def pose_log(
     """
     angle = rotation_log(rotation)
     left = inverse_left_jacobian(angle)
-    bend = jax.jacfwd(lambda phi: dot(inverse_left_jacobian(phi), position))(angle)
+    derivative = jax.jacfwd(lambda phi: dot(inverse_left_jacobian(phi), position))(angle)
     right = left.T
-    top = jnp.concatenate([right, dot(bend, right)], axis=1)
+    top = jnp.concatenate([right, dot(derivative, right)], axis=1)
     bottom = jnp.concatenate([jnp.zeros_like(right), right], axis=1)
     return jnp.concatenate([dot(left, position), angle]), jnp.concatenate([top, bottom])
 

@@ -107,10 +107,10 @@ class WheelTask(PlaneTask):
         weight = jnp.broadcast_to(self.weight, error.shape)
         moves = jnp.concatenate([touching, jacobians[0, 3:]])
 
-        def bend(pull: Float[Array, " m"]) -> Float[Array, ""]:
+        def bound(pull: Float[Array, " m"]) -> Float[Array, ""]:
             return pose_curvature(dot(pull, directions), jnp.zeros(3, pull.dtype), moves)
 
-        return task_rows(error, dot(directions, touching), gain=self.gain, weight=weight, curvature=bend)
+        return task_rows(error, dot(directions, touching), gain=self.gain, weight=weight, curvature=bound)
 
     @property
     def _weight_rows(self) -> int:

@@ -16,12 +16,12 @@ from numba.core import cgutils
 from ._vectors import _BLOCK, _DOUBLE, _INDEX, WIDTH, _splat
 
 BYTES = 8 * WIDTH
-"""Of a block."""
+"""Bytes of a block."""
 ONES, ZEROS = _BLOCK([1.0] * WIDTH), _BLOCK([0.0] * WIDTH)
 
 
 def call_of(builder: Any, name: str, body: Callable[..., Any], arguments: list[Any], result: Any = None) -> Any:
-    """Calls a function of numbers and addresses, ``body(builder, *arguments)``, written where the module has none."""
+    """Call a function of numbers and addresses, ``body(builder, *arguments)``, written where the module has none."""
     name = f"osik_jax_{name}"
     function = builder.module.globals.get(name)
     if function is None:
@@ -36,7 +36,7 @@ def call_of(builder: Any, name: str, body: Callable[..., Any], arguments: list[A
 
 
 def address(context: Any, builder: Any, kind: Any, array: Any, *place: Any) -> Any:
-    """Of an array's number at a place, which may leave its last axis out."""
+    """Return the address of an array's number at a place, which may leave its last axis out."""
     assert kind.layout == "C" and kind.dtype == types.float64, kind
     made = context.make_array(kind)(context, builder, array)
     at = builder.ptrtoint(made.data, _INDEX)
@@ -47,7 +47,7 @@ def address(context: Any, builder: Any, kind: Any, array: Any, *place: Any) -> A
 
 
 def _step(builder: Any, made: Any, kind: Any) -> Any:
-    """Bytes of a matrix's row."""
+    """Return the bytes of a matrix's row."""
     return builder.mul(_INDEX(8), cgutils.unpack_tuple(builder, made.shape, kind.ndim)[-1])
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...numerics._constants import PARALLEL
 from ._frame import lean
 from ._rigid import cross, minus, plus
 
-_PARALLEL = 1e-6
 _TINY = np.finfo(float).tiny ** 0.5
-"""As in ``collision/_distance.py``."""
+"""A length counts as none below it, as in ``collision/_distance.py``."""
 
 
 @lean
@@ -45,7 +45,7 @@ def parameters(a, b, offset):
     """Where along two segments, from 0 to 1, they are nearest; offset: from the start of b to that of a."""
     aa, bb, ab, ao, bo = inner(a, a), inner(b, b), inner(a, b), inner(a, offset), inner(b, offset)
     square = aa * bb - ab * ab
-    if square <= _PARALLEL * aa * bb:
+    if square <= PARALLEL * aa * bb:
         s = 0.5 * (_inside(_over(-ao, aa)) + _inside(_over(ab - ao, aa)))
     else:
         s = _inside(_over(ab * bo - ao * bb, square))

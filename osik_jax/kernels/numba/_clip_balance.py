@@ -27,7 +27,7 @@ def center_of(K, V, W):
 
 @lean
 def support(first, W, contact, d):
-    """Support function of the standing corners, along d and along -d."""
+    """Return the support function of the standing corners, along d and along -d."""
     farthest, nearest = -np.inf, np.inf
     for k in range(CORNERS):
         if contact[k // 2] > 0.5:
@@ -38,13 +38,13 @@ def support(first, W, contact, d):
 
 @lean
 def flat(vector):
-    """A vector's part in the plane of the floor, and its length."""
+    """Return a vector's part in the plane of the floor, and its length."""
     return (vector[0], vector[1], 0.0), np.sqrt(vector[0] * vector[0] + vector[1] * vector[1])
 
 
 @lean
 def find_overhang(K, V, W, contact, center):
-    """As ``overhang``; for the coefficients, both corners of the edge and the ratio at which its nearest point is."""
+    """Return ``overhang``; for its coefficients, both corners of the edge and the ratio at its nearest point too."""
     first, shortest = K.counts[KEYS] + 4, V.wishes[SHORTEST]
     most, direction, a, b, ratio, width = -np.inf, (0.0, 0.0, 0.0), 0, 0, 0.0, np.inf
     for i in range(CORNERS):

@@ -82,7 +82,7 @@ class Memory(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """Of a clip, a row a frame."""
+    """What a clip asks for, a row a frame."""
 
     directions: np.ndarray
     pelvis: np.ndarray
@@ -131,7 +131,7 @@ class Kept(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """Of a clip, Gauss's and Newton's system. ``blocks`` are those on the diagonal, without ``alone``, times -1."""
+    """Gauss's and Newton's system of a clip. ``blocks`` are those on the diagonal, without ``alone``, times -1."""
 
     blocks: np.ndarray  # (F N, N)
     moving: np.ndarray  # (F POINTS, N)

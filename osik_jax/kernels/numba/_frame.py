@@ -39,7 +39,7 @@ def compiled(function: Function | None = None, **options: Any) -> Any:
 
 
 lean = partial(compiled, _nrt=False)
-"""As ``compiled``, for functions that make no array: references are not counted."""
+"""Compile a function that makes no array: references are not counted, else as ``compiled``."""
 
 _METADATA = 1  # XLA_FFI_Extension_Metadata
 _EXECUTE = 3  # XLA_FFI_ExecutionStage_EXECUTE

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...numerics._constants import SMALL_TURN_SQUARED
 from ._frame import lean
 from ._rigid import multiplied
-
-_SMALL = 1e-6
-"""Squared angle [rad^2] below which a series is exact to rounding."""
 
 
 @lean
@@ -36,7 +34,7 @@ def integrate(scalars, turns, q, v, out):
         at, dof = turns[k], turns[count + k]
         x, y, z = v[dof], v[dof + 1], v[dof + 2]
         square = x * x + y * y + z * z
-        if square < _SMALL:
+        if square < SMALL_TURN_SQUARED:
             cosine = 1.0 - square / 8.0 + square * square / 384.0
             factor = 0.5 - square / 48.0 + square * square / 3840.0
         else:
@@ -59,7 +57,7 @@ def difference(scalars, turns, a, b, out):
         w, x, y, z = _unit(a, at)
         w, x, y, z = multiplied((w, -x, -y, -z), _unit(b, at))
         square = x * x + y * y + z * z
-        if square < _SMALL:
+        if square < SMALL_TURN_SQUARED:
             factor = (2.0 - 2.0 / 3.0 * square / (w * w)) / w
         else:
             sine = np.sqrt(square)

@@ -129,7 +129,7 @@ _spread: Any = cast(Any, intrinsic)(_spreading)
 
 
 def _summing_plain(term: Any) -> Any:
-    """The same as a plain loop; ``term(a_j, B_jc)`` is added."""
+    """Return a function that adds the sum over j of ``term(a_j, B_jc)`` to each number of a row, as a plain loop."""
 
     @lean
     def plain(out, base, a, B, first, last, start, stop):

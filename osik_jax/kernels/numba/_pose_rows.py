@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...numerics._constants import SMALL_ANGLE_SQUARED, SMALL_SINE_SQUARED
 from ._dense import fill
 from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
 from ._rigid import composed, cross, minus, transposed
 from ._rigid import turned as rotated
-
-_SMALL_SINE_SQUARED = 1e-6
-_SMALL_ANGLE_SQUARED = 1e-2
-"""As in ``tasks/_rotation.py``."""
 
 
 @lean
@@ -66,7 +63,7 @@ def logarithm(m):
     """Return the rotation vector of a rotation, its angle in [0, pi]."""
     w, x, y, z = quaternion_of(m)
     sine_squared = x * x + y * y + z * z
-    if sine_squared < _SMALL_SINE_SQUARED:
+    if sine_squared < SMALL_SINE_SQUARED:
         tangent_squared = sine_squared / (w * w)
         factor = (2.0 - tangent_squared * (2.0 / 3.0 - tangent_squared * (2.0 / 5.0))) / w
     else:
@@ -80,7 +77,7 @@ def inverse_left_jacobian(e):
     """Return I - [e]/2 + c [e]^2 with ``c = (1 - (angle/2) cot(angle/2)) / angle^2``."""
     x, y, z = e
     s = x * x + y * y + z * z
-    if s < _SMALL_ANGLE_SQUARED:
+    if s < SMALL_ANGLE_SQUARED:
         c = 1 / 12 + s * (1 / 720 + s * (1 / 30240 + s * (1 / 1209600 + s / 47900160)))
     else:
         half = 0.5 * np.sqrt(s)

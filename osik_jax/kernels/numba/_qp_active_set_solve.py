@@ -64,7 +64,7 @@ def find_used_rows(P, labels, used, z):
 
 @lean
 def gap_of(P, labels, i, x, z):
-    """Of row i of the active set: target - row x - compliance z, which is 0 at the minimiser."""
+    """Return target - row x - compliance z of row i of the active set, which is 0 at the minimiser."""
     m, n = len(P.target), len(x)
     target = P.target[i] if i < m else active_bound(P, labels[n + i - m], n + i - m)
     return target - dot(P.rows[i], x, 0, n) - P.compliance[i] * z[i]
@@ -72,7 +72,7 @@ def gap_of(P, labels, i, x, z):
 
 @lean(inline="always")
 def find_gaps(P, W, labels, x, z):
-    """Of each row of the cost target - row x, of each of C target - row x - compliance z, 0 where it is active."""
+    """Find target - row x of each row of the cost, and target - row x - compliance z of each of C, 0 where active."""
     m, n, rows = len(P.target), len(x), len(P.compliance)
     minus_rows(W.gap, P.goal, x, P.turned, 0, n, 0, padded(rows))
     for i in range(m, rows):
@@ -81,7 +81,7 @@ def find_gaps(P, W, labels, x, z):
 
 @lean(inline="always")
 def find_gradient(P, W, labels, x, z):
-    """The gradient D (x - center) - B'(target - B x) - C'y of the Lagrangian; residuals of the cost go into z."""
+    """Find the gradient D (x - center) - B'(target - B x) - C'y of the Lagrangian; residuals of the cost go into z."""
     m, n, rows = len(P.target), len(x), len(P.compliance)
     if m == rows:
         minus_rows(z, P.goal, x, P.turned, 0, n, 0, padded(rows))

@@ -15,7 +15,7 @@ from ._tiles import padded
 
 @lean(inline="always")
 def find_roundoff(P, W, labels, tolerance, x, z):
-    """Of each constraint, ``tolerance`` of the scale of its value and, where it is active, of its multiplier."""
+    """Find the roundoff of each constraint, ``tolerance`` times the scale of its value and, if active, multiplier."""
     m, n = len(P.target), len(x)
     wide = padded(n)
     for j in range(n):
@@ -49,7 +49,7 @@ def find_roundoff(P, W, labels, tolerance, x, z):
 
 @lean
 def find_bound_roundoff(P, W, x, z):
-    """Of each variable on a bound, what counts as no multiplier: rounding of the terms of its gradient."""
+    """Find the roundoff of the multiplier of each variable on a bound: that of the terms of its gradient."""
     m, n, rows = len(P.target), len(x), len(P.compliance)
     clear(W.row_terms, padded(rows))
     plus_sizes(W.row_terms, W.row_terms, x, P.turned, 0, n, 0, padded(rows))

@@ -154,7 +154,7 @@ def take_product_of_lower(C, A, G, n):
 
 @lean
 def take_square_of_lower(C, G, n):
-    """As ``take_square`` for a lower triangular G."""
+    """Take G'G from C, for a lower triangular G of n rows and columns."""
     for left in range(0, n, 2 * WIDTH):
         right = min(left + 2 * WIDTH, padded(n))
         take_product(C, G, G, 0, min(right, n), left, right, left, n)

@@ -7,9 +7,9 @@ import importlib
 import os
 from collections.abc import Iterable
 from types import ModuleType
-from typing import Any
 
 from ..._errors import OsikKeyError, OsikValueError, unknown_name
+from .._model import RobotModel
 from ._embedded import ROBOTS
 from ._mjcf import from_mjcf
 from ._options import LoadOptions
@@ -19,8 +19,8 @@ SUFFIX = "_description"
 _NEAREST = 8
 
 
-def described(name: str, options: LoadOptions) -> dict[str, Any]:
-    """The fields of a robot that ``robot_descriptions`` knows; its own packages are ``options.package_dirs``.
+def described(name: str, options: LoadOptions) -> RobotModel:
+    """Names and numbers of a robot that ``robot_descriptions`` knows; its own packages are ``options.package_dirs``.
 
     Raises:
         ImportError: the package is not installed.

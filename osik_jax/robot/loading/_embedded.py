@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from importlib import resources
-from typing import Any
 
+from .._model import RobotModel
 from ._mjcf import from_mjcf
 from ._options import LoadOptions
 
 ROBOTS = ("nao", "arm7")
 
 
-def embedded(name: str, options: LoadOptions) -> dict[str, Any]:
-    """The fields of an embedded robot, one of ``ROBOTS``."""
+def embedded(name: str, options: LoadOptions) -> RobotModel:
+    """Names and numbers of an embedded robot, one of ``ROBOTS``."""
     text = (resources.files("osik_jax") / "robot" / "models" / f"{name}.xml").read_text(encoding="utf-8")
     return from_mjcf(text, options)

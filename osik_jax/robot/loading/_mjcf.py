@@ -1,4 +1,4 @@
-"""MJCF to the fields of a Robot."""
+"""MJCF to the names and numbers of a robot."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from ..._errors import OsikValueError
+from .._model import RobotModel
 from ._mjmodel import LEAST_INERTIA, element_names, from_mjmodel
 from ._options import LoadOptions
 from ._source import Source, check_root, parse_xml, read_source
@@ -17,8 +18,8 @@ from ._source import Source, check_root, parse_xml, read_source
 FLOATING_BASE = "floating_base"
 
 
-def from_mjcf(mjcf: str | os.PathLike[str], options: LoadOptions) -> dict[str, Any]:
-    """The fields of a Robot from an MJCF file or text; see ``Robot.from_mjcf``."""
+def from_mjcf(mjcf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
+    """Names and numbers of a robot from an MJCF file or text; see ``Robot.from_mjcf``."""
     source = read_source(mjcf, "MJCF")
     check_root(parse_xml(source), "mujoco", source)
     try:

@@ -1,4 +1,4 @@
-"""From a compiled MuJoCo model to the fields of a Robot."""
+"""From a compiled MuJoCo model to the names and numbers of a robot."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..._errors import OsikTypeError, OsikValueError, warn
+from .._model import RobotModel
 from .._tree import DOF_WIDTH, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder
 from ._followers import (
     Follower,
@@ -44,8 +45,8 @@ class Placement(NamedTuple):
     rotation: np.ndarray
 
 
-def from_mjmodel(model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable[str] = ()) -> dict[str, Any]:
-    """The fields of a Robot from a MuJoCo model; see ``Robot.from_mjmodel``.
+def from_mjmodel(model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable[str] = ()) -> RobotModel:
+    """Names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
 
     Args:
         model: the model, with the floating base that it is to have.
@@ -97,7 +98,7 @@ def from_mjmodel(model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable
         velocity_limit=speed,
         q0=_home(home, tree, lower, upper),
     )
-    return dict(tree=tree, holder=ModelHolder(model), **{k: _float_array(v) for k, v in arrays.items()})
+    return RobotModel(tree=tree, holder=ModelHolder(model), **{k: _float_array(v) for k, v in arrays.items()})
 
 
 def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count: int) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""URDF to the fields of a Robot, by way of a MuJoCo model that holds all that the URDF says about the kinematics."""
+"""URDF to a robot's names and numbers, by way of a MuJoCo model that holds all that it says about the kinematics."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from ..._errors import OsikValueError, warn
 from .._feet import find_feet
+from .._model import RobotModel
 from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, from_mjmodel, quaternion
 from ._options import LoadOptions
 from ._packages import Packages, is_uri
@@ -33,8 +34,8 @@ _VISUAL_GROUP, _COLLISION_GROUP = 2, 3
 _MESH_SUFFIXES = (".stl", ".obj", ".msh")
 
 
-def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> dict[str, Any]:
-    """The fields of a Robot from a URDF file or text; see ``Robot.from_urdf``."""
+def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
+    """Names and numbers of a robot from a URDF file or text; see ``Robot.from_urdf``."""
     packages = Packages(options.package_dirs)
     source = read_source(packages.path(urdf) if is_uri(urdf) else urdf, "URDF")
     root = parse_xml(source)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..._errors import OsikValueError
+from .._model import RobotModel
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
 from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, quaternion, rotation_matrix
 from ._urdf_elements import IDENTITY, Pose
-
-if TYPE_CHECKING:
-    from .._robot import Robot
 
 _TYPES = {FREE: "free", BALL: "ball", SLIDE: "slide", HINGE: "hinge"}
 _SHAPES = {
@@ -38,7 +36,7 @@ class _JointPlace(NamedTuple):
     axis: np.ndarray
 
 
-def to_mjcf(robot: Robot) -> str:
+def to_mjcf(robot: RobotModel) -> str:
     """The robot as MJCF; see ``Robot.to_mjcf``."""
     if np.ndim(robot.body_position) != 2:
         raise OsikValueError(
@@ -58,7 +56,7 @@ def to_mjcf(robot: Robot) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _model_name(robot: Robot) -> str:
+def _model_name(robot: RobotModel) -> str:
     """MuJoCo keeps it at the start of the model's names."""
     return robot.mj_model.names.partition(b"\0")[0].decode() or "robot"
 
@@ -76,7 +74,7 @@ def _put(parent: ElementTree.Element, tag: str, **values: str | ArrayLike) -> El
 # --- bodies and joints ---
 
 
-def _body(robot: Robot, body: int, parent: ElementTree.Element) -> ElementTree.Element:
+def _body(robot: RobotModel, body: int, parent: ElementTree.Element) -> ElementTree.Element:
     pose, joints = _pose_and_joints(robot, body)
     element = _put(parent, "body", name=robot.tree.body_names[body], pos=pose.position, quat=quaternion(pose.rotation))
     _add_inertial(robot, body, element, moving=bool(joints))
@@ -85,7 +83,7 @@ def _body(robot: Robot, body: int, parent: ElementTree.Element) -> ElementTree.E
     return element
 
 
-def _pose_and_joints(robot: Robot, body: int) -> tuple[Pose, list[_JointPlace]]:
+def _pose_and_joints(robot: RobotModel, body: int) -> tuple[Pose, list[_JointPlace]]:
     """Where the body sits in its parent, locked joints at their values, and the joints that are left.
 
     A locked joint moves the body's frame, so the anchors and axes of the joints before it are told from there.
@@ -108,22 +106,22 @@ def _pose_and_joints(robot: Robot, body: int) -> tuple[Pose, list[_JointPlace]]:
     return pose, joints
 
 
-def _values(robot: Robot, joint: int) -> np.ndarray:
+def _values(robot: RobotModel, joint: int) -> np.ndarray:
     """What a locked joint is locked at."""
     start = robot.tree.full_qpos_address[joint]
     return np.asarray(robot.qpos_offset, float)[start : start + QPOS_WIDTH[robot.tree.joint_types[joint]]]
 
 
-def _reference(robot: Robot, joint: int) -> float:
+def _reference(robot: RobotModel, joint: int) -> float:
     return float(robot.joint_reference[robot.tree.full_qpos_address[joint]])
 
 
-def _free_pose(robot: Robot, joint: int) -> Pose:
+def _free_pose(robot: RobotModel, joint: int) -> Pose:
     values = _values(robot, joint)
     return Pose(values[:3], rotation_matrix(values[3:]))
 
 
-def _motion(robot: Robot, place: _JointPlace) -> Pose:
+def _motion(robot: RobotModel, place: _JointPlace) -> Pose:
     """By what a locked joint moves its body's frame, in that frame."""
     kind, values = robot.tree.joint_types[place.joint], _values(robot, place.joint)
     if kind == BALL:
@@ -149,7 +147,7 @@ def _seen_from(motion: Pose, place: _JointPlace) -> _JointPlace:
     return _JointPlace(place.joint, back @ (place.anchor - motion.position), back @ place.axis)
 
 
-def _add_inertial(robot: Robot, body: int, element: ElementTree.Element, *, moving: bool) -> None:
+def _add_inertial(robot: RobotModel, body: int, element: ElementTree.Element, *, moving: bool) -> None:
     """Mass and principal moments, at least what MuJoCo asks of what moves."""
     mass, least = float(robot.body_mass[body]), LEAST_INERTIA if moving else 0.0
     if max(mass, least) == 0.0:
@@ -169,7 +167,7 @@ def _add_inertial(robot: Robot, body: int, element: ElementTree.Element, *, movi
     )
 
 
-def _add_joint(robot: Robot, place: _JointPlace, element: ElementTree.Element) -> None:
+def _add_joint(robot: RobotModel, place: _JointPlace, element: ElementTree.Element) -> None:
     tree, joint = robot.tree, place.joint
     kind, name = tree.joint_types[joint], tree.joint_names[joint]
     values: dict[str, str | ArrayLike] = {}
@@ -184,7 +182,7 @@ def _add_joint(robot: Robot, place: _JointPlace, element: ElementTree.Element) -
     _put(element, "joint", name=name, type=_TYPES[kind], **values, **_range(robot, joint))
 
 
-def _range(robot: Robot, joint: int) -> dict[str, ArrayLike]:
+def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
     """Limits of an independent joint; a follower has those of its leader, which the leader keeps."""
     tree, name = robot.tree, robot.tree.joint_names[joint]
     if joint not in tree.dof_address:
@@ -202,7 +200,7 @@ def _range(robot: Robot, joint: int) -> dict[str, ArrayLike]:
     return dict(range=(low, max(high, math.nextafter(low, math.inf))))
 
 
-def _dofs(robot: Robot, joint: int) -> slice:
+def _dofs(robot: RobotModel, joint: int) -> slice:
     """The entries of v that belong to an independent joint."""
     tree = robot.tree
     start = tree.dof_address[joint]
@@ -220,7 +218,7 @@ def _one(values: ArrayLike, joint: str, what: str) -> float:
 # --- frames and shapes ---
 
 
-def _add_frames(robot: Robot, bodies: list[ElementTree.Element]) -> None:
+def _add_frames(robot: RobotModel, bodies: list[ElementTree.Element]) -> None:
     """Geoms of simple shapes, and as sites all frames that are neither those nor bodies."""
     tree = robot.tree
     done = dict.fromkeys(tree.body_names, IDENTITY) | _add_geoms(robot, bodies)
@@ -238,7 +236,7 @@ def _pose(position: ArrayLike, rotation: ArrayLike) -> Pose:
     return Pose(np.asarray(position, float), np.asarray(rotation, float))
 
 
-def _add_geoms(robot: Robot, bodies: list[ElementTree.Element]) -> dict[str, Pose]:
+def _add_geoms(robot: RobotModel, bodies: list[ElementTree.Element]) -> dict[str, Pose]:
     """The shapes that need no file; the frames that are their names, and where they are."""
     model, tree = robot.mj_model, robot.tree
     done: dict[str, Pose] = {}
@@ -270,7 +268,7 @@ def _appearance(model: mujoco.MjModel, geom: int) -> dict[str, str | ArrayLike]:
 # --- what is said of the whole ---
 
 
-def _add_speeds(robot: Robot, element: ElementTree.Element) -> None:
+def _add_speeds(robot: RobotModel, element: ElementTree.Element) -> None:
     for joint in robot.tree.independent:
         name = robot.tree.joint_names[joint]
         speed = _one(robot.velocity_limit[_dofs(robot, joint)], name, "greatest speed")
@@ -278,7 +276,7 @@ def _add_speeds(robot: Robot, element: ElementTree.Element) -> None:
             _put(element, "numeric", name=VELOCITY_LIMIT_PREFIX + name, data=speed)
 
 
-def _add_followers(robot: Robot, element: ElementTree.Element) -> None:
+def _add_followers(robot: RobotModel, element: ElementTree.Element) -> None:
     """``q_follower - reference = constant + multiplier (q_leader - reference)``, as MuJoCo has it."""
     tree = robot.tree
     for follower, leader, multiplier in tree.followers:
@@ -288,7 +286,7 @@ def _add_followers(robot: Robot, element: ElementTree.Element) -> None:
         _put(element, "joint", **names, polycoef=(constant, multiplier, 0.0, 0.0, 0.0))
 
 
-def _add_home(robot: Robot, element: ElementTree.Element) -> None:
+def _add_home(robot: RobotModel, element: ElementTree.Element) -> None:
     tree, full = robot.tree, np.asarray(robot.mujoco_qpos(robot.q0), float)
     kept = [full[start:end] for start, end in zip(tree.full_qpos_address, tree.full_qpos_address[1:], strict=False)]
     moving = [values for joint, values in enumerate(kept) if joint not in tree.locked]

@@ -1,0 +1,103 @@
+"""What a reader makes of a file: a robot's names and numbers, and what follows from them alone."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from ._tree import FREE, KinematicTree, ModelHolder
+
+
+class RobotModel(eqx.Module):
+    """Names and numbers of a robot: what ``loading`` returns, and the base of ``Robot``, which says what they mean."""
+
+    tree: KinematicTree = eqx.field(static=True)
+    body_position: Float[Array, "nbody 3"]
+    body_quaternion: Float[Array, "nbody 4"]
+    body_mass: Float[Array, " nbody"]
+    body_com: Float[Array, "nbody 3"]
+    body_inertia: Float[Array, "nbody 3 3"]
+    joint_position: Float[Array, "njoint 3"]
+    joint_axis: Float[Array, "njoint 3"]
+    dof_armature: Float[Array, " nvfull"]
+    joint_reference: Float[Array, " nqfull"]
+    frame_position: Float[Array, "nframe 3"]
+    frame_rotation: Float[Array, "nframe 3 3"]
+    geom_position: Float[Array, "ngeom 3"]
+    geom_rotation: Float[Array, "ngeom 3 3"]
+    geom_size: Float[Array, "ngeom 3"]
+    qpos_offset: Float[Array, " nqfull"]
+    position_lower: Float[Array, " nv"]
+    position_upper: Float[Array, " nv"]
+    velocity_limit: Float[Array, " nv"]
+    q0: Float[Array, " nq"]
+    holder: ModelHolder = eqx.field(static=True, repr=False)
+
+    @property
+    def nq(self) -> int:
+        """Length of q."""
+        return self.tree.nq
+
+    @property
+    def nv(self) -> int:
+        """Length of v."""
+        return self.tree.nv
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Independent joints in the order of v, free joints left out."""
+        return tuple(self.tree.joint_names[j] for j in self.tree.independent if self.tree.joint_types[j] != FREE)
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Moving bodies, in the order of ``body_mass`` and the other arrays over bodies, whose entry 0 is the world."""
+        return self.tree.body_names[1:]
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Every frame that can be asked for by name: bodies, URDF links (fused or not), sites, geoms."""
+        return self.tree.frame_names
+
+    @property
+    def mimic_joints(self) -> dict[str, tuple[str, float]]:
+        """Followers: name to (leader, multiplier)."""
+        names = self.tree.joint_names
+        return {names[f]: (names[leader], m) for f, leader, m in self.tree.followers}
+
+    @property
+    def locked_joints(self) -> tuple[str, ...]:
+        """Names of the joints frozen at load time."""
+        return tuple(self.tree.joint_names[j] for j in self.tree.locked)
+
+    @property
+    def floating_base(self) -> bool:
+        """Whether the robot has a free joint that is not locked."""
+        return any(self.tree.joint_types[j] == FREE for j in self.tree.independent)
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations."""
+        return self.holder.model
+
+    def joint_qpos_index(self, name: str) -> int:
+        """Where a joint's values start in q; a follower sits where its leader sits.
+
+        Raises:
+            KeyError: no such joint, or it is locked.
+        """
+        return self.tree.qpos_address[self.tree.owner(name)]
+
+    def joint_dof_index(self, name: str) -> int:
+        """Where a joint's velocities start in v; a follower sits where its leader sits.
+
+        Raises:
+            KeyError: no such joint, or it is locked.
+        """
+        return self.tree.dof_address[self.tree.owner(name)]
+
+    def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
+        """The configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
+        index, coefficient = self.tree.qpos_source
+        return jnp.asarray(q)[index] * coefficient + self.qpos_offset
