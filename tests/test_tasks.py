@@ -265,8 +265,8 @@ class Height(osik.Task):
             robot, kinematics, q
         )
         upper = rows.lower if self.form in ("one array", "said to be an interval") else rows.lower + 0.0
-        said = {"said to be an equality": True, "said to be an interval": False}.get(self.form)
-        return osik.TaskRows(rows.error, rows.jacobian, rows.lower, upper, rows.weight, is_equality=said)
+        said = {"is_equality": FORMS[self.form]} if self.form.startswith("said") else {}
+        return osik.TaskRows(rows.error, rows.jacobian, rows.lower, upper, rows.weight, **said)
 
 
 FORMS = {"one array": True, "two arrays": False, "said to be an equality": True, "said to be an interval": False}
