@@ -1,6 +1,7 @@
 """What holds for any task: Jacobians, feed-forward, gradients, batches, tasks of one's own, rows of all together."""
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -265,8 +266,8 @@ class Height(osik.Task):
             robot, kinematics, q
         )
         upper = rows.lower if self.form in ("one array", "said to be an interval") else rows.lower + 0.0
-        said = {"said to be an equality": True, "said to be an interval": False}.get(self.form)
-        return osik.TaskRows(rows.error, rows.jacobian, rows.lower, upper, rows.weight, is_equality=said)
+        make = partial(osik.TaskRows, rows.error, rows.jacobian, rows.lower, upper, rows.weight)
+        return make(is_equality=FORMS[self.form]) if self.form.startswith("said") else make()
 
 
 FORMS = {"one array": True, "two arrays": False, "said to be an equality": True, "said to be an interval": False}

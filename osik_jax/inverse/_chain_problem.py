@@ -19,7 +19,7 @@ from ._pool import Errors
 from ._seeds import shift_of
 from ._solution import InverseKinematicsSolution
 
-_ROUNDINGS = 64.0
+_ROUNDOFF = 64.0
 """Machine epsilons, of the robot's size, by which computed errors may be off."""
 _ENOUGH = 0.01
 """Score at which a search is done; the next step would be a rounding."""
@@ -112,7 +112,7 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
 def allowed(tolerance: Float[Array, "2"], length: Float[Array, ""]) -> Float[Array, "2"]:
     """Tolerances less what rounding may hide, so that what is called converged is so in exact numbers too."""
     size = jnp.stack([jnp.where(jnp.isfinite(length), length, 1.0), jnp.ones_like(length)])
-    hidden = _ROUNDINGS * float(jnp.finfo(tolerance.dtype).eps) * size
+    hidden = _ROUNDOFF * float(jnp.finfo(tolerance.dtype).eps) * size
     return jnp.maximum(tolerance - hidden, 0.25 * tolerance)
 
 
@@ -198,7 +198,7 @@ def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
     """How far targets are at least from what the links can reach, 0 where they may be within."""
     length, root = reaches(search.chain, search.first, search.lower, search.upper)
     asked = np.array(search.rows)[:, :3].all(-1)
-    longest = length * (1.0 + _ROUNDINGS * float(jnp.finfo(length.dtype).eps))
+    longest = length * (1.0 + _ROUNDOFF * float(jnp.finfo(length.dtype).eps))
     away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - longest
     away = jnp.where(jnp.isfinite(away) & asked, away, 0.0)
     return jnp.maximum(jnp.max(away, -1), 0.0)

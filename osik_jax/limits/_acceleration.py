@@ -19,7 +19,7 @@ from ._box import Kind, Limit, limit_box
 from ._configuration import ConfigurationLimit
 
 _Box = tuple[Float[Array, " nv"], Float[Array, " nv"]]
-_ROUNDING = 32.0  # machine epsilons of the way to a bound that braking leaves over
+_ROUNDOFF = 32.0  # machine epsilons of the way to a bound that braking leaves over
 _MOST_STEPS = 1e6  # of braking
 
 
@@ -143,7 +143,7 @@ def _way(bound: Float[Array, " nv"], position: Float[Array, " nv"]) -> Float[Arr
     """To the bound, rounded down; an infinite bound stays so, with gradients 0."""
     free = jnp.isinf(bound)
     way = jnp.where(free, 0.0, bound) - position
-    return jnp.where(free, bound, way - _ROUNDING * jnp.finfo(way.dtype).eps * jnp.abs(way))
+    return jnp.where(free, bound, way - _ROUNDOFF * jnp.finfo(way.dtype).eps * jnp.abs(way))
 
 
 def stopping_speed(

@@ -18,7 +18,7 @@ from ._rows import LimitRows
 
 Kind = Literal["acceleration", "velocity", "braking", "position"]
 _COMPUTED: tuple[Kind, ...] = ("acceleration", "braking")
-_ROUNDINGS = 4.0
+_ROUNDOFF = 4.0
 _ORDER: tuple[Kind, ...] = ("acceleration", "velocity", "braking", "position")
 
 
@@ -102,8 +102,8 @@ def limit_box(
 
 
 def _a_little_below(upper: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """By a few roundings: XLA may compute a bound twice, in two roundings, and bounds that are one would then cross."""
-    fraction = _ROUNDINGS * jnp.finfo(upper.dtype).eps
+    """Return bounds lower by some roundoff: where XLA computes one twice, the two may differ by it, and would cross."""
+    fraction = _ROUNDOFF * jnp.finfo(upper.dtype).eps
     return jnp.where(upper > 0.0, upper * (1.0 - fraction), upper * (1.0 + fraction))
 
 

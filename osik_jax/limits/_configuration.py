@@ -16,7 +16,7 @@ from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values, scalar_layout
 from ._box import Kind, Limit
 
-_ROUNDING = 8.0  # machine epsilons of the way to a bound that are kept clear of it, so that q + v dt stays within
+_ROUNDOFF = 8.0  # machine epsilons of the way to a bound that are kept clear of it, so that q + v dt stays within
 
 
 class ConfigurationLimit(Limit):
@@ -75,7 +75,7 @@ class ConfigurationLimit(Limit):
         """Velocity that leads towards the bound, rounded inward; an infinite bound stays so, with gradients 0."""
         free = jnp.isinf(bound)
         way = jnp.where(free, 0.0, bound) - position
-        way = way + inward * _ROUNDING * jnp.finfo(way.dtype).eps * jnp.abs(way)
+        way = way + inward * _ROUNDOFF * jnp.finfo(way.dtype).eps * jnp.abs(way)
         return jnp.where(free, bound, self.gain * way / dt)
 
     def _convert(self, name: str, value: Any) -> Any:

@@ -323,10 +323,10 @@ def _add_ties(spec: mujoco.MjSpec, robot: Robot) -> None:
         _tie(spec, tree.joint_names[joint], "", offset[at] - reference[at], 0.0)
 
 
-def _tie(spec: mujoco.MjSpec, joint: str, leader: str, constant: float, slope: float) -> None:
+def _tie(spec: mujoco.MjSpec, joint: str, leader: str, constant: float, multiplier: float) -> None:
     tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint, name2=leader, **_GEARED)
     tie.objtype = mujoco.mjtObj.mjOBJ_JOINT
-    tie.data[:5] = (constant, slope, 0.0, 0.0, 0.0)
+    tie.data[:5] = (constant, multiplier, 0.0, 0.0, 0.0)
 
 
 def _compiled(spec: mujoco.MjSpec, source: mujoco.MjModel) -> mujoco.MjModel:

@@ -27,7 +27,7 @@ class Level(eqx.Module):
         weight: of the squared distances of the rows to their intervals, >= 0; None for ones. (m,)
         equalities: rows that are equalities whatever ``upper`` says, which is not looked at there: all where ``upper``
             was left out (static). Name them where bounds are computed under ``jit``: XLA may compute an expression
-            twice, in two roundings, and what was one number is then two. (m,)
+            twice and round it in two ways: what was one number is then two. (m,)
     """
 
     matrix: Float[Array, "m n"]

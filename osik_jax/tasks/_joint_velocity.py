@@ -39,7 +39,7 @@ class VelocityTask(Task):
 
     @abc.abstractmethod
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """Velocities of these dofs [rad/s or m/s]."""
+        """Return the velocities of these dofs that are asked for [rad/s or m/s]."""
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """One row for each dof of the chosen joints, in the order of v."""
@@ -98,7 +98,7 @@ class DampingTask(VelocityTask):
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """Nought."""
+        """Return 0 for each dof."""
         return jnp.zeros(len(dofs), self.weight.dtype)
 
 
@@ -135,7 +135,7 @@ class FreezeTask(VelocityTask):
             raise OsikValueError("a FreezeTask needs at least one joint")
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """Nought."""
+        """Return 0 for each dof."""
         return jnp.zeros(len(dofs), self.weight.dtype)
 
 

@@ -67,7 +67,7 @@ class Problem(eqx.Module):
 
         return Evaluation(*over_scenarios(one, (numbers, vector), scenarios, chunk, self.mesh))
 
-    def slope(
+    def gradient(
         self, vector: Float[Array, " p"], scenarios: Scenarios, chunk: int
     ) -> tuple[Evaluation, Float[Array, " p"]]:
         """Losses at a vector of parameters, and the gradient of their mean.
@@ -79,9 +79,9 @@ class Problem(eqx.Module):
         def one(shared: Any, scenario: Scenarios) -> Any:
             return jax.value_and_grad(put_together(shared[0], static).one, has_aux=True)(shared[1], scenario)
 
-        (losses, kept), slopes = over_scenarios(one, (numbers, vector), scenarios, chunk, self.mesh)
-        kept = kept & jnp.isfinite(slopes).all(1)
-        total = jnp.sum(jnp.where(kept[:, None], slopes, 0.0), 0)
+        (losses, kept), gradients = over_scenarios(one, (numbers, vector), scenarios, chunk, self.mesh)
+        kept = kept & jnp.isfinite(gradients).all(1)
+        total = jnp.sum(jnp.where(kept[:, None], gradients, 0.0), 0)
         return Evaluation(losses, kept), total / jnp.maximum(jnp.sum(kept), 1)
 
 

@@ -207,7 +207,7 @@ def _step(
 ) -> tuple[Array, Any, dict[str, Array]]:
     """The next vector and optimiser's state, and the row of the history."""
     problem: Problem = put_together(numbers, static)
-    trained, gradient = problem.slope(vector, batches[0], chunks[0])
+    trained, gradient = problem.gradient(vector, batches[0], chunks[0])
     held = (
         problem.value(vector, batches[1], chunks[1])
         if len(batches) > 1

@@ -52,22 +52,22 @@ def _step(builder: Any, made: Any, kind: Any) -> Any:
 
 
 def row_bytes(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Bytes between the rows of a matrix."""
+    """Return the bytes between the rows of a matrix."""
     return _step(builder, context.make_array(kind)(context, builder, array), kind)
 
 
 def blocks_of(builder: Any, count: Any) -> Any:
-    """Blocks that so many numbers fill."""
+    """Return how many blocks so many numbers fill."""
     return builder.ashr(builder.add(count, _INDEX(WIDTH - 1)), _INDEX(WIDTH.bit_length() - 1))
 
 
 def _block(builder: Any, at: Any, k: int = 0) -> Any:
-    """A pointer to the k-th block from an address on."""
+    """Return a pointer to the k-th block from an address on."""
     return builder.inttoptr(builder.add(at, _INDEX(BYTES * k)), _BLOCK.as_pointer())
 
 
 def load(builder: Any, at: Any, k: int = 0) -> Any:
-    """The k-th block from an address on."""
+    """Return the k-th block from an address on."""
     return builder.load(_block(builder, at, k), align=8)
 
 
@@ -77,5 +77,5 @@ def store(builder: Any, block: Any, at: Any, k: int = 0) -> None:
 
 
 def everywhere(builder: Any, at: Any) -> Any:
-    """A block of the number at an address."""
+    """Return a block of the number at an address."""
     return _splat(builder, builder.load(builder.inttoptr(at, _DOUBLE.as_pointer())), _BLOCK)

@@ -33,7 +33,7 @@ def is_coupled(weight, first, second, t):
 
 @lean
 def start_frame(S, block, alone, damping, right, n):
-    """The frame's own block, and its right-hand side behind it."""
+    """Put the frame's own block, and its right-hand side behind it."""
     for i in range(n):
         for j in range(i // WIDTH * WIDTH, n):
             S[i, j] = -block[i, j]
@@ -59,7 +59,7 @@ def couple(X, rows, before, weight, first, scaled, plain, n):
 
 @lean
 def take_solved(S, G, y, v, n):
-    """The right-hand side of S less ``G'y``."""
+    """Take ``G'y`` off the right-hand side of S."""
     fill(v, 0.0)
     for k in range(n):
         add(v, y[k, n], G[k], 0, n)

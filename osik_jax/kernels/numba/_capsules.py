@@ -14,13 +14,13 @@ _TINY = np.finfo(float).tiny ** 0.5
 
 @lean
 def inner(a, b):
-    """a . b."""
+    """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @lean
 def times(by, a):
-    """A vector times a number."""
+    """Return a vector times a number."""
     return by * a[0], by * a[1], by * a[2]
 
 
@@ -55,7 +55,7 @@ def parameters(a, b, offset):
 
 @lean
 def across(a, b, outward):
-    """A unit vector perpendicular to two directions, as far outward as may be; any, where there is none."""
+    """Return a unit vector perpendicular to two directions, as far outward as may be; any, where there is none."""
     longer = a if inner(a, a) >= inner(b, b) else b
     x, y, z = abs(longer[0]), abs(longer[1]), abs(longer[2])
     if x <= y and x <= z:
@@ -70,7 +70,7 @@ def across(a, b, outward):
 
 @lean
 def nearest(start_a, along_a, radius_a, start_b, along_b, radius_b):
-    """Distance of two capsules, the nearest points of their surfaces, and the unit vector from the first to the other.
+    """Return how far two capsules are apart, the nearest points of their surfaces, and the unit vector to the other.
 
     Args:
         start_a: one end of the axis.

@@ -16,7 +16,7 @@ CORNERS = 8
 
 @lean
 def center_of(K, V, W):
-    """The centre of mass."""
+    """Return the centre of mass."""
     center = (0.0, 0.0, 0.0)
     for body in range(K.counts[BODIES]):
         if V.mass_fractions[body] != 0.0:
@@ -76,7 +76,7 @@ def find_overhang(K, V, W, contact, center):
 
 @lean
 def ask_balance(K, V, W, J, row, contact, n):
-    """The row of a centre of mass that is beyond its bound, where both feet stand."""
+    """Return the row of a centre of mass that is beyond its bound, where both feet stand."""
     weight = V.wishes[BALANCE]
     if weight == 0.0 or not (max(contact[0], contact[1]) > 0.5 and max(contact[2], contact[3]) > 0.5):
         return row, 0.0

@@ -46,7 +46,7 @@ from ._vectors import WIDTH
 
 @lean
 def ask_limbs(K, V, W, J, row, wanted, n):
-    """Rows of directions: the next row, and half the weighted sum of squares.
+    """Put rows of directions; return the next row, and half the weighted sum of squares.
 
     What a direction d changes by is across it, ``(I - d d') / length`` times what the segment changes by: two rows do
     for the three. A limb that is shorter than what counts as a length has none.
@@ -105,7 +105,7 @@ def ask_root(K, V, W, J, row, wanted, n):
 
 @lean
 def ask_height(K, V, W, J, row, k, gap, weight, n):
-    """The row of a place's height above what it should have."""
+    """Return the row of a place's height above what it should have."""
     if weight == 0.0:
         return row, 0.0
     add_point(K, W, k, (0.0, 0.0, 1.0))
@@ -135,7 +135,7 @@ def ask_floor(K, V, W, J, row, contact, n):
 
 @lean
 def capsule(K, V, W, i):
-    """One end of its axis, the vector to the other, and its radius."""
+    """Return one end of its axis, the vector to the other, and its radius."""
     k = K.counts[KEYS] + 12 + 2 * i
     start = triple(W.points, k)
     return start, minus(triple(W.points, k + 1), start), V.radii[i]
@@ -143,7 +143,7 @@ def capsule(K, V, W, i):
 
 @lean
 def find_near(K, V, W):
-    """How many pairs of capsules are nearer than the margin: their numbers and distances are in ``W.near``."""
+    """Return how many pairs of capsules are nearer than the margin: their numbers and distances are in ``W.near``."""
     margin, count, spheres = V.wishes[MARGIN], 0, W.spheres
     for i in range(K.counts[CAPSULES]):
         start, along, radius = capsule(K, V, W, i)
@@ -215,7 +215,7 @@ def stand(K, V, W, moving, points, n):
 
 @lean
 def clipped(x, lower, upper):
-    """x inside its bounds; NaN where one of the three is."""
+    """Return x inside its bounds; NaN where one of the three is."""
     if not x >= lower:
         return lower
     return x if x <= upper else upper
@@ -223,7 +223,7 @@ def clipped(x, lower, upper):
 
 @lean
 def ask_joints(K, V, q, alone, gradient):
-    """What joints cost by themselves, wishes and bounds."""
+    """Return what joints cost by themselves, wishes and bounds."""
     posture, limit, stiffness = V.wishes[POSTURE], V.wishes[LIMIT], V.wishes[STIFFNESS]
     soft, penalty = 0.0, 0.0
     for j in range(len(alone)):
@@ -334,7 +334,7 @@ def ask_clip(K, V, W, G, R, q, out):
 
 @lean
 def close(R, out, t, following, n):
-    """Finishes frame t, of which ``following`` says where the standing points of the next are."""
+    """Finish frame t, of which ``following`` says where the standing points of the next are."""
     own, N = t % 2, out.blocks.shape[1]
     J, moving = R.rows[own * R.most : own * R.most + R.most], out.moving[t * POINTS : t * POINTS + POINTS]
     count = tie(J, R.count[own], moving, R.weight[own], R.move[own], R.weight[following], R.move[following], n)

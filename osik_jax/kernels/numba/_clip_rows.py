@@ -53,7 +53,7 @@ def add_point(K, W, k, d):
 
 @lean
 def put_row(K, V, W, J, row, scale, residual, n):
-    """The line as a row of J, by the dofs that are independent, with its residual behind it; the line is cleared."""
+    """Put the line as a row of J, by dofs that are independent, with its residual behind it; the line is cleared."""
     if K.counts[STRAIGHT] != 0:
         for j in range(n):
             J[row, j] = scale * W.line[j]
@@ -68,5 +68,5 @@ def put_row(K, V, W, J, row, scale, residual, n):
 
 @lean
 def unit(i):
-    """The i-th axis."""
+    """Return the i-th axis."""
     return 1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0

@@ -144,7 +144,7 @@ class Linearised(NamedTuple):
 
 @compiled
 def structure(at):
-    """The whole numbers at an address."""
+    """Return the whole numbers at an address."""
     c = whole_numbers(at, COUNTS)
     n = c[DOFS]
     at += 4 * COUNTS
@@ -168,7 +168,7 @@ def structure(at):
 
 @compiled
 def numbers(c, at, wishes):
-    """The numbers at an address; of the wishes a copy."""
+    """Return the numbers at an address; of the wishes a copy."""
     n = c[DOFS]
     coefficient, at = vector(at, c[VALUES]), at + 8 * c[VALUES]
     offset, at = vector(at, c[VALUES]), at + 8 * c[VALUES]
@@ -199,7 +199,7 @@ def numbers(c, at, wishes):
 
 @compiled
 def memory(c, at):
-    """Memory for a frame at an address, and where more is."""
+    """Return memory for a frame at an address, and where more is."""
     wide = padded(c[FULL])
     value, at = vector(at, c[VALUES]), at + 8 * c[VALUES]
     position, at = matrix(at, c[BODIES], 3), at + 24 * c[BODIES]
@@ -221,7 +221,7 @@ def memory(c, at):
 
 @compiled
 def kept(c, at):
-    """Memory for rows at an address, and where more is."""
+    """Return memory for rows at an address, and where more is."""
     N, most = padded(c[DOFS] + 1), ROWS + 2 * c[ABOVE] + c[MOST_PAIRS]
     rows, at = matrix(at, 2 * most, N), at + 16 * most * N
     points, at = matrix(at, 2, POINTS), at + 16 * POINTS

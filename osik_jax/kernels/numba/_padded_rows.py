@@ -25,7 +25,7 @@ _MOST = 5
 
 
 def _of_block(name: str) -> Callable[[Any, Any], Any]:
-    """A function of LLVM's, number by number."""
+    """Return a call of a function of LLVM's, number by number."""
     kind = ir.FunctionType(_BLOCK, [_BLOCK])
     full = f"llvm.{name}.v{WIDTH}f64"
     return lambda builder, block: builder.call(cgutils.get_or_insert_function(builder.module, kind, full), (block,))
@@ -61,7 +61,7 @@ def _by_some_blocks(builder: Any, blocks: Any, body: Callable[[Any, int], None])
 
 
 def _summing(what: str) -> Any:
-    """The blocks at ``out`` become those at ``base`` with rows of B added."""
+    """Return an intrinsic: the blocks at ``out`` become those at ``base`` with rows of B added."""
 
     def body(builder, out, base, a, B, step, rows, blocks):
         def some(before: Any, k: int) -> None:

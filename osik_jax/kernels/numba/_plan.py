@@ -53,7 +53,7 @@ class Steps(NamedTuple):
 
 @lean
 def limit_step(V, there, t, step, out):
-    """What a step beyond the limits of speed costs: the cost of frame t and the next."""
+    """Return what a step beyond the limits of speed costs: the cost of frame t and the next."""
     limit, stiffness, cost = V.wishes[SPEED], V.wishes[STIFFNESS], 0.0
     for j in range(len(step)):
         value, bound = there * step[j], V.step[j]
@@ -72,7 +72,7 @@ def limit_step(V, there, t, step, out):
 
 @lean
 def limit_change(K, V, there, t, before, step, out):
-    """What a change of steps costs, and one beyond the limits of acceleration, in frames t to t + 2."""
+    """Return what a change of steps costs, and one beyond the limits of acceleration, in frames t to t + 2."""
     limit, stiffness, soft, penalty = V.wishes[SPEED], V.wishes[STIFFNESS], 0.0, 0.0
     for j in range(len(step)):
         value, bound = there * (step[j] - before[j]), V.change[j]
@@ -96,7 +96,7 @@ def limit_change(K, V, there, t, before, step, out):
 
 @lean
 def linearise(K, V, W, G, R, T, q, out):
-    """Gauss-Newton's system at some configurations; what wishes and bounds cost there."""
+    """Make Gauss-Newton's system at some configurations; what wishes and bounds cost there."""
     soft, penalty = ask_clip(K, V, W, G, R, q, out)
     frames = len(q)
     for t in range(frames):
@@ -118,7 +118,7 @@ def linearise(K, V, W, G, R, T, q, out):
 
 @lean
 def step_from(K, C, T, here, free, damping, q, candidate):
-    """Solves the damped system and takes the step, no longer than the linear model is good for."""
+    """Solve the damped system and take the step, no longer than the linear model is good for."""
     frames, n = T.right.shape
     N = padded(n + 1)
     for t in range(frames):
@@ -138,7 +138,7 @@ def step_from(K, C, T, here, free, damping, q, candidate):
 
 @lean
 def descend(K, V, W, G, R, T, C, free, q, other, here, there, cost):
-    """Improves q; ``other`` and ``there`` are memory. Returns how many systems it took, and where the answer is.
+    """Improve q; ``other`` and ``there`` are memory. Return how many systems it took, and where the answer is.
 
     Args:
         K: structure.
@@ -194,7 +194,7 @@ def descend(K, V, W, G, R, T, C, free, q, other, here, there, cost):
 
 @compiled
 def system(at, frames, n):
-    """Memory for a system at an address, and where more is."""
+    """Return memory for a system at an address, and where more is."""
     N = padded(n + 1)
     blocks, at = matrix(at, frames * N, N), at + 8 * frames * N * N
     moving, at = matrix(at, frames * POINTS, N), at + 8 * frames * POINTS * N
@@ -208,7 +208,7 @@ def system(at, frames, n):
 
 @compiled
 def steps(at, frames, n):
-    """Memory for steps at an address, and where more is."""
+    """Return memory for steps at an address, and where more is."""
     N = padded(n + 1)
     before, at = vector(at, n), at + 8 * n
     step, at = vector(at, n), at + 8 * n
@@ -231,14 +231,14 @@ def lane_of(pointer, lane):
 
 @lean
 def copy(a, b):
-    """a = b."""
+    """Copy b to a."""
     for i in range(len(a)):
         for j in range(a.shape[1]):
             a[i, j] = b[i, j]
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``retargeting/_plan_kernel.py``, flat, with an axis of lanes or of 1."""
+    """Answer a call of XLA: arguments as in ``retargeting/_plan_kernel.py``, flat, with an axis of lanes or of 1."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

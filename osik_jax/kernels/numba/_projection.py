@@ -57,7 +57,7 @@ class Level(NamedTuple):
 
 @lean
 def gap(level, i, value):
-    """From a value of row i to the nearest point of its interval."""
+    """Return how far it is from a value of row i to the nearest point of its interval."""
     if level.equal[i] != 0:
         return level.lower[i] - value
     return min(max(value, level.lower[i]), level.upper[i]) - value
@@ -65,7 +65,7 @@ def gap(level, i, value):
 
 @lean
 def load(W, level):
-    """The level's rows into rows of whole blocks, and into columns; minus them, so that products are taken off."""
+    """Put the level's rows into rows of whole blocks, and into columns; minus them, so that products are taken off."""
     m, n = level.A.shape
     for i in range(m):
         put_multiple(W.rows[i], -1.0, level.A[i], n)
@@ -77,7 +77,7 @@ def load(W, level):
 
 @lean
 def look(W, level, x):
-    """What the level's rows are at x and ask for; the square of the longest row, and the size of all."""
+    """Return what the level's rows are at x and ask for; the square of the longest row, and the size of all."""
     m, n = level.A.shape
     longest, size = 0.0, 0.0
     minus_rows(W.value, W.zeros, x, W.columns, 0, n, 0, m)
@@ -95,7 +95,7 @@ def counts(W, level, i):
 
 @lean(inline="always")
 def level_damping(W, level, first, longest):
-    """The damping of the level: constant + unmet ratio, the ratio of what the step with this very damping misses."""
+    """Return the level's damping, constant + unmet ratio: the ratio of what the step with this very damping misses."""
     m, n = level.A.shape
     whole = level.constant
     if level.unmet != 0.0:
@@ -113,7 +113,7 @@ def level_damping(W, level, first, longest):
 
 @lean
 def missed_with(W, level, damping):
-    """Size of the residual that the step with this damping leaves; rows that do not count are 0 in the step."""
+    """Return the residual's size that the step with this damping leaves; rows that do not count are 0 in the step."""
     m = len(level.A)
     for i in range(m):
         put_multiple(W.symmetric[i], -1.0, W.less[i], padded(m))
@@ -138,7 +138,7 @@ def missed_with(W, level, damping):
 
 @lean(inline="always")
 def find_motion(W, level, first, damping, rank_tolerance, plain):
-    """What the level asks for; takes its row space off the coordinates that are left, the rank that is returned."""
+    """Find what the level asks for, and take its row space off the coordinates that are left; return the rank."""
     m, n = level.A.shape
     square, many = 0.0, 0
     for i in range(m):
@@ -162,7 +162,7 @@ def find_motion(W, level, first, damping, rank_tolerance, plain):
 
 @lean
 def move(W, x):
-    """Adds as much of the motion to x as stays within what levels out of reach leave to those below."""
+    """Add as much of the motion to x as stays within what levels out of reach leave to those below."""
     part, n = 1.0, len(x)
     for i in range(n):
         step = W.motion[i]
@@ -175,7 +175,7 @@ def move(W, x):
 
 @lean
 def narrow(W, level, x, longest, size):
-    """The box of the levels below: what they may spend of the progress of a level that is out of reach."""
+    """Narrow the box of the levels below to what they may spend of the progress of a level that is out of reach."""
     m, n = level.A.shape
     for j in range(n):
         W.bent[j] = max(W.bent[j], level.bends[j] / (size if size > 0.0 else 1.0))
@@ -218,7 +218,7 @@ def solve_level(W, level, x, first, rank_tolerance):
 
 @lean
 def end(W, x, secondary, first, projector):
-    """The secondary motion in what is left, and the projector onto that."""
+    """Add the secondary motion in what is left, and make the projector onto that."""
     n = len(x)
     fill(projector.reshape(-1), 0.0)
     fill(W.motion, 0.0)
@@ -231,7 +231,7 @@ def end(W, x, secondary, first, projector):
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``solvers/null_space/_dispatch.py``, a leading axis of lanes on each."""
+    """Answer a call of XLA: arguments as in ``solvers/null_space/_dispatch.py``, a leading axis of lanes on each."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

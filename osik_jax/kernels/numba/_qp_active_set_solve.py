@@ -32,7 +32,7 @@ _MAX_REFINEMENTS = KERNEL_REFINEMENTS[np.dtype("float64")]
 
 @lean(inline="always")
 def solve_on_active_set(P, W, labels, x, z):
-    """The minimiser with the active constraints as equalities and the others left out, by the smaller system.
+    """Return the minimiser with the active constraints as equalities and the others left out, by the smaller system.
 
     Returns whether its factors are worth something; the gradient is that of the Lagrangian at the minimiser.
 
@@ -50,7 +50,7 @@ def solve_on_active_set(P, W, labels, x, z):
 
 @lean
 def find_used_rows(P, labels, used, z):
-    """Numbers of the rows of the active set, all of the cost and the active ones of C; how many. The others' z is 0."""
+    """Find the rows of the active set, all of the cost and the active ones of C; return how many. Others have z 0."""
     m, n = len(P.target), len(P.damping)
     count = 0
     for i in range(len(P.compliance)):
@@ -95,7 +95,7 @@ def find_gradient(P, W, labels, x, z):
 
 @lean
 def put_columns_of_used(P, W, count, n):
-    """The columns of the rows of the active set, one after another, each as long as these are many."""
+    """Put the columns of the rows of the active set, one after another, each as long as these are many."""
     for j in range(n):
         for a in range(count):
             W.columns[j, a] = P.turned[j, W.used[a]]

@@ -103,7 +103,7 @@ def begin(P, A, target, weight, damping, center, C, compliance):
 
 @lean
 def first_labels(P, guess, labels):
-    """The guess where the bounds that it names exist; pinned variables are active, equality rows where guessed."""
+    """Take the guess where the bounds that it names exist; pinned variables are active, equality rows where guessed."""
     n = len(P.damping)
     for i in range(len(labels)):
         low, high = P.lower[i], P.upper[i]
@@ -117,5 +117,5 @@ def first_labels(P, guess, labels):
 
 @lean
 def active_bound(P, label, i):
-    """The bound at which constraint i is active."""
+    """Return the bound at which constraint i is active."""
     return P.upper[i] if label == AT_UPPER else P.lower[i]

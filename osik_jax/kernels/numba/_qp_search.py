@@ -14,7 +14,7 @@ from ._qp_roundoff import find_roundoff
 
 @lean(inline="always")
 def search(P, W, labels, tolerance, most_changes, x, z, report):
-    """Active set and minimiser of one problem.
+    """Find active set and minimiser of one problem.
 
     Args:
         P: the problem.
@@ -73,7 +73,7 @@ def leaves_out(P, W, labels, x, z):
 
 @lean
 def right_label(P, W, labels, i, x, z):
-    """What constraint i should be: active where it is violated, inactive where its multiplier has the wrong sign."""
+    """Return what constraint i should be: active where violated, inactive where its multiplier has the wrong sign."""
     m, n = len(P.target), len(x)
     if labels[i] == EQUALITY:
         return EQUALITY

@@ -1,7 +1,7 @@
 """Factors L D L' of a symmetric matrix and solutions by them, a block of eight rows in registers at a time.
 
 Nothing goes through memory between one number and the next that depends on it. Matrices are ``padded``, rows too, with
-noughts behind the n-th row and column. With Numba's bounds checks on, these are plain loops.
+zeros behind the n-th row and column. With Numba's bounds checks on, these are plain loops.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _NOTHING, _ZEROS = ir.Constant(_BLOCK, ir.Undefined), _BLOCK([0.0] * WIDTH)
 
 
 def _lane(builder: Any, block: Any, k: int) -> Any:
-    """A block of the k-th number of a block."""
+    """Return a block of the k-th number of a block."""
     return builder.shuffle_vector(block, _NOTHING, _LANES([k] * WIDTH))
 
 
 def _only(builder: Any, block: Any, lanes: range) -> Any:
-    """A block with noughts elsewhere."""
+    """Return a block with zeros elsewhere."""
     return builder.shuffle_vector(block, _ZEROS, _LANES([k if k in lanes else WIDTH for k in range(WIDTH)]))
 
 
@@ -66,7 +66,7 @@ def _factor_beside(builder: Any, S: Any, T: Any, L: Any, inverse: Any, step: Any
 
 
 def _factoring(typing_context, S, T, inverse, k, wide):
-    """The block of rows from k on, from which what is above it has been taken off."""
+    """Return the block of rows from k on, from which what is above it has been taken off."""
 
     def body(builder, S, T, inverse, step, right):
         _factor_block(builder, S, T, inverse, step)
@@ -181,7 +181,7 @@ def factor_symmetric(S, L, T, inverse, diagonal, n, smallest):
 
 @lean
 def solve_symmetric(L, T, inverse, b, n):
-    """b becomes (L D L')^-1 b, with the factors of ``factor_symmetric``; noughts behind its n numbers."""
+    """b becomes (L D L')^-1 b, with the factors of ``factor_symmetric``; zeros behind its n numbers."""
     for j in range(n, padded(n)):
         b[j] = 0.0
     _solve(L, T, inverse, b, padded(n))

@@ -26,12 +26,12 @@ _WIDE = bool(binding.get_host_cpu_features().get("avx512f", False))
 
 @lean
 def padded(n):
-    """Numbers of a row of n."""
+    """Return how many numbers a row of n has, filled up to whole blocks."""
     return (n + WIDTH - 1) // WIDTH * WIDTH
 
 
 def _at(context: Any, builder: Any, kind: Any, array: Any, i: Any, j: Any) -> Any:
-    """A pointer to number j of row i."""
+    """Return a pointer to number j of row i."""
     assert kind.layout == "C" and kind.dtype == types.float64 and kind.ndim == 2, kind
     made = context.make_array(kind)(context, builder, array)
     length = cgutils.unpack_tuple(builder, made.shape, 2)[1]
@@ -39,7 +39,7 @@ def _at(context: Any, builder: Any, kind: Any, array: Any, i: Any, j: Any) -> An
 
 
 def _block(builder: Any, pointer: Any, k: int) -> Any:
-    """A pointer to the k-th block from a number on."""
+    """Return a pointer to the k-th block from a number on."""
     return builder.bitcast(builder.gep(pointer, [ir.IntType(64)(WIDTH * k)]), _BLOCK.as_pointer())
 
 
@@ -140,7 +140,7 @@ def take_product(C, A, B, top, bottom, left, right, first, last):
 
 @lean
 def take_square(C, A, n, right, first, last):
-    """The upper triangle of ``C -= A'A``, n rows and the columns to ``right``, in whole blocks."""
+    """Take A'A from the upper triangle of C: n rows and the columns to ``right``, in whole blocks."""
     for top in range(0, n, WIDTH):
         take_product(C, A, A, top, min(top + WIDTH, n), top, right, first, last)
 

@@ -22,7 +22,7 @@ from ._tiles import padded
 
 
 def handle(frame):
-    """One call of XLA: arguments as in ``solvers/qp/_numba.py``, a leading axis of lanes on each."""
+    """Answer a call of XLA: arguments as in ``solvers/qp/_numba.py``, a leading axis of lanes on each."""
     if not is_call(frame):
         return 0
     given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each

@@ -77,13 +77,13 @@ def equality_followers(model: mujoco.MjModel) -> tuple[list[Follower], dict[int,
     followers, constants = [], {}
     for e in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool)):
         joint, leader = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
-        constant, slope, *higher = (float(x) for x in model.eq_data[e][:5])
+        constant, multiplier, *higher = (float(x) for x in model.eq_data[e][:5])
         reference = float(model.qpos0[model.jnt_qposadr[joint]])
-        if leader < 0 or not (slope or any(higher)):
+        if leader < 0 or not (multiplier or any(higher)):
             constants[joint] = np.array([reference + constant])
         elif not any(higher):
             start = float(model.qpos0[model.jnt_qposadr[leader]])
-            followers.append(Follower(joint, leader, slope, reference + constant - slope * start))
+            followers.append(Follower(joint, leader, multiplier, reference + constant - multiplier * start))
     return followers, constants
 
 

@@ -21,7 +21,7 @@ _SHAPES = {
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")): name
     for name in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box")
 }
-_ROUNDING = 1e-9
+_ROUNDOFF = 1e-9
 """Of its greatest moment of inertia, by which a body may break the triangle inequality for rounding alone."""
 
 _SAME = 1e-6
@@ -155,7 +155,7 @@ def _add_inertial(robot: RobotModel, body: int, element: ElementTree.Element, *,
     moments, axes = np.linalg.eigh(np.asarray(robot.body_inertia[body], float))
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     excess = moments[2] - moments[0] - moments[1]
-    if 0.0 < excess <= _ROUNDING * moments[2]:
+    if 0.0 < excess <= _ROUNDOFF * moments[2]:
         moments[0] += 2.0 * excess
     _put(
         element,

@@ -32,8 +32,8 @@ class Layout(NamedTuple):
 class PaddedHierarchy(NamedTuple):
     """The numbers of a hierarchy.
 
-    Which rows are equalities is decided once and never read off the bounds again: XLA may compute one bound twice, with
-    two roundings.
+    Which rows are equalities is decided once and never read off the bounds again: XLA may compute one bound twice, and
+    round it in two ways.
     """
 
     levels: Level  # with a leading axis of levels; padding rows are 0 and unbounded

@@ -118,7 +118,7 @@ def factor_least_squares(
     left = left[: kept.shape[0]]
 
     def step(x: Float[Array, " n"], slack: Float[Array, " m"]) -> Float[Array, " n"]:
-        # damping pulls on the whole of x in the space that is free, not on the step alone
+        # damping is of the whole of x in the space that is free, not of the step alone
         present = jnp.where(damping > 0.0, apply(active_rows.projector, x), 0.0)
         right = apply(rows, present) - slack
         y = jax.scipy.linalg.solve_triangular(square, apply(left.T, right[order]))

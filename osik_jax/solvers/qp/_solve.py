@@ -101,7 +101,7 @@ def solve_least_squares_qp(
         target: b. (m,)
         weight: of the squared residuals, >= 0. (m,)
         damping: > 0; makes the answer unique. A scalar or one per variable (n,).
-        center: where the damping pulls to. A scalar or one per variable (n,).
+        center: the point that the damping draws x to. A scalar or one per variable (n,).
         lower: as in ``solve_qp``, and so are the following.
         upper: of the box. (n,)
         rows: general constraints. (p, n)
@@ -109,8 +109,8 @@ def solve_least_squares_qp(
         rows_upper: of the rows. (p,)
         rows_compliance: of the rows; 0 where hard. (p,)
         rows_equalities: rows that are equalities whatever ``rows_upper`` says, which is not looked at there (static).
-            Name them where bounds are computed under ``jit``: XLA may compute an expression twice, in two roundings,
-            and what was one number is then two. (p,)
+            Name them where bounds are computed under ``jit``: XLA may compute an expression twice and round it in
+            two ways: what was one number is then two. (p,)
         warm_start: ``active`` of the solution of a problem nearby. (n + p,)
         max_iterations: limit on the changes of the active set (static).
         tolerance: relative violation that counts as none.
