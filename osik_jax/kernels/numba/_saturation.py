@@ -14,6 +14,8 @@ from ...numerics._constants import (
     BOUND_DISTANCE,
     FULL_STEP,
     LOOSE_SATURATION_RANK,
+    LOOSEST_SATURATION_RANK,
+    MAX_SATURATION_CHANGES,
     NEGLIGIBLE_STEP,
     PART,
     PATH_SEARCHES,
@@ -163,23 +165,30 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
     """Find the end of the level's motion, or what comes before it where that has the least damped cost.
 
     The latter as ``solvers/null_space/_scale_path.py`` has it: a search for each scale that is tried, from a part of
-    the straight way to the end on. All searches are one call, for there is much to compile in it.
+    the straight way to the end on. A search has up to three attempts, each with a wider tolerance for joints that
+    depend on each other. All attempts are one call, for there is much to compile in it.
 
     Returns:
         The scale, the blocker, changes of the active set, and what ``solve_level`` says of the end. ``S.kept`` is where
         joints are.
     """
-    n, at, least, low, high, scale = len(x), 1.0, SATURATION_RANK, 0.0, 1.0, 0.0
+    n, at, number, low, high, scale = len(x), 1.0, 0, 0.0, 1.0, 0.0
     blocker, changes, ended, searches, whole, part = 0, 0, 0, 0, 1.0, 1.0
     while searches <= PATH_SEARCHES and changes < most:
-        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, most, least)
+        least, limit = SATURATION_RANK, min(most - changes, MAX_SATURATION_CHANGES * n)
+        if number == 1:
+            least = LOOSE_SATURATION_RANK
+        elif number == 2:
+            least, limit = LOOSEST_SATURATION_RANK, most - changes
+        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, limit, least)
         changes += more
+        if not done and number < 2:
+            number += 1
+            continue
+        number = 0
         if ended == 0:  # the end of the path
             if not done:
-                if least == LOOSE_SATURATION_RANK:
-                    break
-                least = LOOSE_SATURATION_RANK
-                continue
+                break
             blocker, ended = label_joints(S, stop, at_bound, blocking), STRAIGHT
             part = damped_part(W, S, level, x, damping)
             scale, whole, high, at = part * its_scale, its_scale, its_scale, part * its_scale
@@ -301,7 +310,7 @@ def handle(frame):
     S = Search(
         duals, before, vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n),
         vector(at + 4 * line, n), vector(at + 5 * line, n), vector(at + 6 * line, n), vector(at + 7 * line, n),
-        vector(at + 8 * line, n), vector(at + 9 * line, n), vector(at + 10 * line, n),
+        vector(at + 8 * line, n), vector(at + 9 * line, n),
         whole_numbers(marks, n), whole_numbers(marks + 4 * n, n),
         whole_numbers(marks + 8 * n, n), whole_numbers(marks + 12 * n, n),
     )  # fmt: skip
