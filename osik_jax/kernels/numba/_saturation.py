@@ -20,6 +20,7 @@ from ...numerics._constants import (
     PART,
     PATH_SEARCHES,
     PATH_STEP,
+    SATURATION_LOSS,
     SATURATION_RANK,
     SATURATION_RESIDUAL,
     STRAIGHT,
@@ -105,6 +106,45 @@ def put_on_bounds(W, S, count, stop):
 
 
 @lean
+def scale_left(W, S, first, stop, size):
+    """Return how much larger the scale may be: what is left of the combination that stops the motion, or wrong in it.
+
+    By as much of the combination as the null space changes, other joints may make room, each by about ``size``; so do
+    those whose bound is not the one at which the combination is largest.
+    """
+    n, square, wrong = len(S.x), 0.0, 0.0
+    for j in range(first, n):
+        along = dot(W.turned[j], S.normal, 0, n)
+        square += along * along
+    rate = dot(S.normal, W.motion, 0, n)
+    for i in range(n):
+        label = S.passed[i] if i == stop else S.at_bound[i]
+        wrong += max(-label * S.normal[i] * (1.0 if rate > 0.0 else -1.0), 0.0)
+    return (np.sqrt(square) + wrong) * size / abs(rate) if rate != 0.0 else np.inf
+
+
+@lean
+def step_left(S, first, count):
+    """Return how far a saturated joint would go that is let go: no step, where all multipliers have the right sign."""
+    most = 0.0
+    for a in range(count):
+        wrong = S.at_bound[S.who[a]] * S.y[a]
+        if S.stays[a] == 0 and wrong > 0.0:
+            most = max(most, wrong / np.sqrt(dot(S.duals[a], S.duals[a], first, first + count)))
+    return most
+
+
+@lean
+def holds(W, S, first, count, stop, size):
+    """Return whether joints are in their box, no larger scale is possible, and no joint should leave its bound."""
+    if not put_on_bounds(W, S, count, stop) <= SATURATION_RESIDUAL * size:
+        return False
+    if stop >= 0 and not scale_left(W, S, first, stop, size) <= SATURATION_LOSS:
+        return False
+    return step_left(S, first, count) <= SATURATION_LOSS * size
+
+
+@lean
 def attempt(W, S, x, target, first, scale, most, least):
     """Search, and accept where the answer holds; where it does not, put the coordinates back.
 
@@ -115,7 +155,7 @@ def attempt(W, S, x, target, first, scale, most, least):
         for i in range(n):
             S.before[j, i] = W.turned[j, i]
     scale, count, stop, changes, done = search(W, S, x, target, first, scale, most, least)
-    done = done and put_on_bounds(W, S, count, stop) <= SATURATION_RESIDUAL * size(W, S, x, target, scale, count)
+    done = done and holds(W, S, first, count, stop, size(W, S, x, target, scale, count))
     if not done:
         for j in range(first, n):
             for i in range(n):
