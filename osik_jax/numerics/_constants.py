@@ -66,7 +66,7 @@ BOUND_DISTANCE = 1e-9
 """Relative to the bound: a joint at a larger distance is not at its bound."""
 SATURATION_RESIDUAL = 2e-9
 """Relative to the terms that x is made of: the largest residual of the active bounds with which an answer is taken."""
-SATURATION_LOSS = 1e-6
+SATURATION_LOSS = 1e-8
 """In kernels: how much larger the scale may be than the answer's, by what the null space changes of the combination of
 joints that stops the motion; relative to the terms that x is made of, how far a joint may leave its bound by its
 multiplier. An answer with more is not taken."""
