@@ -74,7 +74,30 @@ def recorded_saturated(copies: int) -> Problem:
     by rounding of double precision, which decides how the search goes.
     """
     with np.load(DATA / "saturated_nao.npz") as z:
-        parts = [np.repeat(z[name], copies, 0) for name in z.files]
+        return _saturated([z[name] for name in z.files], copies)
+
+
+def recorded_far_saturated(copies: int) -> tuple[Problem, np.ndarray]:
+    """Eight more whose targets and boxes were changed at random, and the largest scale of their third level.
+
+    Searches that let the joint enter whose saturation costs most, beside joints that nearly depend on each other, went
+    round in four of them and ended at smaller scales in the others. The scales are those of a linear program (HiGHS).
+    """
+    with np.load(DATA / "saturated_nao_far.npz") as z:
+        problem = _saturated([z[name] for name in z.files if name != "largest_scales"], copies)
+        return problem, np.repeat(z["largest_scales"], copies)
+
+
+def check_far_saturated(found: SaturatedResult, problem: Problem, largest: np.ndarray) -> None:
+    """All are solved, inside their box, with the scale of the linear program."""
+    assert np.asarray(found.done).all()
+    assert ((found.x >= problem.lower) & (found.x <= problem.upper)).all()
+    np.testing.assert_allclose(found.scales[:, 2], largest, rtol=0, atol=1e-9)
+
+
+def _saturated(arrays: list[np.ndarray], copies: int) -> Problem:
+    """Recorded problems, each so many times."""
+    parts = [np.repeat(a, copies, 0) for a in arrays]
     levels, *rest = (jnp.asarray(a if a.dtype == bool else a.astype(float)) for a in parts)
     levels *= 1.0 + 1e-15 * np.random.default_rng(0).normal(size=levels.shape)
     return Problem(PaddedLevel(levels, *rest[:3]), Damping(*rest[3:7]), *rest[7:])

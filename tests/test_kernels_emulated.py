@@ -12,7 +12,15 @@ from emulated_warp import emulated, needs_compiler
 from hierarchy_families import SMALL
 from lexicographic import certificate
 from null_space_families import FAMILIES, check_active, check_derivatives_of_saturation, saturated
-from recorded import QP_DAMPING, check_recorded_saturated, recorded_hierarchies, recorded_qps, recorded_saturated
+from recorded import (
+    QP_DAMPING,
+    check_far_saturated,
+    check_recorded_saturated,
+    recorded_far_saturated,
+    recorded_hierarchies,
+    recorded_qps,
+    recorded_saturated,
+)
 
 import osik_jax as osik
 from osik_jax.execution import _backends
@@ -254,6 +262,11 @@ def test_recorded_saturated_problems_whatever_rounding_does(on_emulated_gpu):
     copies = 16
     p = recorded_saturated(copies)
     check_recorded_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, copies)
+
+
+def test_saturation_goes_to_the_largest_scale_there_is(on_emulated_gpu):
+    p, largest = recorded_far_saturated(1)
+    check_far_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, largest)
 
 
 def test_derivatives_of_saturation(on_emulated_gpu, rng):

@@ -11,7 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from null_space_families import FAMILIES, LANES, Problems, check_active, random_problems
-from recorded import check_recorded_saturated, recorded_saturated
+from recorded import (
+    check_far_saturated,
+    check_recorded_saturated,
+    recorded_far_saturated,
+    recorded_saturated,
+)
 from used_memory import used_memory
 
 import osik_jax as osik
@@ -132,6 +137,12 @@ def test_saturation_of_recorded_problems_whatever_rounding_does():
     copies = 64
     p = recorded_saturated(copies)
     check_recorded_saturated(jax.jit(lambda p: _saturation._by_numba(p, 330))(p), p, copies)
+
+
+def test_saturation_goes_to_the_largest_scale_there_is():
+    """Far targets, of which most joints are saturated on the way."""
+    p, largest = recorded_far_saturated(16)
+    check_far_saturated(jax.jit(lambda p: _saturation._by_numba(p, 330))(p), p, largest)
 
 
 @jax.jit

@@ -68,11 +68,19 @@ BOUND_DISTANCE = 1e-9
 """Relative to the bound: a joint at a larger distance is not at its bound."""
 SATURATION_RESIDUAL = 2e-9
 """Relative to the terms that x is made of: the largest residual of the active bounds with which an answer is taken."""
+SATURATION_LOSS = 1e-8
+"""In kernels: how much larger the scale may be than the answer's, by what the null space changes of the combination of
+joints that stops the motion; relative to the terms that x is made of, how far a joint may leave its bound by its
+multiplier. An answer with more is not taken."""
 SATURATION_RANK = 1e-9
 """In kernels: the part of a joint's unit vector in the null space and outside the span of saturated ones, with less of
 which it depends on them; of the largest in a combination, with less of which a joint does not stop the motion."""
-LOOSE_SATURATION_RANK = 1e-6
-"""The same for a second attempt, where the answer of the first does not hold: joints nearly depended on each other."""
+LOOSE_SATURATION_RANK, LOOSEST_SATURATION_RANK = 1e-6, 1e-4
+"""The same for a second and a third attempt, where the answer before does not hold: joints nearly depended on each
+other."""
+MAX_SATURATION_CHANGES = 5
+"""In kernels, for each variable: an attempt with more changes of the active set goes round by rounding, and ends; the
+third may have all that are left."""
 LARGEST_RATE = 10.0
 """In kernels, in units of what the entering joint has in a combination: a joint with more is what the others say most
 about, and takes the entering one's place."""

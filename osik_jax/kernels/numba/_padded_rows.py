@@ -2,7 +2,8 @@
 
 A sum that goes row by row through memory waits for each row to be written before the next is added. Here a few blocks
 of columns stay in registers until all rows are in them. Rows are ``padded`` numbers long, so that every block is whole;
-what is behind their last number comes into nothing else. With Numba's bounds checks on, these are plain loops.
+what is behind their last number comes into nothing else. With Numba's bounds checks on, these are plain loops, over
+whole blocks too as far as arrays go: what is behind the last number is then what it is without checks.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numba.extending import intrinsic
 
 from ._addresses import BYTES, ONES, ZEROS, address, blocks_of, call_of, everywhere, load, row_bytes, store
 from ._frame import lean
+from ._tiles import padded
 from ._vectors import _BLOCK, _CHECKED, _DOUBLE, _INDEX, _LANE, WIDTH, _multiply_add, _splat
 
 _MOST = 5
@@ -133,7 +135,7 @@ def _summing_plain(term: Any) -> Any:
 
     @lean
     def plain(out, base, a, B, first, last, start, stop):
-        for c in range(start, min(stop, len(out), len(base))):
+        for c in range(start, min(start + padded(stop - start), len(out), len(base), B.shape[1])):
             total = base[c]
             for j in range(first, last):
                 total += term(a[j], B[j, c])
@@ -151,7 +153,7 @@ _squares_plain = _summing_plain(lean(lambda a, b: b * b))
 @lean
 def _spread_plain(B, a, v, first, last, start, stop):
     for j in range(first, last):
-        for c in range(start, min(stop, len(v))):
+        for c in range(start, min(start + padded(stop - start), len(v), B.shape[1])):
             B[j, c] += a[j] * v[c]
 
 
@@ -200,7 +202,7 @@ def _each(name: str, formula: Callable[..., Any], count: int) -> Any:
 
 @lean
 def _clear_plain(out, stop):
-    for j in range(min(stop, len(out))):
+    for j in range(min(padded(stop), len(out))):
         out[j] = 0.0
 
 
@@ -209,7 +211,7 @@ def _of_one_plain(formula: Any) -> Any:
 
     @lean
     def plain(out, a, stop):
-        for j in range(min(stop, len(out), len(a))):
+        for j in range(min(padded(stop), len(out), len(a))):
             out[j] = formula(a[j])
 
     return plain
@@ -220,7 +222,7 @@ def _of_two_plain(formula: Any) -> Any:
 
     @lean
     def plain(out, a, b, stop):
-        for j in range(min(stop, len(out), len(a), len(b))):
+        for j in range(min(padded(stop), len(out), len(a), len(b))):
             out[j] = formula(a[j], b[j])
 
     return plain
@@ -234,7 +236,7 @@ _subtract_plain, _multiply_plain = map(_of_two_plain, (lean(lambda a, b: a - b),
 
 @lean
 def _damping_gradient_plain(out, d, a, b, stop):
-    for j in range(min(stop, len(out), len(d), len(a), len(b))):
+    for j in range(min(padded(stop), len(out), len(d), len(a), len(b))):
         out[j] = d[j] * (a[j] - b[j])
 
 

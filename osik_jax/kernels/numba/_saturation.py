@@ -14,10 +14,13 @@ from ...numerics._constants import (
     BOUND_DISTANCE,
     FULL_STEP,
     LOOSE_SATURATION_RANK,
+    LOOSEST_SATURATION_RANK,
+    MAX_SATURATION_CHANGES,
     NEGLIGIBLE_STEP,
     PART,
     PATH_SEARCHES,
     PATH_STEP,
+    SATURATION_LOSS,
     SATURATION_RANK,
     SATURATION_RESIDUAL,
     STRAIGHT,
@@ -103,6 +106,45 @@ def put_on_bounds(W, S, count, stop):
 
 
 @lean
+def scale_left(W, S, first, stop, size):
+    """Return how much larger the scale may be: what is left of the combination that stops the motion, or wrong in it.
+
+    By as much of the combination as the null space changes, other joints may make room, each by about ``size``; so do
+    those whose bound is not the one at which the combination is largest.
+    """
+    n, square, wrong = len(S.x), 0.0, 0.0
+    for j in range(first, n):
+        along = dot(W.turned[j], S.normal, 0, n)
+        square += along * along
+    rate = dot(S.normal, W.motion, 0, n)
+    for i in range(n):
+        label = S.passed[i] if i == stop else S.at_bound[i]
+        wrong += max(-label * S.normal[i] * (1.0 if rate > 0.0 else -1.0), 0.0)
+    return (np.sqrt(square) + wrong) * size / abs(rate) if rate != 0.0 else np.inf
+
+
+@lean
+def step_left(S, first, count):
+    """Return how far a saturated joint would go that is let go: no step, where all multipliers have the right sign."""
+    most = 0.0
+    for a in range(count):
+        wrong = S.at_bound[S.who[a]] * S.y[a]
+        if S.stays[a] == 0 and wrong > 0.0:
+            most = max(most, wrong / np.sqrt(dot(S.duals[a], S.duals[a], first, first + count)))
+    return most
+
+
+@lean
+def holds(W, S, first, count, stop, size):
+    """Return whether joints are in their box, no larger scale is possible, and no joint should leave its bound."""
+    if not put_on_bounds(W, S, count, stop) <= SATURATION_RESIDUAL * size:
+        return False
+    if stop >= 0 and not scale_left(W, S, first, stop, size) <= SATURATION_LOSS:
+        return False
+    return step_left(S, first, count) <= SATURATION_LOSS * size
+
+
+@lean
 def attempt(W, S, x, target, first, scale, most, least):
     """Search, and accept where the answer holds; where it does not, put the coordinates back.
 
@@ -113,7 +155,7 @@ def attempt(W, S, x, target, first, scale, most, least):
         for i in range(n):
             S.before[j, i] = W.turned[j, i]
     scale, count, stop, changes, done = search(W, S, x, target, first, scale, most, least)
-    done = done and put_on_bounds(W, S, count, stop) <= SATURATION_RESIDUAL * size(W, S, x, target, scale, count)
+    done = done and holds(W, S, first, count, stop, size(W, S, x, target, scale, count))
     if not done:
         for j in range(first, n):
             for i in range(n):
@@ -163,23 +205,30 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
     """Find the end of the level's motion, or what comes before it where that has the least damped cost.
 
     The latter as ``solvers/null_space/_scale_path.py`` has it: a search for each scale that is tried, from a part of
-    the straight way to the end on. All searches are one call, for there is much to compile in it.
+    the straight way to the end on. A search has up to three attempts, each with a wider tolerance for joints that
+    depend on each other. All attempts are one call, for there is much to compile in it.
 
     Returns:
         The scale, the blocker, changes of the active set, and what ``solve_level`` says of the end. ``S.kept`` is where
         joints are.
     """
-    n, at, least, low, high, scale = len(x), 1.0, SATURATION_RANK, 0.0, 1.0, 0.0
+    n, at, number, low, high, scale = len(x), 1.0, 0, 0.0, 1.0, 0.0
     blocker, changes, ended, searches, whole, part = 0, 0, 0, 0, 1.0, 1.0
     while searches <= PATH_SEARCHES and changes < most:
-        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, most, least)
+        least, limit = SATURATION_RANK, min(most - changes, MAX_SATURATION_CHANGES * n)
+        if number == 1:
+            least = LOOSE_SATURATION_RANK
+        elif number == 2:
+            least, limit = LOOSEST_SATURATION_RANK, most - changes
+        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, limit, least)
         changes += more
+        if not done and number < 2:
+            number += 1
+            continue
+        number = 0
         if ended == 0:  # the end of the path
             if not done:
-                if least == LOOSE_SATURATION_RANK:
-                    break
-                least = LOOSE_SATURATION_RANK
-                continue
+                break
             blocker, ended = label_joints(S, stop, at_bound, blocking), STRAIGHT
             part = damped_part(W, S, level, x, damping)
             scale, whole, high, at = part * its_scale, its_scale, its_scale, part * its_scale
@@ -301,7 +350,7 @@ def handle(frame):
     S = Search(
         duals, before, vector(at, n), vector(at + line, n), vector(at + 2 * line, n), vector(at + 3 * line, n),
         vector(at + 4 * line, n), vector(at + 5 * line, n), vector(at + 6 * line, n), vector(at + 7 * line, n),
-        vector(at + 8 * line, n), vector(at + 9 * line, n), vector(at + 10 * line, n),
+        vector(at + 8 * line, n), vector(at + 9 * line, n),
         whole_numbers(marks, n), whole_numbers(marks + 4 * n, n),
         whole_numbers(marks + 8 * n, n), whole_numbers(marks + 12 * n, n),
     )  # fmt: skip

@@ -34,7 +34,7 @@ import numpy as np
 from ...numerics._constants import LARGEST_RATE, SATURATION_ROUNDOFF
 from ._dense import fill
 from ._frame import lean
-from ._vectors import add, add_squares, dot
+from ._vectors import add, dot
 
 
 class Search(NamedTuple):
@@ -42,12 +42,11 @@ class Search(NamedTuple):
 
     Fields: of the saturated joints, in the order in which coordinates are theirs: ``duals`` (n, n), in coordinates, of
     which each has 1 along its own joint's column and 0 along the others'; the multipliers ``y``; ``rate``, how much of
-    a column they make up; ``who`` they are; ``stays``, whether they stop the motion. Of all joints: ``x``; ``free``,
-    the squared length of what is left of their columns; ``along``, a direction of theirs; ``normal``, the combination
-    that stops the motion; ``target_part``, of x; ``at_bound``, the label of each; ``passed``, the labels of free ones
-    that the saturated ones put on their bounds; ``begin`` and ``kept``, where they are at the scale 0, and where they
-    were at the last scale that was accepted. In coordinates: ``place`` and ``turn``; ``before`` (n, n) has them as they
-    were.
+    a column they make up; ``who`` they are; ``stays``, whether they stop the motion. Of all joints: ``x``; ``along``, a
+    direction of theirs; ``normal``, the combination that stops the motion; ``target_part``, of x; ``at_bound``, the
+    label of each; ``passed``, the labels of free ones that the saturated ones put on their bounds; ``begin`` and
+    ``kept``, where they are at the scale 0, and where they were at the last scale that was accepted. In coordinates:
+    ``place`` and ``turn``; ``before`` (n, n) has them as they were.
     """
 
     duals: np.ndarray
@@ -55,7 +54,6 @@ class Search(NamedTuple):
     x: np.ndarray
     y: np.ndarray
     rate: np.ndarray
-    free: np.ndarray
     along: np.ndarray
     normal: np.ndarray
     target_part: np.ndarray
@@ -130,15 +128,14 @@ def most_wrong(S, count, roundoff):
 
 
 @lean
-def most_violated(W, S, n, roundoff, least):
-    """Return the free joint beyond its bound whose saturation costs most; -1 for none."""
-    most, which = 0.0, -1
+def most_violated(W, S, n, roundoff):
+    """Return the free joint that is furthest beyond its bound; -1 for none."""
+    most, which = roundoff, -1
     for i in range(n):
         if S.at_bound[i] == 0 and S.passed[i] == 0:
             beyond = max(W.low[i] - S.x[i], S.x[i] - W.high[i])
-            gain = beyond * beyond / max(S.free[i], least * least)
-            if beyond > roundoff and gain > most:
-                most, which = gain, i
+            if beyond > most:
+                most, which = beyond, i
     return which
 
 
@@ -189,8 +186,6 @@ def saturate(W, S, first, count, k, square):
         S.duals[a, head] = -S.rate[a] / pivot
     fill(S.duals[count], 0.0)
     S.duals[count, head] = 1.0 / pivot
-    for i in range(n):
-        S.free[i] -= W.turned[head, i] * W.turned[head, i]
     S.who[count], S.stays[count] = k, 0
 
 
@@ -225,7 +220,6 @@ def release(W, S, first, count, a):
         add(S.duals[b], -scale * dot(S.duals[b], S.turn, first, stop), S.turn, first, stop)
         S.duals[b, last] = 0.0
         W.turned[last, S.who[b]] = 0.0
-    add_squares(S.free, W.turned[last], 0, n)
 
 
 @lean
@@ -304,14 +298,12 @@ def begin_search(W, S, start, target, first):
     """Begin with no joint saturated, and with what the null space makes of the target."""
     n = len(start)
     fill(S.target_part, 0.0)
-    fill(S.free, 0.0)
     fill(S.at_bound, 0)
     fill(S.passed, 0)
     for i in range(n):
         S.along[i] = target[i] - start[i]
     for j in range(first, n):
         add(S.target_part, dot(W.turned[j], S.along, 0, n), W.turned[j], 0, n)
-        add_squares(S.free, W.turned[j], 0, n)
 
 
 @lean
@@ -335,7 +327,7 @@ def search(W, S, start, target, first, scale, most, least):
                 count, changes = count - 1, changes + 1
                 continue
         if entering < 0:
-            entering = most_violated(W, S, n, SATURATION_ROUNDOFF * whole, least)
+            entering = most_violated(W, S, n, SATURATION_ROUNDOFF * whole)
             if entering < 0:
                 going = False
                 break

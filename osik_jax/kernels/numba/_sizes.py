@@ -20,7 +20,7 @@ def row_space_numbers(n, m):
 
 def saturation_numbers(n):
     """Return the numbers of ``Search`` in ``_saturation_search.py``, and a block that is read behind them."""
-    return n * (2 * n + 11) + WIDTH
+    return n * (2 * n + 10) + WIDTH
 
 
 def weighted_qp_numbers(n, m, p):

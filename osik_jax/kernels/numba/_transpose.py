@@ -11,6 +11,7 @@ from numba.extending import intrinsic
 
 from ._addresses import address, call_of, load, row_bytes, store
 from ._frame import lean
+from ._tiles import padded
 from ._vectors import _CHECKED, _INDEX, _LANE, WIDTH
 
 
@@ -56,8 +57,8 @@ def _transposing(upper: bool) -> Any:
 
 @lean
 def _transpose_plain(T, B, m, n):
-    for i in range(m):
-        for j in range(n):
+    for i in range(min(padded(m), B.shape[0], T.shape[1])):
+        for j in range(min(padded(n), B.shape[1], T.shape[0])):
             T[j, i] = B[i, j]
 
 

@@ -35,11 +35,12 @@ _OUTPUTS = (
     dict(solution="double", projectors="double", scales="double", dones="int", joints_at_bounds="int")
     | dict(joints_blocking="int", blockers="int", active_joints="int", report="int")
 )  # fmt: skip
-_WHOLE = ("DAMPING_ITERATIONS", "PART", "PATH_SEARCHES", "STRAIGHT", "WHOLE")
+_WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "STRAIGHT", "WHOLE")
 _NUMBERS = (
     *("BLOCKING_RANK", "BOUND_DISTANCE", "COST_FRACTION", "DAMPING_RIDGE", "FULL_STEP", "LARGEST_RATE"),
-    *("LOOSE_SATURATION_RANK", "MIN_RADIUS", "NEGLIGIBLE_CURVATURE", "NEGLIGIBLE_DAMPING", "NEGLIGIBLE_STEP"),
-    *("PATH_STEP", "SATURATION_RANK", "SATURATION_RESIDUAL", "SATURATION_ROUNDOFF"),
+    *("LOOSE_SATURATION_RANK", "LOOSEST_SATURATION_RANK", "MIN_RADIUS", "NEGLIGIBLE_CURVATURE"),
+    *("NEGLIGIBLE_DAMPING", "NEGLIGIBLE_STEP", "PATH_STEP", "SATURATION_LOSS", "SATURATION_RANK"),
+    *("SATURATION_RESIDUAL", "SATURATION_ROUNDOFF"),
 )
 """Names of the constants that the text takes from ``numerics/_constants.py``."""
 
@@ -65,7 +66,7 @@ class Shape(NamedTuple):
             return 0
         # rows have odd lengths, so that the threads of a warp read from different banks of memory
         wide = max(n, m)
-        doubles = n * (n | 1) + n * (wide | 1) + m * (m | 1) + 15 * n + 6 * m + wide
+        doubles = n * (n | 1) + n * (wide | 1) + m * (m | 1) + 14 * n + 6 * m + wide
         return min(_MAX_WARPS, _SHARED_BYTES // (8 * doubles + 4 * (6 * n + m)))
 
 

@@ -21,15 +21,14 @@ auto most_wrong = [&](double roundoff) {
   }
   return chosen(most, which);
 };
-// the free joint beyond its bound whose saturation costs most
-auto most_violated = [&](double roundoff, double least) {
-  double most = 0.0;
+// the free joint that is furthest beyond its bound
+auto most_violated = [&](double roundoff) {
+  double most = roundoff;
   int which = N;
   for (int i = lane; i < N; i += 32) {
     if (at_bound[i] != 0 || passed[i] != 0) continue;
     const double beyond = fmax(low[i] - now[i], now[i] - high[i]);
-    const double gain = beyond * beyond / fmax(free_part[i], least * least);
-    if (beyond > roundoff && gain > most) most = gain, which = i;
+    if (beyond > most) most = beyond, which = i;
   }
   return chosen(most, which);
 };

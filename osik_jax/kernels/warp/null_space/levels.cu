@@ -10,23 +10,29 @@
 // solvers/null_space/_warp.py says. Where its variables are declared: workspace.cu, problem.cu, level.cu, saturated.cu.
 
 // finds the end of the level's motion, or what comes before it where that has the least damped cost, from a part of the
-// straight way to the end on; returns the scale. `ended`: how (STRAIGHT, PART, WHOLE),
-// 0 where the search has not
+// straight way to the end on; returns the scale. A search has up to three attempts, each with a wider tolerance for
+// joints that depend on each other. `ended`: how (STRAIGHT, PART, WHOLE), 0 where the search has not
 auto go_along = [&](int& ended, int& blocker, int& its_changes) {
   double* const kept = solution.data + problem * N;   // which is written last, and so are the labels
   int* const kept_labels = joints_at_bounds.data + here * N;
-  double at = 1.0, least = SATURATION_RANK, below = 0.0, above = 1.0, whole = 1.0, its_scale = 0.0;
+  double at = 1.0, below = 0.0, above = 1.0, whole = 1.0, its_scale = 0.0;
+  int number = 0;                                     // of the attempt at this scale
   ended = blocker = its_changes = 0;
   for (int searches = 0; searches <= PATH_SEARCHES && its_changes < max_iterations;) {
+    const int own = MAX_SATURATION_CHANGES * N;
+    most_changes = max_iterations - its_changes;
+    if (number < 2 && own < most_changes) most_changes = own;
+    const double least = number == 0 ? SATURATION_RANK : number == 1 ? LOOSE_SATURATION_RANK : LOOSEST_SATURATION_RANK;
     const bool done = attempt(at, least);             // one place in the program for all
     its_changes += changes;
+    if (!done && number < 2) {
+      ++number;
+      continue;
+    }
+    number = 0;
     double part = 1.0;
     if (ended == 0) {                                 // the end of the path
-      if (!done && least == LOOSE_SATURATION_RANK) break;
-      if (!done) {
-        least = LOOSE_SATURATION_RANK;
-        continue;
-      }
+      if (!done) break;
       blocker = label_joints(), ended = STRAIGHT;
       part = damped_part();
       above = whole = scale, its_scale = part * scale;

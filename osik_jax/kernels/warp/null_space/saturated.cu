@@ -51,7 +51,6 @@ auto saturate = [&](int k, double length_squared, int label, double multiplier, 
   const double pivot = turned[head * D + k];
   for (int a = lane; a < count; a += 32) duals[a * D + head] = -rate[a] / pivot;
   for (int j = first + lane; j <= head; j += 32) duals[count * D + j] = j == head ? 1.0 / pivot : 0.0;
-  for (int i = lane; i < N; i += 32) free_part[i] -= turned[head * D + i] * turned[head * D + i];
   if (lane == 0) who[count] = k, stays[count] = its_stay, y[count] = multiplier, at_bound[k] = label;
   ++count;
   __syncwarp();
@@ -96,7 +95,5 @@ auto release = [&](int a, bool moves) {
     duals[b * D + last] = turned[last * D + who[b]] = 0.0;
   }
   __syncwarp();
-  for (int i = lane; i < N; i += 32) free_part[i] += turned[last * D + i] * turned[last * D + i];
   --count;
-  __syncwarp();
 };

@@ -3,7 +3,7 @@
 // the coordinates has one place in the program: a joint that is exchanged for another leaves in one step and is followed
 // in the next.
 constexpr int CHOOSE = 0, REPLACE = 1, STOP = 2;      // a joint that leaves or enters; one in place of another; a stop
-int changes = 0, step = CHOOSE;                       // changes: of the active set, in the search of this level
+int changes = 0, most_changes = 0, step = CHOOSE;     // changes of the active set in this attempt, and its limit
 int entering = -1, joint = -1, label = 0;             // the joint that enters, the one of this step, and its bound
 int leaving = -1, left = -1, left_label = 0;          // the saturated joint that goes; who it was, and at what bound
 int crossings = 0, passes = 0;                        // exchanges of this joint at this scale; how often to settle
@@ -20,20 +20,14 @@ auto begin_search = [&](const double* target, double most) {
   __syncwarp();
   for (int j = first + lane; j < N; j += 32) place[j] = coordinate_times(j, along);
   __syncwarp();
-  for (int i = lane; i < N; i += 32) {
-    target_part[i] = column_times(place, i, first, N);
-    double total = 0.0;
-#pragma unroll 4
-    for (int j = first; j < N; ++j) total += turned[j * D + i] * turned[j * D + i];
-    free_part[i] = total;
-  }
+  for (int i = lane; i < N; i += 32) target_part[i] = column_times(place, i, first, N);
 };
 // chooses the joint that leaves, else the one that enters; returns whether there is one
-auto choose = [&](double roundoff, double least) {
+auto choose = [&](double roundoff) {
   leaving = dropping ? most_wrong(roundoff) : -1;
   dropping = leaving >= 0;
   if (!dropping && entering < 0) {
-    entering = most_violated(roundoff, least);
+    entering = most_violated(roundoff);
     if (entering < 0) return false;
     sign = low[entering] - now[entering] >= now[entering] - high[entering] ? 1.0 : -1.0;
     push = 0.0, crossings = 0;
@@ -113,8 +107,8 @@ auto search = [&](const double* target, double most, double least) {
       passes = 0;
     }
     if (ended) return done;
-    ended = step == CHOOSE && (changes >= max_iterations || crossings > N);  // more exchanges go round, by rounding
-    if (step == CHOOSE && !ended) ended = done = !choose(SATURATION_ROUNDOFF * whole, least);
+    ended = step == CHOOSE && (changes >= most_changes || crossings > N);  // more exchanges go round, by rounding
+    if (step == CHOOSE && !ended) ended = done = !choose(SATURATION_ROUNDOFF * whole);
     if (ended) {
       passes = count > 0 ? 3 : 0;
       continue;

@@ -8,7 +8,7 @@ constexpr int D = N | 1, BD = WIDE | 1, VD = M | 1;   // row lengths in shared m
 constexpr int G = (M + 31) / 32;                      // rows of a lane
 constexpr unsigned ALL = 0xffffffffu;
 
-__shared__ double shared_doubles[WARPS][N * D + N * BD + M * VD + 15 * N + 6 * M + WIDE];
+__shared__ double shared_doubles[WARPS][N * D + N * BD + M * VD + 14 * N + 6 * M + WIDE];
 __shared__ int shared_ints[WARPS][6 * N + M];
 
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
@@ -26,8 +26,7 @@ double* const bent = high + N;                        // bound on the curvature 
 double* const motion = bent + N;                      // what the level asks for
 double* const now = motion + N;                       // x of the search
 double* const target_part = now + N;                  // of that x
-double* const free_part = target_part + N;            // squared length of their columns outside the saturated ones
-double* const along = free_part + N;                  // a direction
+double* const along = target_part + N;                // a direction
 double* const normal = along + N;                     // the combination that stops the motion
 // ---- coordinates
 double* const turn = normal + N;
