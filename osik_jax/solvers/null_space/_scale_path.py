@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from ...execution._lanes import choose
 from ...execution._rules import custom_jvp
-from ...numerics._constants import DERIVATIVE_RANK, PART, PATH_SEARCHES, PATH_STEP, STRAIGHT, WHOLE
+from ...numerics._constants import DERIVATIVE_RANK, PART, PATH_SEARCHES, PATH_STEP, STRAIGHT
 from ...numerics._dense import apply, product
 from ._padding import PaddedLevel
 from ._problem import ActiveTask
@@ -41,7 +41,7 @@ def least_cost(
     rank_tol: Float[Array, " B"],
     max_iterations: int,
 ) -> tuple[SaturationResult, Int[Array, " B"], Float[Array, " B"]]:
-    """Return where damped levels end, how (``STRAIGHT``, ``PART``, ``WHOLE``), and which part of the way there they go.
+    """Return where damped levels end, how (``STRAIGHT``, ``PART``), and which part of the way there they go.
 
     Where the searches fail, that is a part of the straight way to the end of the path; else it is 1.
 
@@ -65,10 +65,8 @@ def least_cost(
         result = result._replace(scale=scale * result.scale, iterations=before.iterations + result.iterations)
         holds = running & result.done & ~(result.blocking != 0).any(-1)
         best = jax.vmap(best_scale)(problem, level, damping, rank_tol, result.active)
-        is_whole = holds & (best >= end.scale * (1.0 - PATH_STEP)) & (high == end.scale)
-        now = choose(is_whole, end._replace(iterations=result.iterations), choose(holds, result, before))
-        ending = jnp.where(is_whole, WHOLE, jnp.where(holds, PART, ending))
-        running = holds & ~is_whole & (jnp.abs(best - scale) > PATH_STEP * scale)
+        now, ending = choose(holds, result, before), jnp.where(holds, PART, ending)
+        running = holds & (jnp.abs(best - scale) > PATH_STEP * scale)
         low, high = jnp.where(best > scale, scale, low), jnp.where(best > scale, high, scale)
         inside = (best > low) & (best < high)
         return number + 1, running, jnp.where(inside, best, 0.5 * (low + high)), low, high, now, ending
