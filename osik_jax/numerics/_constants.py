@@ -53,14 +53,16 @@ NEGLIGIBLE_STEP = 1e-11
 """Relative to the norm of the point where it begins: a shorter step counts as none."""
 FULL_STEP = 1.0 - 1e-9
 """Step lengths from here on are a full step but for roundoff."""
-STRAIGHT, PART = 1, 2
+STRAIGHT, PART, WHOLE = 1, 2, 3
 """Where a level that is done ends: at the part of the straight way to the end of its path at which its damped cost is
-least, that is at the end where all of it is worth its cost; or at the scale of least cost on the path. 0 is one that is
-not done."""
+least, that is at the end where all of it is worth its cost; at the scale of least cost on the path; at the end, though
+less of the straight way would cost less. 0 is one that is not done."""
 PATH_SEARCHES = 6
 """Searches at most for the scale at which a level's damped cost is least; two or three are the rule."""
 PATH_STEP = 1e-9
 """Relative to that scale: a smaller correction is the last."""
+PATH_END = 1e-6
+"""Relative to the largest scale: from here on the joints that are saturated are those with which the path ends."""
 BLOCKING_RANK = 1e-6
 """The part of a blocking joint's unit vector in the null space outside the span of others; with less it depends on
 them."""

@@ -18,12 +18,14 @@ from ...numerics._constants import (
     MAX_SATURATION_CHANGES,
     NEGLIGIBLE_STEP,
     PART,
+    PATH_END,
     PATH_SEARCHES,
     PATH_STEP,
     SATURATION_LOSS,
     SATURATION_RANK,
     SATURATION_RESIDUAL,
     STRAIGHT,
+    WHOLE,
 )
 from ._dense import fill
 from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
@@ -212,8 +214,8 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
         joints are.
     """
     n, at, number, low, high, scale = len(x), 1.0, 0, 0.0, 1.0, 0.0
-    blocker, changes, ended, searches = 0, 0, 0, 0
-    while searches < PATH_SEARCHES and changes < most:
+    blocker, changes, ended, searches, whole, part = 0, 0, 0, 0, 1.0, 1.0
+    while searches <= PATH_SEARCHES and changes < most:
         least, limit = SATURATION_RANK, min(most - changes, MAX_SATURATION_CHANGES * n)
         if number == 1:
             least = LOOSE_SATURATION_RANK
@@ -230,19 +232,31 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
                 break
             blocker, ended = label_joints(S, stop, at_bound, blocking), STRAIGHT
             part = damped_part(W, S, level, x, damping)
-            scale, high, at = part * its_scale, its_scale, part * its_scale
+            scale, whole, high, at = part * its_scale, its_scale, its_scale, part * its_scale
             for i in range(n):
                 S.kept[i] = S.x[i] if part == 1.0 else x[i] + part * (S.x[i] - x[i])
             if part == 1.0 or not at > 0.0:
                 break
             continue
         searches += 1
+        if at == 1.0:  # the end once more
+            if done:
+                blocker, ended, scale = label_joints(S, stop, at_bound, blocking), WHOLE, its_scale
+                for i in range(n):
+                    S.kept[i] = S.x[i]
+            break
         if not done or stop >= 0:
             break
-        ended, scale = PART, its_scale
         for i in range(n):
-            S.kept[i], at_bound[i] = S.x[i], S.at_bound[i]
+            S.along[i] = S.x[i]
         best = best_scale(W, S, level, x, damping, first, count)
+        if ended == STRAIGHT or best >= at * (1.0 - PATH_STEP):  # beyond the least cost the path gets dear
+            ended, scale = PART, its_scale
+            for i in range(n):
+                S.kept[i], at_bound[i] = S.along[i], S.at_bound[i]
+        if best >= whole * (1.0 - PATH_STEP) and high == whole:
+            at, low = 1.0 if at > whole * (1.0 - PATH_END) else whole * (1.0 - 0.5 * PATH_END), at
+            continue
         if abs(best - at) <= PATH_STEP * at:
             break
         if best > at:
@@ -278,7 +292,7 @@ def solve_level(W, S, level, x, target, first, plain, rank_tolerance, most, at_b
 
     Returns:
         The coordinates that it takes, its scale, the blocker, changes of the active set, and how it ended
-        (``STRAIGHT``, ``PART``; 0 where the search has not).
+        (``STRAIGHT``, ``PART``, ``WHOLE``; 0 where the search has not).
     """
     n = len(x)
     load(W, level)

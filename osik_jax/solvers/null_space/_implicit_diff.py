@@ -33,7 +33,7 @@ class ActiveJoints(NamedTuple):
     active: Int[Array, " n"]  # -1 saturated at the lower bound, 1 at the upper, 0 free
     blocking: Int[Array, " n"]  # the joints that limit the level's scale, likewise
     blocker: Int[Array, ""]  # the one of them that the others determine
-    ending: Int[Array, ""]  # STRAIGHT or PART, 0 where it is not done
+    ending: Int[Array, ""]  # STRAIGHT, PART or WHOLE
 
 
 class SaturatedResult(NamedTuple):

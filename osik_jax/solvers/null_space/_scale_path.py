@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from ...execution._lanes import choose
 from ...execution._rules import custom_jvp
-from ...numerics._constants import DERIVATIVE_RANK, PART, PATH_SEARCHES, PATH_STEP, STRAIGHT
+from ...numerics._constants import DERIVATIVE_RANK, PART, PATH_END, PATH_SEARCHES, PATH_STEP, STRAIGHT, WHOLE
 from ...numerics._dense import apply, product
 from ._padding import PaddedLevel
 from ._problem import ActiveTask
@@ -41,7 +41,7 @@ def least_cost(
     rank_tol: Float[Array, " B"],
     max_iterations: int,
 ) -> tuple[SaturationResult, Int[Array, " B"], Float[Array, " B"]]:
-    """Return where damped levels end, how (``STRAIGHT``, ``PART``), and which part of the way there they go.
+    """Return where damped levels end, how (``STRAIGHT``, ``PART``, ``WHOLE``), and which part of the way there they go.
 
     Where the searches fail, that is a part of the straight way to the end of the path; else it is 1.
 
@@ -65,11 +65,17 @@ def least_cost(
         result = result._replace(scale=scale * result.scale, iterations=before.iterations + result.iterations)
         holds = running & result.done & ~(result.blocking != 0).any(-1)
         best = jax.vmap(best_scale)(problem, level, damping, rank_tol, result.active)
-        now, ending = choose(holds, result, before), jnp.where(holds, PART, ending)
-        running = holds & (jnp.abs(best - scale) > PATH_STEP * scale)
+        to_end = holds & (best >= end.scale * (1.0 - PATH_STEP)) & (high == end.scale)
+        is_whole = to_end & (scale > end.scale * (1.0 - PATH_END))
+        # beyond the least cost the path gets dear
+        keeps = holds & ((ending == STRAIGHT) | (best >= scale * (1.0 - PATH_STEP)))
+        now = choose(is_whole, end, choose(keeps, result, before))._replace(iterations=result.iterations)
+        ending = jnp.where(is_whole, WHOLE, jnp.where(keeps, PART, ending))
+        running = holds & ~is_whole & (jnp.abs(best - scale) > PATH_STEP * scale)
         low, high = jnp.where(best > scale, scale, low), jnp.where(best > scale, high, scale)
         inside = (best > low) & (best < high)
-        return number + 1, running, jnp.where(inside, best, 0.5 * (low + high)), low, high, now, ending
+        middle = jnp.where(to_end, end.scale * (1.0 - 0.5 * PATH_END), 0.5 * (low + high))
+        return number + 1, running, jnp.where(inside, best, middle), low, high, now, ending
 
     first, straight = jnp.where(wanted, end.scale * chord, 0.0), jnp.full(len(wanted), STRAIGHT)
     nothing = jnp.zeros_like(first)

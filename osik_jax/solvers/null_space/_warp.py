@@ -35,11 +35,11 @@ _OUTPUTS = (
     dict(solution="double", projectors="double", scales="double", dones="int", joints_at_bounds="int")
     | dict(joints_blocking="int", blockers="int", active_joints="int", report="int")
 )  # fmt: skip
-_WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "STRAIGHT")
+_WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "STRAIGHT", "WHOLE")
 _NUMBERS = (
     *("BLOCKING_RANK", "BOUND_DISTANCE", "COST_FRACTION", "DAMPING_RIDGE", "FULL_STEP", "LARGEST_RATE"),
     *("LOOSE_SATURATION_RANK", "LOOSEST_SATURATION_RANK", "MIN_RADIUS", "NEGLIGIBLE_CURVATURE"),
-    *("NEGLIGIBLE_DAMPING", "NEGLIGIBLE_STEP", "PATH_STEP", "SATURATION_LOSS", "SATURATION_RANK"),
+    *("NEGLIGIBLE_DAMPING", "NEGLIGIBLE_STEP", "PATH_END", "PATH_STEP", "SATURATION_LOSS", "SATURATION_RANK"),
     *("SATURATION_RESIDUAL", "SATURATION_ROUNDOFF"),
 )
 """Names of the constants that the text takes from ``numerics/_constants.py``."""

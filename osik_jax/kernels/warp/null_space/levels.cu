@@ -11,14 +11,14 @@
 
 // finds the end of the level's motion, or what comes before it where that has the least damped cost, from a part of the
 // straight way to the end on; returns the scale. A search has up to three attempts, each with a wider tolerance for
-// joints that depend on each other. `ended`: how (STRAIGHT, PART), 0 where the search has not
+// joints that depend on each other. `ended`: how (STRAIGHT, PART, WHOLE), 0 where the search has not
 auto go_along = [&](int& ended, int& blocker, int& its_changes) {
   double* const kept = solution.data + problem * N;   // which is written last, and so are the labels
   int* const kept_labels = joints_at_bounds.data + here * N;
-  double at = 1.0, below = 0.0, above = 1.0, its_scale = 0.0;
+  double at = 1.0, below = 0.0, above = 1.0, whole = 1.0, its_scale = 0.0;
   int number = 0;                                     // of the attempt at this scale
   ended = blocker = its_changes = 0;
-  for (int searches = 0; searches < PATH_SEARCHES && its_changes < max_iterations;) {
+  for (int searches = 0; searches <= PATH_SEARCHES && its_changes < max_iterations;) {
     const int own = MAX_SATURATION_CHANGES * N;
     most_changes = max_iterations - its_changes;
     if (number < 2 && own < most_changes) most_changes = own;
@@ -30,27 +30,41 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
       continue;
     }
     number = 0;
-    double part = 1.0;
+    double part = 1.0, best = 0.0;
+    bool keeps = true;
+    double* const reached = ended == 0 || at == 1.0 ? now : along;
     if (ended == 0) {                                 // the end of the path
       if (!done) break;
       blocker = label_joints(), ended = STRAIGHT;
       part = damped_part();
-      above = scale, its_scale = part * scale;
+      above = whole = scale, its_scale = part * scale;
+    } else if (at == 1.0) {                           // the end once more
+      if (!done) break;
+      blocker = label_joints(), ended = WHOLE, its_scale = scale;
     } else {
       ++searches;
       if (!done || stop >= 0) break;
-      ended = PART, its_scale = scale;
+      const double tried = scale;
+      for (int i = lane; i < N; i += 32) along[i] = now[i];
+      best = best_scale();
+      keeps = ended == STRAIGHT || best >= at * (1.0 - PATH_STEP);  // beyond the least cost the path gets dear
+      if (keeps) ended = PART, its_scale = tried;
     }
-    for (int i = lane; i < N; i += 32) {
-      kept[i] = part == 1.0 ? now[i] : x[i] + part * (now[i] - x[i]);
+    for (int i = lane; keeps && i < N; i += 32) {
+      kept[i] = part == 1.0 ? reached[i] : x[i] + part * (reached[i] - x[i]);
       kept_labels[i] = at_bound[i];
     }
+    if (ended == WHOLE) break;
     if (ended == STRAIGHT) {
       at = its_scale;
       if (part == 1.0 || !(at > 0.0)) break;
       continue;
     }
-    const double best = best_scale();
+    if (best >= whole * (1.0 - PATH_STEP) && above == whole) {
+      below = at;
+      at = at > whole * (1.0 - PATH_END) ? 1.0 : whole * (1.0 - 0.5 * PATH_END);
+      continue;
+    }
     if (fabs(best - at) <= PATH_STEP * at) break;
     if (best > at) below = at;
     else above = at;
