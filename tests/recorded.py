@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from osik_jax.numerics._constants import PART
 from osik_jax.solvers import Damping
 from osik_jax.solvers.null_space._implicit_diff import SaturatedResult
 from osik_jax.solvers.null_space._padding import PaddedLevel, Problem
@@ -89,10 +90,14 @@ def recorded_far_saturated(copies: int) -> tuple[Problem, np.ndarray]:
 
 
 def check_far_saturated(found: SaturatedResult, problem: Problem, largest: np.ndarray) -> None:
-    """All are solved, inside their box, with the scale of the linear program."""
+    """All are solved, inside their box, with the scale of the linear program; the first may stop before, for its cost."""
     assert np.asarray(found.done).all()
     assert ((found.x >= problem.lower) & (found.x <= problem.upper)).all()
-    np.testing.assert_allclose(found.scales[:, 2], largest, rtol=0, atol=1e-9)
+    scales = np.asarray(found.scales)[:, 2]
+    is_first = np.arange(len(scales)) < len(scales) // 8
+    np.testing.assert_allclose(scales[~is_first], largest[~is_first], rtol=0, atol=1e-9)
+    assert (scales[is_first] <= largest[is_first] + 1e-9).all()
+    assert (np.asarray(found.active_joints.ending)[is_first & (scales < largest - 1e-9), 2] == PART).all()
 
 
 def _saturated(arrays: list[np.ndarray], copies: int) -> Problem:
