@@ -90,7 +90,7 @@ def recorded_far_saturated(copies: int) -> tuple[Problem, np.ndarray]:
 
 
 def check_far_saturated(found: SaturatedResult, problem: Problem, largest: np.ndarray) -> None:
-    """All are solved, inside their box, with the scale of the linear program; the first may stop before, for its cost."""
+    """All are solved, in their box, with the scale of the linear program; the first may stop before, for its cost."""
     assert np.asarray(found.done).all()
     assert ((found.x >= problem.lower) & (found.x <= problem.upper)).all()
     scales = np.asarray(found.scales)[:, 2]
