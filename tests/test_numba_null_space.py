@@ -20,7 +20,7 @@ from recorded import (
 from used_memory import used_memory
 
 import osik_jax as osik
-from osik_jax.execution import _backends
+from osik_jax.execution import _backends, _candidates
 from osik_jax.solvers import Backend, Damping, Level, Status, solve_nullspace
 from osik_jax.solvers._row_factors import row_factors
 from osik_jax.solvers.null_space import _saturation
@@ -350,3 +350,14 @@ def test_no_index_is_out_of_bounds():
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert "passed" in ran.stdout and "failed" not in ran.stdout
     assert "IndexError" not in ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_beside_a_gpu_too_the_kernel_and_the_search_return_the_same_types(monkeypatch, precision):
+    """There both are branches of one program, and with JAX's default precision what is computed in double is a part."""
+    monkeypatch.setattr(_candidates, "cpu_is_default", lambda: False)
+    solve = partial(solved.__wrapped__, backend="numba", method="saturated")
+    jax.clear_caches()
+    with jax.enable_x64(precision == "float64"):
+        jax.make_jaxpr(solve)(jax.tree.map(lambda a: jnp.asarray(a, precision), FAMILIES["damped inequalities"]))
+    jax.clear_caches()
