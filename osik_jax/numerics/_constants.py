@@ -77,12 +77,15 @@ multiplier. An answer with more is not taken."""
 SATURATION_RANK = 1e-9
 """In kernels: the part of a joint's unit vector in the null space and outside the span of saturated ones, with less of
 which it depends on them; of the largest in a combination, with less of which a joint does not stop the motion."""
-LOOSE_SATURATION_RANK, LOOSEST_SATURATION_RANK = 1e-6, 1e-4
-"""The same for a second and a third attempt, where the answer before does not hold: joints nearly depended on each
-other."""
+SOFT_COMPLIANCE, STIFFER_SOFT_COMPLIANCE = 1e-11, 1e-13
+"""In kernels, of the missing part of the motion, in the second and the third attempt, where the answer before does not
+hold: joints nearly depended on each other. The squared length of x that it outweighs; the more is missing, the more
+certain is the first that no larger scale is possible."""
+SOFT_SATURATION_RANK = 1e-11
+"""``SATURATION_RANK`` in these: joints that depend on each other do not both stop the motion there."""
 MAX_SATURATION_CHANGES = 5
-"""In kernels, for each variable: an attempt with more changes of the active set goes round by rounding, and ends; the
-third may have all that are left."""
+"""In kernels, for each variable: the first attempt ends with more changes of the active set, for it goes round by
+rounding; the others may have all that are left."""
 LARGEST_RATE = 10.0
 """In kernels, in units of what the entering joint has in a combination: a joint with more is what the others say most
 about, and takes the entering one's place."""

@@ -13,9 +13,8 @@ from ...numerics._constants import (
     BLOCKING_RANK,
     BOUND_DISTANCE,
     FULL_STEP,
-    LOOSE_SATURATION_RANK,
-    LOOSEST_SATURATION_RANK,
     MAX_SATURATION_CHANGES,
+    NEGLIGIBLE_ENTRY,
     NEGLIGIBLE_STEP,
     PART,
     PATH_END,
@@ -24,6 +23,9 @@ from ...numerics._constants import (
     SATURATION_LOSS,
     SATURATION_RANK,
     SATURATION_RESIDUAL,
+    SOFT_COMPLIANCE,
+    SOFT_SATURATION_RANK,
+    STIFFER_SOFT_COMPLIANCE,
     STRAIGHT,
     WHOLE,
 )
@@ -40,7 +42,7 @@ from ._projection import (
 )
 from ._row_space import set_beside, take_row_space
 from ._row_space_workspace import work_at, work_size
-from ._saturation_search import Search, bound, search, settle, size
+from ._saturation_search import Search, begin_search, bound, search, settle, size
 from ._vectors import add, dot
 
 
@@ -137,30 +139,83 @@ def step_left(S, first, count):
 
 @lean
 def holds(W, S, first, count, stop, size):
-    """Return whether joints are in their box, no larger scale is possible, and no joint should leave its bound."""
+    """Return whether joints are in their box, and no larger scale is possible."""
     if not put_on_bounds(W, S, count, stop) <= SATURATION_RESIDUAL * size:
         return False
-    if stop >= 0 and not scale_left(W, S, first, stop, size) <= SATURATION_LOSS:
-        return False
-    return step_left(S, first, count) <= SATURATION_LOSS * size
+    return stop < 0 or scale_left(W, S, first, stop, size) <= SATURATION_LOSS
 
 
 @lean
-def attempt(W, S, x, target, first, scale, most, least):
+def add_missing_part(W, S, x, first, compliance):
+    """Make what is missing of the motion a short coordinate, before the others: moves along these cost less."""
+    square = dot(W.motion, W.motion, 0, len(x))
+    root = np.sqrt(compliance / square) if square > 0.0 else 0.0
+    for i in range(len(x)):
+        W.turned[first - 1, i] = root * W.motion[i]
+
+
+@lean
+def find_stop(W, S, x, count, most):
+    """Return the scale at which a search with that coordinate ended, and the joint that stops the motion; -1 for none.
+
+    The multipliers are then the combination of joints that stops it: what is missing pulls at it with nearly all.
+    """
+    n, moved, square, largest, stop = len(x), 0.0, 0.0, 0.0, -1
+    for i in range(n):
+        moved += W.motion[i] * (S.x[i] - x[i] - S.target_part[i])
+        square += W.motion[i] * W.motion[i]
+    scale = min(max(moved / square, 0.0), most) if square > 0.0 else most
+    fill(S.normal, 0.0)
+    if scale >= most - PATH_STEP:
+        return scale, -1
+    for a in range(count):
+        if abs(S.y[a]) > largest:
+            largest, stop = abs(S.y[a]), S.who[a]
+    for a in range(count):
+        S.normal[S.who[a]] = S.y[a] / largest
+    if stop >= 0:
+        S.passed[stop] = S.at_bound[stop]
+    return scale, stop
+
+
+@lean
+def put_back(W, S, start):
+    """Put the coordinates back, as they were before the search."""
+    for j in range(start, len(S.x)):
+        for i in range(len(S.x)):
+            W.turned[j, i] = S.before[j, i]
+
+
+@lean
+def attempt(W, S, x, target, first, scale, most, least, compliance):
     """Search, and accept where the answer holds; where it does not, put the coordinates back.
+
+    With a compliance the motion may be missed in part, so that at any scale there is an answer, and joints that nearly
+    depend on each other need no decision. That coordinate takes the place of one which is taken.
 
     The scale, how many joints are saturated, the one that stops the motion, changes, and whether the answer holds.
     """
-    n = len(x)
-    for j in range(first, n):
+    n, start = len(x), first - (1 if compliance > 0.0 else 0)
+    for j in range(start, n):
         for i in range(n):
             S.before[j, i] = W.turned[j, i]
-    scale, count, stop, changes, done = search(W, S, x, target, first, scale, most, least)
-    done = done and holds(W, S, first, count, stop, size(W, S, x, target, scale, count))
+    begin_search(W, S, x, target, first)
+    if start < first:
+        add_missing_part(W, S, x, first, compliance)
+    asked = scale
+    scale, count, stop, changes, done = search(W, S, x, target, start, scale, most, least)
+    whole = size(W, S, x, target, scale, count)
+    done = done and step_left(S, start, count) <= SATURATION_LOSS * whole
+    if start < first:
+        done = done and stop < 0
+        scale, stop = find_stop(W, S, x, count, asked)
+        put_back(W, S, start)
+    done = done and holds(W, S, first, count, stop, whole)
+    for i in range(n):
+        if abs(S.normal[i]) <= NEGLIGIBLE_ENTRY and start < first:
+            S.normal[i] = 0.0
     if not done:
-        for j in range(first, n):
-            for i in range(n):
-                W.turned[j, i] = S.before[j, i]
+        put_back(W, S, start)
     return scale, count, stop, changes, done
 
 
@@ -206,8 +261,8 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
     """Find the end of the level's motion, or what comes before it where that has the least damped cost.
 
     The latter as ``solvers/null_space/_scale_path.py`` has it: a search for each scale that is tried, from a part of
-    the straight way to the end on. A search has up to three attempts, each with a wider tolerance for joints that
-    depend on each other. All attempts are one call, for there is much to compile in it.
+    the straight way to the end on. A search has up to three attempts, the second and the third with a
+    compliance. All attempts are one call, for there is much to compile in it.
 
     Returns:
         The scale, the blocker, changes of the active set, and what ``solve_level`` says of the end. ``S.kept`` is where
@@ -216,14 +271,13 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
     n, at, number, low, high, scale = len(x), 1.0, 0, 0.0, 1.0, 0.0
     blocker, changes, ended, searches, whole, part = 0, 0, 0, 0, 1.0, 1.0
     while searches <= PATH_SEARCHES and changes < most:
-        least, limit = SATURATION_RANK, min(most - changes, MAX_SATURATION_CHANGES * n)
-        if number == 1:
-            least = LOOSE_SATURATION_RANK
-        elif number == 2:
-            least, limit = LOOSEST_SATURATION_RANK, most - changes
-        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, limit, least)
+        least, compliance, limit = SATURATION_RANK, 0.0, min(most - changes, MAX_SATURATION_CHANGES * n)
+        if number > 0:
+            least, limit = SOFT_SATURATION_RANK, most - changes
+            compliance = SOFT_COMPLIANCE if number == 1 else STIFFER_SOFT_COMPLIANCE
+        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, limit, least, compliance)
         changes += more
-        if not done and number < 2:
+        if not done and number < 2 and first > 0:
             number += 1
             continue
         number = 0

@@ -314,7 +314,6 @@ def search(W, S, start, target, first, scale, most, least):
     """
     n = len(start)
     count, stop, rate, changes, entering, sign, push = 0, -1, 0.0, 0, -1, 1.0, 0.0
-    begin_search(W, S, start, target, first)
     settle(W, S, start, scale, first, count)
     whole = size(W, S, start, target, scale, count)
     dropping, going, crossings = False, True, 0

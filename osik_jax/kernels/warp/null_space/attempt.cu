@@ -41,23 +41,72 @@ auto step_left = [&]() {
   }
   return warp_max(most);
 };
-// joints are in their box, no larger scale is possible, and no joint should leave its bound
+// joints are in their box, and no larger scale is possible
 auto holds = [&](double size) {
   const double off = put_on_bounds();
   if (!(off < INFINITY && off <= SATURATION_RESIDUAL * size)) return false;
-  if (stop >= 0 && !(scale_left(size) <= SATURATION_LOSS)) return false;
-  return step_left() <= SATURATION_LOSS * size;
+  return stop < 0 || scale_left(size) <= SATURATION_LOSS;
 };
-// searches and returns whether the answer is accepted
-auto attempt = [&](double most, double least) {
+// makes what is missing of the motion a short coordinate, before the others: moves along these cost less
+auto add_missing_part = [&](double compliance) {
+  double square = 0.0;
+  for (int i = lane; i < N; i += 32) square += motion[i] * motion[i];
+  square = warp_sum(square);
+  const double root = square > 0.0 ? sqrt(compliance / square) : 0.0;
+  for (int i = lane; i < N; i += 32) turned[(first - 1) * D + i] = root * motion[i];
+};
+// the scale at which a search with that coordinate ended, and the joint that stops the motion; the multipliers are then
+// the combination of joints that stops it: what is missing pulls at it with nearly all
+auto find_stop = [&](double most) {
+  double moved = 0.0, square = 0.0, largest = 0.0;
+  int which = N;
+  for (int i = lane; i < N; i += 32)
+    moved += motion[i] * (now[i] - x[i] - target_part[i]), square += motion[i] * motion[i], normal[i] = 0.0;
+  moved = warp_sum(moved), square = warp_sum(square);
+  scale = square > 0.0 ? clip(moved / square, 0.0, most) : most;
+  stop = -1;
+  __syncwarp();
+  if (scale >= most - PATH_STEP) return;
+  for (int a = lane; a < count; a += 32)
+    if (fabs(y[a]) > largest) largest = fabs(y[a]), which = a;
+  warp_argmax(largest, which);
+  if (which == N) return;
+  for (int a = lane; a < count; a += 32) normal[who[a]] = y[a] / largest;
+  stop = who[which];
+  if (lane == 0) passed[stop] = at_bound[stop];
+  __syncwarp();
+};
+// searches and returns whether the answer is accepted. With a compliance the motion may be missed in part, so that at any
+// scale there is an answer, and joints that nearly depend on each other need no decision; that coordinate takes the place
+// of one which is taken
+auto attempt = [&](double most, double least, double compliance) {
   const double* const target = targets.data + here * N;
   double* const before = projectors.data + problem * (N * N);  // which is written last
-  for (int j = first; j < N; ++j)
-    for (int i = lane; i < N; i += 32) before[j * N + i] = turned[j * D + i];
-  const bool done = search(target, most, least) && holds(size_of_numbers(target));
-  if (!done)
-    for (int j = first; j < N; ++j)
+  const bool is_soft = compliance > 0.0;
+  const int start = first - is_soft;
+  const auto put_back = [&]() {
+    for (int j = start; j < N; ++j)
       for (int i = lane; i < N; i += 32) turned[j * D + i] = before[j * N + i];
+    __syncwarp();
+  };
+  for (int j = start; j < N; ++j)
+    for (int i = lane; i < N; i += 32) before[j * N + i] = turned[j * D + i];
+  begin_search(target, most);
+  if (is_soft) add_missing_part(compliance);
+  first = start;
+  bool done = search(target, least);
+  const double whole = size_of_numbers(target);
+  done = done && step_left() <= SATURATION_LOSS * whole;
+  first += is_soft;
+  if (is_soft) {
+    done = done && stop < 0;
+    find_stop(most);
+    put_back();
+  }
+  done = done && holds(whole);
+  for (int i = lane; is_soft && i < N; i += 32)
+    if (fabs(normal[i]) <= NEGLIGIBLE_ENTRY) normal[i] = 0.0;
+  if (!done) put_back();
   __syncwarp();
   return done;
 };

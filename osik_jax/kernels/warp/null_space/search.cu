@@ -94,12 +94,11 @@ auto enter = [&](double length_squared) {
   }
   __syncwarp();
 };
-// finds `now`, inside its box and at a scale of at most `most`, and returns whether it has; a combination with parts
-// below `least` depends on others
-auto search = [&](const double* target, double most, double least) {
+// after `begin_search`: finds `now`, inside its box and at a scale of at most the one it began with, and returns whether
+// it has; a combination with parts below `least` depends on others
+auto search = [&](const double* target, double least) {
   double whole = 0.0;
   bool done = false, ended = false;
-  begin_search(target, most);
   for (;;) {
     if (passes > 0) {
       settle_stopped(passes, stop_rate);
