@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <ucontext.h>
 
 using std::fabs; using std::fmax; using std::fmin; using std::sqrt;
@@ -19,7 +20,7 @@ static bool ended[32];
 static int lane_now;
 static struct { struct { operator unsigned() const { return lane_now; } } x; } threadIdx;
 
-#define __shared__ alignas(16) static
+#define __shared__ alignas(16) static __attribute__((section("shared")))
 static void __syncwarp() { swapcontext(&fibers[lane_now], &outside); }
 
 template <class T> T exchanged(T mine, int from) {
@@ -46,7 +47,9 @@ static int __ffs(unsigned a) { return __builtin_ffs(a); }
 static int __popc(unsigned a) { return __builtin_popcount(a); }
 static float rsqrtf(float a) { return 1.f / std::sqrt(a); }
 
+extern char __start_shared[], __stop_shared[];         // what is __shared__; it begins as numbers that are none
 static void run_warp(void (*thread)(), bool backwards) {
+  memset(__start_shared, 0xff, __stop_shared - __start_shared);
   for (int i = 0; i < 32; ++i) {
     getcontext(&fibers[i]);
     fibers[i].uc_stack.ss_sp = stacks[i];

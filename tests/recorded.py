@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from osik_jax.numerics._constants import PART
+from osik_jax.numerics._constants import PART, SATURATION_LOSS
 from osik_jax.solvers import Damping
 from osik_jax.solvers.null_space._implicit_diff import SaturatedResult
 from osik_jax.solvers.null_space._padding import PaddedLevel, Problem
@@ -84,9 +84,29 @@ def recorded_far_saturated(copies: int) -> tuple[Problem, np.ndarray]:
     Searches that let the joint enter whose saturation costs most, beside joints that nearly depend on each other, went
     round in four of them and ended at smaller scales in the others. The scales are those of a linear program (HiGHS).
     """
-    with np.load(DATA / "saturated_nao_far.npz") as z:
+    return _with_scales("saturated_nao_far.npz", copies)
+
+
+def recorded_single_saturated(copies: int) -> tuple[Problem, np.ndarray]:
+    """Eight first steps of NAO towards targets that had jumped, kinematics in single precision, and the same scales.
+
+    Their rows have the rounding of sums in single precision, so that joints depend on each other to 1e-8 to 1e-5. A
+    search that decides by a tolerance which of them do leaves them unsolved: five with any of 1e-9, 1e-6 and 1e-4.
+    """
+    return _with_scales("saturated_nao_single.npz", copies)
+
+
+def _with_scales(file: str, copies: int) -> tuple[Problem, np.ndarray]:
+    with np.load(DATA / file) as z:
         problem = _saturated([z[name] for name in z.files if name != "largest_scales"], copies)
         return problem, np.repeat(z["largest_scales"], copies)
+
+
+def check_single_saturated(found: SaturatedResult, problem: Problem, largest: np.ndarray) -> None:
+    """All are solved, in their box, with the scale of the linear program to what the kernel asks of an answer."""
+    assert np.asarray(found.done).all()
+    assert ((found.x >= problem.lower) & (found.x <= problem.upper)).all()
+    np.testing.assert_allclose(np.asarray(found.scales)[:, 2], largest, rtol=0, atol=SATURATION_LOSS)
 
 
 def check_far_saturated(found: SaturatedResult, problem: Problem, largest: np.ndarray) -> None:

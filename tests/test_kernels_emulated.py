@@ -16,10 +16,12 @@ from recorded import (
     QP_DAMPING,
     check_far_saturated,
     check_recorded_saturated,
+    check_single_saturated,
     recorded_far_saturated,
     recorded_hierarchies,
     recorded_qps,
     recorded_saturated,
+    recorded_single_saturated,
 )
 
 import osik_jax as osik
@@ -267,6 +269,11 @@ def test_recorded_saturated_problems_whatever_rounding_does(on_emulated_gpu):
 def test_saturation_goes_to_the_largest_scale_there_is(on_emulated_gpu):
     p, largest = recorded_far_saturated(1)
     check_far_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, largest)
+
+
+def test_saturation_with_rows_that_were_summed_in_single_precision(on_emulated_gpu):
+    p, largest = recorded_single_saturated(1)
+    check_single_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, largest)
 
 
 def test_derivatives_of_saturation(on_emulated_gpu, rng):

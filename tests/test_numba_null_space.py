@@ -14,8 +14,10 @@ from null_space_families import FAMILIES, LANES, Problems, check_active, random_
 from recorded import (
     check_far_saturated,
     check_recorded_saturated,
+    check_single_saturated,
     recorded_far_saturated,
     recorded_saturated,
+    recorded_single_saturated,
 )
 from used_memory import used_memory
 
@@ -143,6 +145,12 @@ def test_saturation_goes_to_the_largest_scale_there_is():
     """Far targets, of which most joints are saturated on the way."""
     p, largest = recorded_far_saturated(16)
     check_far_saturated(jax.jit(lambda p: _saturation._by_numba(p, 330))(p), p, largest)
+
+
+def test_saturation_with_rows_that_were_summed_in_single_precision():
+    """As kinematics outside of kernels has them, on a GPU for one."""
+    p, largest = recorded_single_saturated(16)
+    check_single_saturated(jax.jit(lambda p: _saturation._by_numba(p, 330))(p), p, largest)
 
 
 @jax.jit
