@@ -261,8 +261,8 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
     """Find the end of the level's motion, or what comes before it where that has the least damped cost.
 
     The latter as ``solvers/null_space/_scale_path.py`` has it: a search for each scale that is tried, from a part of
-    the straight way to the end on. A search has up to three attempts, the second and the third with a
-    compliance. All attempts are one call, for there is much to compile in it.
+    the straight way to the end on. A search for the end has up to three attempts, the second and the
+    third with a compliance. All attempts are one call, for there is much to compile in it.
 
     Returns:
         The scale, the blocker, changes of the active set, and what ``solve_level`` says of the end. ``S.kept`` is where
@@ -277,7 +277,7 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
             compliance = SOFT_COMPLIANCE if number == 1 else STIFFER_SOFT_COMPLIANCE
         its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, limit, least, compliance)
         changes += more
-        if not done and number < 2 and first > 0:
+        if not done and number < 2 and at == 1.0 and first > 0:
             number += 1
             continue
         number = 0

@@ -10,8 +10,8 @@
 // solvers/null_space/_warp.py says. Where its variables are declared: workspace.cu, problem.cu, level.cu, saturated.cu.
 
 // finds the end of the level's motion, or what comes before it where that has the least damped cost, from a part of the
-// straight way to the end on; returns the scale. A search has up to three attempts, the second and the third with a
-// compliance. `ended`: how (STRAIGHT, PART, WHOLE), 0 where the search has not
+// straight way to the end on; returns the scale. A search for the end has up to three attempts, the second and the
+// third with a compliance. `ended`: how (STRAIGHT, PART, WHOLE), 0 where the search has not
 auto go_along = [&](int& ended, int& blocker, int& its_changes) {
   double* const kept = solution.data + problem * N;   // which is written last, and so are the labels
   int* const kept_labels = joints_at_bounds.data + here * N;
@@ -26,7 +26,7 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
     const double compliance = number == 0 ? 0.0 : number == 1 ? SOFT_COMPLIANCE : STIFFER_SOFT_COMPLIANCE;
     const bool done = attempt(at, least, compliance); // one place in the program for all
     its_changes += changes;
-    if (!done && number < 2 && first > 0) {
+    if (!done && number < 2 && at == 1.0 && first > 0) {
       ++number;
       continue;
     }
