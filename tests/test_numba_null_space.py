@@ -364,7 +364,7 @@ def test_no_index_is_out_of_bounds():
 def test_beside_a_gpu_too_the_kernel_and_the_search_return_the_same_types(monkeypatch, precision):
     """There both are branches of one program, and with JAX's default precision what is computed in double is a part."""
     monkeypatch.setattr(_candidates, "cpu_is_default", lambda: False)
-    solve = partial(solved.__wrapped__, backend="numba", method="saturated")
+    solve = partial(cast(Any, solved).__wrapped__, backend="numba", method="saturated")
     jax.clear_caches()
     with jax.enable_x64(precision == "float64"):
         jax.make_jaxpr(solve)(jax.tree.map(lambda a: jnp.asarray(a, precision), FAMILIES["damped inequalities"]))
