@@ -47,7 +47,9 @@ static int __ffs(unsigned a) { return __builtin_ffs(a); }
 static int __popc(unsigned a) { return __builtin_popcount(a); }
 static float rsqrtf(float a) { return 1.f / std::sqrt(a); }
 
-extern char __start_shared[], __stop_shared[];         // what is __shared__; it begins as numbers that are none
+// what is __shared__ begins as numbers that are none; some text may have none
+__attribute__((section("shared"), used)) static char at_least[16];
+extern char __start_shared[], __stop_shared[];
 static void run_warp(void (*thread)(), bool backwards) {
   memset(__start_shared, 0xff, __stop_shared - __start_shared);
   for (int i = 0; i < 32; ++i) {
