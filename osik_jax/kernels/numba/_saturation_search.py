@@ -310,7 +310,7 @@ def begin_search(W, S, start, target, first):
 def search(W, S, start, target, first, scale, most, least):
     """Return the scale, how many joints are saturated, the one that stops the motion, changes, and whether it is done.
 
-    ``S.x`` is the answer, inside its box; ``scale`` is the largest that is asked for.
+    After ``begin_search``. ``S.x`` is the answer, inside its box; ``scale`` is the largest that is asked for.
     """
     n = len(start)
     count, stop, rate, changes, entering, sign, push = 0, -1, 0.0, 0, -1, 1.0, 0.0
