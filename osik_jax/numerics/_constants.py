@@ -82,7 +82,7 @@ SOFT_COMPLIANCE, STIFFER_SOFT_COMPLIANCE = 1e-11, 1e-13
 hold: joints nearly depended on each other. The squared length of x that it outweighs; the more is missing, the more
 certain is the first that no larger scale is possible."""
 SOFT_SATURATION_RANK = 1e-11
-"""``SATURATION_RANK`` in these attempts: what is missing is a coordinate there, by which few joints depend on others."""
+"""``SATURATION_RANK`` in these attempts: what is missing is a coordinate there, so few joints depend on others."""
 MAX_SATURATION_CHANGES = 5
 """In kernels, for each variable: the first attempt ends with more changes of the active set, for it goes round by
 rounding; the others may have all that are left."""
