@@ -10,6 +10,10 @@
 #include <ucontext.h>
 
 using std::fabs; using std::fmax; using std::fmin; using std::sqrt;
+#define __device__
+#define __builtin_assume(fact)
+#define __isShared(pointer) true
+#define __noinline__ __attribute__((noinline))
 
 struct float4 { float x, y, z, w; };
 template <class T> struct Matrix { T* data; };
@@ -46,6 +50,7 @@ static int __any_sync(unsigned mask, bool yes) { return __ballot_sync(mask, yes)
 static int __ffs(unsigned a) { return __builtin_ffs(a); }
 static int __popc(unsigned a) { return __builtin_popcount(a); }
 static float rsqrtf(float a) { return 1.f / std::sqrt(a); }
+static double rsqrt(double a) { return 1. / std::sqrt(a); }
 
 // what is __shared__ begins as numbers that are none; some text may have none
 __attribute__((section("shared"), used)) static char at_least[16];

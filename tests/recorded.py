@@ -96,6 +96,15 @@ def recorded_single_saturated(copies: int) -> tuple[Problem, np.ndarray]:
     return _with_scales("saturated_nao_single.npz", copies)
 
 
+def recorded_turned_signs(copies: int) -> tuple[Problem, np.ndarray]:
+    """Eight more of these steps, and the same scales; the hand's column of a finger is rounding.
+
+    In attempts that let the motion be missed in part, multipliers are 1e13 times that of the finger, whose sign their
+    rounding turns: unsolved if the search ends with it.
+    """
+    return _with_scales("saturated_nao_signs.npz", copies)
+
+
 def _with_scales(file: str, copies: int) -> tuple[Problem, np.ndarray]:
     with np.load(DATA / file) as z:
         problem = _saturated([z[name] for name in z.files if name != "largest_scales"], copies)

@@ -22,6 +22,7 @@ from recorded import (
     recorded_qps,
     recorded_saturated,
     recorded_single_saturated,
+    recorded_turned_signs,
 )
 
 import osik_jax as osik
@@ -271,8 +272,9 @@ def test_saturation_goes_to_the_largest_scale_there_is(on_emulated_gpu):
     check_far_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, largest)
 
 
-def test_saturation_with_rows_that_were_summed_in_single_precision(on_emulated_gpu):
-    p, largest = recorded_single_saturated(1)
+@pytest.mark.parametrize("recorded", [recorded_single_saturated, recorded_turned_signs])
+def test_saturation_with_rows_that_were_summed_in_single_precision(recorded, on_emulated_gpu):
+    p, largest = recorded(1)
     check_single_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, largest)
 
 

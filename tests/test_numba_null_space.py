@@ -18,6 +18,7 @@ from recorded import (
     recorded_far_saturated,
     recorded_saturated,
     recorded_single_saturated,
+    recorded_turned_signs,
 )
 from used_memory import used_memory
 
@@ -147,9 +148,10 @@ def test_saturation_goes_to_the_largest_scale_there_is():
     check_far_saturated(jax.jit(lambda p: _saturation._by_numba(p, 330))(p), p, largest)
 
 
-def test_saturation_with_rows_that_were_summed_in_single_precision():
+@pytest.mark.parametrize("recorded", [recorded_single_saturated, recorded_turned_signs])
+def test_saturation_with_rows_that_were_summed_in_single_precision(recorded):
     """As kinematics outside of kernels has them, on a GPU for one."""
-    p, largest = recorded_single_saturated(16)
+    p, largest = recorded(16)
     check_single_saturated(jax.jit(lambda p: _saturation._by_numba(p, 330))(p), p, largest)
 
 

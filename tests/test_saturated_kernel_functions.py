@@ -15,8 +15,8 @@ pytestmark = [needs_compiler, pytest.mark.slow]
 N, M = 34, 7
 """Joints, more than a warp has lanes; rows of each of two levels."""
 PINNED = 5
-BEGIN = "A = matrix.data; load_level(); set_beside(); look(x);\n"
-BEGIN_SATURATED = f"""{BEGIN} first += take_row_space(m, 1e-10 * frobenius);
+BEGIN = "A = matrix.data; load_level(); look(); set_beside();\n"
+BEGIN_SATURATED = f"""{BEGIN} first += take_row_space(m, MD, 1e-10 * frobenius);
   for (int i = lane; i < N; i += 32) {{
     target_part[i] = 0.0, passed[i] = 0, motion[i] = given.data[i];
   }}
@@ -71,7 +71,7 @@ def test_the_row_space_comes_first(rank, in_saturation, rng):
     run_them, data = in_saturation
     rows = np.array(data["rows"])
     rows[0, rank:] = rng.normal(size=(M - rank, rank)) @ rows[0, :rank]
-    statements = "rank = take_row_space(m, 1e-10 * frobenius); if (lane == 7) result.data[N * N] = rank;"
+    statements = "rank = take_row_space(m, MD, 1e-10 * frobenius); if (lane == 7) result.data[N * N] = rank;"
     found = run_them("row_space", statements + ALL_COORDINATES, N * N + 1, rows=rows)
     turned = orthonormal(found)
     assert found[-1] == rank

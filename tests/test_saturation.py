@@ -294,6 +294,14 @@ class TestByHand:
         assert float(answer.scales[0]) == pytest.approx(2.0 / 3.0, abs=1e-15)
         np.testing.assert_allclose(answer.slacks[0], [-1.0, -1.0 / 3.0], rtol=0, atol=1e-15)
 
+    @pytest.mark.parametrize("entry, moves", [(3e-8, False), (3e-6, True)])
+    def test_a_joint_that_moves_the_task_by_rounding_alone_is_at_rest(self, entry, moves):
+        """In single precision; the largest scale takes what any other joint can add, however little."""
+        A, wanted = jnp.array([[1.0, 0.5, entry]], jnp.float32), jnp.array([10.0], jnp.float32)
+        bound = jnp.ones(3, jnp.float32)
+        answer = solve_nullspace([Level(A, wanted)], -bound, bound)
+        np.testing.assert_array_equal(answer.x, [1.0, 1.0, float(moves)])
+
     def test_saturated_joints_are_released_for_a_larger_scale(self):
         """A search that only saturates, the most critical joint first, ends at a scale of 0.75 here."""
         rows, wanted = np.array([[0.0, 1.0, -2.0, -2.0], [-2.0, 1.0, 0.0, 1.0]]), np.array([4.0, 2.0])

@@ -261,6 +261,8 @@ PROJECTOR_ROUNDOFF = 0.1
 """Diagonals of projectors are 1 at most; a smaller one has the dependence tolerance of one as large as this."""
 NEGLIGIBLE_ENTRY = 1e-7
 """Joints with a smaller entry in the combination do not block the motion."""
+ENTRY_ROUNDOFF = 2.0
+"""In units of machine epsilon times the largest entry of a row: a smaller entry is what rounding left of 0."""
 SATURATION_ATTEMPTS = 6
 """Where an answer is not accepted, the next attempt has a lower compliance, and only the part of the motion near the
 scale that was found: motions that are too large for their box by orders of magnitude lose digits."""

@@ -155,7 +155,7 @@ def add_missing_part(W, S, x, first, compliance):
 
 
 @lean
-def find_stop(W, S, x, count, most):
+def find_stop(W, S, x, count):
     """Return the scale at which a search with that coordinate ended, and the joint that stops the motion; -1 for none.
 
     The multipliers are then the combination of joints that stops it: what is missing pulls at it with nearly all.
@@ -164,9 +164,9 @@ def find_stop(W, S, x, count, most):
     for i in range(n):
         moved += W.motion[i] * (S.x[i] - x[i] - S.target_part[i])
         square += W.motion[i] * W.motion[i]
-    scale = min(max(moved / square, 0.0), most) if square > 0.0 else most
+    scale = min(max(moved / square, 0.0), 1.0) if square > 0.0 else 1.0
     fill(S.normal, 0.0)
-    if scale >= most - PATH_STEP:
+    if scale >= 1.0 - PATH_STEP:
         return scale, -1
     for a in range(count):
         if abs(S.y[a]) > largest:
@@ -202,19 +202,18 @@ def attempt(W, S, x, target, first, scale, most, least, compliance):
     begin_search(W, S, x, target, first)
     if start < first:
         add_missing_part(W, S, x, first, compliance)
-    asked = scale
     scale, count, stop, changes, done = search(W, S, x, target, start, scale, most, least)
     whole = size(W, S, x, target, scale, count)
     done = done and step_left(S, start, count) <= SATURATION_LOSS * whole
     if start < first:
         done = done and stop < 0
-        scale, stop = find_stop(W, S, x, count, asked)
+        scale, stop = find_stop(W, S, x, count)
         put_back(W, S, start)
     done = done and holds(W, S, first, count, stop, whole)
     for i in range(n):
         if abs(S.normal[i]) <= NEGLIGIBLE_ENTRY and start < first:
             S.normal[i] = 0.0
-    if not done:
+    if not done and start == first:
         put_back(W, S, start)
     return scale, count, stop, changes, done
 

@@ -328,8 +328,10 @@ def search(W, S, start, target, first, scale, most, least):
         if entering < 0:
             entering = most_violated(W, S, n, SATURATION_ROUNDOFF * whole)
             if entering < 0:
-                going = False
-                break
+                if count > 0:  # beside multipliers that are huge, rounding may have turned the sign of another
+                    scale = settle_stopped(W, S, start, scale, first, count, stop, rate)
+                going = dropping = most_wrong(S, count, SATURATION_ROUNDOFF * whole) >= 0
+                continue
             sign = 1.0 if W.low[entering] - S.x[entering] >= S.x[entering] - W.high[entering] else -1.0
             push, crossings = 0.0, 0
         k, changes = entering, changes + 1
@@ -384,6 +386,4 @@ def search(W, S, start, target, first, scale, most, least):
             S.x[k] = bound(W, S, k)
             whole = max(whole, abs(S.x[k]))
             count, entering = count + 1, -1
-    if count > 0:
-        scale = settle_stopped(W, S, start, scale, first, count, stop, rate)
     return scale, count, stop, changes, not going

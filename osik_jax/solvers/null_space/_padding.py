@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ...numerics._constants import ENTRY_ROUNDOFF
 from ...numerics._dense import apply
 from .._damping import Damping
 from ..hqp import Level
@@ -89,6 +90,18 @@ def _pad(level: Level, count: int) -> PaddedLevel:
         jnp.pad(level.upper, (0, more), constant_values=jnp.inf),
         jnp.pad(level.equal, (0, more)),
     )
+
+
+def without_roundoff(problem: Problem) -> Problem:
+    """Return the problem without entries of rows that are roundoff beside the row's largest.
+
+    The largest scale of a motion takes what every joint can add, however little: one that does not move the task but
+    for rounding would go at its top speed.
+    """
+    matrix = problem.levels.matrix
+    largest = jnp.max(jnp.abs(matrix), axis=-1, keepdims=True)
+    is_roundoff = jnp.abs(matrix) <= ENTRY_ROUNDOFF * jnp.finfo(matrix.dtype).eps * largest
+    return problem._replace(levels=problem.levels._replace(matrix=jnp.where(is_roundoff, 0.0, matrix)))
 
 
 def initial_point(problem: Problem) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:

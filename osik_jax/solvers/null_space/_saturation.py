@@ -47,7 +47,7 @@ from .._inverses import row_space_and_motion
 from ..hqp import Level
 from . import _warp
 from ._implicit_diff import ActiveJoints, SaturatedResult, with_derivative
-from ._padding import PaddedLevel, Problem, initial_point, pad_levels
+from ._padding import PaddedLevel, Problem, initial_point, pad_levels, without_roundoff
 from ._projection import level_motion
 from ._scale_path import least_cost
 from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
@@ -91,7 +91,7 @@ def solve_saturated(
     """
     problem = pad_levels(levels, lower, upper, secondary, damping, rank_tol)
     solve = in_lanes(in_double(partial(_solve_on_platform, max_iterations, backend)))
-    end = kept(solve(jax.lax.stop_gradient(problem)))
+    end = kept(solve(jax.lax.stop_gradient(without_roundoff(problem))))
     x, projector, scales = with_derivative((end.x, end.projector, end.scales), end.active_joints, problem, backend)
     return BoundedAnswer(x, projector, scales[: len(levels)], end.active, end.iterations, end.done)
 

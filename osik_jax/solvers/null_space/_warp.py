@@ -20,7 +20,7 @@ from ._implicit_diff import ActiveJoints, SaturatedResult
 from ._padding import Problem
 
 PARTS = (
-    *("workspace", "hqp/reductions", "problem", "level", "row_space", "hqp/cholesky", "damping", "motion"),
+    *("workspace", "hqp/reductions", "calls", "problem", "level", "row_space", "hqp/cholesky", "damping", "motion"),
     *("saturated", "stop", "choices", "search", "attempt", "after", "levels"),
 )
 """The files of the kernel, in their order: each uses what those before it define."""
@@ -66,7 +66,8 @@ class Shape(NamedTuple):
             return 0
         # rows have odd lengths, so that the threads of a warp read from different banks of memory
         wide = max(n, m)
-        doubles = n * (n | 1) + n * (wide | 1) + m * (m | 1) + 14 * n + 6 * m + wide
+        room = n * (wide | 1) + (0 if m * (m | 1) <= n * n else m * (m | 1))
+        doubles = n * (n | 1) + room + 14 * n + 6 * m + wide
         return min(_MAX_WARPS, _SHARED_BYTES // (8 * doubles + 4 * (6 * n + m)))
 
 

@@ -13,7 +13,7 @@ auto cholesky = [&](int count, double ridge) {
     double mine = value[0];
 #pragma unroll
     for (int g = 1; g < G; ++g) mine = k >> 5 == g ? value[g] : mine;
-    const double inverse = 1.0 / sqrt(fmax(__shfl_sync(ALL, mine, k & 31), 1e-300));
+    const double inverse = rsqrt(fmax(__shfl_sync(ALL, mine, k & 31), 1e-300));
     __syncwarp();
 #pragma unroll
     for (int g = 0; g < G; ++g)

@@ -26,11 +26,11 @@ auto take_off_stops = [&]() {
   __syncwarp();
   for (int i = 0; i < N; ++i) {
     if (blocking[i] == 0) continue;
-    for (int j = first + lane; j < N; j += 32) beside[j * BD + columns] = turned[j * D + i];
+    for (int j = lane; j < N - first; j += 32) beside[j * D + columns] = turned[(first + j) * D + i];
     ++columns;
   }
   if (columns == 0) return;
-  first += take_row_space(columns, BLOCKING_RANK);
+  first += take_row_space(columns, D, BLOCKING_RANK);
   for (int i = lane; i < N; i += 32)
     if (blocking[i] != 0)
       for (int j = first; j < N; ++j) turned[j * D + i] = 0.0;
@@ -49,7 +49,7 @@ auto damped_part = [&]() {
   __syncwarp();
   if (!(step_square > NEGLIGIBLE_STEP * NEGLIGIBLE_STEP * x_square)) return 1.0;
   for (int a = lane; a < m; a += 32) {
-    if (counts[a] == 0) continue;
+    if ((counts[a] & AT_X) == 0) continue;
     const double moved = row_times(a, along);
     gain += moved * wanted[a], cost += moved * moved;
   }
@@ -73,7 +73,7 @@ auto best_scale = [&]() {
     gain -= damping * (begin[i] * forward - x[i] * motion[i]), cost += damping * forward * forward;
   }
   for (int a = lane; a < m; a += 32) {
-    if (counts[a] == 0) continue;
+    if ((counts[a] & AT_X) == 0) continue;
     const double moved = row_times(a, motion);
     gain += moved * wanted[a], cost += moved * moved;
   }

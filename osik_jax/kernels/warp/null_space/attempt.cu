@@ -57,16 +57,16 @@ auto add_missing_part = [&](double compliance) {
 };
 // the scale at which a search with that coordinate ended, and the joint that stops the motion; the multipliers are then
 // the combination of joints that stops it: what is missing pulls at it with nearly all
-auto find_stop = [&](double most) {
+auto find_stop = [&]() {
   double moved = 0.0, square = 0.0, largest = 0.0;
   int which = N;
   for (int i = lane; i < N; i += 32)
     moved += motion[i] * (now[i] - x[i] - target_part[i]), square += motion[i] * motion[i], normal[i] = 0.0;
   moved = warp_sum(moved), square = warp_sum(square);
-  scale = square > 0.0 ? clip(moved / square, 0.0, most) : most;
+  scale = square > 0.0 ? clip(moved / square, 0.0, 1.0) : 1.0;
   stop = -1;
   __syncwarp();
-  if (scale >= most - PATH_STEP) return;
+  if (scale >= 1.0 - PATH_STEP) return;
   for (int a = lane; a < count; a += 32)
     if (fabs(y[a]) > largest) largest = fabs(y[a]), which = a;
   warp_argmax(largest, which);
@@ -100,13 +100,13 @@ auto attempt = [&](double most, double least, double compliance) {
   first += is_soft;
   if (is_soft) {
     done = done && stop < 0;
-    find_stop(most);
+    find_stop();
     put_back();
   }
   done = done && holds(whole);
   for (int i = lane; is_soft && i < N; i += 32)
     if (fabs(normal[i]) <= NEGLIGIBLE_ENTRY) normal[i] = 0.0;
-  if (!done) put_back();
+  if (!done && !is_soft) put_back();
   __syncwarp();
   return done;
 };

@@ -82,9 +82,9 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
 // moves x as the level asks and returns the scale; what it takes are the coordinates before `first`
 auto solve_level = [&](int& ended, int& blocker, int& its_changes) {
   load_level();
+  look();
   set_beside();
   compute_damping();
-  look(x);
   find_motion();
   first += rank;
   const double its_scale = go_along(ended, blocker, its_changes);

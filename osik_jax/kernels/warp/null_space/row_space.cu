@@ -9,24 +9,18 @@ auto reflect = [&](int head, double norm, int from, int to) {
   __syncwarp();
   for (int i = lane; i < N; i += 32) {
     along[i] += by * turned[head * D + i];
-    const double part = weight * along[i];
-#pragma unroll 4
-    for (int j = from; j < to; ++j) turned[j * D + i] -= turn[j] * part;
+    subtract(turned + from * D + i, D, turn + from, weight * along[i], to - from);
   }
   __syncwarp();
   return weight;
 };
-// turns the coordinates that are left so that the first ones span the columns of `beside`; how many these are. The
-// longest column that is left is the pivot, the first of equals; one no longer than the cutoff ends it.
-auto take_row_space = [&](int columns, double cutoff) {
+// turns the coordinates that are left so that the first ones span the columns beside them; how many these are. An entry
+// of a column is so far from the next. The longest column that is left is the pivot, the first of equals; one no longer
+// than the cutoff ends it.
+auto take_row_space = [&](int columns, int apart, double cutoff) {
   int at = first;
   __syncwarp();
-  for (int a = lane; a < columns; a += 32) {
-    double total = 0.0;
-#pragma unroll 4
-    for (int j = first; j < N; ++j) total += beside[j * BD + a] * beside[j * BD + a];
-    square[a] = total;
-  }
+  for (int a = lane; a < columns; a += 32) square[a] = squared_norm(beside + a, apart, N - first);
   for (; at < N && at - first < columns; ++at) {
     double most = -1.0, total = 0.0;
     int pivot = columns;
@@ -34,23 +28,17 @@ auto take_row_space = [&](int columns, double cutoff) {
       if (square[a] > most) most = square[a], pivot = a;
     warp_argmax(most, pivot);
     if (pivot == columns) break;                      // a number that is none
-    for (int j = at + lane; j < N; j += 32) turn[j] = beside[j * BD + pivot], total += turn[j] * turn[j];
+    for (int j = at + lane; j < N; j += 32)
+      turn[j] = beside[(j - first) * apart + pivot], total += turn[j] * turn[j];
     const double norm = sqrt(warp_sum(total));
     if (!(norm > cutoff)) break;
     __syncwarp();
     for (int i = lane; i < N; i += 32) along[i] = column_times(turn, i, at, N);
     const double weight = reflect(at, norm, at, N);
     for (int a = lane; a < columns; a += 32) {
-      double product = 0.0, left = 0.0;
-#pragma unroll 4
-      for (int j = at; j < N; ++j) product += turn[j] * beside[j * BD + a];
-      product *= weight;
-#pragma unroll 4
-      for (int j = at; j < N; ++j) {
-        beside[j * BD + a] -= turn[j] * product;
-        if (j > at) left += beside[j * BD + a] * beside[j * BD + a];
-      }
-      square[a] = left;
+      double* const own = beside + (at - first) * apart + a;
+      subtract(own, apart, turn + at, weight * dot(turn + at, own, apart, N - at), N - at);
+      square[a] = squared_norm(own + apart, apart, N - at - 1);
     }
     __syncwarp();
   }

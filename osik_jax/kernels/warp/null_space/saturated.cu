@@ -5,10 +5,7 @@ double scale = 1.0;
 auto bound = [&](int i) { return at_bound[i] > 0 ? high[i] : low[i]; };
 auto bound_passed = [&](int i) { return passed[i] < 0 ? low[i] : high[i]; };
 auto dual_times = [&](int a, const double* v) {       // the dual of a saturated joint times v, of the coordinates
-  double total = 0.0;
-#pragma unroll 4
-  for (int j = first; j < first + count; ++j) total += duals[a * D + j] * v[j];
-  return total;
+  return dot(v + first, duals + a * D + first, 1, count);
 };
 // `now` at the scale with the saturated joints on their bounds, and their multipliers; refined once
 auto settle = [&]() {
@@ -19,12 +16,7 @@ auto settle = [&]() {
     __syncwarp();
     for (int a = lane; a < count; a += 32) gap[a] = bound(who[a]) - now[who[a]];
     __syncwarp();
-    for (int j = first + lane; j < first + count; j += 32) {
-      double total = 0.0;
-#pragma unroll 4
-      for (int a = 0; a < count; ++a) total += gap[a] * duals[a * D + j];
-      place[j] = total;
-    }
+    for (int j = first + lane; j < first + count; j += 32) place[j] = dot(gap, duals + j, D, count);
     __syncwarp();
     for (int i = lane; i < N; i += 32) now[i] += column_times(place, i, first, first + count);
     for (int a = lane; a < count; a += 32) y[a] += dual_times(a, place);
@@ -66,10 +58,7 @@ auto release = [&](int a, bool moves) {
   for (int b = lane; b < count; b += 32) rate[b] = (b == a ? 1.0 : 0.0) - along[who[b]];
   __syncwarp();
   for (int j = first + lane; j < end; j += 32) {      // once more, for rounding
-    double more = 0.0;
-#pragma unroll 4
-    for (int b = 0; b < count; ++b) more += rate[b] * duals[b * D + j];
-    own[j] += more;
+    own[j] += dot(rate, duals + j, D, count);
     turn[j] = own[j], total += own[j] * own[j];
   }
   const double length_squared = warp_sum(total);
@@ -89,9 +78,7 @@ auto release = [&](int a, bool moves) {
   for (int j = first + lane; j < end; j += 32) own[j] = duals[(count - 1) * D + j];
   __syncwarp();
   for (int b = lane; b < count - 1; b += 32) {
-    const double part = weight * dual_times(b, turn);
-#pragma unroll 4
-    for (int j = first; j < last; ++j) duals[b * D + j] -= part * turn[j];
+    subtract(duals + b * D + first, 1, turn + first, weight * dual_times(b, turn), last - first);
     duals[b * D + last] = turned[last * D + who[b]] = 0.0;
   }
   __syncwarp();

@@ -105,7 +105,11 @@ auto search = [&](const double* target, double least) {
       whole = size_of_numbers(target);
       passes = 0;
     }
-    if (ended) return done;
+    if (ended) {  // beside multipliers that are huge, rounding may have turned the sign of another: the search goes on
+      dropping = done && most_wrong(SATURATION_ROUNDOFF * whole) >= 0;
+      if (!dropping) return done;
+      done = false;
+    }
     ended = step == CHOOSE && (changes >= most_changes || crossings > N);  // more exchanges go round, by rounding
     if (step == CHOOSE && !ended) ended = done = !choose(SATURATION_ROUNDOFF * whole);
     if (ended) {

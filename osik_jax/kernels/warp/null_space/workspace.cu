@@ -4,22 +4,25 @@
 // _warp.py: N joints, LEVELS, M rows of the longest level, WARPS of a block, and those of numerics/_constants.py that
 // it shares with Numba's kernel.
 constexpr int WIDE = N > M ? N : M;
-constexpr int D = N | 1, BD = WIDE | 1, VD = M | 1;   // row lengths in shared memory: odd, to meet every bank
-constexpr int G = (M + 31) / 32;                      // rows of a lane
+constexpr int D = N | 1, MD = M | 1;                  // row lengths in shared memory: odd, to meet every bank
+constexpr int G = (M + 31) / 32, H = (N + 31) / 32;   // rows of a lane, and joints
+// room for a level's rows, and for most levels for a square matrix of theirs too; where it does not fit, it is in the
+// global memory of the projector, which is written last, if that is large enough
+constexpr bool HAS_ROOM_ELSEWHERE = M * MD <= N * N;
+constexpr int ROOM = HAS_ROOM_ELSEWHERE ? N * (WIDE | 1) : N * (WIDE | 1) + M * MD;
 constexpr unsigned ALL = 0xffffffffu;
 
-__shared__ double shared_doubles[WARPS][N * D + N * BD + M * VD + 14 * N + 6 * M + WIDE];
+__shared__ double shared_doubles[WARPS][N * D + ROOM + 14 * N + 6 * M + WIDE];
 __shared__ int shared_ints[WARPS][6 * N + M];
 
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
 double* const turned = shared_doubles[warp];          // orthonormal rows: coordinates, those taken first
-double* const beside = turned + N * D;                // row j: coordinate j of the level's rows
-double* const duals = beside;                         // of the saturated joints, once the level's motion is known
-double* const gram = beside + N * BD;                 // Gram matrix above, its Cholesky factor below the diagonal
-double* const triangle = gram;                        // later the triangle of the level's factor
+double* const room = turned + N * D;
+double* const beside = room;                          // columns in the coordinates that are left: the level's rows
+double* const duals = room;                           // of the saturated joints, once the level's motion is known
 
 // ---- joints
-double* const x = gram + M * VD;                      // where the levels so far have moved them
+double* const x = room + ROOM;                        // where the levels so far have moved them
 double* const low = x + N;                            // the box of the levels below
 double* const high = low + N;
 double* const bent = high + N;                        // bound on the curvature of the rows so far
@@ -50,4 +53,5 @@ int* const blocking = passed + N;                     // labels of those that st
 int* const fixed = blocking + N;                      // of those that can move no more; 2 for pinned ones
 int* const who = fixed + N;                           // the saturated joints
 int* const stays = who + N;                           // whether they stop the motion
-int* const counts = stays + N;                        // whether a row takes part
+int* const counts = stays + N;                        // where a row takes part: AT_X, AT_BASE or both
+constexpr int AT_X = 1, AT_BASE = 2;                  // at x; at what of x the null space can not move
