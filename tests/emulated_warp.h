@@ -10,10 +10,6 @@
 #include <ucontext.h>
 
 using std::fabs; using std::fmax; using std::fmin; using std::sqrt;
-#define __device__
-#define __builtin_assume(fact)
-#define __isShared(pointer) true
-#define __noinline__ __attribute__((noinline))
 
 struct float4 { float x, y, z, w; };
 template <class T> struct Matrix { T* data; };
@@ -55,6 +51,10 @@ static double rsqrt(double a) { return 1. / std::sqrt(a); }
 // what is __shared__ begins as numbers that are none; some text may have none
 __attribute__((section("shared"), used)) static char at_least[16];
 extern char __start_shared[], __stop_shared[];
+#define __isShared(pointer) ((char*)(pointer) >= __start_shared && (char*)(pointer) < __stop_shared)
+#define __builtin_assume(fact) if (!(fact)) fprintf(stderr, "not so: %s\n", #fact), abort()
+#define __device__
+#define __noinline__ __attribute__((noinline))
 static void run_warp(void (*thread)(), bool backwards) {
   memset(__start_shared, 0xff, __stop_shared - __start_shared);
   for (int i = 0; i < 32; ++i) {

@@ -187,8 +187,10 @@ def put_back(W, S, start):
 
 
 @lean
-def attempt(W, S, x, target, first, scale, most, least, compliance):
+def attempt(W, S, x, target, first, scale, most, least, compliance, count):
     """Search, and accept where the answer holds; where it does not, put the coordinates back.
+
+    Where ``count`` joints are saturated already, by the attempt before at another scale, it goes on from these.
 
     With a compliance the motion may be missed in part, so that at any scale there is an answer, and joints that nearly
     depend on each other need no decision. That coordinate takes the place of one which is taken.
@@ -196,13 +198,14 @@ def attempt(W, S, x, target, first, scale, most, least, compliance):
     The scale, how many joints are saturated, the one that stops the motion, changes, and whether the answer holds.
     """
     n, start = len(x), first - (1 if compliance > 0.0 else 0)
-    for j in range(start, n):
-        for i in range(n):
-            S.before[j, i] = W.turned[j, i]
-    begin_search(W, S, x, target, first)
+    if count == 0:
+        for j in range(start, n):
+            for i in range(n):
+                S.before[j, i] = W.turned[j, i]
+        begin_search(W, S, x, target, first)
     if start < first:
         add_missing_part(W, S, x, first, compliance)
-    scale, count, stop, changes, done = search(W, S, x, target, start, scale, most, least)
+    scale, count, stop, changes, done = search(W, S, x, target, start, scale, most, least, count)
     whole = size(W, S, x, target, scale, count)
     done = done and step_left(S, start, count) <= SATURATION_LOSS * whole
     if start < first:
@@ -268,14 +271,19 @@ def go_along(W, S, level, x, target, damping, first, most, at_bound, blocking):
         joints are.
     """
     n, at, number, low, high, scale = len(x), 1.0, 0, 0.0, 1.0, 0.0
-    blocker, changes, ended, searches, whole, part = 0, 0, 0, 0, 1.0, 1.0
+    blocker, changes, ended, searches, whole, part, count = 0, 0, 0, 0, 1.0, 1.0, 0
     while searches <= PATH_SEARCHES and changes < most:
         least, compliance, limit = SATURATION_RANK, 0.0, min(most - changes, MAX_SATURATION_CHANGES * n)
         if number > 0:
             least, limit = SOFT_SATURATION_RANK, most - changes
             compliance = SOFT_COMPLIANCE if number == 1 else STIFFER_SOFT_COMPLIANCE
-        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, limit, least, compliance)
+        begun = count
+        its_scale, count, stop, more, done = attempt(W, S, x, target, first, at, limit, least, compliance, begun)
         changes += more
+        if not done or number > 0:  # the next begins anew
+            count = 0
+        if not done and begun > 0:
+            continue
         if not done and number < 2 and at == 1.0 and first > 0:
             number += 1
             continue

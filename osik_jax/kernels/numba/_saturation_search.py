@@ -299,7 +299,6 @@ def begin_search(W, S, start, target, first):
     n = len(start)
     fill(S.target_part, 0.0)
     fill(S.at_bound, 0)
-    fill(S.passed, 0)
     for i in range(n):
         S.along[i] = target[i] - start[i]
     for j in range(first, n):
@@ -307,16 +306,19 @@ def begin_search(W, S, start, target, first):
 
 
 @lean
-def search(W, S, start, target, first, scale, most, least):
+def search(W, S, start, target, first, scale, most, least, count):
     """Return the scale, how many joints are saturated, the one that stops the motion, changes, and whether it is done.
 
-    After ``begin_search``. ``S.x`` is the answer, inside its box; ``scale`` is the largest that is asked for.
+    After ``begin_search``, or from the ``count`` joints that a search at another scale has saturated. ``S.x`` is the
+    answer, inside its box; ``scale`` is the largest that is asked for.
     """
     n = len(start)
-    count, stop, rate, changes, entering, sign, push = 0, -1, 0.0, 0, -1, 1.0, 0.0
+    stop, rate, changes, entering, sign, push = -1, 0.0, 0, -1, 1.0, 0.0
+    fill(S.stays, 0)
+    fill(S.passed, 0)
     settle(W, S, start, scale, first, count)
     whole = size(W, S, start, target, scale, count)
-    dropping, going, crossings = False, True, 0
+    dropping, going, crossings = count > 0, True, 0
     while going and changes < most:
         if dropping:
             wrong = most_wrong(S, count, SATURATION_ROUNDOFF * whole)

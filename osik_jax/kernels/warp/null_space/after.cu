@@ -1,8 +1,7 @@
 // What a level leaves to those below: joints that can move no more, the part of its step, and a narrower box.
 
-// `at_bound` and `blocking` become the joints on their bounds and those that stop the motion; returns which of the
-// latter the others say most about
-auto label_joints = [&]() {
+// `blocking` becomes the joints that stop the motion; returns which of them the others say most about
+auto find_blocking = [&]() {
   double most = 0.0;
   int blocker = N;
   __syncwarp();
@@ -12,11 +11,6 @@ auto label_joints = [&]() {
     if (own > most) most = own, blocker = i;
   }
   warp_argmax(most, blocker);
-  __syncwarp();
-  if (stop >= 0 && lane == 0) {
-    at_bound[stop] = passed[stop];
-    at_bound[blocker < N ? blocker : 0] = 0;
-  }
   __syncwarp();
   return blocker < N ? blocker : 0;
 };

@@ -76,10 +76,10 @@ auto find_stop = [&]() {
   if (lane == 0) passed[stop] = at_bound[stop];
   __syncwarp();
 };
-// searches and returns whether the answer is accepted. With a compliance the motion may be missed in part, so that at any
-// scale there is an answer, and joints that nearly depend on each other need no decision; that coordinate takes the place
-// of one which is taken
-auto attempt = [&](double most, double least, double compliance) {
+// searches, perhaps from the joints that the attempt before has saturated, and returns whether the answer is accepted. With
+// a compliance the motion may be missed in part, so that at any scale there is an answer, and joints that nearly depend on
+// each other need no decision; that coordinate takes the place of one which is taken
+auto attempt = [&](double most, double least, double compliance, bool goes_on) {
   const double* const target = targets.data + here * N;
   double* const before = projectors.data + problem * (N * N);  // which is written last
   const bool is_soft = compliance > 0.0;
@@ -89,9 +89,10 @@ auto attempt = [&](double most, double least, double compliance) {
       for (int i = lane; i < N; i += 32) turned[j * D + i] = before[j * N + i];
     __syncwarp();
   };
-  for (int j = start; j < N; ++j)
+  for (int j = goes_on ? N : start; j < N; ++j)
     for (int i = lane; i < N; i += 32) before[j * N + i] = turned[j * D + i];
-  begin_search(target, most);
+  if (goes_on) go_on(most);
+  else begin_search(target, most);
   if (is_soft) add_missing_part(compliance);
   first = start;
   bool done = search(target, least);

@@ -17,6 +17,7 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
   int* const kept_labels = joints_at_bounds.data + here * N;
   double at = 1.0, below = 0.0, above = 1.0, whole = 1.0, its_scale = 0.0;
   int number = 0;                                     // of the attempt at this scale
+  bool goes_on = false;                               // from the joints that the attempt before has saturated
   ended = blocker = its_changes = 0;
   for (int searches = 0; searches <= PATH_SEARCHES && its_changes < max_iterations;) {
     const int own = MAX_SATURATION_CHANGES * N;
@@ -24,8 +25,10 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
     if (number == 0 && own < most_changes) most_changes = own;
     const double least = number == 0 ? SATURATION_RANK : SOFT_SATURATION_RANK;
     const double compliance = number == 0 ? 0.0 : number == 1 ? SOFT_COMPLIANCE : STIFFER_SOFT_COMPLIANCE;
-    const bool done = attempt(at, least, compliance); // one place in the program for all
+    const bool went_on = goes_on, done = attempt(at, least, compliance, goes_on);  // one place in the program for all
     its_changes += changes;
+    goes_on = done && number == 0;
+    if (!done && went_on) continue;                   // once more, from none
     if (!done && number < 2 && at == 1.0 && first > 0) {
       ++number;
       continue;
@@ -36,12 +39,12 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
     double* const reached = ended == 0 || at == 1.0 ? now : along;
     if (ended == 0) {                                 // the end of the path
       if (!done) break;
-      blocker = label_joints(), ended = STRAIGHT;
+      blocker = find_blocking(), ended = STRAIGHT;
       part = damped_part();
       above = whole = scale, its_scale = part * scale;
     } else if (at == 1.0) {                           // the end once more
       if (!done) break;
-      blocker = label_joints(), ended = WHOLE, its_scale = scale;
+      blocker = find_blocking(), ended = WHOLE, its_scale = scale;
     } else {
       ++searches;
       if (!done || stop >= 0) break;
@@ -53,7 +56,8 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
     }
     for (int i = lane; keeps && i < N; i += 32) {
       kept[i] = part == 1.0 ? reached[i] : x[i] + part * (reached[i] - x[i]);
-      kept_labels[i] = at_bound[i];
+      // the joint that stops the motion is on its bound in the place of the blocker
+      kept_labels[i] = stop >= 0 && i == blocker ? 0 : i == stop ? passed[i] : at_bound[i];
     }
     if (ended == WHOLE) break;
     if (ended == STRAIGHT) {

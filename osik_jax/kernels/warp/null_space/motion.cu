@@ -26,9 +26,10 @@ auto solve_on_basis = [&]() {
     for (int c = k + 1 + lane; c <= rank; c += 32) {  // what this column takes from the later ones
       double* const other = c < rank ? beside + c * MD : right;
       double* const other_below = c < rank ? triangle + c * VD : right_below;
-      const double product = dot(column, other, 1, m) + dot(below, other_below, 1, depth);
+      double product = dot(column, other, 1, m);
+      for (int i = 0; i < depth; ++i) product += below[i] * other_below[i];
       subtract(other, 1, column, product, m);
-      subtract(other_below, 1, below, product, depth);
+      for (int i = 0; i < depth; ++i) other_below[i] -= product * below[i];
       (c < rank ? triangle[k * VD + c] : place[first + k]) = product;
     }
     __syncwarp();

@@ -10,13 +10,20 @@ int crossings = 0, passes = 0;                        // exchanges of this joint
 double sign = 1.0, push = 0.0, stop_rate = 0.0;       // of the entering joint, its multiplier; of the scale
 bool dropping = false, crossing = false, is_known = false;
 
-// no joint is saturated; what the null space makes of the target
-auto begin_search = [&](const double* target, double most) {
-  count = 0, stop = -1, scale = most;
+// a search at this scale at most, from the joints that the one before has saturated
+auto go_on = [&](double most) {
+  stop = -1, scale = most;
   changes = 0, step = CHOOSE, entering = -1, leaving = -1, passes = 1;
-  crossings = 0, dropping = crossing = is_known = false;
+  crossings = 0, dropping = count > 0, crossing = is_known = false;
   __syncwarp();
-  for (int i = lane; i < N; i += 32) along[i] = target[i] - x[i], at_bound[i] = passed[i] = 0;
+  for (int i = lane; i < N; i += 32) stays[i] = passed[i] = 0;
+  __syncwarp();
+};
+// the same with no joint saturated; what the null space makes of the target
+auto begin_search = [&](const double* target, double most) {
+  count = 0;
+  go_on(most);
+  for (int i = lane; i < N; i += 32) along[i] = target[i] - x[i], at_bound[i] = 0;
   __syncwarp();
   for (int j = first + lane; j < N; j += 32) place[j] = coordinate_times(j, along);
   __syncwarp();
@@ -94,7 +101,7 @@ auto enter = [&](double length_squared) {
   }
   __syncwarp();
 };
-// after `begin_search`: finds `now`, inside its box and at a scale of at most the one it began with, and returns whether
+// after `begin_search` or `go_on`: finds `now`, inside its box and at a scale of at most the one it began with, and returns whether
 // it has; a combination with parts below `least` depends on others
 auto search = [&](const double* target, double least) {
   double whole = 0.0;
