@@ -18,7 +18,8 @@ all of them are on their bounds, a cut: no larger one is possible, and 0 is, for
 stop the motion. They stay where they are, for with enough of the normal added all their multipliers have the right
 sign; where a further combination has one of them let go, the free one among them takes its place. The search goes on at
 the new scale, and lets those go first that push in the wrong direction there. The scale falls with every cut, so that
-there are finitely many; at the end there is an x in the box.
+there are finitely many; at the end there is an x in the box. A search may begin with the joints that one at another
+scale has saturated, and lets those go in the same way.
 
 Column i of ``turned``, from row ``first`` on, is joint i in coordinates of the null space; these are turned in place,
 so that the first ``count`` of them have all of the joints that are on their bounds (an orthogonal factorisation). What
