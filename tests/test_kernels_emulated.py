@@ -27,11 +27,13 @@ from recorded import (
 
 import osik_jax as osik
 from osik_jax.execution import _backends
-from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace
+from osik_jax.solvers import Damping, Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace
 from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
 from osik_jax.solvers.hqp import _warp as hqp_kernel
 from osik_jax.solvers.null_space import _saturation
 from osik_jax.solvers.null_space import _warp as null_space_kernel
+from osik_jax.solvers.null_space._padding import Problem, pad_levels
+from osik_jax.solvers.null_space._saturation import _by_numba as by_numba
 from osik_jax.solvers.qp import _dispatch as qp_dispatch
 from osik_jax.solvers.qp import _warp as qp_kernel
 
@@ -276,6 +278,23 @@ def test_saturation_goes_to_the_largest_scale_there_is(on_emulated_gpu):
 def test_saturation_with_rows_that_were_summed_in_single_precision(recorded, on_emulated_gpu):
     p, largest = recorded(1)
     check_single_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, largest)
+
+
+def test_saturation_of_levels_whose_square_matrices_have_no_room_in_shared_memory(on_emulated_gpu, rng):
+    """11 rows of 12 variables, damped by what is missed: the matrix is where the projector will be."""
+    n, m = 12, 11
+
+    def problem() -> Problem:
+        A, wanted = rng.normal(size=(m, n)), rng.normal(size=m)
+        terms = Damping(*map(jnp.asarray, (1e-3, 0.8, np.linalg.norm(wanted), np.full(n, 0.01))))
+        bound = jnp.full(n, 0.3)
+        return pad_levels([Level(A, wanted).scaled()], -bound, bound, jnp.zeros(n), [terms], 1e-9)
+
+    p = jax.tree.map(lambda *a: jnp.stack(a), *(problem() for _ in range(COUNT)))
+    found, expected = (jax.jit(lambda p, solve=solve: solve(p, 330))(p) for solve in (null_space_kernel.solve, by_numba))
+    assert found.done.all()
+    assert expected.done.all()
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-10)
 
 
 def test_derivatives_of_saturation(on_emulated_gpu, rng):

@@ -76,9 +76,9 @@ auto find_stop = [&]() {
   if (lane == 0) passed[stop] = at_bound[stop];
   __syncwarp();
 };
-// searches, perhaps from the joints that the attempt before has saturated, and returns whether the answer is accepted. With
-// a compliance the motion may be missed in part, so that at any scale there is an answer, and joints that nearly depend on
-// each other need no decision; that coordinate takes the place of one which is taken
+// searches, perhaps from the joints that the attempt before has saturated, and returns whether the answer is accepted.
+// With a compliance the motion may be missed in part, so that at any scale there is an answer, and joints that nearly
+// depend on each other need no decision; that coordinate takes the place of one which is taken
 auto attempt = [&](double most, double least, double compliance, bool goes_on) {
   const double* const target = targets.data + here * N;
   double* const before = projectors.data + problem * (N * N);  // which is written last

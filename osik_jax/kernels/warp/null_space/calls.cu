@@ -1,5 +1,5 @@
-// Functions that are called, not put in where they are used: the kernel is so long that fetching instructions is most of
-// its time. They are members of a struct, since C++ has no functions inside of functions; vectors are in shared memory.
+// Functions that are called, not put in where they are used: the kernel is so long that fetching instructions takes most
+// of its time. They are members of a struct, since C++ has no functions inside of functions. Vectors are in shared memory.
 struct Called {
   // `v` times `w`, whose entries are so far apart
   static __device__ __noinline__ double dot(const double* v, const double* w, int apart, int count) {

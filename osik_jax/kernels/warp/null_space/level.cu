@@ -92,7 +92,8 @@ auto set_beside = [&]() {
         if (first + lane + 32 * h < N && a + k < m) beside[(lane + 32 * h) * MD + a + k] = total[h][k];
     __syncwarp();
   }
-  const int side = unmet != 0.0 || m < N - first ? m : N - first;  // without damping to find, only the factor is asked for
+  // where no damping has to be found, it is only the factor's
+  const int side = unmet != 0.0 || m < N - first ? m : N - first;
   VD = side | 1;
   const bool fits = !HAS_ROOM_ELSEWHERE || (N - first) * MD + side * VD <= ROOM;
   gram = fits ? beside + (N - first) * MD : projectors.data + problem * (N * N);

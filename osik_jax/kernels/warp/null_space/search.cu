@@ -101,8 +101,8 @@ auto enter = [&](double length_squared) {
   }
   __syncwarp();
 };
-// after `begin_search` or `go_on`: finds `now`, inside its box and at a scale of at most the one it began with, and returns whether
-// it has; a combination with parts below `least` depends on others
+// after `begin_search` or `go_on`: finds `now`, inside its box and at a scale of at most the one it began with, and
+// returns whether it has; a combination with parts below `least` depends on others
 auto search = [&](const double* target, double least) {
   double whole = 0.0;
   bool done = false, ended = false;
