@@ -291,7 +291,9 @@ def test_saturation_of_levels_whose_square_matrices_have_no_room_in_shared_memor
         return pad_levels([Level(A, wanted).scaled()], -bound, bound, jnp.zeros(n), [terms], 1e-9)
 
     p = jax.tree.map(lambda *a: jnp.stack(a), *(problem() for _ in range(COUNT)))
-    found, expected = (jax.jit(lambda p, solve=solve: solve(p, 330))(p) for solve in (null_space_kernel.solve, by_numba))
+    found, expected = (
+        jax.jit(lambda p, solve=solve: solve(p, 330))(p) for solve in (null_space_kernel.solve, by_numba)
+    )
     assert found.done.all()
     assert expected.done.all()
     np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-10)
