@@ -83,6 +83,8 @@ hold: joints nearly depended on each other. The squared length of x that it outw
 certain is the first that no larger scale is possible."""
 SOFT_SATURATION_RANK = 1e-11
 """``SATURATION_RANK`` in these attempts: what is missing is a coordinate there, so few joints depend on others."""
+SIGN_CHECKS = 3
+"""In kernels: how often a search that would end with a multiplier of the wrong sign, by rounding, goes on."""
 MAX_SATURATION_CHANGES = 5
 """In kernels, for each variable: the first attempt ends with more changes of the active set, for it goes round by
 rounding; the others may have all that are left."""

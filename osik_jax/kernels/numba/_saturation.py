@@ -42,7 +42,7 @@ from ._projection import (
 )
 from ._row_space import set_beside, take_row_space
 from ._row_space_workspace import work_at, work_size
-from ._saturation_search import Search, begin_search, bound, search, settle, size
+from ._saturation_search import Search, begin_search, bound, search, settle, size, step_left
 from ._vectors import add, dot
 
 
@@ -124,17 +124,6 @@ def scale_left(W, S, first, stop, size):
         label = S.passed[i] if i == stop else S.at_bound[i]
         wrong += max(-label * S.normal[i] * (1.0 if rate > 0.0 else -1.0), 0.0)
     return (np.sqrt(square) + wrong) * size / abs(rate) if rate != 0.0 else np.inf
-
-
-@lean
-def step_left(S, first, count):
-    """Return how far a saturated joint would go that is let go: no step, where all multipliers have the right sign."""
-    most = 0.0
-    for a in range(count):
-        wrong = S.at_bound[S.who[a]] * S.y[a]
-        if S.stays[a] == 0 and wrong > 0.0:
-            most = max(most, wrong / np.sqrt(dot(S.duals[a], S.duals[a], first, first + count)))
-    return most
 
 
 @lean

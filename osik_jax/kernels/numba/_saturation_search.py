@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...numerics._constants import LARGEST_RATE, SATURATION_ROUNDOFF
+from ...numerics._constants import LARGEST_RATE, SATURATION_LOSS, SATURATION_ROUNDOFF, SIGN_CHECKS
 from ._dense import fill
 from ._frame import lean
 from ._vectors import add, dot
@@ -126,6 +126,17 @@ def most_wrong(S, count, roundoff):
         if S.stays[a] == 0 and push < worst:
             worst, which = push, a
     return which
+
+
+@lean
+def step_left(S, first, count):
+    """Return how far a saturated joint would go that is let go: no step, where all multipliers have the right sign."""
+    most = 0.0
+    for a in range(count):
+        wrong = S.at_bound[S.who[a]] * S.y[a]
+        if S.stays[a] == 0 and wrong > 0.0:
+            most = max(most, wrong / np.sqrt(dot(S.duals[a], S.duals[a], first, first + count)))
+    return most
 
 
 @lean
@@ -319,7 +330,7 @@ def search(W, S, start, target, first, scale, most, least, count):
     fill(S.passed, 0)
     settle(W, S, start, scale, first, count)
     whole = size(W, S, start, target, scale, count)
-    dropping, going, crossings = count > 0, True, 0
+    dropping, going, crossings, checks = count > 0, True, 0, 0
     while going and changes < most:
         if dropping:
             wrong = most_wrong(S, count, SATURATION_ROUNDOFF * whole)
@@ -333,7 +344,10 @@ def search(W, S, start, target, first, scale, most, least, count):
             if entering < 0:
                 if count > 0:  # beside multipliers that are huge, rounding may have turned the sign of another
                     scale = settle_stopped(W, S, start, scale, first, count, stop, rate)
-                going = dropping = most_wrong(S, count, SATURATION_ROUNDOFF * whole) >= 0
+                    whole = size(W, S, start, target, scale, count)
+                checks += 1
+                going = checks <= SIGN_CHECKS and step_left(S, first, count) > SATURATION_LOSS * whole
+                dropping = going
                 continue
             sign = 1.0 if W.low[entering] - S.x[entering] >= S.x[entering] - W.high[entering] else -1.0
             push, crossings = 0.0, 0

@@ -100,7 +100,7 @@ def without_roundoff(problem: Problem) -> Problem:
     """
     matrix = problem.levels.matrix
     largest = jnp.max(jnp.abs(matrix), axis=-1, keepdims=True)
-    is_roundoff = jnp.abs(matrix) <= ENTRY_ROUNDOFF * jnp.finfo(matrix.dtype).eps * largest
+    is_roundoff = (jnp.abs(matrix) <= ENTRY_ROUNDOFF * jnp.finfo(matrix.dtype).eps * largest) & jnp.isfinite(largest)
     return problem._replace(levels=problem.levels._replace(matrix=jnp.where(is_roundoff, 0.0, matrix)))
 
 

@@ -35,7 +35,7 @@ _OUTPUTS = (
     dict(solution="double", projectors="double", scales="double", dones="int", joints_at_bounds="int")
     | dict(joints_blocking="int", blockers="int", active_joints="int", report="int")
 )  # fmt: skip
-_WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "STRAIGHT", "WHOLE")
+_WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "SIGN_CHECKS", "STRAIGHT", "WHOLE")
 _NUMBERS = (
     *("BLOCKING_RANK", "BOUND_DISTANCE", "COST_FRACTION", "DAMPING_RIDGE", "FULL_STEP", "LARGEST_RATE"),
     *("MIN_RADIUS", "NEGLIGIBLE_CURVATURE", "NEGLIGIBLE_DAMPING", "NEGLIGIBLE_ENTRY", "NEGLIGIBLE_STEP", "PATH_END"),

@@ -32,15 +32,6 @@ auto scale_left = [&](double size) {
   wrong = warp_sum(wrong);
   return rate_of_scale != 0.0 ? (sqrt(square) + wrong) * size / fabs(rate_of_scale) : INFINITY;
 };
-// how far a saturated joint would go that is let go: no step, where all multipliers have the right sign
-auto step_left = [&]() {
-  double most = 0.0;
-  for (int a = lane; a < count; a += 32) {
-    const double wrong = at_bound[who[a]] * y[a];
-    if (stays[a] == 0 && wrong > 0.0) most = fmax(most, wrong / sqrt(dual_times(a, duals + a * D)));
-  }
-  return warp_max(most);
-};
 // joints are in their box, and no larger scale is possible
 auto holds = [&](double size) {
   const double off = put_on_bounds();
@@ -105,6 +96,7 @@ auto attempt = [&](double most, double least, double compliance, bool goes_on) {
     put_back();
   }
   done = done && holds(whole);
+  __syncwarp();
   for (int i = lane; is_soft && i < N; i += 32)
     if (fabs(normal[i]) <= NEGLIGIBLE_ENTRY) normal[i] = 0.0;
   if (!done && !is_soft) put_back();

@@ -21,6 +21,15 @@ auto most_wrong = [&](double roundoff) {
   }
   return chosen(most, which);
 };
+// how far a saturated joint would go that is let go: no step, where all multipliers have the right sign
+auto step_left = [&]() {
+  double most = 0.0;
+  for (int a = lane; a < count; a += 32) {
+    const double wrong = at_bound[who[a]] * y[a];
+    if (stays[a] == 0 && wrong > 0.0) most = fmax(most, wrong / sqrt(dual_times(a, duals + a * D)));
+  }
+  return warp_max(most);
+};
 // the free joint that is furthest beyond its bound
 auto most_violated = [&](double roundoff) {
   double most = roundoff;

@@ -27,7 +27,7 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
     const double compliance = number == 0 ? 0.0 : number == 1 ? SOFT_COMPLIANCE : STIFFER_SOFT_COMPLIANCE;
     const bool went_on = goes_on, done = attempt(at, least, compliance, goes_on);  // one place in the program for all
     its_changes += changes;
-    goes_on = done && number == 0;
+    goes_on = done && number == 0 && count > 0;
     if (!done && went_on) continue;                   // once more, from none
     if (!done && number < 2 && at == 1.0 && first > 0) {
       ++number;

@@ -60,6 +60,7 @@ auto move = [&](double length_squared, double least) {
     return false;
   }
   const double by = sign * fmin(length, full);
+  __syncwarp();
   for (int i = lane; i < N; i += 32) now[i] += by * along[i];
   for (int a = lane; a < count; a += 32) y[a] -= by * rate[a];
   push += by;
@@ -105,6 +106,7 @@ auto enter = [&](double length_squared) {
 // returns whether it has; a combination with parts below `least` depends on others
 auto search = [&](const double* target, double least) {
   double whole = 0.0;
+  int checks = 0;                                     // of signs at the end
   bool done = false, ended = false;
   for (;;) {
     if (passes > 0) {
@@ -113,7 +115,7 @@ auto search = [&](const double* target, double least) {
       passes = 0;
     }
     if (ended) {  // beside multipliers that are huge, rounding may have turned the sign of another: the search goes on
-      dropping = done && most_wrong(SATURATION_ROUNDOFF * whole) >= 0;
+      dropping = done && checks++ < SIGN_CHECKS && step_left() > SATURATION_LOSS * whole;
       if (!dropping) return done;
       done = false;
     }
