@@ -97,7 +97,7 @@ def recorded_single_saturated(copies: int) -> tuple[Problem, np.ndarray]:
 
 
 def recorded_turned_signs(copies: int) -> tuple[Problem, np.ndarray]:
-    """Eight more of these steps, and the same scales; the hand's column of a finger is rounding.
+    """Eight more of these steps, and the same scales; rows know a finger by rounding alone.
 
     In attempts that let the motion be missed in part, multipliers are 1e13 times that of the finger, whose sign their
     rounding turns: unsolved if the search ends with it.

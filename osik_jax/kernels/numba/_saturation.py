@@ -42,7 +42,7 @@ from ._projection import (
 )
 from ._row_space import set_beside, take_row_space
 from ._row_space_workspace import work_at, work_size
-from ._saturation_search import Search, begin_search, bound, search, settle, size, step_left
+from ._saturation_search import Search, begin_search, bound, search, settle, size
 from ._vectors import add, dot
 
 
@@ -196,7 +196,6 @@ def attempt(W, S, x, target, first, scale, most, least, compliance, count):
         add_missing_part(W, S, x, first, compliance)
     scale, count, stop, changes, done = search(W, S, x, target, start, scale, most, least, count)
     whole = size(W, S, x, target, scale, count)
-    done = done and step_left(S, start, count) <= SATURATION_LOSS * whole
     if start < first:
         done = done and stop < 0
         scale, stop = find_stop(W, S, x, count)

@@ -330,8 +330,8 @@ def search(W, S, start, target, first, scale, most, least, count):
     fill(S.passed, 0)
     settle(W, S, start, scale, first, count)
     whole = size(W, S, start, target, scale, count)
-    dropping, going, crossings, checks = count > 0, True, 0, 0
-    while going and changes < most:
+    dropping, crossings, checks = count > 0, 0, 0
+    while changes < most:
         if dropping:
             wrong = most_wrong(S, count, SATURATION_ROUNDOFF * whole)
             dropping = wrong >= 0
@@ -345,9 +345,10 @@ def search(W, S, start, target, first, scale, most, least, count):
                 if count > 0:  # beside multipliers that are huge, rounding may have turned the sign of another
                     scale = settle_stopped(W, S, start, scale, first, count, stop, rate)
                     whole = size(W, S, start, target, scale, count)
-                checks += 1
-                going = checks <= SIGN_CHECKS and step_left(S, first, count) > SATURATION_LOSS * whole
-                dropping = going
+                are_right = step_left(S, first, count) <= SATURATION_LOSS * whole
+                if are_right or checks == SIGN_CHECKS:
+                    return scale, count, stop, changes, are_right
+                checks, dropping = checks + 1, True
                 continue
             sign = 1.0 if W.low[entering] - S.x[entering] >= S.x[entering] - W.high[entering] else -1.0
             push, crossings = 0.0, 0
@@ -403,4 +404,4 @@ def search(W, S, start, target, first, scale, most, least, count):
             S.x[k] = bound(W, S, k)
             whole = max(whole, abs(S.x[k]))
             count, entering = count + 1, -1
-    return scale, count, stop, changes, not going
+    return scale, count, stop, changes, False

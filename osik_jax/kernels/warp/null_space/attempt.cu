@@ -88,7 +88,6 @@ auto attempt = [&](double most, double least, double compliance, bool goes_on) {
   first = start;
   bool done = search(target, least);
   const double whole = size_of_numbers(target);
-  done = done && step_left() <= SATURATION_LOSS * whole;
   first += is_soft;
   if (is_soft) {
     done = done && stop < 0;

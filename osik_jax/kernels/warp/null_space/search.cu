@@ -115,8 +115,9 @@ auto search = [&](const double* target, double least) {
       passes = 0;
     }
     if (ended) {  // beside multipliers that are huge, rounding may have turned the sign of another: the search goes on
-      dropping = done && checks++ < SIGN_CHECKS && step_left() > SATURATION_LOSS * whole;
-      if (!dropping) return done;
+      const bool are_right = done && step_left() <= SATURATION_LOSS * whole;
+      dropping = done && !are_right && checks++ < SIGN_CHECKS;
+      if (!dropping) return are_right;
       done = false;
     }
     ended = step == CHOOSE && (changes >= most_changes || crossings > N);  // more exchanges go round, by rounding
