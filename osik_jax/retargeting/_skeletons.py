@@ -2,101 +2,139 @@
 
 from __future__ import annotations
 
+import functools
 import re
-from collections.abc import Mapping
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping
 
 from .._errors import OsikValueError, unknown_name
-from ._person import NEEDED, OPTIONAL
+from ._person import NEEDED, OPTIONAL, SIDES
 
 ROLES = (*NEEDED, *OPTIONAL)
 """A person's joints and points, as retargeting calls them."""
-
-
-def _sided(table: Mapping[str, str], left: str, right: str) -> dict[str, tuple[str, ...]]:
-    """Both sides of a table of names, in which ``*`` is where the word for the side stands."""
-    sides = {"left": left, "right": right}
-    return {
-        f"{side}_{role}": tuple(name.replace("*", word) for name in names.split())
-        for side, word in sides.items()
-        for role, names in table.items()
-    }
-
-
-def _trunk(**names: str) -> dict[str, tuple[str, ...]]:
-    return {role: tuple(found.split()) for role, found in names.items()}
-
-
-_LIMBS = {name: f"*{name}" for name in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")}
-_BVH = dict(
-    hip="*upleg", knee="*leg", ankle="*foot", toe="*toebase *toe *footend",
-    shoulder="*arm", elbow="*forearm", wrist="*hand",
-)  # fmt: skip
-_RIGIFY = dict(
-    hip="thigh*", knee="shin*", ankle="foot*", toe="toe* foot*end",
-    shoulder="upperarm*", elbow="forearm*", wrist="hand* forearm*end",
-)  # fmt: skip
-_UNREAL = dict(
-    hip="thigh*", knee="calf*", ankle="foot*", toe="ball* foot*end",
-    shoulder="upperarm*", elbow="lowerarm*", wrist="hand*",
-)  # fmt: skip
-PRESETS: dict[str, dict[str, tuple[str, ...]]] = {
-    "roles": {role: (role.replace("_", ""),) for role in ROLES},
-    "smpl": {
-        **_sided({**_LIMBS, "toe": "*foot"}, "left", "right"),
-        **_trunk(pelvis="pelvis", chest="spine2", neck="neck", head="head"),
-    },
-    "smpl short": {
-        **_sided({**_LIMBS, "toe": "*toe"}, "l", "r"),
-        **_trunk(pelvis="pelvis", chest="spine", neck="neck", head="head"),
-    },
-    "bvh": {**_sided(_BVH, "left", "right"), **_trunk(pelvis="hips", chest="spine", neck="neck", head="head")},
-    "rigify": {
-        **_sided(_RIGIFY, "l", "r"),
-        **_trunk(pelvis="pelvis spine", chest="spine001", neck="neck", head="head"),
-    },
-    "unreal": {**_sided(_UNREAL, "l", "r"), **_trunk(pelvis="pelvis", chest="spine01", neck="neck01", head="head")},
-    "deepmimic": {
-        **_sided({**_LIMBS, "heel": "*heel", "toe": "*toe *ankleend"}, "left", "right"),
-        **_trunk(pelvis="root hips", chest="chest", neck="neck", head="head"),
-    },
+_LIMB_WORDS = {
+    "hip": "upleg upperleg thigh femur hip leg 足",
+    "knee": "knee lowerleg lowleg calf shin tibia shank leg ひざ 膝",
+    "ankle": "ankle talus foot calcn calcaneus 足首",
+    "toe": "toebase toes toe bigtoe footindex ball toe0 toe11 foot ankleend footend つま先 足先",
+    "heel": "heel かかと",
+    "shoulder": "upperarm uparm uarm humerus arm shldr shoulder 腕",
+    "elbow": "elbow forearm lowerarm lowarm farm ulna radius ひじ 肘",
+    "wrist": "wrist hand forearmend lowerarmend elbowend 手首",
 }
-"""Role to a clip's names of it, the first that there is, in small letters and without signs.
+"""Words for each joint of a limb, the most specific first. A joint of the clip has one role, so a word that conventions
+use differently is left to the joint further down where a more specific word names the first: Mixamo's ``leg`` is the
+shank (``upleg``, ``leg``), SOMA's the thigh (``leg``, ``shin``); SMPL's ``foot`` is the toe (``ankle``, ``foot``)."""
+_TRUNK_WORDS = {
+    "pelvis": "pelvis hips hip hipcenter midhip spinebase root 下半身",
+    "chest": "spine001 spine03 spine2 spine chest spine01 spine1 spinemid t12 torso upperback thorax spine05 上半身",
+    "neck": "neck neck01 neck1 lowerneck shouldercenter spineshoulder necknose 首",
+    "head": "head 頭",
+}
+"""Words for each joint of the trunk, the preferred one first; ``_trunk`` has the exceptions."""
+_SIDE_WORDS = {"left": ("left", "l", "左"), "right": ("right", "r", "右")}
+_MIDDLE_WORDS = ("", "c", "center")
+_SUFFIX = re.compile(r"(joint|jnt|bone)$")
+_FIRST = re.compile(r"0*1(?=(left|l|左|right|r|右)?$)")
+"""The number of the first of several bones in a row, as of MakeHuman's ``upperleg01.L``."""
+_LONGEST_LIST = 400
 
-``bvh``: those of the CMU database, of Mixamo and of many other BVH files; ``rigify``: of Blender's; ``deepmimic``: of
-BVH files that say ankle for the shank's end too.
-"""
+Part = tuple[str, str]
+"""A side, "" for the trunk, and a word of the tables."""
 
 
 def find_roles(joint_names: tuple[str, ...], mapping: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Of each of a person's joints, what the clip calls it.
+    """Find which of a clip's joints is which of a person's.
+
+    Names are compared without case and separators, with the word for the side (``left``, ``l``) before or after, and
+    without what all names that are used have in front (``mixamorig:``, ``Character1_``, ``Bip01``).
 
     Args:
         joint_names: the clip's.
         mapping: role (``ROLES``) to a name of the clip's, where they are not to be guessed.
 
+    Returns:
+        role to the clip's name of it.
+
     Raises:
         KeyError: the mapping has a role or a joint that does not exist.
-        ValueError: joints that retargeting needs are not found; the message says which, and what there is.
+        ValueError: joints that retargeting needs are not found; the message says which are, and which are not.
     """
     if mapping is not None:
         return _checked(joint_names, mapping)
-    plain = {_plain(name): name for name in joint_names}
-    found = [
-        {
-            role: plain[there[0]]
-            for role, names in preset.items()
-            if (there := [name for name in names if name in plain])
-        }
-        for preset in PRESETS.values()
-    ]
-    best = max(found, key=lambda roles: (sum(role in roles for role in NEEDED), len(roles)))
+    groups: dict[str, dict[Part, str]] = {}
+    for name in joint_names:
+        for prefix, part in _readings(_plain(name)):
+            groups.setdefault(prefix, {}).setdefault(part, name)
+    found = [_assigned(groups[prefix]) for prefix in sorted(groups, key=len)]
+    best = max(found, key=lambda roles: (sum(role in roles for role in NEEDED), len(roles)), default={})
     _check_complete(joint_names, best)
     return best
 
 
 def _plain(name: str) -> str:
-    """A name in small letters, without signs and without what tools put before it."""
-    return re.sub(r"[^a-z0-9]", "", re.sub(r"^mixamorig\d*", "", name.split(":")[-1].lower()))
+    """Return a name in small letters, without separators and without a word for joint at its end."""
+    return _SUFFIX.sub("", "".join(c for c in unicodedata.normalize("NFKC", name).lower() if c.isalnum()))
+
+
+@functools.cache
+def _spellings() -> dict[str, Part]:
+    """Return all ways to write a part of the tables: its word with the word for its side before or after."""
+    out: dict[str, Part] = {}
+    for side, word in ((side, word) for side in SIDES for word in _limb_words()):
+        stem = word.removesuffix("end")
+        end = word[len(stem) :]
+        for own in _SIDE_WORDS[side]:
+            out |= {f"{own}{word}": (side, word), f"{word}{own}": (side, word), f"{stem}{own}{end}": (side, word)}
+    for word in (word for words in _TRUNK_WORDS.values() for word in words.split()):
+        out |= {spelling: ("", word) for own in _MIDDLE_WORDS for spelling in (f"{own}{word}", f"{word}{own}")}
+    return out
+
+
+@functools.cache
+def _limb_words() -> frozenset[str]:
+    return frozenset(word for words in _LIMB_WORDS.values() for word in words.split())
+
+
+def _readings(plain: str) -> Iterator[tuple[str, Part]]:
+    """Yield what a name may say: its prefix, and the part that the rest of it names."""
+    spellings, first = _spellings(), _FIRST.sub("", plain)
+    for start in range(len(plain)):
+        part = spellings.get(plain[start:])
+        if part is None and first != plain:
+            part = spellings.get(first[start:])
+            part = part if part is not None and part[0] else None  # the trunk's words have their numbers
+        if part is not None:
+            yield plain[:start], part
+    for own, side in ((own, side) for side, words in _SIDE_WORDS.items() for own in words if plain.startswith(own)):
+        for start in range(len(own) + 1, len(first)):  # the side stands before the prefix
+            if first[start:] in _limb_words():
+                yield first[len(own) : start], (side, first[start:])
+
+
+def _assigned(parts: Mapping[Part, str]) -> dict[str, str]:
+    """Give each role the first of its words that there is and that no role before it has."""
+    roles = {}
+    for side in SIDES:
+        taken: set[str] = set()
+        for role, words in _LIMB_WORDS.items():
+            word = next((w for w in words.split() if (side, w) in parts and w not in taken), None)
+            if word is not None:
+                taken.add(word)
+                roles[f"{side}_{role}"] = parts[side, word]
+    return roles | _trunk({word: name for (side, word), name in parts.items() if not side})
+
+
+def _trunk(parts: Mapping[str, str]) -> dict[str, str]:
+    """Give the trunk's roles the first of their words that there is."""
+    words = {role: words.split() for role, words in _TRUNK_WORDS.items()}
+    if "spine001" in parts:  # Blender's Rigify: its spine is the pelvis
+        words["pelvis"].insert(0, "spine")
+    if "spine05" not in parts:  # of MakeHuman's and Unreal's five the third, of Unreal's three the first
+        words["chest"].remove("spine03")
+    if "spine" in parts:  # SMPL has spine1 to spine3, Mixamo spine, spine1 and spine2
+        words["chest"].remove("spine2")
+    return {role: parts[there[0]] for role, own in words.items() if (there := [word for word in own if word in parts])}
 
 
 def _checked(joint_names: tuple[str, ...], mapping: Mapping[str, str]) -> dict[str, str]:
@@ -112,7 +150,19 @@ def _checked(joint_names: tuple[str, ...], mapping: Mapping[str, str]) -> dict[s
 def _check_complete(joint_names: tuple[str, ...], roles: Mapping[str, str]) -> None:
     missing = [role for role in NEEDED if role not in roles]
     if missing:
+        found = ", ".join(f"{role}={name}" for role, name in roles.items()) or "none"
+        others = [name for name in joint_names if name not in roles.values()]
         raise OsikValueError(
-            f"the clip has no {', '.join(missing)} that can be told by name; say which joint is which with "
-            f"mapping={{role: joint}}; joints: {', '.join(joint_names)}"
+            f"the clip has no {', '.join(missing)} that can be told by name; found: {found}; other joints: "
+            f"{_shortened(others)}; say which joint is which with mapping={{role: joint}}"
         )
+
+
+def _shortened(names: Iterable[str]) -> str:
+    """Return names with commas between them, as many as a message has room for."""
+    out, names = "", list(names)
+    for count, name in enumerate(names):
+        if len(out) + len(name) > _LONGEST_LIST:
+            return f"{out} and {len(names) - count} more"
+        out += f", {name}" if out else name
+    return out or "none"
