@@ -1,6 +1,7 @@
 """Shared by all tests: double precision, quick compilation that is not done twice, one seed, memory that stays flat."""
 
 import atexit
+import contextlib
 import gc
 import os
 import shutil
@@ -31,6 +32,7 @@ import jax
 import numpy as np
 import pytest
 
+from osik_jax.core import _build
 from osik_jax.kernels.numba._target import register
 from osik_jax.runtime import configure_cpu
 
@@ -43,7 +45,7 @@ gc.set_threshold(50_000, 20, 20)
 MOST_MEMORY = 4 * 2**30
 """What a process may hold after a file of tests, in bytes, before it drops its compiled programs."""
 MANY_TESTS = 500
-LARGE_KERNELS = ("_plan", "_saturation", "_weighted_qp", "_hierarchy", "_projection")
+LARGE_KERNELS = ("_plan", "_saturation", "_weighted_qp", "_projection")
 """In an order in which every second one takes as long to compile as the others."""
 WITH_TORCH = "test_beside_pytorch_kinematics.py"
 WITH_BROWSER = "test_live_browser.py"
@@ -60,6 +62,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for tier, ids in ((t, i) for m in item.iter_markers("variants") for t, i in m.kwargs.items()):
             if item.name.partition("[")[2].removesuffix("]") in ids:
                 item.add_marker(tier)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the core of a checkout whose C++ files have changed since its library was built."""
+    if hasattr(config, "workerinput") or "OSIK_CORE_LIBRARY" in os.environ or "site-packages" in str(_build.FOLDER):
+        return
+    mark = _build.FOLDER / "built.part"
+    if not mark.exists() or mark.read_text() != _build.fingerprint():
+        with contextlib.suppress(RuntimeError):  # no compiler: tests of the core are skipped
+            _build.build()
+            mark.write_text(_build.fingerprint())
 
 
 def pytest_report_header() -> list[str]:

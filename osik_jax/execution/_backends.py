@@ -10,7 +10,8 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
     backend   weighted QP                          hierarchy                           null space
     "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    CUDA: with bounds, any
               hard rows, n <= 64, <= 32 soft rows  fit into shared memory              precision, levels that fit
-    "numba"   CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
+    "core"    as "numba"                           CPUs: any precision, any shape      as "numba"
+    "numba"   CPUs: any precision, least squares   as "core"                           CPUs: any precision,
                                                                                        any shape
     "jax"     none: plain JAX alone, on any platform
 
@@ -21,6 +22,7 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
     "warp"                                    none                                CUDA: float32, about 40 dofs at most
     "numba"                                   CPUs: any robot, any precision      inside the former
 
+"core" is the compiled C++ of ``osik_jax/core``, which takes over the methods of Numba and Warp one by one.
 "auto" takes what is installed and fits, and the search elsewhere. Which platform a program runs on is decided when it
 is lowered, not when it is traced (``on_platforms``).
 """
@@ -36,11 +38,13 @@ from typing import Any, Literal, get_args
 import jax
 
 from .._errors import OsikValueError
+from ..core import _library
 
-Backend = Literal["auto", "jax", "numba", "warp"]
+Backend = Literal["auto", "jax", "core", "numba", "warp"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
 
-_PLATFORM = {"numba": "cpu", "warp": "cuda"}
+_PLATFORM = {"core": "cpu", "numba": "cpu", "warp": "cuda"}
+CPU_KERNELS = {name for name, platform in _PLATFORM.items() if platform == "cpu"}
 _MISSING = {
     "numba": "backend='numba' needs Numba: pip install 'osik-jax[numba]'",
     "warp": "backend='warp' needs Warp: pip install 'osik-jax[cuda]'",
@@ -57,6 +61,8 @@ def check_backend(backend: Any) -> Backend:
     """
     if backend not in BACKENDS:
         raise OsikValueError(f"backend is {backend!r}; backends: {', '.join(BACKENDS)}")
+    if backend == "core" and not _library.installed():
+        raise ModuleNotFoundError(f"backend='core': {_library.core().reason}", name="osik_jax.core")
     if backend in _MISSING and not installed(backend):
         raise ModuleNotFoundError(_MISSING[backend], name=backend)
     if backend == "warp" and not cuda_is_default():
@@ -98,6 +104,8 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
         ValueError: this very kernel was asked for and does not fit.
         Exception: it was asked for and is not there, as ``check_backend``.
     """
+    if backend == "numba" and kernel == "core":  # while other methods are Numba's
+        return fits and _library.installed()
     if backend == kernel:
         check_backend(backend)
         if not fits:
@@ -105,9 +113,13 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
                 f"backend={kernel!r} has no kernel for problems of this kind, precision or shape; take 'auto'"
             )
         return True
-    if not (backend == "auto" and fits and installed(kernel)):
+    if backend == "core" and kernel == "numba":  # while the core lacks this method
+        return fits and _can_be_imported(kernel)
+    if backend != "auto" or not fits:
         return False
-    return cuda_is_default() if kernel == "warp" else _can_be_imported(kernel)
+    if kernel == "core":
+        return _library.installed()
+    return installed(kernel) and (cuda_is_default() if kernel == "warp" else _can_be_imported(kernel))
 
 
 @cache

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ._backends import cpu_is_default, on_platforms
+from ._backends import CPU_KERNELS, cpu_is_default, on_platforms
 
 
 class Candidates(NamedTuple):
@@ -35,8 +35,8 @@ def certified_or_searched(
 ) -> Any:
     """Solve a batch by the kernel of the platform and the search, or by the search alone.
 
-    Where the only kernel is Numba's and JAX's default backend a CPU, the search is traced once for all platforms: on
-    those without the kernel no candidate is certified, and it begins with ``no_candidates``. It may leave out what a
+    Where the only kernel is one for CPUs and JAX's default backend a CPU, the search is traced once for all platforms:
+    on those without the kernel no candidate is certified, and it begins with ``no_candidates``. It may leave out what a
     kernel has tried, so that a program for such a platform is made quicker with ``backend="jax"``.
 
     Args:
@@ -45,11 +45,11 @@ def certified_or_searched(
         problems: pytrees whose arrays have a leading axis.
         no_candidates: from the problems to what ``certified`` returns where nothing is; default: zeros.
     """
-    if set(kernels) != {"numba"} or not cpu_is_default():
+    if len(kernels) != 1 or not kernels.keys() <= CPU_KERNELS or not cpu_is_default():
         return on_platforms({name: kernel.answers for name, kernel in kernels.items()}, search, *problems)
-    certified, search_rest = kernels["numba"]
+    ((name, (certified, search_rest)),) = kernels.items()
 
     def zeros(*problems: Any) -> Any:
         return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(certified, *problems))
 
-    return search_rest(on_platforms({"numba": certified}, no_candidates or zeros, *problems), *problems)
+    return search_rest(on_platforms({name: certified}, no_candidates or zeros, *problems), *problems)

@@ -19,7 +19,7 @@ from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_the_rest
 from ...numerics._constants import BOX_TOLERANCE
-from . import _numba, _warp
+from . import _core, _warp
 from ._cascade import CascadeResult, certify_levels, solve_cascade
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
@@ -57,8 +57,8 @@ def _solve_on_platform(
     kernels = {}
     if takes(backend, "warp", fits=_warp.Shape.of(layout).warps > 0):
         kernels["warp"] = kernel_candidates(layout, max_iterations, _warp.solve)
-    if takes(backend, "numba", fits=True):
-        kernels["numba"] = kernel_candidates(layout, max_iterations, _numba.solve, by_guesses=False)
+    if takes(backend, "core", fits=True):
+        kernels["core"] = kernel_candidates(layout, max_iterations, _core.solve, by_guesses=False)
     search = partial(solve_cascade, layout, max_iterations)
     return certified_or_searched(kernels, search, hierarchy, tolerances, warm_start)
 

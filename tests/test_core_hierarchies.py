@@ -1,25 +1,24 @@
-"""Numba's kernel of hierarchies on a CPU: beside the search, in both precisions, and what happens where it fails."""
+"""The core's hierarchy on a CPU: beside the search, in both precisions, and where its candidates fail."""
 
-import os
-import subprocess
-import sys
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from core_checks import needs_core
 from hierarchy_families import SMALL, Hierarchies, Rows
 from lexicographic import certificate
 from recorded import recorded_hierarchies
 from stretched_hierarchies import stretched
 
-from osik_jax import HierarchicalQP
+from osik_jax import HierarchicalQP, OsikWarning
+from osik_jax.core import _library
 from osik_jax.execution import _backends
 from osik_jax.solvers import Damping, Level, Status, solve_hqp
-from osik_jax.solvers.hqp import _dispatch, _numba
+from osik_jax.solvers.hqp import _core, _dispatch
 
-pytest.importorskip("numba")
+pytestmark = needs_core
 COUNT = 24
 DAMPED = [0.0, Damping(1e-3, 0.3, 2.0, 0.4), 1e-4, Damping(0.0, 0.5, 1.0)]
 
@@ -32,7 +31,7 @@ def families() -> Hierarchies:
 
 
 @partial(jax.jit, static_argnames=("backend", "damped"))
-def solved(levels, lower, upper, warm_start=None, *, backend="numba", damped=False):
+def solved(levels, lower, upper, warm_start=None, *, backend="core", damped=False):
     def one(levels, lower, upper, warm_start):
         damping = DAMPED[: len(levels)] if damped else 0.0
         given = [Level(*level) for level in levels]
@@ -76,7 +75,7 @@ def test_every_level_is_certified_and_nothing_is_left_to_the_search(families, no
 @pytest.mark.variants(slow=["False"])
 @pytest.mark.parametrize("damped", [False, True])
 def test_answers_are_those_of_the_search(families, damped):
-    mine, search = (solved(*given(families), backend=b, damped=damped) for b in ("numba", "jax"))
+    mine, search = (solved(*given(families), backend=b, damped=damped) for b in ("core", "jax"))
     np.testing.assert_array_equal(mine.status, search.status)
     agree = np.abs(mine.x - search.x).max(1) < 1e-6 * (1.0 + np.abs(search.x).max(1))
     assert agree.mean() > 0.99  # what is left: rows whose rank is at the tolerance
@@ -116,13 +115,13 @@ def test_vmap_is_a_loop_and_a_bad_lane_leaves_its_neighbours_alone(families):
 def test_what_the_kernel_leaves_over_is_searched(families, monkeypatch):
     """A kernel that gives wrong answers in every third lane."""
     p = jax.tree.map(lambda a: a[:6], families)
-    right, solve = solved(*given(p)), _numba.solve
+    right, solve = solved(*given(p)), _core.solve
 
     def wrong(*args):
         end = solve(*args)
         return end._replace(x=jnp.where(jnp.arange(len(end.x))[:, None] % 3 == 0, jnp.nan, end.x))
 
-    monkeypatch.setattr(_numba, "solve", wrong)
+    monkeypatch.setattr(_core, "solve", wrong)
     _dispatch.hierarchy_solver.cache_clear()
     jax.clear_caches()
     s = solved(*given(p))
@@ -139,7 +138,7 @@ def test_derivatives_are_those_of_differences():
 
     def norm(t):
         levels = [Level(A[:2], jnp.array([0.3, -0.2]) + t), Level(A[2:], A[2:, 0] * t + 0.5)]
-        return jnp.sum(jnp.sin(solve_hqp(levels, -box, box, backend="numba").x))
+        return jnp.sum(jnp.sin(solve_hqp(levels, -box, box, backend="core").x))
 
     both, step = jax.jit(jax.value_and_grad(norm)), 1e-6
     by_differences = (both(0.2 + step)[0] - both(0.2 - step)[0]) / (2 * step)
@@ -151,7 +150,7 @@ def test_derivatives_are_those_of_differences():
 
 
 def test_a_backend_that_is_not_there(monkeypatch):
-    with pytest.raises(ValueError, match="backend is 'cuda'; backends: auto, jax, numba, warp"):
+    with pytest.raises(ValueError, match="backend is 'cuda'; backends: auto, jax, core, numba, warp"):
         HierarchicalQP(backend="cuda")  # pyright: ignore[reportArgumentType]
     with (
         pytest.raises(RuntimeError, match="CUDA device")
@@ -159,70 +158,23 @@ def test_a_backend_that_is_not_there(monkeypatch):
         else pytest.raises(ModuleNotFoundError, match=r"pip install 'osik-jax\[cuda\]'")
     ):
         HierarchicalQP(backend="warp")
-    monkeypatch.setattr(_backends, "installed", lambda package: False)
-    with pytest.raises(ModuleNotFoundError, match=r"backend='numba' needs Numba: pip install 'osik-jax\[numba\]'"):
-        HierarchicalQP(backend="numba")
-    assert not _backends.takes("auto", "numba", fits=True)
+    monkeypatch.setattr(_library, "core", lambda: _library.Core(None, None, "no compiled core: install g++"))
+    with pytest.raises(ModuleNotFoundError, match=r"backend='core': no compiled core: install g\+\+"):
+        HierarchicalQP(backend="core")
+    with pytest.warns(OsikWarning, match="install g"):
+        _library._warn_once.cache_clear()
+        assert not _backends.takes("auto", "core", fits=True)
 
 
 def test_programs_for_other_machines():
     """Which platform a program is for is decided when it is lowered."""
 
     def solve(target):
-        return solve_hqp([Level(np.ones((1, 3)), target)], -np.ones(3), np.ones(3), backend="numba").x
+        return solve_hqp([Level(np.ones((1, 3)), target)], -np.ones(3), np.ones(3), backend="core").x
 
     traced = jax.jit(solve).trace(np.ones(1))
-    assert "osik_jax_hierarchy" in traced.lower(lowering_platforms=("cpu",)).as_text()
-    assert "osik_jax_hierarchy" not in traced.lower(lowering_platforms=("cuda",)).as_text()
-
-
-@pytest.mark.slow
-def test_the_second_process_does_not_compile():
-    """Nor does importing the package import Numba."""
-    solved(*given(jax.tree.map(lambda a: a[:1], SMALL["conflicting"](np.random.default_rng(0), 1))))
-    code = """
-import sys, osik_jax
-assert "numba" not in sys.modules
-from osik_jax.kernels.numba import _target
-_target.register("_hierarchy")
-print(_target._registered["osik_jax_hierarchy"].cache_hits)
-"""
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.split() == ["1"], ran.stderr
-
-
-def test_rows_in_blocks_are_those_of_numpy():
-    """Of every length and from every start; numbers beside the range are neither used nor changed."""
-    import numba
-
-    from osik_jax.kernels.numba import _vectors
-
-    @numba.njit
-    def all_three(a, b, c, d, start, stop):
-        _vectors.add(c, 0.3, b, start, stop)
-        _vectors.add_squares(d, b, start, stop)
-        return _vectors.dot(a, b, start, stop)
-
-    rng = np.random.default_rng(0)
-    for start, stop in [(8, 3), *((i, i + k) for i in (0, 3, 8) for k in range(34))]:
-        whole = np.full((4, 64), np.nan)
-        whole[:, start:stop] = rng.normal(size=whole[:, start:stop].shape)
-        a, b, c, d = whole.copy()
-        total = all_three(a, b, c, d, start, stop)
-        inside = whole[:, start:stop]
-        np.testing.assert_allclose(total, inside[0] @ inside[1], rtol=0, atol=1e-13)
-        np.testing.assert_allclose(c[start:stop], inside[2] + 0.3 * inside[1], rtol=1e-14, atol=1e-15)
-        np.testing.assert_allclose(d[start:stop], inside[3] + inside[1] ** 2, rtol=1e-14, atol=1e-15)
-        assert np.isnan(np.delete([c, d], np.s_[start : max(start, stop)], axis=1)).all()
-
-
-@pytest.mark.release
-def test_no_index_is_out_of_bounds():
-    """With every index checked: an exception would leave its lanes to the search, and print a line."""
-    code = f"import pytest; pytest.main(['-q', '-n', '0', '-k', 'certified or recorded', {__file__!r}])"
-    environment = os.environ | dict(NUMBA_BOUNDSCHECK="1")
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    assert "3 passed" in ran.stdout and "IndexError" not in ran.stdout + ran.stderr
+    assert "osik_hierarchy" in traced.lower(lowering_platforms=("cpu",)).as_text()
+    assert "osik_hierarchy" not in traced.lower(lowering_platforms=("cuda",)).as_text()
 
 
 @pytest.mark.release
@@ -231,7 +183,7 @@ def test_ten_thousand_problems(rng):
     p = stretched(rng, 2048)
     batches = [p] + [draw(rng, 1024) for draw in SMALL.values()]
     for p in batches:
-        mine, search = (solved(*given(p), backend=backend) for backend in ("numba", "jax"))
+        mine, search = (solved(*given(p), backend=backend) for backend in ("core", "jax"))
         np.testing.assert_array_equal(mine.status, search.status)
         for mine_k, search_k, level in zip(mine.slacks, search.slacks, p.levels, strict=True):
             assert isinstance(level, Rows)

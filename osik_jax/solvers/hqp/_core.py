@@ -1,11 +1,11 @@
-"""Candidates for hierarchies from the kernel for CPUs (``kernels/numba/_hierarchy.py``)."""
+"""Candidates for hierarchies from the compiled core (``core/hierarchy.hpp``)."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
 
-from ...kernels.numba import _target
+from ...core import _library
 from ._cascade import CascadeResult, KernelAnswers, first_working_sets, result_of_kernel
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
@@ -34,8 +34,8 @@ def solve(
     floats = dict(x=(n,), multipliers=(count, h), slack_norms=(count,), dampings=(count,), residual=())
     ints = dict(active_bounds=(n,), active=(count, h), frozen=(count, h), in_cost=(count, m), own=(count, m))
     ints |= dict(ranks=(count,), report=(3,))
-    results = _target.call(
-        "_hierarchy",
+    results = _library.call(
+        "hierarchy",
         [((batch, *shape), kind) for kind, shapes in ((float, floats), (int, ints)) for shape in shapes.values()],
         *(hierarchy.levels.matrix, hierarchy.levels.lower, hierarchy.levels.upper, hierarchy.hard[:, n:]),
         *(hierarchy.hard_lower, hierarchy.hard_upper),

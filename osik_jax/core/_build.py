@@ -1,0 +1,87 @@
+"""Compile the C++ core. Run by the installation (``hatch_build.py``) and by ``python -m osik_jax.core._build``.
+
+Only the standard library is imported, for nothing else is there while a package is installed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+_FLAGS = ["-std=c++20", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
+_V3 = ["-mavx", "-mavx2", "-mfma", "-mbmi", "-mbmi2", "-mf16c", "-mlzcnt", "-mmovbe"]  # x86-64-v3
+_IS_X86 = platform.machine() in ("x86_64", "AMD64")
+
+
+def levels() -> dict[str, list[str]]:
+    """Return the instruction sets that are built here and their compiler flags, the most capable one first."""
+    return {"x86_64_v3": _V3, "x86_64": []} if _IS_X86 else {platform.machine() or "unknown": []}
+
+
+def library_path(level: str) -> Path:
+    """Return where the library for an instruction set is."""
+    return FOLDER / f"_core_{level}.so"
+
+
+def sources() -> list[Path]:
+    """Return the C++ files that make the library."""
+    return sorted([*FOLDER.glob("*.hpp"), *FOLDER.glob("*_cpu.cpp")])
+
+
+def fingerprint() -> str:
+    """Return a hash of the C++ files and the compiler flags."""
+    digest = hashlib.sha256(repr((_FLAGS, levels())).encode())
+    for path in sources():
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def build(flags: tuple[str, ...] = ()) -> list[Path]:
+    """Compile the library for each instruction set, side by side.
+
+    Args:
+        flags: more flags for the compiler, for example ``-fsanitize=address``.
+
+    Returns:
+        Paths of the libraries.
+
+    Raises:
+        RuntimeError: there is no C++20 compiler, or it failed; the message has its last words.
+    """
+    name = os.environ.get("CXX") or "c++"
+    compiler = shutil.which(name)
+    if sys.platform == "win32":
+        raise RuntimeError("the core is not built on Windows")
+    if compiler is None:
+        raise RuntimeError(f"no C++ compiler {name!r} on the PATH")
+    mark, text = fingerprint(), [str(path) for path in sources() if path.suffix == ".cpp"]
+    running = {}
+    for level, own in levels().items():
+        out = library_path(level)
+        out.unlink(missing_ok=True)
+        command = [compiler, *_FLAGS, *own, *flags, f'-DOSIK_SOURCES="{mark}"', "-shared", "-fPIC", *text]
+        running[out] = subprocess.Popen(
+            [*command, "-o", str(part(out))], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        )
+    said = {out: process.communicate()[1] for out, process in running.items()}
+    for out, process in running.items():
+        if process.returncode or not part(out).exists():
+            raise RuntimeError(f"{name} failed with status {process.returncode}: {said[out][-800:]}")
+        part(out).replace(out)  # at once, so that no process loads half a library
+    return list(running)
+
+
+def part(out: Path) -> Path:
+    """Return where a library is written before it is whole."""
+    return out.with_suffix(f".{os.getpid()}.part")
+
+
+if __name__ == "__main__":
+    for path in build(tuple(sys.argv[1:])):
+        print(path)

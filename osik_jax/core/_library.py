@@ -1,0 +1,114 @@
+"""The compiled core: which library is loaded and why, and calls of its methods from JAX."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import threading
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._errors import warn
+from . import _build
+
+_REMEDY = "install a C++ compiler (Debian: g++, macOS: xcode-select --install) and install osik_jax again"
+_registered: set[str] = set()
+_lock = threading.Lock()
+
+
+class Core(NamedTuple):
+    """The compiled core of this process.
+
+    Attributes:
+        library: the library, None where there is none.
+        path: its file, None where there is none.
+        reason: one sentence that says which library is loaded and why, or why none is and what to do.
+    """
+
+    library: ctypes.CDLL | None
+    path: Path | None
+    reason: str
+
+
+@cache
+def core() -> Core:
+    """Return the library for this processor. ``OSIK_CORE_LIBRARY`` names another file, or is "none"."""
+    named = os.environ.get("OSIK_CORE_LIBRARY")
+    if named == "none":
+        return Core(None, None, "the core is switched off by OSIK_CORE_LIBRARY=none")
+    if named:
+        return Core(ctypes.CDLL(named), Path(named), f"the core is {named}, as OSIK_CORE_LIBRARY says")
+    reasons = []
+    for level in reversed(_build.levels()):  # the one that runs everywhere tells what the processor can do
+        path = _build.library_path(level)
+        try:
+            library = ctypes.CDLL(str(path))
+        except OSError as problem:
+            reasons.append(f"{problem}" if path.exists() else f"{path.name} was not built")
+            continue
+        library.osik_sources.restype = ctypes.c_char_p
+        if library.osik_sources().decode() != _build.fingerprint():
+            reasons.append(f"{path.name} was built from other sources (python -m osik_jax.core._build builds it again)")
+            continue
+        if level == "x86_64" and library.osik_has_x86_64_v3():
+            fast = _build.library_path("x86_64_v3")
+            if fast.exists():
+                return Core(ctypes.CDLL(str(fast)), fast, f"{fast.name}: this processor has AVX2 and FMA")
+        return Core(library, path, f"{path.name}: the instruction set {level}")
+    return Core(None, None, f"no compiled core: {'; '.join(reasons)}. Methods run in plain JAX; {_REMEDY}")
+
+
+def installed() -> bool:
+    """Return whether the compiled core is there. The first time that it is not, a warning says what to do."""
+    if core().library is None:
+        _warn_once()
+        return False
+    return True
+
+
+@cache
+def _warn_once() -> None:
+    if os.environ.get("OSIK_CORE_LIBRARY") != "none":
+        warn(core().reason)
+
+
+def call(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any) -> list[Array]:
+    """Call a method of the core on a batch of problems.
+
+    There is no rule for ``vmap``: call it in a function under ``in_lanes``, which hands over a whole batch at once.
+
+    Args:
+        method: name of its handler without "osik_".
+        outputs: shape and type of each result: float (double precision in the core) or int (int32).
+        inputs: arrays; floats are passed in double precision, integers and flags as int32.
+
+    Returns:
+        The results; floats in the precision of the first float among the inputs.
+    """
+    name = register(method)
+    given = next(a.dtype for a in map(jnp.asarray, inputs) if jnp.issubdtype(a.dtype, jnp.floating))
+    with jax.enable_x64(True):
+        wide = [a.astype(_kind(jnp.asarray(a).dtype)) for a in map(jnp.asarray, inputs)]
+        shapes = [jax.ShapeDtypeStruct(shape, _kind(jnp.dtype(kind))) for shape, kind in outputs]
+        results = jax.ffi.ffi_call(name, shapes)(*wide)
+        return [a.astype(given) if a.dtype == jnp.float64 else a for a in results]
+
+
+def register(method: str) -> str:
+    """Make a method's handler known to XLA for CPUs; return its name there."""
+    name = f"osik_{method}"
+    with _lock:
+        if name not in _registered:
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(getattr(core().library, name)), platform="cpu")
+            _registered.add(name)
+    return name
+
+
+def _kind(dtype: Any) -> Any:
+    return jnp.float64 if jnp.issubdtype(dtype, jnp.floating) else jnp.int32

@@ -1,0 +1,155 @@
+// Factorisations of the core, each once, for any team.
+//
+// Matrices are rows of a stride: entry (i, j) of M is M[i ld + j]. Lengths of arrays are given in brackets.
+#pragma once
+#include "team.hpp"
+
+namespace osik {
+
+template <class Real> OSIK_FN Real clip(Real a, Real low, Real high) { return a < low ? low : a > high ? high : a; }
+template <class Real> OSIK_FN Real larger(Real a, Real b) { return b > a ? b : a; }
+
+template <class Team> struct LinearAlgebra {
+  using Real = typename Team::Real;
+  using Int = typename Team::Int;
+
+  // out[i] = sum_j M[i, j] v[j] over start <= j < stop, for the n rows of M
+  OSIK_CALL static void times(Team t, const Real* M, const Real* v, Real* out, int ld, int start, int stop, int n) {
+    t.are_shared(M, v, out);
+    t.each(0, n, [&](int i) { out[i] = t.own_dot(M + i * ld, v, start, stop); });
+  }
+
+  // out[j] = sum_i M[i, j] v[i] over the n rows of M, for start <= j < n
+  OSIK_CALL static void transposed_times(Team t, const Real* M, const Real* v, Real* out, int ld, int start, int n) {
+    t.are_shared(M, v, out);
+    t.columns(start, n, [&](auto c) {
+      auto total = typename decltype(c)::P(0);
+      for (int i = 0; i < n; ++i) total.fma(v[i], c.load(M + i * ld));
+      c.store(out, total);
+    });
+  }
+
+  // The Householder reflection I - scale v v' that moves the entries [at, n) of `row` into entry `at`.
+  // v: [n], row + sign(row[at]) |row| e_at, so that nothing cancels (Golub and Van Loan, Matrix Computations, 5.1)
+  OSIK_FN static Real reflection(const Team& t, const Real* row, int at, int n, Real* v) {
+    const Real norm = sqrt(t.dot(row, row, at, n)), head = row[at];
+    t.each(at, n, [&](int j) { v[j] = j > at ? row[j] : head + (head < 0 ? -norm : norm); });
+    return Real(1) / (norm * (norm + fabs(head)));
+  }
+
+  // The Gram matrix of `count` rows over the columns [start, n): its diagonal goes to `diagonal`, the rest to the upper
+  // triangle of S, or to the lower one.
+  OSIK_CALL static void gram(Team t, const Real* rows, Real* S, Real* diagonal, int ld, int ld_gram, int count,
+                             int start, int n, bool lower) {
+    t.are_shared(rows, S, diagonal);
+    const int of_a = lower ? 1 : ld_gram, of_b = lower ? ld_gram : 1;
+    t.pairs(count, [&](int a, int b) {
+      const Real product = t.own_dot_on(rows + a * ld, rows + b * ld, start, n);
+      if (a == b) diagonal[a] = product;
+      else S[a * of_a + b * of_b] = product;
+    });
+  }
+
+  // The Cholesky factor L of that matrix + ridge I, below the diagonal of S; `inverse` gets 1 / diagonal of L.
+  // Pivots are at least 1e-300, so that a singular matrix gives large numbers and no NaN.
+  OSIK_CALL static void cholesky(Team t, Real* S, const Real* diagonal, Real* inverse, int ld, int count, Real ridge,
+                                 bool lower) {
+    t.are_shared(S, diagonal, inverse);
+    const int of_k = lower ? 1 : ld, of_a = lower ? ld : 1;
+    for (int k = 0; k < count; ++k) {
+      const Real* row_k = S + k * ld;
+      t.each(k, count, [&](int a) {
+        const Real entry = a == k ? diagonal[k] + ridge : S[k * of_k + a * of_a];
+        const Real rest = entry - t.own_dot(S + a * ld, row_k, 0, k);
+        if (a == k) inverse[k] = rest;
+        else S[a * ld + k] = rest;
+      });
+      const Real inverse_pivot = t.inverse_root(larger(Team::SMALLEST_PIVOT, inverse[k]));
+      t.each(k, count, [&](int a) {
+        if (a == k) inverse[k] = inverse_pivot;
+        else S[a * ld + k] *= inverse_pivot;
+      });
+    }
+  }
+
+  // Householder QR with column pivoting of R [rows, n] over the columns [first, n): Q' R replaces R. A column is a pivot
+  // while it is longer than `least`; the longest remaining column is taken first.
+  // V: [rank, ld_V] reflections, scale: [rank], pivot: [rank] columns, squares: [n] squared lengths of the columns.
+  // Returns the rank.
+  OSIK_CALL static int pivoted_qr(Team t, Real* R, Real* V, Real* squares, Real* scales, Int* pivot, int ld, int ld_V,
+                                  int rows, int first, int n, Real least) {
+    t.are_shared(R, V, squares, scales, pivot);
+    int rank = 0;
+    if (rows > 0)
+      t.columns(first, n, [&](auto c) {
+        auto total = typename decltype(c)::P(0);
+        for (int a = 0; a < rows; ++a) total.square(c.load(R + a * ld));
+        c.store(squares, total);
+      });
+    const int most = n - first < rows ? n - first : rows;
+    while (rank < most) {
+      const Best<Real> b = t.best(-1, first, n, [&](int j) { return squares[j]; });
+      const Real norm = sqrt(larger(b.value, Real(0)));
+      if (!(norm > least)) break;
+      const int k = rank, which = b.which;
+      Real* v = V + k * ld_V;
+      const Real head = R[k * ld + which], scale = Real(1) / (norm * (norm + fabs(head)));
+      t.each(k, rows, [&](int a) { v[a] = a > k ? R[a * ld + which] : head + (head < 0 ? -norm : norm); });
+      t.columns(first, n, [&](auto c) {  // R <- R - scale v (v' R), and the squares of the columns below row k
+        using P = typename decltype(c)::P;
+        P total(0), rest(0);
+        for (int a = k; a < rows; ++a) total.fma(v[a], c.load(R + a * ld));
+        for (int a = k; a < rows; ++a) {
+          P x = c.load(R + a * ld);
+          x.fma(-scale * v[a], total);
+          c.store(R + a * ld, x);
+          if (a > k) rest.square(x);
+        }
+        c.store(squares, rest);
+      });
+      t.each(k, rows, [&](int a) {
+        if (a > k) R[a * ld + which] = 0;
+        else squares[which] = 0, scales[k] = scale, pivot[k] = which;
+      });
+      ++rank;
+    }
+    return rank;
+  }
+
+  // The product of a level's rows with the basis Z: R[a, j] = sum_i A[a, i] Z[i, j] for start <= j < n, or 0 where
+  // in_cost[a] is 0. Entry i of row a is A[a row + i column]; it is 0 outside of [nonzero[a], nonzero_end[a]).
+  // Four rows at a time, so that each entry of Z is read once for four.
+  OSIK_CALL static void rows_times_basis(Team t, const Real* A, int row, int column, const Real* Z, Real* R, int ld,
+                                         const Int* in_cost, const Int* nonzero, const Int* nonzero_end, int rows,
+                                         int start, int n) {
+    t.are_shared(Z, R, in_cost, nonzero, nonzero_end);
+    for (int first = 0; first < rows; first += 4) {
+      const Real* r[4];
+      Real factor[4];
+      int from = n, to = 0;
+      for (int b = 0; b < 4; ++b) {
+        const int a = first + b < rows ? first + b : first;
+        const bool in = first + b < rows && in_cost[a];
+        factor[b] = in ? 1 : 0, r[b] = A + a * row;
+        if (in) from = nonzero[a] < from ? nonzero[a] : from, to = nonzero_end[a] > to ? nonzero_end[a] : to;
+      }
+      t.columns(start, n, [&](auto c) {
+        using P = typename decltype(c)::P;
+        P total[4] = {P(0), P(0), P(0), P(0)};
+        for (int i = from; i < to; ++i) {
+          const P z = c.load(Z + i * ld);
+OSIK_UNROLL
+          for (int b = 0; b < 4; ++b) total[b].fma(r[b][i * column], z);
+        }
+OSIK_UNROLL
+        for (int b = 0; b < 4; ++b)
+          if (first + b < rows) {
+            P out(0);
+            c.store(R + (first + b) * ld, out.fma(factor[b], total[b]));
+          }
+      });
+    }
+  }
+};
+
+}  // namespace osik

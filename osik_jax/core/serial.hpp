@@ -1,0 +1,228 @@
+// The team of a CPU: one thread, whose loops over columns use the compiler's vectors.
+#pragma once
+#include <cmath>
+#include <type_traits>
+
+#include "team.hpp"
+
+namespace osik {
+
+#if defined(__AVX512F__)
+constexpr int VECTOR_BYTES = 64;
+#elif defined(__AVX__)
+constexpr int VECTOR_BYTES = 32;
+#else
+constexpr int VECTOR_BYTES = 16;
+#endif
+
+constexpr double INFINITE = __builtin_huge_val();
+
+template <class Real> struct Vector {
+  static constexpr int LANES = VECTOR_BYTES / int(sizeof(Real));
+  typedef Real Loaded __attribute__((vector_size(VECTOR_BYTES), aligned(sizeof(Real)), may_alias));
+  typedef Real Value __attribute__((vector_size(VECTOR_BYTES)));
+  typedef std::conditional_t<sizeof(Real) == 8, long long, int> Bits;
+  typedef Bits Mask __attribute__((vector_size(VECTOR_BYTES)));
+};
+
+// B vectors of neighbouring columns.
+template <class Real, int B> struct Pack {
+  typename Vector<Real>::Value v[B];
+  OSIK_FN Pack() {}
+  OSIK_FN Pack(Real a) {
+    for (int b = 0; b < B; ++b) v[b] = typename Vector<Real>::Value{} + a;
+  }
+  OSIK_FN Pack& operator+=(const Pack& o) {
+    for (int b = 0; b < B; ++b) v[b] += o.v[b];
+    return *this;
+  }
+  OSIK_FN Pack& fma(Real a, const Pack& o) {
+    for (int b = 0; b < B; ++b) v[b] += a * o.v[b];
+    return *this;
+  }
+  OSIK_FN Pack& square(const Pack& o) {
+    for (int b = 0; b < B; ++b) v[b] += o.v[b] * o.v[b];
+    return *this;
+  }
+};
+
+template <class Real, int B> struct Columns {
+  int at;
+  using P = Pack<Real, B>;
+  using V = Vector<Real>;
+  OSIK_FN P load(const Real* row) const {
+    P p;
+    for (int b = 0; b < B; ++b) p.v[b] = *(const typename V::Loaded*)(row + at + b * V::LANES);
+    return p;
+  }
+  OSIK_FN void store(Real* row, const P& p) const {
+    for (int b = 0; b < B; ++b) *(typename V::Loaded*)(row + at + b * V::LANES) = p.v[b];
+  }
+};
+
+template <class R> struct Serial {
+  using Real = R;
+  using Int = int;
+  using Loaded = typename Vector<R>::Loaded;
+  using Value = typename Vector<R>::Value;
+  using Mask = typename Vector<R>::Mask;
+  static constexpr int LANES = Vector<R>::LANES;
+  static constexpr bool COPIES = true;  // a method copies the rows that it is given, so that they are padded
+  static constexpr int BLOCK = 2 * 64 / int(sizeof(R));  // columns of a large pack
+  static constexpr int WIDE = 64 / int(sizeof(R));  // the widest vector of any instruction set
+  static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
+  // a pack that begins at the last column ends within the row
+  static constexpr int stride(int n) { return (n + 2 * WIDE - 2) / WIDE * WIDE; }
+  // the numbers of variables, rows and hard rows that space is laid out for
+  static constexpr int variables(int n) { return n; }
+  static constexpr int level_rows(int m) { return m; }
+  static constexpr int hard_rows(int h) { return h; }
+
+  template <class F> OSIK_FN void each(int a, int b, F f) const {
+    for (int i = a; i < b; ++i) f(i);
+  }
+  template <class F> OSIK_FN void once(F f) const { f(); }
+  template <class F> OSIK_FN void pairs(int count, F f) const {
+    for (int a = 0; a < count; ++a)
+      for (int b = a; b < count; ++b) f(a, b);
+  }
+  OSIK_FN static Real inverse_root(Real a) { return Real(1) / std::sqrt(a); }
+  template <class... P> OSIK_FN static void are_shared(P...) {}
+  // the columns [from, to) of each row outside of which all entries are 0
+  OSIK_FN void nonzero(const Real* A, int row, int, int rows, int n, Int* from, Int* to) const {
+    for (int a = 0; a < rows; ++a, A += row) {
+      int first = 0, last = n;
+      while (first < n && A[first] == Real(0)) ++first;
+      while (last > first && A[last - 1] == Real(0)) --last;
+      from[a] = first, to[a] = last;
+    }
+  }
+  template <class F> OSIK_FN void columns(int a, int b, F f) const {
+    int j = a;
+    for (; b - j > BLOCK - LANES; j += BLOCK) f(Columns<R, BLOCK / LANES>{j});
+    if constexpr (LANES < WIDE)
+      for (; b - j > WIDE - LANES; j += WIDE) f(Columns<R, WIDE / LANES>{j});
+    for (; j < b; j += LANES) f(Columns<R, 1>{j});
+  }
+
+  // ---- reductions
+  template <class F> OSIK_FN Real sum(int a, int b, F f) const {
+    Real t = 0;
+    for (int i = a; i < b; ++i) t += f(i);
+    return t;
+  }
+  template <class F> OSIK_FN int count(int a, int b, F f) const {
+    int t = 0;
+    for (int i = a; i < b; ++i) t += f(i);
+    return t;
+  }
+  // the largest of `t` and the values f(i, largest so far); NaN stays
+  template <class F> OSIK_FN Real most(Real t, int a, int b, F f) const {
+    for (int i = a; i < b; ++i) {
+      const Real v = f(i, t);
+      t = v > t || v != v ? v : t;
+    }
+    return t;
+  }
+  // the largest value of f(i) above `t`, and the first index that has it
+  template <class F> OSIK_FN Best<R> best(Real t, int a, int b, F f) const {
+    Best<R> r{t, -1};
+    for (int i = a; i < b; ++i) {
+      const Real v = f(i);
+      if (v > r.value) r = {v, i};
+    }
+    return r;
+  }
+
+  // ---- vectors
+  template <int K, class V> OSIK_FN static Real total_of(V x) {
+    if constexpr (K == 1) return x[0];
+    else if constexpr (K == 2) return x[0] + x[1];
+    else {
+      typedef Real Half __attribute__((vector_size(K / 2 * sizeof(Real))));
+      Half low, high;
+      __builtin_memcpy(&low, &x, sizeof low);
+      __builtin_memcpy(&high, (const char*)&x + sizeof low, sizeof high);
+      return total_of<K / 2>(low + high);
+    }
+  }
+  OSIK_FN static Real total(Value x) { return total_of<LANES>(x); }
+  // the first `count` numbers of a vector in memory, then zeros; the places of these zeros are read too
+  OSIK_FN static Value first_of(const Real* a, int count) {
+    Mask m;
+    for (int k = 0; k < LANES; ++k) m[k] = k < count ? -1 : 0;
+    return (Value)((Mask) * (const Loaded*)a & m);
+  }
+  OSIK_FN static Real own_dot(const Real* a, const Real* b, int start, int stop, int = 1) {
+    Value t{};
+    int j = start;
+    for (; j + LANES <= stop; j += LANES) t += *(const Loaded*)(a + j) * *(const Loaded*)(b + j);
+    if (j < stop) t += first_of(a + j, stop - j) * first_of(b + j, stop - j);
+    return total(t);
+  }
+  OSIK_FN static Real own_dot_on(const Real* a, const Real* b, int start, int n, int = 1) {
+    Value t{}, u{};
+    int j = start;
+    for (; j + LANES < n; j += 2 * LANES) {
+      t += *(const Loaded*)(a + j) * *(const Loaded*)(b + j);
+      u += *(const Loaded*)(a + j + LANES) * *(const Loaded*)(b + j + LANES);
+    }
+    if (j < n) t += *(const Loaded*)(a + j) * *(const Loaded*)(b + j);
+    return total(t + u);
+  }
+  // the product of a row that is 0 outside of the columns [from, to) with a vector
+  OSIK_FN static Real own_row(const Real* a, const Real* b, int, int, int n, int) { return own_dot_on(a, b, 0, n); }
+  OSIK_FN static Real own_square(const Real* a, int start, int stop, int = 1) { return own_dot(a, a, start, stop); }
+  OSIK_FN static void own_axpy(Real* a, Real by, const Real* b, int start, int stop) {
+    int j = start;
+    for (; j + LANES <= stop; j += LANES) *(Loaded*)(a + j) += by * *(const Loaded*)(b + j);
+    if (j < stop) *(Loaded*)(a + j) += by * first_of(b + j, stop - j);
+  }
+  OSIK_FN Real dot(const Real* a, const Real* b, int start, int stop) const { return own_dot(a, b, start, stop); }
+  OSIK_FN void axpy(Real* a, Real by, const Real* b, int start, int stop) const { own_axpy(a, by, b, start, stop); }
+
+  // ---- reflections: some rows M become M (I - scale v v'), from column `at` on
+  template <int K> static void reflect_packs(Real* M, int ld, int count, const Real* v, Real scale) {
+    Value w[K], x[K];
+    OSIK_UNROLL
+    for (int k = 0; k < K; ++k) w[k] = *(const Loaded*)(v + k * LANES);
+    for (int q = 0; q < count; ++q, M += ld) {
+      Value t{};
+      OSIK_UNROLL
+      for (int k = 0; k < K; ++k) x[k] = *(const Loaded*)(M + k * LANES), t += x[k] * w[k];
+      const Real by = -scale * total(t);
+      OSIK_UNROLL
+      for (int k = 0; k < K; ++k) *(Loaded*)(M + k * LANES) = x[k] + by * w[k];
+    }
+  }
+  void reflect(Real* rows, int ld, int count, const Real* v, Real scale, int at, int n) const {
+    Real* M = rows + at;
+    v += at;
+    switch ((n - at + LANES - 1) / LANES) {  // with all of v in registers
+      case 1: return reflect_packs<1>(M, ld, count, v, scale);
+      case 2: return reflect_packs<2>(M, ld, count, v, scale);
+      case 3: return reflect_packs<3>(M, ld, count, v, scale);
+      case 4: return reflect_packs<4>(M, ld, count, v, scale);
+      case 5: return reflect_packs<5>(M, ld, count, v, scale);
+      case 6: return reflect_packs<6>(M, ld, count, v, scale);
+      default:
+        for (int q = 0; q < count; ++q, M += ld) {
+          const Real by = -scale * own_dot_on(M, v, 0, n - at);
+          for (int j = 0; j < n - at; j += LANES) *(Loaded*)(M + j) += by * *(const Loaded*)(v + j);
+        }
+    }
+  }
+
+  // ---- triangular systems: y <- L^-1 y and y <- L'^-1 y; `inverse` holds the inverses of the diagonal of L
+  OSIK_FN void forward(const Real* L, int ld, const Real* inverse, Real* y, int count) const {
+    for (int k = 0; k < count; ++k) y[k] = (y[k] - own_dot(L + k * ld, y, 0, k)) * inverse[k];
+  }
+  OSIK_FN void backward(const Real* L, int ld, const Real* inverse, Real* y, int count) const {
+    for (int k = count - 1; k >= 0; --k) {
+      y[k] *= inverse[k];
+      own_axpy(y, -y[k], L + k * ld, 0, k);
+    }
+  }
+};
+
+}  // namespace osik

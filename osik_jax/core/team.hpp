@@ -1,0 +1,43 @@
+// Who computes one problem: a CPU thread (Serial) or the 32 threads of a CUDA warp (Warp).
+//
+// A method is a template over its team and is written once, as steps of the whole team:
+//   each(a, b, f)        f(i) for all a <= i < b; afterwards all threads see what f wrote
+//   once(f)              f() by one thread
+//   pairs(n, f)          f(a, b) for all a <= b < n
+//   columns(a, b, f)     f(c) for packs of columns: c.load(row), c.store(row, pack)
+//   sum, count, most, best   reductions of f(i); every thread gets the result
+//   dot, axpy, forward, backward, reflect   vector operations of the whole team
+// The functions own_... are those of one thread, for use inside f.
+//
+// Rows are padded: a row of n numbers has Team::stride(n) places, and the places after the n-th hold zeros.
+// own_dot_on may read these zeros. Real is the type of the numbers: double, or float on a GPU.
+#pragma once
+
+#ifdef __CUDACC__
+#define OSIK_FN __device__ __forceinline__
+#define OSIK_HOST __host__ __device__
+#define OSIK_UNROLL _Pragma("unroll")
+#define OSIK_CALL __device__ __noinline__       // a call on a GPU: all that it needs comes as arguments
+#define OSIK_METHOD __device__ __forceinline__  // a call of a member would move the members to local memory
+#else
+#define OSIK_FN inline __attribute__((always_inline))
+#define OSIK_CALL inline __attribute__((noinline))
+#define OSIK_METHOD OSIK_CALL
+#define OSIK_HOST
+#define OSIK_UNROLL _Pragma("GCC unroll 8")
+#endif
+
+namespace osik {
+
+template <class Real> struct Best {
+  Real value;
+  int which;  // -1 where no value is larger than the start
+};
+
+}  // namespace osik
+
+#ifdef __CUDACC__
+#include "warp.hpp"
+#else
+#include "serial.hpp"
+#endif

@@ -1,0 +1,135 @@
+// What XLA hands to a kernel: the call frame of its foreign function interface (FFI).
+//
+// The structures are those of xla/ffi/api/c_api.h on 64-bit machines, declared here so that one library serves every
+// jaxlib that pyproject.toml allows: their layout is the same from interface 0.1 (jax 0.8) to 0.5. A handler answers
+// XLA's question for its version with the version that XLA itself has.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+namespace osik::xla {
+
+struct Extension {
+  size_t struct_size;
+  int32_t type;
+  Extension* next;
+};
+
+struct Metadata {
+  size_t struct_size;
+  size_t version_struct_size;
+  Extension* version_extension;
+  int32_t major, minor;
+  uint32_t traits;
+};
+
+struct MetadataExtension {
+  Extension base;
+  Metadata* metadata;
+};
+
+struct Buffer {
+  size_t struct_size;
+  Extension* extension;
+  int32_t dtype;
+  void* data;
+  int64_t rank;
+  int64_t* dimensions;
+};
+
+struct List {  // arguments or results
+  size_t struct_size;
+  Extension* extension;
+  int64_t size;
+  int32_t* types;
+  Buffer** buffers;
+};
+
+struct Text {
+  const char* data;
+  size_t size;
+};
+
+struct Scalar {
+  int32_t dtype;
+  void* value;
+};
+
+struct Attributes {  // sorted by name; an entry points to a Scalar or a Text, as its type says
+  size_t struct_size;
+  Extension* extension;
+  int64_t size;
+  int32_t* types;
+  Text** names;
+  void** values;
+};
+
+struct ErrorArguments {
+  size_t struct_size;
+  Extension* extension;
+  const char* message;
+  int32_t code;
+};
+
+struct StreamArguments {
+  size_t struct_size;
+  Extension* extension;
+  void* context;
+  void* stream;
+};
+
+struct Api {  // functions that are not used are named by their place alone
+  size_t struct_size;
+  Extension* extension;
+  size_t version_struct_size;
+  Extension* version_extension;
+  int32_t major, minor;
+  void* internal;
+  void* (*create_error)(ErrorArguments*);
+  void* unused_error[2];
+  void* register_handler;
+  void* (*get_stream)(StreamArguments*);
+};
+
+struct CallFrame {
+  size_t struct_size;
+  Extension* extension;
+  const Api* api;
+  void* context;
+  int32_t stage;
+  List arguments, results;
+  Attributes attributes;
+};
+
+constexpr int METADATA = 1, EXECUTE = 3, INTERNAL_ERROR = 13, OLDEST_MINOR = 1;
+
+// Whether XLA wants the kernel to run. Its question for the interface's version is answered on the way.
+inline bool is_call(CallFrame* frame, uint32_t traits = 0) {
+  Extension* extension = frame->extension;
+  if (extension && extension->type == METADATA) {
+    Metadata* metadata = reinterpret_cast<MetadataExtension*>(extension)->metadata;
+    metadata->major = 0;
+    metadata->minor = frame->api ? frame->api->minor : OLDEST_MINOR;
+    metadata->traits = traits;
+    return false;
+  }
+  return frame->stage == EXECUTE;
+}
+
+// The buffers of one call; every buffer has a leading axis of problems unless said otherwise.
+struct Call {
+  CallFrame* frame;
+  const Buffer& argument(int k) const { return *frame->arguments.buffers[k]; }
+  const Buffer& result(int k) const { return *frame->results.buffers[k]; }
+  int size(int k, int axis) const { return int(argument(k).dimensions[axis]); }
+  template <class T> const T* in(int k) const { return static_cast<const T*>(argument(k).data); }
+  template <class T> T* out(int k) const { return static_cast<T*>(result(k).data); }
+};
+
+// An error that XLA raises in Python with this message.
+inline void* error(CallFrame* frame, const char* message) {
+  ErrorArguments arguments{sizeof(ErrorArguments), nullptr, message, INTERNAL_ERROR};
+  return frame->api->create_error(&arguments);
+}
+
+}  // namespace osik::xla
