@@ -37,6 +37,7 @@ from .limits import PositionBarrier as PositionBarrier
 from .limits import VelocityLimit as VelocityLimit
 from .limits import limit_box as limit_box
 from .limits import limit_rows as limit_rows
+from .limits import no_limits as no_limits
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot
 from .schemes import HierarchicalQP as HierarchicalQP

@@ -79,7 +79,7 @@ class TestBuildProblem:
             np.testing.assert_allclose(found, wanted.velocity, atol=1e-9)
 
     def test_has_the_rows_and_the_box(self, arm, tasks):
-        problem = osik.build_problem(arm, arm.q0, tasks, limits=())
+        problem = osik.build_problem(arm, arm.q0, tasks, limits=osik.no_limits)
         assert np.isinf(problem.lower).all() and np.isinf(problem.upper).all()
         kinematics = kinematics_at(arm, arm.q0)
         jacobian = osik.frame_jacobian(arm, kinematics, "hand")
@@ -115,7 +115,7 @@ def test_a_posture_lets_other_tasks_win(arm, pose):
 
     def missed(posture):
         tasks = {"hand": hand, "posture": posture}
-        return np.abs(osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=()).slack["hand"]).max()
+        return np.abs(osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=osik.no_limits).slack["hand"]).max()
 
     assert missed(background) < 0.05 * missed(named)
 

@@ -162,7 +162,7 @@ class TestRollout:
         assert np.max(run.solution.box_violation) == 0.0
 
     def test_no_steps(self, arm, tasks):
-        run = osik.rollout(arm, arm.q0, tasks, scheme=SCHEMES["weighted"], steps=0, limits=())
+        run = osik.rollout(arm, arm.q0, tasks, scheme=SCHEMES["weighted"], steps=0, limits=osik.no_limits)
         np.testing.assert_array_equal(run.q, [arm.q0])
 
 
@@ -431,7 +431,7 @@ class TestMistakes:
                 jnp.asarray(zeros),
                 {"posture": osik.PostureTask(nao, weight=1.0)},
                 scheme=SCHEMES["weighted"],
-                limits=(),
+                limits=osik.no_limits,
             )
 
     def test_tasks(self, arm, tasks):

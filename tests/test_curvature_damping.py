@@ -124,7 +124,7 @@ def test_inside_it_is_as_exact_as_without(scheme, arm):
     @jax.vmap
     def errors(kappa):
         scheme_ = SCHEMES[scheme](curvature_damping=kappa)
-        motion = osik.rollout(arm, q0, tasks, scheme=scheme_, limits=(), dt=DT, steps=200, targets=targets)
+        motion = osik.rollout(arm, q0, tasks, scheme=scheme_, limits=osik.no_limits, dt=DT, steps=200, targets=targets)
         ends = jax.vmap(lambda q: kinematics_at(arm, q).frame_pose(arm, "hand")[0])(motion.q[1:])
         return jnp.linalg.norm(ends - path, axis=1)
 
@@ -150,7 +150,9 @@ def test_derivatives_with_the_damping_on(scheme, arm):
         )
         q = q0 + 0.1 * t * jnp.arange(7.0)
         made = SCHEMES[scheme](curvature_damping=1.0 + t)
-        return osik.solve(arm, q, {"hand": hand, "posture": posture}, scheme=made, limits=(), dt=DT).velocity
+        return osik.solve(
+            arm, q, {"hand": hand, "posture": posture}, scheme=made, limits=osik.no_limits, dt=DT
+        ).velocity
 
     def once(t):
         return jax.jvp(velocity, (t,), (1.0,))
@@ -207,7 +209,9 @@ def test_a_posture_makes_up_for_it_in_a_weighted_program(arm, posture, error):
         arm, "hand", rows="position", target=(p + error * jnp.array([0.6, 0.0, 0.8]), rotation), weight=4.0, gain=10.0
     )
     still = osik.PostureTask(arm, target=q + 0.1, weight=posture, gain=1.0)
-    found = osik.solve(arm, q, {"hand": hand, "posture": still}, scheme=osik.WeightedQP(damping), limits=(), dt=DT)
+    found = osik.solve(
+        arm, q, {"hand": hand, "posture": still}, scheme=osik.WeightedQP(damping), limits=osik.no_limits, dt=DT
+    )
 
     rows, ask = hand.rows(arm, kinematics, q), still.rows(arm, kinematics, q)
     J, n = np.asarray(rows.jacobian), arm.nv
@@ -231,7 +235,7 @@ def test_its_share_is_traced(arm):
     def velocity(scheme):
         traces.append(1)
         return osik.solve(
-            arm, arm.q0, {"posture": osik.PostureTask(arm, weight=1.0)}, scheme=scheme, limits=()
+            arm, arm.q0, {"posture": osik.PostureTask(arm, weight=1.0)}, scheme=scheme, limits=osik.no_limits
         ).velocity
 
     for kappa in (0.0, 0.5, 1.0):

@@ -193,7 +193,7 @@ class TestFourBar:
         }
         scheme = osik.WeightedQP(damping=1e-9) if hard else osik.HierarchicalQP()
         start = jnp.asarray(_assembled(0.5))
-        path = osik.rollout(linkage, start, tasks, scheme=scheme, dt=dt, steps=steps, limits=())
+        path = osik.rollout(linkage, start, tasks, scheme=scheme, dt=dt, steps=steps, limits=osik.no_limits)
         assert (np.asarray(path.solution.status) == osik.Status.SOLVED).all()
         model = linkage.mj_model
         data = mujoco.MjData(model)

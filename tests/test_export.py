@@ -28,7 +28,7 @@ def step():
     }
 
     def made(name):
-        limits = () if name in ("classical", "reverse") else None
+        limits = osik.no_limits if name in ("classical", "reverse") else None
         return jax.jit(lambda q: osik.solve(robot, q, tasks, scheme=SCHEMES[name], limits=limits).velocity)
 
     return made, robot.q0 + 0.1

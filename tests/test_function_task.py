@@ -242,7 +242,13 @@ class TestClosedLoop:
 
         distance = osik.FunctionTask(arm, FromPoint(home + jnp.array([0.1, 0.0, 0.05])), target=0.2**2, gain=5.0)
         run = osik.rollout(
-            arm, arm.q0, {"distance": distance}, scheme=osik.NullSpace(damping=1e-6), dt=0.01, steps=100, limits=()
+            arm,
+            arm.q0,
+            {"distance": distance},
+            scheme=osik.NullSpace(damping=1e-6),
+            dt=0.01,
+            steps=100,
+            limits=osik.no_limits,
         )
         error = np.asarray(run.solution.error["distance"])[:, 0]
         np.testing.assert_allclose(error[0], 0.1**2 + 0.05**2 - 0.2**2, rtol=1e-12)

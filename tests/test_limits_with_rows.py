@@ -257,7 +257,7 @@ class TestLimitTask:
             "jerk": osik.LimitTask(arm, osik.AccelerationLimit(arm, {"*": 2.0})),
             "posture": osik.PostureTask(arm, target=arm.q0.at[0].set(5.0), priority=2, weight=1.0),
         }
-        path = osik.rollout(arm, arm.q0, soft, scheme=osik.HierarchicalQP(), dt=0.05, steps=60, limits=())
+        path = osik.rollout(arm, arm.q0, soft, scheme=osik.HierarchicalQP(), dt=0.05, steps=60, limits=osik.no_limits)
         assert np.abs(np.diff(np.asarray(path.solution.velocity), axis=0, prepend=0.0)).max() < 2.0 * 0.05 + 1e-9
         reached = np.asarray(path.q[:, 0])
         np.testing.assert_allclose(reached.max(), arm.position_upper[0], atol=1e-9)

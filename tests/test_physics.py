@@ -185,7 +185,7 @@ def test_a_fall_ends_the_run(nao, nao_world):
         steps=400,
         command=physics.Integrated(),
         before_step=push,
-        limits=(),
+        limits=osik.no_limits,
     )
     assert recording.fell and simulation.fallen()
     assert 20 < len(recording.command) < 300
@@ -201,7 +201,7 @@ def test_steady_errors_are_those_of_theory(arm, arm_world, command, left):
     goal = arm.q0 + jnp.linspace(-0.1, 0.1, arm.nq)
     posture = {"posture": osik.PostureTask(arm, target=goal, gain=5.0, weight=1.0)}
     recording = physics.simulate(
-        simulation, posture, scheme=osik.WeightedQP(), dt=DT, steps=800, command=command, limits=()
+        simulation, posture, scheme=osik.WeightedQP(), dt=DT, steps=800, command=command, limits=osik.no_limits
     )
     droop = np.asarray(goal) - recording.q[-1]
     load = simulation.data.qfrc_bias  # at rest: gravity
@@ -231,7 +231,9 @@ def test_other_gains_compile_nothing(arm, arm_world):
         task = {"posture": osik.PostureTask(arm, gain=gain, weight=1.0)}
         command = physics.Lookahead(time)
         simulation = physics.Simulation(arm_world)
-        return physics.simulate(simulation, task, scheme=osik.WeightedQP(), dt=DT, steps=3, command=command, limits=())
+        return physics.simulate(
+            simulation, task, scheme=osik.WeightedQP(), dt=DT, steps=3, command=command, limits=osik.no_limits
+        )
 
     seen = Compilations()
     logging.getLogger("jax").addHandler(seen)
@@ -275,7 +277,7 @@ def test_mistakes_are_told(nao, arm, arm_world):
             scheme=osik.WeightedQP(),
             dt=DT,
             steps=0,
-            limits=(),
+            limits=osik.no_limits,
         )
 
 

@@ -177,7 +177,7 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
         tasks = Push(osik.PostureTask(arm, weight=1.0), start, speed)
         scheme = osik.WeightedQP()
         return osik.rollout(
-            arm, arm.q0, tasks, scheme=scheme, dt=0.01, steps=STEPS, feedback=Drift(amount), limits=()
+            arm, arm.q0, tasks, scheme=scheme, dt=0.01, steps=STEPS, feedback=Drift(amount), limits=osik.no_limits
         ).q
 
     a = run(0.1, np.zeros(7), 0.0)
@@ -191,7 +191,7 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
 def test_what_is_static_compiles_again(arm):
     """The counter counts: an iteration cap, a priority, a task more, another number of steps."""
     task, scheme = osik.PostureTask(arm, weight=1.0), osik.WeightedQP()
-    osik.solve(arm, arm.q0, {"posture": task}, scheme=scheme, limits=())
+    osik.solve(arm, arm.q0, {"posture": task}, scheme=scheme, limits=osik.no_limits)
     changes = (
         ({"posture": task}, osik.WeightedQP(max_iterations=50)),
         ({"posture": osik.PostureTask(arm, priority=4, weight=1.0)}, scheme),
@@ -199,9 +199,9 @@ def test_what_is_static_compiles_again(arm):
     )
     for tasks, other in changes:
         with Compilations() as count:
-            osik.solve(arm, arm.q0, tasks, scheme=other, limits=())
+            osik.solve(arm, arm.q0, tasks, scheme=other, limits=osik.no_limits)
         assert count.names.count("jit(step)") == 1
     for steps in (2, 3):
         with Compilations() as count:
-            osik.rollout(arm, arm.q0, {"posture": task}, scheme=scheme, steps=steps, limits=())
+            osik.rollout(arm, arm.q0, {"posture": task}, scheme=scheme, steps=steps, limits=osik.no_limits)
         assert count.names.count("jit(_rollout)") == 1

@@ -100,7 +100,7 @@ class TestSchemes:
 
         def speed(damping):
             return jnp.abs(
-                osik.solve(arm, arm.q0, task, scheme=scheme.replace(damping=damping), limits=()).velocity
+                osik.solve(arm, arm.q0, task, scheme=scheme.replace(damping=damping), limits=osik.no_limits).velocity
             ).max()
 
         fast, slow, still = jax.vmap(speed)(dampings)

@@ -221,7 +221,7 @@ class TestWeightedQP:
             tasks,
             scheme=osik.WeightedQP(damping=1e-6, curvature_damping=0.0),
             dt=DT,
-            limits=(),
+            limits=osik.no_limits,
         )
         np.testing.assert_allclose(ours.velocity, 0.0, rtol=0, atol=1e-12)
         assert int(ours.status) == osik.Status.SOLVED

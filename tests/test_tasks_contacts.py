@@ -127,7 +127,9 @@ class TestContacts:
             "sole": osik.ContactTask(walker, "toe", anchor=anchor, axis=(0.0, 0.0, 1.0), gain=10.0, hard=True),
             "push": osik.ComTask(walker, target=[0.5, 0.0, 0.9], gain=2.0),
         }
-        path = osik.rollout(walker, walker.q0, tasks, scheme=osik.WeightedQP(), dt=0.02, steps=500, limits=())
+        path = osik.rollout(
+            walker, walker.q0, tasks, scheme=osik.WeightedQP(), dt=0.02, steps=500, limits=osik.no_limits
+        )
         assert (np.asarray(path.solution.status) == osik.Status.SOLVED).all()
         p, R = _pose(walker, path.q[-1], "toe")
         np.testing.assert_allclose(p, anchor[0], atol=1e-6)
@@ -144,7 +146,7 @@ class TestContacts:
         }
         p0, _ = _pose(walker, walker.q0, "toe")
         path = osik.rollout(
-            walker, walker.q0, tasks, scheme=osik.WeightedQP(damping=1e-6), dt=0.02, steps=200, limits=()
+            walker, walker.q0, tasks, scheme=osik.WeightedQP(damping=1e-6), dt=0.02, steps=200, limits=osik.no_limits
         )
         p, _ = _pose(walker, path.q[-1], "toe")
         assert n @ p == pytest.approx(n @ p0, abs=1e-6)
@@ -247,7 +249,9 @@ class TestWheels:
             "motors": osik.PostureTask(cart, joints=("left", "right"), gain=0.0, target_velocity=speeds),
         }
         start = cart.configuration({"z": 0.05, "yaw": 0.3})
-        path = osik.rollout(cart, start, tasks, scheme=osik.WeightedQP(damping=1e-9), dt=dt, steps=steps, limits=())
+        path = osik.rollout(
+            cart, start, tasks, scheme=osik.WeightedQP(damping=1e-9), dt=dt, steps=steps, limits=osik.no_limits
+        )
         v, q = np.asarray(path.solution.velocity), np.asarray(path.q)
         yaw = q[:-1, 3]
         ahead, turn = RADIUS * speeds.mean(), RADIUS * (speeds[1] - speeds[0]) / TRACK
@@ -272,7 +276,7 @@ class TestWheels:
                 cart.q0,
                 tasks | {"pull": pull, "hold": hold},
                 scheme=osik.WeightedQP(damping=1e-9),
-                limits=(),
+                limits=osik.no_limits,
             )
             assert int(answer.status) == osik.Status.SOLVED
             np.testing.assert_allclose(answer.velocity[:2], expected, atol=1e-6)
@@ -288,7 +292,9 @@ class TestWheels:
         }
         x, y, turn = 0.3, -0.5, 0.7
         base = osik.PostureTask(robot, joints=("x", "y", "yaw"), gain=0.0, target_velocity=[x, y, turn])
-        answer = osik.solve(robot, robot.q0, wheels | {"base": base}, scheme=osik.WeightedQP(damping=1e-10), limits=())
+        answer = osik.solve(
+            robot, robot.q0, wheels | {"base": base}, scheme=osik.WeightedQP(damping=1e-10), limits=osik.no_limits
+        )
         places = np.array([[0.3, 0.2], [0.3, -0.2], [-0.3, 0.2], [-0.3, -0.2]])
         hub = np.array([x, y]) + turn * np.stack([-places[:, 1], places[:, 0]], 1)
         np.testing.assert_allclose(answer.velocity[:4], [x, y, 0.0, turn], atol=1e-6)

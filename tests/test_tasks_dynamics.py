@@ -140,7 +140,7 @@ class TestMatrices:
 
 def _solve(robot, q, tasks, scheme):
     """Of all lanes; tasks are shared."""
-    return jax.jit(jax.vmap(lambda q: osik.solve(robot, q, tasks, scheme=scheme, limits=())))(q)
+    return jax.jit(jax.vmap(lambda q: osik.solve(robot, q, tasks, scheme=scheme, limits=osik.no_limits)))(q)
 
 
 class TestAngularMomentum:
@@ -339,7 +339,7 @@ class TestManipulability:
         task = osik.ManipulabilityTask(planar, "tip", rows=FLAT, gain=20.0)
         start = jnp.array([0.2, 0.3])
         path = osik.rollout(
-            planar, start, {"m": task}, scheme=osik.WeightedQP(damping=1e-9), dt=0.02, steps=200, limits=()
+            planar, start, {"m": task}, scheme=osik.WeightedQP(damping=1e-9), dt=0.02, steps=200, limits=osik.no_limits
         )
         np.testing.assert_allclose(path.q[-1], [0.2, np.pi / 2], atol=1e-6)
 

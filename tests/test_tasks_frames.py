@@ -348,7 +348,7 @@ class TestClosedLoop:
 
         def run(field, posture):
             tasks = {"field": field, "posture": posture}
-            out = osik.rollout(head, head.q0, tasks, scheme=scheme, dt=0.01, steps=200, limits=())
+            out = osik.rollout(head, head.q0, tasks, scheme=scheme, dt=0.01, steps=200, limits=osik.no_limits)
             return out.solution.error["field"][:, 0], out.q[-1]
 
         angle, end = run(field, posture)
@@ -370,7 +370,7 @@ class TestClosedLoop:
             "turn": osik.PostureTask(robot, joints=("pan", "tilt"), target=robot.q0 + 0.3, gain=2.0, priority=2),
         }
         run = osik.rollout(
-            robot, robot.q0.at[-2].set(0.6), tasks, scheme=osik.NullSpace(), dt=0.01, steps=150, limits=()
+            robot, robot.q0.at[-2].set(0.6), tasks, scheme=osik.NullSpace(), dt=0.01, steps=150, limits=osik.no_limits
         )
         apart = np.linalg.norm(run.solution.error["together"], axis=1)
         assert apart[0] > 0.05
@@ -398,7 +398,7 @@ class TestBatchesAndCompilation:
             spoiled.append(eqx.tree_at(lambda t, name=name: getattr(t, name), task, leaf))
 
         def solve(task):
-            return osik.solve(head, head.q0, {"look": task}, scheme=osik.WeightedQP(), limits=())
+            return osik.solve(head, head.q0, {"look": task}, scheme=osik.WeightedQP(), limits=osik.no_limits)
 
         solutions = jax.jit(jax.vmap(solve))(osik.stack(spoiled))
         np.testing.assert_array_equal(solutions.status == osik.Status.NUMERICAL_ERROR, [False, True, True, True, True])

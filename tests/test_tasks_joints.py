@@ -158,7 +158,7 @@ class TestAgainstPeers:
             "damping": osik.DampingTask(arm, weight=0.5**2),
             "smooth": osik.LowAccelerationTask(arm, velocity=last, weight=0.7**2),
         }
-        solution = osik.solve(arm, q, ours, scheme=osik.WeightedQP(damping=1e-12), dt=DT, limits=())
+        solution = osik.solve(arm, q, ours, scheme=osik.WeightedQP(damping=1e-12), dt=DT, limits=osik.no_limits)
         np.testing.assert_allclose(solution.velocity, expected, atol=1e-9)
         assert np.abs(expected).max() > 0.5
         error = theirs["coupling"].compute_error(configuration)
@@ -185,7 +185,7 @@ class TestAgainstPeers:
             "still": osik.FreezeTask(arm, ("joint2", "joint5"), hard=True),
         }
         solution = osik.solve(
-            arm, q, ours, scheme=osik.WeightedQP(damping=1e-12, curvature_damping=0.0), dt=DT, limits=()
+            arm, q, ours, scheme=osik.WeightedQP(damping=1e-12, curvature_damping=0.0), dt=DT, limits=osik.no_limits
         )
         assert solution.status == osik.Status.SOLVED
         np.testing.assert_allclose(solution.velocity, expected, atol=1e-8)
@@ -198,7 +198,7 @@ class TestClosedLoop:
         hand = osik.FrameTask(arm, "hand", rows="position", priority=2)
         target = hand.target[0] + jnp.array([0.05, 0.1, 0.05]), hand.target[1]
         tasks = {"still": osik.FreezeTask(arm, ("joint[12]",)), "hand": hand.replace(target=target)}
-        run = osik.rollout(arm, arm.q0, tasks, scheme=osik.NullSpace(), dt=DT, steps=100, limits=())
+        run = osik.rollout(arm, arm.q0, tasks, scheme=osik.NullSpace(), dt=DT, steps=100, limits=osik.no_limits)
         np.testing.assert_allclose(run.q[:, :2], np.broadcast_to(arm.q0[:2], (101, 2)), atol=1e-9)
         assert np.linalg.norm(run.solution.error["hand"][0]) > 0.1
         assert np.linalg.norm(run.solution.error["hand"][-1]) < 1e-3
@@ -210,7 +210,9 @@ class TestClosedLoop:
             "turn": osik.JointVelocityTask(arm, 0.2, joints=("joint1",)),
             "calm": osik.DampingTask(arm, joints=("joint[2-7]",), weight=1e-9),
         }
-        run = osik.rollout(arm, arm.q0, tasks, scheme=osik.WeightedQP(damping=1e-12), dt=DT, steps=50, limits=())
+        run = osik.rollout(
+            arm, arm.q0, tasks, scheme=osik.WeightedQP(damping=1e-12), dt=DT, steps=50, limits=osik.no_limits
+        )
         error = np.asarray(run.solution.error["gear"])[:, 0]
         start = float(arm.q0[3] + 2.0 * arm.q0[5] - 0.5)
         np.testing.assert_allclose(error, start * (1.0 - 5.0 * DT) ** np.arange(50), atol=1e-6)
@@ -221,7 +223,7 @@ class TestClosedLoop:
         posture = osik.PostureTask(arm, target=arm.q0 + 0.5, gain=5.0, weight=1.0)
         smooth = osik.LowAccelerationTask(arm, weight=3.0)
         tasks, scheme = {"posture": posture, "smooth": smooth}, osik.WeightedQP(damping=1e-12)
-        run = osik.rollout(arm, arm.q0, tasks, scheme=scheme, dt=DT, steps=20, limits=())
+        run = osik.rollout(arm, arm.q0, tasks, scheme=scheme, dt=DT, steps=20, limits=osik.no_limits)
         way, speed, speeds = 0.5, 0.0, []
         for _ in range(20):
             speed = (5.0 * way + 3.0 * speed) / 4.0
@@ -229,7 +231,7 @@ class TestClosedLoop:
             speeds.append(speed)
         np.testing.assert_allclose(run.solution.velocity, np.repeat(speeds, 7).reshape(20, 7), rtol=1e-9)
         last = smooth.after(run.solution.velocity[-2])
-        solution = osik.solve(arm, run.q[-2], tasks | {"smooth": last}, scheme=scheme, dt=DT, limits=())
+        solution = osik.solve(arm, run.q[-2], tasks | {"smooth": last}, scheme=scheme, dt=DT, limits=osik.no_limits)
         np.testing.assert_allclose(solution.velocity, np.full(7, speed), rtol=1e-9)
         assert 1.0 < speeds[-1] < max(speeds) and speeds[0] < 0.7
 

@@ -142,7 +142,7 @@ class TestClosedLoop:
             "posture": osik.PostureTask(arm, weight=0.01, gain=0.1 / DT),
         }
         scheme = osik.WeightedQP(damping=1e-12, curvature_damping=0.0)
-        solution = osik.solve(arm, q, ours, scheme=scheme, dt=DT, limits=())
+        solution = osik.solve(arm, q, ours, scheme=scheme, dt=DT, limits=osik.no_limits)
         np.testing.assert_allclose(solution.velocity, expected, atol=1e-8)
         assert np.abs(expected).max() > 0.5
         forms: Any = (("hand", ours["hand"], "pose"), ("elbow", ours["elbow"], "position"))
@@ -151,7 +151,12 @@ class TestClosedLoop:
             for name, task, rows in forms
         }
         decoupled = osik.solve(
-            arm, q, ours | apart, scheme=osik.WeightedQP(damping=1e-12, curvature_damping=0.0), dt=DT, limits=()
+            arm,
+            q,
+            ours | apart,
+            scheme=osik.WeightedQP(damping=1e-12, curvature_damping=0.0),
+            dt=DT,
+            limits=osik.no_limits,
         )
         assert np.abs(decoupled.velocity - expected).max() > 1e-2 * np.abs(expected).max()
 
@@ -169,7 +174,7 @@ class TestClosedLoop:
             task = osik.FrameTask(
                 arm, "hand", target=target, target_velocity=velocity, error="se3", gain=gain, hard=True
             )
-            solution = osik.solve(arm, q, {"hand": task}, scheme=osik.WeightedQP(), dt=dt, limits=())
+            solution = osik.solve(arm, q, {"hand": task}, scheme=osik.WeightedQP(), dt=dt, limits=osik.no_limits)
             return osik.integrate(arm, q, solution.velocity, dt), solution.error["hand"]
 
         times = dt * jnp.arange(steps)

@@ -124,7 +124,11 @@ class TestNames:
     def test_a_task_named_like_a_part(self, arm):
         with pytest.raises(ValueError, match="a task cannot be called 'scheme'"):
             tuning.Loop(
-                arm, {"scheme": osik.PostureTask(arm, weight=1.0)}, scheme=osik.WeightedQP(), steps=1, limits=()
+                arm,
+                {"scheme": osik.PostureTask(arm, weight=1.0)},
+                scheme=osik.WeightedQP(),
+                steps=1,
+                limits=osik.no_limits,
             )
 
 
@@ -236,7 +240,9 @@ class TestScenarios:
 def path(arm, rng, steps=5):
     """A trajectory of random numbers, with errors of three tasks."""
     q = np.asarray(arm.q0) + 0.5 * rng.normal(size=(steps + 1, 7))
-    solution = osik.solve(arm, arm.q0, {"p": osik.PostureTask(arm, weight=1.0)}, scheme=osik.NullSpace(), limits=())
+    solution = osik.solve(
+        arm, arm.q0, {"p": osik.PostureTask(arm, weight=1.0)}, scheme=osik.NullSpace(), limits=osik.no_limits
+    )
     error = {"hand": rng.normal(size=(steps, 3)), "com": rng.normal(size=(steps, 2)), "posture": np.zeros((steps, 7))}
     solution = eqx.tree_at(lambda s: (s.velocity, s.error), solution, (rng.normal(size=(steps, 7)), error))
     return osik.Trajectory(DT * jnp.arange(steps), jnp.asarray(q), jax.tree.map(jnp.asarray, solution))
@@ -249,7 +255,7 @@ def judged(arm):
         "com": osik.ComTask(arm, lower=[-0.2, -np.inf], upper=[0.3, 0.1], axes="xy"),
         "posture": osik.PostureTask(arm, weight=1.0),
     }
-    loop = tuning.Loop(arm, tasks, scheme=osik.WeightedQP(), dt=DT, steps=5, limits=())
+    loop = tuning.Loop(arm, tasks, scheme=osik.WeightedQP(), dt=DT, steps=5, limits=osik.no_limits)
     return path(arm, np.random.default_rng(3)), loop
 
 
@@ -274,7 +280,7 @@ class TestLosses:
 
         trajectory, _ = judged
         trajectory = eqx.tree_at(lambda t: t.solution.error, trajectory, {"com": trajectory.solution.error["com"]})
-        loop = tuning.Loop(arm, tasks, scheme=osik.WeightedQP(), dt=DT, steps=5, limits=())
+        loop = tuning.Loop(arm, tasks, scheme=osik.WeightedQP(), dt=DT, steps=5, limits=osik.no_limits)
         x, upper = np.asarray(trajectory.solution.error["com"]), np.asarray(trajectory.time)[:, None]
         outside = np.maximum(-0.2 - x, 0.0) + np.maximum(x - upper, 0.0)
         assert float(tuning.Tracking()(trajectory, loop)) == pytest.approx((outside**2).sum(1).mean())
@@ -425,7 +431,7 @@ class TestTune:
                 return {"hand": self.hand.replace(target=(p + 0.1 * jnp.sin(self.speed * t), R))}
 
         swing = Swing(osik.FrameTask(small, "hand", rows="position"), jnp.asarray(2.0))
-        loop = tuning.Loop(small, swing, scheme=LeastSquares(), dt=DT, steps=STEPS, limits=())
+        loop = tuning.Loop(small, swing, scheme=LeastSquares(), dt=DT, steps=STEPS, limits=osik.no_limits)
         start = tuning.Scenarios(q0=scenarios.q0)
         space = tuning.ParameterSpace(loop, ["hand.gain", "speed"])
         losses = [

@@ -21,7 +21,7 @@ from osik_jax.scaling import device_mesh
 
 arm = osik.load_robot("arm7")
 tasks = {{"hand": osik.FrameTask(arm, "hand", rows="position")}}
-loop = tuning.Loop(arm, tasks, scheme=osik.NullSpace(damping=1e-2), limits=(), dt=0.05, steps=3)
+loop = tuning.Loop(arm, tasks, scheme=osik.NullSpace(damping=1e-2), limits=osik.no_limits, dt=0.05, steps=3)
 
 def scenarios(count, seed):
     rng = np.random.default_rng(seed)
@@ -99,7 +99,12 @@ def test_two_processes_tune_as_one(eight):
 def test_mistakes():
     arm = osik.load_robot("arm7")
     loop = tuning.Loop(
-        arm, {"posture": osik.PostureTask(arm, weight=1.0)}, scheme=osik.NullSpace(), limits=(), dt=0.05, steps=1
+        arm,
+        {"posture": osik.PostureTask(arm, weight=1.0)},
+        scheme=osik.NullSpace(),
+        limits=osik.no_limits,
+        dt=0.05,
+        steps=1,
     )
     mesh: Any = 8
     scenarios = tuning.Scenarios(q0=arm.q0[None])

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._errors import OsikKeyError, OsikTypeError, OsikValueError, warn
-from ..limits import Limit
+from ..limits import Limit, NoLimits
 from ..numerics._arguments import concrete
 from ..robot import Robot
 from ..robot._made_for import check_made_for, check_robot
@@ -46,7 +46,7 @@ def _check_precision(robot: Robot) -> None:
 
 
 def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
-    """Return the limits as a tuple, None where none are given.
+    """Return the given limits as a tuple, None where none are given; the robot's own limits are not among them.
 
     Raises:
         TypeError: no sequence of limits.
@@ -54,7 +54,12 @@ def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
     """
     if limits is None:
         return None
-    wanted = "it is a sequence, such as (ConfigurationLimit(robot),); None: the robot's own; (): none"
+    if isinstance(limits, NoLimits):
+        return (limits,)
+    wanted = (
+        "it is a sequence of limits beside the robot's own, such as (AccelerationLimit(robot, {'*': 5.0}),); "
+        "osik_jax.no_limits: none at all"
+    )
     if isinstance(limits, Limit | Mapping | str) or not hasattr(limits, "__iter__"):
         raise OsikTypeError(f"limits is {limits!r}; {wanted}")
     limits = tuple(limits)

@@ -14,7 +14,7 @@ from .._errors import OsikValueError
 from ..batching._structure import Static, put_together, taken_apart
 from ..execution._rules import FOUND
 from ..kinematics import integrate
-from ..limits import Limit
+from ..limits import Limit, Limits
 from ..numerics._placeholder import with_placeholder
 from ..robot import Robot
 from ..schemes import Scheme
@@ -41,7 +41,7 @@ def rollout(
     tasks: Tasks | Callable[[Array], Tasks],
     *,
     scheme: Scheme | None = None,
-    limits: Sequence[Limit] | None = None,
+    limits: Limits | None = None,
     dt: Float[Array, ""] | float = 0.005,
     steps: int,
     targets: Targets | None = None,

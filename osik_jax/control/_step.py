@@ -15,7 +15,7 @@ from ..execution._blocks import BLOCK
 from ..execution._rules import blocked
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._forward import kinematics_by
-from ..limits import ConfigurationLimit, Limit, VelocityLimit, limit_box, limit_rows
+from ..limits import ConfigurationLimit, Limit, Limits, limit_box, limit_rows, with_own_limits
 from ..numerics._placeholder import positive, with_placeholder
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
@@ -45,7 +45,7 @@ def solve(
     tasks: Tasks,
     *,
     scheme: Scheme | None = None,
-    limits: Sequence[Limit] | None = None,
+    limits: Limits | None = None,
     dt: Float[Array, ""] | float = 0.005,
     targets: Targets | None = None,
     warm_start: Any = None,
@@ -60,9 +60,10 @@ def solve(
         q: configuration. (nq,)
         tasks: by name; the names come back in ``slack`` and ``error``.
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``. Default: ``WeightedQP()``.
-        limits: hard bounds on the velocity. Default: the robot's own, ``(ConfigurationLimit(robot),
-            VelocityLimit(robot))``; ``()``: none. Those that remember the last step's velocity, such as
-            ``AccelerationLimit``, need it each time: ``limit.after(solution.velocity)``.
+        limits: hard bounds on the velocity beside the robot's own, ``ConfigurationLimit(robot)`` and
+            ``VelocityLimit(robot)``. A given limit of one of these two classes replaces the robot's own;
+            ``osik_jax.no_limits``, alone or in the sequence, switches both off. Limits that remember the last step's
+            velocity, such as ``AccelerationLimit``, need it each time: ``limit.after(solution.velocity)``.
         dt: time until the next step [s].
         targets: of some tasks, by name: what ``task.replace(target=...)`` takes, such as a pose as (position, rotation
             matrix), (position, quaternion w x y z), a 4 x 4 matrix or a ``jaxlie.SE3``. The other tasks keep theirs.
@@ -97,7 +98,7 @@ def build_problem(
     q: Num[ArrayLike, " nq"] | Sequence[float],
     tasks: Tasks,
     *,
-    limits: Sequence[Limit] | None = None,
+    limits: Limits | None = None,
     dt: Float[Array, ""] | float = 0.005,
     targets: Targets | None = None,
 ) -> VelocityProblem:
@@ -119,7 +120,7 @@ def build_problem(
         KeyError, TypeError, ValueError: as in ``solve``.
     """
     check_setting("build_problem(robot, q, tasks)", robot, None, dt)
-    bounds = _own_limits(robot, checked_limits(robot, limits))
+    bounds = with_own_limits(robot, checked_limits(robot, limits))
     check_tasks(tasks, robot)
     check_target_names(tasks, targets)
     q = checked_configuration(robot, q)
@@ -138,7 +139,7 @@ def step(
     dt: Array | float,
     warm_start: Any = None,
 ) -> Solution:
-    chosen, bounds = _own_scheme(q, scheme), _own_limits(robot, limits)
+    chosen, bounds = _own_scheme(q, scheme), with_own_limits(robot, limits)
     dt = positive(dt)
     raw_box = jax.lax.stop_gradient(limit_box(robot, q, bounds, dt))
     (robot, q), is_valid_pose = with_placeholder((robot, q))
@@ -250,8 +251,3 @@ def in_type_of(dt: Any, q: Array) -> Any:
 def _own_scheme(q: Array, scheme: Scheme | None) -> Scheme:
     """Return the scheme that is given, or a weighted QP in the precision of q."""
     return jax.tree.map(lambda leaf: leaf.astype(q.dtype), WeightedQP()) if scheme is None else scheme
-
-
-def _own_limits(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Limit, ...]:
-    """Return the limits that are given, or the robot's own."""
-    return (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else limits

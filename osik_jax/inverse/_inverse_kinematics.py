@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from .._errors import OsikTypeError, OsikValueError
 from ..control._checks import check_setting, checked_configuration, checked_limits
 from ..execution._blocks import in_blocks
-from ..limits import ConfigurationLimit, Limit
+from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
 from ..numerics._arguments import check_count, concrete
 from ..robot import Robot
 from ..schemes import Scheme
@@ -45,7 +45,7 @@ def inverse_kinematics(
     *,
     targets: Mapping[str, Any] | None = None,
     scheme: Scheme | None = None,
-    limits: Sequence[Limit] | None = None,
+    limits: Limits | None = None,
     q0: Float[Array, " nq"] | None = None,
     seeds: int = 64,
     key: int | Array = 0,
@@ -79,8 +79,9 @@ def inverse_kinematics(
             and the like) and hard tasks have to be met; others (postures) are preferences, which fade out on the way.
         targets: of tasks, by name, what ``replace(target=...)`` takes with one more axis in front, for many targets.
         scheme: for tasks, as in ``solve``. Default: ``WeightedQP()``.
-        limits: default: the robot's joint limits; ``()``: none. With a ``CollisionAvoidanceLimit`` or
-            ``PositionBarrier``, steps are those of the scheme. Limits on speeds and accelerations are passed over.
+        limits: beside the robot's joint limits, as in ``solve``; ``osik_jax.no_limits``: none. With a
+            ``CollisionAvoidanceLimit`` or ``PositionBarrier``, steps are those of the scheme. Limits on speeds and
+            accelerations are passed over.
         q0: a configuration to start from first, such as the last one of a path. Default: none for poses,
             ``robot.q0`` for tasks. Joints that carry none of the frames stay as they are there. (nq,)
         seeds: number of searches for a target, to begin with (static).
@@ -189,12 +190,12 @@ def _explored(
 
 
 def joint_box(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Array, Array]:
-    """Limits of each entry of v."""
-    if limits is None:
+    """Return the lower and upper ends of the joint ranges [rad or m], each (nv,)."""
+    if keeps_own(limits, ConfigurationLimit):
         return _inward(robot.position_lower, 1.0), _inward(robot.position_upper, -1.0)
     free = jnp.full(robot.nv, jnp.inf, robot.q0.dtype)
     lower, upper = -free, free
-    for limit in limits:
+    for limit in limits or ():
         if isinstance(limit, ConfigurationLimit):
             lower, upper = jnp.maximum(lower, limit.lower), jnp.minimum(upper, limit.upper)
     return _inward(lower, 1.0), _inward(upper, -1.0)

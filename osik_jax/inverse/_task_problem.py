@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from .._errors import OsikValueError
 from ..control._checks import check_tasks
 from ..kinematics import forward_kinematics
-from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, PositionBarrier
+from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, PositionBarrier, with_own_limits
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
 from ..robot._tree import HINGE, SLIDE
@@ -127,12 +127,11 @@ def read_scheme(scheme: Scheme) -> Scheme:
 
 
 def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ...]:
-    """The limits that speak of configurations; those on speeds do not bind a search.
+    """Return the limits on configurations, the robot's own among them; limits on speeds do not bind a search.
 
     Their rows have gain 1: a step may go as far as their bounds.
     """
-    given = (ConfigurationLimit(robot),) if limits is None else limits
-    kept = [limit for limit in given if isinstance(limit, _KEPT)]
+    kept = [limit for limit in with_own_limits(robot, limits) if isinstance(limit, _KEPT)]
     return tuple(limit if "gain" not in limit.replaceable else limit.replace(gain=1.0) for limit in kept)
 
 

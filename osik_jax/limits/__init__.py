@@ -9,5 +9,10 @@ from ._collision import CollisionAvoidanceLimit as CollisionAvoidanceLimit
 from ._configuration import ConfigurationLimit as ConfigurationLimit
 from ._floating_base import FloatingBaseVelocityLimit as FloatingBaseVelocityLimit
 from ._linear import LinearLimit as LinearLimit
+from ._own import Limits as Limits
+from ._own import NoLimits as NoLimits
+from ._own import keeps_own as keeps_own
+from ._own import no_limits as no_limits
+from ._own import with_own_limits as with_own_limits
 from ._rows import LimitRows as LimitRows
 from ._velocity import VelocityLimit as VelocityLimit

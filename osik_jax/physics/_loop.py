@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -17,11 +17,11 @@ from jaxtyping import Array, Float
 from .._errors import OsikValueError
 from ..batching._structure import is_number
 from ..control import Solution, solve
-from ..control._checks import check_targets
+from ..control._checks import check_targets, checked_limits
 from ..control._rollout import remembering
 from ..control._step import Targets, Tasks, aim
 from ..kinematics import integrate
-from ..limits import Limit
+from ..limits import Limit, Limits
 from ..robot import Robot
 from ..schemes import Scheme
 from ._simulation import Simulation
@@ -108,7 +108,7 @@ def simulate(
     tasks: Tasks | Callable[[Array], Tasks],
     *,
     scheme: Scheme | None = None,
-    limits: Sequence[Limit] | None = None,
+    limits: Limits | None = None,
     dt: float = 0.005,
     steps: int,
     targets: Targets | None = None,
@@ -142,7 +142,7 @@ def simulate(
     robot = simulation.world.robot
     numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), is_number)
     leaves, treedef = jax.tree.flatten(structure)
-    own = None if limits is None else tuple(limits)
+    own = checked_limits(robot, limits)
     program = partial(_control_step, robot, numbers, scheme, own, command or Integrated(), np.asarray(dt))
     step = partial(program, static=(tuple(leaves), treedef))
     held = jnp.asarray(simulation.sense())

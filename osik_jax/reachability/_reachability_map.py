@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -17,7 +16,7 @@ from ..control._checks import check_setting, checked_limits
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import checked_tolerance
 from ..inverse._poses import read_poses
-from ..limits import Limit
+from ..limits import Limits
 from ..numerics._arguments import check_count
 from ..robot import Robot
 from ..scaling import run_in_chunks
@@ -37,7 +36,7 @@ def reachability_map(
     *,
     grid: Grid | int = 20_000,
     orientations: int | ArrayLike | Array = 64,
-    limits: Sequence[Limit] | None = None,
+    limits: Limits | None = None,
     seeds: int = 64,
     key: int = 0,
     position_tolerance: float = 1e-3,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import equinox as eqx
@@ -13,8 +13,9 @@ from .._errors import OsikValueError
 from ..batching._names import leaf_names, replace_named
 from ..batching._structure import is_number
 from ..control import Trajectory, rollout
+from ..control._checks import checked_limits
 from ..control._step import Targets, Tasks
-from ..limits import ConfigurationLimit, Limit, VelocityLimit
+from ..limits import Limit, Limits, with_own_limits
 from ..robot import Robot
 from ..schemes import Scheme, WeightedQP
 
@@ -32,7 +33,8 @@ class Loop(eqx.Module):
         robot: the robot.
         tasks: by name; or a function of time that returns them, of which an ``equinox.Module``'s fields have names.
         scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``; default: the first.
-        limits: hard bounds on the velocity; default: the robot's own, as in ``rollout``.
+        limits: hard bounds on the velocity, as in ``rollout``: those given, then the robot's own that they do not
+            replace.
         dt: time of one step [s].
         steps: number of steps (static).
 
@@ -53,12 +55,12 @@ class Loop(eqx.Module):
         tasks: Tasks | Callable[[Array], Tasks],
         *,
         scheme: Scheme | None = None,
-        limits: Sequence[Limit] | None = None,
+        limits: Limits | None = None,
         dt: ArrayLike | Array = 0.005,
         steps: int,
     ):
-        own = (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else limits
-        self.robot, self.limits, self.steps = robot, tuple(own), steps
+        self.robot, self.steps = robot, steps
+        self.limits = with_own_limits(robot, checked_limits(robot, limits))
         self.scheme = WeightedQP() if scheme is None else scheme
         self.tasks = tasks if callable(tasks) else dict(tasks)
         self.dt = jnp.asarray(dt, robot.q0.dtype)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import webbrowser
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ..._errors import OsikValueError, unknown_name
 from ...control._checks import check_setting, check_tasks, checked_limits
-from ...limits import ConfigurationLimit, Limit, VelocityLimit
+from ...limits import Limits
 from ...robot import Robot
 from ...schemes import Scheme, WeightedQP
 from ...tasks import FrameTask, Task
@@ -210,7 +210,7 @@ def serve_batch(
     tasks: Mapping[str, Mapping[str, Task]],
     *,
     scheme: Scheme | None = None,
-    limits: Sequence[Limit] | None = None,
+    limits: Limits | None = None,
     dt: float = 0.005,
     q0: Float[Array, "B nq"] | Float[Array, " nq"] | None = None,
     look: Look | None = None,
@@ -237,9 +237,8 @@ def serve_batch(
     if not tasks:
         raise OsikValueError("there are no robots: tasks is empty")
     scheme = WeightedQP() if scheme is None else scheme
-    given = (ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else tuple(limits)
     check_setting("serve_batch(robot, tasks)", robot, scheme, dt)
-    checked_limits(robot, given)
+    given = checked_limits(robot, limits) or ()
     for own in tasks.values():
         check_tasks(own, robot)
     start = np.asarray(robot.q0 if q0 is None else q0)

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...kinematics._home import compiled_kinematics
-from ...limits import ConfigurationLimit, VelocityLimit
 from ...robot import Robot
 from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task
@@ -62,7 +61,7 @@ def default_session(
         robot=robot,
         tasks=tasks,
         scheme=WeightedQP(),
-        limits=(ConfigurationLimit(robot), VelocityLimit(robot)),
+        limits=(),
         dt=dt,
         q=np.asarray(start),
         off=frozenset(led),

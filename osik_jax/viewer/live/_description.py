@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from ..._errors import OsikValueError
-from ...limits import CollisionAvoidanceLimit
+from ...limits import CollisionAvoidanceLimit, NoLimits, no_limits
 from ...robot import Robot
 from ...tasks import AdaptiveGain, PostureTask, SupportPolygon
 from ...tasks._pose import PoseTask
@@ -21,6 +21,7 @@ Description = dict[str, Any]
 """``{"kind": name of the class, argument: plain value, ...}``; arguments that change nothing are left out."""
 
 _PARTS = {"AdaptiveGain": AdaptiveGain, "SupportPolygon": SupportPolygon}
+_NO_LIMITS = "no_limits"
 _ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
 
 
@@ -30,6 +31,8 @@ def describe(part: Any, robot: Robot) -> Description:
     Raises:
         ValueError: a class of somebody's own, or an object that its constructor's arguments do not tell all of.
     """
+    if isinstance(part, NoLimits):
+        return {"kind": _NO_LIMITS}
     kind = type(part).__name__
     if getattr(importlib.import_module("osik_jax"), kind, None) is not type(part):
         raise OsikValueError(f"{kind} is no class of osik_jax, so a session file cannot hold it")
@@ -73,6 +76,8 @@ def rebuild(described: Mapping[str, Any], robot: Robot) -> Any:
     Raises:
         ValueError: a description of nothing that is known, or arguments that do not fit.
     """
+    if described.get("kind") == _NO_LIMITS:
+        return no_limits
     found = getattr(importlib.import_module("osik_jax"), str(described.get("kind")), None)
     if not inspect.isclass(found):
         raise OsikValueError(f"{described.get('kind')!r} is no class of osik_jax")
@@ -93,6 +98,8 @@ def rebuild(described: Mapping[str, Any], robot: Robot) -> Any:
 def python(described: Mapping[str, Any]) -> str:
     """The expression that makes it, in a program that has ``import osik_jax as osik`` and a ``robot``."""
     kind = described["kind"]
+    if kind == _NO_LIMITS:
+        return f"osik.{_NO_LIMITS}"
     first = ["robot"] if _takes_robot(getattr(importlib.import_module("osik_jax"), kind)) else []
     own: dict[str, str] = {}
     if kind == "CollisionAvoidanceLimit":

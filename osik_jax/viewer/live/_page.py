@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import webbrowser
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...control._checks import check_setting, check_tasks, checked_limits
-from ...limits import ConfigurationLimit, Limit, VelocityLimit
+from ...limits import Limits
 from ...robot import Robot
 from ...schemes import Scheme, WeightedQP
 from ...tasks import ComTask, SupportPolygon, Task
@@ -155,7 +155,7 @@ def serve(
     tasks: Mapping[str, Task],
     *,
     scheme: Scheme | None = None,
-    limits: Sequence[Limit] | None = None,
+    limits: Limits | None = None,
     dt: float = 0.005,
     q0: Float[Array, " nq"] | None = None,
     look: Look | None = None,
@@ -196,7 +196,7 @@ def serve(
         robot=robot,
         tasks=dict(tasks),
         scheme=WeightedQP() if scheme is None else scheme,
-        limits=(ConfigurationLimit(robot), VelocityLimit(robot)) if limits is None else tuple(limits),
+        limits=checked_limits(robot, limits) or (),
         dt=dt,
         q=np.asarray(start),
         source=RobotSource(source) if isinstance(source, str) else source,

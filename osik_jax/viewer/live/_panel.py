@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError
-from ...limits import CollisionAvoidanceLimit, Limit
+from ...limits import CollisionAvoidanceLimit, Limit, NoLimits
 from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
 from ._obstacles import SLOTS, keeps_off_world
@@ -148,6 +148,8 @@ class Panel:
         self._limit_boxes.clear()
         with self._limits:
             for number, limit in enumerate(session.limits):
+                if isinstance(limit, NoLimits):
+                    continue
                 self._switch_limit(_words(limit), number not in session.limits_off, number)
             if _ITSELF not in map(_words, session.limits):
                 self._switch_limit(_ITSELF, False, None)

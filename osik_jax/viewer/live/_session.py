@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError
-from ...limits import ConfigurationLimit, Limit, VelocityLimit
+from ...limits import ConfigurationLimit, Limit, VelocityLimit, no_limits, with_own_limits
 from ...robot import Robot
 from ...schemes import Scheme
 from ...tasks import Task
@@ -36,7 +36,7 @@ class Session:
         robot: the robot.
         tasks: all tasks by name, switched off or not.
         scheme: how they share the robot.
-        limits: all limits, switched off or not.
+        limits: all limits, switched off or not: those given, then the robot's own that they do not replace.
         dt: time of a step [s].
         q: where the robot starts. (nq,)
         off: names of the tasks that are switched off.
@@ -54,6 +54,10 @@ class Session:
     limits_off: frozenset[int] = frozenset()
     source: RobotSource | None = None
 
+    def __post_init__(self) -> None:
+        """Add the robot's own limits, as ``solve`` does, so that they can be switched off too."""
+        object.__setattr__(self, "limits", with_own_limits(self.robot, self.limits))
+
     @property
     def active_tasks(self) -> dict[str, Task]:
         """The tasks that are switched on."""
@@ -61,8 +65,9 @@ class Session:
 
     @property
     def active_limits(self) -> tuple[Limit, ...]:
-        """The limits that are switched on."""
-        return tuple(limit for number, limit in enumerate(self.limits) if number not in self.limits_off)
+        """The limits that are switched on, as ``solve`` takes them."""
+        on = tuple(limit for number, limit in enumerate(self.limits) if number not in self.limits_off)
+        return (no_limits, *on) if self.limits_off else on
 
     def controller(self) -> Controller:
         """The same controller with weights of 0 and infinite limits in the place of what is off.
@@ -71,7 +76,7 @@ class Session:
         """
         tasks = {name: task.replace(weight=0.0) if name in self.off else task for name, task in self.tasks.items()}
         limits = [_loose(limit) if n in self.limits_off else limit for n, limit in enumerate(self.limits)]
-        return Controller(tasks, self.scheme, [limit for limit in limits if limit is not None])
+        return Controller(tasks, self.scheme, [no_limits, *(limit for limit in limits if limit is not None)])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the session to a file, for ``load_session``.
