@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import re
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -18,6 +17,7 @@ from ..robot import Robot
 from ..robot._feet import find_feet
 from ._body import JOINTS_APART, joints_between
 from ._facing import by_name, facing_x
+from ._limbs import ORIGIN, Chain, find_arm, find_chains, find_leg
 from ._person import SIDES
 from ._profile import Capsule, Foot, Place, Point, Profile
 
@@ -30,23 +30,16 @@ wider gets two capsules; how much of an ellipsoid's length and width a capsule h
 _LIGHTEST, _USUAL = 200.0, 1000.0
 """Density below which an ellipsoid is not believed, and that which it is given then [kg/m^3]: of the links of a G1, a
 NAO, a Talos, a GR1T2 and a GR3 the lightest has 210 (a Talos' head), and more than half have over 1,000."""
-_SAME, _ROOM = 1e-6, 6e-3
-_ORIGIN: Point = (0.0, 0.0, 0.0)
-_GRIPS = re.compile(r"grip|finger|thumb|hand$", re.IGNORECASE)
-
-
-class _Chain(NamedTuple):
-    """Bodies from the trunk to the end of a limb, and where the joint of each is at home [m]."""
-
-    bodies: tuple[int, ...]
-    anchors: np.ndarray
+_ROOM = 6e-3
 
 
 def guess_profile(robot: Robot) -> Profile:
     """The profile of a robot with two legs and two arms, as its tree and its home configuration show it.
 
     Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as what reaches furthest to the sides. A knee
-    or an elbow is the joint that is far from both ends of its limb, a wrist the last that turns the whole hand. Soles
+    or an elbow is the joint that bends its limb far from both ends, a wrist the last joint that turns the whole hand.
+    Where the elbow is the last joint the wrist is the end of its link: a fixed frame that is called a hand, or the far
+    end of its mesh or, without one, of its mass. Soles
     are the feet's corner frames (``NAME_corner_0`` and so on), or their boxes or balls; a foot without is given a
     length that goes with its leg. Look at it, and save it with ``save_profile`` to change it.
 
@@ -64,17 +57,16 @@ def guess_profile(robot: Robot) -> Profile:
     feet = by_name(sorted(feet, key=lambda name: -_y(kinematics.frame_pose(robot, name)[0])))
     robot = facing_x(robot, feet[0], feet[1])
     kinematics = home_kinematics(robot)
-    legs = _chains(robot, kinematics, [tree.frame_bodies[tree.frame(name)] for name in feet])
+    legs = find_chains(robot, kinematics, [tree.frame_bodies[tree.frame(name)] for name in feet])
     used = {body for leg in legs for body in leg.bodies}
-    arms = _chains(robot, kinematics, _hands(robot, kinematics, used))
+    arms = find_chains(robot, kinematics, _hands(robot, kinematics, used))
     keypoints: dict[str, Place] = {}
     for side, leg, arm in zip(SIDES, legs, arms, strict=True):
-        knee, elbow = _bend(leg.anchors, 0), _bend(arm.anchors, 1)
-        hip, shoulder = max(knee - 2, 0), min(1, elbow - 1)
-        wrist = max(_after(arm.anchors, elbow), _hand(robot, arm, elbow))
-        places = dict(hip=leg.bodies[hip], knee=leg.bodies[knee], ankle=leg.bodies[_after(leg.anchors, knee)])
-        places |= dict(shoulder=arm.bodies[shoulder], elbow=arm.bodies[elbow], wrist=arm.bodies[wrist])
-        keypoints |= {f"{side}_{role}": (tree.body_names[body], _ORIGIN) for role, body in places.items()}
+        bodies = dict(zip(("hip", "knee", "ankle"), find_leg(robot, kinematics, leg), strict=True))
+        shoulder, elbow, wrist = find_arm(robot, kinematics, arm)
+        bodies |= dict(shoulder=shoulder, elbow=elbow)
+        keypoints |= {f"{side}_{role}": (tree.body_names[body], ORIGIN) for role, body in bodies.items()}
+        keypoints[f"{side}_wrist"] = wrist
     trunk = tree.body_parents[arms[0].bodies[0]]
     root = tree.root
     found = Profile(
@@ -88,22 +80,6 @@ def guess_profile(robot: Robot) -> Profile:
 
 def _y(position) -> float:
     return float(position[1])
-
-
-def _chains(robot: Robot, kinematics: Kinematics, ends: list[int]) -> list[_Chain]:
-    left, right = ends
-    return [_chain(robot, kinematics, left, right), _chain(robot, kinematics, right, left)]
-
-
-def _chain(robot: Robot, kinematics: Kinematics, end: int, other: int) -> _Chain:
-    """From the first body that the other side's limb does not hang from to the end."""
-    above = robot.tree.descendants[:, end] & ~robot.tree.descendants[:, other]
-    bodies = tuple(int(b) for b in np.flatnonzero(above) if b != robot.tree.root)
-    if len(bodies) < 3:
-        raise OsikValueError(
-            f"the limb that ends in {robot.tree.body_names[end]} has {len(bodies)} joints; it needs three"
-        )
-    return _Chain(bodies, np.asarray(kinematics.body_position)[list(bodies)])
 
 
 def _hands(robot: Robot, kinematics: Kinematics, used: set[int]) -> list[int]:
@@ -121,38 +97,7 @@ def _hands(robot: Robot, kinematics: Kinematics, used: set[int]) -> list[int]:
     return [left, right]
 
 
-def _bend(anchors: np.ndarray, first: int) -> int:
-    """The joint of a limb that is far from both its ends: the knee or the elbow."""
-    first = min(first, len(anchors) - 1)
-    near = [min(np.linalg.norm(a - anchors[first]), np.linalg.norm(a - anchors[-1])) for a in anchors]
-    best = max(near[1:-1], default=0.0)
-    if best < _SAME:
-        raise OsikValueError("a limb has no joint between its ends; it cannot bend as a person's does")
-    return next(i for i, value in enumerate(near) if value > 0.999 * best and 0 < i < len(near) - 1)
-
-
-def _after(anchors: np.ndarray, bend: int) -> int:
-    """The first joint behind a bend that is elsewhere."""
-    apart = np.linalg.norm(anchors - anchors[bend], axis=-1) > _SAME
-    return next(i for i in range(bend + 1, len(anchors)) if apart[i])
-
-
-def _hand(robot: Robot, arm: _Chain, elbow: int) -> int:
-    """The last body of an arm that is still one with the whole hand: behind it fingers part, or a gripper opens.
-
-    A gripper's joint leads or follows another, or is called so.
-    """
-    tree = robot.tree
-    coupled = {joint for follower, leader, _ in tree.followers for joint in (follower, leader)}
-    for i in range(elbow + 1, len(arm.bodies)):
-        siblings = sum(parent == tree.body_parents[arm.bodies[i]] for parent in tree.body_parents)
-        joints = [j for j, body in enumerate(tree.joint_bodies) if body == arm.bodies[i]]
-        if siblings > 1 or any(j in coupled or _GRIPS.search(tree.joint_names[j]) for j in joints):
-            return i - 1
-    return len(arm.bodies) - 1
-
-
-def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: _Chain) -> Foot:
+def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain) -> Foot:
     """The sole's corners, or those of a foot that goes with the leg; at height 0 of a frame that is called a sole."""
     corners = _corners(robot, kinematics, frame)
     if len(corners) >= 4:
@@ -198,9 +143,9 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
     def is_seen(frame: str, end: str | None) -> bool:
         first = tree.frame_bodies[tree.frame(frame)]
         below = set(np.flatnonzero(tree.descendants[first]).tolist())
-        behind = (
-            set() if end is None else set(np.flatnonzero(tree.descendants[tree.frame_bodies[tree.frame(end)]]).tolist())
-        )
+        last = None if end is None else tree.frame_bodies[tree.frame(end)]
+        # a limb that ends in its own link has all bodies below that link
+        behind = set() if last in (None, first) else set(np.flatnonzero(tree.descendants[last]).tolist())
         return bool(bodies & (below - behind))
 
     plain = _plain_capsules(kinematics, profile, robot)
@@ -248,7 +193,9 @@ def _between(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> floa
 def _frames_of_hands(robot: Robot, profile: Profile) -> set[str]:
     """What the wrists' last joints turn."""
     tree = robot.tree
-    wrists = [tree.frame_bodies[tree.frame(profile.keypoints[f"{side}_wrist"][0])] for side in SIDES]
+    elbows, wrists = ({tree.frame_bodies[tree.frame(profile.keypoints[f"{side}_{role}"][0])] for side in SIDES}
+                      for role in ("elbow", "wrist"))  # fmt: skip
+    wrists = sorted(wrists - elbows)  # without a wrist joint the hand is part of the forearm
     turned = set(np.flatnonzero(tree.descendants[wrists].any(0)).tolist())
     return {name for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body in turned}
 

@@ -1,0 +1,257 @@
+"""A robot's legs and arms as its tree shows them: which joint is a knee or an elbow, and where a wrist is."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from .._errors import OsikValueError
+from ..kinematics import Kinematics
+from ..robot import Robot
+from ..robot._tree import BALL, HINGE
+from ._profile import Place, Point
+
+ORIGIN: Point = (0.0, 0.0, 0.0)
+_SAME = 1e-6
+_BENDS = 0.5
+"""Sine of the angle between a hinge and the limb behind it above which the hinge bends the limb. Less twists it: a G1's
+shoulder yaw has 0.19."""
+_SHORTEST = 0.2
+"""Distance of a knee or an elbow from either end of its limb, as a share of the sum of both, at least."""
+_LEAST_FOREARM = 0.2
+"""Distance of a frame that is called a hand from the joint before it, as a share of the upper arm, at least."""
+_MOST_FOREARM = 1.2
+"""The same, at most, where only masses say how long a forearm is: files have placeholders for inertias."""
+_GRIPS = re.compile(r"grip|finger|thumb|hand$", re.IGNORECASE)
+_HANDS = ("wrist", "hand", "palm", "grip", "tool|tcp|effector", "tip")
+"""Names of frames at the end of an arm, those nearest to the wrist first."""
+
+
+class Chain(NamedTuple):
+    """Bodies from the trunk to the end of a limb, and where the joint of each is at home [m]. (k,), (k, 3)."""
+
+    bodies: tuple[int, ...]
+    anchors: Float[np.ndarray, "k 3"]
+
+
+class Arm(NamedTuple):
+    """Bodies of the shoulder and the elbow, and the wrist."""
+
+    shoulder: int
+    elbow: int
+    wrist: Place
+
+
+def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int]) -> list[Chain]:
+    """Return the left and the right limb that end in two bodies.
+
+    Raises:
+        ValueError: a limb has fewer than three joints.
+    """
+    left, right = ends
+    return [_chain(robot, kinematics, left, right), _chain(robot, kinematics, right, left)]
+
+
+def _chain(robot: Robot, kinematics: Kinematics, end: int, other: int) -> Chain:
+    """Return the bodies from the first that the other side's limb does not hang from to the end."""
+    above = robot.tree.descendants[:, end] & ~robot.tree.descendants[:, other]
+    bodies = tuple(int(b) for b in np.flatnonzero(above) if b != robot.tree.root)
+    if len(bodies) < 3:
+        raise OsikValueError(
+            f"the limb that ends in {robot.tree.body_names[end]} has {len(bodies)} joints; it needs three"
+        )
+    return Chain(bodies, np.asarray(kinematics.body_position)[list(bodies)])
+
+
+def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain) -> tuple[int, int, int]:
+    """Return the bodies of hip, knee and ankle.
+
+    Raises:
+        ValueError: no joint between the ends of the leg bends it.
+    """
+    knee = _bend(robot, kinematics, leg, 0)
+    ankle = None if knee is None else _after(leg.anchors, knee)
+    if knee is None or ankle is None:
+        raise _stiff(robot, leg)
+    return leg.bodies[max(knee - 2, 0)], leg.bodies[knee], leg.bodies[ankle]
+
+
+def find_arm(robot: Robot, kinematics: Kinematics, arm: Chain) -> Arm:
+    """Return where an arm bends and where it ends.
+
+    The elbow is the joint that bends the arm far from the shoulder and from the last joint of the hand, and the wrist
+    is that last joint. Where no joint between them bends the arm, the arm has no wrist joint: the end of its last link
+    is the wrist.
+
+    Raises:
+        ValueError: no joint bends the arm.
+    """
+    hand = _hand(robot, arm)
+    own = Chain(arm.bodies[: hand + 1], arm.anchors[: hand + 1])
+    elbow = _bend(robot, kinematics, own, 1)
+    if elbow is not None:
+        return Arm(own.bodies[min(1, elbow - 1)], own.bodies[elbow], (_name(robot, own.bodies[hand]), ORIGIN))
+    fingers = [i for i in range(hand + 1, len(arm.bodies)) if _apart(arm.anchors[i], arm.anchors[hand])]
+    if fingers:
+        wrist = _name(robot, arm.bodies[fingers[0]]), ORIGIN
+        end = arm.anchors[fingers[0]]
+    else:
+        wrist, end = _end(robot, kinematics, arm, hand)
+    extended = Chain((*own.bodies, own.bodies[-1]), np.concatenate([own.anchors, end[None]]))
+    elbow = _bend(robot, kinematics, extended, 1)
+    if elbow is None:
+        raise _stiff(robot, arm)
+    return Arm(own.bodies[min(1, elbow - 1)], own.bodies[elbow], wrist)
+
+
+def _name(robot: Robot, body: int) -> str:
+    return robot.tree.body_names[body]
+
+
+def _stiff(robot: Robot, limb: Chain) -> ValueError:
+    return OsikValueError(
+        f"the limb that ends in {_name(robot, limb.bodies[-1])} has no joint between its ends that bends it as a "
+        "person's does; give a profile that says where its keypoints are"
+    )
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(np.linalg.norm(a - b) > _SAME)
+
+
+def _bend(robot: Robot, kinematics: Kinematics, limb: Chain, first: int) -> int | None:
+    """Return the joint that bends a limb farthest from both its ends: the knee or the elbow; None: there is none.
+
+    Args:
+        robot: the robot.
+        kinematics: at home.
+        limb: the limb, from its first joint to its end.
+        first: the joint that counts as the limb's beginning.
+    """
+    first = min(first, len(limb.anchors) - 1)
+    beginning, end = limb.anchors[first], limb.anchors[-1]
+    ends = np.linalg.norm(limb.anchors[:, None] - np.stack([beginning, end]), axis=-1)
+    near = ends.min(1)
+    inside = near > np.maximum(_SHORTEST * ends.sum(1), _SAME)
+    places = [i for i in range(1, len(near) - 1) if inside[i] and _bends(robot, kinematics, limb, i)]
+    if not places:
+        return None
+    best = max(near[i] for i in places)
+    bend = next(i for i in places if near[i] > 0.999 * best)
+    return next(i for i in range(1, bend + 1) if not _apart(limb.anchors[i], limb.anchors[bend]))
+
+
+def _bends(robot: Robot, kinematics: Kinematics, limb: Chain, i: int) -> bool:
+    """Whether a joint moves what is behind it sideways, and does not twist it."""
+    tree, behind = robot.tree, _after(limb.anchors, i)
+    if behind is None:
+        return False
+    along = limb.anchors[behind] - limb.anchors[i]
+    turn, axes = np.asarray(kinematics.body_rotation[limb.bodies[i]]), np.asarray(robot.joint_axis)
+    for joint, body in enumerate(tree.joint_bodies):
+        if body == limb.bodies[i] and joint not in tree.locked:
+            if tree.joint_types[joint] == BALL:
+                return True
+            across = np.linalg.norm(np.cross(turn @ axes[joint], along)) / np.linalg.norm(along)
+            if tree.joint_types[joint] == HINGE and across > _BENDS:
+                return True
+    return False
+
+
+def _after(anchors: np.ndarray, joint: int) -> int | None:
+    """Return the first joint behind another that is elsewhere."""
+    return next((i for i in range(joint + 1, len(anchors)) if _apart(anchors[i], anchors[joint])), None)
+
+
+def _hand(robot: Robot, arm: Chain) -> int:
+    """Return the last body of an arm that is still one with the whole hand: fingers part behind it, or a gripper opens.
+
+    A gripper's joint leads or follows another, or is called so.
+    """
+    tree = robot.tree
+    coupled = {joint for follower, leader, _ in tree.followers for joint in (follower, leader)}
+    for i in range(2, len(arm.bodies)):
+        siblings = sum(parent == tree.body_parents[arm.bodies[i]] for parent in tree.body_parents)
+        joints = [j for j, body in enumerate(tree.joint_bodies) if body == arm.bodies[i]]
+        if siblings > 1 or any(j in coupled or _GRIPS.search(tree.joint_names[j]) for j in joints):
+            return i - 1
+    return len(arm.bodies) - 1
+
+
+def _end(robot: Robot, kinematics: Kinematics, arm: Chain, last: int) -> tuple[Place, np.ndarray]:
+    """Return the end of an arm's last link as a place and in the world [m]: a fixed hand frame, else its far end."""
+    tree, body, anchor = robot.tree, arm.bodies[last], arm.anchors[last]
+    least = _LEAST_FOREARM * float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
+    names = [name for name, own in zip(tree.frame_names, tree.frame_bodies, strict=True) if own == body]
+    for pattern in _HANDS:
+        at = {
+            name: np.asarray(kinematics.frame_pose(robot, name)[0])
+            for name in names
+            if re.search(pattern, name, re.IGNORECASE)
+        }
+        far = {name: float(np.linalg.norm(place - anchor)) for name, place in at.items()}
+        far = {name: length for name, length in far.items() if length > max(least, _SAME)}
+        if far:
+            nearest = min(far, key=lambda name: (far[name], name))
+            return (nearest, ORIGIN), at[nearest]
+    end = _far_end(robot, body, anchor, _MOST_FOREARM / _LEAST_FOREARM * least)
+    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, _name(robot, body)))
+    x, y, z = np.round((end - position) @ rotation, 6).tolist()
+    return (_name(robot, body), (x, y, z)), end
+
+
+def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.ndarray:
+    """Return how far a body reaches from its joint, along the line to its middle: its meshes, else its masses [m].
+
+    Args:
+        robot: the robot.
+        body: the body; what is fixed to it counts.
+        anchor: where its joint is [m]. (3,)
+        most: length that masses are believed [m].
+    """
+    model = robot.mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.asarray(robot.mujoco_qpos(robot.q0))
+    mujoco.mj_kinematics(model, data)
+    own = model.body(robot.tree.body_names[body]).id
+    fixed = [b for b in range(model.nbody) if model.body_weldid[b] == model.body_weldid[own]]
+    points = _vertices(model, data, fixed)
+    if len(points):
+        return _farthest(points, points.mean(0), anchor, np.inf)
+    masses = model.body_mass[fixed]
+    middle = masses @ data.xipos[fixed] / max(float(masses.sum()), 1e-12)
+    return _farthest(np.concatenate([_rod(model, data, b) for b in fixed]), middle, anchor, most)
+
+
+def _farthest(points: np.ndarray, middle: np.ndarray, anchor: np.ndarray, most: float) -> np.ndarray:
+    """Return the point on the line from an anchor through a middle that is level with the farthest of some points."""
+    along = (middle - anchor) / max(float(np.linalg.norm(middle - anchor)), _SAME)
+    return anchor + np.clip(((points - anchor) @ along).max(), 0.0, most) * along
+
+
+def _vertices(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> Float[np.ndarray, "k 3"]:
+    """Return the vertices of the meshes of some bodies in the world [m]."""
+    out = [np.zeros((0, 3))]
+    for geom in np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) & np.isin(model.geom_bodyid, bodies)):
+        mesh = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        turn = data.geom_xmat[geom].reshape(3, 3)
+        out.append(data.geom_xpos[geom] + model.mesh_vert[first : first + count] @ turn.T)
+    return np.concatenate(out)
+
+
+def _rod(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Float[np.ndarray, "2 3"]:
+    """Return the ends of a rod with the mass and the inertia of a body [m].
+
+    A rod of half length h has the second moment ``m h^2 / 3`` along itself.
+    """
+    inertia = model.body_inertia[body]
+    moments = np.maximum(0.5 * inertia.sum() - inertia, 0.0)
+    longest = int(np.argmax(moments))
+    half = np.sqrt(3.0 * moments[longest] / max(float(model.body_mass[body]), 1e-12))
+    along = half * data.ximat[body].reshape(3, 3)[:, longest]
+    return data.xipos[body] + np.stack([along, -along])
