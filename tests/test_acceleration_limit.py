@@ -47,7 +47,7 @@ class State(NamedTuple):
 
 
 def limits_of(robot, s):
-    ranges = dict(lower={"rail": s.lower}, upper={"rail": s.upper})
+    ranges = dict(lower={"rail": s.lower}, upper={"rail": s.upper}, return_speed={"rail": s.fastest})
     return (
         osik.ConfigurationLimit(robot, **ranges),
         osik.VelocityLimit(robot, velocity={"rail": s.fastest}),

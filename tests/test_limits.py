@@ -81,7 +81,8 @@ class TestFormula:
     def test_against_the_formula(self, robot, offset, dt, lower, width):
         low, high = 3 * lower, 3 * lower + np.abs(width)
         names = ("elbow", "rail", "wheel")
-        limits = _limits(robot, lower=dict(zip(names, low, strict=True)), upper=dict(zip(names, high, strict=True)))
+        ranges = dict(lower=dict(zip(names, low, strict=True)), upper=dict(zip(names, high, strict=True)))
+        limits = _limits(robot, **ranges, return_speed={"*": np.inf})
         ours = _box(robot, _at(robot, 4 * offset), limits, dt)
         speed = np.array([2.0, 0.5, np.inf])
         for result, bound, free in zip(ours, (low, high), (-np.inf, np.inf), strict=True):
@@ -98,7 +99,9 @@ class TestFormula:
         np.testing.assert_allclose(np.asarray(upper)[9:], [0.0, -0.5, np.inf], atol=1e-14)
         lower, upper = _box(robot, q, _limits(robot)[:1], 0.1)
         np.testing.assert_allclose(np.asarray(lower)[9:], [-25 * np.pi / 3, -6.0, -np.inf], rtol=1e-14)
-        np.testing.assert_allclose(np.asarray(upper)[9:], [0.0, -2.0, np.inf], atol=1e-14)
+        np.testing.assert_allclose(np.asarray(upper)[9:], [0.0, -0.5, np.inf], atol=1e-14)
+        at_once = osik.ConfigurationLimit(robot, return_speed={"*": np.inf})
+        np.testing.assert_allclose(np.asarray(_box(robot, q, (at_once,), 0.1)[1])[9:], [0.0, -2.0, np.inf], atol=1e-14)
 
     def test_no_limit(self, robot):
         lower, upper = osik.limit_box(robot, robot.q0, (), 0.1)
@@ -191,7 +194,8 @@ class TestGain:
 
     def test_one_is_the_default_to_the_last_bit(self, typed, rng):
         q = _at(typed, rng.uniform(-1.5, 1.5, 3))
-        alike = osik.ConfigurationLimit(typed), osik.ConfigurationLimit(typed, gain=1.0)
+        at_once = {"return_speed": {"*": np.inf}}
+        alike = osik.ConfigurationLimit(typed, **at_once), osik.ConfigurationLimit(typed, gain=1.0, **at_once)
         plain, given = (_box(typed, q, (limit,), 1 / 300) for limit in alike)
         scalar = np.asarray(typed.position_upper)[SCALAR_V]
         reach = (scalar.astype(q.dtype) - np.asarray(q)[SCALAR_Q]) / np.asarray(1 / 300, q.dtype)
@@ -201,11 +205,12 @@ class TestGain:
 
     @pytest.mark.parametrize("gain", [0.5, 0.95, 1.0])
     def test_are_minks_and_pinks_bounds(self, gain, rng):
-        """On a NAO, and beyond the ends of the ranges too."""
+        """On a NAO, and beyond the ends of the ranges too, where theirs lead back in one step."""
+        at_once = {"return_speed": {"*": np.inf}}
         robot, dt = osik.load_robot("nao"), 0.004
         model = robot.mj_model
         q = np.asarray(robot.q0) + np.r_[np.zeros(7), rng.uniform(-0.5, 0.5, robot.nq - 7)]
-        lower, upper = osik.limit_box(robot, q, (osik.ConfigurationLimit(robot, gain=gain),), dt)
+        lower, upper = osik.limit_box(robot, q, (osik.ConfigurationLimit(robot, gain=gain, **at_once),), dt)
         full = mink.Configuration(model, q=np.asarray(robot.mujoco_qpos(jnp.asarray(q))))
         theirs = mink.ConfigurationLimit(model, gain=gain)
         bound = np.asarray(theirs.compute_qp_inequalities(full, dt).h) / dt
@@ -223,7 +228,7 @@ class TestGain:
         limit = pink.limits.ConfigurationLimit(pinocchio, config_limit_gain=gain)
         configuration = pink.Configuration(pinocchio, pinocchio.createData(), own)
         bound = limit.compute_qp_inequalities(configuration, dt)[1] / dt
-        lower, upper = osik.limit_box(arm, own, (osik.ConfigurationLimit(arm, gain=gain),), dt)
+        lower, upper = osik.limit_box(arm, own, (osik.ConfigurationLimit(arm, gain=gain, **at_once),), dt)
         np.testing.assert_allclose(np.concatenate([upper, -lower]), bound, rtol=1e-9, atol=1e-9)
 
     def test_by_joint(self, robot):

@@ -33,7 +33,7 @@ def accepted(add: Add) -> None:
         "q outside its limits",
         lambda: reach(q + 10.0),
         None,
-        "the joints come back, at their greatest speed",
+        "the joints return, at their greatest speed",
         status=solved,
     )
     add("a 4 x 4 matrix for a target", lambda: hand(target=np.eye(4)), None, "a pose")

@@ -98,7 +98,7 @@ def files(add: Add) -> None:
     add("a range for a joint that does not exist", lambda: two_joints(position_limits={"zz": (0, 1)}), K, "j1, j2")
     add("a range upside down", lambda: two_joints(position_limits={"j1": (1, -1)}), V, "'j1'")
     add("a home of the wrong length", lambda: two_joints(home=np.zeros(3)), V, "(2,)")
-    add("a home in degrees", lambda: two_joints(home={"j1": 30.0}), V, "[-1, 1]")
+    add("a home in degrees", lambda: two_joints(home={"j1": 30.0}), osik.OsikWarning, "[-1, 1]")
     add("a home for a joint that does not exist", lambda: two_joints(home={"zz": 0.0}), K, "j1, j2")
     add("a keyframe that does not exist", lambda: arm().with_home("stand"), K, "keyframe")
     add("entities that explode, URDF", lambda: read(bomb("robot")), V, "broken XML at line 1", foreign=True)

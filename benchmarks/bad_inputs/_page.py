@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import traceback
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ class Case:
         group: heading that it stands under.
         given: what is given, for people.
         run: gives it.
-        error: exception that comes back; None: none does.
+        error: exception or warning that comes back; None: none does.
         words: what the message says among other things; of an input that is accepted, why.
         status: that the answer has, of an input that raises nothing; None: it is no solution.
         foreign: whether the message goes on in words that are not ours or may change, which the page leaves out.
@@ -54,7 +55,9 @@ class Case:
             AssertionError: anything else than what the case says happens.
         """
         try:
-            answer = self.run()
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", osik.OsikWarning)
+                answer = self.run()
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1].filename
             own = type(error).__bases__ if isinstance(error, osik.OsikError) else (type(error),)

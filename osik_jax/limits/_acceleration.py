@@ -16,7 +16,7 @@ from ..numerics._arguments import check_bounds, concrete, entries
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values, scalar_layout
 from ._box import Kind, Limit, limit_box
-from ._configuration import ConfigurationLimit
+from ._configuration import ConfigurationLimit, check_return_speed
 
 _Box = tuple[Float[Array, " nv"], Float[Array, " nv"]]
 _ROUNDOFF = 32.0  # machine epsilons of the way to a bound that braking leaves over
@@ -38,7 +38,8 @@ class AccelerationLimit(Limit):
     three limits never contradict each other in closed loop, whatever is chosen inside the box.
 
     From other states (outside the range, too fast, stopped too late) the acceleration holds, then the velocity limit,
-    then the speed from which the joint can stop at the other end; and it comes back as fast as these let it.
+    then the speed from which the joint can stop at the other end. A joint outside its range returns at
+    ``return_speed``, as soon as its acceleration allows it.
 
     It needs the velocity of the last step: ``rollout`` hands it on; around ``solve`` use
     ``limit = limit.after(solution.velocity)``.
@@ -51,10 +52,13 @@ class AccelerationLimit(Limit):
         velocity: of the last step, (nv,) [rad/s or m/s], or a mapping in the same way; default 0: at rest.
         lower: lower ends of the ranges, as in ``ConfigurationLimit``; use the same there. -inf: none.
         upper: upper ends of the ranges, in the same way.
+        return_speed: speed at which a joint outside its range returns [rad/s or m/s], as in ``ConfigurationLimit``; use
+            the same there.
 
     Raises:
         KeyError: a mapping names a joint that does not exist.
-        ValueError: a wrong shape, an acceleration that is not positive, or a range as in ``ConfigurationLimit``.
+        ValueError: a wrong shape, an acceleration that is not positive, or a range or return speed as in
+            ``ConfigurationLimit``.
     """
 
     kind: ClassVar[Kind] = "acceleration"
@@ -62,6 +66,7 @@ class AccelerationLimit(Limit):
     velocity: Float[Array, " nv"]
     lower: Float[Array, " nv"]
     upper: Float[Array, " nv"]
+    return_speed: Float[Array, " nv"]
 
     def __init__(
         self,
@@ -71,17 +76,19 @@ class AccelerationLimit(Limit):
         velocity: ArrayLike | Array | Mapping[str, float] | None = None,
         lower: ArrayLike | Array | Mapping[str, float] | None = None,
         upper: ArrayLike | Array | Mapping[str, float] | None = None,
+        return_speed: ArrayLike | Array | Mapping[str, float] | None = None,
     ):
         free = jnp.full(robot.nv, jnp.inf)
         self.acceleration = dof_values(robot, acceleration, free, "acceleration")
         self.velocity = dof_values(robot, velocity, jnp.zeros(robot.nv), "velocity")
-        ranges = ConfigurationLimit(robot, lower=lower, upper=upper)
-        self.lower, self.upper = ranges.lower, ranges.upper
+        ranges = ConfigurationLimit(robot, lower=lower, upper=upper, return_speed=return_speed)
+        self.lower, self.upper, self.return_speed = ranges.lower, ranges.upper, ranges.return_speed
         self._check(dof_names(robot))
 
     def parts(self) -> Sequence[Limit]:
         """The accelerations themselves, and the braking; a velocity limit comes in between."""
-        return _Reachable(self.acceleration, self.velocity), _Stopping(self.acceleration, self.lower, self.upper)
+        stopping = _Stopping(self.acceleration, self.lower, self.upper, self.return_speed)
+        return _Reachable(self.acceleration, self.velocity), stopping
 
     def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
         """Both parts together."""
@@ -89,6 +96,7 @@ class AccelerationLimit(Limit):
 
     def _check(self, names: Sequence[str] | None = None) -> None:
         check_bounds(self.lower, self.upper)
+        check_return_speed(self.return_speed, names)
         seen = concrete(self.acceleration)
         if seen is not None and not (seen > 0.0).all():
             raise OsikValueError(f"accelerations have to be positive: {entries(seen, ~(seen > 0.0), names)}")
@@ -120,14 +128,15 @@ class _Stopping(Limit):
     acceleration: Float[Array, " nv"]
     lower: Float[Array, " nv"]
     upper: Float[Array, " nv"]
+    return_speed: Float[Array, " nv"]
 
     def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
-        """Outside a range: back inside in one step, but not faster than what can stop at the other end."""
+        """Outside a range: back at the return speed, but not faster than what can stop at the other end."""
         scalar, index = scalar_layout(robot)
         position = jnp.asarray(q)[index]
         above = stopping_speed(_way(jnp.where(scalar, self.upper, jnp.inf), position), self.acceleration, dt)
         below = stopping_speed(_way(-jnp.where(scalar, self.lower, -jnp.inf), -position), self.acceleration, dt)
-        lower, upper = -below, above
+        lower, upper = -jnp.maximum(below, -self.return_speed), jnp.maximum(above, -self.return_speed)
         outside = upper < 0.0  # above the range; below it, the lower bound is the one to give way
         least, most = jnp.minimum(lower, upper), jnp.maximum(lower, upper)
         return jnp.where(outside, lower, least), jnp.where(outside, most, upper)

@@ -72,8 +72,8 @@ def limit_box(
 
     Acceleration and velocity limits first; then each position limit is clipped into the box so far:
     ``lower = clip((q_lower - q) / dt, v_lower, v_upper)``, ``upper = clip((q_upper - q) / dt, v_lower, v_upper)``.
-    So a joint outside its range comes back as fast as its velocity limit lets it instead of making the problem
-    infeasible. Without limits: -inf and inf.
+    So a joint outside its range returns, at the ``return_speed`` of its ``ConfigurationLimit`` and no faster than its
+    velocity limit allows, instead of making the problem infeasible. Without limits: -inf and inf.
 
     Args:
         robot: the robot.

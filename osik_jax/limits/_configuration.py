@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -11,20 +11,24 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from ..numerics._arguments import check_bounds, concrete
+from ..numerics._arguments import check_bounds, concrete, entries
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values, scalar_layout
 from ._box import Kind, Limit
 
 _ROUNDOFF = 8.0  # machine epsilons of the way to a bound that are kept clear of it, so that q + v dt stays within
+_RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE = 0.5, 0.25
+"""[rad/s] and [m/s]. ISO 10218-1 calls 0.25 m/s reduced speed; half a metre from a hinge, 0.5 rad/s is the same."""
 
 
 class ConfigurationLimit(Limit):
     """Keeps hinges and slides in their range: ``gain (lower - q) / dt <= v <= gain (upper - q) / dt``.
 
     A step of dt with a velocity in this box ends inside the range to the last bit, rounding included. Ball and free
-    joints have no range. With a gain below 1 a joint approaches the end of its range step by step, and one found
-    outside comes back in the same way: each step at least that share of the distance.
+    joints have no range. With a gain below 1 a joint approaches the end of its range step by step.
+
+    A joint that is outside its range, as a measured one may be, returns at ``return_speed``; where less is left than a
+    step at this speed, by the share ``gain`` of the rest in each step. Tasks may make it return faster.
 
     Args:
         robot: the robot; its ``position_lower`` and ``position_upper`` are the defaults.
@@ -33,16 +37,22 @@ class ConfigurationLimit(Limit):
         upper: upper limits, in the same way.
         gain: the share of the way to a limit that a step may take, above 0 and up to 1: a scalar, an array (nv,), or a
             mapping from joint names or globs to values, the others having 1. mink's default is 0.95, pink's 0.5.
+        return_speed: speed at which a joint outside its range returns [rad/s or m/s], positive: an array (nv,), or a
+            mapping from joint names or globs to values that replaces the default for those joints. Default: the
+            robot's own ``velocity_limit`` of the joint, and where that is infinite, 0.5 rad/s or 0.25 m/s. Infinite:
+            the joint returns in one step, as far as other limits allow it.
 
     Raises:
         KeyError: a mapping names a joint that does not exist.
-        ValueError: a wrong shape, lower > upper, a finite limit on a ball or free joint, or a gain outside (0, 1].
+        ValueError: a wrong shape, lower > upper, a finite limit on a ball or free joint, a gain outside (0, 1], or a
+            return speed that is not positive.
     """
 
     kind: ClassVar[Kind] = "position"
     lower: Float[Array, " nv"]
     upper: Float[Array, " nv"]
     gain: Float[Array, ""] | Float[Array, " nv"]
+    return_speed: Float[Array, " nv"]
 
     def __init__(
         self,
@@ -51,6 +61,7 @@ class ConfigurationLimit(Limit):
         lower: ArrayLike | Array | Mapping[str, float] | None = None,
         upper: ArrayLike | Array | Mapping[str, float] | None = None,
         gain: ArrayLike | Array | Mapping[str, float] = 1.0,
+        return_speed: ArrayLike | Array | Mapping[str, float] | None = None,
     ):
         self.lower = dof_values(robot, lower, robot.position_lower, "lower")
         self.upper = dof_values(robot, upper, robot.position_upper, "upper")
@@ -58,15 +69,18 @@ class ConfigurationLimit(Limit):
         if low is not None and high is not None:
             _check(robot, low, high)
         self.gain = _as_gain(robot, gain)
+        self.return_speed = dof_values(robot, return_speed, _own_return_speed(robot), "return_speed")
+        check_return_speed(self.return_speed, dof_names(robot))
 
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-        """Velocities that lead to the ends of each range in one step of dt [s]."""
+        """Return the velocities that lead to the ends of each range in one step of dt [s], or back at return speed."""
         scalar, index = scalar_layout(robot)
         position = jnp.asarray(q)[index]
         lower = self._reach(jnp.where(scalar, self.lower, -jnp.inf), position, dt, inward=1.0)
         upper = self._reach(jnp.where(scalar, self.upper, jnp.inf), position, dt, inward=-1.0)
+        lower, upper = jnp.minimum(lower, self.return_speed), jnp.maximum(upper, -self.return_speed)
         return jnp.minimum(lower, upper), upper
 
     def _reach(
@@ -86,6 +100,20 @@ class ConfigurationLimit(Limit):
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
         _check_gain(self.gain)
+        check_return_speed(self.return_speed)
+
+
+def _own_return_speed(robot: Robot) -> Float[Array, " nv"]:
+    """Return the speed limit of each joint, and a default speed for the joints that have none."""
+    default = jnp.where(robot.tree.turning, _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE)
+    return jnp.where(jnp.isfinite(robot.velocity_limit), robot.velocity_limit, default)
+
+
+def check_return_speed(speed: Array, names: Sequence[str] | None = None) -> None:
+    """Raise ValueError where a return speed can be seen not to be positive."""
+    seen = concrete(speed)
+    if seen is not None and not (seen > 0.0).all():
+        raise OsikValueError(f"return speeds have to be positive: {entries(seen, ~(seen > 0.0), names)}")
 
 
 def _as_gain(robot: Robot, value: ArrayLike | Array | Mapping[str, float]) -> Float[Array, ""] | Float[Array, " nv"]:

@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikTypeError, OsikValueError, unknown_name
+from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
 from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
 from ._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
@@ -21,16 +21,19 @@ Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
 """A keyframe's name or number, a mapping from joint names to values, or a configuration (nq,)."""
 
 _OUTSIDE = 1e-6
-"""A value that is further out of its joint's range is refused [rad or m]; less is the rounding of a file."""
+"""A value that is further out of its joint's range gets a warning [rad or m]; less is the rounding of a file."""
 
 
 def home_configuration(robot: RobotModel, home: Home) -> Float[Array, " nq"]:
-    """The configuration that is meant, checked and with unit quaternions.
+    """Return the configuration that is meant, checked and with unit quaternions.
 
     Raises:
         KeyError: no such keyframe or joint.
         TypeError: none of the things that a home can be.
-        ValueError: a wrong length, not finite, a quaternion of zeros, or a joint outside its range.
+        ValueError: a wrong length, not finite, or a quaternion of zeros.
+
+    Warns:
+        OsikWarning: a joint is outside its range; its value is kept.
     """
     if isinstance(home, str) or _is_integer(home):
         q: Any = _keyframe(robot, home)
@@ -40,7 +43,7 @@ def home_configuration(robot: RobotModel, home: Home) -> Float[Array, " nq"]:
         q = _as_array(home, robot.q0.dtype)
     check_configuration(robot, q, "home")
     q = _with_unit_quaternions(robot, jnp.asarray(q, robot.q0.dtype))
-    return q if isinstance(q, Tracer) else _inside(robot, np.asarray(q))
+    return q if isinstance(q, Tracer) else _without_roundings(robot, np.asarray(q))
 
 
 def _is_integer(home: Any) -> bool:
@@ -102,8 +105,8 @@ def _with_unit_quaternions(robot: RobotModel, q: Float[Array, " nq"]) -> Float[A
     return q
 
 
-def _inside(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
-    """The configuration with roundings beyond a range taken off; ValueError where a joint is further out."""
+def _without_roundings(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
+    """Return the configuration with roundings beyond a range taken off; warn of joints that are further out."""
     if isinstance(robot.position_lower, Tracer):
         return jnp.asarray(q)
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
@@ -111,9 +114,14 @@ def _inside(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
     for joint, start in robot.tree.qpos_address.items():
         if robot.tree.joint_types[joint] in (HINGE, SLIDE):
             low, high = (bound[robot.tree.dof_address[joint]] for bound in (lower, upper))
-            inside[start] = np.clip(q[start], low, high)
-            if abs(inside[start] - q[start]) > _OUTSIDE:
+            nearest = np.clip(q[start], low, high)
+            if abs(nearest - q[start]) > _OUTSIDE:
                 out.append(f"{robot.tree.joint_names[joint]} is {q[start]:g}, its range is [{low:g}, {high:g}]")
+            else:
+                inside[start] = nearest
     if out:
-        raise OsikValueError(f"home is outside the joints' ranges (radians, metres): {'; '.join(out)}")
+        warn(
+            f"home is outside the joints' ranges (radians, metres): {'; '.join(out)}. It is kept as given; the robot "
+            "returns from there at the return_speed of ConfigurationLimit"
+        )
     return jnp.asarray(inside)

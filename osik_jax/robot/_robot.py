@@ -232,7 +232,10 @@ class Robot(RobotModel):
         Raises:
             KeyError: no such joint or keyframe; the message lists those that exist.
             TypeError: nothing that a home can be.
-            ValueError: a wrong length, not finite, a quaternion of zeros, or a joint outside its range.
+            ValueError: a wrong length, not finite, or a quaternion of zeros.
+
+        Warns:
+            OsikWarning: a joint is outside its range, as a measured one may be; its value is kept.
         """
         q0 = home_configuration(self, home)
         return eqx.tree_at(lambda robot: robot.q0, self, q0)
