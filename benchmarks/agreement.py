@@ -1,7 +1,7 @@
 """Kernels beside plain JAX, problem by problem: random problems solved by both.
 
     python -m benchmarks.agreement --solver qp|hqp|nullspace|reverse|saturated [--count 1000000]
-        [--backend numba] [--seed 0] [--batch 4096] [--keep FILE]
+        [--backend core] [--precision float64] [--seed 0] [--batch 4096] [--keep FILE]
 
 Each family is drawn as often as the others: for weighted QPs those of ``tests/weighted_families.py`` and the planted
 ones of ``tests/problem_families.py`` as least squares, for the others those of ``tests/hierarchy_families.py``. Each
@@ -199,13 +199,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.agreement", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--solver", default="hqp", choices=("qp", "hqp", "nullspace", "reverse", "saturated"))
     parser.add_argument("--count", type=int, default=100_000)
-    parser.add_argument("--backend", default="numba")
+    parser.add_argument("--backend", default="core")
+    parser.add_argument("--precision", default="float64", choices=("float64", "float32"), help="of the problems")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--batch", type=int, default=4096, help="problems of one call")
     parser.add_argument("--keep", help="file for the problems that differ, .npz")
     asked = parser.parse_args()
     configure_cpu()
-    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_enable_x64", asked.precision == "float64")
     families, solve, difference = comparison(asked.solver)
     left_over = count_left_over()
 

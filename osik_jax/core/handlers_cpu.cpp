@@ -2,7 +2,6 @@
 //
 // Numbers are double, integers int32. Every argument and result has a leading axis of problems, except for the sizes.
 #include <cstddef>
-#include <exception>
 #include <vector>
 
 #include "hierarchy.hpp"
@@ -35,19 +34,10 @@ void solve_hierarchies(const xla::Call& call) {
   }
 }
 
-template <void (*solve)(const xla::Call&)> void* handle(xla::CallFrame* frame) {
-  if (!xla::is_call(frame)) return nullptr;
-  try {
-    solve(xla::Call{frame});
-  } catch (const std::exception& problem) {  // no memory
-    return xla::error(frame, problem.what());
-  }
-  return nullptr;
-}
 }  // namespace
 
 extern "C" {
-void* osik_hierarchy(xla::CallFrame* frame) { return handle<solve_hierarchies>(frame); }
+void* osik_hierarchy(xla::CallFrame* frame) { return xla::handle<solve_hierarchies>(frame); }
 
 // The sources that this library was built from (_build.py), so that another state of them is noticed.
 const char* osik_sources() { return OSIK_SOURCES; }

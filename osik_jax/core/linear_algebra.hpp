@@ -8,6 +8,7 @@ namespace osik {
 
 template <class Real> OSIK_FN Real clip(Real a, Real low, Real high) { return a < low ? low : a > high ? high : a; }
 template <class Real> OSIK_FN Real larger(Real a, Real b) { return b > a ? b : a; }
+template <class Real> OSIK_FN Real square(Real a) { return a * a; }
 
 template <class Team> struct LinearAlgebra {
   using Real = typename Team::Real;
@@ -70,6 +71,46 @@ template <class Team> struct LinearAlgebra {
         else S[a * ld + k] *= inverse_pivot;
       });
     }
+  }
+
+  // S = L D L': the inverse M of L, with its ones and zeros, and inverse[k] = 1 / D_k. S has its upper triangle, which is
+  // used up. diagonal: [count] space. Returns whether every pivot D_k is at least `smallest` of the diagonal's S_kk.
+  OSIK_CALL static bool inverse_factor(Team t, Real* S, Real* M, Real* inverse, Real* diagonal, int ld, int count,
+                                       Real smallest) {
+    t.are_shared(S, M, inverse, diagonal);
+    const int end = Team::padded(count);
+    t.each(0, count, [&](int i) {
+      diagonal[i] = S[i * ld + i];
+      for (int j = 0; j < end; ++j) M[i * ld + j] = 0;
+      M[i * ld + i] = 1;
+    });
+    bool regular = true;
+    for (int k = 0; k < count && regular; ++k) {
+      const Real* row = S + k * ld;
+      const Real pivot = row[k], by = Real(1) / pivot;
+      regular = pivot > 0 && pivot >= smallest * diagonal[k];
+      t.once([&] { inverse[k] = by; });
+      t.each(k + 1, count, [&](int i) {
+        const Real factor = -row[i] * by;
+        t.own_axpy_on(S + i * ld, factor, row, i, end);
+        t.own_axpy_on(M + i * ld, factor, M + k * ld, 0, k + 1);
+      });
+    }
+    return regular;
+  }
+
+  // b = S^-1 b = M' D^-1 M b with what inverse_factor gave; b has padded(count) places. work: [padded(count)]
+  OSIK_CALL static void apply_inverse(Team t, const Real* M, const Real* inverse, Real* b, Real* work, int ld, int count) {
+    t.are_shared(M, inverse, b, work);
+    const int end = Team::padded(count);
+    t.each(count, end, [&](int j) { b[j] = 0; });
+    t.rows_times([&](int i) { return M + i * ld; }, [](int i) { return i + 1; }, b, work, count);
+    t.each(0, count, [&](int i) { work[i] *= inverse[i]; });
+    t.columns(0, count, [&](auto c) {
+      auto total = typename decltype(c)::P(0);
+      for (int i = c.at; i < count; ++i) total.fma(work[i], c.load(M + i * ld));
+      c.store(b, total);
+    });
   }
 
   // Householder QR with column pivoting of R [rows, n] over the columns [first, n): Q' R replaces R. A column is a pivot

@@ -36,6 +36,19 @@ template <class Real, int B> struct Pack {
     for (int b = 0; b < B; ++b) v[b] += o.v[b];
     return *this;
   }
+  OSIK_FN Pack& operator-=(const Pack& o) {
+    for (int b = 0; b < B; ++b) v[b] -= o.v[b];
+    return *this;
+  }
+  OSIK_FN Pack& operator*=(const Pack& o) {
+    for (int b = 0; b < B; ++b) v[b] *= o.v[b];
+    return *this;
+  }
+  OSIK_FN Pack inverse() const {
+    Pack p;
+    for (int b = 0; b < B; ++b) p.v[b] = Real(1) / v[b];
+    return p;
+  }
   OSIK_FN Pack& fma(Real a, const Pack& o) {
     for (int b = 0; b < B; ++b) v[b] += a * o.v[b];
     return *this;
@@ -66,13 +79,17 @@ template <class R> struct Serial {
   using Loaded = typename Vector<R>::Loaded;
   using Value = typename Vector<R>::Value;
   using Mask = typename Vector<R>::Mask;
+  using Bits = typename Vector<R>::Bits;
   static constexpr int LANES = Vector<R>::LANES;
   static constexpr bool COPIES = true;  // a method copies the rows that it is given, so that they are padded
   static constexpr int BLOCK = 2 * 64 / int(sizeof(R));  // columns of a large pack
   static constexpr int WIDE = 64 / int(sizeof(R));  // the widest vector of any instruction set
   static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
+  static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
   // a pack that begins at the last column ends within the row
   static constexpr int stride(int n) { return (n + 2 * WIDE - 2) / WIDE * WIDE; }
+  // the end of the pack that holds the n-th number
+  static constexpr int padded(int n) { return (n + LANES - 1) / LANES * LANES; }
   // the numbers of variables, rows and hard rows that space is laid out for
   static constexpr int variables(int n) { return n; }
   static constexpr int level_rows(int m) { return m; }
@@ -134,6 +151,18 @@ template <class R> struct Serial {
     return r;
   }
 
+  // the largest |a_j b_j| of rows of n numbers; NaN counts as none
+  OSIK_FN static Real largest(const Real* a, const Real* b, int n) {
+    Value most{};
+    for (int j = 0; j < n; j += LANES) {
+      const Value v = *(const Loaded*)(a + j) * *(const Loaded*)(b + j), size = v < 0 ? -v : v;
+      most = size > most ? size : most;
+    }
+    Real found = 0;
+    for (int e = 0; e < LANES; ++e) found = most[e] > found ? most[e] : found;
+    return found;
+  }
+
   // ---- vectors
   template <int K, class V> OSIK_FN static Real total_of(V x) {
     if constexpr (K == 1) return x[0];
@@ -147,6 +176,20 @@ template <class R> struct Serial {
     }
   }
   OSIK_FN static Real total(Value x) { return total_of<LANES>(x); }
+  // the totals of LANES vectors, as one vector
+  template <int K> OSIK_FN static Value totals_of(const Value* x) {
+    if constexpr (K == 1) return x[0];
+    else {  // lane e of the result has the sum over one of K groups of lanes, of vector e % K
+      const Value a = totals_of<K / 2>(x), b = totals_of<K / 2>(x + K / 2);
+      Mask low, high;
+      for (int e = 0; e < LANES; ++e) {
+        const bool second = e % K >= K / 2;
+        const int own = second ? LANES : 0, lower = e - (second ? K / 2 : 0);
+        low[e] = own + lower, high[e] = own + lower + K / 2;
+      }
+      return __builtin_shuffle(a, b, low) + __builtin_shuffle(a, b, high);
+    }
+  }
   // the first `count` numbers of a vector in memory, then zeros; the places of these zeros are read too
   OSIK_FN static Value first_of(const Real* a, int count) {
     Mask m;
@@ -170,6 +213,10 @@ template <class R> struct Serial {
     if (j < n) t += *(const Loaded*)(a + j) * *(const Loaded*)(b + j);
     return total(t + u);
   }
+  // a += by b for rows of n numbers, from the pack of column `start` on
+  OSIK_FN static void own_axpy_on(Real* a, Real by, const Real* b, int start, int n) {
+    for (int j = start / LANES * LANES; j < n; j += LANES) *(Loaded*)(a + j) += by * *(const Loaded*)(b + j);
+  }
   // the product of a row that is 0 outside of the columns [from, to) with a vector
   OSIK_FN static Real own_row(const Real* a, const Real* b, int, int, int n, int) { return own_dot_on(a, b, 0, n); }
   OSIK_FN static Real own_square(const Real* a, int start, int stop, int = 1) { return own_dot(a, a, start, stop); }
@@ -177,6 +224,79 @@ template <class R> struct Serial {
     int j = start;
     for (; j + LANES <= stop; j += LANES) *(Loaded*)(a + j) += by * *(const Loaded*)(b + j);
     if (j < stop) *(Loaded*)(a + j) += by * first_of(b + j, stop - j);
+  }
+  // the column after the last one that is not 0 in a row of n numbers, or one a little further
+  OSIK_FN static int own_end(const Real* a, int n) {
+    int end = padded(n);
+    while (end > 0) {
+      const Mask other = *(const Loaded*)(a + end - LANES) != 0;
+      Bits any = 0;
+      for (int e = 0; e < LANES; ++e) any |= other[e];
+      if (any) break;
+      end -= LANES;
+    }
+    return end;
+  }
+  // to [padded] = from [n], times a number; zeros after the n-th stay
+  OSIK_FN void scaled_copy(Real* to, Real by, const Real* from, int n) const {
+    int j = 0;
+    for (; j + LANES <= n; j += LANES) *(Loaded*)(to + j) = by * *(const Loaded*)(from + j);
+    if (j < n && n >= LANES) j = n - LANES, *(Loaded*)(to + j) = by * *(const Loaded*)(from + j);
+    else
+      for (; j < n; ++j) to[j] = by * from[j];
+  }
+  // products of A rows with LANES other rows, over the columns [start, n)
+  template <int A> OSIK_FN static void products(const Real* const* a, const Real* const* b, int start, int n, Value* out) {
+    Value t[A][LANES] = {};
+    for (int j = start; j < n; j += LANES) {
+      OSIK_UNROLL
+      for (int e = 0; e < LANES; ++e) {
+        const Value other = *(const Loaded*)(b[e] + j);
+        OSIK_UNROLL
+        for (int i = 0; i < A; ++i) t[i][e] += *(const Loaded*)(a[i] + j) * other;
+      }
+    }
+    for (int i = 0; i < A; ++i) out[i] = totals_of<LANES>(t[i]);
+  }
+  // LANES rows from `first` on, the last one again where there are fewer; returns where the longest of them ends
+  template <class Row, class End>
+  OSIK_FN static int rows_from(Row row, End end, int first, int count, const Real** rows) {
+    int longest = 0;
+    for (int e = 0; e < LANES; ++e) {
+      const int a = first + e < count ? first + e : count - 1, own = end(a);
+      rows[e] = row(a), longest = own > longest ? own : longest;
+    }
+    return longest;
+  }
+  // out[a] = row(a) . v for all a < count; row(a) is 0 from column end(a) on, and out has padded(count) places
+  template <class Row, class End> OSIK_FN void rows_times(Row row, End end, const Real* v, Real* out, int count) const {
+    for (int first = 0; first < count; first += LANES) {
+      const Real* rows[LANES];
+      const int longest = rows_from(row, end, first, count, rows);
+      Value total;
+      products<1>(&v, rows, 0, longest, &total);
+      *(Loaded*)(out + first) = total;
+    }
+  }
+  // S[a, b] = sum_j row(a)_j weight_j row(b)_j for a <= b < count, and any numbers up to padded(count); work: [2, ld]
+  template <class Row, class End>
+  OSIK_FN void weighted_gram(Row row, End end, const Real* weight, Real* S, Real* work, int ld_S, int ld,
+                             int count) const {
+    for (int a = 0; a < count; a += 2) {
+      const int next = a + 1 < count ? a + 1 : a, stop = end(a) > end(next) ? end(a) : end(next);
+      const Real *scaled[2] = {work, work + ld}, *own[2] = {row(a), row(next)};
+      for (int i = 0; i < 2; ++i)
+        for (int j = 0; j < stop; j += LANES)
+          *(Loaded*)(work + i * ld + j) = *(const Loaded*)(own[i] + j) * *(const Loaded*)(weight + j);
+      for (int first = a / LANES * LANES; first < count; first += LANES) {
+        const Real* rows[LANES];
+        const int longest = rows_from(row, end, first, count, rows);
+        Value total[2];
+        products<2>(scaled, rows, 0, longest < stop ? longest : stop, total);
+        *(Loaded*)(S + a * ld_S + first) = total[0];
+        *(Loaded*)(S + next * ld_S + first) = total[next - a];
+      }
+    }
   }
   OSIK_FN Real dot(const Real* a, const Real* b, int start, int stop) const { return own_dot(a, b, start, stop); }
   OSIK_FN void axpy(Real* a, Real by, const Real* b, int start, int stop) const { own_axpy(a, by, b, start, stop); }

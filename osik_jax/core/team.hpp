@@ -7,10 +7,12 @@
 //   columns(a, b, f)     f(c) for packs of columns: c.load(row), c.store(row, pack)
 //   sum, count, most, best   reductions of f(i); every thread gets the result
 //   dot, axpy, forward, backward, reflect   vector operations of the whole team
+//   scaled_copy, rows_times, weighted_gram, largest   a row that gets its padding; products of all rows with a vector,
+//                        and with each other; the largest product
 // The functions own_... are those of one thread, for use inside f.
 //
 // Rows are padded: a row of n numbers has Team::stride(n) places, and the places after the n-th hold zeros.
-// own_dot_on may read these zeros. Real is the type of the numbers: double, or float on a GPU.
+// own_dot_on, own_axpy_on, rows_times and largest may read these zeros, up to Team::padded(n). Real is the type of the numbers: double, or float on a GPU.
 #pragma once
 
 #ifdef __CUDACC__

@@ -6,6 +6,7 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <exception>
 
 namespace osik::xla {
 
@@ -130,6 +131,17 @@ struct Call {
 inline void* error(CallFrame* frame, const char* message) {
   ErrorArguments arguments{sizeof(ErrorArguments), nullptr, message, INTERNAL_ERROR};
   return frame->api->create_error(&arguments);
+}
+
+// What XLA calls: `solve` on the buffers of a call that wants the kernel to run.
+template <void (*solve)(const Call&)> void* handle(CallFrame* frame) {
+  if (!is_call(frame)) return nullptr;
+  try {
+    solve(Call{frame});
+  } catch (const std::exception& problem) {  // no memory
+    return error(frame, problem.what());
+  }
+  return nullptr;
 }
 
 }  // namespace osik::xla

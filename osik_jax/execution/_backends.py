@@ -10,8 +10,8 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
     backend   weighted QP                          hierarchy                           null space
     "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    CUDA: with bounds, any
               hard rows, n <= 64, <= 32 soft rows  fit into shared memory              precision, levels that fit
-    "core"    as "numba"                           CPUs: any precision, any shape      as "numba"
-    "numba"   CPUs: any precision, least squares   as "core"                           CPUs: any precision,
+    "core"    CPUs: any precision, least squares   CPUs: any precision, any shape      as "numba"
+    "numba"   as "core"                            as "core"                           CPUs: any precision,
                                                                                        any shape
     "jax"     none: plain JAX alone, on any platform
 

@@ -46,22 +46,6 @@ def any_number(a):
 
 
 @lean(fastmath=reordered)
-def add_multiple_absolute(y, factor, x, n):
-    """Add factor |x| to y, over the first n."""
-    for i in range(n):
-        y[i] += factor * abs(x[i])
-
-
-@lean(fastmath=reordered)
-def dot_absolute(a, b, n):
-    """Return sum_i |a_i b_i| over the first n."""
-    total = 0.0
-    for i in range(n):
-        total += abs(a[i] * b[i])
-    return total
-
-
-@lean(fastmath=reordered)
 def four_dots(a, b, c, d, n):
     """Return a'c, a'd, b'c and b'd over the first n: each number is read once for two products."""
     ac, ad, bc, bd = 0.0, 0.0, 0.0, 0.0
@@ -123,22 +107,3 @@ def rotate(a, b, cosine, sine, start, n):
         first = a[i]
         a[i] = cosine * first + sine * b[i]
         b[i] = cosine * b[i] - sine * first
-
-
-@lean
-def add_row(R, v, n):
-    """Overwrite R with the upper triangular R+ of R+'R+ = R'R + v v', by Givens rotations; v is used up."""
-    for k in range(n):
-        if v[k] != 0.0:
-            length = np.hypot(R[k, k], v[k])
-            rotate(R[k], v, R[k, k] / length, v[k] / length, k, n)
-
-
-@lean
-def invert_upper(R, columns, n):
-    """Write column k of R^-1 to row k of ``columns``."""
-    for k in range(n):
-        column = columns[k]
-        column[k] = 1.0 / R[k, k]
-        for i in range(k - 1, -1, -1):
-            column[i] = -dot(R[i], column, i + 1, k + 1) / R[i, i]

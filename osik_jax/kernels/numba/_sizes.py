@@ -21,16 +21,3 @@ def row_space_numbers(n, m):
 def saturation_numbers(n):
     """Return the numbers of ``Search`` in ``_saturation_search.py``, and a block that is read behind them."""
     return n * (2 * n + 10) + WIDTH
-
-
-def weighted_qp_numbers(n, m, p):
-    """Return the numbers of ``Workspace`` in ``_qp_problem.py`` and of the problem with the weights multiplied in.
-
-    Args:
-        n: variables.
-        m: rows of the cost.
-        p: rows with bounds.
-    """
-    k, constraints, largest = m + p, n + p, max(n, m + p)
-    wide, high, line = (-(-size // WIDTH) * WIDTH for size in (n, k, largest + constraints))
-    return high * (4 * wide + 3 * high) + largest**2 + p * (n + p) + 2 * constraints**2 + 27 * line

@@ -32,7 +32,7 @@ from ...numerics._constants import (
 )
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
-from . import _numba, _warp
+from . import _core, _warp
 from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
@@ -64,8 +64,8 @@ def _solve_on_platform(
     kernels = {}
     if takes(backend, "warp", fits=has_soft_rows and _fits_warp(qp)):
         kernels["warp"] = warp_candidates(_warp.solve, max_iterations)
-    if takes(backend, "numba", fits=isinstance(qp.cost, LeastSquares)):
-        kernels["numba"] = _numba_candidates(KKT_TOLERANCE[tolerance.dtype], max_iterations)
+    if takes(backend, "core", fits=isinstance(qp.cost, LeastSquares)):
+        kernels["core"] = core_candidates(KKT_TOLERANCE[tolerance.dtype], max_iterations)
     # in a batch on a CPU, problems of few rows are tried in the space of the rows first: it costs less than a round
     by_rows = len(tolerance) > 1 and cpu_is_default() and has_few_rows(qp)
     search_all = partial(search, max_iterations=max_iterations, first_try=try_row_space if by_rows else None)
@@ -100,12 +100,12 @@ def warp_candidates(solve: Solve, max_iterations: int) -> Candidates:
     return Candidates(certified, search_rest)
 
 
-def _numba_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
-    """Return how the CPU kernel is used; ``kkt_tol`` is the largest residual that is certified."""
+def core_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
+    """Return how the compiled core is used; ``kkt_tol`` is the largest residual that is certified."""
 
     def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
         start = jax.vmap(usable_guess)(qp, guess)
-        candidate = _numba.solve(qp, start, tolerance, max_iterations)
+        candidate = _core.solve(qp, start, tolerance, max_iterations)
         result, within_limit = _as_result(qp, candidate), candidate.iterations <= max_iterations
         is_certified = (candidate.converged != 0) & within_limit
         conditions = [jax.vmap(_is_certified)(qp, result, tolerance), jax.vmap(_is_stationary)(qp, result)]

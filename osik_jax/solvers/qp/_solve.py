@@ -115,7 +115,7 @@ def solve_least_squares_qp(
         max_iterations: limit on the changes of the active set (static).
         tolerance: relative violation that counts as none.
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
-            the platform, "jax" for none, "numba" (CPUs) or "warp" (CUDA) for that or an error. It changes the time,
+            the platform, "jax" for none, "core" (CPUs) or "warp" (CUDA) for that or an error. It changes the time,
             not the answer.
     """
     matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)

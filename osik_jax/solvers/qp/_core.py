@@ -1,13 +1,12 @@
-"""Candidates for weighted QPs from the kernel for CPUs (``kernels/numba/_weighted_qp.py``)."""
+"""Candidates for weighted QPs from the compiled core (``core/weighted_qp.hpp``)."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ...core import _library
 from ...execution._computed import side_by_side
-from ...kernels.numba import _target
-from ...kernels.numba._sizes import weighted_qp_numbers
 from ...numerics._constants import INACTIVE, REDUNDANT
 from ._candidate import Candidate
 from ._cost import LeastSquares
@@ -25,19 +24,13 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     """
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
-    batch, m, n = cost.matrix.shape
+    batch, _, n = cost.matrix.shape
     p = qp.rows.shape[1]
     (matrix, *others), _ = arrays(qp)
     packed = side_by_side(*others) if qp.packed is None else qp.packed
-    x, y, active, report, _ = _target.call(
-        "_weighted_qp",
-        [
-            ((batch, n), float),
-            ((batch, p), float),
-            ((batch, n + p), int),
-            ((batch, 3), int),
-            ((weighted_qp_numbers(n, m, p),), float),
-        ],
+    x, y, active, report = _library.call(
+        "weighted_qp",
+        [((batch, n), float), ((batch, p), float), ((batch, n + p), int), ((batch, 3), int)],
         *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
     redundant = active == REDUNDANT

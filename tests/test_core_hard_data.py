@@ -1,4 +1,4 @@
-"""Numba's kernels on hard data: beside plain JAX, quadprog and daqp, and the optimality of each level.
+"""Kernels of CPUs on hard data: beside plain JAX, quadprog and daqp, and the optimality of each level.
 
 Rows come twice or are 0, variables are pinned or have no bounds, weights are 1e-6 to 1e6, and there may be one variable
 or no row.
@@ -11,6 +11,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
+from core_checks import needs_core
 from hierarchy_families import Hierarchies, Rows
 from lexicographic import certificate
 from optimality import by_daqp, by_quadprog
@@ -20,7 +21,7 @@ from weighted_families import Problems
 from benchmarks.agreement import levels_difference, qp_difference, solve_levels, solve_qp
 from osik_jax.solvers import Status
 
-pytest.importorskip("numba")
+pytestmark = needs_core
 
 LANES = 40
 SHAPES = ["6-5", "1-0", "1-3", "6-0", "24-30", "60-40"]
@@ -76,7 +77,7 @@ def hard_levels(n, m, dtype):
 
 def by_both(solve, p):
     run = jax.jit(lambda p, backend: jax.vmap(partial(solve, backend=backend))(p), static_argnums=1)
-    return tuple(jax.tree.map(np.asarray, run(p, backend)) for backend in ("numba", "jax"))
+    return tuple(jax.tree.map(np.asarray, run(p, backend)) for backend in ("core", "jax"))
 
 
 def in_double(p):

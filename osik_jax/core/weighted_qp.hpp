@@ -1,0 +1,367 @@
+// A weighted least-squares problem in a box, with rows that are hard or soft: the candidate that solvers/qp certifies.
+//
+//   min 1/2 sum_i weight_i (A x - target)_i^2 + 1/2 sum_j damping_j (x_j - center_j)^2 + 1/2 sum_q t_q^2 / compliance_q
+//   over lower <= [x; C x + t] <= upper
+//
+// With B = [sqrt(W) A; C], the compliance E of its rows (1 for those of A), z the residuals of the rows of A and the
+// multipliers of those of C, the minimiser on an active set has, over the free variables F,
+//
+//   D (x - center) = B' z,   B x + E z = target   =>   (B_F D_F^-1 B_F' + E) z = target - B x0,   x = x0 + D_F^-1 B_F' z
+//
+// where x0 is the center, or the bound of an active variable (Sherman, Morrison, Woodbury): a system as large as the
+// rows. With more rows than variables the system is the Hessian's. Either is solved again for what the point leaves of
+// the two equations on the left, until that is roundoff; so its factors need not be accurate.
+//
+// The search: from a guessed active set, all constraints with a wrong label change it at once (block principal
+// pivoting, Judice and Pires 1994). Where that stops helping, the dual method (dual_active_set.hpp) begins without
+// active constraints; it cannot cycle.
+#pragma once
+#include "constants.hpp"
+#include "dual_active_set.hpp"
+#include "linear_algebra.hpp"
+
+namespace osik {
+
+// Sizes of all problems of a call.
+struct QPSizes {
+  int m, n, p, max_changes;  // rows of A, variables, rows of C; limit on the changes of the active set
+};
+
+// The data of one problem; N = n + p constraints.
+template <class Real> struct QPData {
+  const Real *matrix, *target, *weight, *damping, *center;  // [m, n], [m], [m], [n], [n]
+  const Real *rows, *compliance, *lower, *upper;            // [p, n], [p], [N], [N]
+  const int* guess;                                         // [N] labels of the active set to try first
+  Real tolerance;                                           // relative violation that counts as none
+};
+
+// The results of one problem.
+template <class Real> struct QPAnswer {
+  Real *x, *multipliers;  // [n], [p] multipliers of the rows of C
+  int *active, *report;   // [N] labels; [3] whether there is a candidate, changes, factorizations
+};
+
+template <class Team> struct WeightedQP {
+  using Real = typename Team::Real;
+  using Int = typename Team::Int;
+  using Algebra = LinearAlgebra<Team>;
+  using Data = QPData<Real>;
+  using Answer = QPAnswer<Real>;
+  static constexpr Real EPS = sizeof(Real) == 8 ? EPSILON : 1.1920929e-07;
+  static constexpr int VECTORS = 24, INTEGERS = 4;
+  Team t;
+  int m, n, p, k, N, ld, lk, max_changes;  // k = m + p rows; strides of rows of n and of k numbers
+  int used, changes, factorizations;       // rows in the system of the active set
+  Real tolerance;
+  const Real *lower, *upper;
+  Real *B;           // [k, ld] the rows
+  Real *S, *M;       // [q, lq] the system of the active set and the inverse of its factor, q = k or n
+  Real *V, *T, *TM;  // [p, ld] M times the active rows of C, and their Schur complement [p, lk] with its inverse factor
+  int lq;
+  // vectors, as long as the longest of k and N
+  Real *TARGET, *COMPLIANCE, *DAMPING, *CENTER, *ROOT, *INVERSE_ROOT, *INVERSE, *X, *Z, *STEP, *GRADIENT, *GAP, *RIGHT,
+      *SOLVED, *PIVOT, *TERMS, *VALUE, *VALUE_ROUNDOFF, *MULTIPLIER_ROUNDOFF, *DIAGONAL, *SMALL, *SMALL_PIVOT,
+      *SCALED, *ALSO_SCALED;  // these two, one after the other, are [2, ld]
+  Int *LABEL, *NEXT, *USED, *END;  // END: a row of B is 0 from this column on
+  DualActiveSet<Team> dual;
+
+  static constexpr OSIK_HOST int width(const QPSizes& s) {
+    const int k = s.m + s.p, N = s.n + s.p;
+    return Team::stride(k > N ? k : N);
+  }
+  static constexpr OSIK_HOST int order(const QPSizes& s) { return s.m + s.p > s.n ? s.m + s.p : s.n; }
+  // numbers and integers of the workspace; the numbers begin as zeros
+  static constexpr OSIK_HOST int doubles(const QPSizes& s) {
+    const int k = s.m + s.p, q = order(s);
+    return (k + s.p) * Team::stride(s.n) + 2 * q * Team::stride(q) + 2 * s.p * Team::stride(k) + VECTORS * width(s) +
+           DualActiveSet<Team>::doubles(s.n, s.p) + Team::stride(0);
+  }
+  static constexpr OSIK_HOST int integers(const QPSizes& s) {
+    return INTEGERS * width(s) + DualActiveSet<Team>::integers(s.n, s.p);
+  }
+
+  OSIK_FN WeightedQP(const QPSizes& s, Real* F, Int* J)
+      : m(s.m), n(s.n), p(s.p), k(s.m + s.p), N(s.n + s.p), ld(Team::stride(s.n)), lk(Team::stride(s.m + s.p)),
+        max_changes(s.max_changes), lq(Team::stride(order(s))) {
+    const int w = width(s), q = order(s);
+    for (Real** v : {&TARGET, &COMPLIANCE, &DAMPING, &CENTER, &ROOT, &INVERSE_ROOT, &INVERSE, &X, &Z, &STEP, &GRADIENT,
+                     &GAP, &RIGHT, &SOLVED, &PIVOT, &TERMS, &VALUE, &VALUE_ROUNDOFF, &MULTIPLIER_ROUNDOFF, &DIAGONAL,
+                     &SMALL, &SMALL_PIVOT, &SCALED, &ALSO_SCALED})
+      *v = F, F += w;
+    B = F, V = B + k * ld, S = V + p * ld, M = S + q * lq, T = M + q * lq, TM = T + p * lk;
+    for (Int** v : {&LABEL, &NEXT, &USED, &END}) *v = J, J += w;
+    dual.begin(n, p, TM + p * lk, J);
+    t.each(n, w, [&](int j) { DAMPING[j] = 1; });  // which has an inverse
+  }
+
+  // ---- one problem
+  OSIK_METHOD void begin(const Data& d) {
+    lower = d.lower, upper = d.upper, tolerance = d.tolerance, changes = factorizations = 0;
+    t.each(n, ld, [&](int j) { X[j] = STEP[j] = GRADIENT[j] = SOLVED[j] = TERMS[j] = RIGHT[j] = 0; });
+    for (int i = 0; i < k; ++i) {
+      const Real root = i < m ? sqrt(d.weight[i]) : Real(1);
+      const Real* row = i < m ? d.matrix + i * n : d.rows + (i - m) * n;
+      t.scaled_copy(B + i * ld, root, row, n);
+      t.once([&] {
+        TARGET[i] = i < m ? root * d.target[i] : 0, COMPLIANCE[i] = i < m ? Real(1) : d.compliance[i - m];
+        Z[i] = 0, END[i] = t.own_end(B + i * ld, n);
+      });
+    }
+    t.scaled_copy(DAMPING, 1, d.damping, n);
+    t.scaled_copy(CENTER, 1, d.center, n);
+    t.columns(0, n, [&](auto c) {
+      auto total = c.load(DAMPING);
+      for (int i = 0; i < m; ++i) total.square(c.load(B + i * ld));
+      c.store(ROOT, total);
+    });
+    t.each(0, Team::padded(n), [&](int j) { ROOT[j] = sqrt(ROOT[j]); });
+    t.each(0, Team::padded(n), [&](int j) { INVERSE_ROOT[j] = Real(1) / ROOT[j]; });
+  }
+  // The guess where the bounds that it names exist. Pinned variables are active, equality rows where guessed.
+  OSIK_FN void first_labels(const int* guess, Int* label) {
+    t.each(0, N, [&](int i) {
+      const Real bound = guess[i] == AT_UPPER ? upper[i] : lower[i];
+      const bool active = guess[i] != INACTIVE && fabs(bound) < Real(INFINITE);
+      const bool equality = lower[i] == upper[i] && (i < n || guess[i] != INACTIVE);
+      label[i] = equality ? EQUALITY : !active ? INACTIVE : guess[i] == AT_UPPER ? AT_UPPER : AT_LOWER;
+    });
+  }
+  OSIK_FN Real bound(int i) const { return LABEL[i] == AT_UPPER ? upper[i] : lower[i]; }
+  OSIK_FN Real* row(int a) const { return B + USED[a] * ld; }
+
+  // ---- what a point leaves of the two equations
+  OSIK_METHOD void find_gap() {  // target - B x for the rows of A, target - B x - E z for those of C
+    t.rows_times([&](int i) { return B + i * ld; }, [&](int i) { return END[i]; }, X, GAP, k);
+    t.each(0, k, [&](int i) {
+      const Real target = i < m ? TARGET[i] : LABEL[n + i - m] == INACTIVE ? 0 : bound(n + i - m) - COMPLIANCE[i] * Z[i];
+      GAP[i] = target - GAP[i];
+    });
+  }
+  OSIK_METHOD void find_gradient() {  // D (x - center) - B' z, with z the residuals of the rows of A
+    find_gap();
+    t.each(0, m, [&](int i) { Z[i] = GAP[i]; });
+    t.columns(0, n, [&](auto c) {
+      auto total = c.load(X);
+      total -= c.load(CENTER);
+      total *= c.load(DAMPING);
+      for (int i = 0; i < k; ++i) total.fma(-Z[i], c.load(B + i * ld));
+      c.store(GRADIENT, total);
+    });
+  }
+  // Whether a correction is the last: it is roundoff, or shrinks no more. `before`: the size of the one before it.
+  OSIK_FN bool is_last(Real& before) const {
+    const Real moved = t.largest(STEP, ROOT, n), far = t.largest(X, ROOT, n);
+    const bool last = before < Real(INFINITE) && (moved <= CORRECTION * far || moved > Real(MIN_DECREASE) * before);
+    before = moved;
+    return last;
+  }
+  static constexpr Real CORRECTION = sizeof(Real) == 8 ? KERNEL_CORRECTION : 1e-6;
+  static constexpr int REFINEMENTS = sizeof(Real) == 8 ? KERNEL_REFINEMENTS : 6;
+
+  // ---- the minimiser on the active set; returns whether the factors are regular
+  OSIK_METHOD bool solve_on_active_set() {
+    ++factorizations;
+    used = 0;
+    for (int i = 0; i < k; ++i) {
+      const bool in = i < m || LABEL[n + i - m] != INACTIVE;
+      t.once([&] { in ? void(USED[used] = i) : void(Z[i] = 0); });
+      used += in;
+    }
+    return used <= n ? solve_by_rows() : solve_by_hessian();
+  }
+  OSIK_METHOD bool solve_by_rows() {
+    t.columns(0, n, [&](auto c) { c.store(X, c.load(CENTER)), c.store(INVERSE, c.load(DAMPING).inverse()); });
+    t.each(0, n, [&](int j) {
+      if (LABEL[j] != INACTIVE) X[j] = bound(j), INVERSE[j] = 0;
+    });
+    t.each(0, k, [&](int i) { Z[i] = 0; });
+    find_gap();
+    t.each(0, used, [&](int a) { RIGHT[a] = GAP[USED[a]]; });
+    t.weighted_gram([&](int a) { return row(a); }, [&](int a) { return END[USED[a]]; }, INVERSE, S, SCALED, lq, ld, used);
+    t.each(0, used, [&](int a) { S[a * lq + a] += COMPLIANCE[USED[a]]; });
+    if (!Algebra::inverse_factor(t, S, M, PIVOT, DIAGONAL, lq, used, Real(KERNEL_PIVOT) * EPS)) return false;
+    t.each(0, n, [&](int j) { GRADIENT[j] = 0; });
+    Real before = INFINITE;
+    for (int round = 0; round < REFINEMENTS; ++round) {
+      Algebra::apply_inverse(t, M, PIVOT, RIGHT, SOLVED, lq, used);
+      t.each(0, used, [&](int a) { Z[USED[a]] += RIGHT[a]; });
+      t.columns(0, n, [&](auto c) {
+        auto total = c.load(GRADIENT);
+        for (int a = 0; a < used; ++a) total.fma(-RIGHT[a], c.load(row(a)));
+        total *= c.load(INVERSE);
+        c.store(STEP, total);
+        auto x = c.load(X);
+        c.store(X, x -= total);
+      });
+      find_gradient();
+      if (is_last(before)) break;
+      t.columns(0, n, [&](auto c) {
+        auto step = c.load(GRADIENT);
+        c.store(STEP, step *= c.load(INVERSE));
+      });
+      t.rows_times([&](int a) { return row(a); }, [&](int a) { return END[USED[a]]; }, STEP, RIGHT, used);
+      t.each(m, used, [&](int a) { RIGHT[a] += GAP[USED[a]]; });
+    }
+    return true;
+  }
+  // H_F = B_F' B_F + D_F, with a row and a column of the identity for active variables; V = M C_F' and V D^-1 V' + E
+  OSIK_METHOD bool factor_hessian() {
+    for (int a = 0; a < n; ++a) {
+      const bool free = LABEL[a] == INACTIVE;
+      t.columns(0, n, [&](auto c) {
+        auto total = typename decltype(c)::P(0);
+        if (free)
+          for (int i = 0; i < m; ++i) total.fma(B[i * ld + a], c.load(B + i * ld));
+        c.store(S + a * lq, total);
+      });
+      t.each(a, n, [&](int b) {
+        if (b == a) S[a * lq + a] = free ? S[a * lq + a] + DAMPING[a] : Real(1);
+        else if (LABEL[b] != INACTIVE) S[a * lq + b] = 0;
+      });
+    }
+    if (!Algebra::inverse_factor(t, S, M, PIVOT, DIAGONAL, lq, n, EPS)) return false;
+    for (int a = 0; a < used - m; ++a) {
+      t.each(0, n, [&](int j) { STEP[j] = LABEL[j] == INACTIVE ? row(m + a)[j] : Real(0); });
+      t.each(0, n, [&](int i) { V[a * ld + i] = t.own_dot_on(M + i * lq, STEP, 0, n); });
+      t.each(0, n, [&](int j) { STEP[j] = V[a * ld + j] * PIVOT[j]; });
+      t.each(0, a + 1, [&](int b) {
+        T[b * lk + a] = t.own_dot_on(V + b * ld, STEP, 0, n) + (a == b ? COMPLIANCE[USED[m + a]] : Real(0));
+      });
+    }
+    return Algebra::inverse_factor(t, T, TM, SMALL_PIVOT, DIAGONAL, lk, used - m, Real(KERNEL_PIVOT) * EPS);
+  }
+  // H_F dx - C_F' dy = -gradient, C_F dx + E dy = gap: (V' D^-1 V + E) dy = gap + V' D^-1 M gradient
+  OSIK_METHOD bool solve_by_hessian() {
+    if (!factor_hessian()) return false;
+    const int rows = used - m;
+    t.each(0, n, [&](int j) { X[j] = LABEL[j] == INACTIVE ? Real(0) : bound(j); });
+    t.each(m, k, [&](int i) { Z[i] = 0; });
+    Real before = INFINITE;
+    find_gradient();
+    for (int round = 0; round < REFINEMENTS; ++round) {
+      t.each(0, n, [&](int j) { RIGHT[j] = LABEL[j] == INACTIVE ? -GRADIENT[j] : Real(0); });
+      t.each(0, n, [&](int i) { SOLVED[i] = PIVOT[i] * t.own_dot_on(M + i * lq, RIGHT, 0, i + 1); });
+      t.each(0, rows, [&](int a) { SMALL[a] = GAP[USED[m + a]] - t.own_dot_on(V + a * ld, SOLVED, 0, n); });
+      Algebra::apply_inverse(t, TM, SMALL_PIVOT, SMALL, TERMS, lk, rows);
+      t.each(0, rows, [&](int a) { Z[USED[m + a]] += SMALL[a]; });
+      for (int a = 0; a < rows; ++a) t.each(0, n, [&](int i) { SOLVED[i] += PIVOT[i] * SMALL[a] * V[a * ld + i]; });
+      Algebra::transposed_times(t, M, SOLVED, STEP, lq, 0, n);
+      t.each(0, n, [&](int j) { X[j] += STEP[j]; });
+      find_gradient();
+      if (is_last(before)) break;
+    }
+    return true;
+  }
+
+  // ---- roundoff of values and multipliers, as constraint_scales in solvers/qp/_problem.py: invariant to units
+  OSIK_METHOD void find_roundoff() {
+    t.columns(0, n, [&](auto c) {  // the Newton step of the cost, by the diagonal of its Hessian
+      auto total = c.load(GRADIENT);
+      for (int i = m; i < k; ++i) total.fma(Z[i], c.load(B + i * ld));
+      total *= c.load(INVERSE_ROOT);
+      c.store(STEP, total *= c.load(INVERSE_ROOT));
+    });
+    t.each(0, n, [&](int j) { TERMS[j] = 1; });
+    Real most = t.largest(X, ROOT, n), longest = t.largest(X, TERMS, n);
+    const Real newton_most = t.largest(STEP, ROOT, n);
+    if (most <= Real(ZERO_TOL) * EPS * newton_most) most = newton_most, longest = t.largest(STEP, TERMS, n);
+    t.each(0, N, [&](int i) {
+      Real reach = 0, unit = 1, per_root = 0, value;
+      if (i < n) per_root = INVERSE_ROOT[i], value = X[i];
+      else {
+        const Real* r = B + (m + i - n) * ld;
+        value = t.own_dot_on(r, X, 0, n), unit = 0;
+        for (int j = 0; j < n; ++j) unit += fabs(r[j]), per_root += fabs(r[j]) * INVERSE_ROOT[j];
+      }
+      reach = most * per_root < longest * unit ? most * per_root : longest * unit;
+      const Real low = fabs(lower[i]), high = fabs(upper[i]), nearest = low < high ? low : high;
+      const Real scale = reach + fabs(value) + (nearest < Real(INFINITE) ? nearest : Real(0));
+      VALUE[i] = value, VALUE_ROUNDOFF[i] = tolerance * scale;
+      if (i >= n) MULTIPLIER_ROUNDOFF[i] = tolerance * scale / square(larger(per_root, Team::SMALLEST_ROOT));
+    });
+    if (t.count(0, n, [&](int j) { return LABEL[j] != INACTIVE; })) find_bound_roundoff();
+  }
+  OSIK_METHOD void find_bound_roundoff() {  // of the multiplier of a variable on its bound: that of its gradient's terms
+    t.each(0, k, [&](int i) {
+      Real size = fabs(i < m ? TARGET[i] : Z[i]);
+      if (i < m)
+        for (int j = 0; j < n; ++j) size += fabs(B[i * ld + j] * X[j]);
+      TERMS[i] = size;
+    });
+    t.each(0, n, [&](int j) {
+      Real size = 0;
+      if (LABEL[j] != INACTIVE) {
+        size = DAMPING[j] * (fabs(X[j]) + fabs(CENTER[j]));
+        for (int i = 0; i < k; ++i) size += TERMS[i] * fabs(B[i * ld + j]);
+      }
+      MULTIPLIER_ROUNDOFF[j] = Real(BOUND_MULTIPLIER) * EPS * size;
+    });
+  }
+
+  // ---- labels
+  // what constraint i should be: active where violated, inactive where its multiplier has the wrong sign
+  OSIK_FN int right_label(int i) const {
+    const int label = LABEL[i];
+    if (label == EQUALITY) return EQUALITY;
+    if (label == INACTIVE) {
+      if (lower[i] == upper[i]) return EQUALITY;
+      if (VALUE[i] < lower[i] - VALUE_ROUNDOFF[i]) return AT_LOWER;
+      return VALUE[i] > upper[i] + VALUE_ROUNDOFF[i] ? AT_UPPER : INACTIVE;
+    }
+    const Real multiplier = i < n ? GRADIENT[i] : Z[m + i - n];
+    return -label * multiplier < -MULTIPLIER_ROUNDOFF[i] ? INACTIVE : label;
+  }
+  // whether an inactive constraint is violated that the active ones do not imply (NEXT: 1 for those that they do)
+  OSIK_FN bool leaves_out() const {
+    return t.count(0, N, [&](int i) { return LABEL[i] == INACTIVE && !NEXT[i] && right_label(i) != INACTIVE; }) > 0;
+  }
+
+  // ---- the search; returns whether there is a candidate
+  OSIK_METHOD bool search() {
+    int fewest = N + 1, lives = MAX_EXCHANGES;
+    while (true) {
+      const bool regular = solve_on_active_set();
+      if (regular) find_roundoff();
+      const int wrong = t.count(0, N, [&](int i) {
+        NEXT[i] = right_label(i);
+        return NEXT[i] != LABEL[i];
+      });
+      if (regular && wrong == 0) return true;
+      lives = wrong < fewest ? MAX_EXCHANGES : lives - 1;
+      fewest = wrong < fewest ? wrong : fewest;
+      if (!regular || lives < 0) return search_dual();
+      t.each(0, N, [&](int i) { LABEL[i] = NEXT[i]; });
+      changes += wrong;
+    }
+  }
+  // The dual method from the pinned variables alone. Its end, solved anew, may miss a bound: then it goes on.
+  OSIK_METHOD bool search_dual() {
+    t.each(0, N, [&](int i) { LABEL[i] = i < n && lower[i] == upper[i] ? EQUALITY : INACTIVE, NEXT[i] = 0; });
+    for (int times = 0;; ++times) {
+      if (!solve_on_active_set()) return false;
+      find_roundoff();
+      if (times > 0 && (times == MAX_DUAL_STARTS || !leaves_out())) break;
+      if (times == 0) dual.factor(B, ld, DAMPING, lower, upper, m);
+      const int steps = dual.run({B + m * ld, COMPLIANCE + m, lower, upper, VALUE_ROUNDOFF, X, Z + m, ld,
+                                  max_changes - changes},
+                                 LABEL, NEXT);
+      if (steps < 0) return false;
+      changes += steps;
+    }
+    t.each(0, N, [&](int i) { LABEL[i] = NEXT[i] ? REDUNDANT : LABEL[i]; });
+    return true;
+  }
+  OSIK_METHOD void solve(const Data& d, const Answer& to) {
+    begin(d);
+    first_labels(d.guess, LABEL);
+    const bool found = search();
+    if (!found) first_labels(d.guess, LABEL);
+    t.each(0, N, [&](int i) {
+      to.active[i] = LABEL[i];
+      if (i < n) to.x[i] = X[i];
+      else to.multipliers[i - n] = LABEL[i] == INACTIVE ? Real(0) : Z[m + i - n];
+    });
+    t.once([&] { to.report[0] = found, to.report[1] = changes, to.report[2] = factorizations; });
+  }
+};
+}  // namespace osik

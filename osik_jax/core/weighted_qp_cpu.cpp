@@ -1,0 +1,36 @@
+// XLA's call of the weighted QP on a CPU: one problem of a batch after another, in double precision.
+#include <utility>
+#include <vector>
+
+#include "weighted_qp.hpp"
+#include "xla.hpp"
+
+using namespace osik;
+
+namespace {
+// Arguments and results as in solvers/qp/_core.py; the second argument has all numbers of a problem but the matrix.
+void solve_weighted_qps(const xla::Call& call) {
+  using Method = WeightedQP<Serial<double>>;
+  const int batch = call.size(0, 0), m = call.size(0, 1), n = call.size(0, 2), N = call.size(2, 1), p = N - n;
+  const QPSizes s{m, n, p, call.in<int>(4)[0]};
+  std::vector<double> space(Method::doubles(s));
+  std::vector<int> labels(Method::integers(s));
+  Method method(s, space.data(), labels.data());
+  const double *matrix = call.in<double>(0), *packed = call.in<double>(1), *tolerance = call.in<double>(3);
+  const int* guess = call.in<int>(2);
+  QPAnswer<double> a{call.out<double>(0), call.out<double>(1), call.out<int>(2), call.out<int>(3)};
+  for (int k = 0; k < batch; ++k) {
+    QPData<double> d{matrix, packed};
+    const double* at = packed;
+    for (auto [field, count] : {std::pair{&d.target, m}, {&d.weight, m}, {&d.damping, n}, {&d.center, n}, {&d.rows, p * n},
+                                {&d.compliance, p}, {&d.lower, N}, {&d.upper, N}})
+      *field = at, at += count;
+    d.guess = guess, d.tolerance = tolerance[k];
+    method.solve(d, a);
+    matrix += size_t(m) * n, packed = at, guess += N;
+    a.x += n, a.multipliers += p, a.active += N, a.report += 3;
+  }
+}
+}  // namespace
+
+extern "C" void* osik_weighted_qp(xla::CallFrame* frame) { return xla::handle<solve_weighted_qps>(frame); }
