@@ -6,7 +6,7 @@ import re
 import pytest
 
 from osik_jax.retargeting import find_roles
-from osik_jax.retargeting._person import NEEDED
+from osik_jax.retargeting._roles import NEEDED
 
 LEGS_AND_ARMS = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 LEFT_RIGHT, CAPITAL, LETTER, SMALL = ("left", "right"), ("Left", "Right"), ("L", "R"), ("l", "r")

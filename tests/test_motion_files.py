@@ -21,6 +21,7 @@ from osik_jax.retargeting import (
     write_csv,
 )
 from osik_jax.retargeting._person import measure
+from osik_jax.retargeting._up import find_up
 
 _TO_Z_UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 
@@ -80,6 +81,83 @@ def test_the_up_axis_is_found_from_the_head(tmp_path):
     np.testing.assert_allclose(left - right, np.tile([0.0, 0.18, 0.0], (motion.frames, 1)), atol=1e-12)
 
 
+def turned(figure, up):
+    """A figure that is turned as a whole, its rest pose as it is: the skeleton stands on y, the motion on another."""
+    turn = Rotation.from_euler(*{"z": ("x", 90), "x": ("z", -90), "-y": ("x", 180)}[up], degrees=True)
+    local = Rotation.from_euler(figure.orders[0], figure.angles[:, 0], degrees=True)
+    angles = figure.angles.copy()
+    angles[:, 0] = (turn * local).as_euler("XYZ", degrees=True)
+    orders = ("XYZ", *figure.orders[1:])
+    return dataclasses.replace(figure, root=turn.apply(figure.root), angles=angles, orders=orders)
+
+
+@pytest.mark.parametrize("up", ["z", "x", "-y"])
+def test_the_up_axis_is_that_of_the_motion_where_the_skeleton_has_another(tmp_path, up):
+    upright = load_motion(write_bvh(tmp_path / "clip.bvh", dancer()))
+    with pytest.warns(OsikWarning, match=f"the person stands along {up} and not along y"):
+        motion = load_motion(write_bvh(tmp_path / "clip.bvh", turned(dancer(), up)))
+    heights = motion.positions[..., 2]
+    np.testing.assert_allclose(heights, upright.positions[..., 2], atol=1e-9)
+    beside, own = (m.positions - m.positions[:, :1] for m in (motion, upright))
+    heading = Rotation.align_vectors(beside.reshape(-1, 3), own.reshape(-1, 3))[0]
+    np.testing.assert_allclose(heading.apply([0.0, 0.0, 1.0]), [0.0, 0.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(beside.reshape(-1, 3), heading.apply(own.reshape(-1, 3)), atol=1e-9)
+    # the rest pose is upright, and rotations are counted from it
+    np.testing.assert_allclose(known(motion.rest_positions), known(upright.rest_positions), atol=1e-12)
+    for one, other in zip(known(motion.rotations)[5], known(upright.rotations)[5], strict=True):
+        one, other = (Rotation.from_quat(q, scalar_first=True) for q in (one, other))
+        np.testing.assert_allclose((heading * other).as_matrix(), one.as_matrix(), atol=1e-9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(load_motion(tmp_path / "clip.bvh", up=up).positions, motion.positions)
+        lying = load_motion(tmp_path / "clip.bvh", up="y")
+    assert np.ptp(lying.positions[0, :, 2]) < 1.0 or up == "-y"
+
+
+@pytest.mark.parametrize("up", ["y", "x", "-y"])
+@pytest.mark.parametrize("rest", [True, False])
+def test_keypoints_with_another_axis_up_are_turned_and_told(tmp_path, up, rest):
+    upright = load_motion(write_bvh(tmp_path / "clip.bvh", dancer()))
+    turns = {"y": "0 1 0 0 0 1 1 0 0", "x": "0 0 1 1 0 0 0 1 0", "-y": "0 -1 0 0 0 -1 1 0 0"}
+    turn = np.array(turns[up].split(), float).reshape(3, 3)
+    parts = dict(rest_positions=known(upright.rest_positions) @ np.transpose(turn)) if rest else {}
+    np.savez(
+        tmp_path / "clip.npz",
+        fps=30.0,
+        positions=upright.positions @ np.transpose(turn),
+        joint_names=np.array(upright.joint_names),
+        **parts,
+    )
+    with pytest.warns(OsikWarning, match=f"the person stands along {up} and not along z.*up='z' keeps z"):
+        motion = load_motion(tmp_path / "clip.npz")
+    np.testing.assert_allclose(motion.positions, upright.positions, atol=1e-12)
+    if rest:
+        np.testing.assert_allclose(known(motion.rest_positions), known(upright.rest_positions), atol=1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        kept = load_motion(tmp_path / "clip.npz", up="z")
+    with pytest.warns(OsikWarning, match=f"looks as if {up} did"):
+        measure(kept, find_roles(kept.joint_names))
+    with pytest.raises(ValueError, match="up is 'w'; it is one of x, y, z, -x"):
+        load_motion(tmp_path / "clip.npz", up="w")
+
+
+def test_a_person_who_lies_or_crawls_stays_down(tmp_path):
+    """On a floor at height 0; crawling along x the trunk points along x in all frames."""
+    standing = load_motion(write_bvh(tmp_path / "clip.bvh", dancer()))
+    down = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    positions = standing.positions @ down.T
+    positions += [0.5, 0.0, -positions[..., 2].min()]
+    still = HumanMotion("lying", 30.0, standing.joint_names, positions)
+    assert find_up(still, "z") == ("z", "x")  # it may stand along x as well
+    moving = dataclasses.replace(
+        still, positions=positions + np.linspace(0.0, 2.0, len(positions))[:, None, None] * [1, 0, 0]
+    )
+    assert find_up(moving, "z") == ("z", None)
+    with pytest.warns(OsikWarning, match="lying: z is taken to point up.*as if x did.*--up=x"):
+        measure(still, find_roles(still.joint_names))
+
+
 def test_a_skeleton_of_no_persons_size_asks_for_the_unit(tmp_path):
     path = write_bvh(tmp_path / "clip.bvh", dancer(), 5.0)
     with pytest.raises(ValueError, match="units large.*unit=METRES"):
@@ -132,6 +210,10 @@ BROKEN = {
     "two motions": (lambda t: t + t[t.index("MOTION") :], r"line 139: a frame is not numbers; the line is 'MOTION'"),
     "a page": (lambda t: "<!DOCTYPE html><html>404</html>", r"line 1: a BVH file starts with HIERARCHY"),
     "nothing": (lambda t: "", r"ends where HIERARCHY should come"),
+    "a huge frame": (lambda t: t[: t.rindex(" ")] + " 1e300\n", r"line 138: a frame has a number over 1e\+08"),
+    "a huge offset": (lambda t: t.replace("0.0 0.25 0.0", "0.0 -1e300 0.0"), r"line 8: OFFSET has a number over"),
+    "a huge rate": (lambda t: t.replace("Time: 0.033333333", "Time: 1e-300"), r"line 114: the frame time is 1e-300 s"),
+    "one line, a number less": (lambda t: " ".join(t.split()[:-1]), r"line 1: a frame has 1367 numbers.* 57"),
 }
 
 
@@ -144,6 +226,27 @@ def test_a_broken_bvh_says_which_line_and_what_is_wrong(tmp_path, which):
     path.write_text(broken)
     with pytest.raises(ValueError, match=message):
         read_bvh(path)
+
+
+def test_statements_of_a_bvh_may_stand_on_any_lines(tmp_path):
+    path = write_bvh(tmp_path / "clip.bvh", dancer())
+    text, whole = path.read_text().replace("JOINT Spine", "JOINT the end of the Spine"), read_bvh(path)
+    tree, motion = text.split("MOTION\n")
+    head, rows = motion.split("\n", 2)[:2], motion.split("\n", 2)[2]
+    spellings = {
+        "one line": text.replace("\n", " "),
+        "the tree on one line": " ".join(tree.split()) + "\nMOTION\n" + motion,
+        "braces without spaces": tree.replace("\n\t{\n", "{").replace("}\n", "}") + "MOTION\n" + motion,
+        "head on MOTION's line": tree + " ".join(["MOTION", *head]) + "\n" + rows,
+        "a number a line": tree + "MOTION\n" + "\n".join(head) + "\n" + rows.replace(" ", "\n"),
+        "numbers under OFFSET": text.replace("OFFSET ", "OFFSET\n"),
+        "a brace behind a name": text.replace("the Spine\n\t{", "the Spine {"),
+    }
+    for what, spelled in spellings.items():
+        path.write_text(spelled)
+        motion = read_bvh(path)
+        assert motion.joint_names[1] == "the end of the Spine", what
+        np.testing.assert_array_equal(motion.positions, whole.positions, what)
 
 
 def _written(path, **changes):
@@ -172,6 +275,10 @@ def test_keypoints_come_back(tmp_path):
         (dict(fps=None), "has no fps; it has positions, joint_names"),
         (dict(positions=np.zeros((4, 3, 3))), r"positions has shape \(4, 3, 3\), expected \(4, 2, 3\)"),
         (dict(positions=np.full((4, 2, 3), np.nan)), r"positions is not finite at \(0, 0, 0\)"),
+        (dict(positions=np.full((4, 2, 3), -1e300)), r"positions is -1e\+300 at \(0, 0, 0\); it is 1e\+06 m at most"),
+        (dict(rest_positions=np.full((2, 3), 1e7)), r"rest_positions is 1e\+07 at"),
+        (dict(fps=1e300), "fps is 1e\\+300; it is frames a second, more than 0 and 100000 at most"),
+        (dict(ground=1e300), "ground is 1e\\+300"),
         (dict(rotations=np.ones((4, 2, 4))), "of hip in frame 0 has length 2"),
         (dict(joint_names=["hip", "hip"]), "joint names occur twice: hip"),
         (dict(fps=0.0), "fps is 0.0"),
@@ -269,7 +376,7 @@ def test_files_that_are_not_there_and_options_that_do_not_go_with_them(tmp_path)
         load_motion(tmp_path / "clip.fbx")
     with pytest.raises(FileNotFoundError, match="no such file: .*clips"):
         load_motion(tmp_path / "clips")
-    with pytest.raises(ValueError, match="go with BVH files"):
+    with pytest.raises(ValueError, match="unit goes with BVH files"):
         load_motion(tmp_path / "clip.npz", unit="cm")
 
 

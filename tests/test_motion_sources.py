@@ -8,7 +8,8 @@ from motion_files import FIGURE, Figure, dancer, write_bvh
 from scipy.spatial.transform import Rotation
 
 from osik_jax.retargeting import HumanMotion, find_roles, load_motion
-from osik_jax.retargeting._person import NEEDED, read_person
+from osik_jax.retargeting._person import read_person
+from osik_jax.retargeting._roles import NEEDED
 
 NAMES = [name for name, _, _ in FIGURE]
 SAME = ("directions", "pelvis", "torso", "feet", "root", "contact")

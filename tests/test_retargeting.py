@@ -48,8 +48,10 @@ from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._fit import FitLoss, _Setting
 from osik_jax.retargeting._folder import _Lengths, retarget_folder
 from osik_jax.retargeting._guess import shrunk
-from osik_jax.retargeting._person import NEEDED, SIDES, read_person
+from osik_jax.retargeting._notes import notes
+from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._plan import _Clip, _improved, _State, make_plan
+from osik_jax.retargeting._roles import NEEDED, SIDES
 from osik_jax.retargeting._terms import Body, frame_rows
 
 FPS = 30.0
@@ -394,6 +396,28 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
         for path in [*out.glob("*.*")]:
             path.unlink()
         retarget_folder(Retargeter(nao), out, tmp_path / "none", progress=False)
+
+
+def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(nao, dance, danced, tmp_path, capsys):
+    assert report(danced)["notes"] == []
+    arguments = ["--acceleration", "0.5", "--no-animation", "--out", str(tmp_path / "out")]
+    assert cli.main(["retarget", str(dance), *arguments]) == 0
+    last = capsys.readouterr().out.strip().splitlines()[-1]
+    figures = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert figures["feet"]["slip_mm_max"] > 1.0
+    assert last == f"note: {figures['notes'][-1]}" and last.startswith("note: a bound gave way: ")
+    rare = dataclasses.replace(danced, contact=danced.contact & (np.arange(30) < 5)[:, None])
+    assert report(rare)["notes"][0].startswith("feet stand in 17 % of the frames")
+    whole = report(danced)
+    tipped = {**whole, "balance": {"com_margin_mm_min": -3.0}, "shapes": {"penetration_mm_max": 2.5}}
+    assert notes(tipped) == ["a bound gave way: shapes overlap by 2.5 mm"]
+    assert notes(tipped, 0.01)[1] == "a bound gave way: the centre of mass is 3.0 mm outside the feet"
+    many = tmp_path / "clips"
+    many.mkdir()
+    (many / "dance.bvh").write_bytes(dance.read_bytes())
+    assert cli.main(["retarget", str(many), *arguments[:-1], str(tmp_path / "all")]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "note: dance: a bound gave way: " in told
 
 
 def test_clips_share_a_longer_program_until_that_costs_more_than_compiling():

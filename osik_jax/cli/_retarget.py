@@ -30,7 +30,7 @@ _COLUMNS = {
     "accel.\n[rad/s²]": "acceleration_max",
     "off\n[deg]": "segment_angle_deg_mean",
 }
-_MOST_ROWS = 50
+_MOST_ROWS, _MOST_NOTES = 50, 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,8 +63,9 @@ class Retarget:
     """Where both feet stand, keep the centre of mass this far inside their edge [m]. Default: it is where it falls."""
     unit: str | None = None
     """Of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
-    up: Literal["x", "y", "z"] | None = None
-    """Of a BVH: the axis that points up. Default: found from the skeleton."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """The clip's axis that points up, as --up=y. Default: found from the motion; where that does not say, the axis of a
+    BVH's rest pose, and z of keypoints."""
     trim: bool = True
     """Of a BVH: leave out its rest pose, where it begins with one from which it jumps."""
     animation: bool = True
@@ -104,7 +105,7 @@ class Retarget:
             _, figures = retarget_to_folder(
                 retargeter, motion, self.out, mapping=mapping, fps=self.fps, animation=self.animation
             )
-        _print_retargeted(console, figures, self.out)
+        _print_retargeted(console, figures, self)
         return 0
 
 
@@ -170,6 +171,7 @@ def _retarget_folder(command: Retarget) -> int:
             trim=command.trim,
         )
     failed: dict[str, str] = summary["failed"]
+    noted = [f"{name}: {note}" for name, notes in summary["notes"].items() for note in notes]
     console = Console()
     if summary["clips"]:
         console.print(_table(summary))
@@ -180,6 +182,10 @@ def _retarget_folder(command: Retarget) -> int:
         highlight=False,
         soft_wrap=True,
     )
+    for note in noted[:_MOST_NOTES]:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    if len(noted) > _MOST_NOTES:
+        console.print(f"note: {len(noted) - _MOST_NOTES} more are in report.json")
     for name, reason in failed.items():
         print(f"osik: {name}: {reason}", file=sys.stderr)
     if failed:
@@ -249,18 +255,22 @@ def _retarget_live(command: Retarget) -> None:
         f"the robot is {waiting + np.median(spent):.0f} ms behind: {command.look_ahead} frames of look-ahead are "
         f"{waiting:.0f} ms, and computing took {np.median(spent):.1f} ms a frame ({spent.max():.1f} at most)"
     )
-    _print_retargeted(console, figures, command.out)
+    _print_retargeted(console, figures, command)
 
 
-def _print_retargeted(console: Console, figures: dict[str, Any], out: Path) -> None:
-    """What came of a clip."""
+def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarget) -> None:
+    """What came of a clip; last, what has to be known before it is used."""
+    from ..retargeting._notes import notes
+
     joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
     console.print(
         f"segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {feet['slip_mm_max']:.2f} mm, soles "
         f"{feet['float_mm_max']:.2f} mm above and {feet['below_floor_mm_max']:.2f} mm below the floor at most, "
         f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
     )
-    console.print(f"written to {out}: {', '.join(sorted(os.listdir(out)))}")
+    console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
+    for note in notes(figures, command.balance):
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _robot_to_retarget(source: str) -> Robot:

@@ -21,8 +21,9 @@ from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._contact import stretches
 from ._goals import Goals
-from ._person import LIMBS, SIDES, Person
+from ._person import Person
 from ._profile import Profile
+from ._roles import LIMBS, SIDES
 from ._terms import Bounds
 
 JOINTS_APART = 3

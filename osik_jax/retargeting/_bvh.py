@@ -9,27 +9,25 @@ from __future__ import annotations
 import codecs
 import dataclasses
 import os
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikKeyError, OsikValueError, warn
+from ._bvh_lines import Lines
 from ._motion import HumanMotion
 from ._rest_frames import rest_frames
 from ._rotations import about, continuous, multiply, rotate
+from ._up import UPS, Up, checked_up, find_up, named, standing_up
 
-Up = Literal["x", "y", "z"]
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "cmu": 0.0254 / 0.45}
 """Metres a unit. ``cmu``: that of the CMU database's skeletons."""
 _HEIGHTS = (1.0, 2.3)
-_SLOWEST = 1.0
+_SLOWEST, _FASTEST = 1.0, 1e-5
+"""Times from one frame to the next that are believed [s]."""
 _UPRIGHT = 0.6
 """How far the head is above the feet in a rest pose in which one stands, as a share of the way along the joints."""
-_AXES: tuple[Up, Up, Up] = ("x", "y", "z")
-_TO_Z_UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 _CHANNELS = {f"{axis}{kind}": (kind, axis.lower()) for axis in "XYZ" for kind in ("position", "rotation")}
 
 
@@ -42,42 +40,6 @@ class _Joint:
     offset: np.ndarray
     channels: tuple[tuple[str, str], ...] = ()
     is_end: bool = False
-
-
-class _Lines:
-    """The file's words line by line, and errors that say where they are."""
-
-    def __init__(self, path: str, text: str):
-        self.path = path
-        self._lines = [(number, words) for number, line in enumerate(text.splitlines(), 1) if (words := line.split())]
-        self._at = 0
-
-    def next(self, expected: str) -> list[str]:
-        if self._at == len(self._lines):
-            raise OsikValueError(f"{self.path} ends where {expected} should come")
-        self._at += 1
-        return self._lines[self._at - 1][1]
-
-    def error(self, what: str) -> ValueError:
-        """The error of the line that was read last."""
-        number, words = self._lines[max(self._at - 1, 0)] if self._lines else (1, [])
-        return OsikValueError(f"{self.path}, line {number}: {what}; the line is {' '.join(words)[:60]!r}")
-
-    def rest(self) -> Iterator[list[str]]:
-        while self._at < len(self._lines):
-            yield self.next("a frame")
-
-    def numbers(self, words: list[str], count: int, what: str) -> list[float]:
-        """Words of the last line as this many finite numbers."""
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            raise self.error(f"{what} is not numbers") from None
-        if len(values) != count:
-            raise self.error(f"{what} has {len(values)} numbers where there should be {count}")
-        if not np.isfinite(values).all():
-            raise self.error(f"{what} is not finite")
-        return values
 
 
 def read_bvh(
@@ -95,8 +57,9 @@ def read_bvh(
         unit: metres a unit, or ``"m"``, ``"cm"``, ``"mm"``, ``"inch"``, ``"cmu"``. None: the one of these in which
             the rest pose is between 1 and 2.3 m large; the way from a foot to the head along the joints, where nobody
             stands in that.
-        up: the file's axis that points up. None: the one along which the head is above the hips in the rest pose, above
-            the feet on the mean of all frames where nobody stands in that; y where no joint is called head.
+        up: the file's axis that points up, ``"x"``, ``"y"``, ``"z"``, or ``"-y"`` and so on. None: the one along which
+            the person stands in the motion; where the motion does not say, the one along which the rest pose stands,
+            else y. An ``OsikWarning`` says where the motion stands along another axis than the rest pose.
         trim: leave out frames at the start that are the rest pose and no motion, with an ``OsikWarning``: all joints
             turned as the root, within 30 degrees, and a jump after them, at more than 5 m/s and three times as far as
             in any other step.
@@ -106,30 +69,28 @@ def read_bvh(
         ValueError: the file is broken; the message says which line and what is wrong. Or the unit cannot be told.
         KeyError: no such unit.
     """
-    source = str(path)
-    lines = _Lines(source, _text(Path(path)))
+    source, up = str(path), checked_up(up)
+    lines = Lines(source, _text(Path(path)))
     joints = _hierarchy(lines)
     fps, values = _frames(lines, sum(len(joint.channels) for joint in joints))
     positions, rotations = _forward(joints, values)
-    rest = _rest(joints)
-    heads, feet = _named(joints, "head"), _named(joints, "foot", "ankle", "toe")
+    rest, names = _rest(joints), tuple(joint.name for joint in joints)
+    heads, feet = named(names, "head"), named(names, "foot", "ankle", "toe")
     way = _way(joints, heads[-1], feet[-1]) if heads and feet else 0.0
-    stands = _stands(rest[heads[-1]] - rest[feet].mean(0), way, up) if way else True
-    size = float(np.ptp(rest, axis=0).max()) if stands else way
-    if up is None:
-        places = rest if stands else positions.mean(0) - positions[:, feet].mean((0, 1))
-        up = _AXES[int(np.argmax(places[heads[-1]]))] if heads else "y"
-    scale, order = _scale(source, unit, size), list(_TO_Z_UP[up])
-    rotations = np.concatenate([rotations[..., :1], rotations[..., 1:][..., order]], -1)
+    rest_up = _axis_up(rest[heads[-1]] - rest[feet].mean(0), way) if way else None
+    stands = rest_up is not None or not way
+    scale = _scale(source, unit, float(np.ptp(rest, axis=0).max()) if stands else way)
     kept = [i for i, joint in enumerate(joints) if not joint.is_end or joint.offset.any()]
     motion = HumanMotion(
         name=Path(path).stem,
         fps=fps,
-        joint_names=tuple(joints[i].name for i in kept),
-        positions=scale * positions[:, kept][..., order],
+        joint_names=tuple(names[i] for i in kept),
+        positions=scale * positions[:, kept],
         rotations=continuous(rotations[:, kept]),
-        rest_positions=scale * rest[kept][:, order] if stands else None,
+        rest_positions=scale * rest[kept] if stands else None,
     )
+    expected = rest_up or find_up(motion, "y")[0]
+    motion = standing_up(source, motion, up, expected, rest_up)
     count = rest_frames(motion) if trim else 0
     if not count:
         return motion
@@ -149,7 +110,7 @@ def _text(path: Path) -> str:
     return content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
 
 
-def _hierarchy(lines: _Lines) -> list[_Joint]:
+def _hierarchy(lines: Lines) -> list[_Joint]:
     if lines.next("HIERARCHY")[0].upper() != "HIERARCHY":
         raise lines.error("a BVH file starts with HIERARCHY")
     joints: list[_Joint] = []
@@ -182,7 +143,7 @@ def _hierarchy(lines: _Lines) -> list[_Joint]:
             raise lines.error(f"{words[0]} is not expected here")
 
 
-def _check_place(lines: _Lines, word: str, joints: list[_Joint], open_joints: list[int]) -> None:
+def _check_place(lines: Lines, word: str, joints: list[_Joint], open_joints: list[int]) -> None:
     """Whether a joint may start here: one ROOT first, all others inside it, and none inside an End Site."""
     if (word == "ROOT") == bool(joints) or (word == "ROOT") == bool(open_joints):
         raise lines.error("a skeleton is one ROOT, and every JOINT and End Site is inside it")
@@ -190,24 +151,24 @@ def _check_place(lines: _Lines, word: str, joints: list[_Joint], open_joints: li
         raise lines.error("nothing is inside an End Site but its OFFSET")
 
 
-def _joint(lines: _Lines, words: list[str], joints: list[_Joint], parent: int) -> int:
+def _joint(lines: Lines, words: list[str], joints: list[_Joint], parent: int) -> int:
     """Adds a joint whose first line was read, up to its opening brace; its place."""
     if words[0].upper() == "END":
         name = f"{joints[parent].name}_end"
         name = name if all(joint.name != name for joint in joints) else f"{name}_{len(joints)}"
     else:
-        name = " ".join(words[1:]).removesuffix("{").strip()
+        name = " ".join(words[1:])
     if not name:
         raise lines.error(f"{words[0]} has no name")
     if any(joint.name == name for joint in joints):
         raise lines.error(f"a second joint is called {name}")
-    if words[-1] != "{" and lines.next("{") != ["{"]:
+    if lines.next("{") != ["{"]:
         raise lines.error(f"{{ should follow {name}")
     joints.append(_Joint(name, parent, np.full(3, np.nan), is_end=words[0].upper() == "END"))
     return len(joints) - 1
 
 
-def _channels(lines: _Lines, words: list[str]) -> tuple[tuple[str, str], ...]:
+def _channels(lines: Lines, words: list[str]) -> tuple[tuple[str, str], ...]:
     if len(words) < 2 or not words[1].isdigit() or int(words[1]) != len(words) - 2:
         raise lines.error("CHANNELS is followed by how many there are, and by their names")
     known = {name.lower(): value for name, value in _CHANNELS.items()}
@@ -219,7 +180,7 @@ def _channels(lines: _Lines, words: list[str]) -> tuple[tuple[str, str], ...]:
     return tuple(known[name.lower()] for name in words[2:])
 
 
-def _frames(lines: _Lines, channels: int) -> tuple[float, Float[np.ndarray, "F C"]]:
+def _frames(lines: Lines, channels: int) -> tuple[float, Float[np.ndarray, "F C"]]:
     words = lines.next("Frames:")
     if words[0].lower() not in ("frames:", "frames") or not words[-1].isdigit():
         raise lines.error("Frames: and their number should follow MOTION")
@@ -232,6 +193,9 @@ def _frames(lines: _Lines, channels: int) -> tuple[float, Float[np.ndarray, "F C
         raise lines.error("the frame time has to be more than 0 s")
     if step > _SLOWEST:
         raise lines.error("the frame time is in seconds, and from one frame to the next it is less than one")
+    if step < _FASTEST:
+        raise lines.error(f"the frame time is {step:g} s; it is {_FASTEST:g} s at least")
+    lines.rewrap(channels, count)
     rows = [lines.numbers(words, channels, "a frame") for words in lines.rest()]
     if len(rows) != count or not rows:
         raise lines.error(f"the file says Frames: {count}, and has {len(rows)}")
@@ -270,15 +234,15 @@ def _forward(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.n
     return positions, rotations
 
 
-def _named(joints: list[_Joint], *words: str) -> list[int]:
-    """The joints with one of some words in their names."""
-    return [i for i, joint in enumerate(joints) if any(word in joint.name.lower() for word in words)]
+def _axis_up(feet_to_head: Float[np.ndarray, "3"], way: float) -> Up | None:
+    """Return the axis along which somebody stands in the rest pose: the head is above the feet by most of the way.
 
-
-def _stands(feet_to_head: Float[np.ndarray, "3"], way: float, up: Up | None) -> bool:
-    """Whether somebody stands in the rest pose: the head is above the feet by most of the way along the joints."""
-    above = feet_to_head.max() if up is None else feet_to_head[_AXES.index(up)]
-    return bool(above > _UPRIGHT * way)
+    Args:
+        feet_to_head: in the rest pose. (3,)
+        way: length of the way along the joints.
+    """
+    above = np.concatenate([feet_to_head, -feet_to_head])
+    return UPS[int(np.argmax(above))] if above.max() > _UPRIGHT * way else None
 
 
 def _way(joints: list[_Joint], a: int, b: int) -> float:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from ..robot import Robot
-from ._bvh import Up
 from ._film import film
 from ._fit import Fit, fit
 from ._load import clips_in, load_clip
@@ -19,6 +18,7 @@ from ._report import report
 from ._retarget import Retargeter
 from ._retargeted import Retargeted
 from ._robot_motion import write_csv
+from ._up import Up
 
 _HELD_OUT = 4
 """One clip in so many has a say in which step of a fit is taken, and none in the steps."""

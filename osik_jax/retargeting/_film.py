@@ -12,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from ._person import LIMBS
 from ._retargeted import Retargeted
+from ._roles import LIMBS
 
 _TRUNK = (
     ("left_hip", "right_hip"),

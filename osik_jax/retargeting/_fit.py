@@ -22,10 +22,10 @@ from ._goals import Goals, Weights
 from ._lanes import padded
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION
-from ._person import LIMBS
 from ._plan import at_solution, make_plan, mend_plan
 from ._profile import Profile
 from ._retarget import Retargeter, checked_by_name
+from ._roles import LIMBS
 from ._terms import Body, Bounds, frame_rows
 
 TUNED = ("pelvis", "torso", "root", "foot", "posture", "smooth", "smooth_base")

@@ -17,7 +17,6 @@ from ..execution._workers import cores
 from ..scaling._fingerprint import differences, fingerprint, identifier
 from ..scaling._lock import only_job
 from ..scaling._progress import Progress, reported
-from ._bvh import Up
 from ._command import write_json, write_motion
 from ._lanes import Clip, one_a_core, shared_length
 from ._load import clips_in, load_clip
@@ -25,6 +24,7 @@ from ._motion import HumanMotion
 from ._profile_file import profile_text, save_profile
 from ._report import report
 from ._retarget import Retargeter
+from ._up import Up
 
 FIGURES = {
     "off_plan_rad": ("off_plan_rad",),
@@ -73,14 +73,14 @@ def retarget_folder(
         mapping: as of ``Retargeter.retarget``, the same for all.
         fps: as of ``Retargeter.retarget``, the same for all.
         unit: of the BVH files among them, as of ``load_motion``.
-        up: of the BVH files among them, as of ``load_motion``.
+        up: of all files, as of ``load_motion``.
         trim: of the BVH files among them, as of ``load_motion``.
         chunk: clips that a GPU works on at once; on a CPU each core works on one.
         progress: whether to show a bar; or a function of the number of clips that are done and of all.
 
     Returns:
         the summary: ``clips`` (how many are finished), ``frames``, ``worst`` (the largest value of each figure),
-        ``failed`` (error by clip) and ``figures`` (by clip).
+        ``failed`` (error by clip), ``notes`` (what ``report`` says in words, by clip) and ``figures`` (by clip).
 
     Raises:
         ValueError: no clips in the folder, or ``out`` has another job in it; the message says what differs.
@@ -246,6 +246,7 @@ def _summary(found: Mapping[str, dict[str, Any]], failed: Mapping[str, str], ord
         "frames": sum(row["frames"] for row in rows.values()),
         "worst": {key: max(values) for key, values in seen.items() if values},
         "failed": {name: failed[name] for name in order if name in failed},
+        "notes": {name: own["notes"] for name, own in figures.items() if own.get("notes")},
         "figures": rows,
     }
 

@@ -18,8 +18,8 @@ from ..robot._feet import find_feet
 from ._body import JOINTS_APART, joints_between
 from ._facing import by_name, facing_x
 from ._limbs import ORIGIN, Chain, find_arm, find_chains, find_leg
-from ._person import SIDES
 from ._profile import Capsule, Foot, Place, Point, Profile
+from ._roles import SIDES
 
 _FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
 _LEG_RADIUS, _ARM_RADIUS, _TRUNK_RADIUS = 0.18, 0.18, 0.3

@@ -11,13 +11,14 @@ import numpy as np
 
 from .._errors import OsikValueError
 from .._npz import open_npz
-from ._motion import CONTACT_POINTS, HumanMotion
+from ._motion import CONTACT_POINTS, LARGEST, HumanMotion
 from ._rotations import continuous
+from ._up import Up, checked_up, find_rest_up, standing_up
 
 _AXES = ("x", "y", "z")
 
 
-def read_keypoints(path: str | os.PathLike[str]) -> HumanMotion:
+def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> HumanMotion:
     """Reads ``.npz`` or ``.csv`` keypoints, in metres, z up.
 
     ``.npz``: ``fps``, ``positions`` (F, J, 3), ``joint_names`` (J,); optional ``rotations`` (F, J, 4; w x y z),
@@ -27,11 +28,18 @@ def read_keypoints(path: str | os.PathLike[str]) -> HumanMotion:
     ``.csv``: a line of headings, ``time`` and ``NAME.x``, ``NAME.y``, ``NAME.z`` of each joint, optionally
     ``contact.left_heel`` and so on (0 or 1); then a line for each frame, at a constant rate.
 
+    Args:
+        path: the file.
+        up: the axis that points up, ``"x"``, ``"y"``, ``"z"``, or ``"-y"`` and so on. None: z, unless the motion stands
+            along another axis, which an ``OsikWarning`` says.
+
     Raises:
         FileNotFoundError: no such file.
         ValueError: the file is broken; the message says which array, or which line and column, and what is wrong.
     """
-    return _from_csv(Path(path)) if str(path).lower().endswith(".csv") else _from_npz(Path(path))
+    up, source = checked_up(up), Path(path)
+    motion = _from_csv(source) if str(path).lower().endswith(".csv") else _from_npz(source)
+    return standing_up(str(path), motion, up, "z", find_rest_up(motion))
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -144,8 +152,10 @@ def _row(path: Path, number: int, row: list[str], headings: list[str]) -> list[f
             value = float(text)
         except ValueError:
             value = np.nan
-        if not np.isfinite(value):
-            raise OsikValueError(f"{path}, line {number}, column {heading}: {text!r} is no finite number")
+        if not abs(value) <= LARGEST:
+            raise OsikValueError(
+                f"{path}, line {number}, column {heading}: {text!r} is no finite number up to {LARGEST:g}"
+            )
         out.append(value)
     return out
 

@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 
 from .._errors import OsikValueError
-from ._bvh import Up, read_bvh
+from ._bvh import read_bvh
 from ._keypoints import read_keypoints
 from ._motion import HumanMotion
+from ._up import Up
 
 ENDINGS = (".bvh", ".npz", ".csv")
 
@@ -21,13 +22,13 @@ def load_motion(
     Args:
         path: the file.
         unit: of a BVH, see ``read_bvh``.
-        up: of a BVH, see ``read_bvh``.
+        up: the file's axis that points up, see ``read_bvh`` and ``read_keypoints``. None: found from the motion.
         trim: of a BVH, see ``read_bvh``.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: another ending, ``unit`` or ``up`` with keypoints (they are metres, z up), or a broken file: the
-            message says where, and what is wrong.
+        ValueError: another ending, ``unit`` with keypoints (they are metres), or a broken file: the message says where,
+            and what is wrong.
         KeyError: no such unit.
     """
     ending = Path(path).suffix.lower()
@@ -37,15 +38,14 @@ def load_motion(
         if not ending and not Path(path).exists():  # perhaps a folder's name with a letter wrong
             raise FileNotFoundError(f"no such file: {path}")
         raise OsikValueError(f"{path} is none of .bvh, .npz and .csv")
-    if unit is not None or up is not None:
-        raise OsikValueError("unit and up go with BVH files; keypoints are metres, z up")
-    return read_keypoints(path)
+    if unit is not None:
+        raise OsikValueError("unit goes with BVH files; keypoints are metres")
+    return read_keypoints(path, up=up)
 
 
 def load_clip(path: Path, unit: str | float | None, up: Up | None, trim: bool) -> HumanMotion:
-    """A clip; unit and axis go with BVH files alone."""
-    bvh = path.suffix.lower() == ".bvh"
-    return load_motion(path, unit=unit if bvh else None, up=up if bvh else None, trim=trim)
+    """A clip; the unit goes with BVH files alone."""
+    return load_motion(path, unit=unit if path.suffix.lower() == ".bvh" else None, up=up, trim=trim)
 
 
 def clips_in(folder: Path) -> dict[str, Path]:

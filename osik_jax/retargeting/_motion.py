@@ -13,6 +13,10 @@ from ._rotations import continuous, slerp
 CONTACT_POINTS = ("left_heel", "left_toe", "right_heel", "right_toe")
 """The columns of ``HumanMotion.contact``."""
 _UNIT = 1e-3
+LARGEST = 1e6
+"""Coordinates that are believed [m]."""
+_FASTEST = 1e5
+"""Frames a second that are believed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,8 +34,8 @@ class HumanMotion:
         ground: height of the floor [m]; None: to be found.
 
     Raises:
-        ValueError: shapes that do not agree, numbers that are not finite, quaternions that are not of unit length,
-            a name that occurs twice, or a rate that is not positive.
+        ValueError: shapes that do not agree, numbers that are not finite or over 1e6 m, quaternions that are not of
+            unit length, a name that occurs twice, or a rate that is not positive.
     """
 
     name: str
@@ -45,8 +49,8 @@ class HumanMotion:
 
     def __post_init__(self) -> None:
         frames, joints = len(self.positions), len(self.joint_names)
-        if not (np.isfinite(self.fps) and self.fps > 0.0):
-            raise OsikValueError(f"fps is {self.fps}; it is frames a second, more than 0")
+        if not 0.0 < self.fps <= _FASTEST:
+            raise OsikValueError(f"fps is {self.fps}; it is frames a second, more than 0 and {_FASTEST:g} at most")
         repeated = sorted({name for name in self.joint_names if self.joint_names.count(name) > 1})
         if repeated:
             raise OsikValueError(f"joint names occur twice: {', '.join(repeated)}")
@@ -59,7 +63,7 @@ class HumanMotion:
             raise OsikValueError(
                 f"contact has shape {np.shape(self.contact)}, expected {(frames, 4)}: {CONTACT_POINTS}"
             )
-        if self.ground is not None and not np.isfinite(self.ground):
+        if self.ground is not None and not abs(self.ground) <= LARGEST:
             raise OsikValueError(f"ground is {self.ground}; it is a height in metres")
         if self.rotations is not None:
             length = np.linalg.norm(self.rotations, axis=-1)
@@ -130,3 +134,7 @@ def _check_array(name: str, value: np.ndarray | None, shape: tuple[int, ...]) ->
     wrong = ~np.isfinite(value)
     if wrong.any():
         raise OsikValueError(f"{name} is not finite at {tuple(np.argwhere(wrong)[0].tolist())}")
+    far = np.abs(value) > LARGEST
+    if far.any():
+        at = np.argwhere(far)[0]
+        raise OsikValueError(f"{name} is {value[tuple(at)]:g} at {tuple(at.tolist())}; it is {LARGEST:g} m at most")

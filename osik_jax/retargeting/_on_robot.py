@@ -12,9 +12,9 @@ from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._body import Build, pairs_apart
 from ._facing import facing_x
-from ._person import SIDES
 from ._profile import Profile
 from ._profile_file import check_profile, find_profile
+from ._roles import SIDES
 from ._terms import Body, Bounds
 
 ACCELERATION = 240.0

@@ -8,26 +8,13 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._errors import OsikValueError
+from .._errors import OsikValueError, warn
 from ._contact import find_contact, find_noise
 from ._floor import Floor, find_floor
 from ._motion import CONTACT_POINTS, HumanMotion
+from ._roles import LIMBS, SIDES
+from ._up import find_up
 
-LIMBS = (
-    ("left_hip", "left_knee"),
-    ("left_knee", "left_ankle"),
-    ("right_hip", "right_knee"),
-    ("right_knee", "right_ankle"),
-    ("left_shoulder", "left_elbow"),
-    ("left_elbow", "left_wrist"),
-    ("right_shoulder", "right_elbow"),
-    ("right_elbow", "right_wrist"),
-)
-"""The segments whose directions are followed: from the first role to the second."""
-SIDES = ("left", "right")
-NEEDED = tuple(dict.fromkeys(role for limb in LIMBS for role in limb))
-"""Roles that every person has."""
-OPTIONAL = ("pelvis", "chest", "neck", "head", "left_heel", "left_toe", "right_heel", "right_toe")
 _SHORTEST = 1e-9
 _SPINE = 1e-3
 _TOE, _SOLE, _HEEL = 0.35, 0.12, 0.3
@@ -119,10 +106,19 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
         motion: the clip.
         roles: of each of a person's joints, what the clip calls it (``find_roles``).
 
+    An ``OsikWarning`` says where the motion does not look as if z were up.
+
     Raises:
         ValueError: legs of a length that nobody's have: the clip is not in metres.
     """
     points = {role: motion.track(name) for role, name in roles.items()}
+    up, other = find_up(motion, "z", roles)
+    other = up if up != "z" else other
+    if other is not None:
+        warn(
+            f"{motion.name}: z is taken to point up, and the motion looks as if {other} did; "
+            f"load_motion(path, up={other!r}) and --up={other} turn {other} up"
+        )
     straight, flat = None, {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
     if motion.rest_positions is not None:
         at = {role: motion.joint_names.index(name) for role, name in roles.items()}

@@ -17,7 +17,7 @@ from ..numerics._dense import product
 from ..robot._joint_selection import scalar_layout
 from ._balance import mass_fractions
 from ._goals import Goals, Weights
-from ._person import LIMBS
+from ._roles import LIMBS
 from ._terms import CLEARANCE, PAIRS, SHORTEST, SWINGING, Body, Bounds
 
 _HIPS = ("left_hip", "right_hip")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from .._errors import OsikValueError
 from ._goals import Weights
-from ._person import NEEDED, SIDES
+from ._roles import NEEDED, SIDES
 
 Point = tuple[float, float, float]
 Place = tuple[str, Point]

@@ -16,8 +16,8 @@ from .._errors import OsikValueError, unknown_name
 from ..robot import Robot
 from ._goals import Weights
 from ._guess import guess_profile
-from ._person import SIDES
 from ._profile import Capsule, Foot, Place, Point, Profile
+from ._roles import SIDES
 
 BUNDLED = ("nao", "g1", "talos")
 

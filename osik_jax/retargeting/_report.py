@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float
 from ..physics._world import frame_pose
 from ..tasks._polygon import hull
 from ._body import JOINTS_APART, joints_between
-from ._person import LIMBS, SIDES
+from ._notes import notes
 from ._profile import Profile
 from ._retargeted import Retargeted
+from ._roles import LIMBS, SIDES
 
 JUMP = 15.0
 """A change of joint speed from one frame to the next that counts as a jump [rad/s]."""
@@ -36,9 +37,10 @@ def report(result: Retargeted) -> dict[str, Any]:
     ``shapes``: how deep the profile's capsules are in each other.
     ``tracking``: keypoints against the person's, limb by limb, with the scale that fits each limb best; and the angle
     between the person's segments and the robot's.
+    ``notes``: sentences on bounds that gave way, and on feet that stand in less than 20 % of the frames.
     """
     places = _places(result)
-    return {
+    figures = {
         "frames": len(result.q),
         "fps": result.motion.fps,
         "iterations": result.iterations,
@@ -49,6 +51,7 @@ def report(result: Retargeted) -> dict[str, Any]:
         "shapes": {"penetration_mm_max": _penetration(result, places["capsules"])},
         "tracking": _tracking(result, places["keypoints"]),
     }
+    return {**figures, "notes": notes(figures)}
 
 
 def _places(result: Retargeted) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
 
 from .._errors import OsikValueError, unknown_name
-from ._person import NEEDED, OPTIONAL, SIDES
+from ._roles import NEEDED, OPTIONAL, SIDES
 
 ROLES = (*NEEDED, *OPTIONAL)
 """A person's joints and points, as retargeting calls them."""

@@ -21,8 +21,8 @@ from ..robot._joint_selection import scalar_layout
 from ..tasks._rotation import dot, rotation_log
 from ._balance import mass_fractions, overhang
 from ._goals import Goals, Weights
-from ._person import LIMBS
 from ._profile import Place, Profile
+from ._roles import LIMBS
 
 SHORTEST = 1e-6
 PAIRS = 12
