@@ -31,7 +31,7 @@ def library_path(level: str) -> Path:
 
 def sources() -> list[Path]:
     """Return the C++ files that make the library."""
-    return sorted([*FOLDER.glob("*.hpp"), *FOLDER.glob("*_cpu.cpp")])
+    return sorted([*FOLDER.glob("*.hpp"), *FOLDER.glob("*.cpp")])
 
 
 def fingerprint() -> str:

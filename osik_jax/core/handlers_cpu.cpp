@@ -39,6 +39,13 @@ void solve_hierarchies(const xla::Call& call) {
 extern "C" {
 void* osik_hierarchy(xla::CallFrame* frame) { return xla::handle<solve_hierarchies>(frame); }
 
+// Bytes of shared memory that a warp needs for one problem, a multiple of 16.
+int osik_hierarchy_bytes(int L, int m, int n, int h) {
+  const Sizes s{L, m, n, h, 0, nullptr, nullptr, nullptr};
+  using Method = Hierarchy<WarpSizes>;
+  return (8 * Method::doubles(s) + int(sizeof(Method::Int)) * Method::integers(s) + 15) / 16 * 16;
+}
+
 // The sources that this library was built from (_build.py), so that another state of them is noticed.
 const char* osik_sources() { return OSIK_SOURCES; }
 

@@ -175,11 +175,18 @@ template <class Team> struct Hierarchy {
   OSIK_METHOD void factor_level_rows() {
     ++factorizations;
     rows_in_basis(first_free);
-    rank = Algebra::pivoted_qr(t, R, V, WORK, SCALE, PIVOT, ld, lm, rows, first_free, n, rank_tol * longest);
+    // With damping the step has a curvature in every direction: it uses all pivots above roundoff. A row that is left
+    // out of the step stays in the gradient, and the two would contradict each other where a bound is released.
+    const double least = (damping > 0.0 ? DAMPED_RANK : rank_tol) * longest;
+    rank = Algebra::pivoted_qr(t, R, V, WORK, SCALE, PIVOT, ld, lm, rows, first_free, n, least);
     if (damping > 0.0) {
       gram(rank, first_free, true);
       cholesky(rank, damping + FACTOR_RIDGE * longest * longest, true);
     }
+  }
+  // The number of pivots above the rank tolerance: the rows that the level determines for the levels below.
+  OSIK_FN int determined_rank() const {
+    return t.count(0, rank, [&](int k) { return fabs(R[k * ld + PIVOT[k]]) > rank_tol * longest; });
   }
   // Move the columns that the level determines in front of the free columns, for the levels below.
   OSIK_METHOD void freeze_columns() {
@@ -298,8 +305,8 @@ template <class Team> struct Hierarchy {
     root_cost = sqrt(t.dot(SLACK, SLACK, 0, rows) + damping * t.dot(X, X, 0, n));
   }
   OSIK_FN static int usable_side(int side, double lower, double upper) {
-    if (side < 0 && std::isfinite(lower)) return -1;
-    return side > 0 && std::isfinite(upper) ? 1 : 0;
+    if (side < 0 && is_finite(lower)) return -1;
+    return side > 0 && is_finite(upper) ? 1 : 0;
   }
   struct Improvement {
     bool feasible, consistent, signs;
@@ -340,7 +347,7 @@ template <class Team> struct Hierarchy {
     bool feasible = false;
     for (int attempt = 0; attempt < MAX_ATTEMPTS; ++attempt) {
       solve_on_working_set();
-      if (!std::isfinite(x_max)) {
+      if (!is_finite(x_max)) {
         feasible = false;
         break;
       }
@@ -377,7 +384,7 @@ template <class Team> struct Hierarchy {
     auto knot = [&](int e) {
       const int a = e / 2;
       const double bound = e % 2 ? UPPER[a] : LOWER[a];
-      if (e == 2 * rows || RATE[a] == 0.0 || !std::isfinite(bound)) return 1.0;
+      if (e == 2 * rows || RATE[a] == 0.0 || !is_finite(bound)) return 1.0;
       return larger(0.0, (bound - VALUE[a]) / RATE[a]);
     };
     const double before = t.most(0.0, 0, 2 * rows + 1, [&](int e, double so_far) {
@@ -388,14 +395,14 @@ template <class Team> struct Hierarchy {
       const double s = knot(e);
       return s > before ? -s : -INFINITE;
     });
-    const double probe = std::isfinite(after) ? 0.5 * (before + after) : before + 1.0;
+    const double probe = is_finite(after) ? 0.5 * (before + after) : before + 1.0;
     const double first = line_derivative(before, damping_x, damping_d);
     const double second = line_derivative(probe, damping_x, damping_d);
     return second > first ? larger(0.0, before - first * (probe - before) / (second - first)) : before;
   }
   OSIK_METHOD bool primal_active_set(bool factored) {
     int stalled = 0;
-    bool weak_tried = false, active_changed = !factored, unfactored = !factored;
+    bool weak_tried = false, active_changed = !factored, unfactored = !factored, stays = false;
     for (int iteration = 0; iteration < size.max_iterations; ++iteration) {
       evaluate();
       if (active_changed) factor_active_rows();
@@ -411,8 +418,10 @@ template <class Team> struct Hierarchy {
       const double square = t.sum(0, rows, [&](int a) { return IN_COST[a] ? RATE[a] * RATE[a] : 0.0; });
       const double step_square = t.dot(STEP, STEP, 0, n);
       const double damping_x = damping * t.dot(X, STEP, 0, n), damping_d = damping * step_square;
+      // a step that is roundoff is no descent direction, and the line search would stay where it is
+      const bool descends = t.dot(RATE, SLACK, 0, rows) + damping_x < 0.0;
       bool weak = false;
-      if (sqrt(square + damping_d) <= step_tol * (longest * x_max + root_cost)) {
+      if (stays || !descends || sqrt(square + damping_d) <= step_tol * (longest * x_max + root_cost)) {
         multipliers();
         weak = !weak_tried && !is_stationary();
         if (!weak) {
@@ -424,7 +433,7 @@ template <class Team> struct Hierarchy {
           });
           if (b.which < 0) return true;
           t.once([&] { ACTIVE[b.which] = 0; });
-          active_changed = true, ++changes;
+          active_changed = true, stays = false, ++changes;
           continue;
         }
         weak_tried = true;
@@ -452,6 +461,7 @@ template <class Team> struct Hierarchy {
       }
       t.axpy(X, length, STEP, 0, n);
       stalled = moved > 0.0 ? 0 : stalled + 1;
+      stays = !blocked && moved <= EPSILON * x_max;  // a row at its bound to roundoff holds the line search up
     }
     return false;
   }
@@ -577,12 +587,13 @@ template <class Team> struct Hierarchy {
       to.active[hard_at + q] = ACTIVE[q], to.multipliers[hard_at + q] = MULTIPLIER[q];
       return FREEZES[q] != (ACTIVE[q] != 0);
     });
-    const int before = rank;
+    const int before = determined_rank();
     if (!(same_cost && all_freeze)) {  // the level's own factors serve where they have just the rows that are frozen
       t.each(0, h, [&](int q) { ACTIVE[q] = FREEZES[q] ? ACTIVE[q] : 0; });
       factor_active_rows();
       factor_level_rows();
     }
+    rank = determined_rank();
     const bool tie = same_cost && rank != before && damping == 0.0;
     t.each(0, h, [&](int q) {
       const int active = to.active[hard_at + q];

@@ -15,8 +15,6 @@ constexpr int VECTOR_BYTES = 32;
 constexpr int VECTOR_BYTES = 16;
 #endif
 
-constexpr double INFINITE = __builtin_huge_val();
-
 template <class Real> struct Vector {
   static constexpr int LANES = VECTOR_BYTES / int(sizeof(Real));
   typedef Real Loaded __attribute__((vector_size(VECTOR_BYTES), aligned(sizeof(Real)), may_alias));

@@ -36,6 +36,20 @@ template <class Real> struct Best {
   int which;  // -1 where no value is larger than the start
 };
 
+// How a warp lays out its workspace. The host uses it to compute the size of one.
+struct WarpSizes {
+  using Int = short;
+  static constexpr bool COPIES = false;  // rows are read from global memory
+  static constexpr OSIK_HOST int stride(int n) { return n | 1; }  // odd: threads read different banks of memory
+  static constexpr OSIK_HOST int variables(int n) { return n; }
+  static constexpr OSIK_HOST int level_rows(int m) { return m; }
+  static constexpr OSIK_HOST int hard_rows(int h) { return h; }
+};
+
+constexpr double LARGEST_DOUBLE = 1.7976931348623157e308, INFINITE = __builtin_bit_cast(double, 0x7ff0000000000000ull);
+
+OSIK_FN bool is_finite(double a) { return a >= -LARGEST_DOUBLE && a <= LARGEST_DOUBLE; }  // false for NaN
+
 }  // namespace osik
 
 #ifdef __CUDACC__

@@ -43,7 +43,7 @@ from ..core import _library
 Backend = Literal["auto", "jax", "core", "numba", "warp"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
 
-_PLATFORM = {"core": "cpu", "numba": "cpu", "warp": "cuda"}
+_PLATFORM = {"core": "cpu", "core-cuda": "cuda", "numba": "cpu", "warp": "cuda"}
 CPU_KERNELS = {name for name, platform in _PLATFORM.items() if platform == "cpu"}
 _MISSING = {
     "numba": "backend='numba' needs Numba: pip install 'osik-jax[numba]'",
@@ -106,6 +106,8 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
     """
     if backend == "numba" and kernel == "core":  # while other methods are Numba's
         return fits and _library.installed()
+    if kernel == "core-cuda":
+        return backend in ("auto", "core") and fits and cuda_is_default()
     if backend == kernel:
         check_backend(backend)
         if not fits:

@@ -112,8 +112,9 @@ The latter is smaller: such a multiplier says that the active set is not right, 
 the curvature is that the rows leave."""
 GRADIENT_TOL = 4.0
 """In units of machine epsilon times the gradient's terms: how large a certified gradient of a free variable may be."""
-BOX_TOLERANCE = 1e3
-"""In units of the feasibility tolerance: how far a candidate may be outside its box (the answer is clipped into it)."""
+BOX_TOLERANCE = 10.0
+"""In units of the rank tolerance: how far a candidate may be outside its box, into which it is clipped before it is
+certified. A bound that a step approaches by less than the rank tolerance of the step does not stop it."""
 MAX_LOSS = 100.0
 """In units of the rank tolerance: a level whose optimum the levels below have worsened by more is not kept."""
 
@@ -229,6 +230,8 @@ SINGULAR_TOL = 100.0
 """In units of machine epsilon of the data: singular values that are smaller are not inverted in derivatives."""
 ZERO_PIVOT = 1e-2
 """In units of the rank tolerance: a pivot up to this is 0, whatever rank another factorisation has found."""
+DAMPED_RANK = 1e-14
+"""Pivots of a damped level's rows that count in its step, relative to its longest row: all above roundoff."""
 EXTRA_DAMPING = 1e-9
 """In units of the level's longest row, squared; whatever the level's own damping: the Hessian has to be regular. A
 kernel takes one step so damped along directions that the rank tolerance left out."""

@@ -12,14 +12,14 @@ from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from ...execution._backends import Backend, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_the_rest
 from ...numerics._constants import BOX_TOLERANCE
-from . import _core, _warp
+from . import _core, _cuda, _warp
 from ._cascade import CascadeResult, certify_levels, solve_cascade
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
@@ -55,7 +55,9 @@ def _solve_on_platform(
     warm_start: WorkingSet | None,
 ) -> CascadeResult:
     kernels = {}
-    if takes(backend, "warp", fits=_warp.Shape.of(layout).warps > 0):
+    if takes(backend, "core-cuda", fits=_cuda.fits(layout)):
+        kernels["core-cuda"] = kernel_candidates(layout, max_iterations, _cuda.solve, by_guesses=False)
+    elif takes(backend, "warp", fits=_warp.Shape.of(layout).warps > 0):
         kernels["warp"] = kernel_candidates(layout, max_iterations, _warp.solve)
     if takes(backend, "core", fits=True):
         kernels["core"] = kernel_candidates(layout, max_iterations, _core.solve, by_guesses=False)
@@ -75,8 +77,10 @@ def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve, *, by_g
 
     def certified(hierarchy: PaddedHierarchy, tolerances: Tolerances, warm_start: WorkingSet | None) -> CascadeResult:
         candidates = solve(layout, hierarchy, tolerances, warm_start, max_iterations)
-        result = jax.vmap(certify_levels)(candidates, hierarchy, tolerances)
-        return result._replace(done=result.done & jax.vmap(_is_valid)(result, hierarchy, tolerances))
+        valid = jax.vmap(_is_valid)(candidates, hierarchy, tolerances)
+        answers = candidates._replace(x=jax.vmap(_inside_box)(candidates.x, hierarchy))
+        result = jax.vmap(certify_levels)(answers, hierarchy, tolerances)
+        return result._replace(done=result.done & valid)
 
     def search_rest(
         result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances, warm_start: WorkingSet | None
@@ -90,12 +94,14 @@ def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve, *, by_g
     return Candidates(certified, search_rest)
 
 
+def _inside_box(x: Float[Array, " n"], hierarchy: PaddedHierarchy) -> Float[Array, " n"]:
+    """Return x clipped into its box."""
+    return jnp.clip(x, hierarchy.hard_lower[: len(x)], hierarchy.hard_upper[: len(x)])
+
+
 def _is_valid(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> Bool[Array, ""]:
-    """Check that the numbers are finite and that x is inside its box."""
-    n = len(result.x)
-    lower, upper = hierarchy.hard_lower[:n], hierarchy.hard_upper[:n]
-    # the answer is clipped into its box, so that roundoff of x may pass here
-    margin = BOX_TOLERANCE * tolerances.feasible * (jnp.max(jnp.abs(result.x)) + jnp.abs(result.x))
-    inside = (result.x >= lower - margin) & (result.x <= upper + margin)
-    valid = jnp.isfinite(result.x) & inside
+    """Check that the numbers are finite and that x is inside its box, up to roundoff."""
+    x = result.x
+    inside = jnp.abs(x - _inside_box(x, hierarchy)) <= BOX_TOLERANCE * tolerances.rank * jnp.max(jnp.abs(x))
+    valid = jnp.isfinite(x) & inside
     return valid.all() & jnp.isfinite(result.residual) & jnp.isfinite(result.multipliers).all()

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import WORKING_SET_SOLVES
+from ...numerics._constants import DAMPED_RANK, WORKING_SET_SOLVES
 from ...numerics._dense import apply, product
 from .._level import Level
 from ._active_rows import ActiveRows, drop_dependent, factor_active_rows, multipliers, restoring_step
@@ -109,8 +109,10 @@ def factor_least_squares(
     level, damping = problem.level, problem.damping
     rows = jnp.where(in_cost[:, None], product(level.matrix, active_rows.projector), 0.0)
     basis, triangle, order = jax.scipy.linalg.qr(rows.T, mode="economic", pivoting=True)
-    # pivots are lengths of rows, so they are compared with the longest row of the level
-    keep = jnp.abs(jnp.diagonal(triangle)) > tolerances.rank * level.size
+    # pivots are lengths of rows, so they are compared with the longest row of the level; a damped step takes all above
+    # roundoff, for a row that only the gradient has would contradict the step where a bound is released
+    pivots = jnp.abs(jnp.diagonal(triangle)) / jnp.where(level.size > 0.0, level.size, 1.0)
+    keep = pivots > jnp.where(damping > 0.0, DAMPED_RANK, tolerances.rank)
     kept = jnp.where(keep[:, None], triangle, 0.0).T
     # a diagonal of 1 below pivots that are left out makes their component of y 0 and the matrix regular
     damped = jnp.concatenate([kept, jnp.diag(jnp.where(keep, jnp.sqrt(damping), 1.0))])
@@ -124,7 +126,7 @@ def factor_least_squares(
         y = jax.scipy.linalg.solve_triangular(square, apply(left.T, right[order]))
         return apply(basis, jnp.where(keep, y, 0.0)) - present
 
-    return step, jnp.sum(keep, dtype=jnp.int32)
+    return step, jnp.sum(pivots > tolerances.rank, dtype=jnp.int32)
 
 
 def wrong_signs(

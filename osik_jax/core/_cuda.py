@@ -1,0 +1,123 @@
+"""Calls of the core's methods on a GPU: CUDA text for the sizes at hand, compiled by NVRTC at the first call."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import sys
+from collections.abc import Sequence
+from functools import cache
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from . import _build, _library
+
+SHARED_BYTES = 227 * 1024
+"""Shared memory of one block at most, on devices of compute capability 9.0; less on others, which take the search."""
+_LOCAL_INCLUDE = re.compile(r'^#include "(.*)"\n', re.MULTILINE)
+_SYSTEM_INCLUDE = re.compile(r"^#include <.*>\n", re.MULTILINE)
+
+
+def installed() -> bool:
+    """Return whether the core and NVRTC are there."""
+    return _library.core().library is not None and nvrtc() is not None
+
+
+@cache
+def nvrtc() -> str | None:
+    """Return the path of the NVRTC library: of the wheels that JAX for CUDA brings, else of a CUDA toolkit."""
+    folders = [*sys.path, "/usr/local/cuda"]
+    patterns = ("nvidia/**/lib/libnvrtc.so.*", "lib64/libnvrtc.so*")
+    found = [path for folder in folders for pattern in patterns for path in glob(f"{folder}/{pattern}", recursive=True)]
+    libraries = [path for path in found if "builtins" not in path and ".alt." not in path]
+    return libraries[0] if libraries else None
+
+
+@cache
+def text_of(header: str) -> str:
+    """Return a header of the core with the headers that it includes, as one text for NVRTC."""
+    seen: set[str] = set()
+
+    def inlined(name: str) -> str:
+        if name in seen or name == "serial.hpp":  # the team of a CPU
+            return ""
+        seen.add(name)
+        text = _SYSTEM_INCLUDE.sub("", (_build.FOLDER / name).read_text())
+        return _LOCAL_INCLUDE.sub(lambda match: inlined(match[1]), text.replace("#pragma once\n", ""))
+
+    return inlined(header)
+
+
+def call(
+    source: str,
+    outputs: Sequence[tuple[tuple[int, ...], Any]],
+    *inputs: Array,
+    problems: int,
+    warps: int,
+    shared: int,
+) -> list[Array]:
+    """Launch a kernel named ``osik_kernel`` with one warp for each problem.
+
+    Args:
+        source: CUDA text.
+        outputs: shape and dtype of each result.
+        inputs: arrays, as the kernel wants them.
+        problems: how many there are.
+        warps: problems of one block.
+        shared: bytes of shared memory of one problem.
+
+    Returns:
+        The results.
+    """
+    _register()
+    shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in outputs]
+    key = hashlib.sha256(source.encode()).hexdigest()[:24]
+    numbers = dict(problems=problems, per_block=warps, threads=32 * warps, shared=warps * shared)
+    with jax.enable_x64(True):
+        run = jax.ffi.ffi_call("osik_cuda", shapes)
+        return list(run(*inputs, source=source, key=key, **{name: np.int32(n) for name, n in numbers.items()}))
+
+
+@cache
+def _register() -> None:
+    library = _library.core().library
+    assert library is not None
+    folder = cache_folder()
+    library.osik_cuda_paths((nvrtc() or "libnvrtc.so").encode(), folder.encode())
+    jax.ffi.register_ffi_target("osik_cuda", jax.ffi.pycapsule(library.osik_cuda), platform="CUDA")
+
+
+def cache_folder() -> str:
+    """Return the folder of compiled kernels, made if need be; "" where it cannot be written."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "osik_jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return ""
+    return str(folder) if os.access(folder, os.W_OK) else ""
+
+
+def constants(**values: Any) -> str:
+    """Return C++ constants: numbers, and lists of integers (which have one entry at least)."""
+    lines = []
+    for name, value in values.items():
+        if isinstance(value, Sequence):
+            entries = ", ".join(map(str, value)) or "0"
+            lines.append(f"__device__ const int {name}[] = {{{entries}}};")
+        else:
+            lines.append(f"constexpr int {name} = {value};")
+    return "\n".join(lines) + "\n"
+
+
+def as_double(a: Any) -> Array:
+    """Return numbers in double precision, whatever JAX's default is."""
+    with jax.enable_x64(True):
+        return jnp.asarray(a).astype(jnp.float64)
