@@ -19,7 +19,7 @@ constexpr int INACTIVE = 0, AT_LOWER = -1, AT_UPPER = 1, EQUALITY = 2, REDUNDANT
 
 // weighted QP, in double precision
 constexpr int KERNEL_REFINEMENTS = 10, MAX_EXCHANGES = 2, MAX_DUAL_STARTS = 8;
-constexpr double EPSILON = 2.220446049250313e-16, KERNEL_CORRECTION = 1e-10, MIN_DECREASE = 0.25, KERNEL_PIVOT = 1e2,
+constexpr double KERNEL_CORRECTION = 1e-10, MIN_DECREASE = 0.25, KERNEL_PIVOT = 1e2,
                  ZERO_TOL = 100.0, BOUND_MULTIPLIER = 1.0, KERNEL_DEPENDENCE = 1e-14, REDUNDANCY_TOL = 1e3;
 
 }  // namespace osik

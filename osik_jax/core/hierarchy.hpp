@@ -164,12 +164,31 @@ template <class Team> struct Hierarchy {
         return q < n ? outside : outside / (HARD_NORM[q] * HARD_NORM[q]);
       });
       if (!(b.value > rank_tol * rank_tol)) break;
-      const double scale = Algebra::reflection(t, Z + b.which * ld, first_free, n, WORK);
-      reflect(Z, 0, h, WORK, scale, first_free);
-      t.once([&] { PENDING[b.which] = 0, ACTIVE_ROW[first_free - first_active] = b.which; });
-      ++first_free;
+      rotate_active_row(b.which);
+      t.once([&] { PENDING[b.which] = 0; });
     }
     t.each(0, h, [&](int q) { ACTIVE[q] = PENDING[q] ? 0 : ACTIVE[q]; });
+  }
+  // Rotate hard row q, as it is outside of the active rows so far, into column first_free.
+  OSIK_FN void rotate_active_row(int q) {
+    const double scale = Algebra::reflection(t, Z + q * ld, first_free, n, WORK);
+    reflect(Z, 0, h, WORK, scale, first_free);
+    t.once([&] { ACTIVE_ROW[first_free - first_active] = q; });
+    ++first_free;
+  }
+  // Add one row to the factors of the active rows, which leaves the active set if it depends on them.
+  OSIK_METHOD void add_active_row(int q) {
+    const double outside = t.dot(Z + q * ld, Z + q * ld, first_free, n);
+    if (first_free < n && outside > rank_tol * rank_tol * HARD_NORM[q] * HARD_NORM[q]) rotate_active_row(q);
+    else t.once([&] { ACTIVE[q] = 0; });
+  }
+  // Remove one row from the factors: the rows after it are rotated anew.
+  OSIK_METHOD void remove_active_row(int q) {
+    const int count = first_free - first_active;
+    const int place = t.best(-1.0, 0, count, [&](int k) { return ACTIVE_ROW[k] == q ? 1.0 : -1.0; }).which;
+    if (place < 0) return;
+    first_free = first_active + place;
+    for (int k = place + 1; k < count; ++k) add_active_row(ACTIVE_ROW[k]);
   }
   // Q' (A Z) = R by reflections with column pivoting, in the free columns
   OSIK_METHOD void factor_level_rows() {
@@ -402,17 +421,21 @@ template <class Team> struct Hierarchy {
   }
   OSIK_METHOD bool primal_active_set(bool factored) {
     int stalled = 0;
-    bool weak_tried = false, active_changed = !factored, unfactored = !factored, stays = false;
+    int added = -1, removed = -1;
+    bool weak_tried = false, stays = false;
     for (int iteration = 0; iteration < size.max_iterations; ++iteration) {
       evaluate();
-      if (active_changed) factor_active_rows();
+      const bool active_changed = !factored || added >= 0 || removed >= 0;
+      if (!factored) factor_active_rows();
+      else if (added >= 0) add_active_row(added);
+      else if (removed >= 0) remove_active_row(removed);
       const int other = t.count(0, rows, [&](int a) {
         const int in_cost = EQUALITY[a] || SLACK[a] != 0.0, is_other = in_cost != IN_COST[a];
         IN_COST[a] = in_cost;
         return is_other;
       });
-      if (active_changed || unfactored || other) factor_level_rows();
-      active_changed = unfactored = false;
+      if (active_changed || other) factor_level_rows();
+      factored = true, added = removed = -1;
       least_squares_step();
       t.each(0, rows, [&](int a) { RATE[a] = row_value(a, STEP); });
       const double square = t.sum(0, rows, [&](int a) { return IN_COST[a] ? RATE[a] * RATE[a] : 0.0; });
@@ -433,7 +456,7 @@ template <class Team> struct Hierarchy {
           });
           if (b.which < 0) return true;
           t.once([&] { ACTIVE[b.which] = 0; });
-          active_changed = true, stays = false, ++changes;
+          removed = b.which, stays = false, ++changes;
           continue;
         }
         weak_tried = true;
@@ -457,7 +480,7 @@ template <class Team> struct Hierarchy {
       if (blocked) {
         const double rate = b.which < n ? STEP[b.which] : t.dot(hard + (b.which - n) * ld, STEP, 0, n);
         t.once([&] { ACTIVE[b.which] = rate > 0.0 ? 1 : -1; });
-        ++changes, active_changed = true, weak_tried = false;
+        ++changes, added = b.which, weak_tried = false;
       }
       t.axpy(X, length, STEP, 0, n);
       stalled = moved > 0.0 ? 0 : stalled + 1;
