@@ -49,6 +49,18 @@ class AdaptiveGain(eqx.Module):
         return (self.maximum - self.minimum) * jnp.exp(-self.decay * safe_norm(error)) + self.minimum
 
 
+class _CappedGain(AdaptiveGain):
+    """An adaptive gain that is at most ``cap`` [1/s]."""
+
+    cap: Float[Array, ""]
+
+    def __init__(self, gain: AdaptiveGain, cap: Float[Array, ""]):
+        self.maximum, self.minimum, self.decay, self.cap = gain.maximum, gain.minimum, gain.decay, cap
+
+    def __call__(self, error: Float[Array, " m"]) -> Float[Array, ""]:
+        return _at_most(super().__call__(error), self.cap)
+
+
 Gain = Float[Array, ""] | AdaptiveGain
 """A task's gain as it is stored: a constant [1/s], or an AdaptiveGain."""
 
@@ -60,6 +72,18 @@ def as_gain(value: Any, dtype: Any = None) -> Gain:
             return value
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), value)
     return as_scalar(value, "gain", dtype)
+
+
+def capped_gain(gain: Gain, dt: Float[Array, ""] | float) -> Gain:
+    """Return the gain, at most 1 / dt [1/s]: with this gain, one step of dt [s] takes all of an error."""
+    if isinstance(gain, AdaptiveGain):
+        return _CappedGain(gain, 1.0 / jnp.asarray(dt, gain.maximum.dtype))
+    return _at_most(gain, 1.0 / jnp.asarray(dt, gain.dtype))
+
+
+def _at_most(gain: Float[Array, ""], cap: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the smaller one; where they are equal, the derivative is that of the gain."""
+    return jnp.where(gain > cap, cap, gain)
 
 
 def evaluate_gain(gain: Gain, error: Float[Array, " m"]) -> Float[Array, ""]:

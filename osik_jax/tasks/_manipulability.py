@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import equinox as eqx
 import jax
@@ -133,6 +133,10 @@ class ManipulabilityTask(Task):
             upper=self.upper,
             feedforward=self.target_velocity[None],
         )
+
+    def during(self, dt: Float[Array, ""] | float) -> Self:
+        """Return the task for a step of dt [s]; where it climbs, its gain is no rate of an error and stays."""
+        return self if self.target_velocity is None else super().during(dt)
 
     def value(self, robot: Robot, q: Float[Array, " nq"]) -> Float[Array, ""]:
         """Yoshikawa's index, or its logarithm, at configuration q."""

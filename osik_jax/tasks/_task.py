@@ -19,7 +19,7 @@ from ..numerics._replace import Replaceable
 from ..robot import Robot
 from ..robot._made_for import MadeForRobot
 from ._curvature import jacobian_curvature, levers, no_curvature
-from ._gain import Gain, as_gain, evaluate_gain
+from ._gain import Gain, as_gain, capped_gain, evaluate_gain
 from ._leaves import as_own_weight, as_weight
 from ._repr import short_repr
 
@@ -79,7 +79,8 @@ class Task(MadeForRobot, Replaceable):
             INFEASIBLE and misses it, with all that is hard, by least squares with their weights.
         weight: of the task's squared residual against others in the same weighted problem or level; where a task says
             so, one for each of its rows.
-        gain: [1/s], a constant or an ``AdaptiveGain``: the wanted error rate is ``-gain * error``.
+        gain: [1/s], a constant or an ``AdaptiveGain``: the wanted error rate is ``-gain * error``. In a step of dt,
+            more than ``1 / dt`` counts as that.
     """
 
     weight: Float[Array, "..."] = eqx.field(default=1.0, converter=as_own_weight, kw_only=True)
@@ -97,9 +98,11 @@ class Task(MadeForRobot, Replaceable):
         """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
 
     def during(self, dt: Float[Array, ""] | float) -> Self:
-        """The task for a step of dt [s], which ``solve`` asks for; itself where that does not matter."""
-        del dt
-        return self
+        """Return the task for a step of dt [s], as ``solve`` uses it: with a gain of at most 1 / dt.
+
+        With 1 / dt a step takes all of the error. With more it overshoots, and from 2 / dt on errors grow.
+        """
+        return eqx.tree_at(lambda task: task.gain, self, capped_gain(self.gain, dt))
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
         """The task for the next step, once this one's answer is ``velocity``; itself where it remembers nothing."""
