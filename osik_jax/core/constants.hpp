@@ -8,11 +8,12 @@ constexpr double EPSILON = 2.220446049250313e-16;
 // damping of a level, and the box that it leaves to the levels below
 constexpr int DAMPING_ITERATIONS = 3;
 constexpr double DAMPING_RIDGE = 1e-13, NEGLIGIBLE_DAMPING = 1e-13, COST_FRACTION = 0.1, MIN_RADIUS = 1e-6,
-                 NEGLIGIBLE_CURVATURE = 1e-6;
+                 NEGLIGIBLE_CURVATURE = 1e-6, TIE_ROUNDOFF = 100.0;
 
 // hierarchy
 constexpr int MAX_STALLED = 20, MAX_ATTEMPTS = 4;
-constexpr double STATIONARITY_TOL = 10.0, DAMPED_RANK = 1e-14, EXTRA_DAMPING = 1e-9, FACTOR_RIDGE = 1e-14;
+constexpr double STATIONARITY_TOL = 10.0, DAMPED_RANK = 1e-14, EXTRA_DAMPING = 1e-9, FACTOR_RIDGE = 1e-14,
+                 MAX_DETOUR = 100.0;
 
 // labels of constraints
 constexpr int INACTIVE = 0, AT_LOWER = -1, AT_UPPER = 1, EQUALITY = 2, REDUNDANT = 3;

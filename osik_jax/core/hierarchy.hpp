@@ -78,6 +78,7 @@ template <class Team> struct Hierarchy {
   double longest, longest_square, frobenius;  // norms of the level's longest row (with the damping) and of its matrix
   double damping, unmet, demand;              // of the level: total, the part of unmet tasks, the norm of its targets
   double x_max, slack_norm, root_cost, gradient_norm, residual;
+  double largest;  // x_max of the largest guess from which the search of a level went on
   double rank_tol, step_tol, multiplier_tol, feasible_tol;
   double *Z;       // [h, ld] the basis
   double *R;       // [m, ld] the level's rows in the basis
@@ -374,14 +375,19 @@ template <class Team> struct Hierarchy {
       copy(ACTIVE, PENDING, h);
       const Improvement now = improve_working_set();
       feasible = now.feasible;
-      if (now.feasible && now.consistent && now.signs && is_stationary()) return factored = true;
+      if (now.feasible && now.consistent && now.signs && is_stationary()) {
+        largest = larger(largest, x_max);
+        return factored = true;
+      }
       if (now.changes == 0 || attempt + 1 == MAX_ATTEMPTS) {
         copy(PENDING, ACTIVE, h);
         break;
       }
       changes += now.changes;
     }
-    if (!feasible) {
+    if (feasible)
+      largest = larger(largest, x_max);
+    else {
       copy(START, X, n);
       copy(ACTIVE_ABOVE, ACTIVE, h);
     }
@@ -499,10 +505,12 @@ template <class Team> struct Hierarchy {
       to_basis(first_active, X, WORK);
       from_basis(first_active, n, STEP);
       t.each(0, n, [&](int i) { base[i] = X[i] - STEP[i]; });
+      // where a row stands on its bound, roundoff must not decide whether the step has to keep it there
+      const double tie = TIE_ROUNDOFF * EPSILON * t.most(0.0, 0, n, [&](int i, double) { return fabs(X[i]); });
       t.each(0, rows, [&](int a) {
-        const double value = row_value(a, base);
-        goal[a] = target(a, value) - value;
-        IN_COST[a] = EQUALITY[a] || goal[a] != 0.0;
+        const double value = row_value(a, base), miss = target(a, value) - value;
+        IN_COST[a] = EQUALITY[a] || fabs(miss) > tie * ROW_NORM[a];
+        goal[a] = IN_COST[a] ? miss : 0.0;
       });
       rows_in_basis(first_active);
       const double trace = gram(rows, first_active, false);
@@ -550,7 +558,7 @@ template <class Team> struct Hierarchy {
 
   // ---- the levels
   OSIK_METHOD void begin(const Problem& p) {
-    changes = factorizations = 0;
+    largest = 0.0;
     t.each(0, h, [&](int q) {
       ACTIVE[q] = 0, HARD_NORM[q] = 1.0, HARD_LOWER[q] = p.hard_lower[q], HARD_UPPER[q] = p.hard_upper[q];
       for (int j = 0; j < ld; ++j) Z[q * ld + j] = 0.0;
@@ -633,17 +641,23 @@ template <class Team> struct Hierarchy {
     });
     return tie ? before : rank;
   }
-  OSIK_METHOD void solve(const Problem& p, const Answer& to) {
+  // the residual in units of the terms of the level's gradient
+  OSIK_FN double relative_residual() const {
+    const double terms = longest * larger(longest * x_max, root_cost);
+    return residual / (terms > 0.0 ? terms : 1.0);
+  }
+  struct Outcome {
+    bool done;
+    double residual;
+  };
+  // all levels, from the guesses of a warm start or without them
+  OSIK_METHOD Outcome solve_levels(const Problem& p, const Answer& to, bool warm) {
     const int L = size.L;
     t.each(0, L * h, [&](int e) { to.multipliers[e] = 0.0, to.active[e] = to.frozen[e] = 0; });
     t.each(0, L * m, [&](int e) { to.in_cost[e] = to.own[e] = 0; });
     t.each(0, L, [&](int k) { to.ranks[k] = 0, to.slack_norms[k] = INFINITE, to.dampings[k] = 0.0; });
-    rank_tol = p.tolerances[0], step_tol = p.tolerances[1], multiplier_tol = p.tolerances[2];
-    feasible_tol = p.tolerances[3];
-    const bool warm = t.count(0, L * m, [&](int e) { return p.guess_own[e] != 0; }) > 0;
     begin(p);
-    bool done = true;
-    double worst = 0.0;
+    Outcome all{true, 0.0};
     for (level = first_row = 0; level < L && first_active < n; ++level) {
       rows = size.row_counts[level], unmet = p.damping[3 * level + 1], demand = p.damping[3 * level + 2];
       has_inequalities = t.count(n, h, [&](int q) { return size.level_of_hard[q] == level; }) > 0;
@@ -651,21 +665,31 @@ template <class Team> struct Hierarchy {
       bool factored = false;
       bool optimal = warm && try_guess(p.guess_hard + level * h, p.guess_own + level * m, factored);
       if (!optimal) optimal = primal_active_set(factored);
-      done = done && optimal, worst = larger(worst, residual);
       const int in_cost_rank = freeze(to);
+      all.done = all.done && optimal, all.residual = larger(all.residual, relative_residual());
       t.once([&] { to.ranks[level] = in_cost_rank, to.slack_norms[level] = slack_norm, to.dampings[level] = damping; });
       narrow_box(p.bends + level * n);
       freeze_columns();
       first_row += rows;
     }
+    return all;
+  }
+  OSIK_METHOD void solve(const Problem& p, const Answer& to) {
+    rank_tol = p.tolerances[0], step_tol = p.tolerances[1], multiplier_tol = p.tolerances[2];
+    feasible_tol = p.tolerances[3];
+    const bool warm = t.count(0, size.L * m, [&](int e) { return p.guess_own[e] != 0; }) > 0;
+    changes = factorizations = 0;
+    Outcome all = solve_levels(p, to, warm);
+    // a guess far beyond the answer has left its roundoff there: all levels are solved again without guesses
+    if (warm && !(all.done && largest <= MAX_DETOUR * x_max)) all = solve_levels(p, to, false);
     t.each(0, n, [&](int i) {  // a bound that levels narrowed for those below them is none of the box
       const int at = ACTIVE_BOUND[i];
       const bool narrowed = at < 0 ? HARD_LOWER[i] > p.hard_lower[i] : HARD_UPPER[i] < p.hard_upper[i];
       to.x[i] = X[i], to.active_bounds[i] = narrowed ? 0 : at;
     });
     t.once([&] {
-      to.residual[0] = worst;
-      to.report[0] = done, to.report[1] = changes, to.report[2] = factorizations;
+      to.residual[0] = all.residual;
+      to.report[0] = all.done, to.report[1] = changes, to.report[2] = factorizations;
     });
   }
 };

@@ -40,6 +40,9 @@ DAMPING_RIDGE_ROUNDOFF = 10.0
 """In units of machine epsilon: the ridge is no smaller, which counts in single precision."""
 NEGLIGIBLE_DAMPING = 1e-13
 """Relative to the square of the level's longest row: gradients of a smaller damping are below roundoff."""
+TIE_ROUNDOFF = 100.0
+"""In units of machine epsilon of the terms of a row: one that is off its interval by less has no part in the damped
+step."""
 COST_FRACTION = 0.1
 """Of a level's decrease of cost, the fraction that the levels below may cost it at second order."""
 MIN_RADIUS = 1e-6
@@ -115,8 +118,12 @@ GRADIENT_TOL = 4.0
 BOX_TOLERANCE = 10.0
 """In units of the rank tolerance: how far a candidate may be outside its box, into which it is clipped before it is
 certified. A bound that a step approaches by less than the rank tolerance of the step does not stop it."""
-MAX_LOSS = 100.0
-"""In units of the rank tolerance: a level whose optimum the levels below have worsened by more is not kept."""
+MAX_RESIDUAL = 10.0
+"""In units of the rank tolerance: the largest ``kkt_residual`` of a hierarchy that is SOLVED. With the default rank
+tolerances this is ``KKT_TOLERANCE``."""
+MAX_DETOUR = 100.0
+"""In units of the answer: how large x may be on the way from a warm start. Tolerances are relative to x, and
+``HARD_ROW_TOL`` of an x that is larger by this factor is still the residual of an answer that is SOLVED."""
 
 # ---- the dual active-set method
 

@@ -26,6 +26,7 @@ from ..numerics._constants import (
     MIN_RADIUS,
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
+    TIE_ROUNDOFF,
 )
 from ..numerics._dense import apply, product
 from ._level import positive_root
@@ -119,7 +120,10 @@ def level_damping(
     # the level's step does not depend on what x has in the projector's range
     base = x - apply(projector, x)
     goal = -level.distance(base)
-    in_cost = level.equal | (goal != 0.0)
+    # where a row stands on its bound, roundoff must not decide whether the step has to keep it there
+    terms = jnp.sqrt(jnp.sum(level.matrix**2, -1)) * jnp.max(jnp.abs(x), initial=0.0)
+    in_cost = level.equal | (jnp.abs(goal) > TIE_ROUNDOFF * float(jnp.finfo(goal.dtype).eps) * terms)
+    goal = jnp.where(in_cost, goal, 0.0)
     rows = jnp.where(in_cost[:, None], product(level.matrix, projector), 0.0)
     gram = product(rows, rows.T)
     eye = jnp.eye(len(goal), dtype=gram.dtype)

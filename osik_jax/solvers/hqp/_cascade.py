@@ -6,6 +6,7 @@ guess is right (``_primal_active_set.py``), and freezes what it determines (``_f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._lanes import choose
-from ...numerics._constants import MAX_LOSS
+from ...numerics._constants import MAX_DETOUR, MAX_RESIDUAL
 from .._damping import level_damping
 from .._level import Level
 from ._active_rows import drop_dependent, factor_active_rows
@@ -106,30 +107,39 @@ def solve_cascade(
         by_guesses: whether working sets are guessed before the primal method searches for them (static). A kernel has
             tried that by then, and it is much of what there is to compile.
     """
-
-    def solve_next(state: CascadeState, now: tuple[Array, Any, WorkingSet | None]) -> tuple[CascadeState, LevelOutcome]:
-        k, level, guess = now
-        problem = jax.vmap(partial(_level_problem, layout, k))(hierarchy, level, state)
-        is_free = jnp.trace(state.projector, axis1=1, axis2=2) > 0.5  # the trace is the dimension that is left
-        skipped = skip(state, problem)
-
-        def solve() -> tuple[CascadeState, LevelOutcome]:
-            if by_guesses:
-                attempts = _solve_on_guesses(problem, is_free, tolerances, guess, known, max_iterations)
-            else:
-                attempts = jax.vmap(placeholder)(problem)._replace(optimal=~is_free), no_changes, no_changes
-            solved = _solve_level(state, problem, attempts, tolerances, max_iterations)
-            return choose(is_free, solved, skipped)
-
-        return jax.lax.cond(jnp.any(is_free), solve, lambda: skipped)
-
-    first = jax.vmap(_start)(hierarchy)
-    no_changes = jnp.zeros(len(first.x), jnp.int32)
     # all zeros stand for no warm start: an equality of a solution has a 2
     known = None if warm_start is None else jnp.any(warm_start.own != 0, (1, 2))
     levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (hierarchy.levels, warm_start))
-    numbers = jnp.arange(layout.levels)
-    state, outcomes = jax.lax.scan(solve_next, first, (numbers, levels, guesses))
+    first = jax.vmap(_start)(hierarchy)
+    no_changes = jnp.zeros(len(first.x), jnp.int32)
+
+    def solve_levels(wanted: Bool[Array, " B"], known: Bool[Array, " B"] | None) -> tuple[CascadeState, LevelOutcome]:
+        def solve_next(
+            state: CascadeState, now: tuple[Array, Any, WorkingSet | None]
+        ) -> tuple[CascadeState, LevelOutcome]:
+            k, level, guess = now
+            problem = jax.vmap(partial(_level_problem, layout, k))(hierarchy, level, state)
+            # the trace is the dimension that is left
+            is_free = wanted & (jnp.trace(state.projector, axis1=1, axis2=2) > 0.5)
+            skipped = skip(state, problem)
+
+            def solve() -> tuple[CascadeState, LevelOutcome]:
+                if by_guesses:
+                    attempts = _solve_on_guesses(problem, is_free, tolerances, guess, known, max_iterations)
+                else:
+                    attempts = jax.vmap(placeholder)(problem)._replace(optimal=~is_free), no_changes, no_changes
+                solved = _solve_level(state, problem, attempts, tolerances, max_iterations)
+                return choose(is_free, solved, skipped)
+
+            return jax.lax.cond(jnp.any(is_free), solve, lambda: skipped)
+
+        return jax.lax.scan(solve_next, first, (jnp.arange(layout.levels), levels, guesses))
+
+    everywhere = jnp.ones(len(first.x), bool)
+    if known is None or not by_guesses:
+        state, outcomes = solve_levels(everywhere, known)
+    else:
+        state, outcomes = _solve_again_without_guesses(solve_levels, everywhere, known)
     active_sets, working_sets, multipliers, slack_norms = jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), outcomes)
     result = CascadeResult(
         x=state.x,
@@ -144,6 +154,51 @@ def solve_cascade(
         done=state.done,
     )
     return jax.vmap(certify_levels)(result, hierarchy, tolerances)
+
+
+class _Passes(NamedTuple):
+    """Passes through all levels: the first with the guesses of warm starts, the second without them."""
+
+    count: Int[Array, ""]
+    wanted: Bool[Array, " B"]
+    state: CascadeState
+    outcomes: LevelOutcome
+
+
+def _solve_again_without_guesses(
+    solve_levels: Callable[..., tuple[CascadeState, LevelOutcome]],
+    everywhere: Bool[Array, " B"],
+    known: Bool[Array, " B"],
+) -> tuple[CascadeState, LevelOutcome]:
+    """Solve all levels, and once more without the warm start where it led nowhere, or far beyond the answer.
+
+    Tolerances and roundoff of a level are relative to the largest x on its way, so a guess with variables at 1e10 leaves
+    1e-6 of roundoff in rows that should hold exactly.
+
+    Args:
+        solve_levels: from the problems to solve and those with a usable warm start to the last state and the outcomes.
+        everywhere: True in all problems. (B,)
+        known: problems that have a warm start. (B,)
+    """
+
+    def is_running(p: _Passes) -> Bool[Array, ""]:
+        return (p.count < 2) & jnp.any(p.wanted)
+
+    def solve(p: _Passes) -> _Passes:
+        state, outcomes = solve_levels(p.wanted, known & (p.count == 0))
+        counted = state._replace(
+            iterations=p.state.iterations + state.iterations,
+            factorizations=p.state.factorizations + state.factorizations,
+        )
+        state = choose(p.wanted, counted, p.state)
+        outcomes = jax.tree.map(
+            lambda new, old: jnp.where(p.wanted.reshape(1, -1, *[1] * (new.ndim - 2)), new, old), outcomes, p.outcomes
+        )
+        near = state.largest <= MAX_DETOUR * jnp.max(jnp.abs(state.x), 1)
+        return _Passes(p.count + 1, known & ~(state.done & near), state, outcomes)
+
+    nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(solve_levels, everywhere, known))
+    return jax.lax.while_loop(is_running, solve, _Passes(jnp.asarray(0, jnp.int32), everywhere, *nothing))[2:]
 
 
 def _bounds_of_the_box(hierarchy: PaddedHierarchy, state: CascadeState) -> Int[Array, "B n"]:
@@ -174,6 +229,7 @@ def _start(hierarchy: PaddedHierarchy) -> CascadeState:
         curvature=jnp.zeros(n, dtype),
         active_bounds=jnp.where(pinned, 2, 0).astype(jnp.int32),
         residual=jnp.zeros((), dtype),
+        largest=jnp.zeros((), dtype),
         iterations=zero,
         factorizations=zero,
         done=jnp.asarray(True),
@@ -226,6 +282,7 @@ def _solve_level(
     end, iterations = jax.lax.cond(jnp.all(best.optimal), accept, search)
     # an iteration of the primal method factors active rows and least squares, and freezing factors once
     counted = state._replace(
+        largest=jnp.maximum(state.largest, jnp.where(best.feasible, jnp.max(jnp.abs(best.x), 1), 0.0)),
         iterations=state.iterations + changes + iterations,
         factorizations=state.factorizations + factorizations + 2 * iterations + 1,
     )
@@ -320,26 +377,38 @@ def _primal_start(
     return jax.tree.map(lambda a, b: jnp.where(solution.feasible, a, b), _as_primal_state(solution), above)
 
 
-def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> CascadeResult:
-    """Check that no level lost its optimum to the levels below; what was lost is part of the residual.
-
-    Roundoff is that of the largest x on the way: levels may have been at bounds that those below them have left.
-    """
+def largest_active_bound(result: CascadeResult, hierarchy: PaddedHierarchy) -> Float[Array, ""]:
+    """Return the largest active bound of all levels, relative to its row's length: x was as large as that somewhere."""
     length = jnp.sqrt(jnp.sum(hierarchy.hard**2, -1))
     active = result.working_sets.hard
-    # how large x was on the way: at least as far as the bounds that were active
     bound = jnp.where(active < 0, hierarchy.hard_lower, hierarchy.hard_upper)
     # a bound that is active only because it was narrowed may be infinite here; it was nearer than x
     usable = (active != 0) & (length > 0.0) & jnp.isfinite(bound)
-    largest_bound = jnp.max(jnp.where(usable, jnp.abs(bound) / jnp.where(length > 0.0, length, 1.0), 0.0))
-    largest = jnp.maximum(jnp.max(jnp.abs(result.x)), largest_bound)
+    return jnp.max(jnp.where(usable, jnp.abs(bound) / jnp.where(length > 0.0, length, 1.0), 0.0))
 
-    def loss(level: Level, slack_norm: Array) -> tuple[Array, Array]:
-        # a level's norm at the end, beside that at its own optimum; what it lost is a force by the longest row
+
+def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> CascadeResult:
+    """Check the residual: each level's own one, and by how much the levels below have changed the norm that it reached.
+
+    The norm of a level at its optimum is one number on all of its minimisers. So a smaller norm at the answer says, like
+    a larger one, that one of the two points is no optimum.
+    """
+
+    def change(level: Level, slack_norm: Array) -> Array:
         now = jnp.sqrt(jnp.sum(level.distance(result.x) ** 2))
-        increase = jnp.maximum(now - slack_norm, 0.0)
-        allowed = MAX_LOSS * tolerances.rank * (level.size * largest + now)
-        return level.size * increase, increase <= allowed
+        terms = jnp.maximum(level.size * jnp.max(jnp.abs(result.x)), now)
+        # a level that found no freedom left has an infinite norm: nothing below it moves x
+        changed = jnp.where(jnp.isfinite(slack_norm), jnp.abs(now - slack_norm), 0.0)
+        return changed / jnp.where(terms > 0.0, terms, 1.0)
 
-    residual, kept = jax.vmap(loss)(hierarchy.levels, result.slack_norms)
-    return result._replace(residual=jnp.maximum(result.residual, jnp.max(residual)), done=result.done & jnp.all(kept))
+    changes = jax.vmap(change)(hierarchy.levels, result.slack_norms)
+    n = len(result.x)
+    # the answer is on its active bounds to the last bit, so x has to be there but for roundoff
+    bound = jnp.where(result.active_bounds < 0, hierarchy.hard_lower[:n], hierarchy.hard_upper[:n])
+    gap = jnp.where(
+        result.active_bounds != 0, jnp.abs(result.x - jnp.where(result.active_bounds != 0, bound, 0.0)), 0.0
+    )
+    size = jnp.max(jnp.abs(result.x))
+    off_bound = jnp.max(gap) / jnp.where(size > 0.0, size, 1.0)
+    residual = jnp.maximum(result.residual, jnp.maximum(jnp.max(changes), off_bound))
+    return result._replace(residual=residual, done=result.done & (residual <= MAX_RESIDUAL * tolerances.rank))

@@ -33,7 +33,8 @@ class CascadeState(NamedTuple):
     projector: Float[Array, "n n"]  # onto the null space of the frozen rows
     curvature: Float[Array, " n"]  # bound on the curvature of the rows so far along each variable
     active_bounds: Int[Array, " n"]  # of the box, frozen or not
-    residual: Float[Array, ""]
+    residual: Float[Array, ""]  # largest stationarity residual of a level, in units of its gradient's terms
+    largest: Float[Array, ""]  # largest absolute variable at a guess from which the search of a level went on
     iterations: Int[Array, ""]
     factorizations: Int[Array, ""]
     done: Bool[Array, ""]
@@ -128,6 +129,7 @@ def _state_below(
     low, high, curvature = narrow_box(
         problem.damping_terms, problem.level, state.curvature, end.x, problem.lower[:n], problem.upper[:n]
     )
+    terms = problem.size * jnp.maximum(problem.size * jnp.max(jnp.abs(end.x)), problem.root_cost(end.x, found.slack))
     # the levels below may not make a row of this level worse: its interval is widened to the value reached, no further
     return state._replace(
         x=end.x,
@@ -140,7 +142,7 @@ def _state_below(
         active_bounds=jnp.where(
             end.active[:n] != 0, end.active[:n], jnp.where(state.frozen[:n], state.active_bounds, 0)
         ),
-        residual=jnp.maximum(state.residual, end.residual),
+        residual=jnp.maximum(state.residual, end.residual / jnp.where(terms > 0.0, terms, 1.0)),
         done=state.done & end.done,
     )
 

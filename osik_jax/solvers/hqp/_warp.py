@@ -19,14 +19,17 @@ from ...numerics._constants import (
     COST_FRACTION,
     DAMPING_ITERATIONS,
     DAMPING_RIDGE,
+    EPSILON,
     EXTRA_DAMPING,
     FACTOR_RIDGE,
     MAX_ATTEMPTS,
+    MAX_DETOUR,
     MAX_STALLED,
     MIN_RADIUS,
     NEGLIGIBLE_CURVATURE,
     NEGLIGIBLE_DAMPING,
     STATIONARITY_TOL,
+    TIE_ROUNDOFF,
 )
 from ._cascade import CascadeResult, KernelAnswers, first_working_sets, result_of_kernel
 from ._padding import Layout, PaddedHierarchy
@@ -226,6 +229,7 @@ def source(shape: Shape, parts: tuple[str, ...] = PARTS) -> str:
     constants = dict(NEGLIGIBLE_DAMPING=NEGLIGIBLE_DAMPING, COST_FRACTION=COST_FRACTION, DAMPING_RIDGE=DAMPING_RIDGE)
     constants |= dict(MIN_RADIUS=MIN_RADIUS, NEGLIGIBLE_CURVATURE=NEGLIGIBLE_CURVATURE)
     constants |= dict(EXTRA_DAMPING=EXTRA_DAMPING, FACTOR_RIDGE=FACTOR_RIDGE, STATIONARITY_TOL=STATIONARITY_TOL)
+    constants |= dict(TIE_ROUNDOFF=TIE_ROUNDOFF * EPSILON, MAX_DETOUR=MAX_DETOUR)
     head += [f"constexpr double {name} = {value!r};" for name, value in constants.items()]
     head += [f"const int {name}[] = {{{', '.join(map(str, values))}}};" for name, values in lists.items()]
     return "\n".join(head) + "\n" + rolled(text("hqp", parts))

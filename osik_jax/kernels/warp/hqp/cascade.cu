@@ -33,24 +33,32 @@ auto write_skipped_level = [&]() {                    // no freedom is left: not
 
 bool all_done = true;
 double worst_residual = 0.0;
-for (level = 0; level < LEVELS; ++level) {
-  here = problem * LEVELS + level;
-  m = COUNT[level], has_inequalities = HAS_INEQUALITIES[level] != 0;
-  B = A + OFFSET[level];
-  if (width == 0) {
-    write_skipped_level();
-    continue;
+for (;;) {
+  begin();
+  all_done = true, worst_residual = 0.0;
+  for (level = 0; level < LEVELS; ++level) {
+    here = problem * LEVELS + level;
+    m = COUNT[level], has_inequalities = HAS_INEQUALITIES[level] != 0;
+    B = A + OFFSET[level];
+    if (width == 0) {
+      write_skipped_level();
+      continue;
+    }
+    load_level();
+    compute_damping();
+    optimal = false;
+    const bool starts_feasible = warm && try_warm_start();
+    primal_active_set(!starts_feasible, !starts_feasible);
+    all_done = all_done && optimal;
+    freeze();
+    const double terms = size * fmax(size * x_max, root_cost);
+    worst_residual = fmax(worst_residual, residual / (terms > 0.0 ? terms : 1.0));
+    narrow_box();
+    remove_determined();
   }
-  load_level();
-  compute_damping();
-  optimal = false;
-  const bool starts_feasible = warm && try_warm_start();
-  primal_active_set(!starts_feasible, !starts_feasible);
-  all_done = all_done && optimal;
-  worst_residual = fmax(worst_residual, residual);
-  freeze();
-  narrow_box();
-  remove_determined();
+  // a guess far beyond the answer has left its roundoff there: all levels are solved again without guesses
+  if (!warm || (all_done && largest <= MAX_DETOUR * x_max)) break;
+  warm = false;
 }
 
 #pragma unroll

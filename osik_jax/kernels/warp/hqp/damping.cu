@@ -8,7 +8,7 @@ auto distance = [&](int g) {                          // of row lane + 32 g, in 
 };
 // x without what the level may change, what its rows miss there, and the Gram matrix of these rows; returns its trace
 auto prepare_damping = [&](double* base, double* goal) {
-  double d[H], squares[H], trace = 0.0;
+  double d[H], squares[H], trace = 0.0, far = 0.0;
   bool all[G];
 #pragma unroll
   for (int g = 0; g < G; ++g) all[g] = true;
@@ -23,11 +23,14 @@ auto prepare_damping = [&](double* base, double* goal) {
   __syncwarp();
   from_basis(0, width, d);
 #pragma unroll
-  for (int h = 0; h < H; ++h) base[h] = x[h] - d[h];
+  for (int h = 0; h < H; ++h) base[h] = x[h] - d[h], far = fmax(far, exists[h] ? fabs(x[h]) : 0.0);
+  far = warp_max(far);
   to_point(base);
 #pragma unroll
   for (int g = 0; g < G; ++g) {
     goal[g] = in_level[g] ? -distance(g) : 0.0;
+    // where a row stands on its bound, roundoff must not decide whether the step has to keep it there
+    if (!equal[g] && !(fabs(goal[g]) > TIE_ROUNDOFF * length[g] * far)) goal[g] = 0.0;
     if (in_level[g]) work_b[lane + 32 * g] = equal[g] || goal[g] != 0.0 ? 1.0 : 0.0;
   }
   __syncwarp();

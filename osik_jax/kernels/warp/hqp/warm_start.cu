@@ -133,6 +133,7 @@ auto try_warm_start = [&]() {                         // returns whether x is fe
     if (changed == 0) break;
     changes += changed;
   }
+  if (feasible) largest = fmax(largest, x_max);
   if (!feasible) {
 #pragma unroll
     for (int h = 0; h < H; ++h) x[h] = start[h], active[h] = inherited[h];
