@@ -81,6 +81,24 @@ def test_answers_are_those_of_the_search(families, damped):
     assert agree.mean() > 0.99  # what is left: rows whose rank is at the tolerance
 
 
+@pytest.mark.parametrize("damped", [False, True])
+def test_foreign_warm_starts_change_no_answer(families, damped, rng):
+    """Working sets of other problems, and bounds of 1e10; ties that roundoff may break in two ways are among them."""
+    huge = (rng.random(families.lower.shape) < 0.4) & (families.lower < families.upper)
+    p = families._replace(
+        lower=np.where(huge, -1e10, np.maximum(families.lower, -1e10)),
+        upper=np.where(huge, 1e10, np.minimum(families.upper, 1e10)),
+    )
+    cold = solved(*given(p), damped=damped)
+    for other in (1, 7, len(huge) // 2):
+        guess = jax.tree.map(lambda a, other=other: jnp.roll(a, other, 0), cold.warm_start)
+        warm = solved(*given(p), guess, damped=damped)
+        both = (np.asarray(warm.status) == Status.SOLVED) & (np.asarray(cold.status) == Status.SOLVED)
+        assert both.mean() > 0.99 and np.asarray(warm.kkt_residual)[both].max() < 1e-9
+        scale = 1.0 + np.abs(cold.x).max(1, keepdims=True)
+        np.testing.assert_allclose((warm.x / scale)[both], (cold.x / scale)[both], rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_recorded_hierarchies(precision, nothing_is_searched):
     r = recorded_hierarchies(unit_rows=True)

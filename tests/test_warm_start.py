@@ -101,6 +101,37 @@ def test_bounds_that_levels_were_at_and_left_are_part_of_the_scale(rng):
     np.testing.assert_allclose(warm.x, cold.x, atol=1e-14)
 
 
+@pytest.mark.variants(slow=["jax"])
+@pytest.mark.parametrize("backend", ["auto", "jax"])
+def test_working_sets_of_other_problems_beside_bounds_of_1e10(backend, rng):
+    """A guess at a bound of 1e10 has tolerances and roundoff of that size; nothing of them may be in the answer."""
+    n, lanes = 12, 256
+    A, B = rng.normal(size=(lanes, 3, n)), rng.normal(size=(lanes, 6, n))
+    a, b = rng.normal(size=(lanes, 3)), rng.normal(size=(lanes, 6))
+    widths = np.where(rng.random((lanes, 6)) < 0.3, rng.exponential(size=(lanes, 6)), 0.0)
+    bound = np.where(rng.random((lanes, n)) < 0.4, 0.05, 1e10)
+
+    @jax.jit
+    def solve(warm, damping):
+        def one(A, a, B, b, width, bound, warm):
+            levels = [Level(A, a), Level(B, b, b + width)]
+            return solve_hqp(levels, -bound, bound, warm_start=warm, damping=damping, backend=backend)
+
+        return jax.vmap(one)(A, a, B, b, widths, bound, warm)
+
+    none = WorkingSet(jnp.zeros((lanes, 3, n + 6), jnp.int32), jnp.zeros((lanes, 3, 6), jnp.int32))
+    random = WorkingSet(*(jnp.asarray(rng.integers(-1, 3, x.shape), jnp.int32) for x in none))
+    for damping in (0.0, 1e-3):
+        cold = solve(none, damping)
+        for guess in (jax.tree.map(lambda x: jnp.roll(x, 1, 0), cold.warm_start), random, cold.warm_start):
+            warm = solve(guess, damping)
+            solved = np.asarray(cold.status) == Status.SOLVED
+            assert solved.mean() > 0.98
+            np.testing.assert_array_equal(np.asarray(warm.status)[solved], Status.SOLVED)
+            assert np.asarray(warm.kkt_residual)[solved].max() < 1e-9
+            np.testing.assert_allclose(warm.x[solved], cold.x[solved], rtol=0, atol=1e-9 * np.abs(cold.x).max())
+
+
 @pytest.fixture(scope="module")
 def reaching():
     """A hand that is told to go faster than its joints can."""

@@ -172,8 +172,8 @@ def _solve_again_without_guesses(
 ) -> tuple[CascadeState, LevelOutcome]:
     """Solve all levels, and once more without the warm start where it led nowhere, or far beyond the answer.
 
-    Tolerances and roundoff of a level are relative to the largest x on its way, so a guess with variables at 1e10 leaves
-    1e-6 of roundoff in rows that should hold exactly.
+    Tolerances and roundoff of a level are relative to the largest x on its way. So a guess with variables at 1e10
+    leaves 1e-6 of roundoff in rows that should hold exactly.
 
     Args:
         solve_levels: from the problems to solve and those with a usable warm start to the last state and the outcomes.
@@ -390,8 +390,8 @@ def largest_active_bound(result: CascadeResult, hierarchy: PaddedHierarchy) -> F
 def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> CascadeResult:
     """Check the residual: each level's own one, and by how much the levels below have changed the norm that it reached.
 
-    The norm of a level at its optimum is one number on all of its minimisers. So a smaller norm at the answer says, like
-    a larger one, that one of the two points is no optimum.
+    The norm of a level at its optimum is one number on all of its minimisers. So a smaller norm at the answer says,
+    like a larger one, that one of the two points is no optimum.
     """
 
     def change(level: Level, slack_norm: Array) -> Array:

@@ -42,8 +42,8 @@ class HQPSolution(eqx.Module):
         factorizations: systems factored, all levels together.
         kkt_residual: the larger of two numbers without units. One is the largest stationarity residual of a level,
             relative to the terms of its gradient. The other is the largest change of a level's norm by the levels below
-            it, relative to the terms of its rows. An answer that is SOLVED has at most 1e-9, or 1e-5 in single precision
-            (ten times the rank tolerance).
+            it, relative to the terms of its rows. An answer that is SOLVED has at most 1e-9, or 1e-5 in single
+            precision (ten times the rank tolerance).
         active: of the box, -1 at the lower bound, 1 at the upper, 2 equality, 0 free. (n,)
         active_rows: of each level, its rows outside their interval: -1 below it, 1 above, 2 equality; 0 for those
             inside. ((m,), ...)
