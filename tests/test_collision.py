@@ -431,7 +431,7 @@ def test_mistakes_are_named(arm, avoidance):
         CollisionShape.sphere(0.0)
     with pytest.raises(ValueError, match="no convex hull"):
         CollisionShape.convex(np.eye(3))
-    with pytest.raises(ValueError, match="no rotation"):
+    with pytest.raises(ValueError, match="rotation is not one"):
         CollisionShape.box((1.0, 1.0, 1.0), rotation=-np.eye(3))
 
 

@@ -341,8 +341,8 @@ class TestConstruction:
             (dict(lower={"elbow": np.nan}), ValueError, "elbow"),
             (dict(lower={"elbo": 0.0}), KeyError, "did you mean 'elbow'"),
             (dict(lower=np.zeros(3)), ValueError, r"lower has shape \(3,\), expected \(12,\).*elbow, rail, wheel"),
-            (dict(upper={"ball": 1.0}), ValueError, "only hinges and slides have a range.*ball"),
-            (dict(upper={"root": 1.0}), ValueError, "only hinges and slides have a range.*root"),
+            (dict(upper={"ball": -1.0}), ValueError, "lower > upper|upper of the ball joint 'ball' is"),
+            (dict(upper={"root": 1.0}), ValueError, "a free joint has no range.*root"),
         ],
     )
     def test_configuration(self, robot, options, error, message):

@@ -162,7 +162,11 @@ class TestRangesOfOneValue:
             ({"to_upper": 1.0}, TypeError, "pair"),
             ({"to_upper": (1, -1)}, ValueError, "lower"),
             ({"to_upper": (np.nan, 1)}, ValueError, "lower"),
-            ({"floating_base": (0, 1)}, ValueError, "free or ball"),
+            (
+                {"floating_base": (0, 1)},
+                ValueError,
+                "'floating_base' is free; only hinges, slides and balls have a range",
+            ),
         ):
             with pytest.raises(error, match=words):
                 osik.Robot.from_urdf(ARM, floating_base=True, position_limits=limits)  # pyright: ignore[reportArgumentType]

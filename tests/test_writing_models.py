@@ -183,7 +183,7 @@ def edited(name: str, joint: str, value: float) -> Robot:
     ("robot", "message"),
     [
         (lambda: edited("position_lower", "y", -1.0), r"joint 'y' is limited on one side, \[-1.0, inf\]"),
-        (lambda: edited("position_lower", "fly", -1.0), r"joint 'fly' is free or ball: .* no place for its position"),
+        (lambda: edited("position_lower", "fly", -1.0), r"joint 'fly' is free: .* no place for its position"),
         (lambda: edited("velocity_limit", "ball", 1.0), r"the dofs of joint 'ball' differ in greatest speed"),
         (
             lambda: osik.stack([osik.load_robot("arm7")] * 2),

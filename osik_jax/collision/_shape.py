@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
 from ..numerics._arguments import concrete
+from ..numerics._rotations import exact_rotation
 from ._geometry import Kind, UnitCore, convex_hull
-
-_ROTATION_TOLERANCE = 1e-4
 
 
 class CollisionShape(eqx.Module):
@@ -172,12 +171,7 @@ def _rotation(value: Any) -> Float[Array, "3 3"]:
     out = jnp.asarray(value, float)
     if out.shape != (3, 3):
         raise OsikValueError(f"rotation has shape {out.shape}, expected (3, 3)")
-    seen = concrete(out)
-    if seen is not None:
-        off = np.abs(seen @ seen.T - np.eye(3)).max()
-        if not (off < _ROTATION_TOLERANCE and np.linalg.det(seen) > 0.0):
-            raise OsikValueError("rotation is no rotation matrix: its columns are not right-handed unit vectors")
-    return out
+    return exact_rotation(out, "rotation")
 
 
 def _turned_to(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -55,7 +55,7 @@ def _bent(robot: Robot) -> Float[Array, " nq"]:
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     q0, step = np.asarray(robot.q0), np.zeros(robot.nv)
     for joint, dof in robot.tree.dof_address.items():
-        if np.isfinite(upper[dof] - lower[dof]):
+        if robot.tree.joint_types[joint] in (HINGE, SLIDE) and np.isfinite(upper[dof] - lower[dof]):
             away = 0.5 * (lower[dof] + upper[dof]) - q0[robot.tree.qpos_address[joint]]
             step[dof] = np.clip(away, -0.05 * (upper[dof] - lower[dof]), 0.05 * (upper[dof] - lower[dof]))
     return integrate(robot, robot.q0, jnp.asarray(step, robot.q0.dtype), 1.0)

@@ -16,7 +16,7 @@ from ._chain import Chain, chain_kinematics, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal
 from ._fixed import at_solution
 from ._pool import Errors
-from ._seeds import shift_of
+from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
 
 _ROUNDOFF = 64.0
@@ -88,8 +88,9 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
     dofs = dof_of_entries(robot)[coordinates]
     lower, upper = settings.lower[dofs], settings.upper[dofs]
     first = jnp.clip(settings.home[coordinates], lower, upper)
-    low, high = _starts(robot, coordinates, lower, upper, first)
-    length = jnp.max(jax.lax.stop_gradient(reaches(chain, first, lower, upper)[0]))
+    box = starting_box(lower, upper)
+    low, high = _starts(robot, coordinates, *box, first)
+    length = jnp.max(jax.lax.stop_gradient(reaches(chain, first, *box)[0]))
     return ChainSearch(
         rows=rows,
         chain=chain,
@@ -196,7 +197,7 @@ def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> t
 
 def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
     """How far targets are at least from what the links can reach, 0 where they may be within."""
-    length, root = reaches(search.chain, search.first, search.lower, search.upper)
+    length, root = reaches(search.chain, search.first, *starting_box(search.lower, search.upper))
     asked = np.array(search.rows)[:, :3].all(-1)
     longest = length * (1.0 + _ROUNDOFF * float(jnp.finfo(length.dtype).eps))
     away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - longest

@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikTypeError, OsikValueError
 from ..control._checks import check_setting, checked_configuration, checked_limits
@@ -174,6 +175,7 @@ def _explored(
     robot: Robot, goals: Any, *, settings: Settings, route: Any, seeds: int, steps: int, warm: bool, near: bool
 ) -> tuple[InverseKinematicsSolution, Outcomes]:
     """All searches of each target, to their ends: a pure function of a fixed amount of work."""
+    goals, valid = _with_placeholders(goals)
     search = route.search(robot, settings, warm=warm, near=near)
     fixed_search, fixed_goals = jax.lax.stop_gradient((search, goals))
     last = fixed_search.finishing() if near else None
@@ -186,7 +188,30 @@ def _explored(
     outcomes, best = in_blocks(some, (fixed_goals,), _TOGETHER)
     x = jnp.take_along_axis(outcomes.x, best[:, None, None], 1)[:, 0]
     taken = jnp.full(len(best), seeds * (steps + (LAST if near else 0)), jnp.int32)
-    return route.answer(robot, search, goals, x, best, taken), outcomes
+    found = route.answer(robot, search, goals, x, best, taken)
+    most = jnp.asarray(jnp.finfo(x.dtype).max, x.dtype)
+    return (
+        dataclasses.replace(
+            found,
+            converged=found.converged & valid,
+            position_error=jnp.where(valid, found.position_error, most),
+            orientation_error=jnp.where(valid, found.orientation_error, most),
+        ),
+        outcomes,
+    )
+
+
+def _with_placeholders(goals: Any) -> tuple[Any, Bool[Array, " targets"]]:
+    """The targets with 0 in place of those that are not finite, which traced ones may be; and which are valid."""
+    numbers, rest = eqx.partition(goals, eqx.is_inexact_array)
+    valid = jnp.ones(len(jax.tree.leaves(goals)[0]), bool)
+    for leaf in jax.tree.leaves(numbers):
+        valid &= jnp.isfinite(leaf).reshape(len(leaf), -1).all(1)
+
+    def kept(a: Array) -> Array:
+        return jnp.where(valid.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)
+
+    return eqx.combine(jax.tree.map(kept, numbers), rest), valid
 
 
 def joint_box(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Array, Array]:

@@ -14,13 +14,13 @@ from jaxtyping import Array
 
 from .._errors import OsikValueError
 from ..numerics._arguments import concrete
+from ..numerics._rotations import exact_quaternion, exact_rotation
 from ..robot import Robot
 from ..tasks._targets import as_pose, pose_array
 from ._chain_search import Goal
 
 _POSITION = (True,) * 3 + (False,) * 3
 _POSE = (True,) * 6
-_TOLERANCE = 1e-4
 _ACCEPTED = (
     "a pose is (position (3,), rotation matrix (3, 3)), (position (3,), quaternion w x y z (4,)), a (4, 4) matrix, a "
     "jaxlie.SE3, or a position (3,) alone; many have one more axis in front"
@@ -71,8 +71,13 @@ def _one(value: Any, dtype: Any) -> tuple[Array, Array, tuple[bool, ...]]:
             f"got positions of shape {pose[0].shape} and rotations of shape {pose[1].shape}; many poses are positions "
             "(n, 3) with rotation matrices (n, 3, 3) or quaternions w x y z (n, 4), or matrices (n, 4, 4)"
         )
-    _check_many(*pose)
-    return *jax.vmap(lambda p, r: as_pose((p, r), dtype))(*pose), _POSE
+    position, rotation = pose
+    if rotation.shape[1:] not in ((4,), (3, 3)):
+        raise OsikValueError(f"got rotations of shape {rotation.shape}; many are (n, 3, 3), or (n, 4): w x y z")
+    _check_finite(position)
+    if rotation.ndim == 2:
+        return position, jaxlie.SO3(exact_quaternion(rotation, "rotation")).as_matrix(), _POSE
+    return position, exact_rotation(rotation, "rotation"), _POSE
 
 
 def _has_parts(value: Any) -> bool:
@@ -93,19 +98,3 @@ def _check_finite(array: Array) -> None:
     seen = concrete(array)
     if seen is not None and not np.isfinite(seen).all():
         raise OsikValueError("the targets' positions have to be finite")
-
-
-def _check_many(position: Array, rotation: Array) -> None:
-    """As ``as_pose`` checks one, where the numbers can be seen."""
-    _check_finite(position)
-    seen = concrete(rotation)
-    if seen is None:
-        return
-    if seen.ndim == 2:
-        wrong = ~(np.abs(np.linalg.norm(seen, axis=-1) - 1.0) < _TOLERANCE)
-    else:
-        residual = np.abs(seen @ np.swapaxes(seen, -1, -2) - np.eye(3)).max((-1, -2))
-        wrong = ~((residual < _TOLERANCE) & (np.linalg.det(seen) > 0.0))
-    if wrong.any():
-        numbers = np.flatnonzero(wrong)[:10].tolist()
-        raise OsikValueError(f"rotations that are none (R R' = I and det R = 1, or quaternions of length 1): {numbers}")

@@ -8,12 +8,19 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
 _BITS = 32
+_UNLIMITED = 100.0
+"""Limits further out than this [rad or m] are placeholders that files write for none, such as 1e9."""
 
 
 def shift_of(key: int | Array, dimensions: int) -> UInt[Array, " n"]:
     """Where the sequence begins in each dimension, from an integer or a key of ``jax.random``."""
     made = jax.random.key(key) if jnp.issubdtype(jnp.result_type(key), jnp.integer) and jnp.ndim(key) == 0 else key
     return jax.random.bits(made, (dimensions,), jnp.uint32)
+
+
+def starting_box(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Limits as searches start within them: infinite beyond 100 rad or 100 m, which spread starts over nothing."""
+    return jnp.where(lower < -_UNLIMITED, -jnp.inf, lower), jnp.where(upper > _UNLIMITED, jnp.inf, upper)
 
 
 def unit_points(shift: UInt[Array, " n"], number: Int[Array, "..."], dtype: jnp.dtype) -> Float[Array, "... n"]:

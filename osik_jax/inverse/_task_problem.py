@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,14 +15,15 @@ from ..control._checks import check_tasks
 from ..kinematics import forward_kinematics
 from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, PositionBarrier, with_own_limits
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._balls import ball_rotation, independent_balls, with_balls_inside
+from ..robot._joint_selection import dof_names, dofs_of
 from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
 from ..tasks import Task
 from ._chain_problem import Settings, allowed
 from ._fixed import at_solution
 from ._pool import Errors
-from ._seeds import shift_of
+from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
 from ._task_search import CURVATURE, Aims, TaskSearch, entry_limits, is_goal
 
@@ -43,6 +44,13 @@ class TaskParts(NamedTuple):
     limits: tuple[Limit, ...]
 
 
+class _ProjectedRange(ConfigurationLimit):
+    """Ranges for a search, which turns ball joints back into their range after each step: no margin, no short steps."""
+
+    ball_margin: ClassVar[float] = 0.0
+    ball_step: ClassVar[float] = float("inf")
+
+
 class TaskRoute(NamedTuple):
     """Tasks and limits of any kind; hashable."""
 
@@ -51,8 +59,8 @@ class TaskRoute(NamedTuple):
         del warm, near
         parts: TaskParts = settings.parts
         lower, upper = entry_limits(robot, settings.lower, settings.upper)
-        first = jnp.clip(settings.home, lower, upper)
-        low, high = _starts(robot, lower, upper, first)
+        first = with_balls_inside(robot.tree, jnp.clip(settings.home, lower, upper), settings.upper)
+        low, high = _starts(robot, *starting_box(lower, upper), first)
         return TaskSearch(
             robot=robot,
             tasks=parts.tasks,
@@ -63,6 +71,7 @@ class TaskRoute(NamedTuple):
             high=high,
             lower=lower,
             upper=upper,
+            angles=settings.upper,
             shift=shift_of(settings.key, robot.nq),
             tolerance=allowed(settings.tolerance, jnp.asarray(_RADIUS, first.dtype)),
             enough=jnp.asarray(_ENOUGH, first.dtype),
@@ -132,7 +141,14 @@ def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ..
     Their rows have gain 1: a step may go as far as their bounds.
     """
     kept = [limit for limit in with_own_limits(robot, limits) if isinstance(limit, _KEPT)]
-    return tuple(limit if "gain" not in limit.replaceable else limit.replace(gain=1.0) for limit in kept)
+    return tuple(_unhurried(robot, limit) for limit in kept)
+
+
+def _unhurried(robot: Robot, limit: Limit) -> Limit:
+    """The limit as a search takes it."""
+    if isinstance(limit, ConfigurationLimit):
+        return _ProjectedRange(robot, lower=limit.lower, upper=limit.upper)  # pyright: ignore[reportCallIssue]
+    return limit if "gain" not in limit.replaceable else limit.replace(gain=1.0)
 
 
 def _starts(robot: Robot, lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
@@ -153,14 +169,27 @@ def _evaluated(
     gradients = [jnp.matmul(own.jacobian.T, own.weight * own.pull, precision="highest") for own in rows.values()]
     sizes = [jnp.sqrt(jnp.sum(own.weight * own.pull**2)) for own in rows.values()]
     levers = [jnp.sqrt(jnp.matmul(own.weight, own.jacobian**2, precision="highest")) for own in rows.values()]
-    gradient, most = sum(gradients), sum(size * lever for size, lever in zip(sizes, levers, strict=True))
+    gradient: Any = sum(gradients)
+    most: Any = sum(size * lever for size, lever in zip(sizes, levers, strict=True))
     box = [limit.box(search.robot, q, 1.0) for limit in search.limits if isinstance(limit, ConfigurationLimit)]
     low = sum((lower >= -_AT).astype(jnp.int32) for lower, _ in box) > 0 if box else jnp.zeros(search.robot.nv, bool)
     high = sum((upper <= _AT).astype(jnp.int32) for _, upper in box) > 0 if box else jnp.zeros(search.robot.nv, bool)
     stopped = jnp.abs(gradient) > _STOPPED * most
     at_lower, at_upper = stopped & low & (gradient > 0.0), stopped & high & (gradient < 0.0)
     active = at_upper.astype(jnp.int32) - at_lower.astype(jnp.int32)
+    active = _with_balls(search, q, gradient, most, active)
     return {name: jnp.where(own.weight > 0.0, own.pull, 0.0) for name, own in rows.items()}, active, errors
+
+
+def _with_balls(search: TaskSearch, q: Array, gradient: Array, most: Array, active: Array) -> Array:
+    """Marks the first entry of each ball joint that is at the end of its range and is driven further along its axis."""
+    for joint in independent_balls(search.robot.tree):
+        dofs = np.array(dofs_of(search.robot, [joint]))
+        at = search.robot.tree.qpos_address[joint]
+        angle, axis = ball_rotation(q[at : at + 4])
+        driven = jnp.dot(axis, gradient[dofs]) < -_STOPPED * jnp.max(most[dofs])
+        active = active.at[dofs[0]].set((driven & (angle >= search.angles[dofs[0]] - _AT)).astype(active.dtype))
+    return active
 
 
 def _clearance(robot: Robot, limit: CollisionAvoidanceLimit, q: Float[Array, " nq"]) -> tuple[Array, Array]:

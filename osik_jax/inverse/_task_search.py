@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, Int, UInt
 
 from ..control._step import velocity_problem
 from ..kinematics import difference, forward_kinematics, integrate
-from ..limits import Limit, limit_rows
+from ..limits import ConfigurationLimit, Limit, limit_rows
 from ..robot import Robot
+from ..robot._balls import with_balls_inside
 from ..robot._joint_selection import scalar_layout
 from ..schemes import Scheme, VelocityProblem
 from ..tasks import (
@@ -88,6 +89,7 @@ class TaskSearch(eqx.Module):
         high: (nq,)
         lower: limits of each entry of q, -inf where free. (nq,)
         upper: (nq,)
+        angles: greatest angles of ball joints, in their three entries of v, inf where free. (nv,)
         shift: of the sequence of starts. (nq,)
         tolerance: of position [m] and orientation [rad]. (2,)
         enough: score at which a search stays where it is. ()
@@ -102,6 +104,7 @@ class TaskSearch(eqx.Module):
     high: Float[Array, " nq"]
     lower: Float[Array, " nq"]
     upper: Float[Array, " nq"]
+    angles: Float[Array, " nv"]
     shift: UInt[Array, " nq"]
     tolerance: Float[Array, "2"]
     enough: Float[Array, ""]
@@ -154,7 +157,8 @@ class TaskSearch(eqx.Module):
         sizes = [sizes_of(goals[name], own) for name, own in rows.items()]
         position, orientation = (jnp.max(jnp.stack(part)) for part in zip(*sizes, strict=True))
         score = jnp.maximum(position / self.tolerance[0], orientation / self.tolerance[1])
-        bounds = limit_rows(self.robot, kinematics, q, self.limits, 1.0)
+        others = [limit for limit in self.limits if not isinstance(limit, ConfigurationLimit)]  # ranges hold always
+        bounds = limit_rows(self.robot, kinematics, q, others, 1.0)
         if bounds is not None:
             missed = jnp.max(bounds.violation(jnp.zeros(self.robot.nv, q.dtype)), initial=0.0)
             score = jnp.maximum(score, missed / (_CLEAR * self.tolerance[0]))
@@ -182,7 +186,8 @@ class TaskSearch(eqx.Module):
     def _moved(self, q: Array, velocity: Array) -> Array:
         after = integrate(self.robot, q, velocity)
         bounded = jnp.isfinite(self.lower) | jnp.isfinite(self.upper)
-        return jnp.where(bounded, jnp.clip(after, self.lower, self.upper), after)
+        clipped = jnp.where(bounded, jnp.clip(after, self.lower, self.upper), after)
+        return with_balls_inside(self.robot.tree, clipped, self.angles)
 
 
 def is_goal(task: Task) -> bool:

@@ -8,6 +8,7 @@ from typing import ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
@@ -47,8 +48,9 @@ class AccelerationLimit(Limit):
     Args:
         robot: the robot; its ``position_lower`` and ``position_upper`` are the default ranges.
         acceleration: greatest accelerations [rad/s^2 or m/s^2]: an array (nv,), or a mapping from joint names or globs
-            to values; joints that are not named are free. A free base takes part only when it is named (the value then
-            bounds the change of each of its six velocities) or in an array. Infinite: free.
+            to values that replaces the robot's own ``acceleration_limit`` for those joints. Default: the robot's own,
+            which a URDF 1.2 has. A free base takes part only when it is named (the value then bounds the change of each
+            of its six velocities) or in an array. Infinite: free.
         velocity: of the last step, (nv,) [rad/s or m/s], or a mapping in the same way; default 0: at rest.
         lower: lower ends of the ranges, as in ``ConfigurationLimit``; use the same there. -inf: none.
         upper: upper ends of the ranges, in the same way.
@@ -57,8 +59,8 @@ class AccelerationLimit(Limit):
 
     Raises:
         KeyError: a mapping names a joint that does not exist.
-        ValueError: a wrong shape, an acceleration that is not positive, or a range or return speed as in
-            ``ConfigurationLimit``.
+        ValueError: a wrong shape, an acceleration that is not positive, no acceleration for a robot that has none of
+            its own, or a range or return speed as in ``ConfigurationLimit``.
     """
 
     kind: ClassVar[Kind] = "acceleration"
@@ -71,15 +73,19 @@ class AccelerationLimit(Limit):
     def __init__(
         self,
         robot: Robot,
-        acceleration: ArrayLike | Array | Mapping[str, float],
+        acceleration: ArrayLike | Array | Mapping[str, float] | None = None,
         *,
         velocity: ArrayLike | Array | Mapping[str, float] | None = None,
         lower: ArrayLike | Array | Mapping[str, float] | None = None,
         upper: ArrayLike | Array | Mapping[str, float] | None = None,
         return_speed: ArrayLike | Array | Mapping[str, float] | None = None,
     ):
-        free = jnp.full(robot.nv, jnp.inf)
-        self.acceleration = dof_values(robot, acceleration, free, "acceleration")
+        own = concrete(robot.acceleration_limit)
+        if acceleration is None and own is not None and np.isinf(own).all():
+            raise OsikValueError(
+                "the robot has no acceleration limits of its own: give acceleration, such as {'*': 10.0} in rad/s^2"
+            )
+        self.acceleration = dof_values(robot, acceleration, robot.acceleration_limit, "acceleration")
         self.velocity = dof_values(robot, velocity, jnp.zeros(robot.nv), "velocity")
         ranges = ConfigurationLimit(robot, lower=lower, upper=upper, return_speed=return_speed)
         self.lower, self.upper, self.return_speed = ranges.lower, ranges.upper, ranges.return_speed

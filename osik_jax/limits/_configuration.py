@@ -11,10 +11,14 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from ..kinematics import Kinematics
 from ..numerics._arguments import check_bounds, concrete, entries
 from ..robot import Robot
-from ..robot._joint_selection import dof_names, dof_values, scalar_layout
+from ..robot._balls import independent_balls
+from ..robot._joint_selection import dof_names, dof_values, dofs_of, scalar_layout
+from ._ball import MARGIN, SHORTEST, BallRates, ball_rates
 from ._box import Kind, Limit
+from ._rows import LimitRows
 
 _ROUNDOFF = 8.0  # machine epsilons of the way to a bound that are kept clear of it, so that q + v dt stays within
 _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE = 0.5, 0.25
@@ -22,13 +26,19 @@ _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE = 0.5, 0.25
 
 
 class ConfigurationLimit(Limit):
-    """Keeps hinges and slides in their range: ``gain (lower - q) / dt <= v <= gain (upper - q) / dt``.
+    """Keeps joints in their range: ``gain (lower - q) / dt <= v <= gain (upper - q) / dt``.
 
-    A step of dt with a velocity in this box ends inside the range to the last bit, rounding included. Ball and free
-    joints have no range. With a gain below 1 a joint approaches the end of its range step by step.
+    A step of dt with a velocity in this box ends inside the range to the last bit, rounding included. With a gain below
+    1 a joint approaches the end of its range step by step.
 
     A joint that is outside its range, as a measured one may be, returns at ``return_speed``; where less is left than a
     step at this speed, by the share ``gain`` of the rest in each step. Tasks may make it return faster.
+
+    The range of a ball joint bounds the angle by which it is turned from its reference, MuJoCo's ``range``. ``upper``
+    has that angle in the joint's three entries, and ``lower`` is not used there. The bound is a row along the axis of
+    the turn, and a box: a joint comes to rest at 99.8 % of its range, and near the end turns by at most 3.4 % of the
+    range a step about each of its axes, so that no step leaves the range. From outside it returns at half of
+    ``return_speed``. Free joints have no range.
 
     Args:
         robot: the robot; its ``position_lower`` and ``position_upper`` are the defaults.
@@ -44,11 +54,13 @@ class ConfigurationLimit(Limit):
 
     Raises:
         KeyError: a mapping names a joint that does not exist.
-        ValueError: a wrong shape, lower > upper, a finite limit on a ball or free joint, a gain outside (0, 1], or a
-            return speed that is not positive.
+        ValueError: a wrong shape, lower > upper, a finite limit on a free joint, a ball joint's angle that is not
+            positive or differs between its entries, a gain outside (0, 1], or a return speed that is not positive.
     """
 
     kind: ClassVar[Kind] = "position"
+    ball_margin: ClassVar[float] = MARGIN
+    ball_step: ClassVar[float] = SHORTEST
     lower: Float[Array, " nv"]
     upper: Float[Array, " nv"]
     gain: Float[Array, ""] | Float[Array, " nv"]
@@ -81,7 +93,30 @@ class ConfigurationLimit(Limit):
         lower = self._reach(jnp.where(scalar, self.lower, -jnp.inf), position, dt, inward=1.0)
         upper = self._reach(jnp.where(scalar, self.upper, jnp.inf), position, dt, inward=-1.0)
         lower, upper = jnp.minimum(lower, self.return_speed), jnp.maximum(upper, -self.return_speed)
+        balls = self._balls(robot, q, dt)
+        if balls is not None:
+            fastest = jnp.full_like(upper, jnp.inf).at[jnp.array(balls.dofs)].set(balls.fastest[:, None])
+            lower, upper = jnp.maximum(lower, -fastest), jnp.minimum(upper, fastest)
         return jnp.minimum(lower, upper), upper
+
+    def rows(
+        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
+    ) -> LimitRows | None:
+        """Bounds on the rate of each ball joint's angle; None for a robot without ball joints."""
+        del kinematics
+        balls = self._balls(robot, q, dt)
+        if balls is None:
+            return None
+        count = len(balls.dofs)
+        matrix = jnp.zeros((count, robot.nv), balls.axis.dtype)
+        matrix = matrix.at[np.arange(count)[:, None], np.array(balls.dofs)].set(balls.axis)
+        return LimitRows(matrix, jnp.full(count, -jnp.inf, matrix.dtype), balls.outward)
+
+    def _balls(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> BallRates | None:
+        gain = jnp.broadcast_to(self.gain, self.upper.shape)
+        q = jnp.asarray(q, jnp.result_type(jnp.asarray(q), self.upper))
+        form = dict(margin=self.ball_margin, shortest=self.ball_step)
+        return ball_rates(robot, q, self.upper, gain, self.return_speed, dt, **form)
 
     def _reach(
         self, bound: Float[Array, " nv"], position: Float[Array, " nv"], dt: Float[Array, ""] | float, *, inward: float
@@ -140,7 +175,15 @@ def _check(robot: Robot, lower: np.ndarray, upper: np.ndarray) -> None:
         what = ", ".join(f"{names[i]} ({lower[i]} > {upper[i]})" for i in unordered)
         raise OsikValueError(f"limits with lower > upper: {what}")
     scalar, _ = scalar_layout(robot)
-    bounded = np.flatnonzero(~scalar & (np.isfinite(lower) | np.isfinite(upper)))
+    balls = [dofs_of(robot, [joint]) for joint in independent_balls(robot.tree)]
+    turning = np.isin(np.arange(robot.nv), balls)
+    bounded = np.flatnonzero(~scalar & ~turning & (np.isfinite(lower) | np.isfinite(upper)))
     if len(bounded):
         what = ", ".join(dict.fromkeys(names[i] for i in bounded))
-        raise OsikValueError(f"only hinges and slides have a range; leave these infinite: {what}")
+        raise OsikValueError(f"a free joint has no range; leave these infinite: {what}")
+    for own in balls:
+        if not upper[own[0]] > 0.0 or (upper[own] != upper[own[0]]).any():
+            raise OsikValueError(
+                f"upper of the ball joint {names[own[0]]!r} is {upper[own]}; it is one positive angle, in all three "
+                "entries"
+            )

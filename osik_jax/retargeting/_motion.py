@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._errors import OsikValueError, unknown_name
+from ..numerics._rotations import ROUNDED
 from ._rotations import continuous, slerp
 
 CONTACT_POINTS = ("left_heel", "left_toe", "right_heel", "right_toe")
 """The columns of ``HumanMotion.contact``."""
-_UNIT = 1e-3
 LARGEST = 1e6
 """Coordinates that are believed [m]."""
 _FASTEST = 1e5
@@ -28,7 +28,8 @@ class HumanMotion:
         fps: frames a second.
         joint_names: of the joints, each once.
         positions: of the joints in the world [m]. (F, J, 3)
-        rotations: of the joints in the world, unit quaternions w x y z; None where they are not known. (F, J, 4)
+        rotations: of the joints in the world, quaternions w x y z of length 1 within 2 %, which are normalised; None:
+            not known. (F, J, 4)
         rest_positions: of the joints in the pose in which all rotations are the identity [m]; None: not known. (J, 3)
         contact: whether left heel, left toe, right heel and right toe stand on the ground; None: to be found. (F, 4)
         ground: height of the floor [m]; None: to be found.
@@ -67,12 +68,13 @@ class HumanMotion:
             raise OsikValueError(f"ground is {self.ground}; it is a height in metres")
         if self.rotations is not None:
             length = np.linalg.norm(self.rotations, axis=-1)
-            if np.abs(length - 1.0).max() > _UNIT:
+            if np.abs(length - 1.0).max() > ROUNDED:
                 frame, joint = np.unravel_index(np.argmax(np.abs(length - 1.0)), length.shape)
                 raise OsikValueError(
                     f"rotations are unit quaternions w x y z; that of {self.joint_names[joint]} in frame {frame} has "
                     f"length {length[frame, joint]:.4g}"
                 )
+            object.__setattr__(self, "rotations", np.asarray(self.rotations) / length[..., None])
 
     @property
     def frames(self) -> int:

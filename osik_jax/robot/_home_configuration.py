@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
+from ._balls import ball_rotation, with_balls_inside
 from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
 from ._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
@@ -111,6 +112,7 @@ def _without_roundings(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
         return jnp.asarray(q)
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     out, inside = [], q.copy()
+    turned_back = np.asarray(with_balls_inside(robot.tree, jnp.asarray(q), robot.position_upper))
     for joint, start in robot.tree.qpos_address.items():
         if robot.tree.joint_types[joint] in (HINGE, SLIDE):
             low, high = (bound[robot.tree.dof_address[joint]] for bound in (lower, upper))
@@ -119,6 +121,13 @@ def _without_roundings(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
                 out.append(f"{robot.tree.joint_names[joint]} is {q[start]:g}, its range is [{low:g}, {high:g}]")
             else:
                 inside[start] = nearest
+        elif robot.tree.joint_types[joint] == BALL:
+            angle = float(ball_rotation(jnp.asarray(q[start : start + 4]))[0])
+            greatest = upper[robot.tree.dof_address[joint]]
+            if angle > greatest + _OUTSIDE:
+                out.append(f"{robot.tree.joint_names[joint]} is turned by {angle:g}, its range is [0, {greatest:g}]")
+            else:
+                inside[start : start + 4] = turned_back[start : start + 4]
     if out:
         warn(
             f"home is outside the joints' ranges (radians, metres): {'; '.join(out)}. It is kept as given; the robot "

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, ArrayLike, Float, Num
 
+from ._load_report import LoadReport
 from ._tree import FREE, KinematicTree, ModelHolder
 
 
@@ -32,6 +33,7 @@ class RobotModel(eqx.Module):
     position_lower: Float[Array, " nv"]
     position_upper: Float[Array, " nv"]
     velocity_limit: Float[Array, " nv"]
+    acceleration_limit: Float[Array, " nv"]
     q0: Float[Array, " nq"]
     holder: ModelHolder = eqx.field(static=True, repr=False)
 
@@ -80,6 +82,11 @@ class RobotModel(eqx.Module):
     def mj_model(self) -> mujoco.MjModel:
         """The MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations."""
         return self.holder.model
+
+    @property
+    def load_report(self) -> LoadReport:
+        """What the file asks for and the robot does not keep: element, name, and what was done instead, each."""
+        return self.holder.report
 
     def joint_qpos_index(self, name: str) -> int:
         """Where a joint's values start in q; a follower sits where its leader sits.

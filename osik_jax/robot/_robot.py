@@ -52,8 +52,11 @@ class Robot(RobotModel):
         geom_size: MuJoCo's sizes of each geom [m]; of a mesh, factors of its vertices. (ngeom, 3)
         qpos_offset: values of locked joints and offsets of followers, 0 elsewhere. (full nq,)
         position_lower: lower joint limits [rad or m], -inf where free. (nv,)
-        position_upper: upper joint limits [rad or m], inf where free. (nv,)
+        position_upper: upper joint limits [rad or m], inf where free. The three entries of a ball joint are the
+            greatest angle by which it may be turned from its reference, and those of ``position_lower`` minus that.
+            (nv,)
         velocity_limit: greatest joint speeds [rad/s or m/s], inf where free. (nv,)
+        acceleration_limit: greatest joint accelerations [rad/s^2 or m/s^2], inf where free. (nv,)
         q0: the robot's home configuration. (nq,)
     """
 

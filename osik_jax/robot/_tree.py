@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from .._errors import OsikKeyError, unknown_name
+from ._load_report import LoadReport
 
 FREE, BALL, SLIDE, HINGE = (
     int(t)
@@ -28,9 +29,15 @@ DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ModelHolder:
-    """Carries the MuJoCo model along without taking part in comparison: only the tree decides what may be stacked."""
+    """Carries what a robot was made from, and does not take part in comparison: the tree decides what may be stacked.
+
+    Attributes:
+        model: the MuJoCo model.
+        report: what the file asks for and the robot does not keep.
+    """
 
     model: mujoco.MjModel
+    report: LoadReport = dataclasses.field(default_factory=LoadReport)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ModelHolder)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
+from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._leaves import check_finite, concrete
 
 Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
@@ -19,11 +20,14 @@ PoseLike = tuple[ArrayLike | Array, ArrayLike | Array] | ArrayLike | Array | jax
 """``(p (3,), R (3, 3))``, ``(p (3,), quaternion w x y z (4,))``, a (4, 4) matrix, a ``jaxlie.SE3`` or another object
 with ``as_matrix()`` (mink's) or ``homogeneous`` (Pinocchio's); p or R alone where the other does not matter."""
 
-_TOLERANCE = 1e-4
+_LAST_ROW = 1e-4
 
 
 def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> Pose:
     """A pose from any of the ways to write one, see ``PoseLike``.
+
+    Quaternions and matrices that are rounded, up to 2 %, become the nearest rotation. Traced values that are farther
+    from a rotation become NaN, which a solve answers with its status.
 
     Args:
         value: the pose.
@@ -39,7 +43,6 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> 
         array = pose_array(value, dtype)
         if array.shape == (4, 4):
             parts = array[:3, 3], array[:3, :3]
-            _check_matrix(parts[1])
             _check_last_row(array)
         elif array.shape == (3,) and rest[1] is not None:
             parts = array, jnp.asarray(rest[1], dtype)
@@ -92,31 +95,13 @@ def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
 
 
 def _rotation(given: Float[Array, "3 3"] | Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """The rotation matrix of itself or of a quaternion."""
+    """The rotation matrix of itself or of a quaternion, either rounded to a few digits."""
     if given.shape == (4,):
-        _check_quaternion(given)
-        norm = jnp.sqrt(jnp.sum(given**2))
-        return jaxlie.SO3(given / norm).as_matrix()
-    _check_matrix(given)
-    return given
-
-
-def _check_quaternion(wxyz: Float[Array, "4"]) -> None:
-    seen = concrete(wxyz)
-    if seen is not None and not abs(np.linalg.norm(seen) - 1.0) < _TOLERANCE:
-        raise OsikValueError(f"the target's quaternion (w, x, y, z) has to be of length 1 to {_TOLERANCE}, got {seen}")
-
-
-def _check_matrix(rotation: Float[Array, "3 3"]) -> None:
-    seen = concrete(rotation)
-    if seen is None:
-        return
-    residual = np.abs(seen @ seen.T - np.eye(3)).max()
-    if not (residual < _TOLERANCE and np.linalg.det(seen) > 0.0):
-        raise OsikValueError(f"the target's rotation is not one (R R' = I to {_TOLERANCE}, det R = 1):\n{seen}")
+        return jaxlie.SO3(exact_quaternion(given, "the target's quaternion")).as_matrix()
+    return exact_rotation(given, "the target's rotation")
 
 
 def _check_last_row(matrix: Float[Array, "4 4"]) -> None:
     seen = concrete(matrix)
-    if seen is not None and not np.abs(seen[3] - [0.0, 0.0, 0.0, 1.0]).max() < _TOLERANCE:
+    if seen is not None and not np.abs(seen[3] - [0.0, 0.0, 0.0, 1.0]).max() < _LAST_ROW:
         raise OsikValueError(f"the last row of a pose's matrix is 0 0 0 1, got {seen[3]}; is it transposed?")

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from ..._errors import OsikValueError
+from .._load_report import LoadNote
 from .._model import RobotModel
 from ._mjmodel import LEAST_INERTIA, element_names, from_mjmodel
 from ._options import LoadOptions
@@ -23,22 +24,22 @@ def from_mjcf(mjcf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     source = read_source(mjcf, "MJCF")
     check_root(parse_xml(source), "mujoco", source)
     try:
-        model = _model(source, options.floating_base)
+        model, notes = _model(source, options.floating_base)
     except ValueError as error:
         raise OsikValueError(f"{source.label}: {error}") from None
     fixed = _free_joints(model) if options.floating_base is False else ()
-    return from_mjmodel(model, options, fixed=fixed)
+    return from_mjmodel(model, options, fixed=fixed, notes=notes)
 
 
-def _model(source: Source, floating_base: bool | None) -> mujoco.MjModel:
+def _model(source: Source, floating_base: bool | None) -> tuple[mujoco.MjModel, list[LoadNote]]:
     read = mujoco.MjSpec.from_string if source.path is None else mujoco.MjSpec.from_file
     spec = read(str(source.path or source.content))
     spec.compiler.fusestatic = False  # it would lose the names of the bodies that it fuses
-    model = _compile(spec)
+    model, notes = _compile(spec)
     if floating_base and not _free_joints(model):
         _add_base(spec, model)
-        return spec.compile()
-    return model
+        return spec.compile(), notes
+    return model, notes
 
 
 def _free_joints(model: mujoco.MjModel) -> list[str]:
@@ -47,19 +48,20 @@ def _free_joints(model: mujoco.MjModel) -> list[str]:
     return [name for name, is_free in zip(names, free, strict=True) if is_free]
 
 
-def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
+def _compile(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, list[LoadNote]]:
     """Compiles as is; if that fails, without what comes from files, then with some mass where MuJoCo demands it."""
+    notes: list[LoadNote] = []
     try:
-        return spec.compile()
+        return spec.compile(), notes
     except ValueError as error:
         if any(_needs_file(asset) for asset in _assets(spec)):
-            _strip_files(spec, error)
+            notes = _strip_files(spec, error)
     try:
-        return spec.compile()
+        return spec.compile(), notes
     except ValueError:
         spec.compiler.boundmass = max(spec.compiler.boundmass, LEAST_INERTIA)
         spec.compiler.boundinertia = max(spec.compiler.boundinertia, LEAST_INERTIA)
-    return spec.compile()
+    return spec.compile(), notes
 
 
 def _assets(spec: mujoco.MjSpec) -> Iterator[Any]:
@@ -73,8 +75,11 @@ def _needs_file(asset: Any) -> bool:
     return bool(asset.file) or any(getattr(asset, "cubefiles", ()))
 
 
-def _strip_files(spec: mujoco.MjSpec, error: ValueError) -> None:
-    """Deletes assets that come from files and all that uses them; ``error`` is why they cannot be read."""
+def _strip_files(spec: mujoco.MjSpec, error: ValueError) -> list[LoadNote]:
+    """Deletes assets that come from files and all that uses them; ``error`` is why they cannot be read.
+
+    The notes name what collides and is gone.
+    """
     lost = {kind: {a.name: a.file for a in getattr(spec, kind) if _needs_file(a)} for kind in ("meshes", "hfields")}
     geoms = [g for g in spec.geoms if g.meshname in lost["meshes"] or g.hfieldname in lost["hfields"]]
     for geom in geoms:
@@ -83,12 +88,21 @@ def _strip_files(spec: mujoco.MjSpec, error: ValueError) -> None:
                 f"body {geom.parent.name!r} takes its mass from the mesh file {lost['meshes'][geom.meshname]!r}, which "
                 f"cannot be read ({error}); give the body an <inertial>, or the file"
             )
+    files = lost["meshes"] | lost["hfields"]
+    notes = [
+        LoadNote(
+            "geom", geom.name or geom.parent.name, f"left out: {files[geom.meshname or geom.hfieldname]} is not read"
+        )
+        for geom in geoms
+        if geom.contype or geom.conaffinity
+    ]
     _delete_references(spec, {geom.name for geom in geoms if geom.name})
     textures = {t.name for t in spec.textures if _needs_file(t)}
     for material in spec.materials:
         material.textures = ["" if name in textures else name for name in material.textures]
     for element in [*geoms, *(asset for asset in _assets(spec) if _needs_file(asset))]:
         spec.delete(element)
+    return notes
 
 
 def _gives_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..._errors import OsikTypeError, OsikValueError, warn
+from .._balls import with_balls_inside
+from .._load_report import LoadNote, LoadReport
 from .._model import RobotModel
-from .._tree import DOF_WIDTH, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder
+from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder
 from ._followers import (
     Follower,
     as_mapping,
@@ -22,10 +24,14 @@ from ._followers import (
     qpos_offset,
     resolve_followers,
 )
+from ._model_notes import model_notes
 from ._options import LoadOptions, PositionLimits
 
 VELOCITY_LIMIT_PREFIX = "velocity_limit/"
 """A custom numeric of this name and a joint's holds the joint's greatest speed [rad/s or m/s]."""
+
+ACCELERATION_LIMIT_PREFIX = "acceleration_limit/"
+"""A custom numeric of this name and a joint's holds the joint's greatest acceleration [rad/s^2 or m/s^2]."""
 
 LEAST_INERTIA = 2e-15
 """Mass [kg] and moments [kg m^2] of moving bodies that have none: MuJoCo asks for more than 1e-15."""
@@ -37,6 +43,13 @@ _ONE_VALUE = 1e-10
 """A range that is not wider is a single value [rad or m]; the bound is pink's."""
 
 
+_NOTES_SHOWN = 8
+"""So many lines of the load report are in the warning."""
+
+_KEY_ROUNDING = 1e-3
+"""By which a keyframe may have a joint outside its range [rad or m]: files are rounded."""
+
+
 class Placement(NamedTuple):
     """The moving body (its number in the tree) that a body of the model is fixed to, and the body's pose in it."""
 
@@ -45,13 +58,16 @@ class Placement(NamedTuple):
     rotation: np.ndarray
 
 
-def from_mjmodel(model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable[str] = ()) -> RobotModel:
+def from_mjmodel(
+    model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable[str] = (), notes: Iterable[LoadNote] = ()
+) -> RobotModel:
     """Names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
 
     Args:
         model: the model, with the floating base that it is to have.
         options: of which limits and locked joints are honoured here.
         fixed: names of free joints that are locked where the model has them, unless ``options`` lock them too.
+        notes: what the file that the model was made from asks for and the model does not have.
     """
     if not isinstance(model, mujoco.MjModel):
         raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
@@ -80,9 +96,15 @@ def from_mjmodel(model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable
         raise OsikValueError(f"the model has no joint left to move; joints: {', '.join(names)}, all locked")
     ranges = options.position_limits or {}
     low, high = _ranges(model, names, ranges)
-    lower, upper, speed = _limits(tree, followers, low, high, _speeds(model, names, options.velocity_limits or {}))
+    speeds = _rates(model, names, VELOCITY_LIMIT_PREFIX, "velocity", options.velocity_limits or {})
+    accelerations = _rates(model, names, ACCELERATION_LIMIT_PREFIX, "acceleration", {})
+    lower, upper = _position_limits(tree, followers, low, high)
     _warn_of_frozen(tree, lower, upper, ranges)
     home = model.key_qpos[0] if model.nkey else model.qpos0
+    q0 = _home(home, tree, lower, upper)
+    found = [*notes, *model_notes(model, names, low, high, speeds), *_home_notes(model, tree, home, q0)]
+    report = LoadReport(note for note in found if note.name not in {names[j] for j in locked})
+    _warn_of_report(report)
     arrays = dict(
         **_body_arrays(model, bodies, placement),
         joint_position=model.jnt_pos,
@@ -95,10 +117,11 @@ def from_mjmodel(model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable
         qpos_offset=qpos_offset(model, followers, locked),
         position_lower=lower,
         position_upper=upper,
-        velocity_limit=speed,
-        q0=_home(home, tree, lower, upper),
+        velocity_limit=_rate_limits(tree, followers, speeds),
+        acceleration_limit=_rate_limits(tree, followers, accelerations),
+        q0=q0,
     )
-    return RobotModel(tree=tree, holder=ModelHolder(model), **{k: _float_array(v) for k, v in arrays.items()})
+    return RobotModel(tree=tree, holder=ModelHolder(model, report), **{k: _float_array(v) for k, v in arrays.items()})
 
 
 def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count: int) -> tuple[str, ...]:
@@ -212,40 +235,52 @@ def _geom_arrays(model: mujoco.MjModel, placement: list[Placement]) -> dict[str,
     )
 
 
-def _speeds(model: mujoco.MjModel, names: tuple[str, ...], given: Mapping[str, float]) -> np.ndarray:
-    """Greatest speed of each joint: from the model's custom numerics, then from ``given``."""
+def _rates(
+    model: mujoco.MjModel, names: tuple[str, ...], prefix: str, what: str, given: Mapping[str, float]
+) -> np.ndarray:
+    """Greatest speed or acceleration of each joint: from the model's custom numerics, then from ``given``."""
     numerics = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_NUMERIC, n) for n in range(model.nnumeric)]
+    own = {
+        numeric.removeprefix(prefix): float(model.numeric_data[model.numeric_adr[n]])
+        for n, numeric in enumerate(numerics)
+        if numeric.startswith(prefix)
+    }
     out = np.full(len(names), np.inf)
-    for n, numeric in enumerate(numerics):
-        if numeric.startswith(VELOCITY_LIMIT_PREFIX):
-            joint = numeric.removeprefix(VELOCITY_LIMIT_PREFIX)
-            _set_speed(out, names, joint, float(model.numeric_data[model.numeric_adr[n]]))
-    for pattern, value in given.items():
-        _set_speed(out, names, pattern, float(value))
+    for pattern, value in (*own.items(), *given.items()):
+        for joint in match_joints(pattern, names):
+            if not float(value) > 0.0:
+                raise OsikValueError(f"the {what} limit of joint {names[joint]!r} is {value}; it has to be positive")
+            out[joint] = float(value)
     return out
 
 
-def _set_speed(speeds: np.ndarray, names: tuple[str, ...], pattern: str, value: float) -> None:
-    for joint in match_joints(pattern, names):
-        if not value > 0.0:
-            raise OsikValueError(f"the velocity limit of joint {names[joint]!r} is {value}; it has to be positive")
-        speeds[joint] = value
-
-
 def _ranges(model: mujoco.MjModel, names: tuple[str, ...], given: PositionLimits) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper limit of each joint: from the model, then from ``given``."""
+    """Lower and upper limit of each joint: from the model, then from ``given``; of a ball, -+ its greatest angle."""
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
-    scalar = np.isin(model.jnt_type, (HINGE, SLIDE))
-    limited = model.jnt_limited.astype(bool) & scalar
+    ball = model.jnt_type == BALL
+    limited = model.jnt_limited.astype(bool) & np.isin(model.jnt_type, (HINGE, SLIDE))
     low[limited], high[limited] = model.jnt_range[limited].T
+    for joint in np.flatnonzero(model.jnt_limited.astype(bool) & ball):
+        low[joint], high[joint] = _ball_range((0.0, model.jnt_range[joint].max()), names[joint])
     for pattern, limits in given.items():
-        joints = [joint for joint in match_joints(pattern, names) if scalar[joint] or names[joint] == pattern]
         lower, upper = _range(limits, pattern)
-        for joint in joints:
-            if not scalar[joint]:
-                raise OsikValueError(f"joint {pattern!r} is free or ball; only hinges and slides have a range")
-            low[joint], high[joint] = lower, upper
+        found = [joint for joint in match_joints(pattern, names) if model.jnt_type[joint] != FREE]
+        if not found and pattern in names:
+            raise OsikValueError(f"joint {pattern!r} is free; only hinges, slides and balls have a range")
+        scalar = [joint for joint in found if not ball[joint]]
+        for joint in scalar or found:  # a glob that matches hinges or slides says nothing of balls
+            low[joint], high[joint] = _ball_range((lower, upper), names[joint]) if ball[joint] else (lower, upper)
     return low, high
+
+
+def _ball_range(limits: tuple[float, float], name: str) -> tuple[float, float]:
+    """Minus and plus the greatest angle by which a ball joint is turned; infinite from pi on, which none exceeds."""
+    lower, upper = limits
+    if not upper > 0.0 or lower not in (0.0, -upper):
+        raise OsikValueError(
+            f"the range of the ball joint {name!r} is {limits}; it is (0, the greatest angle by which it is turned)"
+        )
+    return (-upper, upper) if upper < np.pi else (-np.inf, np.inf)
 
 
 def _range(limits: tuple[float, float], pattern: str) -> tuple[float, float]:
@@ -258,23 +293,33 @@ def _range(limits: tuple[float, float], pattern: str) -> tuple[float, float]:
     return lower, upper
 
 
-def _limits(
-    tree: KinematicTree, followers: list[Follower], low: np.ndarray, high: np.ndarray, speed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position and velocity limits over v; a leader's are narrowed by those of its followers."""
-    low, high, speed = low.copy(), high.copy(), speed.copy()
+def _position_limits(
+    tree: KinematicTree, followers: list[Follower], low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position limits over v; a leader's are narrowed by those of its followers."""
+    low, high = low.copy(), high.copy()
     for joint, leader, multiplier, offset in followers:
         a, b = sorted(((low[joint] - offset) / multiplier, (high[joint] - offset) / multiplier))
         low[leader], high[leader] = max(low[leader], a), min(high[leader], b)
-        speed[leader] = min(speed[leader], speed[joint] / abs(multiplier))
         if low[leader] > high[leader]:
             raise OsikValueError(
                 f"joint {tree.joint_names[leader]!r} and its follower {tree.joint_names[joint]!r} have no position "
                 f"in common: lower {low[leader]} > upper {high[leader]}"
             )
-    width = [DOF_WIDTH[tree.joint_types[j]] for j in tree.independent]
-    lower, upper, velocity = (np.repeat(a[list(tree.independent)], width) for a in (low, high, speed))
-    return lower, upper, velocity
+    return _over_dofs(tree, low), _over_dofs(tree, high)
+
+
+def _rate_limits(tree: KinematicTree, followers: list[Follower], rates: np.ndarray) -> np.ndarray:
+    """Greatest speeds or accelerations over v; a leader's are narrowed by those of its followers."""
+    rates = rates.copy()
+    for joint, leader, multiplier, _ in followers:
+        rates[leader] = min(rates[leader], rates[joint] / abs(multiplier))
+    return _over_dofs(tree, rates)
+
+
+def _over_dofs(tree: KinematicTree, values: np.ndarray) -> np.ndarray:
+    """Values of joints, repeated for each entry of v of the independent joints."""
+    return np.repeat(values[list(tree.independent)], [DOF_WIDTH[tree.joint_types[j]] for j in tree.independent])
 
 
 def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, given: PositionLimits) -> None:
@@ -291,8 +336,28 @@ def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, g
         )
 
 
+def _warn_of_report(report: LoadReport) -> None:
+    """One warning for all that the file asks for and the robot does not keep."""
+    if report:
+        shown = "; ".join(map(str, report[:_NOTES_SHOWN]))
+        rest = f"; and {len(report) - _NOTES_SHOWN} more" if len(report) > _NOTES_SHOWN else ""
+        warn(f"the robot does not keep all that its file asks for (print(robot.load_report)): {shown}{rest}")
+
+
+def _home_notes(model: mujoco.MjModel, tree: KinematicTree, qpos: np.ndarray, q0: np.ndarray) -> Iterator[LoadNote]:
+    """Joints that the first keyframe has outside their range."""
+    if not model.nkey:
+        return
+    key = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, 0) or "0"
+    for joint, start in tree.qpos_address.items():
+        full, width = tree.full_qpos_address[joint], QPOS_WIDTH[tree.joint_types[joint]]
+        if width in (1, 4) and np.abs(qpos[full : full + width] - q0[start : start + width]).max() > _KEY_ROUNDING:
+            name = tree.joint_names[joint]
+            yield LoadNote("keyframe", key, f"{name} is outside its range there, and at its end in q0")
+
+
 def _home(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """The independent entries of a full qpos, hinges and slides brought inside their limits."""
+    """The independent entries of a full qpos, joints brought inside their limits."""
     q = np.zeros(tree.nq)
     for joint, start in tree.qpos_address.items():
         full, width = tree.full_qpos_address[joint], QPOS_WIDTH[tree.joint_types[joint]]
@@ -300,4 +365,4 @@ def _home(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.nd
         if width == 1:
             dof = tree.dof_address[joint]
             q[start] = np.clip(q[start], lower[dof], upper[dof])
-    return q
+    return np.asarray(with_balls_inside(tree, jnp.asarray(q), jnp.asarray(upper)))

@@ -21,7 +21,8 @@ def is_uri(given: object) -> bool:
 class Packages:
     """Where ROS packages lie: in folders given, then in those of ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
 
-    A folder is either a package itself, by its own name, or holds packages.
+    A folder is either a package itself, by its own name, or holds packages. An address is taken as it is, then with
+    ``%20`` and the like decoded, then with its backslashes as slashes.
     """
 
     def __init__(self, folders: Iterable[str | os.PathLike[str]] = ()) -> None:
@@ -41,7 +42,8 @@ class Packages:
             FileNotFoundError: there is no such file; the message lists where it was looked for.
         """
         text = str(address)
-        tried = list(dict.fromkeys(self._candidates(text, beside)))
+        spellings = dict.fromkeys([text, unquote(text), unquote(text).replace("\\", "/")])
+        tried = list(dict.fromkeys(path for spelling in spellings for path in self._candidates(spelling, beside)))
         for path in tried:
             if path.is_file():
                 return path
@@ -50,7 +52,7 @@ class Packages:
 
     def _candidates(self, text: str, beside: Path | None) -> Iterator[Path]:
         if text.startswith(_FILE_SCHEME):
-            yield Path(unquote(text.removeprefix(_FILE_SCHEME)))
+            yield Path(text.removeprefix(_FILE_SCHEME))
         elif text.startswith(_PACKAGE_SCHEMES):
             package, _, rest = text.partition("://")[2].lstrip("/").partition("/")  # some write three slashes
             for folder in (*self.folders, *_environment()):

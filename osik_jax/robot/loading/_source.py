@@ -6,6 +6,7 @@ import difflib
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,13 +56,15 @@ def read_source(given: str | os.PathLike[str], kind: str) -> Source:
 
 
 def parse_xml(source: Source) -> ElementTree.Element:
-    """The root element. Comments may hold ``--``, which strict XML forbids and robot files often do.
+    """The root element of XML that may break three rules, as robot files often do.
+
+    Comments may hold ``--``, an ``&`` may stand alone, and prefixes of names (``drake:``) may be undeclared.
 
     Raises:
         ValueError: the XML is broken; the message gives line and column.
     """
     try:
-        return ElementTree.fromstring(_without_comments(source.content))
+        return ElementTree.fromstring(_edited(source.content, _well_formed))
     except ElementTree.ParseError as error:
         line, column = error.position
         reason = str(error).partition(":")[0]
@@ -75,15 +78,21 @@ def check_root(root: ElementTree.Element, expected: str, source: Source) -> None
         raise OsikValueError(f"{source.label}: the root element is <{root.tag}>, not <{expected}>: this is {what}")
 
 
-def _without_comments(content: str | bytes) -> str | bytes:
-    """Comments become the line breaks in them, so that line numbers stay."""
+def _edited(content: str | bytes, edit: Callable[[str], str]) -> str | bytes:
+    """Text or the bytes of a file, edited as text of one byte a character."""
     if isinstance(content, bytes):  # latin-1 maps every byte to one character and back
-        return _blank(content.decode("latin-1")).encode("latin-1")
-    return _blank(content)
+        return edit(content.decode("latin-1")).encode("latin-1")
+    return edit(content)
 
 
-def _blank(text: str) -> str:
-    return re.sub("<!--.*?-->", lambda comment: "\n" * comment.group().count("\n"), text, flags=re.DOTALL)
+def _well_formed(text: str) -> str:
+    """Without comments, whose line breaks stay so that line numbers do; ampersands escaped, prefixes declared."""
+    text = re.sub("<!--.*?-->", lambda comment: "\n" * comment.group().count("\n"), text, flags=re.DOTALL)
+    text = re.sub(r"&(?!#?\w+;)", "&amp;", text)
+    used = {prefix for prefix in re.findall(r"<(\w+):\w", text)} | set(re.findall(r"\s(\w+):\w+\s*=", text))
+    lacking = sorted(prefix for prefix in used - {"xml", "xmlns"} if f"xmlns:{prefix}" not in text)
+    declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in lacking)
+    return re.sub(r"<\w+", lambda root: root.group() + declared, text, count=1)
 
 
 def _missing(path: Path, kind: str) -> str:

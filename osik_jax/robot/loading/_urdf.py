@@ -14,12 +14,15 @@ import numpy as np
 
 from ..._errors import OsikValueError, warn
 from .._feet import find_feet
+from .._load_report import LoadNote
 from .._model import RobotModel
-from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, from_mjmodel, quaternion
+from ._mjmodel import ACCELERATION_LIMIT_PREFIX, LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, from_mjmodel, quaternion
 from ._options import LoadOptions
 from ._packages import Packages, is_uri
 from ._source import check_root, parse_xml, read_source
 from ._urdf_elements import IDENTITY, Joint, Link, Pose, Shape, Urdf, read_urdf
+from ._urdf_meshes import meshes_of
+from ._urdf_notes import urdf_notes
 
 WORLD = "world"
 FLOATING_BASE = "floating_base"
@@ -31,7 +34,7 @@ GEOMS = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3
-_MESH_SUFFIXES = (".stl", ".obj", ".msh")
+_Compiled = tuple[mujoco.MjModel, list[LoadNote]]
 
 
 def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
@@ -41,15 +44,23 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     root = parse_xml(source)
     check_root(root, "robot", source)
     try:
-        description = _with_base(read_urdf(root), options.floating_base, source.label)
-        spec = urdf_spec(description)
+        read = read_urdf(root)
+        description = _with_base(read, options.floating_base, source.label)
         if options.collision_meshes:
-            _add_meshes(spec, description, packages, source.path)
-        model = spec.compile()
+            model, notes = _compiled_with_meshes(description, packages, source.path)
+        else:
+            model, notes = urdf_spec(description).compile(), []
     except ValueError as error:
         raise OsikValueError(f"{source.label}: {error}") from None
+    notes = [*urdf_notes(root, {joint.name: joint for joint in read.joints}), *read.notes, *notes]
     floating = [joint.name for joint in description.joints if joint.kind == "floating"]
-    return from_mjmodel(model, options, fixed=floating if options.floating_base is False else ())
+    one_sided = {
+        joint.name: (joint.lower, joint.upper)
+        for joint in description.joints
+        if math.isfinite(joint.lower) != math.isfinite(joint.upper)
+    }
+    options = options._replace(position_limits={**one_sided, **(options.position_limits or {})})
+    return from_mjmodel(model, options, fixed=floating if options.floating_base is False else (), notes=notes)
 
 
 def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
@@ -59,11 +70,12 @@ def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
     if urdf.root == WORLD:
         return _freed_from_world(urdf) if wanted and not has_one else urdf
     kind = "floating" if wanted and not has_one else "fixed"
-    base = Joint(_base_name(urdf), kind, WORLD, urdf.root, IDENTITY, np.zeros(3), -math.inf, math.inf, math.inf, None)
+    base = Joint(_base_name(urdf), kind, WORLD, urdf.root, IDENTITY, np.zeros(3))
     if WORLD in urdf.links:
         raise OsikValueError(f"only the root link may be called {WORLD!r}, and the root link is {urdf.root!r}")
     world = Link(WORLD, 0.0, IDENTITY, np.zeros((3, 3)), ())
-    return Urdf(urdf.name, {WORLD: world, **urdf.links}, (base, *urdf.joints), WORLD)
+    links, joints = {WORLD: world, **urdf.links}, (base, *urdf.joints)
+    return dataclasses.replace(urdf, links=links, joints=joints, root=WORLD)
 
 
 def _guess_floats(urdf: Urdf, has_free_joint: bool, label: str) -> bool:
@@ -110,7 +122,8 @@ def _base_name(urdf: Urdf) -> str:
 def urdf_spec(urdf: Urdf) -> mujoco.MjSpec:
     """The MuJoCo model: a body for every link but the root, which is the world.
 
-    Mimic joints are joint equality constraints and speed limits are custom numerics, which ``from_mjmodel`` reads.
+    Mimic joints are joint equality constraints; limits of speeds and accelerations are custom numerics, which
+    ``from_mjmodel`` reads. A joint that is limited on one side has no range here, for MJCF has both limits or none.
     Moving links without mass or inertia get 2e-15 kg and kg m^2. Shapes have no mass and touch nothing.
     """
     spec = mujoco.MjSpec()
@@ -179,27 +192,26 @@ def _add_geom(body: mujoco.MjsBody, shape: Shape, **form: Any) -> None:
     )
 
 
-def _add_meshes(spec: mujoco.MjSpec, urdf: Urdf, packages: Packages, beside: Path | None) -> None:
-    """Adds the collision shapes that are meshes; a file at one scale is read once."""
-    names: dict[tuple[Path, tuple[float, ...]], str] = {}
-    for link in urdf.links.values():
-        body = spec.worldbody if link.name == urdf.root else spec.body(link.name)
-        for shape in link.shapes:
-            if shape.kind != "mesh" or shape.visual:
-                continue
-            key = packages.path(shape.file, beside=beside), shape.size
-            _check_mesh(key[0], link.name)
-            if key not in names:
-                names[key] = f"{key[0].stem}_{len(names)}"
-                spec.add_mesh(name=names[key], file=str(key[0]), scale=shape.size)
-            _add_geom(body, shape, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=names[key])
+def _compiled(urdf: Urdf, packages: Packages, beside: Path | None, *, checked: bool) -> _Compiled:
+    """The model with the collision shapes that are meshes, and notes on those; see ``meshes_of``."""
+    spec = urdf_spec(urdf)
+    found, notes = meshes_of(urdf, packages, beside, checked=checked)
+    for form in {form["name"]: form for _, _, form in found}.values():
+        spec.add_mesh(**form)
+    for link, shape, form in found:
+        body = spec.worldbody if link == urdf.root else spec.body(link)
+        _add_geom(body, shape, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=form["name"])
+    return spec.compile(), notes
 
 
-def _check_mesh(path: Path, link: str) -> None:
-    if path.suffix.lower() not in _MESH_SUFFIXES:
-        raise OsikValueError(
-            f"link {link!r}: MuJoCo cannot read the mesh {str(path)!r}; it reads {', '.join(_MESH_SUFFIXES)}"
-        )
+def _compiled_with_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> _Compiled:
+    """As the files are; if MuJoCo does not take them so, each is tried alone."""
+    try:
+        return _compiled(urdf, packages, beside, checked=False)
+    except OsikValueError:
+        raise
+    except ValueError:
+        return _compiled(urdf, packages, beside, checked=True)
 
 
 def geom_size(shape: Shape) -> list[float]:
@@ -216,7 +228,7 @@ def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, joint: Joint) -> None:
     elif joint.kind != "fixed":
         slides = joint.kind == "prismatic"
         limits = {}
-        if math.isfinite(joint.lower):
+        if math.isfinite(joint.lower) and math.isfinite(joint.upper):
             # MuJoCo asks for lower < upper: equal limits are one unit in the last place apart.
             limits["range"] = [joint.lower, max(joint.upper, np.nextafter(joint.lower, math.inf))]
         body.add_joint(
@@ -226,8 +238,10 @@ def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, joint: Joint) -> None:
             limited=mujoco.mjtLimited.mjLIMITED_TRUE if limits else mujoco.mjtLimited.mjLIMITED_FALSE,
             **limits,
         )
-        if math.isfinite(joint.speed):
-            spec.add_numeric(name=VELOCITY_LIMIT_PREFIX + joint.name, data=[joint.speed], size=1)
+        rates = {VELOCITY_LIMIT_PREFIX: joint.speed, ACCELERATION_LIMIT_PREFIX: joint.acceleration}
+        for prefix, rate in rates.items():
+            if math.isfinite(rate):
+                spec.add_numeric(name=prefix + joint.name, data=[rate], size=1)
 
 
 def _add_mimic(spec: mujoco.MjSpec, joint: Joint) -> None:

@@ -12,9 +12,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from ..._errors import OsikValueError
+from .._load_report import LoadNote
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating")
-_SCALAR = ("revolute", "continuous", "prismatic")
+SCALAR = ("revolute", "continuous", "prismatic")
 _Color = tuple[float, ...]
 
 
@@ -65,7 +66,7 @@ class Mimic:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint; ``lower``, ``upper`` and ``speed`` are infinite where the joint is free."""
+    """A joint; ``lower``, ``upper``, ``speed`` and ``acceleration`` are infinite where the joint is free."""
 
     name: str
     kind: str
@@ -73,20 +74,22 @@ class Joint:
     child: str
     origin: Pose
     axis: np.ndarray
-    lower: float
-    upper: float
-    speed: float
-    mimic: Mimic | None
+    lower: float = -math.inf
+    upper: float = math.inf
+    speed: float = math.inf
+    acceleration: float = math.inf
+    mimic: Mimic | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A robot: links by name, joints with parents before children, the link that has no parent."""
+    """A robot: links by name, joints with parents before children, the link without a parent, notes on the reading."""
 
     name: str
     links: Mapping[str, Link]
     joints: tuple[Joint, ...]
     root: str
+    notes: tuple[LoadNote, ...] = ()
 
 
 def read_urdf(element: ElementTree.Element) -> Urdf:
@@ -96,14 +99,15 @@ def read_urdf(element: ElementTree.Element) -> Urdf:
         ValueError: an element is broken, or the links do not form one tree; the message names it.
     """
     _refuse_xacro(element)
+    notes: list[LoadNote] = []
     colors = {m.get("name", ""): color for m in element.findall("material") if (color := _rgba(m))}
-    links = _by_name("link", (_link(e, colors) for e in element.findall("link")))
+    links = _by_name("link", (_link(e, colors, notes) for e in element.findall("link")))
     if not links:
         raise OsikValueError("the URDF has no <link>")
     joints = _by_name("joint", (_joint(e) for e in element.findall("joint")))
     root = _root(links, joints)
     _check_mimics(joints)
-    return Urdf(element.get("name", ""), links, tuple(_parents_first(root, links, joints)), root)
+    return Urdf(element.get("name", ""), links, tuple(_parents_first(root, links, joints)), root, tuple(notes))
 
 
 def _refuse_xacro(element: ElementTree.Element) -> None:
@@ -133,10 +137,7 @@ def _attribute(element: ElementTree.Element | None, name: str, where: str) -> st
 
 
 def _numbers(text: str, count: int, where: str) -> np.ndarray:
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.full(0, np.nan)
+    values = _floats(text)
     if len(values) != count or not np.isfinite(values).all():
         raise OsikValueError(
             f"{where}: {text!r} is not {'a finite number' if count == 1 else f'{count} finite numbers'}"
@@ -144,20 +145,42 @@ def _numbers(text: str, count: int, where: str) -> np.ndarray:
     return values
 
 
+def _floats(text: str) -> np.ndarray:
+    """The numbers in a text; empty where one of its words is none."""
+    try:
+        return np.array([float(word) for word in text.split()])
+    except ValueError:
+        return np.zeros(0)
+
+
+def _text(element: ElementTree.Element, name: str, default: str) -> str:
+    """An attribute; one that is empty counts as absent."""
+    return element.get(name, "").strip() or default
+
+
 def _number(element: ElementTree.Element, name: str, where: str, default: str | None = None) -> float:
-    text = _attribute(element, name, where) if default is None else element.get(name, default)
+    text = _attribute(element, name, where) if default is None else _text(element, name, default)
     return float(_numbers(text, 1, f"{where}, {name}")[0])
+
+
+def _bound(element: ElementTree.Element, name: str, where: str) -> float:
+    """A number that may be infinite, 0 where it is absent."""
+    text = _text(element, name, "0")
+    values = _floats(text)
+    if len(values) != 1 or np.isnan(values[0]):
+        raise OsikValueError(f"{where}, {name}: {text!r} is not a finite number, inf or -inf")
+    return float(values[0])
 
 
 def _origin(element: ElementTree.Element, where: str) -> Pose:
     origin = element.find("origin")
     if origin is None:
         return IDENTITY
-    position = _numbers(origin.get("xyz", "0 0 0"), 3, f"{where}, origin xyz")
+    position = _numbers(_text(origin, "xyz", "0 0 0"), 3, f"{where}, origin xyz")
     if "quat_xyzw" in origin.attrib:
         x, y, z, w = _numbers(origin.attrib["quat_xyzw"], 4, f"{where}, origin quat_xyzw")
         return Pose(position, _from_quaternion(np.array([w, x, y, z]), where))
-    return Pose(position, _from_angles(*_numbers(origin.get("rpy", "0 0 0"), 3, f"{where}, origin rpy")))
+    return Pose(position, _from_angles(*_numbers(_text(origin, "rpy", "0 0 0"), 3, f"{where}, origin rpy")))
 
 
 def _from_quaternion(quaternion: np.ndarray, where: str) -> np.ndarray:
@@ -179,11 +202,20 @@ def _from_angles(roll: float, pitch: float, yaw: float) -> np.ndarray:
     return about_z @ about_y @ about_x
 
 
-def _link(element: ElementTree.Element, colors: Mapping[str, _Color]) -> Link:
+def _link(element: ElementTree.Element, colors: Mapping[str, _Color], notes: list[LoadNote]) -> Link:
+    """A link. Shapes that are broken are left out: no kinematics needs them, and those for collisions are noted."""
     name = _attribute(element, "name", "a <link>")
     where = f"link {name!r}"
-    shapes = [_shape(e, colors, where) for e in element if e.tag in ("visual", "collision")]
+    shapes = []
+    for shape in (e for e in element if e.tag in ("visual", "collision")):
+        try:
+            shapes.append(_shape(shape, colors, where))
+        except OsikValueError as error:
+            if shape.tag == "collision":
+                notes.append(LoadNote("collision", name, f"the shape is left out: {error}"))
     mass, inertial, inertia = _inertial(element.find("inertial"), where)
+    if any(not _text(e, "value", "") for e in element.findall("inertial/mass")):
+        notes.append(LoadNote("mass", name, "0, for the file gives no value"))
     return Link(name, mass, inertial, inertia, tuple(shape for shape in shapes if shape is not None))
 
 
@@ -192,7 +224,7 @@ def _inertial(element: ElementTree.Element | None, where: str) -> tuple[float, P
         return 0.0, IDENTITY, np.zeros((3, 3))
     where = f"{where}, inertial"
     mass_element = element.find("mass")
-    mass = 0.0 if mass_element is None else _number(mass_element, "value", f"{where}, mass")
+    mass = 0.0 if mass_element is None else _number(mass_element, "value", f"{where}, mass", "0")
     if mass < 0.0:
         raise OsikValueError(f"{where}: the mass {mass} is negative")
     moments = element.find("inertia")
@@ -207,7 +239,10 @@ def _rgba(material: ElementTree.Element | None) -> _Color | None:
     color = None if material is None else material.find("color")
     if color is None:
         return None
-    return tuple(_numbers(color.get("rgba", ""), 4, "material, color rgba"))
+    values = _floats(color.get("rgba", "").replace(",", " "))
+    if len(values) not in (3, 4) or not np.isfinite(values).all():
+        return None  # colours are for drawing alone
+    return (*values[:3].tolist(), values[3] if len(values) == 4 else 1.0)
 
 
 def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], where: str) -> Shape | None:
@@ -228,7 +263,10 @@ def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], where: st
 
 def _size(shape: ElementTree.Element, where: str) -> tuple[float, ...]:
     if shape.tag == "mesh":
-        return tuple(_numbers(shape.get("scale", "1 1 1"), 3, f"{where}, mesh scale"))
+        scale = _text(shape, "scale", "1 1 1")
+        return tuple(
+            _numbers(scale if len(scale.split()) > 1 else f"{scale} {scale} {scale}", 3, f"{where}, mesh scale")
+        )
     if shape.tag == "box":
         return tuple(_numbers(_attribute(shape, "size", where), 3, f"{where}, box size"))
     lengths = ("radius",) if shape.tag == "sphere" else ("radius", "length")
@@ -244,44 +282,51 @@ def _joint(element: ElementTree.Element) -> Joint:
         raise OsikValueError(
             f"{where} has the type {kind!r}, which is not supported{advice}. Types: {', '.join(JOINT_KINDS)}"
         )
-    lower, upper, speed = _joint_limits(element.find("limit"), kind, where)
+    lower, upper, speed, acceleration = _joint_limits(element.find("limit"), kind, where)
     return Joint(
         name=name,
         kind=kind,
         parent=_attribute(element.find("parent"), "link", f"{where}, parent"),
         child=_attribute(element.find("child"), "link", f"{where}, child"),
         origin=_origin(element, where),
-        axis=_axis(element.find("axis"), where) if kind in _SCALAR else np.array([1.0, 0.0, 0.0]),
+        axis=_axis(element.find("axis"), where) if kind in SCALAR else np.array([1.0, 0.0, 0.0]),
         lower=lower,
         upper=upper,
         speed=speed,
-        mimic=_mimic(element.find("mimic"), where) if kind in _SCALAR else None,
+        acceleration=acceleration,
+        mimic=_mimic(element.find("mimic"), where) if kind in SCALAR else None,
     )
 
 
 def _axis(element: ElementTree.Element | None, where: str) -> np.ndarray:
-    axis = np.array([1.0, 0.0, 0.0]) if element is None else _numbers(element.get("xyz", "1 0 0"), 3, f"{where}, axis")
+    axis = (
+        np.array([1.0, 0.0, 0.0]) if element is None else _numbers(_text(element, "xyz", "1 0 0"), 3, f"{where}, axis")
+    )
     length = np.linalg.norm(axis)
     if length == 0.0:
         raise OsikValueError(f"{where}: the axis is zero")
     return axis / length
 
 
-def _joint_limits(element: ElementTree.Element | None, kind: str, where: str) -> tuple[float, float, float]:
-    """``(lower, upper, speed)``; no ``<limit>`` is no limit, and a speed of 0 is read as unknown."""
-    if element is None or kind not in _SCALAR:
-        return -math.inf, math.inf, math.inf
+def _joint_limits(element: ElementTree.Element | None, kind: str, where: str) -> tuple[float, float, float, float]:
+    """``(lower, upper, speed, acceleration)``; no ``<limit>`` is no limit, and a speed of 0 is read as unknown.
+
+    URDF 1.2 has an acceleration and a deceleration; the lesser holds for both.
+    """
+    if element is None or kind not in SCALAR:
+        return -math.inf, math.inf, math.inf, math.inf
     where = f"{where}, limit"
-    speed = _number(element, "velocity", where, "0")
-    if speed < 0.0:
-        raise OsikValueError(f"{where}: the velocity {speed} is negative")
-    speed = speed or math.inf
+    rates = {name: _bound(element, name, where) for name in ("velocity", "acceleration", "deceleration")}
+    for name, rate in rates.items():
+        if rate < 0.0:
+            raise OsikValueError(f"{where}: the {name} {rate} is negative")
+    speed, *accelerations = (rate or math.inf for rate in rates.values())
     if kind == "continuous":
-        return -math.inf, math.inf, speed
-    lower, upper = (_number(element, name, where, "0") for name in ("lower", "upper"))
-    if lower > upper:
+        return -math.inf, math.inf, speed, min(accelerations)
+    lower, upper = (_bound(element, name, where) for name in ("lower", "upper"))
+    if lower > upper or lower == math.inf or upper == -math.inf:
         raise OsikValueError(f"{where}: lower {lower} > upper {upper}")
-    return lower, upper, speed
+    return lower, upper, speed, min(accelerations)
 
 
 def _mimic(element: ElementTree.Element | None, where: str) -> Mimic | None:
@@ -340,7 +385,7 @@ def _check_mimics(joints: Mapping[str, Joint]) -> None:
             raise OsikValueError(
                 f"joint {joint.name!r} mimics what is not there: {_no_such('joint', joint.mimic.leader, joints)}"
             )
-        if leader.kind not in _SCALAR:
+        if leader.kind not in SCALAR:
             raise OsikValueError(f"joint {joint.name!r} mimics {leader.name!r}, which is {leader.kind}")
         _check_chain(joint, joints)
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ..._errors import OsikValueError
 from .._model import RobotModel
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
-from ._mjmodel import LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, quaternion, rotation_matrix
+from ._mjmodel import ACCELERATION_LIMIT_PREFIX, LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, quaternion, rotation_matrix
 from ._urdf_elements import IDENTITY, Pose
 
 _TYPES = {FREE: "free", BALL: "ball", SLIDE: "slide", HINGE: "hinge"}
@@ -49,7 +49,7 @@ def to_mjcf(robot: RobotModel) -> str:
     for body in range(1, len(robot.tree.body_names)):
         bodies.append(_body(robot, body, bodies[robot.tree.body_parents[body]]))
     _add_frames(robot, bodies)
-    _add_speeds(robot, ElementTree.SubElement(root, "custom"))
+    _add_rates(robot, ElementTree.SubElement(root, "custom"))
     _add_followers(robot, ElementTree.SubElement(root, "equality"))
     _add_home(robot, ElementTree.SubElement(root, "keyframe"))
     ElementTree.indent(root)
@@ -191,8 +191,10 @@ def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
     lower, upper = (np.asarray(leaf[dof], float) for leaf in (robot.position_lower, robot.position_upper))
     if np.isinf(lower).all() and np.isinf(upper).all():
         return {}
-    if tree.joint_types[joint] in (FREE, BALL):
-        raise OsikValueError(f"joint {name!r} is free or ball: MJCF has no place for its position limits")
+    if tree.joint_types[joint] == FREE:
+        raise OsikValueError(f"joint {name!r} is free: MJCF has no place for its position limits")
+    if tree.joint_types[joint] == BALL:
+        return dict(range=(0.0, _one(upper, name, "upper")))
     low, high = float(lower[0]), float(upper[0])
     if math.isinf(low) or math.isinf(high):
         raise OsikValueError(f"joint {name!r} is limited on one side, [{low}, {high}]: MJCF has both limits or none")
@@ -268,12 +270,17 @@ def _appearance(model: mujoco.MjModel, geom: int) -> dict[str, str | ArrayLike]:
 # --- what is said of the whole ---
 
 
-def _add_speeds(robot: RobotModel, element: ElementTree.Element) -> None:
+def _add_rates(robot: RobotModel, element: ElementTree.Element) -> None:
+    rates = {
+        VELOCITY_LIMIT_PREFIX: (robot.velocity_limit, "greatest speed"),
+        ACCELERATION_LIMIT_PREFIX: (robot.acceleration_limit, "greatest acceleration"),
+    }
     for joint in robot.tree.independent:
         name = robot.tree.joint_names[joint]
-        speed = _one(robot.velocity_limit[_dofs(robot, joint)], name, "greatest speed")
-        if math.isfinite(speed):
-            _put(element, "numeric", name=VELOCITY_LIMIT_PREFIX + name, data=speed)
+        for prefix, (values, what) in rates.items():
+            rate = _one(values[_dofs(robot, joint)], name, what)
+            if math.isfinite(rate):
+                _put(element, "numeric", name=prefix + name, data=rate)
 
 
 def _add_followers(robot: RobotModel, element: ElementTree.Element) -> None:

@@ -1,0 +1,94 @@
+"""Ranges of ball joints as bounds on the next step.
+
+A ball joint is turned by an angle about an axis; its range bounds the angle. Along the axis the angle grows by what the
+joint turns. A turn across the axis makes the angle grow too, in the second order: by at most
+``step^2 / (2 (range - step))``, for the angle is twice a distance on the unit sphere in four dimensions, whose second
+derivative is the cotangent of the distance. So a bound along the axis alone would be left by a step across it. Steps
+near the end of the range are therefore short, and the bound along the axis has a margin that such a step cannot use up.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ..robot import Robot
+from ..robot._balls import ball_rotation, independent_balls
+from ..robot._joint_selection import dofs_of
+
+MARGIN = 0.002
+"""Share of the range that is kept clear of its end."""
+SHORTEST = 0.06
+"""Share of the range that a step may always turn by; its square is less than ``2 MARGIN (1 - MARGIN - SHORTEST)``."""
+_RETURN = 0.5
+"""Share of the longest step by which a joint comes back from outside its range: the bounds on the step allow it."""
+
+
+class BallRates(NamedTuple):
+    """Bounds on the angular velocity of each independent ball joint, which follow from those on its next step.
+
+    Attributes:
+        dofs: entries of v of each joint. (k, 3)
+        axis: about which each joint is turned, in its body; 0 where ``outward`` does not bind. (k, 3)
+        outward: greatest rate along the axis [rad/s], inf for none. (k,)
+        fastest: greatest absolute value of each entry [rad/s], inf for none. (k,)
+    """
+
+    dofs: list[list[int]]
+    axis: Float[Array, "k 3"]
+    outward: Float[Array, " k"]
+    fastest: Float[Array, " k"]
+
+
+def ball_rates(
+    robot: Robot,
+    q: Float[Array, " nq"],
+    upper: Float[Array, " nv"],
+    gain: Float[Array, " nv"],
+    return_speed: Float[Array, " nv"],
+    dt: ArrayLike,
+    *,
+    margin: float,
+    shortest: float,
+) -> BallRates | None:
+    """Return the bounds for a step of dt of the ball joints; None where there are none.
+
+    Farther from the end of the range than ``shortest``, a step shorter than the way to the end cannot leave the range,
+    whatever its direction. Nearer to it, ``shortest`` bounds its length, and a row what it turns along the axis.
+
+    Args:
+        robot: the robot.
+        q: configuration. (nq,)
+        upper: greatest angles [rad], in the three entries of each ball joint. (nv,)
+        gain: share of the way to the end that a step may take. (nv,)
+        return_speed: from outside the range, half of which is used: each entry of the box allows that. (nv,) [rad/s]
+        dt: time of the step [s].
+        margin: share of the range that is kept clear of its end.
+        shortest: share of the range that a step may always turn by; inf: any length.
+    """
+    joints = independent_balls(robot.tree)
+    if not joints:
+        return None
+    dofs = [dofs_of(robot, [joint]) for joint in joints]
+    first = jnp.array([own[0] for own in dofs])
+    turned = [ball_rotation(q[at : at + 4]) for at in (robot.tree.qpos_address[joint] for joint in joints)]
+    angle, axis = (jnp.stack(part) for part in zip(*turned, strict=True))
+    free, share = upper[first] >= jnp.pi, gain[first]  # no rotation is greater than pi
+    span = jnp.where(free, jnp.pi, upper[first])
+    way, least = span - angle, (shortest if np.isfinite(shortest) else 1.0) * span
+    longest = jnp.maximum(share * way, least) / jnp.sqrt(3.0)
+    speed = return_speed[first]
+    unlimited = jnp.isinf(speed)  # inf dt has no derivative
+    swift = jnp.where(unlimited, longest, jnp.where(unlimited, 1.0, speed) * dt)
+    back = -_RETURN * jnp.minimum(longest, swift)
+    outward = jnp.maximum(share * (way - margin * span), back)
+    binds = ~free & (way < 0.5 * span)  # the axis of a small angle is ill-conditioned, and the length is bound enough
+    return BallRates(
+        dofs,
+        jnp.where(binds[:, None], axis, 0.0),
+        jnp.where(binds, outward / dt, jnp.inf),
+        jnp.where(free | jnp.isinf(shortest), jnp.inf, longest / dt),
+    )

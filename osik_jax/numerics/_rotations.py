@@ -1,0 +1,79 @@
+"""Rotations as users have them, rounded to a few digits, made exact."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._errors import OsikValueError
+from ._arguments import concrete
+
+ROUNDED = 0.02
+"""By which lengths of quaternions and of a matrix's columns may differ from 1: the rounding to two or three digits."""
+_EXACT = 64.0
+"""Machine epsilons: a matrix whose residual is not greater is taken as it is."""
+_ITERATIONS = 4
+"""Of the method of Newton and Schulz: each takes a residual e below e^2, so four take 0.04 below 1e-16."""
+
+
+def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B 4"]:
+    """Return quaternions divided by their lengths, which are 1 within 2 %.
+
+    Raises:
+        ValueError: a length can be seen to be another, or not finite; ``what`` is what the message calls it. A
+            quaternion of another length that is traced becomes NaN.
+    """
+    squared = jnp.sum(given**2, -1, keepdims=True)
+    valid = (squared >= (1.0 - ROUNDED) ** 2) & (squared <= (1.0 + ROUNDED) ** 2)
+    _refuse(valid[..., 0], given, what, f"w x y z has to be of length 1 within {ROUNDED:.0%}")
+    safe = jnp.where(valid, given, jnp.array([1.0, 0.0, 0.0, 0.0], given.dtype))
+    length = jnp.sqrt(jnp.sum(safe**2, -1, keepdims=True))
+    return jnp.where(valid, safe / length, jnp.nan)
+
+
+def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B 3 3"]:
+    """Return the rotation matrices that are nearest to the given ones, whose columns have length 1 within 2 %.
+
+    Raises:
+        ValueError: a matrix can be seen not to be that near to a rotation; ``what`` is what the message calls it. A
+            matrix of that kind that is traced becomes NaN.
+    """
+    eye = jnp.eye(3, dtype=given.dtype)
+    residual = jnp.max(jnp.abs(_product(given, jnp.swapaxes(given, -1, -2)) - eye), (-1, -2), keepdims=True)
+    first, second, third = (given[..., k, :] for k in range(3))
+    right_handed = jnp.sum(jnp.cross(first, second) * third, -1)[..., None, None] > 0.0
+    valid = (residual <= (1.0 + ROUNDED) ** 2 - 1.0) & right_handed
+    _refuse(valid[..., 0, 0], given, what, f"R R' = I within {ROUNDED:.0%} of the lengths, det R = 1")
+    exact = residual <= _EXACT * float(jnp.finfo(given.dtype).eps)
+    seen = concrete(exact)
+    if seen is not None and seen.all():
+        return given
+    safe = jnp.where(valid, given, eye)
+    rotation = jax.lax.cond(jnp.all(exact), lambda matrix: matrix, _nearest, safe)
+    return jnp.where(valid, jnp.where(exact, safe, rotation), jnp.nan)
+
+
+def _nearest(matrix: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:
+    """The orthogonal factor of the polar decomposition (N. Higham, "Functions of Matrices", 2008, section 8.3)."""
+    for _ in range(_ITERATIONS):
+        gram = _product(jnp.swapaxes(matrix, -1, -2), matrix)
+        matrix = 1.5 * matrix - 0.5 * _product(matrix, gram)
+    return matrix
+
+
+def _product(a: Float[Array, "*B 3 3"], b: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:
+    return jnp.matmul(a, b, precision="highest")
+
+
+def _refuse(valid: Bool[Array, "*B"], given: Array, what: str, right: str) -> None:
+    """Raises ValueError with the first of the values that can be seen not to be valid, and the places of up to ten."""
+    seen, values = concrete(valid), concrete(given)
+    if seen is None or values is None or seen.all():
+        return
+    if seen.ndim == 0:
+        raise OsikValueError(f"{what} is not one: {right}, got {values.tolist()}")
+    at = np.argwhere(~seen)[:10].tolist()
+    places = [place[0] if len(place) == 1 else tuple(place) for place in at]
+    raise OsikValueError(f"{what}s that are none: {places}; {right}, the first is {values[tuple(at[0])].tolist()}")

@@ -1,0 +1,101 @@
+"""Collision shapes of a URDF that are mesh files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ..._errors import OsikValueError
+from .._load_report import LoadNote
+from ._packages import Packages
+from ._urdf_elements import Shape, Urdf
+
+_MESH_SUFFIXES = (".stl", ".obj", ".msh")
+_THICKNESS = 1e-3
+"""What a flat mesh is made thick by [m]."""
+_LINE = 1e-6
+"""A mesh whose extent in a second direction is less than this share of its extent in the first is a line."""
+
+
+def meshes_of(
+    urdf: Urdf, packages: Packages, beside: Path | None, *, checked: bool
+) -> tuple[list[tuple[str, Shape, dict[str, Any]]], list[LoadNote]]:
+    """The collision shapes that are meshes: link, shape and what ``MjSpec.add_mesh`` takes; a file at one scale is one.
+
+    Args:
+        urdf: the robot.
+        packages: where files are looked for.
+        beside: the URDF's own file.
+        checked: try each mesh alone. A flat one is thickened, one that MuJoCo cannot read is left out, and the notes
+            say so. Without, all are returned as they are, which is quicker.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a file of a kind that MuJoCo does not read.
+    """
+    known: dict[tuple[Path, tuple[float, ...]], tuple[dict[str, Any] | None, str]] = {}
+    found, notes = [], []
+    for link in urdf.links.values():
+        for shape in link.shapes:
+            if shape.kind != "mesh" or shape.visual:
+                continue
+            path = packages.path(shape.file, beside=beside)
+            _check_mesh(path, link.name)
+            key = path, shape.size
+            if key not in known:
+                form = dict(name=f"{path.stem}_{len(known)}", file=str(path), scale=shape.size)
+                known[key] = _repaired(form) if checked else (form, "")
+            form, done = known[key]
+            if form is not None:
+                found.append((link.name, shape, form))
+            if done:
+                notes.append(LoadNote("collision mesh", link.name, f"{path} {done}"))
+    return found, notes
+
+
+def _check_mesh(path: Path, link: str) -> None:
+    if path.suffix.lower() not in _MESH_SUFFIXES:
+        raise OsikValueError(
+            f"link {link!r}: MuJoCo cannot read the mesh {str(path)!r}; it reads {', '.join(_MESH_SUFFIXES)}"
+        )
+
+
+def _repaired(form: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
+    """What can be added in place of a mesh, None for nothing; and what was done, empty for a mesh that is as it was."""
+    try:
+        _compiled(form)
+    except ValueError as error:
+        reason = " ".join(str(error).partition("\n")[0].removeprefix("Error: ").split())
+    else:
+        return form, ""
+    try:
+        shell = _compiled({**form, "scale": (1.0, 1.0, 1.0), "inertia": mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL})
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, shell.mesh_quat[0])
+        points = shell.mesh_vert @ turn.reshape(3, 3).T + shell.mesh_pos[0]
+        thick = dict(name=form["name"], uservert=_thickened(points * np.array(form["scale"])).ravel())
+        _compiled(thick)
+    except ValueError:
+        return None, f"is left out: {reason}"
+    return thick, f"is flat, and {1e3 * _THICKNESS:g} mm thick here"
+
+
+def _compiled(form: dict[str, Any]) -> mujoco.MjModel:
+    """The mesh alone, without its hull, which a model of a URDF does not have either."""
+    spec = mujoco.MjSpec()
+    spec.add_mesh(**form)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=form["name"], contype=0, conaffinity=0)
+    return spec.compile()
+
+
+def _thickened(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Points on both sides of the plane that the given ones are in; ValueError where they are on one line."""
+    _, extents, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
+    if not extents[1] > _LINE * extents[0]:
+        raise OsikValueError("the points are on one line")
+    aside = 0.5 * _THICKNESS * axes[2]
+    return np.concatenate([points + aside, points - aside])

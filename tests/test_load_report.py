@@ -1,0 +1,299 @@
+"""What a file asks for and a robot does not keep: reported element by element, and in one warning."""
+
+import warnings
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax import Robot
+
+ARM = """<mujoco>{head}<worldbody>
+  <body name="first"><joint name="a" axis="0 1 0" range="-90 90" {a}/><geom name="one" size=".1" {geom}/>
+    <body name="second" pos="0 0 .3"><joint name="b" axis="0 1 0" range="-90 90"/><geom name="two" size=".1"/>
+      <site name="end" pos="0 0 .3"/></body></body>
+  <body name="other" pos="1 0 0"><joint name="c" axis="0 1 0"/>
+    <geom name="three" size=".1" contype="0" conaffinity="0"/></body>
+</worldbody>{more}</mujoco>"""
+TIED = '<equality><{} name="e" {}/></equality>'
+SERVO = '<actuator><position name="m" joint="a" {}/></actuator>'
+FIXED = '<tendon><fixed name="t" {}><joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>'
+
+
+def loaded(load, *args, **options) -> tuple[Robot, list[str]]:
+    """The robot and the warnings about its report."""
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        robot = load(*args, **options)
+    return robot, [str(w.message) for w in seen if "does not keep" in str(w.message)]
+
+
+def notes(robot: Robot) -> set[tuple[str, str]]:
+    return {(note.element, note.name) for note in robot.load_report}
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        (dict(more=FIXED.format("") + '<equality><tendon name="e" tendon1="t"/></equality>'), ("tendon equality", "e")),
+        (dict(more=FIXED.format('limited="true" range="0 1"')), ("tendon range", "t")),
+        (dict(more=FIXED.format('stiffness="3"')), ("tendon stiffness", "t")),
+        (dict(more=FIXED.format("") + '<actuator><motor name="m" tendon="t"/></actuator>'), ("tendon actuator", "t")),
+        (dict(a='stiffness="5" springref="10"'), ("joint stiffness", "a")),
+        (dict(a='margin="0.1"'), ("joint margin", "a")),
+        (dict(more=SERVO.format('ctrlrange="-1 1"')), ("actuator range", "m")),
+        (dict(more=SERVO.format('gear="2" ctrlrange="-3 3"')), ("actuator range", "m")),
+        (dict(more='<actuator><intvelocity name="m" joint="c" actrange="-1 1"/></actuator>'), ("actuator range", "m")),
+        (dict(more='<actuator><velocity name="m" joint="a" ctrlrange="-2 2"/></actuator>'), ("actuator range", "m")),
+        (dict(more=TIED.format("connect", 'body1="second" body2="other" anchor="0 0 0"')), ("connect equality", "e")),
+        (dict(more=TIED.format("weld", 'body1="second" body2="other"')), ("weld equality", "e")),
+        (dict(more=TIED.format("joint", 'joint1="a" joint2="b" polycoef="0 1 2 0 0"')), ("joint equality", "e")),
+        (dict(head='<option><flag limit="disable"/></option>'), ("option flag", "limit")),
+        (dict(geom='margin="0.02"'), ("geom margin", "one")),
+        (dict(more='<contact><pair geom1="one" geom2="three"/></contact>'), ("contact pair", "one, three")),
+        (dict(more='<keyframe><key name="k" qpos="2 0 0"/></keyframe>'), ("keyframe", "k")),
+    ],
+)  # fmt: skip
+def test_each_element_of_an_mjcf_is_named(parts: dict[str, str], expected: tuple[str, str]):
+    robot, told = loaded(Robot.from_mjcf, ARM.format_map(dict(head="", a="", geom="", more="") | parts))
+    assert notes(robot) == {expected}
+    assert len(told) == 1 and f"{expected[0]} {expected[1]!r}: " in told[0]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        dict(a='damping="3" frictionloss="1" armature="0.1" actuatorfrclimited="true" actuatorfrcrange="-1 1"'),
+        dict(more='<actuator><motor joint="a" ctrlrange="-1 1" forcerange="-2 2"/></actuator>'),
+        dict(more='<actuator><position joint="a" ctrlrange="-1.571 1.571"/></actuator>'),
+        dict(more='<equality><joint joint1="a" joint2="b" polycoef="0 2 0 0 0"/></equality>'),
+        dict(more='<equality><weld body1="second" body2="other" active="false"/></equality>'),
+        dict(more='<contact><exclude body1="first" body2="other"/><pair geom1="one" geom2="two"/></contact>'),
+        dict(more='<keyframe><key qpos="1 0 0"/></keyframe>'),
+    ],
+)
+def test_what_is_kept_or_a_force_is_not_named(parts: dict[str, str]):
+    robot, told = loaded(Robot.from_mjcf, ARM.format_map(dict(head="", a="", geom="", more="") | parts))
+    assert (robot.load_report, told) == ((), [])
+    assert str(robot.load_report) == "everything in the file that constrains motion is kept"
+
+
+def test_embedded_robots_keep_everything():
+    for name in ("nao", "arm7"):
+        robot, told = loaded(osik.load_robot, name)
+        assert (robot.load_report, told) == ((), [])
+
+
+def test_notes_on_locked_joints_are_left_out():
+    text = ARM.format(head="", a='stiffness="5"', geom="", more="")
+    assert loaded(Robot.from_mjcf, text, locked_joints=["a"])[0].load_report == ()
+
+
+def test_geoms_without_their_files_are_named():
+    text = """<mujoco><asset><mesh name="hull" file="nowhere.stl"/></asset><worldbody><body><joint/>
+      <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><geom name="shell" type="mesh" mesh="hull"/>
+      <geom name="drawn" type="mesh" mesh="hull" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
+    robot, told = loaded(Robot.from_mjcf, text)
+    assert notes(robot) == {("geom", "shell")} and "nowhere.stl" in told[0]
+
+
+# --- URDF ---
+
+INERTIAL = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+
+def urdf(limit: str = 'lower="-1" upper="1" velocity="2"', *, joint: str = "", more: str = "", kind="revolute") -> str:
+    return f"""<robot name="r"><link name="base">{INERTIAL}</link><link name="l1">{INERTIAL}</link>
+      <link name="l2">{INERTIAL}</link><link name="tip"/>
+      <joint name="a" type="{kind}"><parent link="base"/><child link="l1"/><axis xyz="0 1 0"/>
+        <limit {limit}/>{joint}</joint>
+      <joint name="b" type="revolute"><parent link="l1"/><child link="l2"/><origin xyz="1 0 0"/><axis xyz="0 1 0"/>
+        <limit lower="-1" upper="1" velocity="2"/></joint>
+      <joint name="t" type="fixed"><parent link="l2"/><child link="tip"/><origin xyz="1 0 0"/></joint>{more}</robot>"""
+
+
+SAFETY = '<safety_controller k_velocity="1" k_position="1" soft_lower_limit="{}" soft_upper_limit="{}"/>'
+CONTROL = '<ros2_control name="c" type="system"><joint name="a">{}</joint></ros2_control>'
+BOUNDED = '<command_interface name="{}"><param name="min">{}</param><param name="max">{}</param></command_interface>'
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (urdf('lower="-1" upper="1" velocity="2" jerk="9"'), ("limit jerk", "a")),
+        (urdf('lower="-1" upper="1" acceleration="5" deceleration="4"'), ("limit deceleration", "a")),
+        (urdf('lower="-1" upper="1"', kind="continuous"), ("limit", "a")),
+        (urdf(joint=SAFETY.format(-0.5, 1)), ("safety_controller", "a")),
+        (urdf(joint='<spring k="3"/>'), ("spring", "a")),
+        (urdf(more='<loop_joint name="closing" type="revolute"/>'), ("loop_joint", "closing")),
+        (urdf(more='<drake:ball_constraint name="x"/>'), ("ball_constraint", "x")),
+        (urdf(more='<gazebo><joint name="c" type="revolute"/></gazebo>'), ("gazebo joint", "c")),
+        (urdf(more="<gazebo><joint>b</joint><mimicJoint>a</mimicJoint></gazebo>"), ("gazebo mimic", "a")),
+        (urdf(more='<gazebo reference="a"><springStiffness>7</springStiffness></gazebo>'), ("gazebo spring", "a")),
+        (urdf(more='<transmission><passive_joint name="a"/></transmission>'), ("transmission passive_joint", "a")),
+        (urdf(more=CONTROL.format(BOUNDED.format("position", -0.5, 0.5))), ("ros2_control position", "a")),
+        (urdf(more=CONTROL.format(BOUNDED.format("velocity", -1, 1))), ("ros2_control velocity", "a")),
+        (urdf(more=CONTROL.format('<param name="mimic">b</param>')), ("ros2_control mimic", "a")),
+        (urdf(more='<link name="x"><collision><geometry><cylinder radius="1"/></geometry></collision></link>'
+              '<joint name="y" type="fixed"><parent link="tip"/><child link="x"/></joint>'), ("collision", "x")),
+        (urdf(more=f'<link name="x">{INERTIAL.replace("value", "worth")}</link>'
+              '<joint name="y" type="fixed"><parent link="tip"/><child link="x"/></joint>'), ("mass", "x")),
+    ],
+)  # fmt: skip
+def test_each_element_of_a_urdf_is_named(text: str, expected: tuple[str, str]):
+    robot, told = loaded(Robot.from_urdf, text, floating_base=False)
+    assert notes(robot) == {expected}
+    assert len(told) == 1 and f"{expected[0]} {expected[1]!r}: " in told[0]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        urdf(joint='<dynamics damping="abc" friction="2"/><calibration rising="0"/>' + SAFETY.format(-1, 1)),
+        urdf('lower="-7" upper="7" velocity="0" effort="nan"'),
+        urdf('lower="-1e9" upper="1e9"', kind="continuous"),
+        urdf(more=CONTROL.format(BOUNDED.format("position", -1, 1) + BOUNDED.format("effort", -1, 1))),
+        urdf(
+            more='<transmission name="g"><joint name="a"/><mechanicalReduction>50</mechanicalReduction></transmission>'
+        ),
+        urdf(more='<gazebo reference="base"><material>Red</material></gazebo>', joint='<mimic joint="b"/>'),
+        urdf('lower="-1" upper="1" acceleration="5"'),
+    ],
+)
+def test_what_is_kept_or_a_force_is_not_named_in_a_urdf(text: str):
+    robot, told = loaded(Robot.from_urdf, text, floating_base=False)
+    assert (robot.load_report, told) == ((), [])
+
+
+def test_a_long_report_is_shortened_in_the_warning():
+    more = "".join(f'<loop_joint name="loop{k}"/>' for k in range(12))
+    robot, told = loaded(Robot.from_urdf, urdf(more=more), floating_base=False)
+    assert len(robot.load_report) == 12 and "and 4 more" in told[0] and "loop8" not in told[0]
+    table = str(robot.load_report).splitlines()
+    assert table[0].split() == ["element", "name", "what", "was", "done", "instead"] and len(table) == 13
+
+
+# --- accelerations ---
+
+
+def test_accelerations_of_urdf_1_2_are_the_default():
+    """The lesser of acceleration and deceleration; a mapping replaces some; a follower narrows its leader's."""
+    limit = 'lower="-1" upper="1" velocity="2" acceleration="{}" deceleration="{}"'
+    robot = loaded(Robot.from_urdf, urdf(limit.format(5, 4)), floating_base=False)[0]
+    np.testing.assert_array_equal(robot.acceleration_limit, [4.0, np.inf])
+    np.testing.assert_array_equal(osik.AccelerationLimit(robot).acceleration, [4.0, np.inf])
+    np.testing.assert_array_equal(osik.AccelerationLimit(robot, {"b": 3.0}).acceleration, [4.0, 3.0])
+    path = osik.rollout(
+        robot, robot.q0, {"posture": osik.PostureTask(robot, target=jnp.array([0.5, 0.0]))},
+        limits=(osik.AccelerationLimit(robot),), steps=100, dt=0.01,
+    )  # fmt: skip
+    change = np.diff(np.asarray(path.solution.velocity)[:, 0], prepend=0.0)
+    assert np.abs(change).max() == pytest.approx(0.04, rel=1e-6)
+    mimic = urdf(limit.format(6, 6), joint='<mimic joint="b" multiplier="2"/>')
+    np.testing.assert_array_equal(Robot.from_urdf(mimic, floating_base=False).acceleration_limit, [3.0])
+    again = Robot.from_mjcf(robot.to_mjcf())
+    np.testing.assert_array_equal(again.acceleration_limit, robot.acceleration_limit)
+
+
+def test_no_accelerations_to_take():
+    with pytest.raises(ValueError, match="no acceleration limits of its own"):
+        osik.AccelerationLimit(osik.load_robot("arm7"))
+
+
+# --- numbers and details as people have them ---
+
+
+@pytest.mark.parametrize(
+    ("limit", "expected"),
+    [
+        ('lower="-inf" upper="inf" effort="inf" velocity="inf"', (-np.inf, np.inf, np.inf)),
+        ('lower="-INF" upper="Infinity" velocity="2"', (-np.inf, np.inf, 2.0)),
+        ('lower="-1e400" upper="2" velocity="2"', (-np.inf, 2.0, 2.0)),
+        ('lower="-3" upper="+inf" velocity="1e500"', (-3.0, np.inf, np.inf)),
+    ],
+)
+def test_infinite_limits_are_none(limit: str, expected: tuple[float, ...]):
+    robot = Robot.from_urdf(urdf(limit), floating_base=False)
+    assert (robot.position_lower[0], robot.position_upper[0], robot.velocity_limit[0]) == expected
+    assert robot.position_upper[1] == 1.0
+
+
+@pytest.mark.parametrize("limit", ['lower="nan" upper="1"', 'lower="inf" upper="inf"', 'upper="1" velocity="nan"'])
+def test_limits_that_are_no_numbers_are_refused(limit: str):
+    with pytest.raises(ValueError, match="joint 'a', limit"):
+        Robot.from_urdf(urdf(limit), floating_base=False)
+
+
+@pytest.mark.parametrize("bound", ["1e10", "600.283", "101"])
+def test_huge_limits_count_as_none_for_starts(bound: str):
+    """The two joints' answers stay within some turns, in both precisions, and the true error is small."""
+    text = urdf(f'lower="-{bound}" upper="{bound}" velocity="2"').replace('lower="-1"', f'lower="-{bound}"')
+    rng, robot = np.random.default_rng(0), Robot.from_urdf(text, floating_base=False)
+    q = np.column_stack([rng.uniform(-3, 3, 20), rng.uniform(-2.5, 0.9, 20)])
+    points = np.column_stack([np.cos(q[:, 0]) + np.cos(q.sum(1)), np.zeros(20), -np.sin(q[:, 0]) - np.sin(q.sum(1))])
+    for typed in (robot, robot.astype("float32")):
+        found = osik.inverse_kinematics(typed, {"tip": points}, seeds=16)
+        here = np.asarray(found.q, float)
+        reached = np.column_stack([np.cos(here[:, 0]) + np.cos(here.sum(1)), -np.sin(here[:, 0]) - np.sin(here.sum(1))])
+        assert found.converged.all() and np.abs(here).max() < 20.0
+        assert np.linalg.norm(reached - points[:, [0, 2]], axis=1).max() < 1.1e-3
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        '<material name="m"><color rgba="red"/></material>',
+        '<material name="m"><color rgba="1 0 0"/></material>',
+        '<material name="m"><color/></material>',
+        '<link name="x"><visual><geometry><cylinder radius=".1"/></geometry></visual></link>'
+        '<joint name="y" type="fixed"><parent link="tip"/><child link="x"/><origin xyz="" rpy=""/></joint>',
+        '<link name="x"><visual><geometry><mesh/></geometry><origin rpy="a b c"/></visual></link>'
+        '<joint name="y" type="fixed"><parent link="tip"/><child link="x"/></joint>',
+        '<gazebo reference="tom & jerry"/>',
+    ],
+)
+def test_details_that_no_kinematics_needs_stop_nothing(more: str):
+    robot, told = loaded(Robot.from_urdf, urdf(more=more), floating_base=False)
+    assert robot.nq == 2 and told == []
+
+
+def test_colours_of_three_numbers_are_opaque():
+    color = '<material name="m"><color rgba="1 0.5 0"/></material>'
+    visual = f'<visual><geometry><sphere radius="1"/></geometry>{color}</visual>'
+    text = urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{visual}')
+    np.testing.assert_allclose(Robot.from_urdf(text, floating_base=False).mj_model.geom_rgba, [[1.0, 0.5, 0.0, 1.0]])
+
+
+PLATE = "v 0 0 0\nv .1 0 0\nv .1 .2 0\nv 0 .2 0\nf 1 2 3\nf 1 3 4\n"
+LINE = "v 0 0 0\nv .1 0 0\nv .2 0 0\nv .3 0 0\nf 1 2 3\nf 2 3 4\n"
+TETRA = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+@pytest.mark.parametrize(
+    ("mesh", "scale", "count", "message"),
+    [
+        (PLATE, "1 1 1", 2, "plate file.obj is flat, and 1 mm thick here"),
+        (TETRA, "1 0 1", 2, "plate file.obj is flat, and 1 mm thick here"),
+        (LINE, "1 1 1", 1, "plate file.obj is left out"),
+        (TETRA, "2 2 2", 2, None),
+    ],
+)
+def test_flat_meshes_do_not_stop_the_robot(tmp_path: Path, mesh: str, scale: str, count: int, message: str | None):
+    """One of two meshes is flat; the other stays as it is. The address is written with %20."""
+    (tmp_path / "plate file.obj").write_text(mesh)
+    (tmp_path / "whole.obj").write_text(TETRA)
+    shape = '<collision><geometry><mesh filename="{}" scale="{}"/></geometry></collision>'
+    shapes = shape.format("plate%20file.obj", scale) + shape.format("whole.obj", "1")
+    path = tmp_path / "robot.urdf"
+    path.write_text(urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{shapes}'))
+    robot, told = loaded(Robot.from_urdf, path, floating_base=False, collision_meshes=True)
+    assert len(robot.tree.geom_types) == count
+    assert notes(robot) == ({("collision mesh", "l1")} if message else set())
+    assert not message or (message in told[0] and "'l1'" in told[0])
+    model = robot.mj_model
+    spans = [
+        np.ptp(model.mesh_vert[at : at + n], 0) for at, n in zip(model.mesh_vertadr, model.mesh_vertnum, strict=True)
+    ]
+    assert len(spans) == count and min(spans[0]) >= (0.9e-3 if message else 0.05)
