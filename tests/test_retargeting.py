@@ -42,7 +42,6 @@ from osik_jax.retargeting._balance import overhang
 from osik_jax.retargeting._banded import BandedSystem, solve_banded
 from osik_jax.retargeting._body import Build, pairs_apart
 from osik_jax.retargeting._contact import find_contact, find_ground
-from osik_jax.retargeting._described import described_urdf
 from osik_jax.retargeting._facing import by_name
 from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._fit import FitLoss, _Setting
@@ -53,6 +52,7 @@ from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._plan import _Clip, _improved, _State, make_plan
 from osik_jax.retargeting._roles import NEEDED, SIDES
 from osik_jax.retargeting._terms import Body, frame_rows
+from osik_jax.robot.loading import example_urdf
 
 FPS = 30.0
 HIGHEST = jax.lax.Precision.HIGHEST
@@ -624,7 +624,7 @@ def test_a_guess_sees_the_same_robot(nao):
 
 
 def test_a_g1_is_guessed_from_its_urdf():
-    g1 = osik.Robot.from_urdf(described_urdf("g1"), floating_base=True)
+    g1 = osik.Robot.from_urdf(example_urdf("g1"), floating_base=True)
     guess, own = guess_profile(g1), load_profile("g1")
     assert find_profile(g1) == own
     for side in ("left", "right"):
@@ -646,12 +646,12 @@ def test_a_g1_is_guessed_from_its_urdf():
     ],
 )
 def test_a_wrist_is_not_what_grips(urdf, wrist):
-    robot = osik.Robot.from_urdf(described_urdf("g1").parents[2] / urdf, floating_base=True)
+    robot = osik.Robot.from_urdf(example_urdf("g1").parents[2] / urdf, floating_base=True)
     assert guess_profile(robot).keypoints["left_wrist"][0] == wrist
 
 
 def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
-    path = described_urdf("talos")
+    path = example_urdf("talos")
     talos, own = osik.Robot.from_urdf(path, floating_base=True), load_profile("talos")
     assert find_profile(talos) == own
     boxes = ElementTree.parse(path.with_name("talos_full_v2_box.urdf")).getroot()
@@ -668,7 +668,7 @@ def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
 
 @pytest.mark.slow
 def test_talos_dances_with_its_feet_where_they_are(dance):
-    talos = osik.Robot.from_urdf(described_urdf("talos"), floating_base=True)
+    talos = osik.Robot.from_urdf(example_urdf("talos"), floating_base=True)
     figures = report(retarget(talos, load_motion(dance)))
     assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.05
     assert figures["feet"]["float_mm_max"] < 0.05 and figures["feet"]["below_floor_mm_max"] < 0.05
@@ -692,7 +692,7 @@ def outside_capsules(robot, capsules, points):
 def test_guessed_capsules_cover_the_meshes_of_limbs(name):
     """The vertices of the collision meshes that MuJoCo reads, beside capsules out of masses alone."""
     plain, meshed = (
-        osik.Robot.from_urdf(described_urdf(name), floating_base=True, collision_meshes=meshes)
+        osik.Robot.from_urdf(example_urdf(name), floating_base=True, collision_meshes=meshes)
         for meshes in (False, True)
     )
     model, vertices = meshed.mj_model, []
@@ -713,7 +713,7 @@ def test_guessed_capsules_cover_the_meshes_of_limbs(name):
 @pytest.mark.parametrize("part", ["rubber_hand", "wrist_yaw_link"])
 def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
     """The vertices of a G1's hands as they look; the hand is fixed to a wrist that is too light for a capsule."""
-    path = described_urdf("g1")
+    path = example_urdf("g1")
     g1 = osik.Robot.from_urdf(path, floating_base=True)
     profile, places = guess_profile(g1), home_kinematics(g1)
     for side in SIDES:
@@ -727,7 +727,7 @@ def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
 
 
 def test_links_without_a_size_get_no_capsule():
-    path = described_urdf("g1").parents[2] / "icub_description/robots/icub_reduced.urdf"
+    path = example_urdf("g1").parents[2] / "icub_description/robots/icub_reduced.urdf"
     icub = osik.Robot.from_urdf(path, floating_base=True)
     capsules = {capsule.frame: capsule.radius for capsule in guess_profile(icub).capsules}
     assert "l_ankle_2" not in capsules and min(capsules.values()) > 1e-3
@@ -742,7 +742,7 @@ def test_links_without_a_size_get_no_capsule():
 )
 def test_links_are_no_longer_than_between_their_joints(urdf, link, ends):
     """By their inertias an iCub's chest is 63 cm wide, and a Romeo's thigh 88 cm long."""
-    robot = osik.Robot.from_urdf(described_urdf("g1").parents[2] / urdf, floating_base=True)
+    robot = osik.Robot.from_urdf(example_urdf("g1").parents[2] / urdf, floating_base=True)
     places = home_kinematics(robot)
     first, last = (np.asarray(places.frame_pose(robot, frame)[0]) for frame in ends)
     along = (last - first) / np.linalg.norm(last - first)

@@ -23,7 +23,7 @@ class Ik:
     """
 
     robot: Annotated[str, tyro.conf.Positional]
-    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
     frame: str
     """The frame: a link, body, site or geom."""
     position: tuple[float, float, float]

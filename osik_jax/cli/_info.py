@@ -10,6 +10,7 @@ import tyro
 from ._robots import read_robot
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Column, Table
 
     from ..robot import Robot
@@ -17,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Info:
-    """Prints a robot's joints with their limits, its frames and its mass."""
+    """Prints a robot's joints with their limits, its frames and its mass, and what it does not keep of its file."""
 
     robot: Annotated[str, tyro.conf.Positional]
-    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
     base: Literal["auto", "floating", "fixed"] = "auto"
     """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
@@ -38,7 +39,22 @@ class Info:
         for follower, (leader, multiplier) in robot.mimic_joints.items():
             console.print(f"{follower} follows {leader}, times {multiplier:g}")
         console.print(f"[bold]{len(robot.frame_names)} frames[/bold]: {', '.join(robot.frame_names)}")
+        _print_report(console, robot)
         return 0
+
+
+def _print_report(console: Console, robot: Robot) -> None:
+    """What the file asks for and the robot does not keep, as a table."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    if not robot.load_report:
+        console.print(f"[bold]load report[/bold]: {robot.load_report}")
+        return
+    table = Table("element", "name", "what was done instead", title="load report")
+    for note in robot.load_report:
+        table.add_row(*(escape(text) for text in note))
+    console.print(table)
 
 
 def _joint_table(robot: Robot) -> Table:

@@ -19,7 +19,7 @@ class Reach:
     """
 
     robot: str
-    """A URDF or MJCF file, or one of the embedded robots: nao, arm7."""
+    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
     frame: str
     """The frame: a link, body, site or geom, carried by hinges and slides."""
     out: Path = Path("map.npz")

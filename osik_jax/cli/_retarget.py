@@ -13,7 +13,7 @@ import tyro
 
 from .._errors import OsikValueError
 from ._messages import told
-from ._robots import EMBEDDED, read_robot
+from ._robots import read_robot
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -46,7 +46,7 @@ class Retarget:
     clip: Annotated[str, tyro.conf.Positional]
     """A BVH file, or keypoints as .npz or .csv; or a folder with such files."""
     robot: str = "nao"
-    """nao; g1 or talos (of example-robot-data, where that is installed); or a URDF or MJCF file."""
+    """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
     out: Path = Path("osik-retarget")
     """Folder to write to."""
     profile: str | None = None
@@ -274,12 +274,10 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
 
 
 def _robot_to_retarget(source: str) -> Robot:
-    """A robot by name or file, its base floating; some names are of example-robot-data's."""
-    from ..retargeting._described import DESCRIBED, described_urdf
+    """A robot by name or file, its base floating."""
+    from ..robot.loading import ROBOTS
 
-    if source in DESCRIBED and not os.path.exists(source):
-        source = str(described_urdf(source))
-    return read_robot(source, "auto" if source in EMBEDDED else "floating", named=("nao", *DESCRIBED))
+    return read_robot(source, "auto" if source in ROBOTS else "floating")
 
 
 def _number_or_name(text: str) -> str | float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,36 +12,34 @@ from ._messages import USER_ERRORS, CommandError, told
 if TYPE_CHECKING:
     from ..robot import Robot
 
-EMBEDDED = ("nao", "arm7")
 FLOATING = {"auto": None, "floating": True, "fixed": False}
 """What ``--base`` says of the root: whether it moves freely, None where the file is to say."""
 
 
-def read_robot(source: str, base: str = "auto", *, named: Sequence[str] = EMBEDDED) -> Robot:
-    """A robot by name (embedded, or one of robot_descriptions), or a URDF or MJCF file, told apart by what is in it.
+def read_robot(source: str, base: str = "auto") -> Robot:
+    """A robot by a name that ``load_robot`` takes, or a URDF or MJCF file, told apart by what is in it.
 
     Args:
         source: name or path.
         base: ``"floating"``, ``"fixed"``, or ``"auto"``.
-        named: the robots that a command knows by name, for its message.
 
     Raises:
         CommandError: no such file, or what is in it is broken.
     """
     from ..robot import Robot, load_robot
-    from ..robot.loading import is_mjcf
+    from ..robot.loading import NAMES, ROBOTS, is_mjcf
 
     with told():
-        if source in EMBEDDED and not os.path.exists(source):
+        if source in ROBOTS and not os.path.exists(source):
             if base != "auto":
                 raise OsikValueError(f"--base goes with a file; {source} is what it is")
             return load_robot(source)
         path, floating = Path(source), FLOATING[base]
         if not path.is_file():
-            if source.endswith("_description"):
+            if source in NAMES or source.endswith("_description"):
                 return _described(source, floating)
             raise FileNotFoundError(
-                f"no such file: {source} (robots by name: {', '.join(named)}; names of robot_descriptions end in "
+                f"no such file: {source} (robots by name: {', '.join(NAMES)}; names of robot_descriptions end in "
                 "_description)"
             )
         if is_mjcf(path):

@@ -28,7 +28,7 @@ class View:
     file: Annotated[Path | None, tyro.conf.Positional] = None
     """A motion.npz to play, a session.json to open, or a map.npz. Default: drag the robot."""
     robot: str = "nao"
-    """A URDF or MJCF file, or nao, arm7, g1 (from the package example-robot-data), or a name of robot_descriptions."""
+    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
     base: Literal["auto", "floating", "fixed"] = "auto"
     """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     support: tuple[str, ...] = ()
@@ -45,12 +45,13 @@ class View:
     def run(self) -> int:
         """Serves a page until Ctrl-C, which is how a view ends."""
         from ..viewer.live import _open
+        from ..viewer.live._source import RobotSource
 
         with told():
             if self.html is not None and (self.file is None or self.file.suffix == ".json" or _open.is_map(self.file)):
                 raise CommandError("--html goes with a motion.npz")
             _open.check(self.host, 0 if self.html is not None else self.port)
-            source = _open.source_of(self.robot, FLOATING[self.base])
+            source = RobotSource(self.robot, FLOATING[self.base])
             if self.file is not None and self.file.suffix == ".json":
                 view = _open.open_session(self.file, host=self.host, port=self.port)
             else:

@@ -5,6 +5,7 @@ Nothing here runs inside a program: what is traced is looked at as far as its ty
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from .._errors import OsikKeyError, OsikTypeError, OsikValueError, warn
@@ -19,8 +21,14 @@ from ..limits import Limit, NoLimits
 from ..numerics._arguments import concrete
 from ..robot import Robot
 from ..robot._made_for import check_made_for, check_robot
+from ..robot._plausible import warn_of_far_joints
 from ..schemes import Scheme, SchemeAnswer, VelocityProblem
 from ..tasks import Task, TaskRows
+
+_DIVERGES = 2.0
+"""An error e becomes (1 - gain dt) e in a step."""
+_DEGREES = 6.5
+"""Configurations without larger numbers are not looked at for degrees: those would be less than a turn in radians."""
 
 
 def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
@@ -99,6 +107,24 @@ def check_tasks(tasks: Any, robot: Robot | None = None) -> None:
             check_made_for(task, robot, f"tasks[{name!r}]")
 
 
+def checked_start(robot: Robot, q0: Any) -> Array:
+    """Return a configuration to start from, as ``checked_configuration`` does; warn of joints far outside their range.
+
+    Raises:
+        TypeError, ValueError: as ``checked_configuration``.
+    """
+    q0 = checked_configuration(robot, q0)
+    warn_of_far_joints(robot, q0, "q0")
+    return q0
+
+
+def warn_of_degrees(robot: Robot, q: Array) -> None:
+    """As ``checked_start`` warns, for a function that is called at each step: small numbers are not looked at."""
+    seen = concrete(q)
+    if seen is not None and np.abs(seen).max() > _DEGREES:
+        warn_of_far_joints(robot, seen, "q")
+
+
 def checked_configuration(robot: Robot, q: Any) -> Array:
     """Return q, checked, as floats at least as precise as the robot's.
 
@@ -112,6 +138,37 @@ def checked_configuration(robot: Robot, q: Any) -> Array:
         raise OsikTypeError(f"q is {q!r}; it is a configuration: {robot.nq} numbers") from None
     robot.check_configuration(q)
     return q.astype(jnp.result_type(q, robot.q0))
+
+
+_accepted_gains: tuple[Any, ...] = ()
+"""dt and the gains that were looked at last, and are not too large: the next call with the same ones is quicker."""
+
+
+def warn_of_large_gains(tasks: Mapping[str, Task], dt: Any) -> None:
+    """Give one ``OsikWarning`` that names the tasks whose gain times dt is above 2; nothing is said of traced numbers.
+
+    Their errors grow at each step.
+    """
+    global _accepted_gains
+    gains = [getattr(task, "gain", 0.0) for task in tasks.values()]
+    seen = (dt, *gains)
+    if len(seen) == len(_accepted_gains) and all(map(operator.is_, seen, _accepted_gains)):
+        return
+    large = [float(getattr(gain, "maximum", gain)) for gain in gains if not _is_traced(gain)]
+    if _is_traced(dt) or len(large) < len(gains):
+        return
+    named = [f"{name} (gain {gain:g})" for name, gain in zip(tasks, large, strict=True) if gain * float(dt) > _DIVERGES]
+    if not named:
+        _accepted_gains = seen
+        return
+    warn(
+        f"gain times dt is above {_DIVERGES:g}, so that errors grow at each step of {float(dt):g} s: "
+        f"{', '.join(named)}. Gains are in 1/s, dt is in seconds"
+    )
+
+
+def _is_traced(tree: Any) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def check_steps(steps: Any) -> None:

@@ -26,6 +26,8 @@ from ._checks import (
     check_tasks,
     checked_configuration,
     checked_limits,
+    checked_start,
+    warn_of_large_gains,
 )
 from ._solution import Solution, Trajectory
 from ._step import Targets, Tasks, aim, in_type_of, step
@@ -76,6 +78,9 @@ def rollout(
     Raises:
         TypeError, ValueError: as in ``solve``; ``targets``, ``feedback`` or ``steps`` do not fit.
         KeyError: ``targets`` names a task that does not exist.
+
+    Warns:
+        OsikWarning: as in ``solve``.
     """
     check_setting("rollout(robot, q0, tasks)", robot, scheme, dt)
     limits = checked_limits(robot, limits)
@@ -88,7 +93,9 @@ def rollout(
                 f"feedback has shape {feedback.shape}; it is one configuration a step, {(steps, robot.nq)}"
             )
     numbers, static = taken_apart((tasks if callable(tasks) else dict(tasks), feedback))
-    q0 = checked_configuration(robot, q0)
+    q0 = checked_start(robot, q0)
+    if not callable(tasks):
+        warn_of_large_gains(tasks, dt)
     return _rollout(
         robot,
         q0,

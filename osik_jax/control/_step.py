@@ -32,6 +32,8 @@ from ._checks import (
     checked_configuration,
     checked_limits,
     solved_with,
+    warn_of_degrees,
+    warn_of_large_gains,
 )
 from ._solution import Solution
 
@@ -82,7 +84,8 @@ def solve(
             float64 numbers while ``jax_enable_x64`` is off.
 
     Warns:
-        OsikWarning: a robot that has float32 numbers while ``jax_enable_x64`` is on.
+        OsikWarning: a robot that has float32 numbers while ``jax_enable_x64`` is on; numbers that are probably in other
+            units: a joint far outside its range, or a gain times dt above 2, which makes errors grow.
     """
     check_setting("solve(robot, q, tasks)", robot, scheme, dt)
     limits = checked_limits(robot, limits)
@@ -90,6 +93,8 @@ def solve(
     check_target_names(tasks, targets)
     check_warm_start(warm_start)
     q = checked_configuration(robot, q)
+    warn_of_degrees(robot, q)
+    warn_of_large_gains(tasks, dt)
     return step(robot, q, aim(dict(tasks), targets), scheme, limits, in_type_of(dt, q), warm_start)
 
 

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikTypeError, OsikValueError
-from ..control._checks import check_setting, checked_configuration, checked_limits
+from ..control._checks import check_setting, checked_limits, checked_start
 from ..execution._blocks import in_blocks
 from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
 from ..numerics._arguments import check_count, concrete
@@ -105,13 +105,16 @@ def inverse_kinematics(
         KeyError: no such frame or task; the message lists those that exist.
         ValueError: numbers that are no pose, batches of different lengths, a tolerance that the precision cannot tell,
             or no task that says where anything has to be; a robot of the wrong precision, as in ``solve``.
+
+    Warns:
+        OsikWarning: a joint is far outside its range in ``q0``, as degrees are.
     """
     check_setting("inverse_kinematics(robot, tasks)", robot, scheme, 1.0)
     check_count("seeds", seeds)
     check_count("steps", steps)
     check_count("restarts", restarts, least=0)
     limits, dtype = checked_limits(robot, limits), robot.q0.dtype
-    home = robot.q0 if q0 is None else checked_configuration(robot, q0).astype(dtype)
+    home = robot.q0 if q0 is None else checked_start(robot, q0).astype(dtype)
     problem = read_problem(robot, tasks, targets, scheme, limits)
     lower, upper = joint_box(robot, limits)
     tolerance = _together(

@@ -12,6 +12,7 @@ from .._errors import OsikValueError
 from ..numerics._arguments import concrete, entries
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values
+from ..robot._plausible import warn_of_fast_joints
 from ._box import Kind, Limit
 
 
@@ -27,6 +28,9 @@ class VelocityLimit(Limit):
     Raises:
         KeyError: the mapping names a joint that does not exist.
         ValueError: a wrong shape, or a speed that is negative or not a number.
+
+    Warns:
+        OsikWarning: a speed is more than ten times the robot's own, as degrees a second are.
     """
 
     kind: ClassVar[Kind] = "velocity"
@@ -35,6 +39,8 @@ class VelocityLimit(Limit):
     def __init__(self, robot: Robot, *, velocity: ArrayLike | Array | Mapping[str, float] | None = None):
         self.velocity = dof_values(robot, velocity, robot.velocity_limit, "velocity")
         self._check(dof_names(robot))
+        if velocity is not None:
+            warn_of_fast_joints(dof_names(robot), self.velocity, robot.velocity_limit, "velocity")
 
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float

@@ -26,6 +26,9 @@ def load_robot(
 ) -> Robot:
     """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
 
+    ``"g1"`` (Unitree's, 29 joints) and ``"talos"`` (PAL's) are URDFs of the package example-robot-data, where that is
+    installed, else of robot_descriptions. Every command of ``osik`` takes the same names.
+
     Any other name is one of the package robot_descriptions (the extra ``descriptions``): MuJoCo Menagerie as
     ``panda_mj_description``, ``g1_mj_description`` and so on, URDFs as ``panda_description``. That package clones the
     robot's git repository into a cache when it is asked for the first time.
@@ -42,6 +45,7 @@ def load_robot(
         KeyError: no such robot; the message lists those with names like it, and of a path says what reads files. No
             such joint or keyframe.
         ImportError: the robot is one of robot_descriptions, which is not installed.
+        FileNotFoundError: the robot is ``"g1"`` or ``"talos"``, and neither package is installed.
         ValueError: the robot comes as xacro alone, its file cannot be read, or ``home`` does not fit.
 
     Warns:
@@ -51,14 +55,13 @@ def load_robot(
         raise OsikTypeError(f"name is {name!r}; it is a name, such as {' or '.join(map(repr, loading.ROBOTS))}")
     if os.sep in name or name.lower().endswith(_OF_FILES):
         raise OsikKeyError(
-            f"no robot {name!r}: load_robot takes names ({', '.join(loading.ROBOTS)}, or one of robot_descriptions); "
+            f"no robot {name!r}: load_robot takes names ({', '.join(loading.NAMES)}, or one of robot_descriptions); "
             "files are read by Robot.from_urdf(path) and Robot.from_mjcf(path)"
         )
-    load = loading.embedded if name in loading.ROBOTS else loading.described
     options = LoadOptions(
         floating_base=floating_base,
         velocity_limits=velocity_limits,
         position_limits=position_limits,
         locked_joints=locked_joints,
     )
-    return Robot._of(load(name, options), home)
+    return Robot._of(loading.named(name, options), home)

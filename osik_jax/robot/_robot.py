@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, DTypeLike, Num
 
 from ..numerics._arguments import float_dtype
 from . import loading
-from ._configuration import check_configuration, with_joints
+from ._configuration import check_configuration, configuration
 from ._describe import described
 from ._home_configuration import Home, home_configuration
 from ._links import Factors, scaled_leaves
@@ -219,8 +219,11 @@ class Robot(RobotModel):
         Raises:
             KeyError: no such joint, or it is locked.
             ValueError: a free or ball joint, which no single number sets.
+
+        Warns:
+            OsikWarning: a joint is more than 0.5 rad or 0.5 m outside its range, as degrees are.
         """
-        return with_joints(self, joints, base)
+        return configuration(self, joints, base)
 
     def with_home(self, home: Home) -> Self:
         """The same robot with another ``q0``, which is what tasks made from then on aim at by default.

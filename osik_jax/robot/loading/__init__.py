@@ -2,10 +2,15 @@
 
 from ._descriptions import described as described
 from ._descriptions import urdf_of_description as urdf_of_description
+from ._embedded import EXAMPLES as EXAMPLES
+from ._embedded import NAMES as NAMES
 from ._embedded import ROBOTS as ROBOTS
 from ._embedded import embedded as embedded
 from ._mjcf import from_mjcf as from_mjcf
 from ._mjmodel import from_mjmodel as from_mjmodel
+from ._named import ELSEWHERE as ELSEWHERE
+from ._named import example_urdf as example_urdf
+from ._named import named as named
 from ._options import LoadOptions as LoadOptions
 from ._options import LockedJoints as LockedJoints
 from ._options import PositionLimits as PositionLimits

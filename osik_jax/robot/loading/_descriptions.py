@@ -10,7 +10,7 @@ from types import ModuleType
 
 from ..._errors import OsikKeyError, OsikValueError, unknown_name
 from .._model import RobotModel
-from ._embedded import ROBOTS
+from ._embedded import NAMES
 from ._mjcf import from_mjcf
 from ._options import LoadOptions
 from ._urdf import from_urdf
@@ -58,18 +58,18 @@ def _known(name: str) -> tuple[str, ...]:
             raise ImportError(
                 f"robot {name!r} needs robot_descriptions: pip install 'osik-jax[descriptions]'"
             ) from missing
-        raise unknown_name("robot", name, ROBOTS) from None
+        raise unknown_name("robot", name, NAMES) from None
     return tuple(package.DESCRIPTIONS)
 
 
 def _unknown(name: str, known: Iterable[str]) -> KeyError:
-    """Hundreds are known: the message lists the embedded ones, and those with names like this one."""
-    available = (*ROBOTS, *known)
+    """Hundreds are known: the message lists the short names, and those with names like this one."""
+    available = (*NAMES, *known)
     close = difflib.get_close_matches(name, available, n=_NEAREST)
     short = name.removesuffix(SUFFIX)
     close += [other for other in available if short and short in other and other not in close]
     hint = f"; did you mean {', '.join(map(repr, close[:_NEAREST]))}?" if close else "."
-    return OsikKeyError(f"no robot {name!r}{hint} robots: {', '.join(ROBOTS)}, and robot_descriptions.DESCRIPTIONS")
+    return OsikKeyError(f"no robot {name!r}{hint} robots: {', '.join(NAMES)}, and robot_descriptions.DESCRIPTIONS")
 
 
 def _package_dirs(module: ModuleType) -> list[str]:

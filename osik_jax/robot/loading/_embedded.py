@@ -9,6 +9,10 @@ from ._mjcf import from_mjcf
 from ._options import LoadOptions
 
 ROBOTS = ("nao", "arm7")
+EXAMPLES = ("g1", "talos")
+"""Unitree's G1 with 29 joints, and PAL's Talos, whose URDFs come with the package example-robot-data."""
+NAMES = (*ROBOTS, *EXAMPLES)
+"""Names that ``load_robot`` and every command take, beside those of robot_descriptions."""
 
 
 def embedded(name: str, options: LoadOptions) -> RobotModel:

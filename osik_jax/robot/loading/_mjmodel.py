@@ -14,6 +14,7 @@ from ..._errors import OsikTypeError, OsikValueError, warn
 from .._balls import with_balls_inside
 from .._load_report import LoadNote, LoadReport
 from .._model import RobotModel
+from .._plausible import warn_of_fast_joints
 from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder
 from ._followers import (
     Follower,
@@ -97,6 +98,8 @@ def from_mjmodel(
     ranges = options.position_limits or {}
     low, high = _ranges(model, names, ranges)
     speeds = _rates(model, names, VELOCITY_LIMIT_PREFIX, "velocity", options.velocity_limits or {})
+    own_speeds = _rates(model, names, VELOCITY_LIMIT_PREFIX, "velocity", {})
+    warn_of_fast_joints(names, speeds, own_speeds, "velocity_limits")
     accelerations = _rates(model, names, ACCELERATION_LIMIT_PREFIX, "acceleration", {})
     lower, upper = _position_limits(tree, followers, low, high)
     _warn_of_frozen(tree, lower, upper, ranges)

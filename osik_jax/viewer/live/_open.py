@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,9 +24,6 @@ from ._session import load_session
 from ._source import RobotSource, source_look
 from ._stance import sole_polygon, standing
 
-_G1 = "g1_description/urdf/g1_29dof_rev_1_0.urdf"
-_G1_DESCRIPTION = "g1_mj_description"
-
 
 def check(host: str, port: int) -> None:
     """Finds out before the work what would fail after it.
@@ -38,18 +34,6 @@ def check(host: str, port: int) -> None:
     """
     import_viser()
     check_port(host, port)
-
-
-def source_of(name: str, floating_base: bool | None) -> RobotSource:
-    """Where a robot comes from; ``g1`` is that of example-robot-data, or of robot_descriptions."""
-    if name != "g1" or Path(name).exists():
-        return RobotSource(name, floating_base)
-    try:
-        files = importlib.metadata.files("example-robot-data") or []
-    except importlib.metadata.PackageNotFoundError:
-        files = []
-    found = [str(file.locate()) for file in files if str(file).endswith(_G1)]
-    return RobotSource(found[0] if found else _G1_DESCRIPTION, floating_base)
 
 
 def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: str, port: int) -> LiveView:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import suppress
 from pathlib import Path
 
 from ...robot import Robot, load_robot
-from ...robot.loading import ROBOTS, is_mjcf, urdf_of_description
+from ...robot.loading import ELSEWHERE, EXAMPLES, NAMES, ROBOTS, example_urdf, is_mjcf, urdf_of_description
 from .._look import Look, read_look
 
 _SUFFIX = "_description"
@@ -17,7 +18,7 @@ class RobotSource:
     """A robot by name or file.
 
     Attributes:
-        robot: name of an embedded robot or one of robot_descriptions, or path of a URDF or MJCF file.
+        robot: a name that ``load_robot`` takes, or the path of a URDF or MJCF file.
         floating_base: as in ``Robot.from_urdf``; None: as the file says.
     """
 
@@ -27,7 +28,7 @@ class RobotSource:
     @property
     def is_file(self) -> bool:
         """Whether it is a file, rather than a name."""
-        return self.robot not in ROBOTS and not self.robot.endswith(_SUFFIX)
+        return Path(self.robot).is_file() or (self.robot not in NAMES and not self.robot.endswith(_SUFFIX))
 
     @property
     def is_mjcf(self) -> bool:
@@ -61,5 +62,10 @@ def source_look(source: RobotSource) -> Look | None:
     """What a URDF shows; None of robots whose shapes are in their model already."""
     if source.is_file:
         return None if source.is_mjcf else read_look(source.robot)
-    urdf = None if source.robot in ROBOTS else urdf_of_description(source.robot)
+    if source.robot in ROBOTS:
+        return None
+    if source.robot in EXAMPLES:
+        with suppress(FileNotFoundError):
+            return read_look(example_urdf(source.robot))
+    urdf = urdf_of_description(ELSEWHERE.get(source.robot, source.robot))
     return None if urdf is None else read_look(urdf[0], package_dirs=urdf[1])

@@ -1,0 +1,61 @@
+"""Numbers that are probably in other units than radians, metres and seconds: told once, and taken as they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jax.core import Tracer
+
+from .._errors import warn
+from ._model import RobotModel
+from ._tree import HINGE, SLIDE
+
+_FAR = 0.5
+"""A joint that is further outside its range [rad or m] than this is not there: encoders are off by a hundredth."""
+_TIMES = 10.0
+"""A speed that is more times the file's is not meant: degrees are 57 times radians, millimetres 1000 times metres."""
+_NAMES_SHOWN = 4
+
+
+def warn_of_far_joints(robot: RobotModel, q: Any, what: str) -> None:
+    """Gives one ``OsikWarning`` that names the hinges and slides of q (nq,) that are far outside their range.
+
+    Nothing is said of traced numbers.
+    """
+    parts = (q, robot.position_lower, robot.position_upper)
+    if any(isinstance(part, Tracer) for part in parts):
+        return
+    values, lower, upper = (np.asarray(part) for part in parts)
+    tree = robot.tree
+    far = []
+    for joint, at in tree.qpos_address.items():
+        if tree.joint_types[joint] in (HINGE, SLIDE):
+            low, high = (float(bound[tree.dof_address[joint]]) for bound in (lower, upper))
+            if not low - _FAR <= values[at] <= high + _FAR:
+                far.append(f"{tree.joint_names[joint]} is {values[at]:g}, its range is [{low:g}, {high:g}]")
+    if far:
+        warn(f"{what} is far outside the joints' ranges; it is in radians and metres: {_some(far)}")
+
+
+def warn_of_fast_joints(names: Any, given: Any, own: Any, what: str) -> None:
+    """Gives one ``OsikWarning`` that names the entries whose given speed is more than ten times the file's.
+
+    Args:
+        names: of each entry.
+        given: speeds [rad/s or m/s]; infinite ones say that none is meant.
+        own: of the file, infinite where it has none.
+        what: what the message calls the speeds.
+    """
+    if isinstance(given, Tracer) or isinstance(own, Tracer):
+        return
+    given, own = np.asarray(given), np.asarray(own)
+    fast = np.flatnonzero(np.isfinite(given) & (given > _TIMES * own))
+    if len(fast):
+        shown = dict.fromkeys(f"{names[k]}: {given[k]:g}, the file has {own[k]:g}" for k in fast)
+        warn(f"{what} is more than ten times the file's; it is in rad/s and m/s: {_some(list(shown))}")
+
+
+def _some(texts: list[str]) -> str:
+    more = f"; and {len(texts) - _NAMES_SHOWN} more" if len(texts) > _NAMES_SHOWN else ""
+    return "; ".join(texts[:_NAMES_SHOWN]) + more

@@ -1,0 +1,48 @@
+"""Names of robots: ``load_robot`` and every command take the same ones."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.cli import CommandError, read_robot
+from osik_jax.cli._retarget import _robot_to_retarget
+from osik_jax.robot.loading import NAMES, example_urdf
+from osik_jax.viewer.live._source import RobotSource, load_source, source_look
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_way_loads_the_same_robot(name: str):
+    robot = osik.load_robot(name)
+    for other in (read_robot(name), load_source(RobotSource(name))):
+        assert other.tree == robot.tree
+        np.testing.assert_array_equal(other.q0, robot.q0)
+    if robot.floating_base:
+        assert _robot_to_retarget(name).tree == robot.tree
+    assert RobotSource(name).python() == f"osik.load_robot({name!r})"
+
+
+@pytest.mark.parametrize("name", ["g1", "talos"])
+def test_urdfs_of_example_robot_data(name: str):
+    """The same as its file, with a base as asked; the page finds the meshes' shapes."""
+    robot = osik.Robot.from_urdf(example_urdf(name), floating_base=False)
+    assert osik.load_robot(name, floating_base=False).tree == robot.tree
+    assert read_robot(name, "fixed").tree == robot.tree
+    assert source_look(RobotSource(name)) is not None
+
+
+def test_without_the_packages_both_are_named(monkeypatch):
+    monkeypatch.setattr(sys, "path", [])
+    monkeypatch.setitem(sys.modules, "robot_descriptions", None)
+    with pytest.raises(FileNotFoundError, match="pip install example-robot-data"):
+        osik.load_robot("g1")
+    with pytest.raises(CommandError, match="pip install example-robot-data"):
+        read_robot("g1")
+
+
+def test_unknown_names_list_those_that_are_known():
+    with pytest.raises(CommandError, match="robots by name: nao, arm7, g1, talos"):
+        read_robot("g2")
+    with pytest.raises(KeyError, match="nao, arm7, g1, talos"):
+        osik.load_robot("g1.urdf")
