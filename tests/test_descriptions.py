@@ -97,7 +97,7 @@ def test_options_reach_embedded_robots_too():
         ("toy_mj_descriptoin", r"no robot 'toy_mj_descriptoin'; did you mean 'toy_mj_description', 'toy_description'"),
         (
             "solo12",
-            r"no robot 'solo12'; did you mean 'solo12_description'\? robots: nao, arm7, g1, talos, and robot_descriptions.DESC",
+            r"no robot 'solo12'; did you mean 'solo12_description'\? robots: nao, arm7, g1, talos, and robot_desc",
         ),
         ("solo_description", r"did you mean .*'solo12_description'"),
         ("qqq", r"no robot 'qqq'\. robots: nao, arm7, g1, talos, and robot_descriptions.DESCRIPTIONS"),
