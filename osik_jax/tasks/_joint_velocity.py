@@ -16,6 +16,7 @@ from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ..robot._joint_selection import dofs_of, select_all
+from ._background import background_weight
 from ._leaves import WeightLike, as_joint_weight, as_scalar, as_vector
 from ._task import Task, TaskRows, check_priority
 
@@ -77,7 +78,7 @@ class DampingTask(VelocityTask):
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
             to take part.
         weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0.
+            globs to weights, in which a joint that is not named has 0. Default: as that of a ``PostureTask``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -91,10 +92,11 @@ class DampingTask(VelocityTask):
         robot: Robot,
         *,
         joints: Iterable[str] | None = None,
-        weight: WeightLike = 1e-3,
+        weight: WeightLike | None = None,
         priority: int = 1,
         hard: bool = False,
     ):
+        weight = background_weight(robot) if weight is None else weight
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
@@ -193,7 +195,7 @@ class LowAccelerationTask(VelocityTask):
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
             to take part.
         weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0.
+            globs to weights, in which a joint that is not named has 0. Default: as that of a ``PostureTask``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -210,10 +212,11 @@ class LowAccelerationTask(VelocityTask):
         *,
         velocity: ArrayLike | Array = 0.0,
         joints: Iterable[str] | None = None,
-        weight: WeightLike = 1e-3,
+        weight: WeightLike | None = None,
         priority: int = 1,
         hard: bool = False,
     ):
+        weight = background_weight(robot) if weight is None else weight
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
         self.velocity = as_vector(velocity, (robot.nv,), "velocity", robot.q0.dtype)
 

@@ -16,14 +16,12 @@ from ..kinematics import Kinematics, difference
 from ..robot import Robot
 from ..robot._joint_selection import dofs_of, is_scalar, select_all
 from ..robot._tree import BALL, DOF_WIDTH, FREE
+from ._background import background_weight
 from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_bounds, check_finite
 from ._rotation import inverse_left_jacobian
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
-
-_BACKGROUND = 1e-3
-"""Weight of a posture of the whole robot: other tasks of the same priority win against it."""
 
 
 class PostureTask(Task):
@@ -44,8 +42,9 @@ class PostureTask(Task):
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; rows are in the order of v whatever the order here.
             Default: all but the free base, which has to be named to take part.
         weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0. Default: 1e-3 for a target of the whole robot,
-            so that other tasks win; 1 where joints are named, and for bounds.
+            globs to weights, in which a joint that is not named has 0. Default: 1 where joints are named, and for
+            bounds; for a target of the whole robot 1e-3, so that other tasks win, and less on a robot whose size s, the
+            longest way along its links, is below half a metre: 1e-3 (s / 0.5 m)^2.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
@@ -83,7 +82,7 @@ class PostureTask(Task):
         dofs = dofs_of(robot, self.joints)
         rows = len(dofs)
         if weight is None:
-            weight = _BACKGROUND if joints is None and lower is None and upper is None else 1.0
+            weight = background_weight(robot) if joints is None and lower is None and upper is None else 1.0
         self.weight = as_joint_weight(robot, weight, dofs)
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)

@@ -12,6 +12,7 @@ from ...kinematics._home import compiled_kinematics
 from ...robot import Robot
 from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task
+from ...tasks._background import angle_scale
 from ._session import Session
 from ._source import RobotSource
 
@@ -56,7 +57,9 @@ def default_session(
         tasks[name] = FrameTask(robot, name, target=pose, rows=rows, weight=WEIGHTS["hand"], gain=_GAIN, priority=3)
     led: Mapping[str, Task] = _led_later(robot, start) if robot.floating_base else {}
     tasks |= led
-    tasks["posture"] = PostureTask(robot, target=start, weight=WEIGHTS["posture"], gain=1.0, priority=4)
+    tasks["posture"] = PostureTask(
+        robot, target=start, weight=WEIGHTS["posture"] * angle_scale(robot), gain=1.0, priority=4
+    )
     return Session(
         robot=robot,
         tasks=tasks,
