@@ -16,7 +16,7 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
     "jax"     none: plain JAX alone, on any platform
 
     of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks
-    "numba"   where JAX's default is a CPU: any robot, any precision
+    "core"    where JAX's default is a CPU: any robot, any precision
 
     of retargeting                            iterations of a plan                a plan's banded systems
     "warp"                                    none                                CUDA: float32, about 40 dofs at most

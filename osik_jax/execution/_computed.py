@@ -21,24 +21,25 @@ from ._lanes import lanes_of, no_lanes
 from ._rules import custom_jvp
 
 
-def by_numba(plain: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[..., Any]:
+def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], backend: str = "core") -> Callable[..., Any]:
     """Return the plain function, on CPUs by a kernel of a batch. What is given by name is static.
 
     Args:
         plain: of one problem: pytrees of arrays by position.
         kernel: the same for arrays with a leading axis, of the lanes or of length 1 where all lanes share one.
+        backend: whose kernel it is, "core" or "numba".
     """
 
     @cache
     def anywhere(**options: Any) -> Callable[..., Any]:
         wide = over_lanes(partial(plain, **options))
-        return in_shared_lanes(partial(on_platforms, {"numba": partial(kernel, **options)}, wide))
+        return in_shared_lanes(partial(on_platforms, {backend: partial(kernel, **options)}, wide))
 
     @custom_jvp
-    def by_kernel(*args: Any, **options: Any) -> Any:
+    def computed(*args: Any, **options: Any) -> Any:
         return anywhere(**options)(*args)
 
-    @by_kernel.defjvp
+    @computed.defjvp
     def _(primals: tuple[Any, ...], tangents: tuple[Any, ...], **options: Any) -> tuple[Any, Any]:
         return jax.jvp(partial(plain, **options), primals, tangents)
 
@@ -46,7 +47,7 @@ def by_numba(plain: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[
         kinds = {jnp.result_type(a) for a in jax.tree.leaves(args)}
         usual = all(kind == jnp.result_type(float) for kind in kinds if jnp.issubdtype(kind, jnp.floating))
         # how precisions mix is the definition's to say
-        return (by_kernel if usual else plain)(*args, **options)
+        return (computed if usual else plain)(*args, **options)
 
     return function
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ..execution._backends import Backend, cuda_is_default, takes
-from ..execution._computed import by_numba
+from ..execution._computed import by_kernel
 from ..robot import Robot
 from ..robot._made_for import check_robot
 from ..robot._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
@@ -112,7 +112,7 @@ def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kin
     Raises:
         ModuleNotFoundError: the backend's package is not installed.
     """
-    if not takes(backend, "numba", fits=True) or cuda_is_default():
+    if not takes(backend, "core", fits=True) or cuda_is_default():
         return forward_kinematics(robot, q)
     robot.check_configuration(q)
     return Kinematics(*_bodies(robot, q), backend=backend)
@@ -261,6 +261,6 @@ def _frames_by_kernel(robot: Robot, kinematics: Kinematics, *, names: tuple[str,
     return _kernels.moving_frames(robot, kinematics, [robot.tree.frame(name) for name in names])
 
 
-_bodies = by_numba(_fields, _kernels.bodies)
-_moving_frames = by_numba(_frames, _frames_by_kernel)
-_moving_center = by_numba(moving_center, _kernels.center_of_mass)
+_bodies = by_kernel(_fields, _kernels.bodies)
+_moving_frames = by_kernel(_frames, _frames_by_kernel)
+_moving_center = by_kernel(moving_center, _kernels.center_of_mass)

@@ -1,8 +1,7 @@
-"""Kinematics on a CPU by Numba's kernels (``kernels/numba``), called from JAX.
+"""Kinematics on a CPU by the compiled core (``core/kinematics.hpp``), called from JAX.
 
-They compute what ``_forward.py`` says, a configuration at a time and in double precision; that file is the definition,
-what runs elsewhere, and the derivative. Arguments have a leading axis of lanes, or one of length 1 where all lanes have
-the same: robots are seldom many.
+``_forward.py`` is the definition, what runs elsewhere, and the derivative. The core computes in double precision.
+Arguments have a leading axis of lanes, or one of length 1 where all lanes share them: robots are seldom many.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..core import _library
 from ..execution._computed import side_by_side
-from ..kernels.numba import _target
 from ..robot import Robot
 from ..robot._tree import KinematicTree
 
@@ -25,19 +24,15 @@ def bodies(robot: Robot, q: Float[Array, "lanes nq"]) -> tuple[Array, ...]:
     """The fields of ``Kinematics``."""
     tree = robot.tree
     index, coefficient = tree.qpos_source
-    integers = np.concatenate([tree.body_parents, tree.joint_types, tree.joint_bodies, index])
+    integers = np.concatenate([[len(index)], tree.body_parents, tree.joint_types, tree.joint_bodies, index])
     numbers = side_by_side(
         *(coefficient[None], robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion),
         *(robot.joint_position, robot.joint_axis),
     )
     lanes, count, full = max(len(q), len(numbers)), len(tree.body_parents), len(tree.dof_joint)
     shapes = (count, 3), (count, 3, 3), (full, 3), (full, 3), (full, 3)
-    *found, _ = _target.call(
-        "_kinematics",
-        [*(((lanes, *shape), float) for shape in shapes), ((len(index),), float)],
-        *(q, numbers, integers.astype(np.int32)),
-    )
-    return tuple(found)
+    outputs = [((lanes, *shape), float) for shape in shapes]
+    return tuple(_library.call("kinematics", outputs, q, numbers, integers.astype(np.int32)))
 
 
 def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Array, Array, Array]:
@@ -49,8 +44,8 @@ def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Ar
     numbers = side_by_side(factors[None], robot.frame_position[:, chosen], robot.frame_rotation[:, chosen])
     given = _arrays(kinematics)
     lanes, k = max(len(a) for a in (*given, numbers)), len(chosen)
-    positions, rotations, jacobians = _target.call(
-        "_moving_frames",
+    positions, rotations, jacobians = _library.call(
+        "moving_frames",
         [((lanes, *shape), float) for shape in ((k, 3), (k, 3, 3), (k, 6, tree.nv))],
         *(*given, numbers, integers.astype(np.int32)),
     )
@@ -60,12 +55,8 @@ def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Ar
 def center_of_mass(robot: Robot, kinematics: Any) -> tuple[Array, Array]:
     """The centre of the masses of the bodies, and its Jacobian."""
     given, integers, lanes = center_arguments(robot, kinematics)
-    count = len(robot.tree.body_parents)
-    center, jacobian, _ = _target.call(
-        "_center_of_mass",
-        [((lanes, 3), float), ((lanes, 3, robot.tree.nv), float), ((count, 4), float)],
-        *(*given, integers),
-    )
+    outputs = [((lanes, 3), float), ((lanes, 3, robot.tree.nv), float)]
+    center, jacobian = _library.call("center_of_mass", outputs, *given, integers)
     return center, jacobian
 
 

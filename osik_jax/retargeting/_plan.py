@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..execution._backends import takes
-from ..execution._computed import by_numba
+from ..execution._computed import by_kernel
 from ..kinematics import difference, integrate
 from ..numerics._dense import product
 from ..robot._joint_selection import scalar_layout
@@ -241,7 +241,7 @@ def _descended_by_numba(
     return Plan(*_plan_kernel.descended(*clip, q, rules, most, endings))
 
 
-_by_kernel = by_numba(_descended_plain, _descended_by_numba)
+_by_kernel = by_kernel(_descended_plain, _descended_by_numba, "numba")
 
 
 def _improved(clip: _Clip, state: _State) -> _State:

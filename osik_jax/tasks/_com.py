@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..execution._computed import by_numba, side_by_side
-from ..kernels.numba import _target
+from ..core import _library
+from ..execution._computed import by_kernel, side_by_side
 from ..kinematics import Kinematics, center_of_mass
 from ..kinematics._forward import body_masses, moving_center
 from ..kinematics._kernels import center_arguments
@@ -181,20 +181,20 @@ def _fields_by_kernel(task: ComTask, robot: Robot, kinematics: Kinematics) -> tu
     """The same of many lanes."""
     assert task.target is not None and task.target_velocity is not None and not isinstance(task.gain, AdaptiveGain)
     given, integers, lanes = center_arguments(robot, kinematics)
-    m, nv, count = len(task.axes), robot.tree.nv, len(robot.tree.body_parents)
+    m, nv = len(task.axes), robot.tree.nv
     weight = task.weight if task.weight.ndim == 2 else task.weight[:, None]
     weight = jnp.broadcast_to(weight, (len(weight), m))
     numbers = side_by_side(task.target, task.target_velocity, weight, task.gain)
     lanes = max(lanes, len(numbers))
     options = np.concatenate([integers, axis_numbers(task.axes), robot.tree.turning]).astype(np.int32)
-    shapes = (lanes, m), (lanes, m, nv), (lanes, m), (lanes,), (lanes, m), (lanes, nv), (4 * count + 3 + 3 * nv,)
-    error, rows, wanted, curvature, pull, levers, _ = _target.call(
-        "_center_rows", [(shape, float) for shape in shapes], *given, options, numbers
+    shapes = (lanes, m), (lanes, m, nv), (lanes, m), (lanes,), (lanes, m), (lanes, nv)
+    error, rows, wanted, curvature, pull, levers = _library.call(
+        "center_rows", [(shape, float) for shape in shapes], *given, options, numbers
     )
     return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers
 
 
-_by_kernel = by_numba(_fields, _fields_by_kernel)
+_by_kernel = by_kernel(_fields, _fields_by_kernel)
 
 
 def _cast(polygon: SupportPolygon, dtype: Any) -> SupportPolygon:

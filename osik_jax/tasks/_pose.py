@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError, unknown_name
+from ..core import _library
 from ..execution._backends import Backend
-from ..execution._computed import by_numba, side_by_side
-from ..kernels.numba import _target
+from ..execution._computed import by_kernel, side_by_side
 from ..robot import Robot
 from ._curvature import pose_curvature
 from ._framed import FramedTask
@@ -229,14 +229,14 @@ def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian
     given = (position, rotation, jacobian, numbers)
     lanes, count, nv = max(len(a) for a in given), len(kept), jacobian.shape[-1]
     options = np.array([*task.kept, task.axes == "frame", task.orientation_jacobian == "geometric"], np.int32)
-    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (6 * nv + 12,)
-    error, rows, wanted, curvature, pull, levers, _ = _target.call(
-        "_pose_rows", [(shape, float) for shape in shapes], *given, options
+    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv)
+    error, rows, wanted, curvature, pull, levers = _library.call(
+        "pose_rows", [(shape, float) for shape in shapes], *given, options
     )
     return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers
 
 
-_by_kernel = by_numba(_fields, _fields_by_kernel)
+_by_kernel = by_kernel(_fields, _fields_by_kernel)
 
 
 def _axes(axes: str | None, outer_axes: str, error: str) -> str:

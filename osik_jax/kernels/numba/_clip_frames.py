@@ -38,8 +38,7 @@ from ._clip_workspace import (
 )
 from ._dense import any_number, fill
 from ._frame import lean
-from ._pose_rows import logarithm, nine, three
-from ._rigid import composed, cross, minus, plus, put, transposed, triple, turning
+from ._rigid import composed, cross, logarithm, minus, nine, plus, put, three, transposed, triple, turning
 from ._tiles import take_square
 from ._vectors import WIDTH
 

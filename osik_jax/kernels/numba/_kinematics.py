@@ -1,4 +1,4 @@
-"""Kernel of ``kinematics/_forward.py``: poses of bodies and axes of dofs, one configuration after another.
+"""Poses of bodies and axes of dofs, as ``kinematics/_forward.py`` defines them, for kernels of plans.
 
 It goes through the bodies from the root, so that each finds its parent done. What a joint does in its body's parent is
 MJX's ``kinematics``, for quaternions of any length too.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._frame import arguments, data, dimension, is_call, lean, matrix, results, vector, whole_numbers
+from ._frame import lean
 from ._rigid import (
     carried,
     composed,
@@ -110,37 +110,3 @@ def turn_with_bodies(kinds, owners, R, ang):
             dof += 3
         else:
             dof += 1
-
-
-def handle(frame):
-    """Answer a call of XLA: arguments as in ``kinematics/_kernels.py``, each with a leading axis of lanes, or of 1."""
-    if not is_call(frame):
-        return 0
-    given, found = arguments(frame), results(frame)  # pointers to buffers, eight bytes each
-    lanes, bodies, nv = dimension(found, 0), dimension(found, 8), dimension(found + 16, 8)
-    nq, full = dimension(given, 8), dimension(found + 40, 0)
-    whole, numbers = dimension(given + 8, 8), data(given + 16)
-    joints = dimension(given + 16, 0) - bodies - full >> 1
-    own, other = nq * (dimension(given, 0) > 1), whole * (dimension(given + 8, 0) > 1)  # numbers between lanes
-    parents, kinds = whole_numbers(numbers, bodies), whole_numbers(numbers + 4 * bodies, joints)
-    owners = whole_numbers(numbers + 4 * (bodies + joints), joints)
-    source = whole_numbers(numbers + 4 * (bodies + 2 * joints), full)
-    value = vector(data(found + 40), full)
-    for lane in range(lanes):
-        q, at = vector(data(given) + 8 * own * lane, nq), data(given + 8) + 8 * other * lane
-        factor, extra, reference = vector(at, full), vector(at + 8 * full, full), vector(at + 16 * full, full)
-        for i in range(full):
-            value[i] = factor[i] * q[source[i]] + extra[i]
-        at += 24 * full
-        positions, at = matrix(at, bodies, 3), at + 24 * bodies
-        quaternions, at = matrix(at, bodies, 4), at + 32 * bodies
-        fixed, axes = matrix(at, joints, 3), matrix(at + 24 * joints, joints, 3)
-        R = matrix(data(found + 8) + 72 * bodies * lane, bodies, 9)
-        angular = matrix(data(found + 24) + 24 * nv * lane, nv, 3)
-        place_bodies(
-            parents, kinds, owners, value, reference, positions, quaternions, fixed, axes,
-            matrix(data(found) + 24 * bodies * lane, bodies, 3), R, matrix(data(found + 16) + 24 * nv * lane, nv, 3),
-            angular, matrix(data(found + 32) + 24 * nv * lane, nv, 3),
-        )  # fmt: skip
-        turn_with_bodies(kinds, owners, R, angular)
-    return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...numerics._constants import SMALL_SINE_SQUARED
 from ._frame import lean
 
 
@@ -125,3 +126,53 @@ def normalized(q):
         return 1e6, 1e6, 1e6, 1e6
     length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return q[0] / length, q[1] / length, q[2] / length, q[3] / length
+
+
+@lean
+def nine(a):
+    """Return a rotation from an array of its numbers."""
+    return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]
+
+
+@lean
+def three(a, first):
+    """Return a vector from three numbers of an array."""
+    return a[first], a[first + 1], a[first + 2]
+
+
+@lean
+def quaternion_of(m):
+    """Return the quaternion of a rotation, by the largest number of four; w is not negative.
+
+    M. Day, "Converting a rotation matrix to a quaternion", 2015.
+    """
+    if m[8] < 0.0:
+        if m[0] > m[4]:
+            t = 1.0 + m[0] - m[4] - m[8]
+            q = m[7] - m[5], t, m[3] + m[1], m[2] + m[6]
+        else:
+            t = 1.0 - m[0] + m[4] - m[8]
+            q = m[2] - m[6], m[3] + m[1], t, m[7] + m[5]
+    elif m[0] < -m[4]:
+        t = 1.0 - m[0] - m[4] + m[8]
+        q = m[3] - m[1], m[2] + m[6], m[7] + m[5], t
+    else:
+        t = 1.0 + m[0] + m[4] + m[8]
+        q = t, m[7] - m[5], m[2] - m[6], m[3] - m[1]
+    factor = 0.5 / np.sqrt(t)
+    factor = -factor if q[0] < 0.0 else factor
+    return factor * q[0], factor * q[1], factor * q[2], factor * q[3]
+
+
+@lean
+def logarithm(m):
+    """Return the rotation vector of a rotation, its angle in [0, pi]."""
+    w, x, y, z = quaternion_of(m)
+    sine_squared = x * x + y * y + z * z
+    if sine_squared < SMALL_SINE_SQUARED:
+        tangent_squared = sine_squared / (w * w)
+        factor = (2.0 - tangent_squared * (2.0 / 3.0 - tangent_squared * (2.0 / 5.0))) / w
+    else:
+        sine = np.sqrt(sine_squared)
+        factor = 2.0 * np.arctan2(sine, w) / sine
+    return factor * x, factor * y, factor * z

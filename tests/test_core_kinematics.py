@@ -1,4 +1,4 @@
-"""Numba's kernels of the kinematics on a CPU: beside the plain methods and MuJoCo C, and the derivatives of both."""
+"""The core's kinematics on a CPU: beside the plain methods and MuJoCo C, and the derivatives of both."""
 
 from dataclasses import replace
 from functools import partial
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from core_checks import needs_core
 from test_kinematics import quick_jit, random_configurations, spread, toy_robot
 
 import osik_jax as osik
@@ -17,7 +18,7 @@ from osik_jax.kinematics._forward import kinematics_by, moving_center, moving_fr
 from osik_jax.tasks import AdaptiveGain
 from osik_jax.tasks._rows import rows_of
 
-pytest.importorskip("numba")
+pytestmark = needs_core
 ROUNDING = 1e-13
 """Of numbers near 1, which some dozen products and sums have made."""
 COUPLED = """
@@ -81,7 +82,7 @@ def everything(backend, subtree, robot, q):
 
 
 def both(name: str):
-    return tuple(partial(everything, backend, SUBTREES[name]) for backend in ("numba", "jax"))
+    return tuple(partial(everything, backend, SUBTREES[name]) for backend in ("core", "jax"))
 
 
 def assert_near(ours, theirs, atol=ROUNDING):
@@ -116,7 +117,7 @@ def test_beside_the_plain_method(robots, name):
 def test_beside_mujoco(robots, name):
     robot = robots[name]
     data, to_mujoco = mujoco.MjData(robot.mj_model), spread(robot)
-    run = quick_jit(partial(everything, "numba", None))
+    run = quick_jit(partial(everything, "core", None))
     for q in random_configurations(robot, 2, 2):
         data.qpos[:] = robot.mujoco_qpos(jnp.asarray(q))
         mujoco.mj_kinematics(robot.mj_model, data)
@@ -212,7 +213,7 @@ def test_rows_of_poses(robots, case):
 
     half = robot.q0.at[3:7].set(jnp.array([1e-9, 0.6, 0.0, 0.8]))
     q = jnp.concatenate([jnp.asarray(random_configurations(robot, 6, 4)), robot.q0[None], half[None]])
-    ours, theirs = (quick_jit(jax.vmap(partial(rows, backend=backend)))(q) for backend in ("numba", "jax"))
+    ours, theirs = (quick_jit(jax.vmap(partial(rows, backend=backend)))(q) for backend in ("core", "jax"))
     assert_near(ours, theirs, atol=1e-11)
 
 
@@ -227,7 +228,7 @@ def test_derivatives_of_rows(robots):
         return sum(map(_total, jax.tree.leaves(rows_of(robot, kin, q, tasks))))
 
     ours, theirs = (
-        quick_jit(jax.grad(partial(total, backend=backend), argnums=(0, 1)))(q, tasks) for backend in ("numba", "jax")
+        quick_jit(jax.grad(partial(total, backend=backend), argnums=(0, 1)))(q, tasks) for backend in ("core", "jax")
     )
     assert_near(*map(jax.tree.leaves, (ours, theirs)), atol=1e-9)
 
@@ -242,9 +243,9 @@ def test_a_step_that_says_jax_has_no_kernel(robots):
         return osik.solve(robot, q, tasks, scheme=osik.WeightedQP(backend=backend)).velocity
 
     q = robot.q0 + 0.1
-    texts = {b: jax.jit(partial(step, backend=b)).lower(q).as_text() for b in ("jax", "numba")}
-    assert "osik_jax_" not in texts["jax"]
-    for kernel in ("osik_jax_kinematics", "osik_jax_moving_frames", "osik_jax_pose_rows", "osik_weighted_qp"):
-        assert kernel in texts["numba"]
+    texts = {b: jax.jit(partial(step, backend=b)).lower(q).as_text() for b in ("jax", "core")}
+    assert "osik_" not in texts["jax"]
+    for kernel in ("osik_kinematics", "osik_moving_frames", "osik_pose_rows", "osik_weighted_qp"):
+        assert kernel in texts["core"]
     exported = jax.export.export(jax.jit(partial(step, backend="jax")))(q)
-    np.testing.assert_allclose(exported.call(q), step(q, "numba"), atol=1e-9)
+    np.testing.assert_allclose(exported.call(q), step(q, "core"), atol=1e-9)

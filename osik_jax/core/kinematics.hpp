@@ -1,0 +1,141 @@
+// Poses of bodies and axes of dofs, poses and Jacobians of frames, centre of mass: what kinematics/_forward.py defines.
+//
+// Bodies are in an order in which each comes after its parent; body 0 is the world. "Full" dofs are those of MuJoCo's
+// model; each adds to one column of the joint velocity v with a factor, or is locked (column -1).
+#pragma once
+#include "rigid.hpp"
+
+namespace osik {
+
+enum JointType { FREE_JOINT = 0, BALL_JOINT = 1, SLIDE_JOINT = 2, HINGE_JOINT = 3 };  // MuJoCo's
+
+// The robot's kinematic tree.
+template <class Real> struct Tree {
+  int bodies, joints, dofs;                        // dofs: full ones
+  const int *parents, *types, *owners;             // [bodies]; [joints] type and body; joints of a body are neighbours
+  const Real *reference;                           // [full nq] configuration at which bodies are where they are described
+  const Real *position, *quaternion;               // [bodies, 3], [bodies, 4] of each body in its parent
+  const Real *joint_position, *joint_axis;         // [joints, 3] in the joint's body
+};
+
+// Where everything is, in world axes.
+template <class Real> struct Placed {
+  Real *position, *rotation;          // [bodies, 3], [bodies, 9]
+  Real *linear, *angular, *anchor;    // [dofs, 3] direction, axis, and a point on the axis of each full dof
+};
+
+// Place the bodies at configuration q: [full nq].
+template <class Real> void place_bodies(const Tree<Real>& tree, const Real* q, const Placed<Real>& to) {
+  using V = Vec3<Real>;
+  using Q = Quaternion<Real>;
+  const V zero{0, 0, 0};
+  zero.put(to.position), Mat3<Real>::identity().put(to.rotation);
+  const Real* reference = tree.reference;
+  Real *linear = to.linear, *angular = to.angular, *anchor = to.anchor;
+  auto add_dof = [&](V direction, V axis, V point) {
+    direction.put(linear), axis.put(angular), point.put(anchor);
+    linear += 3, angular += 3, anchor += 3;
+  };
+  for (int body = 1, joint = 0; body < tree.bodies; ++body) {
+    const V origin = V::of(to.position + 3 * tree.parents[body]);
+    const Mat3<Real> frame = Mat3<Real>::of(to.rotation + 9 * tree.parents[body]);
+    V position = V::of(tree.position + 3 * body);
+    Q turn = Q::of(tree.quaternion + 4 * body);
+    const int first = joint;
+    Real* first_axis = angular;
+    for (; joint < tree.joints && tree.owners[joint] == body; ++joint) {
+      const int type = tree.types[joint];
+      if (type == FREE_JOINT) {
+        position = V::of(q), turn = Q::of(q + 3).normalized();
+        const V at = origin + frame * position;
+        add_dof({1, 0, 0}, zero, at), add_dof({0, 1, 0}, zero, at), add_dof({0, 0, 1}, zero, at);
+        for (int k = 0; k < 3; ++k) add_dof(zero, zero, at);
+        q += 7, reference += 7;
+        continue;
+      }
+      const V fixed = V::of(tree.joint_position + 3 * joint), given = V::of(tree.joint_axis + 3 * joint);
+      const V own = turn.carry(fixed) + position, axis = turn.carry(given), at = origin + frame * own;
+      if (type == BALL_JOINT) {
+        turn = turn * Q::of(q).normalized();
+        position = own - turn.carry(fixed);
+        for (int k = 0; k < 3; ++k) add_dof(zero, zero, at);
+        q += 4, reference += 4;
+        continue;
+      }
+      const Real displacement = *q++ - *reference++;
+      if (type == SLIDE_JOINT) {
+        position = position + displacement * axis;
+        add_dof(frame * axis, zero, at);
+      } else {
+        const Real half = Real(0.5) * displacement, sine = sin(half);
+        turn = turn * Q{Real(cos(half)), sine * given.x, sine * given.y, sine * given.z};
+        position = own - turn.carry(fixed);
+        add_dof(zero, frame * axis, at);
+      }
+    }
+    (origin + frame * position).put(to.position + 3 * body);
+    const Mat3<Real> rotation = frame * turn.rotation();
+    rotation.put(to.rotation + 9 * body);
+    const Mat3<Real> axes = rotation.transposed();
+    for (int k = first; k < joint; ++k) {  // ball and free joints rotate about the axes of their body
+      const int type = tree.types[k];
+      first_axis += type == FREE_JOINT ? 9 : 0;
+      if (type <= BALL_JOINT) axes.put(first_axis);
+      first_axis += type <= BALL_JOINT ? 9 : 3;
+    }
+  }
+}
+
+// What each full dof does to the velocity: its column of v, -1 for none, and the factor.
+template <class Real> struct DofColumns {
+  int dofs, nv;
+  const int* column;   // [dofs]
+  const Real* factor;  // [dofs]
+};
+
+// A point and a frame that go along with a body, and the Jacobian J [6, nv] of the point: rows [linear; angular].
+// body_position: [3], body_rotation: [9]; offset: [3] and turn: [9] of the frame in its body; moved: [dofs] flags
+template <class Real>
+void move_frame(const DofColumns<Real>& d, const Placed<Real>& placed, int body, const Real* offset, const Real* turn,
+                const int* moved, Real* position, Real* rotation, Real* J) {
+  using V = Vec3<Real>;
+  const Mat3<Real> carrier = Mat3<Real>::of(placed.rotation + 9 * body);
+  const V at = V::of(placed.position + 3 * body) + carrier * V::of(offset);
+  at.put(position), (carrier * Mat3<Real>::of(turn)).put(rotation);
+  for (int e = 0; e < 6 * d.nv; ++e) J[e] = 0;
+  for (int dof = 0; dof < d.dofs; ++dof) {
+    const int column = d.column[dof];
+    if (column < 0 || !moved[dof]) continue;
+    const V axis = V::of(placed.angular + 3 * dof);
+    const V speed = V::of(placed.linear + 3 * dof) + cross(axis, at - V::of(placed.anchor + 3 * dof));
+    const Real factor = d.factor[dof];
+    Real* to = J + column;
+    for (Real v : {speed.x, speed.y, speed.z, axis.x, axis.y, axis.z}) *to += factor * v, to += d.nv;
+  }
+}
+
+// The centre of mass and its Jacobian J [3, nv]: the mass that each dof moves, at its centre, over the whole mass.
+// mass: [bodies], center: [bodies, 3] in the body; owner: [dofs] body of each full dof; below: [bodies, 4] space
+template <class Real>
+void move_center(const DofColumns<Real>& d, const Placed<Real>& placed, int bodies, const int* parents, const int* owner,
+                 const Real* mass, const Real* center, Real* below, Real* point, Real* J) {
+  using V = Vec3<Real>;
+  for (int body = 0; body < bodies; ++body) {
+    const V at = V::of(placed.position + 3 * body) + Mat3<Real>::of(placed.rotation + 9 * body) * V::of(center + 3 * body);
+    below[4 * body] = mass[body], (mass[body] * at).put(below + 4 * body + 1);
+  }
+  for (int body = bodies - 1; body > 0; --body)  // with all that hangs from each body
+    for (int i = 0; i < 4; ++i) below[4 * parents[body] + i] += below[4 * body + i];
+  for (int i = 0; i < 3; ++i) point[i] = below[1 + i] / below[0];
+  for (int e = 0; e < 3 * d.nv; ++e) J[e] = 0;
+  for (int dof = 0; dof < d.dofs; ++dof) {
+    const int column = d.column[dof];
+    if (column < 0) continue;
+    const Real* carried = below + 4 * owner[dof];
+    const V arm = V::of(carried + 1) - carried[0] * V::of(placed.anchor + 3 * dof);
+    const V speed = carried[0] * V::of(placed.linear + 3 * dof) + cross(V::of(placed.angular + 3 * dof), arm);
+    const Real factor = d.factor[dof] / below[0];
+    J[column] += factor * speed.x, J[d.nv + column] += factor * speed.y, J[2 * d.nv + column] += factor * speed.z;
+  }
+}
+}  // namespace osik

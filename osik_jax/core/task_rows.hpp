@@ -1,0 +1,131 @@
+// Rows of tasks that ask for a pose or a centre of mass: what tasks/_pose.py and tasks/_com.py define.
+#pragma once
+#include "kinematics.hpp"
+
+namespace osik {
+
+// The rows of one task with m rows; fields of TaskRows (tasks/_task.py). The wanted velocity is both bounds.
+template <class Real> struct Rows {
+  Real *error, *jacobian, *wanted, *curvature, *pull, *levers;  // [m], [m, nv], [m], [1], [m], [nv]
+};
+
+// The pose that a task asks for, and how.
+template <class Real> struct PoseGoal {
+  const Real *position, *rotation, *velocity;  // [3], [9], [6] of the target, [linear; angular]
+  const Real *weight, *gain;                   // [m] of the rows that are kept, [1]
+  const int* kept;                             // [6] flags
+  bool in_frame, geometric;                    // rows along the frame's axes; without the inverse left Jacobian
+};
+
+// The Frobenius norm of the matrix with entries pull . (axis_i x arm_j), from the sums of products of axes and of arms:
+// xx, xy, xz, yy, yz, zz.
+template <class Real> Real paired(Vec3<Real> pull, const Real* axes, const Real* arms) {
+  Real size = fabs(pull.x);
+  size = fabs(pull.y) > size ? fabs(pull.y) : size, size = fabs(pull.z) > size ? fabs(pull.z) : size;
+  if (!(size > 0)) return 0;
+  const Vec3<Real> unit = Real(1) / size * pull;
+  const Real x = unit.x, y = unit.y, z = unit.z;
+  const Real xx = axes[0], xy = axes[1], xz = axes[2], yy = axes[3], yz = axes[4], zz = axes[5];
+  // products of pull x axis_i with each other
+  const Real txx = y * y * zz - 2 * y * z * yz + z * z * yy, tyy = z * z * xx - 2 * z * x * xz + x * x * zz;
+  const Real tzz = x * x * yy - 2 * x * y * xy + y * y * xx, txy = y * z * xz - x * y * zz - z * z * xy + x * z * yz;
+  const Real txz = x * y * yz - y * y * xz - x * z * yy + y * z * xy;
+  const Real tyz = x * z * xy - y * z * xx - x * x * yz + x * y * xz;
+  const Real squared = txx * arms[0] + tyy * arms[3] + tzz * arms[5] + 2 * (txy * arms[1] + txz * arms[2] + tyz * arms[4]);
+  return squared > 0 ? size * sqrt(squared) : 0;
+}
+
+// A bound on the curvature of a pose's error along force and torque on the frame: tasks/_curvature.py, pose_curvature.
+template <class Real> Real pose_curvature(Vec3<Real> force, Vec3<Real> torque, const Real* J, int nv) {
+  Real axes[6] = {}, arms[6] = {};
+  auto add = [](Real* sums, Real x, Real y, Real z) {
+    sums[0] += x * x, sums[1] += x * y, sums[2] += x * z, sums[3] += y * y, sums[4] += y * z, sums[5] += z * z;
+  };
+  for (int j = 0; j < nv; ++j) {
+    const Real x = J[3 * nv + j], y = J[4 * nv + j], z = J[5 * nv + j];
+    if (x == 0 && y == 0 && z == 0) continue;
+    add(axes, x, y, z), add(arms, J[j], J[nv + j], J[2 * nv + j]);
+  }
+  return (paired(force, axes, arms) + Real(0.5) * paired(torque, axes, axes)) / Real(1.4142135623730951);
+}
+
+// Rows of a pose task, from the frame's position [3], rotation [9] and Jacobian J [6, nv].
+//
+// The error of the position is p - p*; that of the rotation R is the logarithm e of R R*', or of R*'R in the frame's
+// axes. Its rate is E w: E the inverse left Jacobian of SO(3) at e, w the angular velocity; in the frame's axes E'R' w.
+template <class Team, class Real>
+void pose_rows(const Team& t, const PoseGoal<Real>& goal, const Real* position, const Real* rotation, const Real* J, int nv,
+               const Rows<Real>& to) {
+  using V = Vec3<Real>;
+  using M = Mat3<Real>;
+  const M R = M::of(rotation), own = R.transposed(), wanted = M::of(goal.rotation);
+  const M outer = goal.in_frame ? own : M::identity();  // to the axes of the linear rows
+  const M between = goal.in_frame ? wanted.transposed() * R : R * wanted.transposed();
+  const V offset = V::of(position) - V::of(goal.position), turn = rotation_log(between);
+  const M E = goal.geometric ? M::identity() : inverse_left_jacobian(turn);
+  const M factor = goal.in_frame ? E.transposed() * own : E;
+  const V linear = outer * V::of(goal.velocity), target_turn = V::of(goal.velocity + 3);
+  const V angular = factor * (goal.in_frame ? target_turn : between * target_turn), distance = outer * offset;
+  const Real error[6] = {distance.x, distance.y, distance.z, turn.x, turn.y, turn.z};
+  const Real forward[6] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
+  t.each(0, nv, [&](int j) {
+    const V moves{J[j], J[nv + j], J[2 * nv + j]}, axis{J[3 * nv + j], J[4 * nv + j], J[5 * nv + j]};
+    const V v = goal.in_frame ? own * (moves + cross(offset, axis)) : moves, w = factor * axis;
+    const Real column[6] = {v.x, v.y, v.z, w.x, w.y, w.z};
+    Real square = 0;
+    for (int i = 0, row = 0; i < 6; ++i)
+      if (goal.kept[i]) {
+        to.jacobian[row * nv + j] = column[i];
+        square += goal.weight[row++] * column[i] * column[i];
+      }
+    to.levers[j] = sqrt(square);
+  });
+  t.once([&] {
+    Real pull[6] = {};
+    for (int i = 0, row = 0; i < 6; ++i)
+      if (goal.kept[i]) {
+        to.error[row] = error[i], to.pull[row] = *goal.gain * error[i], to.wanted[row] = forward[i] - to.pull[row];
+        pull[i] = goal.weight[row] * to.pull[row];
+        ++row;
+      }
+    const V force = V::of(pull), torque = V::of(pull + 3);
+    *to.curvature = goal.in_frame ? pose_curvature(R * force, R * torque, J, nv) : pose_curvature(force, torque, J, nv);
+  });
+}
+
+// The point that a task asks the centre of mass to be at, along `m` of the world's axes.
+template <class Real> struct CenterGoal {
+  int m;
+  const int *axes, *turning;                       // [m] 0 for x, 1 for y, 2 for z; [nv] whether a dof turns something
+  const Real *target, *velocity, *weight, *gain;   // [m], [m], [m], [1]
+};
+
+// Rows of a task on the centre of mass `point` [3] with Jacobian J [3, nv].
+template <class Team, class Real>
+void center_rows(const Team& t, const CenterGoal<Real>& goal, const Real* point, const Real* J, int nv,
+                 const Rows<Real>& to) {
+  t.each(0, nv, [&](int j) {
+    Real square = 0;
+    for (int i = 0; i < goal.m; ++i) {
+      const Real entry = J[goal.axes[i] * nv + j];
+      to.jacobian[i * nv + j] = entry, square += goal.weight[i] * entry * entry;
+    }
+    to.levers[j] = sqrt(square);
+  });
+  t.each(0, goal.m, [&](int i) {
+    to.error[i] = point[goal.axes[i]] - goal.target[i];
+    to.pull[i] = *goal.gain * to.error[i], to.wanted[i] = goal.velocity[i] - to.pull[i];
+  });
+  // the length of the weighted pull times the Frobenius norm of the columns of dofs that turn something
+  const Real largest = t.most(Real(0), 0, goal.m, [&](int i, Real) { return fabs(goal.weight[i] * to.pull[i]); });
+  const Real unit = largest > 0 ? Real(1) / largest : Real(0);
+  const Real square = t.sum(0, goal.m, [&](int i) {
+    const Real part = goal.weight[i] * to.pull[i] * unit;
+    return part * part;
+  });
+  const Real turning = t.sum(0, nv, [&](int j) {
+    return goal.turning[j] ? J[j] * J[j] + J[nv + j] * J[nv + j] + J[2 * nv + j] * J[2 * nv + j] : Real(0);
+  });
+  t.once([&] { *to.curvature = largest * sqrt(square) * sqrt(turning); });
+}
+}  // namespace osik
