@@ -45,7 +45,7 @@ gc.set_threshold(50_000, 20, 20)
 MOST_MEMORY = 4 * 2**30
 """What a process may hold after a file of tests, in bytes, before it drops its compiled programs."""
 MANY_TESTS = 500
-LARGE_KERNELS = ("_plan", "_saturation", "_projection")
+LARGE_KERNELS = ("_plan",)
 """In an order in which every second one takes as long to compile as the others."""
 WITH_TORCH = "test_beside_pytorch_kinematics.py"
 WITH_BROWSER = "test_live_browser.py"

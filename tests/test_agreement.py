@@ -3,11 +3,11 @@
 import sys
 
 import pytest
+from core_checks import needs_core
 
 from benchmarks import agreement
 
-pytest.importorskip("numba")
-pytestmark = pytest.mark.slow
+pytestmark = [needs_core, pytest.mark.slow]
 
 
 @pytest.fixture

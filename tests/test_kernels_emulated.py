@@ -33,7 +33,7 @@ from osik_jax.solvers.hqp import _warp as hqp_kernel
 from osik_jax.solvers.null_space import _saturation
 from osik_jax.solvers.null_space import _warp as null_space_kernel
 from osik_jax.solvers.null_space._padding import Problem, pad_levels
-from osik_jax.solvers.null_space._saturation import _by_numba as by_numba
+from osik_jax.solvers.null_space._saturation import _by_core as by_core
 from osik_jax.solvers.qp import _dispatch as qp_dispatch
 from osik_jax.solvers.qp import _warp as qp_kernel
 
@@ -291,9 +291,7 @@ def test_saturation_of_levels_whose_square_matrices_have_no_room_in_shared_memor
         return pad_levels([Level(A, wanted).scaled()], -bound, bound, jnp.zeros(n), [terms], 1e-9)
 
     p = jax.tree.map(lambda *a: jnp.stack(a), *(problem() for _ in range(COUNT)))
-    found, expected = (
-        jax.jit(lambda p, solve=solve: solve(p, 330))(p) for solve in (null_space_kernel.solve, by_numba)
-    )
+    found, expected = (jax.jit(lambda p, solve=solve: solve(p, 330))(p) for solve in (null_space_kernel.solve, by_core))
     assert found.done.all()
     assert expected.done.all()
     np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-10)

@@ -158,7 +158,6 @@ print("done")
 @pytest.mark.parametrize("solver", ["nullspace", "hqp"])
 def test_kernels_wait_for_no_workers(solver):
     """Two batches side by side on two cores, nothing configured: null spaces with ``backend="jax"`` wait for ever."""
-    pytest.importorskip("numba")
     assert in_a_process(f"SOLVER = {solver!r}\n{SIDE_BY_SIDE}").stdout == "done\n"
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from core_checks import needs_core
 from hierarchy_families import degenerate
 from optimality import outside_cone
 from task_checks import kinematics_at
@@ -234,6 +235,7 @@ class TestProperties:
                     assert move.status == 0
                     assert move.x[joint] == pytest.approx(x[joint], abs=1e-6)
 
+    @needs_core
     @pytest.mark.variants(release=["easy"])
     @pytest.mark.parametrize("name", FAMILIES)
     def test_the_kernel_and_the_plain_method_decide_alike(self, solved, name):
@@ -241,7 +243,6 @@ class TestProperties:
 
         Where a level asks for rounding alone, as it may where joints tie, it has any scale.
         """
-        pytest.importorskip("numba")
         p = solved[name][0]
         found, expected = (jax.tree.map(np.asarray, solve_full(p, backend=backend)) for backend in ("auto", "jax"))
         np.testing.assert_array_equal(found.status, Status.SOLVED)
@@ -630,17 +631,15 @@ def one_row_with_its_derivative(wanted, lower, upper, *, backend):
 
 
 @pytest.mark.parametrize("excess", [0.1, 1e-7])
-@pytest.mark.parametrize("backend", ["jax", "numba"])
+@pytest.mark.parametrize("backend", ["jax", pytest.param("core", marks=needs_core)])
 def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend, excess):
     """In closed form: the level asks 8 x - y = 65, x ends at its bound, and y = 8 x - 65 but for roundoff at its own.
 
     What y is beyond its bound is more than roundoff of the numbers, and less than that of the scale, which falls by a
     65th of it. So nothing is blocked, and y follows what is asked. Without bounds x is 8, beyond its bound by
-    ``excess``: the larger one tries Numba's kernel, the smaller one plain JAX, whose penalty lowers the scale by a
+    ``excess``: the larger one tries the core, the smaller one plain JAX, whose penalty lowers the scale by a
     share of it.
     """
-    if backend == "numba":
-        pytest.importorskip("numba")
     x = 8.0 - excess
     y = 8.0 * x - 65.0
     lower, upper = jnp.array([-jnp.inf, y + 1.2e-10]), jnp.array([x, jnp.inf])

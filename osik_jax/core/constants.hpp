@@ -26,4 +26,15 @@ constexpr double KERNEL_CORRECTION = 1e-10, MIN_DECREASE = 0.25, KERNEL_PIVOT = 
 // rotations
 constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2;
 
+// null space
+constexpr double INDEPENDENT_ROWS = 1e-7;
+
+// saturation
+constexpr int STRAIGHT = 1, PART = 2, WHOLE = 3;
+constexpr int PATH_SEARCHES = 6, SIGN_CHECKS = 3, MAX_SATURATION_CHANGES = 5;
+constexpr double NEGLIGIBLE_STEP = 1e-11, FULL_STEP = 0.999999999, PATH_STEP = 1e-9, PATH_END = 1e-6, BLOCKING_RANK = 1e-6,
+                 BOUND_DISTANCE = 1e-9, SATURATION_RESIDUAL = 2e-9, SATURATION_LOSS = 1e-8, SATURATION_RANK = 1e-9,
+                 SATURATION_COMPLIANCE = 1e-12, STIFFER_SATURATION_COMPLIANCE = 1e-13, SOFT_SATURATION_RANK = 1e-11,
+                 LARGEST_RATE = 10.0, SATURATION_ROUNDOFF = 1e-11, NEGLIGIBLE_ENTRY = 1e-7;
+
 }  // namespace osik

@@ -138,8 +138,8 @@ template <class Team> struct LinearAlgebra {
       t.each(k, rows, [&](int a) { v[a] = a > k ? R[a * ld + which] : head + (head < 0 ? -norm : norm); });
       t.columns(first, n, [&](auto c) {  // R <- R - scale v (v' R), and the squares of the columns below row k
         using P = typename decltype(c)::P;
-        P total(0), rest(0);
-        for (int a = k; a < rows; ++a) total.fma(v[a], c.load(R + a * ld));
+        const P total = weighted_sum(c, v, R, ld, k, rows);
+        P rest(0);
         for (int a = k; a < rows; ++a) {
           P x = c.load(R + a * ld);
           x.fma(-scale * v[a], total);
@@ -157,9 +157,116 @@ template <class Team> struct LinearAlgebra {
     return rank;
   }
 
+  // sum_a v[a] M[a, c] over start <= a < stop, as two sums that do not wait for each other
+  template <class C> OSIK_FN static auto weighted_sum(C c, const Real* v, const Real* M, int ld, int start, int stop) {
+    typename C::P even(0), odd(0);
+    int a = start;
+    for (; a + 1 < stop; a += 2) even.fma(v[a], c.load(M + a * ld)), odd.fma(v[a + 1], c.load(M + (a + 1) * ld));
+    if (a < stop) even.fma(v[a], c.load(M + a * ld));
+    return even += odd;
+  }
+
+  // out[j] = sum_k v[k] M[k, j] over the first `rows` rows of M, for start <= j < stop; `add`: added to what out has
+  OSIK_CALL static void combine(Team t, const Real* M, const Real* v, Real* out, int ld, int rows, int start, int stop,
+                                bool add) {
+    t.are_shared(M, v, out);
+    t.columns(start, stop, [&](auto c) {
+      auto total = weighted_sum(c, v, M, ld, 0, rows);
+      c.store(out, add ? total += c.load(out) : total);
+    });
+  }
+
+  // out[i, a] = A[a row + i column] for `rows` rows and n columns of A, four rows at a time
+  OSIK_CALL static void transpose(Team t, const Real* A, int row, int column, Real* out, int ld, int rows, int n) {
+    t.are_shared(out);
+    for (int first = 0; first < rows; first += 4) {
+      const Real* r[4];
+      for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first) * row;
+      t.each(0, n, [&](int i) {
+OSIK_UNROLL
+        for (int b = 0; b < 4; ++b)
+          if (first + b < rows) out[i * ld + first + b] = r[b][i * column];
+      });
+    }
+  }
+
+  // M <- Q'M of the first `count` rows and n columns of M, with the reflections of pivoted_qr, two at a time
+  OSIK_CALL static void apply_reflections(Team t, const Real* V, const Real* scales, Real* M, int ld_V, int ld,
+                                          int rank, int count, int n) {
+    t.are_shared(V, scales, M);
+    for (int k = 0; k < rank; k += 2) {
+      const bool two = k + 1 < rank;
+      const Real *v = V + k * ld_V, *w = two ? v + ld_V : v, scale_v = scales[k], scale_w = two ? scales[k + 1] : 0;
+      const Real cross = two ? scale_v * t.dot(v, w, k + 1, count) : Real(0);
+      t.columns(0, n, [&](auto c) {
+        using P = typename decltype(c)::P;
+        P along_v(0), along_w(0), head = c.load(M + k * ld);
+        along_v.fma(v[k], head);
+        for (int a = k + 1; a < count; ++a) {
+          const P x = c.load(M + a * ld);
+          along_v.fma(v[a], x), along_w.fma(w[a], x);
+        }
+        along_w.fma(-cross, along_v);
+        c.store(M + k * ld, head.fma(-scale_v * v[k], along_v));
+        for (int a = k + 1; a < count; ++a) {
+          P x = c.load(M + a * ld);
+          c.store(M + a * ld, x.fma(-scale_v * v[a], along_v).fma(-scale_w * w[a], along_w));
+        }
+      });
+    }
+  }
+
+  // The y of least |M'y - b|^2, for the first `rows` rows of M [rows + 1, columns], which are independent, and its last
+  // row b, in whose first places y is. Reflections from the right make M lower triangular.
+  // v: [ld] zeros from `columns` on, as M has; inverse: [rows]
+  OSIK_CALL static void least_squares_of_rows(Team t, Real* M, Real* v, Real* inverse, int ld, int rows, int columns) {
+    t.are_shared(M, v, inverse);
+    for (int k = 0; k < rows; ++k) {
+      const Real scale = reflection(t, M + k * ld, k, columns, v);
+      t.reflect(M + (k + 1) * ld, ld, rows - k, v, scale, k, columns);
+      t.once([&] { inverse[k] = Real(1) / (M[k * ld + k] - v[k]); });
+    }
+    t.backward(M, ld, inverse, M + rows * ld, rows);
+  }
+
+  // out[b, j] = factor_b sum_i r_b[i column] Z[i, j] over from <= i < to, for start <= j < n and the first `rows` of
+  // four rows, so that each entry of Z is read once for four.
+  OSIK_FN static void four_rows(const Team& t, const Real* const (&r)[4], const Real (&factor)[4], int column,
+                                const Real* Z, Real* out, int ld, int ld_out, int rows, int from, int to, int start,
+                                int n) {
+    t.narrow_columns(start, n, [&](auto c) {
+      using P = typename decltype(c)::P;
+      P total[4] = {P(0), P(0), P(0), P(0)};
+      for (int i = from; i < to; ++i) {
+        const P z = c.load(Z + i * ld);
+OSIK_UNROLL
+        for (int b = 0; b < 4; ++b) total[b].fma(r[b][i * column], z);
+      }
+OSIK_UNROLL
+      for (int b = 0; b < 4; ++b)
+        if (b < rows) {
+          P out_b(0);
+          c.store(out + b * ld_out, out_b.fma(factor[b], total[b]));
+        }
+    });
+  }
+
+  // out = A M for `rows` rows of A, whose entry (a, i) is A[a row + i column], and `inner` rows and n columns of M;
+  // `upper`: of a symmetric product, on and above the diagonal
+  OSIK_CALL static void product(Team t, const Real* A, int row, int column, const Real* M, int ld, Real* out, int ld_out,
+                                int rows, int inner, int n, bool upper = false) {
+    t.are_shared(A, M, out);
+    const Real factor[4] = {1, 1, 1, 1};
+    for (int first = 0; first < rows; first += 4) {
+      const Real* r[4];
+      for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first) * row;
+      four_rows(t, r, factor, column, M, out + first * ld_out, ld, ld_out, rows - first, 0, inner, upper ? first : 0,
+                n);
+    }
+  }
+
   // The product of a level's rows with the basis Z: R[a, j] = sum_i A[a, i] Z[i, j] for start <= j < n, or 0 where
   // in_cost[a] is 0. Entry i of row a is A[a row + i column]; it is 0 outside of [nonzero[a], nonzero_end[a]).
-  // Four rows at a time, so that each entry of Z is read once for four.
   OSIK_CALL static void rows_times_basis(Team t, const Real* A, int row, int column, const Real* Z, Real* R, int ld,
                                          const Int* in_cost, const Int* nonzero, const Int* nonzero_end, int rows,
                                          int start, int n) {
@@ -174,21 +281,7 @@ template <class Team> struct LinearAlgebra {
         factor[b] = in ? 1 : 0, r[b] = A + a * row;
         if (in) from = nonzero[a] < from ? nonzero[a] : from, to = nonzero_end[a] > to ? nonzero_end[a] : to;
       }
-      t.columns(start, n, [&](auto c) {
-        using P = typename decltype(c)::P;
-        P total[4] = {P(0), P(0), P(0), P(0)};
-        for (int i = from; i < to; ++i) {
-          const P z = c.load(Z + i * ld);
-OSIK_UNROLL
-          for (int b = 0; b < 4; ++b) total[b].fma(r[b][i * column], z);
-        }
-OSIK_UNROLL
-        for (int b = 0; b < 4; ++b)
-          if (first + b < rows) {
-            P out(0);
-            c.store(R + (first + b) * ld, out.fma(factor[b], total[b]));
-          }
-      });
+      four_rows(t, r, factor, column, Z, R + first * ld, ld, ld, rows - first, from, to, start, n);
     }
   }
 };

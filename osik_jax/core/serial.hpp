@@ -115,6 +115,10 @@ template <class R> struct Serial {
   template <class F> OSIK_FN void columns(int a, int b, F f) const {
     int j = a;
     for (; b - j > BLOCK - LANES; j += BLOCK) f(Columns<R, BLOCK / LANES>{j});
+    narrow_columns(j, b, f);
+  }
+  template <class F> OSIK_FN void narrow_columns(int a, int b, F f) const {
+    int j = a;
     if constexpr (LANES < WIDE)
       for (; b - j > WIDE - LANES; j += WIDE) f(Columns<R, WIDE / LANES>{j});
     for (; j < b; j += LANES) f(Columns<R, 1>{j});

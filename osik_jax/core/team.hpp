@@ -5,6 +5,7 @@
 //   once(f)              f() by one thread
 //   pairs(n, f)          f(a, b) for all a <= b < n
 //   columns(a, b, f)     f(c) for packs of columns: c.load(row), c.store(row, pack)
+//   narrow_columns(a, b, f)  the same with smaller packs, for an f that works on several at once
 //   sum, count, most, best   reductions of f(i); every thread gets the result
 //   dot, axpy, forward, backward, reflect   vector operations of the whole team
 //   scaled_copy, rows_times, weighted_gram, largest   a row that gets its padding; products of all rows with a vector,

@@ -75,6 +75,7 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes {
     for (int i = a + me(); i < b; i += 32) f(ColumnOf<R>{{i}});
     __syncwarp();
   }
+  template <class F> OSIK_FN void narrow_columns(int a, int b, F f) const { columns(a, b, f); }
 
   // ---- reductions
   OSIK_FN static Real all_sum(Real t) {

@@ -10,9 +10,9 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
     backend   weighted QP                          hierarchy                           null space
     "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    CUDA: with bounds, any
               hard rows, n <= 64, <= 32 soft rows  fit into shared memory              precision, levels that fit
-    "core"    CPUs: any precision, least squares   CPUs: any precision, any shape      as "numba"
-    "numba"   as "core"                            as "core"                           CPUs: any precision,
+    "core"    CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
                                                                                        any shape
+    "numba"   as "core"                            as "core"                           as "core"
     "jax"     none: plain JAX alone, on any platform
 
     of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks

@@ -80,7 +80,7 @@ multiplier. An answer with more is not taken."""
 SATURATION_RANK = 1e-9
 """In kernels: the part of a joint's unit vector in the null space and outside the span of saturated ones, with less of
 which it depends on them; of the largest in a combination, with less of which a joint does not stop the motion."""
-SOFT_COMPLIANCE, STIFFER_SOFT_COMPLIANCE = 1e-11, 1e-13
+SATURATION_COMPLIANCE, STIFFER_SATURATION_COMPLIANCE = 1e-12, 1e-13
 """In kernels, of the missing part of the motion, in the second and the third attempt, where the answer before does not
 hold: joints nearly depended on each other. The squared length of x that it outweighs; the more is missing, the more
 certain is the first that no larger scale is possible."""

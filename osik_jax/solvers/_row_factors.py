@@ -4,8 +4,8 @@ Modified Gram-Schmidt with the longest row that is left as the pivot (A. Bjorck,
 orthogonalization", Linear Algebra and its Applications 197, 1994); each new direction is orthogonalised twice, after
 which it is orthogonal to roundoff ("twice is enough"). On the way the columns of [A basis'; sqrt(damping) I] are
 orthogonalised as well. A batch is factored together, one pivot of all problems an iteration, by products with vectors:
-on a GPU, LAPACK's factorisations are many calls each. On a CPU a kernel does the same for one problem after another
-(``kernels/numba/_row_factors.py``).
+on a GPU, LAPACK's factorisations are many calls each. On a CPU the core does the same for one problem after another
+(``core/row_factors.hpp``).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..core import _library
 from ..execution._backends import Backend, on_platforms, takes
 from ..execution._double import first_smallest
 from ..execution._lanes import in_lanes
-from ..kernels.numba import _target
 from ..numerics._dense import apply
 
 
@@ -63,15 +63,14 @@ def _factored(backend: Backend) -> Callable[[Array, Array, Array], RowFactors]:
 
 def _factors_anywhere(backend: Backend, matrix: Array, cutoff: Array, damping: Array) -> RowFactors:
     fits = matrix.shape[1] > 0
-    kernels = {"numba": _by_numba} if fits and takes(backend, "numba", fits=True) else {}
+    kernels = {"core": _by_core} if fits and takes(backend, "core", fits=True) else {}
     return on_platforms(kernels, _factors, matrix, cutoff, damping)
 
 
-def _by_numba(matrix: Float[Array, "B m n"], cutoff: Float[Array, " B"], damping: Float[Array, " B"]) -> RowFactors:
+def _by_core(matrix: Float[Array, "B m n"], cutoff: Float[Array, " B"], damping: Float[Array, " B"]) -> RowFactors:
     batch, m, n = matrix.shape
-    shapes = (batch, m, n), (batch, 2 * m, m), (batch, m, m), (m * (n + 2 * m),)
-    outputs = [(shape, float) for shape in shapes]
-    return RowFactors(*_target.call("_row_factors", outputs, matrix, cutoff, damping)[:3])
+    outputs = [(shape, float) for shape in ((batch, m, n), (batch, 2 * m, m), (batch, m, m))]
+    return RowFactors(*_library.call("row_factors", outputs, matrix, cutoff, damping))
 
 
 def _factors(matrix: Float[Array, "B m n"], cutoff: Float[Array, " B"], damping: Float[Array, " B"]) -> RowFactors:

@@ -15,7 +15,10 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ._frame import lean
-from ._sizes import WIDTH as WIDTH  # LLVM splits a block where registers are shorter
+
+WIDTH = 8
+"""Numbers of a block; rows that are read in blocks are filled up to whole ones. LLVM splits a block where registers are
+shorter."""
 
 BEYOND = WIDTH - 1
 """Numbers after the last row that may be read."""

@@ -1,7 +1,7 @@
-"""Which backend computes the classical projection: on a CPU, a kernel for all levels of one problem after another.
+"""Which backend computes the classical projection: on a CPU, the core for all levels of one problem after another.
 
-It computes what ``_projection.py`` defines, in double precision; nothing is searched, so nothing is certified. That
-file is the definition, what runs elsewhere, and the derivative.
+``core/null_space.hpp`` computes what ``_projection.py`` defines, in double precision; nothing is searched, so nothing
+is certified. That file is the definition, what runs elsewhere, and the derivative.
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ...core import _library
 from ...execution._backends import Backend, on_platforms, takes
 from ...execution._lanes import in_lanes
 from ...execution._rules import custom_jvp
-from ...kernels.numba import _target
-from ...kernels.numba._sizes import row_space_numbers
 from .._damping import Damping
 from ..hqp import Level
 from ._projection import solve_forward
@@ -32,7 +31,7 @@ def project(
 ) -> Answer:
     """Return what ``solve_forward`` does, by the kernel where there is one; the damping has an axis of levels."""
     rank_tol = jnp.asarray(rank_tol, secondary.dtype)
-    if takes(backend, "numba", fits=True):
+    if takes(backend, "core", fits=True):
         return _by_kernel(list(levels), secondary, damping, rank_tol, backend=backend)
     return _plain(list(levels), secondary, damping, rank_tol, backend=backend)
 
@@ -56,16 +55,15 @@ def _by_kernel_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backe
 def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Array], Answer]:
     """Return the function of one problem."""
     plain = jax.vmap(partial(_plain, backend=backend))
-    return in_lanes(partial(on_platforms, dict(numba=_by_numba), plain))
+    return in_lanes(partial(on_platforms, dict(core=_by_core), plain))
 
 
-def _by_numba(
+def _by_core(
     levels: list[Level], secondary: Float[Array, "B n"], damping: Damping, rank_tol: Float[Array, " B"]
 ) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
     batch, n = secondary.shape
-    m = max(level.lower.shape[1] for level in levels)
     equal = [jax.vmap(lambda one: one.equal)(level) for level in levels]
     rows = [a for level, e in zip(levels, equal, strict=True) for a in (level.matrix, level.lower, level.upper, e)]
-    shapes = (batch, n), (batch, n, n), (row_space_numbers(n, m),)  # the last is space to work in
-    x, projector, _ = _target.call("_projection", [(s, float) for s in shapes], secondary, *damping, rank_tol, *rows)
+    outputs = [((batch, n), float), ((batch, n, n), float)]
+    x, projector = _library.call("projection", outputs, secondary, *damping, rank_tol, *rows)
     return x, projector

@@ -14,7 +14,7 @@ no admissible scale, and then drops the whole task. The motion d always has one.
 joints that block it can move no more whatever comes after: they are removed from the null space of the levels below,
 whose scale would otherwise be 0.
 
-Kernels take a problem through all levels, on CPUs one after another (``kernels/numba/_saturation.py``), on CUDA devices
+Kernels take a problem through all levels, on CPUs one after another (``core/saturation.hpp``), on CUDA devices
 by a warp of threads each (``kernels/warp/null_space``); problems without an answer of theirs are searched here, which
 is the definition, what runs elsewhere, and the derivative.
 
@@ -33,14 +33,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ...core import _library
 from ...execution._backends import Backend, takes
 from ...execution._blocks import BLOCK
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_a_few
 from ...execution._rules import found as kept
-from ...kernels.numba import _target
-from ...kernels.numba._sizes import row_space_numbers, saturation_numbers
 from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
@@ -115,8 +114,8 @@ def _solve_on_platform(max_iterations: int, backend: Backend, problem: Problem) 
     kernels = {}
     if takes(backend, "warp", fits=_warp.Shape.of(problem).warps > 0):
         kernels["warp"] = _kernel_candidates(max_iterations, search, _warp.solve, None)
-    if takes(backend, "numba", fits=True):
-        kernels["numba"] = _kernel_candidates(max_iterations, search, _by_numba, BLOCK)
+    if takes(backend, "core", fits=True):
+        kernels["core"] = _kernel_candidates(max_iterations, search, _by_core, BLOCK)
     return certified_or_searched(kernels, search, problem)
 
 
@@ -167,15 +166,14 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> Sa
     return SaturatedResult(end.x, end.projector, scales, joints, active, end.iterations, end.done)
 
 
-def _by_numba(problem: Problem, max_iterations: int) -> SaturatedResult:
-    """Return the kernel's answers, ``done`` where it has one."""
-    batch, count, m, n = problem.levels.matrix.shape
-    space = row_space_numbers(n, m) + saturation_numbers(n)
+def _by_core(problem: Problem, max_iterations: int) -> SaturatedResult:
+    """Return the core's answers, ``done`` where it has one."""
+    batch, count, _, n = problem.levels.matrix.shape
     floats = (batch, n), (batch, n, n), (batch, count)
     ints = (batch, count), (batch, count, n), (batch, count, n), (batch, count), (batch, n), (batch, 2)
-    x, projector, scales, done, at_bound, blocking, blocker, active, report, *_ = _target.call(
-        "_saturation",
-        [*((s, float) for s in floats), *((s, int) for s in ints), ((space,), float), ((5 * n,), int)],
+    x, projector, scales, done, at_bound, blocking, blocker, active, report = _library.call(
+        "saturation",
+        [*((s, float) for s in floats), *((s, int) for s in ints)],
         *(*problem.levels, *problem.damping, problem.targets, problem.lower, problem.upper, problem.rank_tol),
         np.array([max_iterations], np.int32),
     )

@@ -68,7 +68,7 @@ def solve_nullspace(
             rank 0, not the rank of its rounding.
         max_iterations: limit on the search for the saturated joints, for each level (static); default 10 (n + 2).
         backend: whose kernels compute (static): "auto" for those that are there for the platform, "jax" for none,
-            "numba" (CPUs) or, with bounds, "warp" (CUDA) for those or an error. It changes the time, not the answer.
+            "core" (CPUs) or, with bounds, "warp" (CUDA) for those or an error. It changes the time, not the answer.
 
     Raises:
         ValueError: an order that does not exist, bounds in reverse order, a damping too many or few, or a backend that

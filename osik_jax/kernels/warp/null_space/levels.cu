@@ -1,9 +1,9 @@
 // Saturation in the null space, all levels of a problem by one warp in double precision. The problem is the one that
-// solvers/null_space/_saturation.py states; the method is that of Numba's kernel (kernels/numba/_saturation.py), part
-// by part: the motion of a level in coordinates of the null space, then joints put on their bounds by a dual method in
+// solvers/null_space/_saturation.py states; the method is that of core/saturation.hpp, part by part:
+// the motion of a level in coordinates of the null space, then joints put on their bounds by a dual method in
 // these coordinates, and the joints that stop the level taken off them.
 //
-// The motion has one way where Numba's kernel has quicker ones beside it: reflections that bring the level's row space
+// The motion has one way where the core has a quicker one beside it: reflections that bring the level's row space
 // to the front of the coordinates, and orthogonal factors of its rows there.
 //
 // This is the end of the body of one function: the other files of this folder stand before it, in the order that
@@ -24,7 +24,7 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
     most_changes = max_iterations - its_changes;
     if (number == 0 && own < most_changes) most_changes = own;
     const double least = number == 0 ? SATURATION_RANK : SOFT_SATURATION_RANK;
-    const double compliance = number == 0 ? 0.0 : number == 1 ? SOFT_COMPLIANCE : STIFFER_SOFT_COMPLIANCE;
+    const double compliance = number == 0 ? 0.0 : number == 1 ? SATURATION_COMPLIANCE : STIFFER_SATURATION_COMPLIANCE;
     const bool went_on = goes_on, done = attempt(at, least, compliance, goes_on);  // one place in the program for all
     its_changes += changes;
     goes_on = done && number == 0 && count > 0;

@@ -1,5 +1,5 @@
 // The saturated joints and the largest scale of a level's motion, by the dual method that
-// kernels/numba/_saturation_search.py describes. One loop goes from step to step, so that each function that changes
+// core/saturation.hpp describes. One loop goes from step to step, so that each function that changes
 // the coordinates has one place in the program: a joint that is exchanged for another leaves in one step and is followed
 // in the next.
 constexpr int CHOOSE = 0, REPLACE = 1, STOP = 2;      // a joint that leaves or enters; one in place of another; a stop

@@ -2,7 +2,7 @@
 //
 // Joint i belongs to lane i % 32, and so do coordinate i, saturated joint i and row i of the level. Constants from
 // _warp.py: N joints, LEVELS, M rows of the longest level, WARPS of a block, and those of numerics/_constants.py that
-// it shares with Numba's kernel.
+// it shares with the core.
 constexpr int WIDE = N > M ? N : M;
 constexpr int D = N | 1, MD = M | 1;                  // row lengths in shared memory: odd, to meet every bank
 constexpr int G = (M + 31) / 32, H = (N + 31) / 32;   // rows of a lane, and joints
