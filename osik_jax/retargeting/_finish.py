@@ -13,6 +13,7 @@ from ..kinematics import difference, integrate
 from ..limits import AccelerationLimit, Limit, limit_box
 from ..limits._acceleration import stopping_speed
 from ..robot import Robot
+from ..robot._balls import independent_balls, with_balls_inside
 from ..robot._joint_selection import scalar_layout
 
 _SPARE = 0.1
@@ -61,7 +62,11 @@ def inside_limits(
     behind = difference(robot, q, goal)
     back = jnp.sign(behind) * stopping_speed(jnp.abs(behind), spare, dt)
     v = jnp.clip(difference(robot, goal, following) / dt + back, lower, upper)
-    return integrate(robot, q, v, dt), v
+    after = integrate(robot, q, v, dt)
+    if not independent_balls(robot.tree):
+        return after, v
+    after = with_balls_inside(robot.tree, after, robot.position_upper)  # the box alone does not bound their angles
+    return after, difference(robot, q, after) / dt
 
 
 def _accelerations(robot: Robot, limits: Sequence[Limit]) -> Float[Array, " nv"]:
@@ -77,4 +82,5 @@ def inside_ranges(robot: Robot, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
     """A configuration with its joints inside their ranges."""
     scalar, index = scalar_layout(robot)
     at = index[scalar]
-    return q.at[at].set(jnp.clip(q[at], robot.position_lower[scalar], robot.position_upper[scalar]))
+    q = q.at[at].set(jnp.clip(q[at], robot.position_lower[scalar], robot.position_upper[scalar]))
+    return with_balls_inside(robot.tree, q, robot.position_upper)

@@ -67,9 +67,10 @@ class OnRobot:
 
 
 def _on_joints(robot: Robot, acceleration: float | Mapping[str, float]) -> AccelerationLimit:
-    """A limit on accelerations of the joints; the base is free."""
+    """A limit on accelerations of the joints, no greater than the robot's own; the base is free."""
     if isinstance(acceleration, Mapping):
         return AccelerationLimit(robot, acceleration)
     if not acceleration > 0.0:
         raise OsikValueError(f"acceleration is {acceleration}; it has to be more than 0")
-    return AccelerationLimit(robot, np.where(scalar_layout(robot)[0], acceleration, np.inf))
+    given = np.where(scalar_layout(robot)[0], acceleration, np.inf)
+    return AccelerationLimit(robot, np.minimum(given, np.asarray(robot.acceleration_limit)))

@@ -71,7 +71,9 @@ def _tendon_notes(model: mujoco.MjModel, joints: tuple[str, ...]) -> Iterator[Lo
         name = _name(model, mujoco.mjtObj.mjOBJ_TENDON, tendon)
         if model.tendon_limited[tendon]:
             yield LoadNote(
-                "tendon range", name, "not kept; of a fixed tendon LinearLimit or JointCouplingTask keeps it"
+                "tendon range",
+                name,
+                "not kept; that of a fixed tendon is kept by a JointCouplingTask with lower and upper",
             )
         if model.tendon_stiffness[tendon] > 0.0:
             yield LoadNote("tendon stiffness", name, "the spring is left out")
