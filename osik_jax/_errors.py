@@ -8,6 +8,8 @@ import warnings
 from pathlib import Path
 
 _PACKAGE = str(Path(__file__).parent)
+_WRAPPERS = ("equinox", "jaxtyping")
+"""Packages that call methods of ours for a caller: a warning points beyond them too."""
 
 
 class OsikError(Exception):
@@ -41,8 +43,10 @@ class OsikWarning(UserWarning):
 
 def warn(message: str) -> None:
     """Gives an ``OsikWarning`` that points at the line outside this package that led here."""
-    level, frame = 2, sys._getframe(1)
-    while frame is not None and frame.f_code.co_filename.startswith(_PACKAGE):
+    loaded = [sys.modules[name] for name in _WRAPPERS if name in sys.modules]
+    wrappers = [str(Path(module.__file__).parent) for module in loaded if module.__file__]
+    inside, level, frame = (_PACKAGE, *wrappers), 2, sys._getframe(1)
+    while frame is not None and frame.f_code.co_filename.startswith(inside):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, OsikWarning, stacklevel=level)
 

@@ -47,6 +47,15 @@ def test_degrees_of_a_configuration(arm, tasks):
     assert arm.configuration({"joint2": 0.3})[1] == pytest.approx(0.3)
 
 
+def test_warnings_point_at_the_caller(arm):
+    """Also through Equinox's wrappers of methods and constructors."""
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        arm.configuration({"joint2": 45.0})
+        osik.VelocityLimit(arm, velocity={"*": 180.0})
+    assert [w.filename for w in seen] == [__file__] * 2
+
+
 def test_an_encoder_a_little_outside_is_silent(arm, tasks):
     q = np.asarray(arm.position_upper) + 0.01
     assert told(lambda: osik.solve(arm, q, tasks)) == []

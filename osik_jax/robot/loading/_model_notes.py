@@ -70,11 +70,8 @@ def _tendon_notes(model: mujoco.MjModel, joints: tuple[str, ...]) -> Iterator[Lo
     for tendon in range(model.ntendon):
         name = _name(model, mujoco.mjtObj.mjOBJ_TENDON, tendon)
         if model.tendon_limited[tendon]:
-            yield LoadNote(
-                "tendon range",
-                name,
-                "not kept; that of a fixed tendon is kept by a JointCouplingTask with lower and upper",
-            )
+            done = "not kept; a JointCouplingTask with lower and upper keeps that of a fixed tendon"
+            yield LoadNote("tendon range", name, done)
         if model.tendon_stiffness[tendon] > 0.0:
             yield LoadNote("tendon stiffness", name, "the spring is left out")
         wraps = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
