@@ -22,6 +22,8 @@ from . import _build, _library
 SHARED_BYTES = 227 * 1024
 """Shared memory of one block at most, on devices of compute capability 9.0; less on others, which take the search."""
 _LOCAL_INCLUDE = re.compile(r'^#include "(.*)"\n', re.MULTILINE)
+# a loop stays a loop unless the line before it asks to unroll it: unrolled, the text exceeds the instruction cache
+_LOOP = re.compile(r"(?<!unroll\n)(?<!unroll \d\n)(?<!OSIK_UNROLL\n)^ *(?:for|while) \(", re.MULTILINE)
 _SYSTEM_INCLUDE = re.compile(r"^#include <.*>\n", re.MULTILINE)
 
 
@@ -52,7 +54,7 @@ def text_of(header: str) -> str:
         text = _SYSTEM_INCLUDE.sub("", (_build.FOLDER / name).read_text())
         return _LOCAL_INCLUDE.sub(lambda match: inlined(match[1]), text.replace("#pragma once\n", ""))
 
-    return inlined(header)
+    return _LOOP.sub(r"#pragma unroll 1\n\g<0>", inlined(header))
 
 
 def call(

@@ -24,9 +24,8 @@ void solve_hierarchies(const xla::Call& call) {
            call.out<int>(5),    call.out<int>(6),    call.out<int>(7),    call.out<int>(8),    call.out<int>(9),
            call.out<int>(10),   call.out<int>(11)};
   using Method = Hierarchy<Team>;
-  std::vector<double> space(Method::doubles(s));
-  std::vector<int> labels(Method::integers(s));
-  Method method(s, space.data(), labels.data());
+  std::vector<char> space(Method::bytes(s));
+  Method method(s, space.data());
   for (int k = 0; k < batch; ++k) {
     method.solve(p, a);
     advance(p, s);
@@ -43,7 +42,7 @@ void* osik_hierarchy(xla::CallFrame* frame) { return xla::handle<solve_hierarchi
 int osik_hierarchy_bytes(int L, int m, int n, int h) {
   const Sizes s{L, m, n, h, 0, nullptr, nullptr, nullptr};
   using Method = Hierarchy<WarpSizes>;
-  return (8 * Method::doubles(s) + int(sizeof(Method::Int)) * Method::integers(s) + 15) / 16 * 16;
+  return Method::bytes(s);
 }
 
 // The sources that this library was built from (_build.py), so that another state of them is noticed.

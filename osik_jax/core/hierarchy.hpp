@@ -68,7 +68,7 @@ OSIK_FN void advance(Answer& a, const Sizes& s, size_t by = 1) {
 template <class Team> struct Hierarchy {
   using Int = typename Team::Int;
   using Algebra = LinearAlgebra<Team>;
-  static constexpr int VECTORS = 20, INTEGERS = 13;
+  static constexpr int VECTORS = 19, INTEGERS = 13;
   Team t;
   Sizes size;
   // n, m, h as above; strides of the basis and of the level's factors; strides of A; the current level and its rows
@@ -80,43 +80,93 @@ template <class Team> struct Hierarchy {
   double x_max, slack_norm, root_cost, gradient_norm, residual;
   double largest;  // x_max of the largest guess from which the search of a level went on
   double rank_tol, step_tol, multiplier_tol, feasible_tol;
-  double *Z;       // [h, ld] the basis
-  double *R;       // [m, ld] the level's rows in the basis
-  double *V, *S;   // [m, lm] reflections above the diagonal, a Cholesky factor below it
-  double *hard;    // [h - n, ld] hard rows beside the box
-  double *copied;  // [m, ld] the level's rows, padded
-  // vectors, as long as the longest of n, m and h
-  double *X, *START, *STEP, *WORK, *DOWNHILL, *CURVATURE, *HARD_LOWER, *HARD_UPPER, *HARD_NORM, *MULTIPLIER, *LOWER,
-      *UPPER, *ROW_NORM, *VALUE, *SLACK, *RATE, *RIGHT, *SCALE, *INVERSE, *DIAGONAL;
-  const double* A;
-  Int *ACTIVE, *ACTIVE_ABOVE, *FROZEN, *PENDING, *FREEZES, *EQUALITY, *IN_COST, *OWN, *PIVOT, *NONZERO, *NONZERO_END,
-      *ACTIVE_BOUND, *ACTIVE_ROW;
+  const double* A;  // the level's rows, entry i of row a at A[a row + i column]
 
+  // ---- the workspace: where each array begins, in bytes
   static constexpr OSIK_HOST int width(const Sizes& s) {
     const int n = Team::variables(s.n), m = Team::level_rows(s.m), h = Team::hard_rows(s.h);
     return Team::stride(h > m ? h : m > n ? m : n);
   }
-  // numbers and integers of the workspace
-  static constexpr OSIK_HOST int doubles(const Sizes& s) {
-    const int n = Team::variables(s.n), m = Team::level_rows(s.m), h = Team::hard_rows(s.h);
-    return (2 * h - n + m * (Team::COPIES ? 2 : 1)) * Team::stride(n) + m * Team::stride(m) + VECTORS * width(s) +
-           (Team::COPIES ? 8 : 0);
+  // rows of the length of the basis in front of a matrix: the basis has h, the level's rows m, the hard rows h - n
+  template <int HARD, int ROWS, int VARIABLES> struct MatrixAt {
+    static constexpr OSIK_HOST int of(const Sizes& s) {
+      const int n = Team::variables(s.n), m = Team::level_rows(s.m), h = Team::hard_rows(s.h);
+      return 8 * (VECTORS * width(s) + (HARD * h + ROWS * m - VARIABLES * n) * Team::stride(n));
+    }
+  };
+  using BasisAt = MatrixAt<0, 0, 0>;
+  using RowsAt = MatrixAt<1, 0, 0>;
+  using HardAt = MatrixAt<1, 1, 0>;
+  using CopiedAt = MatrixAt<2, 1, 1>;
+  struct FactorsAt {
+    static constexpr OSIK_HOST int of(const Sizes& s) {
+      const int m = Team::level_rows(s.m);
+      return CopiedAt::of(s) + 8 * (Team::COPIES ? m * Team::stride(Team::variables(s.n)) : 0);
+    }
+  };
+  static constexpr OSIK_HOST int bytes_of_numbers(const Sizes& s) {
+    const int m = Team::level_rows(s.m);
+    return FactorsAt::of(s) + 8 * (m * Team::stride(m) + (Team::COPIES ? 8 : 0));  // the last row is read on
   }
-  static constexpr OSIK_HOST int integers(const Sizes& s) { return INTEGERS * width(s); }
+  static constexpr OSIK_HOST int bytes(const Sizes& s) {
+    return (bytes_of_numbers(s) + INTEGERS * width(s) * int(sizeof(Int)) + 15) / 16 * 16;
+  }
+  template <int K> struct VectorAt {
+    static constexpr OSIK_HOST int of(const Sizes& s) { return 8 * K * width(s); }
+  };
+  template <int K> struct LabelsAt {
+    static constexpr OSIK_HOST int of(const Sizes& s) { return bytes_of_numbers(s) + int(sizeof(Int)) * K * width(s); }
+  };
+  template <int K> using Numbers = typename Team::template Array<double, VectorAt<K>, Sizes>;
+  template <int K> using Labels = typename Team::template Array<Int, LabelsAt<K>, Sizes>;
+  template <class At> using Matrix = typename Team::template Array<double, At, Sizes>;
+  Matrix<BasisAt> Z;       // [h, ld] the basis
+  Matrix<RowsAt> R;        // [m, ld] the level's rows in the basis
+  Matrix<HardAt> hard;     // [h - n, ld] hard rows beside the box
+  Matrix<CopiedAt> copied;  // [m, ld] the level's rows, padded, if the team copies them
+  Matrix<FactorsAt> V, S;  // [m, lm] one matrix: reflections above the diagonal, a Cholesky factor below it
+  // vectors, as long as the longest of n, m and h
+  Numbers<0> X;
+  Numbers<1> START;
+  Numbers<2> STEP;
+  Numbers<3> WORK;
+  Numbers<4> DOWNHILL;
+  Numbers<5> CURVATURE;
+  Numbers<6> HARD_LOWER;
+  Numbers<7> HARD_UPPER;
+  Numbers<8> HARD_NORM;
+  Numbers<9> MULTIPLIER;
+  Numbers<10> LOWER;
+  Numbers<11> UPPER;
+  Numbers<12> ROW_NORM;
+  Numbers<13> VALUE;
+  Numbers<14> SLACK;
+  Numbers<15> RATE;
+  Numbers<16> RIGHT;
+  Numbers<17> SCALE;
+  Numbers<18> INVERSE;
+  Numbers<4> DIAGONAL;  // in the place of DOWNHILL: a Gram matrix is factored before multipliers are computed
+  Labels<0> ACTIVE;
+  Labels<1> ACTIVE_ABOVE;
+  Labels<2> FROZEN;
+  Labels<3> PENDING;
+  Labels<4> FREEZES;
+  Labels<5> EQUALITY;
+  Labels<6> IN_COST;
+  Labels<7> OWN;
+  Labels<8> PIVOT;
+  Labels<9> NONZERO;
+  Labels<10> NONZERO_END;
+  Labels<11> ACTIVE_BOUND;
+  Labels<12> ACTIVE_ROW;
 
-  OSIK_FN Hierarchy(const Sizes& s, double* F, Int* J)
+  template <class... Arrays> OSIK_FN void place(char* space, Arrays&... arrays) { (arrays.place(space, size), ...); }
+  OSIK_FN Hierarchy(const Sizes& s, char* space)
       : size(s), n(s.n), m(s.m), h(s.h), ld(Team::stride(Team::variables(n))),
         lm(Team::stride(Team::level_rows(m))), row(ld), column(1) {
-    const int w = width(s);
-    for (double** v : {&X, &START, &STEP, &WORK, &DOWNHILL, &CURVATURE, &HARD_LOWER, &HARD_UPPER, &HARD_NORM,
-                       &MULTIPLIER, &LOWER, &UPPER, &ROW_NORM, &VALUE, &SLACK, &RATE, &RIGHT, &SCALE, &INVERSE,
-                       &DIAGONAL})
-      *v = F, F += w;
-    const int nc = Team::variables(n), mc = Team::level_rows(m), hc = Team::hard_rows(h);
-    Z = F, R = Z + hc * ld, hard = R + mc * ld, V = S = hard + (hc - nc) * ld, copied = S + mc * lm;
-    for (Int** v : {&ACTIVE, &ACTIVE_ABOVE, &FROZEN, &PENDING, &FREEZES, &EQUALITY, &IN_COST, &OWN, &PIVOT, &NONZERO,
-                    &NONZERO_END, &ACTIVE_BOUND, &ACTIVE_ROW})
-      *v = J, J += w;
+    place(space, Z, R, hard, copied, V, S, X, START, STEP, WORK, DOWNHILL, CURVATURE, HARD_LOWER, HARD_UPPER, HARD_NORM,
+          MULTIPLIER, LOWER, UPPER, ROW_NORM, VALUE, SLACK, RATE, RIGHT, SCALE, INVERSE, DIAGONAL, ACTIVE, ACTIVE_ABOVE,
+          FROZEN, PENDING, FREEZES, EQUALITY, IN_COST, OWN, PIVOT, NONZERO, NONZERO_END, ACTIVE_BOUND, ACTIVE_ROW);
   }
 
   // ---- single rows
@@ -126,9 +176,8 @@ template <class Team> struct Hierarchy {
   OSIK_FN double target(int a, double value) const { return EQUALITY[a] ? LOWER[a] : clip(value, LOWER[a], UPPER[a]); }
   OSIK_FN bool may_block(int q) const { return !FROZEN[q] && size.level_of_hard[q] < level; }
   OSIK_FN double row_value(int a, const double* d) const { return t.own_row(A + a * row, d, NONZERO[a], NONZERO_END[a], n, column); }
-  template <class From, class To> OSIK_FN void copy(const From* a, To* b, int count) {
-    t.each(0, count, [&](int j) { b[j] = a[j]; });
-  }
+  OSIK_FN void copy(const double* a, double* b, int count) { Algebra::copy(t, a, b, count); }
+  OSIK_FN void copy(const Int* a, Int* b, int count) { Algebra::copy(t, a, b, count); }
 
   // ---- the basis
   // out = Z WORK over the columns [start, stop)

@@ -14,6 +14,10 @@ template <class Team> struct LinearAlgebra {
   using Real = typename Team::Real;
   using Int = typename Team::Int;
 
+  template <class T> OSIK_CALL static void copy(Team t, const T* from, T* to, int count) {
+    t.each(0, count, [&](int j) { to[j] = from[j]; });
+  }
+
   // out[i] = sum_j M[i, j] v[j] over start <= j < stop, for the n rows of M
   OSIK_CALL static void times(Team t, const Real* M, const Real* v, Real* out, int ld, int start, int stop, int n) {
     t.are_shared(M, v, out);

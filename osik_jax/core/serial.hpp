@@ -71,8 +71,16 @@ template <class Real, int B> struct Columns {
   }
 };
 
+// An array of a workspace, at the place that At::of says [bytes].
+template <class T, class At, class Sizes> struct PointerArray {
+  T* data;
+  OSIK_FN void place(char* space, const Sizes& s) { data = reinterpret_cast<T*>(space + At::of(s)); }
+  OSIK_FN operator T*() const { return data; }
+};
+
 template <class R> struct Serial {
   using Real = R;
+  template <class T, class At, class Sizes> using Array = PointerArray<T, At, Sizes>;
   using Int = int;
   using Loaded = typename Vector<R>::Loaded;
   using Value = typename Vector<R>::Value;

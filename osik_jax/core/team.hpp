@@ -20,8 +20,9 @@
 #define OSIK_FN __device__ __forceinline__
 #define OSIK_HOST __host__ __device__
 #define OSIK_UNROLL _Pragma("unroll")
-#define OSIK_CALL __device__ __noinline__       // a call on a GPU: all that it needs comes as arguments
-#define OSIK_METHOD __device__ __forceinline__  // a call of a member would move the members to local memory
+// Calls keep the text short: it has to fit into the instruction cache.
+#define OSIK_CALL __device__ __noinline__
+#define OSIK_METHOD __device__ __noinline__
 #else
 #define OSIK_FN inline __attribute__((always_inline))
 #define OSIK_CALL inline __attribute__((noinline))
@@ -38,8 +39,12 @@ template <class Real> struct Best {
 };
 
 // How a warp lays out its workspace. The host uses it to compute the size of one.
+template <class T, class At, class Sizes> struct NoArray {};
+
 struct WarpSizes {
   using Int = short;
+  using Real = double;
+  template <class T, class At, class Sizes> using Array = NoArray<T, At, Sizes>;
   static constexpr bool COPIES = false;  // rows are read from global memory
   static constexpr OSIK_HOST int stride(int n) { return n | 1; }  // odd: threads read different banks of memory
   static constexpr OSIK_HOST int variables(int n) { return n; }

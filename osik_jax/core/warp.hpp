@@ -22,9 +22,18 @@ template <class Real> struct ColumnOf : Column {
   OSIK_FN void store(Real* row, const P& p) const { row[at] = p.v; }
 };
 
+extern __shared__ double shared_space[];  // of one problem: a block is one warp
+
+// An array of a workspace in shared memory. Its address is a constant, so that no register and no member holds it.
+template <class T, class At, class Sizes> struct SharedArray {
+  OSIK_FN void place(char*, const Sizes&) {}
+  OSIK_FN operator T*() const { return reinterpret_cast<T*>(reinterpret_cast<char*>(shared_space) + At::of(Sizes{})); }
+};
+
 // Space is laid out for N variables, M rows of a level and H hard rows, which are constants of a compilation.
 template <class R, int N, int M, int H> struct Warp : WarpSizes {
   using Real = R;
+  template <class T, class At, class Sizes> using Array = SharedArray<T, At, Sizes>;
   static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
   static constexpr unsigned ALL = 0xffffffffu;
   static constexpr OSIK_HOST int variables(int) { return N; }
@@ -78,21 +87,21 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes {
   template <class F> OSIK_FN void narrow_columns(int a, int b, F f) const { columns(a, b, f); }
 
   // ---- reductions
-  OSIK_FN static Real all_sum(Real t) {
-#pragma unroll 1
+  OSIK_CALL static Real all_sum(Real t) {
+#pragma unroll
     for (int d = 16; d; d /= 2) t += __shfl_xor_sync(ALL, t, d);
     return t;
   }
-  OSIK_FN static Real all_most(Real t) {
-#pragma unroll 1
+  OSIK_CALL static Real all_most(Real t) {
+#pragma unroll
     for (int d = 16; d; d /= 2) {
       const Real v = __shfl_xor_sync(ALL, t, d);
       t = v > t || v != v ? v : t;
     }
     return t;
   }
-  OSIK_FN static Best<R> all_best(Best<R> r) {
-#pragma unroll 1
+  OSIK_CALL static Best<R> all_best(Best<R> r) {
+#pragma unroll
     for (int d = 16; d; d /= 2) {
       const Real v = __shfl_xor_sync(ALL, r.value, d);
       const int w = __shfl_xor_sync(ALL, r.which, d);
@@ -161,11 +170,11 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes {
 #pragma unroll 2
     for (int j = start; j < stop; ++j) a[j] += by * b[j];
   }
-  OSIK_FN Real dot(const Real* a, const Real* b, int start, int stop) const {
+  OSIK_CALL Real dot(const Real* a, const Real* b, int start, int stop) const {
     __syncwarp();
     return sum(start, stop, [&](int j) { return a[j] * b[j]; });
   }
-  OSIK_FN void axpy(Real* a, Real by, const Real* b, int start, int stop) const {
+  OSIK_CALL void axpy(Real* a, Real by, const Real* b, int start, int stop) const {
     each(start, stop, [&](int j) { a[j] += by * b[j]; });
   }
   OSIK_CALL void reflect(Real* rows, int ld, int count, const Real* v, Real scale, int at, int n) const {

@@ -16,23 +16,20 @@ _MAX_ROWS = 64  # the triangular solves of a warp hold two entries a thread
 _KERNEL = """
 using namespace osik;
 using Method = Hierarchy<Warp<double, N, M, H>>;
-extern "C" __global__ void __launch_bounds__(32 * WARPS) osik_kernel(
+extern "C" __global__ void __launch_bounds__(32) osik_kernel(
     const double* matrix, const double* lower, const double* upper, const double* hard, const double* hard_lower,
     const double* hard_upper, const double* damping, const double* bends, const double* tolerances,
     const int* equality, const int* pinned, const int* guess_hard, const int* guess_own,
     double* x, double* multipliers, double* slack_norms, double* dampings, double* residual,
     int* active_bounds, int* active, int* frozen, int* in_cost, int* own, int* ranks, int* report, int problems) {
-  extern __shared__ double shared[];
-  const int warp = threadIdx.x >> 5, k = blockIdx.x * WARPS + warp;
-  if (k >= problems) return;
+  const int k = blockIdx.x;
   const Sizes s{L, M, N, H, MAX_ITERATIONS, ROW_COUNTS, LEVEL_OF_HARD, ROW_OF_HARD};
-  double* space = shared + warp * (BYTES / 8);
   Problem p{matrix, lower, upper, hard, hard_lower, hard_upper, damping, bends, tolerances,
             equality, pinned, guess_hard, guess_own, 1, ROWS, true};
   Answer a{x, multipliers, slack_norms, dampings, residual, active_bounds, active, frozen, in_cost, own, ranks, report};
   advance(p, s, k);
   advance(a, s, k);
-  Method method(s, space, (Method::Int*)(space + Method::doubles(s)));
+  Method method(s, nullptr);
   method.solve(p, a);
 }
 """
@@ -55,8 +52,8 @@ def fits(layout: Layout) -> bool:
 @cache
 def _source(layout: Layout, max_iterations: int) -> str:
     n, h = layout.variables, len(layout.level_of_hard)
-    numbers = dict(N=n, M=layout.rows, H=h, L=layout.levels, ROWS=sum(layout.row_counts), WARPS=1)
-    numbers |= dict(MAX_ITERATIONS=max_iterations, BYTES=_bytes(layout))
+    numbers = dict(N=n, M=layout.rows, H=h, L=layout.levels, ROWS=sum(layout.row_counts))
+    numbers |= dict(MAX_ITERATIONS=max_iterations)
     rows = [layout.hard_of_row[layout.level_of_hard[q]].index(q) for q in range(n, h)]
     lists = dict(ROW_COUNTS=layout.row_counts, LEVEL_OF_HARD=layout.level_of_hard, ROW_OF_HARD=rows)
     return _cuda.text_of("hierarchy.hpp") + _cuda.constants(**numbers, **lists) + _KERNEL
