@@ -377,16 +377,6 @@ def _primal_start(
     return jax.tree.map(lambda a, b: jnp.where(solution.feasible, a, b), _as_primal_state(solution), above)
 
 
-def largest_active_bound(result: CascadeResult, hierarchy: PaddedHierarchy) -> Float[Array, ""]:
-    """Return the largest active bound of all levels, relative to its row's length: x was as large as that somewhere."""
-    length = jnp.sqrt(jnp.sum(hierarchy.hard**2, -1))
-    active = result.working_sets.hard
-    bound = jnp.where(active < 0, hierarchy.hard_lower, hierarchy.hard_upper)
-    # a bound that is active only because it was narrowed may be infinite here; it was nearer than x
-    usable = (active != 0) & (length > 0.0) & jnp.isfinite(bound)
-    return jnp.max(jnp.where(usable, jnp.abs(bound) / jnp.where(length > 0.0, length, 1.0), 0.0))
-
-
 def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> CascadeResult:
     """Check the residual: each level's own one, and by how much the levels below have changed the norm that it reached.
 

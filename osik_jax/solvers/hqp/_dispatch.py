@@ -18,9 +18,9 @@ from ...execution._backends import Backend, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_the_rest
-from ...numerics._constants import BOX_TOLERANCE, MAX_DETOUR
+from ...numerics._constants import BOX_TOLERANCE
 from . import _core, _cuda, _warp
-from ._cascade import CascadeResult, certify_levels, largest_active_bound, solve_cascade
+from ._cascade import CascadeResult, certify_levels, solve_cascade
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
@@ -80,8 +80,6 @@ def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve, *, by_g
         valid = jax.vmap(_is_valid)(candidates, hierarchy, tolerances)
         answers = candidates._replace(x=jax.vmap(_inside_box)(candidates.x, hierarchy))
         result = jax.vmap(certify_levels)(answers, hierarchy, tolerances)
-        if warm_start is not None:
-            valid &= jax.vmap(_is_direct)(answers, hierarchy)
         return result._replace(done=result.done & valid)
 
     def search_rest(
@@ -99,11 +97,6 @@ def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve, *, by_g
 def _inside_box(x: Float[Array, " n"], hierarchy: PaddedHierarchy) -> Float[Array, " n"]:
     """Return x clipped into its box."""
     return jnp.clip(x, hierarchy.hard_lower[: len(x)], hierarchy.hard_upper[: len(x)])
-
-
-def _is_direct(result: CascadeResult, hierarchy: PaddedHierarchy) -> Bool[Array, ""]:
-    """Check that no level ended far beyond the answer, as a foreign warm start may make it do."""
-    return largest_active_bound(result, hierarchy) <= MAX_DETOUR * jnp.max(jnp.abs(result.x))
 
 
 def _is_valid(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> Bool[Array, ""]:
