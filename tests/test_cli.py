@@ -64,12 +64,21 @@ def test_version_is_the_packages(capsys):
     assert capsys.readouterr().out.startswith("osik-jax 0.")
 
 
-@pytest.mark.parametrize("arguments", [["dmo"], ["demo", "--motion", "jump"], ["demo", "--schemes", "magic"], ["info"]])
+@pytest.mark.parametrize("arguments", [["dmo"], ["demo", "--motion", "jump"], ["demo", "--schemes", "magic"]])
 def test_unknown_words_exit_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as exit_info:
         cli.main(arguments)
     assert exit_info.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_info_of_the_system_says_which_core_is_loaded(capsys):
+    from osik_jax.core import _library
+
+    assert cli.main(["info", "--system"]) == 0
+    said = capsys.readouterr().out
+    assert _library.core().reason in said and "jaxlib" in said and "NVRTC" in said
+    assert "--system" in refused(capsys, "info")
 
 
 def test_missing_and_broken_files_are_named(capsys, tmp_path):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from ._messages import CommandError
 from ._robots import read_robot
 
 if TYPE_CHECKING:
@@ -20,8 +21,10 @@ if TYPE_CHECKING:
 class Info:
     """Prints a robot's joints with their limits, its frames and its mass, and what it does not keep of its file."""
 
-    robot: Annotated[str, tyro.conf.Positional]
+    robot: Annotated[str, tyro.conf.Positional] = ""
     """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
+    system: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the versions and devices in use, and which compiled core is loaded and why."""
     base: Literal["auto", "floating", "fixed"] = "auto"
     """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
@@ -29,8 +32,14 @@ class Info:
         """Runs the command; returns the exit code."""
         from rich.console import Console
 
-        robot = read_robot(self.robot, self.base)
         console = Console()
+        if self.system:
+            _print_system(console)
+        if not self.robot:
+            if self.system:
+                return 0
+            raise CommandError("osik info needs a robot, as in osik info nao, or --system")
+        robot = read_robot(self.robot, self.base)
         base = "floating base" if robot.floating_base else "bolted down"
         mass = float(robot.body_mass.sum())
         size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {mass:.3f} kg"
@@ -41,6 +50,27 @@ class Info:
         console.print(f"[bold]{len(robot.frame_names)} frames[/bold]: {', '.join(robot.frame_names)}")
         _print_report(console, robot)
         return 0
+
+
+def _print_system(console: Console) -> None:
+    """Print versions, devices and which compiled core is loaded."""
+    import platform
+    from importlib.metadata import version
+
+    import jax
+
+    from ..core import _cuda, _library
+
+    packages = ", ".join(f"{name} {version(name)}" for name in ("osik-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx"))
+    nvrtc = _cuda.nvrtc() or "none; it comes with jax[cuda13] and jax[cuda12]"
+    lines = (
+        f"Python {platform.python_version()} on {platform.machine()}: {packages}",
+        f"devices: {', '.join(map(str, jax.devices()))}",
+        f"compiled core: {_library.core().reason}",
+        f"CUDA compiler (NVRTC): {nvrtc}",
+    )
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _print_report(console: Console, robot: Robot) -> None:
