@@ -48,3 +48,31 @@ def test_a_hierarchy_is_not_exported_unasked(step):
     made, q = step
     with pytest.raises(ValueError, match="lapack_dgeqp3_ffi"):
         jax.export.export(made("hierarchical"))(q)
+
+
+@pytest.mark.variants(release=["classical", "reverse", "saturated"])
+@pytest.mark.parametrize("name", SCHEMES)
+def test_a_symbolic_batch_is_exported(name, step):
+    """One program for batches of any size: the numbers of ``vmap`` with each size."""
+    made, q = step
+    (n,) = jax.export.symbolic_shape("n")
+    checks = [PIVOTED_QR] if name == "hierarchical" else []
+    many = jax.jit(jax.vmap(made(name)))
+    exported = jax.export.export(many, disabled_checks=checks)(jax.ShapeDtypeStruct((n, *q.shape), q.dtype))
+    rng = np.random.default_rng(0)
+    for count in (1, 3, 40):
+        batch = q + rng.uniform(-0.2, 0.2, (count, len(q)))
+        np.testing.assert_allclose(exported.call(batch), many(batch), atol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", ["core", "numba"])
+@pytest.mark.parametrize("is_symbolic", [False, True])
+def test_a_program_with_a_kernel_is_refused_in_our_words(kernel, is_symbolic):
+    robot = osik.load_robot("arm7")
+    tasks = {"hand": osik.FrameTask(robot, "hand", rows="position")}
+    scheme = osik.NullSpace(backend="numba") if kernel == "numba" else osik.WeightedQP(backend="core")
+    step = jax.jit(jax.vmap(lambda q: osik.solve(robot, q, tasks, scheme=scheme).velocity))
+    lanes = jax.export.symbolic_shape("n")[0] if is_symbolic else 4
+    with pytest.raises(osik.OsikError, match=r"calls a compiled kernel.*jax\.export.*backend=\"jax\""):
+        jax.export.export(step)(jax.ShapeDtypeStruct((lanes, robot.nq), robot.q0.dtype))
+    assert np.isfinite(step(robot.q0[None])).all()  # as ever where nothing is exported

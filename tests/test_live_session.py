@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -171,3 +171,12 @@ def test_a_default_session_has_what_there_is_to_drag() -> None:
     kinematics = osik.forward_kinematics(ROBOT, ROBOT.q0)
     for name in one.active_tasks:
         np.testing.assert_allclose(one.tasks[name].rows(ROBOT, kinematics, ROBOT.q0).error, 0.0, atol=1e-9)
+
+
+def test_a_source_may_be_a_name(tmp_path):
+    arm = osik.load_robot("arm7")
+    one = Session(
+        arm, {"p": osik.PostureTask(arm)}, osik.WeightedQP(), (), 0.01, np.asarray(arm.q0), source=cast(Any, "arm7")
+    )
+    one.save(tmp_path / "session.json")
+    assert load_session(tmp_path / "session.json").source == RobotSource("arm7")

@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from .._errors import OsikValueError
 from ..batching._structure import Static, put_together, taken_apart
+from ..execution._memory_maps import watch_memory_maps
 from ..execution._rules import FOUND
 from ..kinematics import integrate
 from ..limits import Limit, Limits
@@ -96,7 +97,7 @@ def rollout(
     q0 = checked_start(robot, q0)
     if not callable(tasks):
         warn_of_large_gains(tasks, dt)
-    return _rollout(
+    path = _rollout(
         robot,
         q0,
         numbers,
@@ -107,6 +108,8 @@ def rollout(
         static=static,
         steps=steps,
     )
+    watch_memory_maps("rollout", _rollout)
+    return path
 
 
 @partial(jax.jit, static_argnames=("static", "steps"))

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from ..execution._blocks import BLOCK
+from ..execution._memory_maps import watch_memory_maps
 from ..execution._rules import blocked
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._forward import kinematics_by
@@ -95,7 +96,9 @@ def solve(
     q = checked_configuration(robot, q)
     warn_of_degrees(robot, q)
     warn_of_large_gains(tasks, dt)
-    return step(robot, q, aim(dict(tasks), targets), scheme, limits, in_type_of(dt, q), warm_start)
+    solution = step(robot, q, aim(dict(tasks), targets), scheme, limits, in_type_of(dt, q), warm_start)
+    watch_memory_maps("solve", step)
+    return solution
 
 
 def build_problem(

@@ -36,6 +36,7 @@ from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import jax
+import numpy as np
 
 from .._errors import OsikValueError
 from ..core import _library
@@ -138,7 +139,25 @@ def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., A
     """Call the function that takes a kernel's candidates on the kernel's platform, and the search elsewhere.
 
     The functions are not differentiated. One program may be lowered for several platforms.
+
+    Raises:
+        ValueError: a symbolic batch of ``jax.export``, which no kernel takes; a kernel in a program that is exported.
     """
+    from ._rules import KERNEL_IN_EXPORT, not_exported  # which needs this module
+
     if not kernels:
         return search(*args)
-    return jax.lax.platform_dependent(*args, default=search, **{_PLATFORM[name]: f for name, f in kernels.items()})
+    if any(is_symbolic(size) for leaf in jax.tree.leaves(args) for size in jax.numpy.shape(leaf)):
+        raise OsikValueError(KERNEL_IN_EXPORT)
+
+    def kept_here(kernel: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *given: kernel(*not_exported(given))
+
+    return jax.lax.platform_dependent(
+        *args, default=search, **{_PLATFORM[name]: kept_here(kernel) for name, kernel in kernels.items()}
+    )
+
+
+def is_symbolic(count: Any) -> bool:
+    """Return whether a size is a symbol of ``jax.export``, which compares with no number."""
+    return not isinstance(count, int | np.integer)

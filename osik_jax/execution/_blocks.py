@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ._backends import cpu_is_default
+from ._backends import cpu_is_default, is_symbolic
 from ._lapack import lanes_in_one
 from ._workers import too_few_workers, warn_of_few_workers
 
@@ -22,6 +22,8 @@ The solvers have the same, so that a block of a step is one of theirs.
 def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> Any:
     """Return ``function(*args)``, computed on a CPU some lanes at a time, one block after another.
 
+    A symbolic number of lanes (``jax.export``) is one block.
+
     Args:
         function: takes and returns pytrees whose arrays have a leading axis, the lanes.
         args: what it is called with.
@@ -29,6 +31,8 @@ def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) ->
             so many would be split among workers that are too few.
     """
     count = jax.tree.leaves(args)[0].shape[0]
+    if is_symbolic(count):
+        return function(*args)
     if count > 1 and too_few_workers():
         warn_of_few_workers()
         size = lanes_in_one(function, args, min(size, count))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Int
 
-from ._backends import cpu_is_default
+from ._backends import cpu_is_default, is_symbolic
 from ._blocks import BLOCK, first_axes_as_one, in_blocks
 from ._lapack import lanes_in_one
 from ._workers import too_few_workers
@@ -66,6 +66,9 @@ def lanes_of(args: Any, axes: Any = None) -> int:
     """
     leaves = jax.tree.leaves(args)
     counts = {a.shape[int(axis)] for a, axis in zip(leaves, jax.tree.leaves(axes) or [0] * len(leaves), strict=True)}
+    symbolic = [count for count in counts if is_symbolic(count)]
+    if symbolic:
+        return symbolic[0]
     return 0 if 0 in counts else max(counts)
 
 
@@ -120,7 +123,9 @@ def with_a_few(
         again: from a block's data and state to its new state.
         block: lanes that are worked on together; default: a few, as is good where most lanes are done.
     """
-    lanes = len(done)
+    lanes = done.shape[0]
+    if is_symbolic(lanes):
+        return jax.lax.cond(jnp.all(done), lambda: state, lambda: choose(done, state, again(data, state)))
     block = (FEW_ON_CPU if cpu_is_default() else FEW) if block is None else block
     if lanes > 1 and too_few_workers():
         block = lanes_in_one(again, (data, state), min(block, lanes))

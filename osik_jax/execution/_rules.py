@@ -27,6 +27,7 @@ from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.typing import ArrayLike
 
+from .._errors import OsikValueError
 from ._blocks import in_blocks
 
 FOUND = "found by a search"
@@ -154,3 +155,30 @@ _ruled.def_abstract_eval(lambda *_, body, **__: body.out_avals)
 mlir.register_lowering(_ruled, mlir.lower_fun(_run, multiple_results=True))
 ad.primitive_jvps[_ruled] = _differentiate
 batching.primitive_batchers[_ruled] = _batch
+
+
+def not_exported(tree: Any) -> Any:
+    """Return the arrays as they are; a program for ``jax.export`` with them in it is refused when it is lowered.
+
+    For arguments of kernels: their custom calls are known to this process alone.
+    """
+    return jax.tree.map(lambda a: _not_exported.bind(jnp.asarray(a)), tree)
+
+
+def _lower_unless_exported(context: mlir.LoweringRuleContext, operand: Any) -> list[Any]:
+    parameters = context.module_context.lowering_parameters
+    if getattr(parameters, "for_export", False):
+        raise OsikValueError(KERNEL_IN_EXPORT)
+    return [operand]
+
+
+KERNEL_IN_EXPORT = (
+    "this program calls a compiled kernel of osik_jax, which is in this process alone, so jax.export cannot save it: "
+    'make the scheme with backend="jax", such as WeightedQP(backend="jax"), and export the program again'
+)
+_not_exported = Primitive("not_exported")
+_not_exported.def_impl(lambda operand: operand)
+_not_exported.to_lojax = lambda operand: operand
+_not_exported.def_abstract_eval(lambda operand: operand)
+mlir.register_lowering(_not_exported, _lower_unless_exported)
+batching.defvectorized(_not_exported)

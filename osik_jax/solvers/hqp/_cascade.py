@@ -111,7 +111,7 @@ def solve_cascade(
     known = None if warm_start is None else jnp.any(warm_start.own != 0, (1, 2))
     levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (hierarchy.levels, warm_start))
     first = jax.vmap(_start)(hierarchy)
-    no_changes = jnp.zeros(len(first.x), jnp.int32)
+    no_changes = jnp.zeros(first.x.shape[0], jnp.int32)
 
     def solve_levels(wanted: Bool[Array, " B"], known: Bool[Array, " B"] | None) -> tuple[CascadeState, LevelOutcome]:
         def solve_next(
@@ -135,7 +135,7 @@ def solve_cascade(
 
         return jax.lax.scan(solve_next, first, (jnp.arange(layout.levels), levels, guesses))
 
-    everywhere = jnp.ones(len(first.x), bool)
+    everywhere = jnp.ones(first.x.shape[0], bool)
     if known is None or not by_guesses:
         state, outcomes = solve_levels(everywhere, known)
     else:
@@ -342,7 +342,7 @@ def _solve_on_guesses(
         best = choose(skipped, s.best, solved)
         return _Attempts(s.count + 1, best, s.changes + changes, s.factorizations + factorizations)
 
-    zeros = jnp.zeros(len(wanted), jnp.int32)
+    zeros = jnp.zeros(wanted.shape[0], jnp.int32)
     nothing_yet = jax.vmap(placeholder)(problem)._replace(optimal=~wanted)
     first = jnp.asarray(1 if guess is None else 0, jnp.int32)
     return jax.lax.while_loop(is_running, attempt, _Attempts(first, nothing_yet, zeros, zeros))[1:]

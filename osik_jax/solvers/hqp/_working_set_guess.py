@@ -35,7 +35,7 @@ def guess_working_set(
         The damped minimisers, the working sets, and how many changes they took.
     """
     constraints, root, start = jax.vmap(_tableau)(problem)
-    zeros = jnp.zeros(len(wanted), jnp.int32)
+    zeros = jnp.zeros(wanted.shape[0], jnp.int32)
     end = dual_active_set(constraints, start, searching=wanted, iterations=zeros, max_iterations=max_iterations)
     return jax.vmap(_minimiser)(problem, root, end), jax.vmap(_working_set)(problem, end), end.iterations
 

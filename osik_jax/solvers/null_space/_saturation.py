@@ -142,7 +142,7 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> Sa
     """Solve all levels of a batch in plain JAX; every array has a leading axis of problems, then perhaps of levels."""
     x, projector = jax.vmap(initial_point)(problem)
     fixed = jnp.where(problem.lower == problem.upper, 2, 0).astype(jnp.int32)
-    zeros = jnp.zeros(len(x), jnp.int32)
+    zeros = jnp.zeros(x.shape[0], jnp.int32)
 
     def solve_level(
         state: _State, each: tuple[PaddedLevel, Damping, Array]

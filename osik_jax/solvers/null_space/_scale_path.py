@@ -77,7 +77,7 @@ def least_cost(
         middle = jnp.where(to_end, end.scale * (1.0 - 0.5 * PATH_END), 0.5 * (low + high))
         return number + 1, running, jnp.where(inside, best, middle), low, high, now, ending
 
-    first, straight = jnp.where(wanted, end.scale * chord, 0.0), jnp.full(len(wanted), STRAIGHT, jnp.int32)
+    first, straight = jnp.where(wanted, end.scale * chord, 0.0), jnp.full(wanted.shape[0], STRAIGHT, jnp.int32)
     nothing = jnp.zeros_like(first)
     start: tuple[Any, ...] = (jnp.zeros((), jnp.int32), wanted, first, nothing, end.scale, end, straight)
     *_, result, ending = jax.lax.while_loop(is_running, search, start)

@@ -101,7 +101,7 @@ def solve_scaled_motion(problem: ScaledMotion, max_iterations: int) -> Saturatio
         problem: every array has a leading axis of problems.
         max_iterations: limit on the changes of the active set (static).
     """
-    batch = len(problem.start)
+    batch = problem.start.shape[0]
     inactive, zeros = jnp.zeros(problem.start.shape, jnp.int32), jnp.zeros(batch, jnp.int32)
     ones = jnp.ones(batch, problem.start.dtype)
     start = SaturationResult(problem.start, 0.0 * ones, inactive, inactive, zeros, zeros, zeros > 0)
@@ -132,7 +132,7 @@ def _attempt(
     problem: ScaledMotion, compliance: Float[Array, ""], searching: Bool[Array, " B"], max_iterations: int
 ) -> SaturationResult:
     constraints, root, start = jax.vmap(_tableau, (0, None))(problem, compliance)
-    zeros = jnp.zeros(len(root), jnp.int32)
+    zeros = jnp.zeros(root.shape[0], jnp.int32)
     end = dual_active_set(constraints, start, searching=searching, iterations=zeros, max_iterations=max_iterations)
     active_set = jax.vmap(_active_set)(problem, root, end)
     result = jax.vmap(_result)(problem, active_set, _refined(problem, active_set), end.iterations)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...execution._backends import Backend, cpu_is_default, on_platforms, takes
+from ...execution._backends import Backend, cpu_is_default, is_symbolic, on_platforms, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
@@ -67,7 +67,8 @@ def _solve_on_platform(
     if takes(backend, "core", fits=isinstance(qp.cost, LeastSquares)):
         kernels["core"] = core_candidates(KKT_TOLERANCE[tolerance.dtype], max_iterations)
     # in a batch on a CPU, problems of few rows are tried in the space of the rows first: it costs less than a round
-    by_rows = len(tolerance) > 1 and cpu_is_default() and has_few_rows(qp)
+    lanes = tolerance.shape[0]
+    by_rows = not is_symbolic(lanes) and lanes > 1 and cpu_is_default() and has_few_rows(qp)
     search_all = partial(search, max_iterations=max_iterations, first_try=try_row_space if by_rows else None)
     return certified_or_searched(kernels, search_all, qp, guess, tolerance, no_candidates=initial_result)
 
@@ -220,7 +221,7 @@ def _solve_kkt_by_warp(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B
         lower=jnp.where(is_equality, bound, -jnp.inf),
         upper=jnp.where(is_equality, bound, jnp.inf),
     )
-    tolerance = jnp.full(len(active), SINGLE_TOL, center.dtype)
+    tolerance = jnp.full(active.shape[0], SINGLE_TOL, center.dtype)
     candidate = _warp.solve(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
     point = jnp.concatenate([candidate.x, jnp.where(active_rows, candidate.row_multipliers, 0.0)], 1)
     done = (candidate.converged != 0) & jnp.isfinite(point).all(1)

@@ -108,7 +108,7 @@ def refine(
         dx, dy = correction(x, y)
         return x + dx, y + dy, jax.vmap(_relative_size)(dx * root, (x + dx) * root), count + 1
 
-    start = (x, y, jnp.full(len(x), jnp.inf, x.dtype), jnp.asarray(0))
+    start = (x, y, jnp.full(x.shape[0], jnp.inf, x.dtype), jnp.asarray(0))
     x, y, relative, _ = jax.lax.while_loop(is_running, again, start)
     return x, y, relative <= limit
 

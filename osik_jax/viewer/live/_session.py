@@ -41,7 +41,8 @@ class Session:
         q: where the robot starts. (nq,)
         off: names of the tasks that are switched off.
         limits_off: numbers of the limits that are switched off, in the order of ``limits``.
-        source: where the robot comes from; None: not known, so that the session cannot be saved.
+        source: where the robot comes from, a ``RobotSource``, or its name or file alone; None: not known, so that the
+            session cannot be saved.
     """
 
     robot: Robot
@@ -55,8 +56,10 @@ class Session:
     source: RobotSource | None = None
 
     def __post_init__(self) -> None:
-        """Add the robot's own limits, as ``solve`` does, so that they can be switched off too."""
+        """Add the robot's own limits, as ``solve`` does, so that they can be switched off too; make a name a source."""
         object.__setattr__(self, "limits", with_own_limits(self.robot, self.limits))
+        if isinstance(self.source, str):
+            object.__setattr__(self, "source", RobotSource(self.source))
 
     @property
     def active_tasks(self) -> dict[str, Task]:

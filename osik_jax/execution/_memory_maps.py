@@ -1,0 +1,55 @@
+"""Memory maps of a process, of which each compiled program keeps hundreds on Linux."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from .._errors import warn
+
+_MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+_SHARE = 0.75
+"""Of the kernel's maximum, from which on a warning is given: some 25 programs before the process would end."""
+_seen: dict[str, int] = {}
+
+
+def watch_memory_maps(name: str, compiled: Any) -> None:
+    """Warn once where the process nears the kernel's maximum of memory maps, at which it is ended.
+
+    Args:
+        name: of the function.
+        compiled: what ``jax.jit`` made of it. Maps are counted only where it has more programs than at the last call.
+    """
+    programs = compiled._cache_size()
+    if programs <= _seen.get(name, 0):
+        return
+    _seen[name] = programs
+    maps, most = counted_maps(), _most_maps()
+    if maps is not None and most is not None and maps > _SHARE * most:
+        _warn_once(maps, most)
+
+
+def counted_maps() -> int | None:
+    """Return how many memory maps this process has; None where the system does not say."""
+    try:
+        return _MAPS.read_bytes().count(b"\n")
+    except OSError:
+        return None
+
+
+@cache
+def _most_maps() -> int | None:
+    try:
+        return int(_MOST.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+@cache
+def _warn_once(maps: int, most: int) -> None:
+    warn(
+        f"this process has {maps} of the {most} memory maps that the system allows. Each compiled structure of tasks "
+        "takes several hundred, and at the limit the process is aborted. Change numbers by replace, which compiles "
+        "nothing; call jax.clear_caches(); or raise the limit: sysctl -w vm.max_map_count=262144"
+    )
