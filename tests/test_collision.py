@@ -410,7 +410,7 @@ def test_mistakes_are_named(arm, avoidance):
     with pytest.raises(KeyError, match="did you mean 'hand'"):
         osik.CollisionAvoidanceLimit(arm, pairs=[("hant", "floor")])
     with pytest.raises(ValueError, match="no pair of shapes is left"):
-        osik.CollisionAvoidanceLimit(arm, pairs=[("upper", "middle")])
+        osik.CollisionAvoidanceLimit(arm, pairs=[("middle", "fixed")])
     with pytest.raises(ValueError, match="all 5 pairs are nearer than 9"):
         osik.CollisionAvoidanceLimit(arm, q0_distance=9.0)
     with pytest.raises(ValueError, match="detection_distance"):
@@ -610,9 +610,10 @@ class TestTooNearAtHome:
         assert limit.left_out == (("hand", "ball"),) and ("hand", "ball") not in limit.pairs
 
     def test_what_is_chosen_here_is_left_out_and_can_be_seen(self, arm, shapes):
+        with pytest.warns(osik.OsikWarning, match=r"not kept apart.*hand-ball \(0.005 m\)"):
+            limit = osik.CollisionAvoidanceLimit(arm, shapes=shapes, minimum_distance=self.MINIMUM)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            limit = osik.CollisionAvoidanceLimit(arm, shapes=shapes, minimum_distance=self.MINIMUM)
             asked = osik.CollisionAvoidanceLimit(
                 arm, shapes=shapes, pairs=[("hand", "ball"), ("floor", "hand")], q0_distance=self.MINIMUM
             )
@@ -620,14 +621,17 @@ class TestTooNearAtHome:
         assert asked.left_out == (("hand", "ball"),)
 
     def test_a_pair_that_cannot_be_kept_apart_is_named(self, arm):
-        with pytest.raises(ValueError, match=r"\('upper', 'middle'\).*neighbouring"):
-            osik.CollisionAvoidanceLimit(arm, pairs=[("upper", "middle"), ("floor", "hand")])
+        with pytest.raises(ValueError, match=r"\('middle', 'fixed'\).*on one body"):
+            osik.CollisionAvoidanceLimit(arm, pairs=[("middle", "fixed"), ("floor", "hand")])
+        with pytest.raises(ValueError, match=r"\('upp\*', 'middle'\).*neighbouring"):
+            osik.CollisionAvoidanceLimit(arm, pairs=[("upp*", "middle"), ("floor", "hand")])
         with pytest.raises(TypeError, match="pairs of names"):
             osik.CollisionAvoidanceLimit(arm, pairs=["hand"])  # pyright: ignore[reportArgumentType]
 
 
 def test_pairs_nearer_than_the_minimum_at_q0_are_left_out_unless_said_otherwise(arm):
-    limit = osik.CollisionAvoidanceLimit(arm, minimum_distance=0.35, detection_distance=0.5)
+    with pytest.warns(osik.OsikWarning, match="nearer than 0.35 m"):
+        limit = osik.CollisionAvoidanceLimit(arm, minimum_distance=0.35, detection_distance=0.5)
     assert limit.pairs == osik.CollisionAvoidanceLimit(arm, q0_distance=0.35).pairs
     with pytest.raises(ValueError, match="more than minimum_distance"):
         limit.replace(minimum_distance=0.6)

@@ -114,3 +114,23 @@ def test_elbows_without_wrists_follow_the_person(tmp_path):
     result = retarget(stick_robot(CAPSULE, CAPSULE), motion)
     figures = report(result)
     assert figures["tracking"]["segment_angle_deg_mean"] < 2.0 and figures["feet"]["slip_mm_max"] < 0.1
+
+
+@pytest.mark.parametrize("mass, moment", [(10.0, 0.1), (15.0, 1.0), (1.0, 1.0), (30.0, 1e-5)])
+@pytest.mark.parametrize("solid", [True, False], ids=["a shape", "no shape"])
+def test_a_trunk_with_placeholder_inertia_is_as_large_as_its_shape(mass, moment, solid):
+    """A box of 12 by 20 by 40 cm that meets others; without it the trunk is as wide as the shoulders are apart."""
+    stick = stick_robot((CAPSULE, FOREARM, 0.03)[0], (CAPSULE, FOREARM, 0.03)[0])
+    text = stick.to_mjcf()
+    start = text.index("<inertial", text.index('name="base"'))
+    end = text.index("/>", start) + 2
+    placeholder = f'<inertial pos="0 0 0.2" mass="{mass}" diaginertia="{moment} {moment} {moment}"/>'
+    box = '<geom type="box" pos="0 0 0.2" size="0.06 0.1 0.2" mass="0"/>' if solid else ""
+    robot = osik.Robot.from_mjcf(text[:start] + placeholder + box + text[end:])
+    trunk = [capsule for capsule in guess_profile(robot).capsules if capsule.frame == "base"]
+    assert trunk
+    for capsule in trunk:
+        ends = np.array([capsule.start, capsule.end])
+        most = 0.061 if solid else 0.3 * 0.4 + 1e-6
+        assert capsule.radius <= most and np.abs(ends[:, 0]).max() < 1e-6
+        assert ends[:, 2].min() - capsule.radius > -0.01 and ends[:, 2].max() + capsule.radius < 0.5

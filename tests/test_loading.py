@@ -188,7 +188,7 @@ def test_primitives_are_kept_for_drawing_and_meshes_dropped():
     np.testing.assert_array_equal(model.geom_pos[0], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(model.geom_rgba[0], [1.0, 0.0, 0.0, 1.0])
     assert model.geom_group.tolist() == [2, 3, 3]
-    assert not model.geom_contype.any()
+    assert model.geom_contype.tolist() == model.geom_conaffinity.tolist() == [0, 1, 1]
     assert model.body_mass.sum() == 3.0
 
 
@@ -687,7 +687,7 @@ def test_wrong_configurations_are_refused():
 
 
 def test_robots_of_one_tree_stack_and_vmap():
-    """FK, CoM and a step over the stack equal the loop; one program serves all."""
+    """FK, CoM and a step over the stack equal the loop. One program serves the stack, and one each file's model."""
     texts = [ARM.replace("0.1 0 0.2", f"{0.1 * k} {0.05 * k} 0.2").replace("1.5", str(1.0 + k)) for k in range(1, 4)]
     robots = [Robot.from_urdf(text, floating_base=True) for text in texts]
     q, traced = jnp.asarray(np.random.default_rng(3).normal(size=(3, 9))), []
@@ -699,13 +699,15 @@ def test_robots_of_one_tree_stack_and_vmap():
         jacobian = osik.frame_jacobian(robot, kin, "lower")
         return (*kin.frame_pose(robot, "lower"), jacobian, osik.center_of_mass(robot, kin), robot.position_upper)
 
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *robots)
+    stacked = osik.stack(robots)
     batch = jax.vmap(at)(stacked, q)
+    jax.vmap(at)(osik.stack(robots[::-1]), q)
+    at(jax.tree.map(lambda leaf: leaf[0], stacked), q[0])
     for k, robot in enumerate(robots):
         for ours, one in zip(batch, at(robot, q[k]), strict=True):
             np.testing.assert_allclose(ours[k], one, rtol=0.0, atol=1e-14)
         np.testing.assert_allclose(batch[0][k], mujoco_pose(robot, normalised(q[k]), "lower")[0], atol=1e-14)
-    assert len(traced) == 1
+    assert len(traced) == 1 + len(robots)
     assert not np.allclose(batch[0][0], batch[0][1])
 
 

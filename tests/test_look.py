@@ -12,8 +12,8 @@ from PIL import Image
 
 import osik_jax as osik
 from osik_jax import viewer
-from osik_jax.viewer._collada import read_collada
-from osik_jax.viewer._meshes import read_mesh
+from osik_jax.robot.loading._collada import read_collada
+from osik_jax.robot.loading._meshes import read_mesh
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raster import Rasterizer, draw_triangles

@@ -425,7 +425,12 @@ def test_packages_are_found(package: Path, where: str, slash: str, monkeypatch: 
         ),
         ("../meshes/other.obj", "other.obj", FileNotFoundError, r"no file 'other.obj'. Looked for: .*/urdf/other.obj"),
         ("bot_description/m", "bot/m", FileNotFoundError, r"no file 'package://bot/m.*name the folder of the package"),
-        ("../meshes/other.obj", "bot.urdf", ValueError, r"link 'tip': MuJoCo cannot read .*bot.urdf'; it reads .stl"),
+        (
+            "../meshes/other.obj",
+            "bot.urdf",
+            ValueError,
+            r"link 'tip': the mesh .*bot.urdf' is of no kind .*\.dae, \.stl",
+        ),
     ],
 )
 def test_meshes_that_cannot_be_read_are_named(package: Path, old: str, new: str, error: type, message: str):

@@ -46,7 +46,7 @@ from osik_jax.retargeting._facing import by_name
 from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._fit import FitLoss, _Setting
 from osik_jax.retargeting._folder import _Lengths, retarget_folder
-from osik_jax.retargeting._guess import shrunk
+from osik_jax.retargeting._link_shapes import shrunk
 from osik_jax.retargeting._notes import notes
 from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._plan import _Clip, _improved, _State, make_plan

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from .._errors import OsikValueError
+from ..robot._model import RobotModel
 from ..robot._tree import KinematicTree, ModelHolder
 from ._names import find_leaves, leaf_names, replace_named
 
@@ -66,6 +67,8 @@ def batched(tree: T, values: Mapping[str, Any]) -> T:
 def stack(items: Sequence[T]) -> T:
     """Return one pytree of stacked arrays from several of the same structure: robots, tasks, limits; ``vmap`` over it.
 
+    A stack of robots of different files has no ``mj_model``, and what is read from it is to be made robot by robot.
+
     Raises:
         ValueError: there is nothing to stack, or structure differs: the message says what, and why it cannot.
     """
@@ -75,7 +78,27 @@ def stack(items: Sequence[T]) -> T:
         reason = _difference(items[0], item, "")
         if reason is not None:
             raise OsikValueError(f"item {place} does not stack on item 0: {reason}")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *_with_one_model(items))
+
+
+def _with_one_model(items: Sequence[T]) -> list[T]:
+    """Return the items with robots that share one model holder: their own where it is equal, else an empty one."""
+    flat = [jax.tree.flatten(item, is_leaf=_is_robot) for item in items]
+    columns = [_alike(parts) for parts in zip(*(leaves for leaves, _ in flat), strict=True)]
+    return [
+        structure.unflatten(leaves) for (_, structure), leaves in zip(flat, zip(*columns, strict=True), strict=True)
+    ]
+
+
+def _is_robot(part: Any) -> bool:
+    return isinstance(part, RobotModel)
+
+
+def _alike(parts: Sequence[Any]) -> Sequence[Any]:
+    """Return corresponding parts of the items; robots whose models differ with an empty holder."""
+    if not _is_robot(parts[0]) or all(part.holder == parts[0].holder for part in parts):
+        return parts
+    return [dataclasses.replace(part, holder=ModelHolder(None)) for part in parts]
 
 
 _PRIORITY = "a priority is structure, for each is a level with shapes of its own; make one batch for each order"

@@ -41,7 +41,11 @@ class Info:
             raise CommandError("osik info needs a robot, as in osik info nao, or --system")
         robot = read_robot(self.robot, self.base)
         base = "floating base" if robot.floating_base else "bolted down"
-        mass = float(robot.body_mass.sum())
+        mass = (
+            float(robot.body_mass[robot.tree.is_own].sum())
+            if len(robot.tree.robots) <= 1
+            else float(robot.body_mass.sum())
+        )
         size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {mass:.3f} kg"
         console.print(f"[bold]{self.robot}[/bold]: {size}")
         console.print(_joint_table(robot))

@@ -24,6 +24,16 @@ CYLINDER_SIDES = 16
 MOST_EDGES = 24
 """Edge directions of a hull with more of them are left out of the search for separating axes."""
 
+MOST_NORMALS = 64
+"""A hull with more face normals is searched along the 40 directions of ``_spread_normals`` instead."""
+
+MOST_VERTICES = 256
+"""A hull with more vertices is replaced by one of so many of them, with a radius that covers the others."""
+
+_FIRST_VERTICES = 32
+_VERTICES_A_ROUND = 16
+"""How a large hull is thinned out: it begins with so many vertices, and each round adds those furthest outside."""
+
 _MERGED = 1e-6
 """Normals and edge directions that differ by less are one."""
 
@@ -58,11 +68,13 @@ class UnitCore(NamedTuple):
         vertices: (v, 3)
         normals: of its faces, each or its opposite. (f, 3)
         edges: directions of its edges, each or its opposite. (e, 3)
+        radius: of the ball that is added to it. ()
     """
 
     vertices: Float[np.ndarray, "v 3"] | Array
     normals: Float[np.ndarray, "f 3"] | Array
     edges: Float[np.ndarray, "e 3"] | Array
+    radius: Float[np.ndarray, ""] | Array = np.zeros(())
 
 
 @cache
@@ -78,25 +90,37 @@ def unit_core(kind: Kind) -> UnitCore:
 
 
 def convex_hull(points: np.ndarray) -> UnitCore:
-    """The hull of points that do not lie in a plane.
+    """Return the hull of points that do not lie in a plane.
+
+    A hull of more than ``MOST_VERTICES`` vertices is covered by one of fewer vertices and a radius around it.
+
+    Args:
+        points: [m]. (k, 3)
 
     Raises:
-        ValueError: they do, or are not finite.
+        ValueError: the points lie in a plane, or are not finite.
     """
-    try:
-        hull = scipy.spatial.ConvexHull(np.asarray(points, float))
-    except (scipy.spatial.QhullError, ValueError) as error:
-        raise OsikValueError(f"these {len(points)} points have no convex hull: {str(error).splitlines()[0]}") from None
+    hull = _qhull(points)
+    outermost = hull.points[hull.vertices]
+    radius = 0.0
+    if len(outermost) > MOST_VERTICES:
+        hull = _thinned(outermost)
+        radius = _reach_outside(outermost, hull)
     faces, normals = hull.simplices, hull.equations[:, :3]
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     normals_of_edges = np.tile(np.arange(len(faces)), 3)
-    edges = _bent_edges(hull.points, np.sort(ends, axis=1), normals[normals_of_edges])
-    edges = _different(edges)
-    return UnitCore(hull.points[hull.vertices], _different(normals), edges if len(edges) <= MOST_EDGES else edges[:0])
+    edges = _different(_bent_edges(hull.points, np.sort(ends, axis=1), normals[normals_of_edges]))
+    normals = _different(normals)
+    return UnitCore(
+        hull.points[hull.vertices],
+        normals if len(normals) <= MOST_NORMALS else _spread_normals(),
+        edges if len(edges) <= MOST_EDGES else edges[:0],
+        np.asarray(radius),
+    )
 
 
-def geom_hull(model: mujoco.MjModel, geom: int) -> UnitCore:
-    """The hull of a mesh geom: MuJoCo's own, so no finer than its ``maxhullvert``, where it has one."""
+def mesh_hull(model: mujoco.MjModel, geom: int) -> UnitCore:
+    """Return the hull of a mesh geom: MuJoCo's own, so no finer than its ``maxhullvert``, where it has one."""
     mesh = model.geom_dataid[geom]
     start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     points = model.mesh_vert[start : start + count]
@@ -107,11 +131,63 @@ def geom_hull(model: mujoco.MjModel, geom: int) -> UnitCore:
     return convex_hull(points)
 
 
+def _qhull(points: np.ndarray) -> scipy.spatial.ConvexHull:
+    try:
+        return scipy.spatial.ConvexHull(np.asarray(points, float))
+    except (scipy.spatial.QhullError, ValueError) as error:
+        raise OsikValueError(f"these {len(points)} points have no convex hull: {str(error).splitlines()[0]}") from None
+
+
+def _thinned(points: np.ndarray) -> scipy.spatial.ConvexHull:
+    """Return the hull of ``MOST_VERTICES`` of these vertices, chosen so that the others are little outside it."""
+    chosen = scipy.spatial.ConvexHull(points, qhull_options=f"TA{_FIRST_VERTICES}").vertices
+    hull = _qhull(points[chosen])
+    while len(chosen) < MOST_VERTICES:
+        outside = points @ hull.equations[:, :3].T + hull.equations[:, 3]
+        furthest = np.argmax(outside, 0)  # of each face
+        order = np.argsort(-outside[furthest, np.arange(len(furthest))])
+        new = dict.fromkeys(furthest[order].tolist())
+        new = [point for point in new if point not in set(chosen.tolist())]
+        room = min(_VERTICES_A_ROUND, MOST_VERTICES - len(chosen))
+        if not new:
+            break
+        chosen = np.concatenate([chosen, new[:room]])
+        hull = _qhull(points[chosen])
+    return hull
+
+
+def _reach_outside(points: np.ndarray, hull: scipy.spatial.ConvexHull) -> float:
+    """Return a bound on how far outside a hull any of the points is: its distance to the face it is furthest out of."""
+    outside = points @ hull.equations[:, :3].T + hull.equations[:, 3]
+    corners = hull.points[hull.simplices[np.argmax(outside, 1)]]
+    return float(np.sqrt(_squares_to_triangles(points, corners).max()))
+
+
+def _squares_to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return the squared distance of each point (k, 3) to its triangle (k, 3, 3)."""
+    ends = np.roll(corners, -1, axis=1) - corners
+    arms = points[:, None] - corners
+    share = np.clip((arms * ends).sum(-1) / np.maximum((ends * ends).sum(-1), 1e-300), 0.0, 1.0)
+    to_edges = np.square(arms - share[..., None] * ends).sum(-1).min(1)
+    normal = np.cross(ends[:, 0], ends[:, 1])
+    inside = (np.cross(normal[:, None], ends) * arms).sum(-1) >= 0.0
+    height = np.square((arms[:, 0] * normal).sum(-1)) / np.maximum(np.square(normal).sum(-1), 1e-300)
+    return np.where(inside.all(1), height, to_edges)
+
+
+@cache
+def _spread_normals() -> np.ndarray:
+    """Return 40 directions all around, as the faces of the polyhedron of an ellipsoid have them."""
+    return _different(scipy.spatial.ConvexHull(_ball()).equations[:, :3])
+
+
 def padded(cores: Sequence[UnitCore]) -> UnitCore:
-    """Cores of one size, with a leading axis: short ones repeat their first rows; all have edges, or none."""
+    """Cores of one size, with a leading axis: short ones repeat their last rows; all have edges, or none."""
     complete = all(len(core.edges) for core in cores)
-    columns = zip(*(core if complete else core._replace(edges=np.zeros((0, 3))) for core in cores), strict=True)
-    return UnitCore(*(_of_one_length(column) for column in columns))
+    whole = [core if complete else core._replace(edges=np.zeros((0, 3))) for core in cores]
+    array = jnp if any(isinstance(core.radius, jax.Array) for core in cores) else np
+    vertices, normals, edges = (_of_one_length([core[k] for core in whole]) for k in range(3))
+    return UnitCore(vertices, normals, edges, array.stack([core.radius for core in cores]))
 
 
 def scaling(kinds: Sequence[Kind]) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +205,7 @@ def world_cores(
 ) -> Core:
     """Cores of shapes of MuJoCo's sizes, placed in the world; all with a leading axis."""
     entries, rounded = scaling(kinds)
-    vertices, normals, edges = (jnp.asarray(rows, size.dtype) for rows in unit)
+    vertices, normals, edges, radius = (jnp.asarray(rows, size.dtype) for rows in unit)
     x, y, z = (size[np.arange(len(kinds)), entries[:, i], None] for i in range(3))
     factors, areas = jnp.stack([x, y, z], -1), jnp.stack([y * z, x * z, x * y], -1)
     turn = rotation[:, None]
@@ -137,7 +213,7 @@ def world_cores(
         position[:, None] + rotate(turn, vertices * factors),
         rotate(turn, unit_rows(normals * areas)),
         rotate(turn, edges * factors),
-        jnp.where(rounded, size[:, 0], 0.0),
+        jnp.where(rounded, size[:, 0], radius * jnp.max(jnp.abs(factors[:, 0]), -1)),
     )
 
 
@@ -179,11 +255,10 @@ def _bent_edges(points: np.ndarray, ends: np.ndarray, normals: np.ndarray) -> np
 
 def _different(directions: np.ndarray) -> np.ndarray:
     """Unit vectors without those that are, or are opposite to, one before them."""
-    kept: list[np.ndarray] = []
-    for direction in directions:
-        if all(min(np.linalg.norm(direction - k), np.linalg.norm(direction + k)) > _MERGED for k in kept):
-            kept.append(direction)
-    return np.array(kept).reshape(-1, 3)
+    apart = np.linalg.norm(directions[:, None] - directions, axis=-1)
+    opposite = np.linalg.norm(directions[:, None] + directions, axis=-1)
+    repeats = np.tril(np.minimum(apart, opposite) <= _MERGED, -1).any(1)
+    return directions[~repeats].reshape(-1, 3)
 
 
 def _of_one_length(parts: Sequence[Float[np.ndarray, "n 3"] | Array]) -> Float[np.ndarray, "k n 3"] | Array:

@@ -12,6 +12,7 @@ import mujoco
 from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..robot import Robot
 from ..robot._tree import KinematicTree
+from ..robot.loading._mjmodel import element_names
 from ._geometry import KINDS, Kind
 from ._shape import CollisionShape
 
@@ -26,16 +27,23 @@ class Member(NamedTuple):
         aliases: the link and the moving body that it is fixed to, ``"world"`` for the world.
         kind: None where no distance to it can be computed.
         body: the moving body that it is fixed to.
+        link: number of the model's body that it is fixed to.
         masks: MuJoCo's ``contype`` and ``conaffinity``; None: meets all.
-        link: number of the model's body that it is fixed to; None for an added shape.
+        added: whether it is an added shape, and no geom of the robot.
     """
 
     name: str
     aliases: tuple[str, ...]
     kind: Kind | None
     body: int
+    link: int
     masks: tuple[int, int] | None = None
-    link: int | None = None
+    added: bool = False
+
+    @property
+    def label(self) -> str:
+        """What messages call it: its name, with its link where the name does not tell it."""
+        return self.name if self.added or self.name in self.aliases else f"{self.name} (of {self.aliases[0]})"
 
     @property
     def solid(self) -> bool:
@@ -51,47 +59,65 @@ def members(robot: Robot, shapes: Mapping[str, CollisionShape]) -> list[Member]:
         ValueError: a shape is called like a geom.
     """
     tree, model = robot.tree, robot.mj_model
-    out = []
-    for geom, (name, kind, body) in enumerate(zip(tree.geom_names, tree.geom_types, tree.geom_bodies, strict=True)):
-        link = int(model.geom_bodyid[geom])
-        called = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, link) or ""
-        masks = int(model.geom_contype[geom]), int(model.geom_conaffinity[geom])
-        out.append(Member(name, (called, tree.body_names[body]), KINDS.get(kind), body, masks, link))
+    bodies = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    links = [*model.geom_bodyid.tolist(), *(bodies.index(mesh.link) for mesh in robot.holder.meshes)]
+    masks = [*zip(model.geom_contype.tolist(), model.geom_conaffinity.tolist(), strict=True)]
+    masks += [(1, 1)] * len(robot.holder.meshes)
+    geoms = zip(tree.geom_names, tree.geom_types, tree.geom_bodies, links, masks, strict=True)
+    out = [
+        Member(name, (bodies[link], tree.body_names[body]), KINDS.get(kind), body, link, meets)
+        for name, kind, body, link, meets in geoms
+    ]
     for name, shape in shapes.items():
         if name in tree.geom_names:
             raise OsikValueError(f"a shape is called {name!r}, and so is a geom of the robot; call it something else")
         body = 0 if shape.frame is None else tree.frame_bodies[tree.frame(shape.frame)]
         aliases = (shape.frame or tree.body_names[0], tree.body_names[body])
-        out.append(Member(name, aliases, shape.kind, body))
+        out.append(Member(name, aliases, shape.kind, body, _link_of_frame(model, bodies, shape.frame), added=True))
     return out
+
+
+def _link_of_frame(model: mujoco.MjModel, bodies: Sequence[str], frame: str | None) -> int:
+    """Return the model's body that a frame is fixed to: its own, or that of the site or geom."""
+    if frame is None or frame in bodies:
+        return 0 if frame is None else bodies.index(frame)
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, frame.removeprefix("site:"))
+    if site >= 0 and not frame.startswith("geom:"):
+        return int(model.site_bodyid[site])
+    return int(model.geom_bodyid[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, frame.removeprefix("geom:"))])
 
 
 def candidate_pairs(
     robot: Robot, scene: Sequence[Member], pairs: Patterns | None, exclude: Iterable[str | tuple[str, str]]
 ) -> list[tuple[int, int]]:
-    """Pairs of members that can move against each other, are no neighbours, and are asked for.
+    """Return the pairs of members that can move against each other, are no neighbours, and are asked for.
+
+    Pairs that ``pairs`` asks for by their names, not by a glob, may be neighbours, and the model may exclude them.
 
     Raises:
         KeyError: a pattern matches nothing.
         ValueError: a geom that no distance can be computed to takes part, or nothing is left.
     """
-    welds, parents = _welds(robot.tree)
     pairs = None if pairs is None else _checked(pairs)
     wanted = _default_pairs(scene) if pairs is None else _named_pairs(scene, pairs)
     excluded = _excluded(scene, exclude)
-    unwanted = excluded | _model_excludes(robot, scene)
+    named = exact_pairs(scene, pairs)
+    unwanted = excluded | (_model_excludes(robot, scene) - named)
+    rigid = _RigidParts(robot)
     found = []
     for i, j in sorted(wanted - unwanted):
-        a, b = welds[scene[i].body], welds[scene[j].body]
-        neighbours = a and b and (a == parents[b] or b == parents[a])
-        if a != b and not neighbours and {scene[i].kind, scene[j].kind} != {Kind.PLANE}:
+        a, b = rigid.part(scene[i]), rigid.part(scene[j])
+        neighbours = (i, j) not in named and (a == rigid.parent(b) or b == rigid.parent(a))
+        movable = a != b and max(a, b) > 0
+        if movable and not neighbours and {scene[i].kind, scene[j].kind} != {Kind.PLANE}:
             found.append((i, j))
     for pattern in pairs or ():
         asked = _named_pairs(scene, [pattern]) - excluded
         if asked and asked.isdisjoint(found) and found:
             raise OsikValueError(
-                f"pairs asks for {pattern!r}, none of which can be kept apart: what is on one body or on neighbouring "
-                "ones, on two planes, or what the model's <exclude> names does not count"
+                f"pairs asks for {pattern!r}, none of which can be kept apart: what is on one body, fixed to the world "
+                "on both sides, or on two planes does not count, and by globs neither do neighbouring bodies nor what "
+                "the model's <exclude> names"
             )
     odd = sorted({scene[k].name for pair in found for k in pair if scene[k].kind is None})
     if odd:
@@ -99,7 +125,7 @@ def candidate_pairs(
             f"no distance to these geoms can be computed (height field or SDF); exclude them: {', '.join(odd)}"
         )
     if not found:
-        solid = ", ".join(member.name for member in scene if member.solid) or "none"
+        solid = ", ".join(member.label for member in scene if member.solid) or "none"
         raise OsikValueError(
             "no pair of shapes is left to keep apart: those of the same or of neighbouring bodies, geoms that do not "
             f"collide (contype and conaffinity) and excluded ones do not count; what collides: {solid}"
@@ -180,14 +206,42 @@ def _model_excludes(robot: Robot, scene: Sequence[Member]) -> set[tuple[int, int
     return {
         (i, j)
         for (i, a), (j, b) in itertools.combinations(enumerate(scene), 2)
-        if pairs and a.link is not None and b.link is not None and frozenset((a.link, b.link)) in pairs
+        if pairs and not a.added and not b.added and frozenset((a.link, b.link)) in pairs
     }
 
 
-def _welds(tree: KinematicTree) -> tuple[list[int], list[int]]:
-    """Of each body the one that it cannot move against (locked joints do not move), and of each that one's parent."""
+class _RigidParts:
+    """Which shapes cannot move against each other, and which of them one joint moves against each other.
+
+    A part is called by the number of its moving body in the tree, or, if it is fixed to the world, by minus the number
+    of its first link below the world in the model. The world itself is part 0. Locked joints do not move.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._model, self._welds = robot.mj_model, _welds(robot.tree)
+        names = element_names(self._model, mujoco.mjtObj.mjOBJ_BODY, "body", self._model.nbody)
+        self._parents = [self._above(robot.tree, body, names) for body in range(len(robot.tree.body_names))]
+
+    def part(self, member: Member) -> int:
+        """Return the part that a shape belongs to."""
+        return self._part(member.body, member.link)
+
+    def parent(self, part: int) -> int | None:
+        """Return the part that a moving part hangs from by its joints; None if that is the world, or if it is fixed."""
+        return self._parents[part] if part > 0 else None
+
+    def _part(self, body: int, link: int) -> int:
+        return self._welds[body] or -int(self._model.body_rootid[link])
+
+    def _above(self, tree: KinematicTree, body: int, names: Sequence[str]) -> int | None:
+        above = self._model.body_parentid[names.index(tree.body_names[body])]
+        return self._part(tree.body_parents[body], above) or None
+
+
+def _welds(tree: KinematicTree) -> list[int]:
+    """Return for each body the one that it cannot move against (locked joints do not move)."""
     moving = {tree.joint_bodies[j] for j in range(len(tree.joint_names)) if j not in tree.locked}
     welds: list[int] = []
     for body, parent in enumerate(tree.body_parents):
         welds.append(body if body in moving or body == 0 else welds[parent])
-    return welds, [welds[tree.body_parents[weld]] for weld in range(len(welds))]
+    return welds

@@ -161,7 +161,7 @@ def separation_jacobian(
 
     A point's velocity along the normal is the dof's at the robot's root, and its turning times the arm from there.
     """
-    root = kinematics.body_position[tree.root]
+    root = kinematics.body_position[tree.reference_body]
     at_root = kinematics.dof_linear + cross(kinematics.dof_anchor - root, kinematics.dof_angular)
     straight = jnp.matmul(near.normal, at_root.T, precision="highest")
 

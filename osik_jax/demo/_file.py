@@ -101,7 +101,7 @@ def guess_moving_frame(robot: Robot) -> str:
     """The free joint's body; without one, the deepest frame that sounds like a tool or hand, else the last tip."""
     tree = robot.tree
     if robot.floating_base:
-        return tree.body_names[tree.body_parents.index(0, 1)]
+        return tree.body_names[tree.root]
     depth = [0] * len(tree.body_parents)
     for body, parent in enumerate(tree.body_parents[1:], 1):
         depth[body] = depth[parent] + 1

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..kinematics import forward_kinematics, frame_jacobian, integrate
 from ..kinematics._home import compiled_kinematics
 from ..robot import Robot
-from ..robot._tree import FREE, HINGE, SLIDE
+from ..robot._tree import HINGE, SLIDE
 from ..tasks import FrameTask
 from ..viewer import Outline
 
@@ -46,8 +46,7 @@ def start(robot: Robot, outline: Outline, moving: str, standing: Sequence[str], 
 
 def raised(robot: Robot, q: Array, height: float) -> Float[Array, " nq"]:
     """The configuration with the floating base higher by so much [m]."""
-    joint = next(j for j in robot.tree.independent if robot.tree.joint_types[j] == FREE)
-    return q.at[robot.tree.qpos_address[joint] + 2].add(height)
+    return q.at[robot.tree.qpos_address[robot.tree.free_bases[0]] + 2].add(height)
 
 
 def _bent(robot: Robot) -> Float[Array, " nq"]:

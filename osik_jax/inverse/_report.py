@@ -26,8 +26,10 @@ def print_found(console: Console, robot: Robot, found: InverseKinematicsSolution
 def configuration_table(robot: Robot, q: Any) -> Table:
     """A configuration, joint by joint."""
     table = Table("joint", *(Column(name, justify="right") for name in ("in q", "value", "lower", "upper")))
-    if robot.floating_base:
-        table.add_row("base", "0-6", " ".join(f"{float(value):.5f}" for value in q[:7]), "", "")
+    for joint in robot.tree.free_bases:
+        start = robot.tree.qpos_address[joint]
+        pose = " ".join(f"{float(value):.5f}" for value in q[start : start + 7])
+        table.add_row("base", f"{start}-{start + 6}", pose, "", "")
     for name in robot.joint_names:
         dof, index = robot.joint_dof_index(name), robot.joint_qpos_index(name)
         numbers = (q[index], robot.position_lower[dof], robot.position_upper[dof])

@@ -44,7 +44,7 @@ def _composer(tree: KinematicTree) -> Callable[..., Poses]:
         position, rotation = poses(*local)
         frame = rotation[tree.parents]
         angular = rotate(frame, _axis(compose(turns, turned.mT)))
-        at = jax.lax.stop_gradient(position[tree.root])  # any point would do; one nearby loses no digits
+        at = jax.lax.stop_gradient(position[tree.reference_body])  # any point would do; one nearby loses no digits
         linear = rotate(frame, moves) - cross(angular, position - at)  # of what goes along, as it passes there
         below = jnp.asarray(tree.descendants.T, position.dtype)
         total = jnp.matmul(below, jnp.concatenate([linear, angular], -1), precision="highest")

@@ -159,14 +159,14 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Arr
 def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3"]:
     """Centre of mass [m], in the world, of the whole robot or of the body ``subtree`` and all that hangs from it.
 
-    What is fixed to the world (an arm's base) does not count, as in Pinocchio and unlike MuJoCo. A frame that is not a
-    body stands for the moving body that carries it.
+    What is fixed to the world (an arm's base) does not count, as in Pinocchio and unlike MuJoCo, nor do loose bodies of
+    a scene. A frame that is not a body stands for the moving body that carries it.
 
     Raises:
         KeyError: no such body.
-        ValueError: the subtree has no mass.
+        ValueError: the subtree has no mass, or the scene has several trees that may be the robot.
     """
-    mass, moment = _body_moments(robot, kinematics, subtree)
+    mass, moment = _body_moments(robot, kinematics, body_masses(robot, subtree))
     return jnp.sum(moment, 0) / jnp.sum(mass)
 
 
@@ -176,12 +176,7 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
     Raises:
         KeyError, ValueError: as in ``center_of_mass``.
     """
-    mass, moment = _body_moments(robot, kinematics, subtree)
-    carried = jnp.asarray(robot.tree.moves, mass.dtype)
-    mass_below, moment_below = (jnp.matmul(a.T, carried, precision="highest") for a in (mass, moment))
-    arm = moment_below - mass_below * kinematics.dof_anchor.T
-    columns = mass_below * kinematics.dof_linear.T + cross(kinematics.dof_angular.T, arm, along=-2)
-    return independent_columns(robot.tree, columns / jnp.sum(mass))
+    return _center_and_jacobian(_with_masses(robot, subtree), kinematics)[1]
 
 
 def moving_center(
@@ -192,10 +187,27 @@ def moving_center(
     Raises:
         KeyError, ValueError: as in ``center_of_mass``.
     """
+    alone = _with_masses(robot, subtree)
     if kinematics.backend == "jax":
-        return center_of_mass(robot, kinematics, subtree), com_jacobian(robot, kinematics, subtree)
+        return _center_and_jacobian(alone, kinematics)
+    return _moving_center(alone, replace(kinematics, backend="jax"))
+
+
+def _with_masses(robot: Robot, subtree: str | None) -> Robot:
+    """Return the robot with ``body_masses`` as its masses."""
     mass = body_masses(robot, subtree)
-    return _moving_center(eqx.tree_at(lambda robot: robot.body_mass, robot, mass), replace(kinematics, backend="jax"))
+    return robot if mass is robot.body_mass else eqx.tree_at(lambda robot: robot.body_mass, robot, mass)
+
+
+def _center_and_jacobian(robot: Robot, kinematics: Kinematics) -> tuple[Float[Array, "3"], Float[Array, "3 nv"]]:
+    """Return the centre of all masses, and its Jacobian."""
+    mass, moment = _body_moments(robot, kinematics, robot.body_mass)
+    carried = jnp.asarray(robot.tree.moves, mass.dtype)
+    mass_below, moment_below = (jnp.matmul(a.T, carried, precision="highest") for a in (mass, moment))
+    arm = moment_below - mass_below * kinematics.dof_anchor.T
+    columns = mass_below * kinematics.dof_linear.T + cross(kinematics.dof_angular.T, arm, along=-2)
+    center = jnp.sum(moment, 0) / jnp.sum(mass)
+    return center, independent_columns(robot.tree, columns / jnp.sum(mass))
 
 
 def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"]) -> Float[Array, "... nv"]:
@@ -224,28 +236,27 @@ def _motion_axes(
 
 
 def _body_moments(
-    robot: Robot, kinematics: Kinematics, subtree: str | None
+    robot: Robot, kinematics: Kinematics, mass: Float[Array, " nbody"]
 ) -> tuple[Float[Array, " nbody"], Float[Array, "nbody 3"]]:
-    """Mass, and mass times centre of mass, of each body (0 outside the subtree)."""
-    mass = body_masses(robot, subtree)
+    """Return the given masses, and mass times centre of mass of each body."""
     centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
     return mass, mass[:, None] * centers
 
 
-def body_masses(robot: Robot, subtree: str | None) -> Float[Array, " nbody"]:
-    """Of each body, 0 outside the subtree.
+def body_masses(robot: Robot, subtree: str | None = None) -> Float[Array, " nbody"]:
+    """Return the mass of each body [kg], 0 outside the subtree, or outside the robot.
 
     Raises:
         KeyError, ValueError: as in ``center_of_mass``.
     """
-    mass = robot.body_mass
-    if subtree is not None:
-        root = robot.tree.frame_bodies[robot.tree.frame(subtree)]
-        below = robot.tree.descendants[root]
-        if not isinstance(mass, Tracer) and not np.asarray(mass)[below].sum() > 0.0:
-            raise OsikValueError(f"the subtree of {subtree!r} has no mass, so it has no centre of mass")
-        mass = jnp.where(below, mass, 0.0)
-    return mass
+    mass, tree = robot.body_mass, robot.tree
+    if subtree is None:
+        own = tree.is_own
+        return mass if own[1:].all() else jnp.where(own, mass, 0.0)
+    below = tree.descendants[tree.frame_bodies[tree.frame(subtree)]]
+    if not isinstance(mass, Tracer) and not np.asarray(mass)[below].sum() > 0.0:
+        raise OsikValueError(f"the subtree of {subtree!r} has no mass, so it has no centre of mass")
+    return jnp.where(below, mass, 0.0)
 
 
 def _fields(robot: Robot, q: Float[Array, " nq"]) -> tuple[Array, ...]:
@@ -263,4 +274,4 @@ def _frames_by_kernel(robot: Robot, kinematics: Kinematics, *, names: tuple[str,
 
 _bodies = by_kernel(_fields, _kernels.bodies)
 _moving_frames = by_kernel(_frames, _frames_by_kernel)
-_moving_center = by_kernel(moving_center, _kernels.center_of_mass)
+_moving_center = by_kernel(_center_and_jacobian, _kernels.center_of_mass)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..robot import Robot
-from ._forward import Kinematics, center_of_mass, independent_columns
+from ._forward import Kinematics, body_masses, center_of_mass, independent_columns
 from ._rigid import compose, cross, rotate
 
 
@@ -50,11 +51,24 @@ def centroidal_momentum_matrix(robot: Robot, kinematics: Kinematics) -> Float[Ar
 
     The linear rows are the robot's mass times ``com_jacobian``. Drives (``robot.dof_armature``) do not count, as in
     MuJoCo and Pinocchio (D. Orin, A. Goswami, S.-H. Lee, "Centroidal dynamics of a humanoid robot", Autonomous Robots
-    35, 2013).
+    35, 2013). Loose bodies of a scene have no part in it.
+
+    Raises:
+        ValueError: the scene has several trees that may be the robot.
     """
+    robot = _without_scene(robot)
     momenta = _momenta(robot, kinematics)
     angular = momenta.angular + cross(momenta.center - center_of_mass(robot, kinematics), momenta.linear)
     return independent_columns(robot.tree, jnp.concatenate([momenta.linear, angular], -1).T)
+
+
+def _without_scene(robot: Robot) -> Robot:
+    """Return the robot with bodies of the scene that have neither mass nor inertia."""
+    own = robot.tree.is_own
+    if own[1:].all():
+        return robot
+    inertia = jnp.where(own[:, None, None], robot.body_inertia, 0.0)
+    return eqx.tree_at(lambda robot: (robot.body_mass, robot.body_inertia), robot, (body_masses(robot), inertia))
 
 
 def _momenta(robot: Robot, kinematics: Kinematics) -> Momenta:
@@ -72,8 +86,8 @@ def _composites(robot: Robot, kinematics: Kinematics) -> Composite:
     masses = below * mass
     total = jnp.sum(masses, -1)
     heavy = total > 0.0
-    moment = jnp.matmul(masses, centers - centers[robot.tree.root], precision="highest")
-    center = centers[robot.tree.root] + moment / jnp.where(heavy, total, 1.0)[:, None]
+    moment = jnp.matmul(masses, centers - centers[robot.tree.reference_body], precision="highest")
+    center = centers[robot.tree.reference_body] + moment / jnp.where(heavy, total, 1.0)[:, None]
     arm = centers - center[:, None]
     spread = jnp.sum((masses[:, :, None] * arm)[..., :, None] * arm[..., None, :], 1)
     own = compose(compose(turn, robot.body_inertia), turn.mT)

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
 from ..collision._distance import Nearest
-from ..collision._geometry import Kind, UnitCore, geom_hull, padded
+from ..collision._geometry import Kind, UnitCore, padded
+from ..collision._hulls import Hulls, read_hulls
 from ..collision._pairs import Member, Patterns, candidate_pairs, exact_pairs, members
 from ..collision._scene import Placed, Scene, grouped, nearest, place, separation_jacobian
 from ..collision._shape import CollisionShape
@@ -112,13 +113,14 @@ class CollisionAvoidanceLimit(Limit):
         shapes, pairs = dict(shapes or {}), None if pairs is None else list(pairs)
         found = members(robot, shapes)
         possible = candidate_pairs(robot, found, pairs, exclude)
+        hulls, possible = read_hulls(robot, found, shapes, possible)
         least = self.minimum_distance if q0_distance is None else q0_distance
-        whatever = exact_pairs(found, pairs) if q0_distance is None else set()
-        kept, near = _apart_at_home(robot, found, shapes, possible, least, whatever)
+        named = exact_pairs(found, pairs) if q0_distance is None else set()
+        kept, near = _apart_at_home(robot, found, shapes, hulls, possible, least, named)
         self.left_out = tuple((found[i].name, found[j].name) for i, j in near)
-        if pairs is not None and q0_distance is None and near:
-            _warn_of_left_out(self.left_out, list(near.values()), self.minimum_distance)
-        self.scene, self.shapes, self.hulls = _assembled(robot, found, shapes, kept)
+        if q0_distance is None and near:
+            _warn_of_left_out(_shown(found, near), self.minimum_distance)
+        self.scene, self.shapes, self.hulls = _assembled(robot, found, shapes, hulls, kept)
         self.max_pairs = min(max_pairs, len(kept))
 
     @property
@@ -222,15 +224,16 @@ def _apart_at_home(
     robot: Robot,
     found: Sequence[Member],
     shapes: Mapping[str, CollisionShape],
+    hulls: Hulls,
     possible: Sequence[tuple[int, int]],
     least: Float[Array, ""] | float,
-    whatever: set[tuple[int, int]],
+    named: set[tuple[int, int]],
 ) -> tuple[list[tuple[int, int]], dict[tuple[int, int], float]]:
-    """Pairs that are no nearer than ``least`` at q0, or are kept whatever they are; and the others' distances [m]."""
-    if (isinstance(least, float) and least == -np.inf) or whatever.issuperset(possible):
+    """Return the pairs no nearer than ``least`` at q0 or asked for by name, and the distances [m] of all others."""
+    if (isinstance(least, float) and least == -np.inf) or named.issuperset(possible):
         return list(possible), {}
-    scene, added, hulls = _assembled(robot, found, shapes, possible)
-    distances = concrete(_home_distances(robot, scene, added, hulls)), concrete(least)
+    scene, added, cores = _assembled(robot, found, shapes, hulls, possible)
+    distances = concrete(_home_distances(robot, scene, added, cores)), concrete(least)
     if distances[0] is None or distances[1] is None:
         raise OsikTypeError("which pairs are apart at q0 cannot be told from traced numbers; give q0_distance=-inf")
     taking_part = _taking_part(possible)
@@ -238,26 +241,26 @@ def _apart_at_home(
         tuple(sorted((taking_part[i], taking_part[j]))): float(distance)
         for (i, j), distance in zip(scene.pairs, distances[0], strict=True)
     }
-    near = {pair: apart[pair] for pair in possible if pair not in whatever and apart[pair] < distances[1]}
+    near = {pair: apart[pair] for pair in possible if pair not in named and apart[pair] < distances[1]}
     if len(near) == len(possible):
         raise OsikValueError(
             f"all {len(possible)} pairs are nearer than {least} m at q0; a smaller q0_distance keeps them: "
-            f"{_shown([(found[i].name, found[j].name) for i, j in near], list(near.values()))}"
+            f"{_shown(found, near)}"
         )
     return [pair for pair in possible if pair not in near], near
 
 
-def _warn_of_left_out(names: Sequence[tuple[str, str]], distances: Sequence[float], least: Float[Array, ""]) -> None:
+def _warn_of_left_out(shown: str, least: Float[Array, ""]) -> None:
     warn(
-        f"these pairs are asked for and not kept apart, for at q0 they are nearer than {float(least):g} m: "
-        f"{_shown(names, distances)}. Say what is meant: their names instead of a glob keep them, q0_distance=-inf "
-        f"keeps all, exclude or q0_distance={float(least):g} leaves them out"
+        f"these pairs are not kept apart, for at q0 they are nearer than {float(least):g} m: {shown}. Say what is "
+        f"meant: their names in pairs keep them, q0_distance=-inf keeps all, exclude or q0_distance={float(least):g} "
+        "leaves them out"
     )
 
 
-def _shown(names: Sequence[tuple[str, str]], distances: Sequence[float]) -> str:
+def _shown(found: Sequence[Member], near: Mapping[tuple[int, int], float]) -> str:
     """Pairs with their distances."""
-    return ", ".join(f"{a}-{b} ({d:.3g} m)" for (a, b), d in zip(names, distances, strict=True))
+    return ", ".join(f"{found[i].label}-{found[j].label} ({d:.3g} m)" for (i, j), d in near.items())
 
 
 def _home_distances(robot: Robot, scene: Scene, added: Placed, hulls: UnitCore | None) -> Float[Array, " pairs"]:
@@ -269,16 +272,19 @@ def _home_distances(robot: Robot, scene: Scene, added: Placed, hulls: UnitCore |
 
 
 def _assembled(
-    robot: Robot, found: Sequence[Member], shapes: Mapping[str, CollisionShape], pairs: Sequence[tuple[int, int]]
+    robot: Robot,
+    found: Sequence[Member],
+    shapes: Mapping[str, CollisionShape],
+    hulls: Hulls,
+    pairs: Sequence[tuple[int, int]],
 ) -> tuple[Scene, Placed, UnitCore | None]:
     """The scene of some pairs of members, its added shapes and its hulls."""
     taking_part = _taking_part(pairs)
     number = {k: n for n, k in enumerate(taking_part)}
-    geoms = [k for k in taking_part if found[k].link is not None]
+    geoms = [k for k in taking_part if not found[k].added]
     added = [found[k].name for k in taking_part[len(geoms) :]]
     kinds = [Kind(found[k].kind) for k in taking_part]
     hulled = [k for k, kind in zip(taking_part, kinds, strict=True) if kind is Kind.HULL]
-    units = [_unit(robot, k, shapes.get(found[k].name)) for k in hulled]
     scene = Scene(
         names=tuple(found[k].name for k in taking_part),
         kinds=tuple(kinds),
@@ -292,13 +298,8 @@ def _assembled(
     placed = Placed(
         *(_stacked([getattr(shapes[name], field) for name in added], like, dtype) for field, like in _PLACED)
     )
-    hulls = jax.tree.map(lambda rows: jnp.asarray(rows, dtype), padded(units)) if units else None
-    return scene, placed, hulls
-
-
-def _unit(robot: Robot, number: int, shape: CollisionShape | None) -> UnitCore:
-    """The hull of an added shape, or of one of the robot's geoms."""
-    return geom_hull(robot.mj_model, number) if shape is None or shape.hull is None else shape.hull
+    cores = padded([hulls[k] for k in hulled]) if hulled else None
+    return scene, placed, jax.tree.map(lambda rows: jnp.asarray(rows, dtype), cores)
 
 
 _PLACED = (("position", (3,)), ("rotation", (3, 3)), ("size", (3,)))

@@ -31,7 +31,7 @@ class FloatingBaseVelocityLimit(Limit):
         linear: greatest speeds along the three axes [m/s], (3,) or a scalar; left out or infinite: free.
         angular: greatest speeds about the three axes [rad/s], in the same way.
         axes: ``"base"`` or ``"world"`` (static).
-        joint: name of the free joint; default: the only one (static).
+        joint: name of the free joint; default: the robot's own, loose bodies of a scene left out (static).
 
     Raises:
         KeyError: no such free joint.
@@ -98,11 +98,14 @@ def _free_joint(robot: Robot, name: str | None) -> int:
     free = {tree.joint_names[j]: j for j in tree.independent if tree.joint_types[j] == FREE}
     if not free:
         raise OsikValueError("the robot has no free joint; load it with floating_base=True, or use a VelocityLimit")
-    if name is None and len(free) > 1:
+    if name is not None:
+        if name not in free:
+            raise unknown_name("free joint", name, tuple(free))
+        return free[name]
+    own = tree.free_bases
+    if len(own) != 1:
         raise OsikValueError(f"which free joint? joint is one of: {', '.join(free)}")
-    if name is not None and name not in free:
-        raise unknown_name("free joint", name, tuple(free))
-    return free[name] if name is not None else next(iter(free.values()))
+    return own[0]
 
 
 def _speeds(robot: Robot, value: ArrayLike | Array | None, what: str) -> Float[Array, "3"] | None:

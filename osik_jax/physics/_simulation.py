@@ -131,9 +131,8 @@ class Simulation:
         return frame_pose(self.world.robot, self.data, frame)
 
     def com(self) -> Float[np.ndarray, "3"]:
-        """Centre of mass [m] of all that moves. (3,)."""
-        mass = np.where(self.model.body_weldid != 0, self.model.body_mass, 0.0)
-        return mass @ self.data.xipos / mass.sum()
+        """Centre of mass [m] of the robot. (3,)."""
+        return self.world.own_masses @ self.data.xipos / self.world.own_masses.sum()
 
     def contact_points(self) -> Float[np.ndarray, "k 3"]:
         """Where the contact points of all feet are [m], foot after foot. (k, 3)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
 from ..robot import Robot
+from ..robot._own_masses import own_masses
 from ..robot._tree import BALL, FREE
 from ._servo import Servo as Servo
 from ._servo import add_servo, choose_servos
@@ -60,6 +62,11 @@ class World:
     servos: Mapping[str, Servo]
     feet: Mapping[str, Float[np.ndarray, "k 3"]]
     floor: float
+
+    @cached_property
+    def own_masses(self) -> Float[np.ndarray, " bodies"]:
+        """Mass of each body [kg], 0 where it is fixed to the world or not the robot's."""
+        return own_masses(self.robot)
 
     def contact_geoms(self, foot: str) -> list[int]:
         """The spheres of a foot, by their number in the model."""

@@ -74,4 +74,5 @@ def _unit_and_length(vectors: Float[Array, "k 2"]) -> tuple[Float[Array, "k 2"],
 
 def mass_fractions(robot: Robot) -> Float[Array, "*B nbody"]:
     """Return the fraction of the robot's mass that each body has."""
-    return robot.body_mass / robot.body_mass.sum(-1, keepdims=True)
+    own = jnp.where(robot.tree.is_own, robot.body_mass, 0.0)
+    return own / own.sum(-1, keepdims=True)

@@ -99,6 +99,7 @@ class Build:
         scale: robot over person; None: the ratio of their legs, and stretch.
         stretch: what that ratio is multiplied with.
         start: the home configuration, limbs bent where they are at the end of a range (``_with_bent_limbs``). (nq,)
+        base: where the base's free joint starts in q.
         lower: ends of the joints' ranges [rad or m]. (nv,)
         upper: the other ends. (nv,)
         speed: limits [rad/s or m/s]. (nv,)
@@ -112,6 +113,7 @@ class Build:
     scale: float | None
     stretch: float
     start: Float[np.ndarray, " nq"]
+    base: int
     lower: Float[np.ndarray, " nv"]
     upper: Float[np.ndarray, " nv"]
     speed: Float[np.ndarray, " nv"]
@@ -136,6 +138,7 @@ class Build:
             scale=profile.scale,
             stretch=profile.stretch,
             start=_with_bent_limbs(robot, profile),
+            base=robot.tree.qpos_address[robot.tree.free_bases[0]],
             lower=np.asarray(robot.position_lower),
             upper=np.asarray(robot.position_upper),
             speed=np.asarray(robot.velocity_limit),
@@ -159,8 +162,9 @@ class Build:
         """One posture throughout, with the pelvis where and as the person's is."""
         turn = np.asarray(goals.pelvis)
         q = np.tile(self.start, (len(turn), 1))
-        q[:, :3] = np.asarray(goals.root) - turn @ self.hips
-        q[:, 3:7] = Rotation.from_matrix(turn @ self.turn).as_quat(scalar_first=True)
+        base = self.base
+        q[:, base : base + 3] = np.asarray(goals.root) - turn @ self.hips
+        q[:, base + 3 : base + 7] = Rotation.from_matrix(turn @ self.turn).as_quat(scalar_first=True)
         return q
 
     def bounds(self, acceleration: Float[np.ndarray, " nv"], dt: float) -> Bounds:

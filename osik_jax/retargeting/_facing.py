@@ -33,7 +33,8 @@ def facing_x(robot: Robot, left: str, right: str) -> Robot:
     if quarters % 4 == 0:
         return robot
     angle, q = -0.25 * np.pi * quarters, np.array(robot.q0)
-    c, s, (w, x, y, z) = np.cos(angle), np.sin(angle), q[3:7]
-    q[:2] = np.array([[c * c - s * s, -2.0 * c * s], [2.0 * c * s, c * c - s * s]]) @ q[:2]
-    q[3:7] = [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
+    at = robot.tree.qpos_address[robot.tree.free_bases[0]]
+    c, s, (w, x, y, z) = np.cos(angle), np.sin(angle), q[at + 3 : at + 7]
+    q[at : at + 2] = np.array([[c * c - s * s, -2.0 * c * s], [2.0 * c * s, c * c - s * s]]) @ q[at : at + 2]
+    q[at + 3 : at + 7] = [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
     return robot.with_home(q)

@@ -15,9 +15,11 @@ from ..kinematics._home import home_kinematics
 from ..physics._world import contact_corners, sole_points
 from ..robot import Robot
 from ..robot._feet import find_feet
+from ..robot._own_masses import own_masses
 from ._body import JOINTS_APART, joints_between
 from ._facing import by_name, facing_x
 from ._limbs import ORIGIN, Chain, find_arm, find_chains, find_leg
+from ._link_shapes import by_inertia, by_shapes, is_credible, shrunk
 from ._profile import Capsule, Foot, Place, Point, Profile
 from ._roles import SIDES
 
@@ -27,9 +29,6 @@ _HAND = 0.6
 _LEAST_MASS, _LEAST_SIZE, _THINNEST, _WIDE, _LONG, _SHELL = 3e-3, 1e-3, 0.1, 1.6, 1.15, 1.2
 """Links that count, as a share of the robot's mass; what is smaller [m] or flatter is not trusted; a trunk that is
 wider gets two capsules; how much of an ellipsoid's length and width a capsule has."""
-_LIGHTEST, _USUAL = 200.0, 1000.0
-"""Density below which an ellipsoid is not believed, and that which it is given then [kg/m^3]: of the links of a G1, a
-NAO, a Talos, a GR1T2 and a GR3 the lightest has 210 (a Talos' head), and more than half have over 1,000."""
 _ROOM = 6e-3
 
 
@@ -142,6 +141,11 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
 
     def is_seen(frame: str, end: str | None) -> bool:
         first = tree.frame_bodies[tree.frame(frame)]
+        if end == profile.keypoints["left_shoulder"][0] and frame != end:  # what both arms hang from is the trunk
+            arms = [tree.frame_bodies[tree.frame(profile.keypoints[f"{side}_shoulder"][0])] for side in SIDES]
+            return bool(
+                bodies & set(np.flatnonzero(tree.descendants[first] & tree.descendants[:, arms].all(1)).tolist())
+            )
         below = set(np.flatnonzero(tree.descendants[first]).tolist())
         last = None if end is None else tree.frame_bodies[tree.frame(end)]
         # a limb that ends in its own link has all bodies below that link
@@ -207,47 +211,43 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...], hands: set[str]) -> li
     are as wide as the mean of their ellipsoids' widths and thicknesses, hands as the widths: they are flat, and touch
     each other with thumbs and fingers. Two thin capsules side by side cover them less well, and such hands slip past
     each other: plans stay where they cross.
-    An ellipsoid of semi-axes a, b, c and mass m turns about the first with ``m (b^2 + c^2) / 5``.
+
+    A link whose ellipsoid is not credible is as large as its collision shapes. Without such shapes its ellipsoid is
+    made smaller where it is too light; of the trunk it is left out.
     """
-    model, out = robot.mj_model, []
-    names, least = set(robot.frame_names), _LEAST_MASS * float(robot.mj_model.body_mass.sum())
+    model, masses, out = robot.mj_model, own_masses(robot), []
+    names, least = set(robot.frame_names), _LEAST_MASS * float(masses.sum())
     for body in range(1, model.nbody):
-        mass, inertia = float(model.body_mass[body]), model.body_inertia[body]
         name = str(model.body(body).name)
-        if name not in names or not mass > least:
+        if name not in names or not masses[body] > least:
             continue
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.body_iquat[body])
-        axes = np.sqrt(np.maximum(2.5 / mass * (inertia.sum() - 2.0 * inertia), 0.0))
-        axes *= shrunk(mass, axes)
-        long, wide, thin = np.argsort(-axes)
-        if not axes[thin] > max(_LEAST_SIZE, _THINNEST * axes[long]):
+        extent, shell = by_inertia(model, body), _SHELL
+        credible = is_credible(masses[body], extent.half)
+        by_file = None if credible else by_shapes(robot, body)
+        if by_file is not None:
+            extent, shell = by_file, 1.0
+        elif name in trunk and not credible:
             continue
-        apart = name in trunk and axes[wide] > _WIDE * axes[thin]
-        across = axes[wide] if name in hands else 0.5 * (axes[wide] + axes[thin])
-        radius = _SHELL * float(axes[thin] if apart else across)
-        along, aside = turn.reshape(3, 3)[:, long], turn.reshape(3, 3)[:, wide]
-        reach = max(_LONG * axes[long] - radius, 0.05 * radius)
-        spans = [-reach, reach]
-        if name not in trunk:
+        half = extent.half if by_file is not None else extent.half * shrunk(masses[body], extent.half)
+        long, wide, thin = np.argsort(-half)
+        if not half[thin] > max(_LEAST_SIZE, _THINNEST * half[long]):
+            continue
+        apart = name in trunk and half[wide] > _WIDE * half[thin]
+        across = half[wide] if name in hands else 0.5 * (half[wide] + half[thin])
+        radius = shell * float(half[thin] if apart else across)
+        along, aside = extent.axes[:, long], extent.axes[:, wide]
+        reach = max(float((_LONG if by_file is None else 1.0) * half[long] - radius), 0.05 * radius)
+        middle = float((extent.center - model.body_ipos[body]) @ along)
+        spans = [middle - reach, middle + reach]
+        if name not in trunk and by_file is None:
             spans += _spanned(model, body, along, radius, least)
         spans = _between_joints(model, body, along, radius, spans)
-        aside_by = _SHELL * axes[wide] - radius
+        aside_by = shell * half[wide] - radius
         for shift in (aside_by, -aside_by) if apart else (0.0,):
-            centre = model.body_ipos[body] + shift * aside
+            centre = extent.center - middle * along + shift * aside
             ends = _pair(np.stack([centre + min(spans) * along, centre + max(spans) * along]))
             out.append(Capsule(name, *ends, round(radius, 6)))
     return out
-
-
-def shrunk(mass: float, axes: np.ndarray) -> float:
-    """What an ellipsoid's semi-axes [m] are multiplied with, so that it weighs what a link may.
-
-    Inertias that files have about another point than the centre of mass, or as placeholders, are those of ellipsoids
-    that are far too large: too light for their size.
-    """
-    density = mass / max(4.0 / 3.0 * np.pi * float(np.prod(axes)), 1e-12)
-    return (density / _USUAL) ** (1.0 / 3.0) if density < _LIGHTEST else 1.0
 
 
 def _between_joints(

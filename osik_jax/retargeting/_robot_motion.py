@@ -56,7 +56,7 @@ def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> R
     index, coefficient = tree.qpos_source
     qpos = q[:, index] * coefficient + np.asarray(robot.qpos_offset)
     joints = [j for j, kind in enumerate(tree.joint_types) if kind != FREE]
-    base = next(j for j, kind in enumerate(tree.joint_types) if kind == FREE)
+    (base,) = tree.free_bases
     addresses = tree.full_qpos_address
     at = int(addresses[base])
     columns = [*range(at, at + 7), *(int(addresses[j]) for j in joints)]

@@ -6,6 +6,7 @@ import numpy as np
 from jax.core import Tracer
 
 from ._model import RobotModel
+from ._tree import FREE
 
 _NAMES_SHOWN = 4
 
@@ -27,8 +28,8 @@ def described(robot: RobotModel) -> str:
 
 
 def model_name(robot: RobotModel) -> str:
-    """What the file calls the robot; empty where it does not."""
-    return robot.mj_model.names.split(b"\0")[0].decode(errors="replace")
+    """What the file calls the robot; empty where it does not, and of robots of different files."""
+    return "" if robot.holder.model is None else robot.mj_model.names.split(b"\0")[0].decode(errors="replace")
 
 
 def _some(names: tuple[str, ...]) -> str:
@@ -43,7 +44,8 @@ def _not_free(robot: RobotModel) -> str:
 def _mass(robot: RobotModel) -> str:
     if isinstance(robot.body_mass, Tracer) or np.ndim(robot.body_mass) > 1:
         return "of each robot its own"
-    return f"{np.sum(np.asarray(robot.body_mass)[1:]):.4g} kg"
+    own = np.asarray(robot.body_mass)[robot.tree.is_own] if len(robot.tree.robots) <= 1 else robot.body_mass[1:]
+    return f"{np.sum(own):.4g} kg"
 
 
 def _limited(robot: RobotModel) -> str:
@@ -52,5 +54,5 @@ def _limited(robot: RobotModel) -> str:
     if any(isinstance(array, Tracer) or np.ndim(array) > 1 for array in own):
         return "of each robot its own"
     ranged = np.isfinite(own[0]) | np.isfinite(own[1])
-    total = robot.nv - (6 if robot.floating_base else 0)
+    total = robot.nv - 6 * sum(robot.tree.joint_types[j] == FREE for j in robot.tree.independent)
     return f"{ranged.sum()} ranges and {np.isfinite(own[2]).sum()} speeds of {total} joint coordinates"

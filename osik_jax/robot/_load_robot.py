@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from .._errors import OsikKeyError, OsikTypeError
 from . import loading
@@ -23,6 +23,7 @@ def load_robot(
     position_limits: PositionLimits | None = None,
     locked_joints: LockedJoints = (),
     home: Home | None = None,
+    root: str | Sequence[str] | None = None,
 ) -> Robot:
     """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
 
@@ -40,6 +41,7 @@ def load_robot(
         position_limits: likewise.
         locked_joints: likewise.
         home: likewise.
+        root: likewise.
 
     Raises:
         KeyError: no such robot; the message lists those with names like it, and of a path says what reads files. No
@@ -63,5 +65,6 @@ def load_robot(
         velocity_limits=velocity_limits,
         position_limits=position_limits,
         locked_joints=locked_joints,
+        root=root,
     )
     return Robot._of(loading.named(name, options), home)

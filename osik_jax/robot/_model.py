@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, ArrayLike, Float, Num
 
+from .._errors import OsikValueError
 from ._load_report import LoadReport
 from ._tree import FREE, KinematicTree, ModelHolder
 
@@ -75,12 +76,20 @@ class RobotModel(eqx.Module):
 
     @property
     def floating_base(self) -> bool:
-        """Whether the robot has a free joint that is not locked."""
-        return any(self.tree.joint_types[j] == FREE for j in self.tree.independent)
+        """Whether the robot hangs from a free joint that is not locked; loose bodies of a scene do not count."""
+        return bool(self.tree.free_bases)
 
     @property
     def mj_model(self) -> mujoco.MjModel:
-        """The MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations."""
+        """The MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations.
+
+        Raises:
+            ValueError: the robot is a stack of robots whose models differ.
+        """
+        if self.holder.model is None:
+            raise OsikValueError(
+                "this is a stack of robots of different files, so it has no single mj_model: take it from one robot"
+            )
         return self.holder.model
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -72,8 +72,9 @@ class Robot(RobotModel):
         home: Home | None = None,
         collision_meshes: bool = False,
         package_dirs: Iterable[str | os.PathLike[str]] = (),
+        root: str | Sequence[str] | None = None,
     ) -> Robot:
-        """Loads a URDF. Boxes, spheres, cylinders and capsules are kept as geoms; mesh files are not read unless asked.
+        """Loads a URDF. Boxes, spheres, cylinders and capsules are kept as geoms; no mesh file is read unless asked.
 
         Every link is a frame, with or without a joint of its own. Limits come from ``<limit>``: no ``<limit>`` means
         none, an absent ``lower`` or ``upper`` is 0 as the format has it, and a velocity of 0 or none means unknown,
@@ -95,10 +96,11 @@ class Robot(RobotModel):
             locked_joints: names or globs of joints to freeze at 0, or a mapping from them to the values to freeze at
                 [rad or m]. A mimic joint is locked by locking its leader.
             home: what ``q0`` is, see ``with_home``. Default: zeros, brought inside the joints' ranges.
-            collision_meshes: read the collision shapes that are meshes (STL, OBJ, MSH) too; without, no mesh file is
-                needed.
+            collision_meshes: read the collision shapes that are meshes (DAE, STL, OBJ, MSH) into ``mj_model``. Without,
+                their files are read when a ``CollisionAvoidanceLimit`` needs them.
             package_dirs: folders that are ROS packages or hold some, for ``package://`` addresses. Then
                 ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH`` are looked through, then the folders above the file.
+            root: as in ``from_mjcf``.
 
         Raises:
             FileNotFoundError: no such file, or with ``collision_meshes`` a mesh is not found; the message says where it
@@ -118,6 +120,7 @@ class Robot(RobotModel):
             locked_joints=locked_joints,
             collision_meshes=collision_meshes,
             package_dirs=package_dirs,
+            root=root,
         )
         return cls._of(loading.from_urdf(urdf, options), home)
 
@@ -131,6 +134,7 @@ class Robot(RobotModel):
         position_limits: PositionLimits | None = None,
         locked_joints: LockedJoints = (),
         home: Home | None = None,
+        root: str | Sequence[str] | None = None,
     ) -> Robot:
         """Loads an MJCF file or text.
 
@@ -150,6 +154,9 @@ class Robot(RobotModel):
             locked_joints: as in ``from_urdf``.
             home: what ``q0`` is, see ``with_home``: a keyframe's name or number, for instance. Default: the first
                 keyframe, or ``qpos0`` where there is none, brought inside the joints' ranges.
+            root: name of a body of the robot in a scene with other things that move, or names of several. The tree that
+                it is in is the robot, whose mass, momentum and base count. Default: the tree with a joint that an
+                actuator drives; if there is none, with a joint that has a range; else all that moves.
 
         Raises:
             FileNotFoundError: no such file.
@@ -166,6 +173,7 @@ class Robot(RobotModel):
             velocity_limits=velocity_limits,
             position_limits=position_limits,
             locked_joints=locked_joints,
+            root=root,
         )
         return cls._of(loading.from_mjcf(mjcf, options), home)
 
@@ -178,6 +186,7 @@ class Robot(RobotModel):
         position_limits: PositionLimits | None = None,
         locked_joints: LockedJoints = (),
         home: Home | None = None,
+        root: str | Sequence[str] | None = None,
     ) -> Robot:
         """Takes a compiled MuJoCo model.
 
@@ -188,6 +197,7 @@ class Robot(RobotModel):
             position_limits: as in ``from_urdf``.
             locked_joints: as in ``from_urdf``; without a value, joints freeze at ``qpos0``.
             home: as in ``from_mjcf``.
+            root: as in ``from_mjcf``.
 
         Raises:
             TypeError: ``model`` is no ``mujoco.MjModel``.
@@ -199,7 +209,7 @@ class Robot(RobotModel):
             OsikWarning: a joint cannot move because its range is a single value.
         """
         options = LoadOptions(
-            velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked_joints
+            velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked_joints, root=root
         )
         return cls._of(loading.from_mjmodel(model, options), home)
 

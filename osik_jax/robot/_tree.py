@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Generic, TypeVar, cast
@@ -11,7 +12,7 @@ import jax
 import mujoco
 import numpy as np
 
-from .._errors import OsikKeyError, unknown_name
+from .._errors import OsikKeyError, OsikValueError, unknown_name
 from ._load_report import LoadReport
 
 FREE, BALL, SLIDE, HINGE = (
@@ -27,23 +28,66 @@ QPOS_WIDTH = {FREE: 7, BALL: 4, SLIDE: 1, HINGE: 1}
 DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class ModelHolder:
-    """Carries what a robot was made from, and does not take part in comparison: the tree decides what may be stacked.
+@dataclasses.dataclass(frozen=True)
+class UnreadMesh:
+    """A collision mesh of a URDF whose file is read when distances to it are asked for.
 
     Attributes:
-        model: the MuJoCo model.
-        report: what the file asks for and the robot does not keep.
+        link: name of its link.
+        file: its address, as the URDF has it.
+        scale: of the file's numbers along x, y and z.
+        position: of the shape in its link [m].
+        rotation: from the shape's axes to the link's, row by row.
+        beside: path of the URDF, which relative addresses start from; None for a text.
+        folders: where packages are looked for first.
     """
 
-    model: mujoco.MjModel
+    link: str
+    file: str
+    scale: tuple[float, ...]
+    position: tuple[float, ...]
+    rotation: tuple[tuple[float, ...], ...]
+    beside: str | None
+    folders: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ModelHolder:
+    """What a robot was made from: its MuJoCo model, and the collision meshes that the model does not hold.
+
+    Two holders are equal if their models have equal content, so a function of ``jax.jit`` is compiled anew for a robot
+    of another file. What a function reads from the model while it is traced is then that robot's own.
+
+    Attributes:
+        model: the MuJoCo model; None in a stack of robots whose models differ.
+        report: what the file asks for and the robot does not keep.
+        meshes: collision meshes whose files are not read; they are the last of the tree's geoms.
+    """
+
+    model: mujoco.MjModel | None
     report: LoadReport = dataclasses.field(default_factory=LoadReport)
+    meshes: tuple[UnreadMesh, ...] = dataclasses.field(default=(), repr=False)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, ModelHolder)
+        if self is other:
+            return True
+        if not isinstance(other, ModelHolder) or (self.meshes, self.report) != (other.meshes, other.report):
+            return False
+        return self.model is other.model or self._content == other._content
 
     def __hash__(self) -> int:
-        return 0
+        """Return a hash of sizes alone: every call of a jitted function asks for it."""
+        model = self.model
+        return hash(None if model is None else (model.nq, model.nv, model.nbody, model.ngeom, len(self.meshes)))
+
+    @cached_property
+    def _content(self) -> bytes:
+        """Digest of all that the model is made of."""
+        if self.model is None:
+            return b""
+        buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, buffer)
+        return hashlib.blake2b(buffer.tobytes(), digest_size=16).digest()
 
 
 _Arrays = TypeVar("_Arrays")
@@ -84,11 +128,14 @@ class KinematicTree:
         joint_bodies: the body that each joint moves.
         frame_names: every name that can be asked for: bodies, URDF links, sites, geoms.
         frame_bodies: the body that each frame is fixed to.
-        geom_names: name of each of the MuJoCo model's geoms, in its order.
+        geom_names: name of each of the MuJoCo model's geoms, in its order, then of the collision meshes that it does
+            not hold (``ModelHolder.meshes``).
         geom_types: MuJoCo's geom types.
         geom_bodies: the body that each geom is fixed to.
         followers: ``(follower, leader, multiplier)`` by joint index, hinges and slides only.
         locked: indices of locked joints.
+        robots: for each tree of the scene that may be the robot, its topmost bodies. Empty: all that moves is one
+            robot.
     """
 
     body_names: tuple[str, ...]
@@ -103,6 +150,7 @@ class KinematicTree:
     geom_bodies: tuple[int, ...] = ()
     followers: tuple[tuple[int, int, float], ...] = ()
     locked: tuple[int, ...] = ()
+    robots: tuple[tuple[int, ...], ...] = ()
 
     def __hash__(self) -> int:
         return self._hash
@@ -214,9 +262,53 @@ class KinematicTree:
         return np.asarray(self.body_parents, np.int32)
 
     @cached_property
-    def root(self) -> int:
-        """The first moving body, or the world where nothing moves."""
+    def reference_body(self) -> int:
+        """The first moving body, or the world where nothing moves: points nearby are summed about its origin."""
         return min(1, len(self.body_parents) - 1)
+
+    @cached_property
+    def tops(self) -> tuple[int, ...]:
+        """Topmost bodies of the robot.
+
+        Raises:
+            ValueError: several trees of the scene may be the robot.
+        """
+        if len(self.robots) > 1:
+            found = ", ".join(self.body_names[tops[0]] for tops in self.robots)
+            raise OsikValueError(
+                f"the scene has {len(self.robots)} trees that may be the robot, and the centre of mass, the momentum "
+                f"and the base are one robot's. Name a body of it when the scene is loaded, root=NAME, or several of "
+                f"them for all; trees: {found}"
+            )
+        return self.robots[0] if self.robots else self._below_the_world
+
+    @cached_property
+    def root(self) -> int:
+        """The first body of the robot that moves, or the world where nothing moves.
+
+        Raises:
+            ValueError: as in ``tops``.
+        """
+        return self.tops[0] if self.tops else 0
+
+    @cached_arrays
+    def is_own(self) -> np.ndarray:
+        """Which bodies are the robot's, rather than the scene's. (nbody,), bool.
+
+        Raises:
+            ValueError: as in ``tops``.
+        """
+        return np.asarray(self.descendants[list(self.tops)].any(0))
+
+    @cached_property
+    def free_bases(self) -> tuple[int, ...]:
+        """The free joints, not locked, that the robot hangs from; those of all robots where several may be meant."""
+        tops = {top for tops in self.robots for top in tops} or set(self._below_the_world)
+        return tuple(j for j in self.independent if self.joint_types[j] == FREE and self.joint_bodies[j] in tops)
+
+    @cached_property
+    def _below_the_world(self) -> tuple[int, ...]:
+        return tuple(body for body, parent in enumerate(self.body_parents) if body and not parent)
 
     @cached_arrays
     def doublings(self) -> np.ndarray:

@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ..robot.loading._collada import Triangles
+from ..robot.loading._meshes import read_mesh
 from ..robot.loading._packages import Packages
 from ..robot.loading._source import check_root, parse_xml, read_source
 from ..robot.loading._urdf import GEOMS, geom_size
 from ..robot.loading._urdf_elements import Link, Shape, Urdf, read_urdf
-from ._collada import Triangles
-from ._meshes import read_mesh
 
 _NEAR = 3
 """So many folders above a URDF are searched for a mesh whose package has another name there."""

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..robot import Robot
+from ..robot._own_masses import own_masses
 
 
 def mujoco_poses(robot: Robot, q: ArrayLike | Array) -> Iterator[mujoco.MjData]:
@@ -27,9 +28,8 @@ def mujoco_poses(robot: Robot, q: ArrayLike | Array) -> Iterator[mujoco.MjData]:
 
 
 def robot_com(robot: Robot, data: mujoco.MjData) -> Float[np.ndarray, "3"]:
-    """Centre of mass [m] of all that moves, from MuJoCo; what is fixed to the world does not count."""
-    model = robot.mj_model
-    mass = np.where(model.body_weldid != 0, model.body_mass, 0.0)
+    """Centre of mass [m] of the robot's bodies that move, from MuJoCo; neither the scene nor a fixed base counts."""
+    mass = own_masses(robot)
     return mass @ data.xipos / mass.sum()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from .._balls import with_balls_inside
 from .._load_report import LoadNote, LoadReport
 from .._model import RobotModel
 from .._plausible import warn_of_fast_joints
-from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder
+from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder, UnreadMesh
 from ._followers import (
     Follower,
     as_mapping,
@@ -27,6 +27,7 @@ from ._followers import (
 )
 from ._model_notes import model_notes
 from ._options import LoadOptions, PositionLimits
+from ._robots import robot_trees
 
 VELOCITY_LIMIT_PREFIX = "velocity_limit/"
 """A custom numeric of this name and a joint's holds the joint's greatest speed [rad/s or m/s]."""
@@ -59,8 +60,20 @@ class Placement(NamedTuple):
     rotation: np.ndarray
 
 
+class NamedMesh(NamedTuple):
+    """A collision mesh that the model does not hold, and its name; empty where it has none."""
+
+    name: str
+    mesh: UnreadMesh
+
+
 def from_mjmodel(
-    model: mujoco.MjModel, options: LoadOptions, *, fixed: Iterable[str] = (), notes: Iterable[LoadNote] = ()
+    model: mujoco.MjModel,
+    options: LoadOptions,
+    *,
+    fixed: Iterable[str] = (),
+    notes: Iterable[LoadNote] = (),
+    meshes: Sequence[NamedMesh] = (),
 ) -> RobotModel:
     """Names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
 
@@ -69,6 +82,7 @@ def from_mjmodel(
         options: of which limits and locked joints are honoured here.
         fixed: names of free joints that are locked where the model has them, unless ``options`` lock them too.
         notes: what the file that the model was made from asks for and the model does not have.
+        meshes: collision meshes that the model does not hold; they become the last of the robot's geoms.
     """
     if not isinstance(model, mujoco.MjModel):
         raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
@@ -79,6 +93,8 @@ def from_mjmodel(
     followers, locked = resolve_followers(names, *equality_followers(model), asked)
     bodies, placement = _moving_bodies(model)
     frames = _frames(model, body_names, placement)
+    geom_names = element_names(model, mujoco.mjtObj.mjOBJ_GEOM, "geom", model.ngeom)
+    mesh_places = [_mesh_place(placement[body_names.index(named.mesh.link)], named.mesh) for named in meshes]
     tree = KinematicTree(
         body_names=tuple(body_names[b] for b in bodies),
         body_parents=tuple(placement[model.body_parentid[b]].body for b in bodies),
@@ -87,11 +103,12 @@ def from_mjmodel(
         joint_bodies=tuple(placement[b].body for b in model.jnt_bodyid),
         frame_names=tuple(frames),
         frame_bodies=tuple(frame.body for frame in frames.values()),
-        geom_names=element_names(model, mujoco.mjtObj.mjOBJ_GEOM, "geom", model.ngeom),
-        geom_types=tuple(int(t) for t in model.geom_type),
-        geom_bodies=tuple(placement[b].body for b in model.geom_bodyid),
+        geom_names=(*geom_names, *_free_names(geom_names, meshes)),
+        geom_types=(*map(int, model.geom_type), *[int(mujoco.mjtGeom.mjGEOM_MESH)] * len(meshes)),
+        geom_bodies=(*(placement[b].body for b in model.geom_bodyid), *(place.body for place in mesh_places)),
         followers=tuple(follower[:3] for follower in followers),
         locked=tuple(sorted(locked)),
+        robots=_robots(model, body_names, placement, locked, options.root),
     )
     if tree.nv == 0:
         raise OsikValueError(f"the model has no joint left to move; joints: {', '.join(names)}, all locked")
@@ -116,7 +133,7 @@ def from_mjmodel(
         joint_reference=model.qpos0,
         frame_position=[frame.position for frame in frames.values()],
         frame_rotation=[frame.rotation for frame in frames.values()],
-        **_geom_arrays(model, placement),
+        **_geom_arrays(model, placement, mesh_places),
         qpos_offset=qpos_offset(model, followers, locked),
         position_lower=lower,
         position_upper=upper,
@@ -124,7 +141,8 @@ def from_mjmodel(
         acceleration_limit=_rate_limits(tree, followers, accelerations),
         q0=q0,
     )
-    return RobotModel(tree=tree, holder=ModelHolder(model, report), **{k: _float_array(v) for k, v in arrays.items()})
+    holder = ModelHolder(model, report, tuple(named.mesh for named in meshes))
+    return RobotModel(tree=tree, holder=holder, **{k: _float_array(v) for k, v in arrays.items()})
 
 
 def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count: int) -> tuple[str, ...]:
@@ -182,6 +200,21 @@ def _moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
     return bodies, placement
 
 
+def _robots(
+    model: mujoco.MjModel,
+    names: Sequence[str],
+    placement: list[Placement],
+    locked: Iterable[int],
+    root: str | Sequence[str] | None,
+) -> tuple[tuple[int, ...], ...]:
+    """Return the topmost moving bodies of each robot that the model may show; empty if the model is one tree."""
+    found = robot_trees(model, names, locked, root)
+    topmost = [b for b in range(1, model.nbody) if model.body_jntnum[b] and not placement[model.body_parentid[b]].body]
+    if {model.body_rootid[b] for b in topmost} == {tree for trees in found for tree in trees} and len(found) == 1:
+        return ()
+    return tuple(tuple(placement[b].body for b in topmost if model.body_rootid[b] in trees) for trees in found)
+
+
 def _placed(on: Placement, position: np.ndarray, quaternion: np.ndarray) -> Placement:
     return Placement(on.body, on.position + on.rotation @ position, on.rotation @ rotation_matrix(quaternion))
 
@@ -226,15 +259,33 @@ def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Place
     )
 
 
-def _geom_arrays(model: mujoco.MjModel, placement: list[Placement]) -> dict[str, ArrayLike]:
-    """Poses of the geoms in the moving bodies, and their sizes."""
+def _mesh_place(on: Placement, mesh: UnreadMesh) -> Placement:
+    position, rotation = np.array(mesh.position), np.array(mesh.rotation)
+    return Placement(on.body, on.position + on.rotation @ position, on.rotation @ rotation)
+
+
+def _free_names(taken: Sequence[str], meshes: Sequence[NamedMesh]) -> list[str]:
+    """Names of the collision meshes; one without a name is called by its number, as ``element_names`` does."""
+    out: list[str] = []
+    for number, placed in enumerate(meshes, len(taken)):
+        name = placed.name or f"geom{number}"
+        while name in taken or name in out:
+            name += "_"
+        out.append(name)
+    return out
+
+
+def _geom_arrays(
+    model: mujoco.MjModel, placement: list[Placement], meshes: Sequence[Placement]
+) -> dict[str, ArrayLike]:
+    """Poses of the geoms in the moving bodies, and their sizes; those of meshes that the model does not hold last."""
     described = zip(model.geom_bodyid, model.geom_pos, model.geom_quat, strict=True)
-    poses = [_placed(placement[body], position, quaternion) for body, position, quaternion in described]
-    meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    poses = [*(_placed(placement[body], position, quaternion) for body, position, quaternion in described), *meshes]
+    size = np.where(model.geom_type[:, None] == mujoco.mjtGeom.mjGEOM_MESH, 1.0, model.geom_size)
     return dict(
         geom_position=np.array([pose.position for pose in poses]).reshape(-1, 3),
         geom_rotation=np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
-        geom_size=np.where(meshes[:, None], 1.0, model.geom_size),
+        geom_size=np.concatenate([size, np.ones((len(meshes), 3))]),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 LockedJoints: TypeAlias = Iterable[str] | Mapping[str, float]
@@ -23,3 +23,4 @@ class LoadOptions(NamedTuple):
     locked_joints: LockedJoints = ()
     collision_meshes: bool = False
     package_dirs: Iterable[str | os.PathLike[str]] = ()
+    root: str | Sequence[str] | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,15 @@ from ..._errors import OsikValueError, warn
 from .._feet import find_feet
 from .._load_report import LoadNote
 from .._model import RobotModel
-from ._mjmodel import ACCELERATION_LIMIT_PREFIX, LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, from_mjmodel, quaternion
+from .._tree import UnreadMesh
+from ._mjmodel import (
+    ACCELERATION_LIMIT_PREFIX,
+    LEAST_INERTIA,
+    VELOCITY_LIMIT_PREFIX,
+    NamedMesh,
+    from_mjmodel,
+    quaternion,
+)
 from ._options import LoadOptions
 from ._packages import Packages, is_uri
 from ._source import check_root, parse_xml, read_source
@@ -45,11 +53,12 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     check_root(root, "robot", source)
     try:
         read = read_urdf(root)
-        description = _with_base(read, options.floating_base, source.label)
+        description, unread = _with_base(read, options.floating_base, source.label), ()
         if options.collision_meshes:
             model, notes = _compiled_with_meshes(description, packages, source.path)
         else:
             model, notes = urdf_spec(description).compile(), []
+            unread = tuple(_unread_meshes(description, packages, source.path))
     except ValueError as error:
         raise OsikValueError(f"{source.label}: {error}") from None
     notes = [*urdf_notes(root, {joint.name: joint for joint in read.joints}), *read.notes, *notes]
@@ -60,7 +69,8 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
         if math.isfinite(joint.lower) != math.isfinite(joint.upper)
     }
     options = options._replace(position_limits={**one_sided, **(options.position_limits or {})})
-    return from_mjmodel(model, options, fixed=floating if options.floating_base is False else (), notes=notes)
+    fixed = floating if options.floating_base is False else ()
+    return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread)
 
 
 def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
@@ -124,7 +134,8 @@ def urdf_spec(urdf: Urdf) -> mujoco.MjSpec:
 
     Mimic joints are joint equality constraints; limits of speeds and accelerations are custom numerics, which
     ``from_mjmodel`` reads. A joint that is limited on one side has no range here, for MJCF has both limits or none.
-    Moving links without mass or inertia get 2e-15 kg and kg m^2. Shapes have no mass and touch nothing.
+    Moving links without mass or inertia get 2e-15 kg and kg m^2. Shapes have no mass. Collision shapes have MuJoCo's
+    default masks, so that all of them meet; visual shapes meet nothing.
     """
     spec = mujoco.MjSpec()
     spec.modelname = urdf.name
@@ -180,12 +191,14 @@ def _add_shapes(body: mujoco.MjsBody, link: Link) -> None:
 
 def _add_geom(body: mujoco.MjsBody, shape: Shape, **form: Any) -> None:
     color = {} if shape.color is None else {"rgba": shape.color}
+    meets = 0 if shape.visual else 1
     body.add_geom(
+        name="" if shape.visual else shape.name,
         pos=shape.pose.position,
         quat=quaternion(shape.pose.rotation),
         group=_VISUAL_GROUP if shape.visual else _COLLISION_GROUP,
-        contype=0,
-        conaffinity=0,
+        contype=meets,
+        conaffinity=meets,
         mass=0.0,
         **form,
         **color,
@@ -212,6 +225,16 @@ def _compiled_with_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -
         raise
     except ValueError:
         return _compiled(urdf, packages, beside, checked=True)
+
+
+def _unread_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> Iterator[NamedMesh]:
+    """Yield the collision shapes that are meshes, without a look at their files."""
+    urdf_path, folders = None if beside is None else str(beside.absolute()), tuple(map(str, packages.folders))
+    for link in urdf.links.values():
+        for shape in (shape for shape in link.shapes if shape.kind == "mesh" and not shape.visual):
+            position, rotation = tuple(shape.pose.position.tolist()), tuple(map(tuple, shape.pose.rotation.tolist()))
+            mesh = UnreadMesh(link.name, shape.file, shape.size, position, rotation, urdf_path, folders)
+            yield NamedMesh(shape.name, mesh)
 
 
 def geom_size(shape: Shape) -> list[float]:

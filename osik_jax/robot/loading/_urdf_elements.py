@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import itertools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator, Mapping
@@ -34,7 +35,10 @@ IDENTITY = Pose(np.zeros(3), np.eye(3))
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A box (full edges), sphere (radius), cylinder or capsule (radius, length) [m], or a mesh (scale of its file)."""
+    """A box (full edges), sphere (radius), cylinder or capsule (radius, length) [m], or a mesh (scale of its file).
+
+    ``name`` is empty where the file gives none.
+    """
 
     kind: str
     size: tuple[float, ...]
@@ -42,6 +46,7 @@ class Shape:
     color: _Color | None
     visual: bool
     file: str = ""
+    name: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +112,30 @@ def read_urdf(element: ElementTree.Element) -> Urdf:
     joints = _by_name("joint", (_joint(e) for e in element.findall("joint")))
     root = _root(links, joints)
     _check_mimics(joints)
-    return Urdf(element.get("name", ""), links, tuple(_parents_first(root, links, joints)), root, tuple(notes))
+    named = _with_unique_shape_names(links)
+    return Urdf(element.get("name", ""), named, tuple(_parents_first(root, links, joints)), root, tuple(notes))
+
+
+def _with_unique_shape_names(links: Mapping[str, Link]) -> dict[str, Link]:
+    """Return the links with each collision shape's name used once: a name that is taken gets its link's before it."""
+    taken: set[str] = set()
+
+    def unique(shape: Shape, link: str) -> Shape:
+        name = shape.name
+        if name in taken and name:
+            count = itertools.count(2)
+            name = f"{link}/{name}"
+            while name in taken:
+                name = f"{link}/{shape.name}_{next(count)}"
+        taken.add(name)
+        return dataclasses.replace(shape, name=name)
+
+    return {
+        name: dataclasses.replace(
+            link, shapes=tuple(shape if shape.visual else unique(shape, name) for shape in link.shapes)
+        )
+        for name, link in links.items()
+    }
 
 
 def _refuse_xacro(element: ElementTree.Element) -> None:
@@ -258,7 +286,9 @@ def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], where: st
         return None
     material = element.find("material")
     color = _rgba(material) or (None if material is None else colors.get(material.get("name", "")))
-    return Shape(shape.tag, size, _origin(element, where), color, element.tag == "visual", file)
+    return Shape(
+        shape.tag, size, _origin(element, where), color, element.tag == "visual", file, element.get("name", "")
+    )
 
 
 def _size(shape: ElementTree.Element, where: str) -> tuple[float, ...]:

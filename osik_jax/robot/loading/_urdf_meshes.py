@@ -11,10 +11,10 @@ from jaxtyping import Float
 
 from ..._errors import OsikValueError
 from .._load_report import LoadNote
+from ._meshes import SUFFIXES, is_read_by_mujoco, joined, read_mesh
 from ._packages import Packages
 from ._urdf_elements import Shape, Urdf
 
-_MESH_SUFFIXES = (".stl", ".obj", ".msh")
 _THICKNESS = 1e-3
 """What a flat mesh is made thick by [m]."""
 _LINE = 1e-6
@@ -35,7 +35,7 @@ def meshes_of(
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a file of a kind that MuJoCo does not read.
+        ValueError: a file of a kind that cannot be read.
     """
     known: dict[tuple[Path, tuple[float, ...]], tuple[dict[str, Any] | None, str]] = {}
     found, notes = [], []
@@ -47,7 +47,7 @@ def meshes_of(
             _check_mesh(path, link.name)
             key = path, shape.size
             if key not in known:
-                form = dict(name=f"{path.stem}_{len(known)}", file=str(path), scale=shape.size)
+                form = dict(name=f"{path.stem}_{len(known)}", scale=shape.size, **_source(path))
                 known[key] = _repaired(form) if checked else (form, "")
             form, done = known[key]
             if form is not None:
@@ -58,10 +58,18 @@ def meshes_of(
 
 
 def _check_mesh(path: Path, link: str) -> None:
-    if path.suffix.lower() not in _MESH_SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise OsikValueError(
-            f"link {link!r}: MuJoCo cannot read the mesh {str(path)!r}; it reads {', '.join(_MESH_SUFFIXES)}"
+            f"link {link!r}: the mesh {str(path)!r} is of no kind that can be read: {', '.join(SUFFIXES)}"
         )
+
+
+def _source(path: Path) -> dict[str, Any]:
+    """Return where MuJoCo takes a mesh from: its file, or the triangles of a file that MuJoCo cannot read."""
+    if is_read_by_mujoco(path):
+        return dict(file=str(path))
+    vertices, faces = joined(read_mesh(path))
+    return dict(uservert=vertices.ravel(), userface=faces.ravel())
 
 
 def _repaired(form: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
@@ -77,7 +85,7 @@ def _repaired(form: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, shell.mesh_quat[0])
         points = shell.mesh_vert @ turn.reshape(3, 3).T + shell.mesh_pos[0]
-        thick = dict(name=form["name"], uservert=_thickened(points * np.array(form["scale"])).ravel())
+        thick = dict(name=form["name"], uservert=thickened(points * np.array(form["scale"])).ravel())
         _compiled(thick)
     except ValueError:
         return None, f"is left out: {reason}"
@@ -85,14 +93,14 @@ def _repaired(form: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
 
 
 def _compiled(form: dict[str, Any]) -> mujoco.MjModel:
-    """The mesh alone, without its hull, which a model of a URDF does not have either."""
+    """The mesh alone, with its hull, which a model of a URDF has too."""
     spec = mujoco.MjSpec()
     spec.add_mesh(**form)
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=form["name"], contype=0, conaffinity=0)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=form["name"])
     return spec.compile()
 
 
-def _thickened(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+def thickened(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Points on both sides of the plane that the given ones are in; ValueError where they are on one line."""
     _, extents, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     if not extents[1] > _LINE * extents[0]:

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 
 from ..._errors import OsikValueError
 from .._model import RobotModel
-from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
+from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree
 from ._mjmodel import ACCELERATION_LIMIT_PREFIX, LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, quaternion, rotation_matrix
+from ._robots import ROBOT_ROOTS
 from ._urdf_elements import IDENTITY, Pose
 
 _TYPES = {FREE: "free", BALL: "ball", SLIDE: "slide", HINGE: "hinge"}
@@ -49,7 +50,9 @@ def to_mjcf(robot: RobotModel) -> str:
     for body in range(1, len(robot.tree.body_names)):
         bodies.append(_body(robot, body, bodies[robot.tree.body_parents[body]]))
     _add_frames(robot, bodies)
-    _add_rates(robot, ElementTree.SubElement(root, "custom"))
+    custom = ElementTree.SubElement(root, "custom")
+    _add_rates(robot, custom)
+    _add_roots(robot.tree, custom)
     _add_followers(robot, ElementTree.SubElement(root, "equality"))
     _add_home(robot, ElementTree.SubElement(root, "keyframe"))
     ElementTree.indent(root)
@@ -281,6 +284,13 @@ def _add_rates(robot: RobotModel, element: ElementTree.Element) -> None:
             rate = _one(values[_dofs(robot, joint)], name, what)
             if math.isfinite(rate):
                 _put(element, "numeric", name=prefix + name, data=rate)
+
+
+def _add_roots(tree: KinematicTree, element: ElementTree.Element) -> None:
+    """Writes which trees are the robot, where there are several and that is clear."""
+    trees = sum(not parent for parent in tree.body_parents[1:])
+    if trees > 1 and len(tree.robots) <= 1:
+        ElementTree.SubElement(element, "text", name=ROBOT_ROOTS, data=" ".join(tree.body_names[b] for b in tree.tops))
 
 
 def _add_followers(robot: RobotModel, element: ElementTree.Element) -> None:

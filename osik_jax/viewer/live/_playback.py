@@ -13,7 +13,6 @@ from jaxtyping import Float
 from ..._errors import OsikValueError
 from ..._npz import open_npz
 from ...robot import Robot
-from ...robot._tree import FREE
 from .._look import Look
 from .._mujoco import mujoco_poses
 from .._outline import floor_height
@@ -91,7 +90,7 @@ def _retargeted(arrays: Mapping[str, np.ndarray], robot: Robot, path: Any) -> di
     if unknown or not robot.floating_base or qpos.ndim != 2 or qpos.shape[1] != 7 + len(names):
         what = f"it has no joint {unknown[0]}" if unknown else "its base is fixed, or the columns are others"
         raise OsikValueError(f"{path} is the motion of another robot ({what}): say which with --robot")
-    free = next(tree.qpos_address[j] for j in tree.independent if tree.joint_types[j] == FREE)
+    free = tree.qpos_address[tree.free_bases[0]]
     q = np.tile(np.asarray(robot.q0, float), (len(qpos), 1))
     q[:, free : free + 7] = qpos[:, :7]
     for column, name in enumerate(names, 7):

@@ -13,7 +13,6 @@ from ...kinematics import forward_kinematics, integrate
 from ...kinematics._home import home_kinematics
 from ...robot import Robot
 from ...robot._joint_selection import scalar_layout
-from ...robot._tree import FREE
 from ...tasks import FrameTask, SupportPolygon, support_polygon
 from .._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
 from .._parts import RobotParts
@@ -47,8 +46,7 @@ def standing(robot: Robot, shapes: RobotParts, feet: Sequence[str]) -> Float[np.
         return q
     q = _crouched(robot, feet) if feet else q
     data = next(mujoco_poses(robot, q))
-    joint = next(j for j in robot.tree.independent if robot.tree.joint_types[j] == FREE)
-    q[robot.tree.qpos_address[joint] + 2] -= lowest_points(shapes, data).min()
+    q[robot.tree.qpos_address[robot.tree.free_bases[0]] + 2] -= lowest_points(shapes, data).min()
     return q
 
 

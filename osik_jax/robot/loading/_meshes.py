@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 
-from .._errors import OsikValueError
+from ..._errors import OsikValueError
+from .._tree import UnreadMesh
 from ._collada import Triangles, read_collada
+from ._packages import Packages
 
 SUFFIXES = (".dae", ".stl", ".obj", ".msh")
 _TEXT_STL = b"facet"
@@ -23,14 +27,38 @@ def read_mesh(path: Path) -> list[Triangles]:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise OsikValueError(f"{path}: a mesh has to be one of {', '.join(SUFFIXES)}")
-    if suffix == ".dae":
-        parts = read_collada(path)
+    if is_read_by_mujoco(path):
+        parts = [_by_mujoco(path)]
     else:
-        parts = [_text_stl(path) if suffix == ".stl" and _is_text(path) else _by_mujoco(path)]
+        parts = read_collada(path) if suffix == ".dae" else [_text_stl(path)]
     solid = [part for part in parts if _has_area(part)]
     if not solid:
         raise OsikValueError(f"{path}: nothing in it has a surface")
     return solid
+
+
+def is_read_by_mujoco(path: Path) -> bool:
+    """Return whether MuJoCo reads a mesh file itself: neither COLLADA nor STL as text."""
+    return path.suffix.lower() != ".dae" and not (path.suffix.lower() == ".stl" and _is_text(path))
+
+
+def joined(parts: Sequence[Triangles]) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "m 3"]]:
+    """Return vertices [m] and triangles of the parts of a mesh as one."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
+    return np.concatenate([part.vertices for part in parts]), np.concatenate(faces)
+
+
+def unread_points(mesh: UnreadMesh) -> Float[np.ndarray, "k 3"]:
+    """Return the vertices of a collision mesh [m], in the axes of its shape.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file cannot be read.
+    """
+    beside = None if mesh.beside is None else Path(mesh.beside)
+    path = Packages(mesh.folders).path(mesh.file, beside=beside)
+    return joined(read_mesh(path))[0] * np.array(mesh.scale)
 
 
 def _has_area(part: Triangles) -> bool:

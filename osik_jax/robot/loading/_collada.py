@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from PIL import Image
 
-from .._errors import OsikValueError
+from ..._errors import OsikValueError
 
 _Element = ElementTree.Element
 _Color = tuple[float, float, float, float]
@@ -134,6 +133,8 @@ class _Document:
         beside = None if file is None else self._path.parent / file.strip().removeprefix("file://")
         if beside is None or not beside.is_file():
             return None
+        from PIL import Image  # not at the top: a robot without textures needs no picture library
+
         try:
             with Image.open(beside) as picture:
                 pixels = np.asarray(picture.convert("RGB").resize((16, 16)))

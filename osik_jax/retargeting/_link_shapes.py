@@ -1,0 +1,127 @@
+"""How large links are by the collision shapes of the file, where their inertias say nothing credible."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from .._errors import OsikError
+from ..robot import Robot
+from ..robot.loading._meshes import unread_points
+from ..robot.loading._mjmodel import rotation_matrix
+
+_LIGHTEST, _DENSEST = 200.0, 20_000.0
+"""Densities that links may have [kg/m^3]: of the links of a G1, a NAO, a Talos, a GR1T2 and a GR3 the lightest has 210
+(a Talos' head); no metal that links are made of has more than 20,000."""
+
+_USUAL = 1000.0
+"""Density that an ellipsoid is given where it is too light [kg/m^3]; more than half of those links have more."""
+
+_ROUND = 1e-6
+"""Semi-axes that differ by a smaller share are equal."""
+
+_GEOM = mujoco.mjtGeom
+
+
+class Extent(NamedTuple):
+    """A box or ellipsoid in a body's frame: its centre [m], its axes in columns, and its half lengths [m]."""
+
+    center: Float[np.ndarray, "3"]
+    axes: Float[np.ndarray, "3 3"]
+    half: Float[np.ndarray, "3"]
+
+
+def density(mass: float, half: Float[np.ndarray, "3"]) -> float:
+    """Return the density [kg/m^3] of an ellipsoid of a mass [kg] with these semi-axes [m]."""
+    return mass / max(4.0 / 3.0 * np.pi * float(np.prod(half)), 1e-12)
+
+
+def is_credible(mass: float, half: Float[np.ndarray, "3"]) -> bool:
+    """Return whether an ellipsoid of a mass [kg] with these semi-axes [m] may be a link of a robot.
+
+    Its density may not be absurd, and it may not be a ball: three equal moments of inertia are placeholders.
+    """
+    return _LIGHTEST <= density(mass, half) <= _DENSEST and np.ptp(half) > _ROUND * np.max(half)
+
+
+def shrunk(mass: float, half: Float[np.ndarray, "3"]) -> float:
+    """Return the factor for an ellipsoid's semi-axes [m] with which it weighs what a link may.
+
+    Inertias that files have about another point than the centre of mass, or as placeholders, are those of ellipsoids
+    that are far too large: too light for their size.
+    """
+    found = density(mass, half)
+    return (found / _USUAL) ** (1.0 / 3.0) if found < _LIGHTEST else 1.0
+
+
+def by_inertia(model: mujoco.MjModel, body: int) -> Extent:
+    """Return the solid ellipsoid of a body's inertia.
+
+    An ellipsoid of semi-axes a, b, c and mass m turns about the first with ``m (b^2 + c^2) / 5``.
+    """
+    mass, inertia = float(model.body_mass[body]), model.body_inertia[body]
+    half = np.sqrt(np.maximum(2.5 / mass * (inertia.sum() - 2.0 * inertia), 0.0))
+    return Extent(model.body_ipos[body].copy(), rotation_matrix(model.body_iquat[body]), half)
+
+
+def by_shapes(robot: Robot, body: int) -> Extent | None:
+    """Return the box around a body's collision shapes, along their principal axes; None if there are none.
+
+    Mesh files that the model does not hold are read; a file that cannot be read is left out.
+    """
+    clouds = [_geom_points(robot.mj_model, geom) for geom in _solid_geoms(robot.mj_model, body)]
+    clouds += _unread_points(robot, body)
+    if not clouds:
+        return None
+    points = np.concatenate(clouds)
+    middle = points.mean(0)
+    axes = np.linalg.svd(points - middle, full_matrices=True)[2].T
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    along = (points - middle) @ axes
+    low, high = along.min(0), along.max(0)
+    return Extent(middle + axes @ (0.5 * (low + high)), axes, 0.5 * (high - low))
+
+
+def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    kinds = (*_HALVES, int(_GEOM.mjGEOM_MESH))
+    return np.flatnonzero(solid & (model.geom_bodyid == body) & np.isin(model.geom_type, kinds)).tolist()
+
+
+def _geom_points(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
+    """Return the corners of the box around a geom, or the vertices of a mesh, in the body's frame [m]."""
+    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+    if kind in _HALVES:
+        corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * _HALVES[kind](size)
+    else:
+        mesh = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        corners = model.mesh_vert[first : first + count].astype(float)
+    return model.geom_pos[geom] + corners @ rotation_matrix(model.geom_quat[geom]).T
+
+
+def _unread_points(robot: Robot, body: int) -> list[Float[np.ndarray, "k 3"]]:
+    """Return the vertices of the collision meshes whose files the model does not hold, in the link's frame [m]."""
+    model, out = robot.mj_model, []
+    link = model.body(body).name
+    for mesh in robot.holder.meshes:
+        if mesh.link == link:
+            try:
+                points = unread_points(mesh)
+            except (OSError, OsikError):
+                continue
+            out.append(np.array(mesh.position) + points @ np.array(mesh.rotation).T)
+    return out
+
+
+_HALVES = {
+    int(_GEOM.mjGEOM_SPHERE): lambda size: np.full(3, size[0]),
+    int(_GEOM.mjGEOM_CAPSULE): lambda size: np.array([size[0], size[0], size[0] + size[1]]),
+    int(_GEOM.mjGEOM_CYLINDER): lambda size: np.array([size[0], size[0], size[1]]),
+    int(_GEOM.mjGEOM_ELLIPSOID): np.array,
+    int(_GEOM.mjGEOM_BOX): np.array,
+}
+"""Half lengths of the box around a geom [m], from MuJoCo's sizes."""
