@@ -12,7 +12,7 @@ from task_checks import (
 )
 
 import osik_jax as osik
-from osik_jax.tasks._gain import safe_norm
+from osik_jax.numerics._guarded import safe_norm
 
 
 @pytest.fixture(scope="module")

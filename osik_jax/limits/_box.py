@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..numerics._arguments import concrete
+from ..numerics._guarded import clipped
 from ..numerics._replace import Replaceable
 from ..robot import Robot
 from ..robot._made_for import MadeForRobot
@@ -95,7 +96,7 @@ def limit_box(
     parts = [part for limit in limits for part in limit.parts()]
     for limit in sorted(parts, key=lambda part: _ORDER.index(part.kind)):
         low, high = limit.box(robot, q, dt)
-        lower, upper = jnp.clip(low, lower, upper), jnp.clip(high, lower, upper)
+        lower, upper = clipped(low, lower, upper), clipped(high, lower, upper)
     if any(part.kind in _COMPUTED for part in parts):
         lower = jnp.minimum(lower, _a_little_below(upper))
     return lower, upper

@@ -146,7 +146,7 @@ MAX_INFEASIBLE = 2
 """Dual methods that end as infeasible before projected Newton takes over; one that changes nothing is enough."""
 ROW_MULTIPLIER = 1e-3
 """Relative to what all rows add to a variable's gradient: a multiplier of a row that is smaller has no sign."""
-SOFT_COMPLIANCE = 1e-12
+INFEASIBLE_COMPLIANCE = 1e-12
 """Compliance of infeasible hard rows relative to C diag(H)^-1 C': with it the least violation has a derivative."""
 KKT_RIDGE = {jnp.dtype("float64"): 10.0, jnp.dtype("float32"): 1.0}
 """In units of machine epsilon times the diagonal: keeps the factor of a semidefinite Hessian from breaking."""

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ..execution._backends import check_backend
+from ..numerics._guarded import clipped
 from ..solvers import Backend, Level, NullSpaceSolution, solve_nullspace
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
@@ -98,12 +99,12 @@ class NullSpace(Scheme):
     def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
         """Return where the first level begins: an inequality row that holds there takes no part in it."""
         nowhere = jnp.zeros_like(problem.position)
-        return jnp.clip(nowhere, problem.lower, problem.upper) if self.saturates else nowhere
+        return clipped(nowhere, problem.lower, problem.upper) if self.saturates else nowhere
 
 
 def _first_residual(first: Level, answer: NullSpaceSolution, problem: VelocityProblem) -> Float[Array, ""]:
     """Return what the first priority misses of its scaled motion, as a gradient over the joints that can move."""
-    start = jnp.clip(jnp.zeros_like(answer.x), problem.lower, problem.upper)
+    start = clipped(jnp.zeros_like(answer.x), problem.lower, problem.upper)
     left = first.matrix @ (answer.x - start) + answer.scales[0] * first.distance(start)
     return jnp.max(jnp.abs(jnp.where(problem.lower == problem.upper, 0.0, first.matrix.T @ left)))
 

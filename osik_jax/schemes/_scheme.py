@@ -16,11 +16,12 @@ from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
 from ..numerics._constants import BELOW_OTHERS, CONSTRAINT_TOL, STANDING_SPEED
 from ..numerics._dense import apply, short_sum
+from ..numerics._guarded import quotient, safe_norm
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
-from ..tasks._curvature import fraction_to_damp, length, row_sums
+from ..tasks._curvature import fraction_to_damp, row_sums
 
 
 class VelocityProblem(eqx.Module):
@@ -69,7 +70,7 @@ class VelocityProblem(eqx.Module):
         A step leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
         different chains, so their parts add up like the sides of a right angle.
         """
-        return length(self._bounds([self.rows[name] for name in names]))
+        return safe_norm(self._bounds([self.rows[name] for name in names]))
 
     def curvature_damping(self, names: Iterable[str]) -> Float[Array, ""]:
         """Return the damping of the velocity that makes up for what the linear model of these tasks leaves out.
@@ -81,13 +82,13 @@ class VelocityProblem(eqx.Module):
         rest = [own for own in rows if not own.is_equality]
         equal = [own for own in rows if own.is_equality and own.dofs is None]  # rows on single dofs bend nothing
         if not equal:
-            return length(self._bounds(rest))
+            return safe_norm(self._bounds(rest))
         # what each row adds to its task's distance and stiffness: few operations whatever the number of tasks;
         # weights and Jacobians are NaN where the step is not valid, and times NaN a derivative of 0 is NaN
         divisors = [jnp.where(own.curvature > 0.0, own.curvature, 1.0) for own in equal]
         pull_per_curvature = jnp.concatenate(
             [
-                jnp.broadcast_to(own.pull / divisor, own.error.shape)
+                jnp.broadcast_to(quotient(own.pull, divisor), own.error.shape)
                 for own, divisor in zip(equal, divisors, strict=True)
             ]
         )
@@ -101,7 +102,7 @@ class VelocityProblem(eqx.Module):
         distance, stiffness = jnp.sum(jnp.where(of_task, parts[:, None], 0.0), axis=2)
         bounds = self._bounds(equal)
         fraction = fraction_to_damp(bounds, distance, stiffness)
-        return length(jnp.concatenate([self._bounds(rest), fraction * bounds]))
+        return safe_norm(jnp.concatenate([self._bounds(rest), fraction * bounds]))
 
     def _bounds(self, rows: Sequence[TaskRows]) -> Float[Array, " k"]:
         """Return dt times the curvature of each; no number where all tasks are hard."""
@@ -135,7 +136,7 @@ class VelocityProblem(eqx.Module):
                 Damping(
                     constant,
                     factor * self.curvature_damping(names),
-                    length(jnp.concatenate(residuals)),
+                    safe_norm(jnp.concatenate(residuals)),
                     factor * self.bends(names),
                 )
             )

@@ -15,6 +15,7 @@ from ..execution._backends import check_backend, takes
 from ..numerics._arguments import concrete
 from ..numerics._constants import DIAGONAL_RATIO, SINGLE_DAMPING
 from ..numerics._dense import short_sum
+from ..numerics._guarded import quotient
 from ..solvers import Backend, Level, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iterations
@@ -122,10 +123,10 @@ def _diagonal_terms(
         weight, wanted = (jnp.append(a, 0.0)[row_of_dof] for a in (finite, finite * rows.lower))
         diagonal, weighted = diagonal + weight, weighted + wanted
     total = curvature + DIAGONAL_RATIO * diagonal
-    diagonal = diagonal + curvature_damping * (curvature / jnp.where(total > 0.0, total, 1.0))  # b^2 overflows
+    diagonal = diagonal + curvature_damping * quotient(curvature, jnp.where(total > 0.0, total, 1.0))
     least = _least_damping(problem, backend)
     diagonal = jnp.where(diagonal < least, least, diagonal)
-    center = weighted / diagonal
+    center = quotient(weighted, jnp.where(diagonal > 0.0, diagonal, 1.0))
     for rows in single_dof:
         diagonal = jnp.where(jnp.isnan(rows.weight).any(), jnp.nan, diagonal)
     return dict(damping=diagonal, center=center)

@@ -29,6 +29,7 @@ from ..numerics._constants import (
     TIE_ROUNDOFF,
 )
 from ..numerics._dense import apply, product
+from ..numerics._guarded import clipped, quotient, safe_norm
 from ._level import positive_root
 
 
@@ -134,9 +135,9 @@ def level_damping(
         # the damped step J'(J J' + damping I)^-1 goal, clipped into the box
         total = damping.constant + damping.unmet * ratio + ridge
         factor = jnp.linalg.cholesky(gram + jnp.where(total > 0.0, total, 1.0) * eye)
-        end = jnp.clip(base + apply(rows.T, cho_solve((factor, True), goal)), lower, upper)
-        residual = positive_root(jnp.sum(level.distance(end) ** 2))
-        ratio = jnp.minimum(residual / demand, 1.0)
+        end = clipped(base + apply(rows.T, cho_solve((factor, True), goal)), lower, upper)
+        residual = safe_norm(level.distance(end))
+        ratio = jnp.minimum(quotient(residual, demand), 1.0)
     total = damping.constant + damping.unmet * ratio
     longest_square = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
     return jnp.where(total > NEGLIGIBLE_DAMPING * longest_square, total, 0.0)
@@ -171,11 +172,11 @@ def narrow_box(
         Lower and upper bounds of the new box, and the curvature with the level's own in it.
     """
     longest_square = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
-    size = positive_root(jnp.sum(level.matrix**2))
+    size = safe_norm(level.matrix.ravel())
     # the level's own curvature, in units of the Frobenius norm of its rows
-    curvature = jnp.maximum(curvature, damping.bends / jnp.where(size > 0.0, size, 1.0))
-    residual = jnp.minimum(positive_root(jnp.sum(level.distance(x) ** 2)), damping.demand)
-    ratio = residual / jnp.where(damping.demand > 0.0, damping.demand, 1.0)
+    curvature = jnp.maximum(curvature, quotient(damping.bends, jnp.where(size > 0.0, size, 1.0)))
+    residual = jnp.minimum(safe_norm(level.distance(x)), damping.demand)
+    ratio = quotient(residual, jnp.where(damping.demand > 0.0, damping.demand, 1.0))
     cost = residual * size * curvature
     is_restricted = (cost > NEGLIGIBLE_CURVATURE * jnp.max(cost)) & (
         damping.unmet * ratio > NEGLIGIBLE_DAMPING * longest_square
@@ -183,6 +184,6 @@ def narrow_box(
     count = jnp.maximum(jnp.sum(is_restricted), 1)
     # cost_j radius_j^2 = gain / count for each variable that is restricted; all without the factor 1/2
     gain = COST_FRACTION * (damping.demand - residual) * (damping.demand + residual)
-    radius = positive_root(gain / (count * jnp.where(is_restricted, cost, 1.0))) + MIN_RADIUS
+    radius = positive_root(quotient(gain, count * jnp.where(is_restricted, cost, 1.0))) + MIN_RADIUS
     radius = jnp.where(is_restricted, radius, jnp.inf)
     return jnp.maximum(lower, x - radius), jnp.minimum(upper, x + radius), curvature

@@ -25,14 +25,13 @@ from __future__ import annotations
 
 import math
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..execution._backends import cuda_is_default
 from ..numerics._constants import FARTHEST_ERROR, LEVER_ROUNDOFF, NEAR_ERROR, UNHELD_PART
 from ..numerics._dense import short_sum
-from ._gain import safe_norm
+from ..numerics._guarded import largest, quotient, safe_norm
 from ._rotation import dot
 
 
@@ -61,7 +60,7 @@ def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 3"], arms: Float[Arra
     The square of that norm is the sum of the products of two 3 x 3 matrices, entry by entry: those of
     ``pull x axis_i`` with each other, which are the axes' own between two cross products, and those of the arms.
     """
-    size = _largest(pull)
+    size = largest(pull)
     x, y, z = pull / size
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = axes
     turned = {  # a few sums of numbers are one operation, and products of small matrices are several
@@ -77,24 +76,12 @@ def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 3"], arms: Float[Arra
     return size * jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
-def length(pull: Float[Array, " m"]) -> Float[Array, ""]:
-    """Return the Euclidean norm, which does not overflow; its gradient at 0 is 0."""
-    size = _largest(pull)
-    return size * safe_norm(pull / size)
-
-
-def _largest(pull: Float[Array, " m"]) -> Float[Array, ""]:
-    """Return the largest absolute entry, 1 where all are 0; a constant for derivatives."""
-    largest = jnp.max(jnp.abs(jax.lax.stop_gradient(pull)), initial=0.0)
-    return jnp.where(largest > 0.0, largest, 1.0)
-
-
 def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"]) -> Float[Array, ""]:
     """Return the bound for any rows: the pull's length times the Frobenius norm of their Jacobian.
 
     Instead of their own, it may be a Jacobian that the rows combine.
     """
-    return length(pull) * safe_norm(jacobian.ravel())
+    return safe_norm(pull) * safe_norm(jacobian.ravel())
 
 
 def fraction_to_damp(
@@ -114,7 +101,7 @@ def fraction_to_damp(
     ratio = jnp.clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR)
     far = ratio**2 / (1.0 + ratio**2)
     total = 0.5 * bound + stiffness
-    resisted = stiffness / jnp.where(total > 0.0, total, 1.0)
+    resisted = quotient(stiffness, jnp.where(total > 0.0, total, 1.0))
     return 1.0 - (1.0 - UNHELD_PART) * far * resisted
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from ..numerics._guarded import safe_norm
 from ._leaves import as_scalar, concrete
 
 
@@ -89,11 +90,3 @@ def _at_most(gain: Float[Array, ""], cap: Float[Array, ""]) -> Float[Array, ""]:
 def evaluate_gain(gain: Gain, error: Float[Array, " m"]) -> Float[Array, ""]:
     """The gain [1/s] at this error."""
     return gain(error) if isinstance(gain, AdaptiveGain) else gain
-
-
-def safe_norm(vector: Float[Array, " m"]) -> Float[Array, ""]:
-    """Euclidean norm whose gradient at 0 is 0."""
-    squared = jnp.sum(vector**2)
-    positive = squared > 0.0
-    root = jnp.sqrt(jnp.where(positive, squared, 1.0))
-    return jnp.where(positive, root, 0.0)

@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
 from ..numerics._constants import POINTING_SINE_SQUARED
+from ..numerics._guarded import safe_norm
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._framed import FramedTask
-from ._gain import AdaptiveGain, as_gain, safe_norm
+from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_scalar, as_vector, concrete
 from ._rotation import dot
 from ._task import TaskRows, check_priority, task_rows

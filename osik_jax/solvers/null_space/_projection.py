@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from ...execution._backends import Backend
 from ...numerics._constants import FULL_STEP, NEGLIGIBLE_STEP
 from ...numerics._dense import apply, product
+from ...numerics._guarded import quotient
 from .._damping import Damping, level_damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
@@ -128,5 +129,5 @@ def damped_step_length(
     square = jnp.sum(step**2)
     cost = jnp.sum(change**2) + damping * square
     is_damped = (damping > 0.0) & (cost > 0.0) & (square > NEGLIGIBLE_STEP**2 * jnp.sum(start**2))
-    length = jnp.sum(change * task.error) / jnp.where(is_damped, cost, 1.0)
+    length = quotient(jnp.sum(change * task.error), jnp.where(is_damped, cost, 1.0))
     return jnp.where(is_damped & (length < FULL_STEP), jnp.maximum(length, 0.0), 1.0)

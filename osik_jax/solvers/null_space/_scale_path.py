@@ -27,6 +27,7 @@ from ...execution._lanes import choose
 from ...execution._rules import custom_jvp
 from ...numerics._constants import DERIVATIVE_RANK, PART, PATH_END, PATH_SEARCHES, PATH_STEP, STRAIGHT, WHOLE
 from ...numerics._dense import apply, product
+from ...numerics._guarded import quotient
 from ._padding import PaddedLevel
 from ._problem import ActiveTask
 from ._projection import damped_step_length
@@ -113,7 +114,7 @@ def best_scale(
     cost = jnp.sum(change**2) + damping * jnp.sum(along**2)
     gain = jnp.sum(change * task.error) - damping * jnp.sum(begin * along - problem.start * problem.motion)
     moves = cost > 0.0
-    return jnp.where(moves, gain / jnp.where(moves, cost, 1.0), 1.0)
+    return jnp.where(moves, quotient(gain, jnp.where(moves, cost, 1.0)), 1.0)
 
 
 def at_bounds(

@@ -55,6 +55,7 @@ from ...numerics._constants import (
     STIFFER_COMPLIANCE,
 )
 from ...numerics._dense import apply
+from ...numerics._guarded import quotient
 from .._box import clip_to_box
 from .._goldfarb_idnani import Constraints, DualState, Roundoff, dual_active_set, initial_state
 
@@ -289,4 +290,4 @@ def blocked_scale(problem: ScaledMotion, active: Int[Array, " n"], normal: Float
     """
     gap = jnp.sum(normal * jnp.where(active != 0, problem.bound(active) - problem.start, 0.0))
     rate = jnp.sum(normal * problem.motion)
-    return jnp.clip(jnp.where(rate != 0.0, gap / jnp.where(rate != 0.0, rate, 1.0), 1.0), 0.0, 1.0)
+    return jnp.clip(jnp.where(rate != 0.0, quotient(gap, jnp.where(rate != 0.0, rate, 1.0)), 1.0), 0.0, 1.0)

@@ -21,12 +21,12 @@ from ...numerics._constants import (
     AT_UPPER,
     EQUALITY,
     INACTIVE,
+    INFEASIBLE_COMPLIANCE,
     KKT_TOLERANCE,
     MAX_INFEASIBLE,
     MAX_ROUNDS,
     REDUNDANCY_TOL,
     RELAXED,
-    SOFT_COMPLIANCE,
 )
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
@@ -172,7 +172,7 @@ def _by_newton(qp: QP, result: SearchResult, *, kkt_tol: float, max_iterations: 
     # a minimiser gets one more round; the least violation of infeasible rows is final
     infeasible = end.converged & end.infeasible
     optimal = end.converged & ~end.infeasible
-    softened = jnp.maximum(SOFT_COMPLIANCE * largest[:, None], qp.compliance)
+    softened = jnp.maximum(INFEASIBLE_COMPLIANCE * largest[:, None], qp.compliance)
     return result._replace(
         x=end.x,
         row_multipliers=end.row_multipliers,

@@ -1,0 +1,42 @@
+"""Arithmetic whose derivatives hold where bounds coincide, and where the squares of small numbers underflow."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def quotient(a: Float[Array, "*#S"], b: Float[Array, "*#S"]) -> Float[Array, "*S"]:
+    """Return a / b for a b that is not 0; its derivatives need no square of b.
+
+    The derivative of ``a / b`` itself divides by b^2. In single precision that is 0 for a b of 1e-23, and the
+    derivative NaN.
+    """
+    size = jax.lax.stop_gradient(b)
+    return (a / size) / (b / size)
+
+
+def safe_norm(vector: Float[Array, " m"]) -> Float[Array, ""]:
+    """Return the Euclidean norm, whose squares neither overflow nor underflow; its gradient at 0 is 0."""
+    size = largest(vector)
+    squared = jnp.sum((vector / size) ** 2)
+    positive = squared > 0.0
+    return size * jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+
+def largest(vector: Float[Array, "..."]) -> Float[Array, ""]:
+    """Return the largest absolute entry, 1 where all are 0; a constant for derivatives."""
+    found = jnp.max(jnp.abs(jax.lax.stop_gradient(vector)), initial=0.0)
+    return jnp.where((found > 0.0) & (found < jnp.inf), found, 1.0)
+
+
+def clipped(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return x clipped into [lower, upper]; where all three are one number, the derivative is that of the bounds.
+
+    With bounds that are one number the result is that number, whatever x does. ``jnp.clip`` gives x a quarter of the
+    derivative there. Where x touches one bound alone, the derivative is the mean of both sides.
+    """
+    pinned = (x == lower) & (lower == upper)
+    low, high = (jnp.where(pinned, bound, 0.0) for bound in (lower, upper))
+    return jnp.where(pinned, 0.5 * low + 0.5 * high, jnp.clip(x, lower, upper))

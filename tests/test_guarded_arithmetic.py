@@ -1,0 +1,119 @@
+"""Derivatives where bounds coincide and where squares of small numbers underflow, and names that are given once."""
+
+import ast
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.numerics._guarded import clipped, quotient, safe_norm
+
+SIZES = [1e-30, 1e-20, 1e-12, 1.0, 1e12]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_derivatives_of_a_quotient_in_single_precision(size):
+    a, b = np.float32(3.0 * size), np.float32(2.0 * size)
+    value, (by_a, by_b) = jax.value_and_grad(quotient, argnums=(0, 1))(a, b)
+    assert value.dtype == np.float32
+    np.testing.assert_allclose([value, by_a * size, by_b * size], [1.5, 0.5, -0.75], rtol=1e-6)
+
+
+def test_a_quotient_has_the_value_and_the_second_derivative_of_a_division(rng):
+    a, b = rng.normal(size=(2, 20))
+    np.testing.assert_array_equal(quotient(a, b), a / b)
+    second = jax.vmap(jax.grad(jax.grad(quotient, 1), 1))(a, b)
+    np.testing.assert_allclose(second, 2.0 * a / b**3, rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_norm_in_single_precision(size):
+    vector = np.array([3.0 * size, 0.0, -4.0 * size], np.float32)
+    value, gradient = jax.value_and_grad(safe_norm)(vector)
+    np.testing.assert_allclose(value, 5.0 * size, rtol=1e-6)
+    np.testing.assert_allclose(gradient, [0.6, 0.0, -0.8], atol=1e-6)
+    np.testing.assert_array_equal(jax.grad(safe_norm)(0.0 * vector), 0.0)
+
+
+def test_a_clip_between_equal_bounds_has_their_derivative():
+    def at(t, pinned):
+        return clipped(1.0 + 3.0 * t, 1.0 + pinned * t, 1.0 + pinned * t)
+
+    for pinned in (0.0, 2.0):
+        np.testing.assert_allclose(jax.grad(at)(0.0, pinned), pinned)
+    x = jnp.array([-2.0, -1.0, 0.5, 1.0, 2.0])
+    np.testing.assert_array_equal(clipped(x, -jnp.ones(5), jnp.ones(5)), np.clip(x, -1.0, 1.0))
+    slopes = jax.vmap(jax.grad(lambda x: clipped(x, -1.0, 1.0)))(x)
+    np.testing.assert_array_equal(slopes, [0.0, 0.5, 1.0, 0.5, 0.0])
+
+
+ARM = osik.load_robot("arm7")
+NOMINAL = osik.VelocityLimit(ARM, velocity={"*": 2.0})
+PINNED = osik.VelocityLimit(ARM, velocity={"*": 2.0, "joint1": 0.0, "joint4": 0.0})
+ONE_POSE = np.array([0.3, *ARM.position_upper[1:]])
+LIMITS = {
+    "range": (osik.ConfigurationLimit(ARM),),
+    "speed": (osik.ConfigurationLimit(ARM), NOMINAL),
+    "pinned": (osik.ConfigurationLimit(ARM), PINNED),
+    "gain": (osik.ConfigurationLimit(ARM, gain=0.3), PINNED),
+    "return speed": (osik.ConfigurationLimit(ARM, return_speed={"*": 0.5, "joint1": 1e-9}), NOMINAL),
+    "one pose": (osik.ConfigurationLimit(ARM, lower={"joint1": 0.3}, upper={"joint1": 0.3}), NOMINAL),
+    "acceleration": (
+        osik.AccelerationLimit(ARM, {"*": 5.0}, velocity={"*": 0.1}),
+        osik.ConfigurationLimit(ARM),
+        NOMINAL,
+    ),
+    "acceleration, pinned": (osik.AccelerationLimit(ARM, {"*": 5.0}), osik.ConfigurationLimit(ARM), PINNED),
+}
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_the_box_has_the_slopes_of_differences(name, rng):
+    """At the ends of ranges, beyond them and inside: the derivative is between the slopes of both sides."""
+    step = 1e-7
+    box = jax.jit(jax.vmap(lambda q: jnp.stack(osik.limit_box(ARM, q, LIMITS[name], 0.005))))
+    low, high = (np.asarray(a, float) for a in (ARM.position_lower, ARM.position_upper))
+    inside = rng.uniform(low, high, (20, ARM.nq))
+    near = high - rng.exponential(0.01, (20, ARM.nq))
+    q = np.concatenate([[low, high, high + 0.1, low - 0.1, ONE_POSE, ARM.q0], inside, near])
+    # each bound depends on its own joint alone, so one direction has all slopes
+    _, slopes = jax.jvp(box, (q,), (np.ones_like(q),))
+    here, after, before = (np.asarray(box(q + shift)) for shift in (0.0, step, -step))
+    sides = np.stack([(after - here) / step, (here - before) / step])
+    finite = np.isfinite(here)
+    assert np.isfinite(slopes).all() and finite.any()
+    slack = 1e-5 * (1.0 + np.abs(slopes))
+    assert (slopes >= sides.min(0) - slack)[finite].all() and (slopes <= sides.max(0) + slack)[finite].all()
+
+
+@pytest.mark.slow
+def test_derivatives_of_the_saturated_null_space_near_a_target_in_single_precision():
+    def rate(precision):
+        with jax.enable_x64(precision == "float64"):
+            arm = osik.load_robot("arm7")
+            hand, posture = osik.FrameTask(arm, "hand", priority=1), osik.PostureTask(arm, weight=1e-3, priority=2)
+            p, R = hand.target
+
+            def velocity(e):
+                given = {"hand": hand.replace(target=(p + e, R)), "posture": posture}
+                return osik.solve(arm, arm.q0, given, scheme=osik.NullSpace(method="saturated")).velocity.sum()
+
+            distances = jnp.array([1e-2, 1e-3, 1e-4, 1e-6], precision)
+            return jax.jit(jax.vmap(lambda e: jax.jvp(velocity, (e,), (jnp.ones_like(e),))[1]))(distances)
+
+    np.testing.assert_allclose(rate("float32"), rate("float64"), rtol=1e-3)
+
+
+def test_no_module_gives_a_name_to_two_values():
+    """The second value of a constant stands silently against the text and the tables of the first."""
+    twice = []
+    for path in sorted(Path(osik.__file__).parent.rglob("*.py")):
+        statements = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Assign | ast.AnnAssign)]
+        targets = [a for node in statements for a in (node.targets if isinstance(node, ast.Assign) else [node.target])]
+        inside = [a for target in targets for a in ast.walk(target) if isinstance(a, ast.Name)]
+        names = [a.id for a in inside if isinstance(a.ctx, ast.Store)]
+        twice += [f"{path.name}: {name}" for name in sorted(set(names)) if names.count(name) > 1]
+    assert not twice
