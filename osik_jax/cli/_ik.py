@@ -38,8 +38,8 @@ class Ik:
     """Of the solutions that are found, the one nearest to the home configuration."""
     all: bool = False
     """Print all solutions that differ."""
-    seeds: int = 64
-    """Number of searches."""
+    seeds: int | None = None
+    """Number of searches. Default: 64; with --nearest and --all up to 256, by the number of joints."""
     key: int = 0
     """Number of the sequence of their starts."""
     position_tolerance: float = 1e-3

@@ -19,6 +19,8 @@ from ..kinematics._rigid import compose, cross, rotate, rotation_matrix
 from ..robot import Robot
 from ..robot._tree import HINGE, SLIDE, KinematicTree
 
+_SMALL_ANGLE_SQUARED = 1e-6
+
 
 class Layout(NamedTuple):
     """Which joints take part, and how they hang together; hashable.
@@ -249,6 +251,12 @@ def _times(a: Float[Array, "*k m 3 lanes"], b: Float[Array, "*k 3 n lanes"]) -> 
 
 def jacobian(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames 6 n lanes"]:
     """Of each frame over the chain's coordinates: rows [linear; angular] in world axes, linear at its origin."""
+    own, layout = _joint_columns(chain, kinematics), chain.layout
+    return jnp.stack([_column(layout, own, dof) for dof in layout.dofs], 2)
+
+
+def _joint_columns(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames k 6 lanes"]:
+    """The same over the chain's joints."""
     layout = chain.layout
     hinge = np.array(layout.hinges)[:, None, None]
     columns = []
@@ -257,8 +265,57 @@ def jacobian(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames 
         linear = jnp.where(hinge, cross(kinematics.axis, arm, along=-2), kinematics.axis)
         both = jnp.concatenate([linear, jnp.where(hinge, kinematics.axis, 0.0)], 1)
         columns.append(jnp.where(np.array(carried)[:, None, None], both, 0.0))
-    own = jnp.stack(columns)  # (frames, k, 6, lanes)
-    return jnp.stack([_column(layout, own, dof) for dof in layout.dofs], 2)
+    return jnp.stack(columns)
+
+
+def curvature(
+    chain: Chain,
+    kinematics: ChainKinematics,
+    linear: Float[Array, "frames 3 lanes"],
+    angular: Float[Array, "frames 3 lanes"],
+    radian: Float[Array, ""],
+) -> Float[Array, "n n lanes"]:
+    """What the Hessian of half the squared errors has beside J'J, with J as in ``jacobian``.
+
+    Where joint a comes before joint b, ``d^2 p / da db = w_a x (dp / db)``, w_a being the axis of a hinge and 0 for a
+    slide. The derivative of the angular error is ``I - K / 2 + c K^2`` times the angular velocity, K being its cross
+    matrix and ``c = (1 - (t / 2) cot(t / 2)) / t^2`` for an angle t.
+
+    Args:
+        chain: the chain.
+        kinematics: of it.
+        linear: position error of each frame [m].
+        angular: orientation error of each frame, axis times angle [rad]; 0 where the orientation is free.
+        radian: what a radian of it counts as [m].
+    """
+    first = np.triu(np.ones((len(chain.layout.joints),) * 2, bool))[..., None]
+    parts = []
+    for at, own in enumerate(_joint_columns(chain, kinematics)):
+        turn = own[:, 3:]
+        lever = cross(own[:, :3], linear[at][None], along=-2)
+        lever = lever + 0.5 * radian**2 * cross(turn, angular[at][None], along=-2)
+        pairs = jnp.sum(turn[:, None] * lever[None], 2)
+        aside = cross(turn, angular[at][None], along=-2)
+        squares = radian**2 * _log_curvature(angular[at]) * jnp.sum(aside[:, None] * aside[None], 2)
+        parts.append(jnp.where(first, pairs, jnp.swapaxes(pairs, 0, 1)) - squares)
+    moved = _entry_factors(chain.layout)
+    return jnp.einsum("ai,ijl,bj->abl", moved, sum(parts[1:], parts[0]), moved, precision="highest")
+
+
+def _log_curvature(angular: Float[Array, "3 lanes"]) -> Float[Array, " lanes"]:
+    squared = jnp.sum(angular**2, 0)
+    small = squared < _SMALL_ANGLE_SQUARED
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    return jnp.where(small, 1.0 / 12.0, (1.0 - 0.5 * angle / jnp.tan(0.5 * angle)) / angle**2)
+
+
+def _entry_factors(layout: Layout) -> Float[np.ndarray, "n k"]:
+    """By how much each coordinate moves each joint."""
+    out = np.zeros((len(layout.dofs), len(layout.joints)))
+    for at, entry in enumerate(layout.entries):
+        if entry >= 0:
+            out[layout.dofs.index(entry), at] = layout.factors[at]
+    return out
 
 
 def _column(layout: Layout, own: Float[Array, "frames k 6 lanes"], dof: int) -> Float[Array, "frames 6 lanes"]:

@@ -11,13 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, scalar_layout
-from ..robot._tree import HINGE
-from ._chain import Chain, chain_kinematics, chain_layout, make_chain
-from ._chain_search import ChainSearch, Goal
+from ._chain import Chain, Layout, chain_kinematics, chain_layout, make_chain
+from ._chain_search import ChainSearch, Goal, lanes_last
 from ._fixed import at_solution
 from ._pool import Errors
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
+from ._turns import one_turn
 
 _ROUNDOFF = 64.0
 """Machine epsilons, of the robot's size, by which computed errors may be off."""
@@ -74,6 +74,15 @@ class ChainRoute(NamedTuple):
         """Entries of q that a search moves."""
         return np.array(chain_layout(robot.tree, self.frames).dofs, int)
 
+    def asked(self, settings: Settings) -> dict[str, tuple[bool, ...]]:
+        """The rows of each frame that count."""
+        del settings
+        return dict(zip(self.frames, self.rows, strict=True))
+
+    def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
+        """Whether a whole turn of each of these entries changes no pose."""
+        return np.array(turning(chain_layout(robot.tree, self.frames)))
+
     def answer(self, robot: Robot, search: ChainSearch, goal: Goal, x: Array, seed: Array, steps: Array) -> Any:
         """What was found for many targets, its errors computed anew, with the derivative of a solution."""
         return answer(robot, self, search, goal, x, seed, steps)
@@ -88,11 +97,12 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
     dofs = dof_of_entries(robot)[coordinates]
     lower, upper = settings.lower[dofs], settings.upper[dofs]
     first = jnp.clip(settings.home[coordinates], lower, upper)
-    box = starting_box(lower, upper)
-    low, high = _starts(robot, coordinates, *box, first)
+    box, turns = starting_box(lower, upper), turning(layout)
+    low, high = _starts(layout, turns, *box, first)
     length = jnp.max(jax.lax.stop_gradient(reaches(chain, first, *box)[0]))
     return ChainSearch(
         rows=rows,
+        turns=turns,
         chain=chain,
         lower=lower,
         upper=upper,
@@ -125,13 +135,22 @@ def dof_of_entries(robot: Robot) -> np.ndarray:
     return out
 
 
-def _starts(robot: Robot, coordinates: np.ndarray, lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
-    """Finite ends of where searches start: the limits, or half a turn or a metre around the first configuration."""
-    kinds = {at: robot.tree.joint_types[joint] for joint, at in robot.tree.qpos_address.items()}
-    width = np.array([np.pi if kinds[at] == HINGE else 1.0 for at in coordinates.tolist()])
+def turning(layout: Layout) -> tuple[bool, ...]:
+    """Whether a whole turn of each coordinate brings every joint that it moves to the same place."""
+    moved = [[j for j, entry in enumerate(layout.entries) if entry == dof] for dof in layout.dofs]
+    return tuple(all(layout.hinges[j] and layout.factors[j] % 1.0 == 0.0 for j in own) for own in moved)
+
+
+def _starts(layout: Layout, turns: tuple[bool, ...], lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
+    """Finite ends of where searches start: the limits, one turn of them, or a metre around the first configuration."""
+    hinge = np.array([layout.hinges[layout.entries.index(dof)] for dof in layout.dofs])
+    width = np.where(hinge, np.pi, 1.0)
     free = jnp.isinf(lower) | jnp.isinf(upper)
     low = jnp.where(free, jnp.maximum(first - width, lower), lower)
-    return low.astype(first.dtype), jnp.where(free, jnp.minimum(first + width, upper), upper).astype(first.dtype)
+    high = jnp.where(free, jnp.minimum(first + width, upper), upper)
+    once, again = one_turn(lower, upper, first)
+    wide = np.array(turns) & (upper - lower > 2.0 * np.pi)
+    return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, again, high).astype(first.dtype)
 
 
 def reaches(chain: Chain, x: Array, lower: Array, upper: Array) -> tuple[Float[Array, " frames"], Array]:
@@ -160,9 +179,9 @@ def answer(
     steps: Int[Array, " targets"],
 ) -> InverseKinematicsSolution:
     """What was found for many targets, its errors computed anew, with the derivative of a solution."""
-    x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
+    x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
     fixed_search, fixed_x = jax.lax.stop_gradient((search, x))
-    turned = Goal(jnp.moveaxis(goal.position, 0, -1), jnp.moveaxis(goal.rotation, 0, -1))
+    turned = lanes_last(goal)
     residual, active, errors = _evaluated(fixed_search, fixed_x.T, jax.lax.stop_gradient(turned))
     converged = errors.score <= 1.0
     coordinates = np.array(search.chain.layout.dofs, int)

@@ -9,18 +9,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt
+from jaxtyping import Array, Bool, Float, Int, UInt
 
-from ._chain import Chain, chain_kinematics, jacobian
+from ._chain import Chain, ChainKinematics, chain_kinematics, curvature, jacobian
 from ._error import rotation_error
-from ._linear import solve_positive
+from ._linear import solve_positive, solve_with_pivots
+from ._minimum import minimum
 from ._pool import Errors
 from ._seeds import unit_points
+from ._turns import unwound
 
 _DAMPING = 0.03
 """Of the squared error: with less, steps from afar go too far; with more, they are short."""
 _LEAST_DAMPING = 1e-5
 """Of the squared length that a radian counts as: keeps singular arms from long steps where the error is small."""
+_ISOLATED = 0.01
+"""An arm is not singular where each motion by 1 rad moves a frame by this, relative to what a radian counts as."""
+_GAIN = 1e-4
+"""A step towards a local optimum that promises less, relative to the position tolerance, is the last one."""
 
 
 class Goal(NamedTuple):
@@ -35,6 +41,11 @@ class Goal(NamedTuple):
     rotation: Float[Array, "*lanes frames 3 3"]
 
 
+def lanes_last(goal: Goal) -> Goal:
+    """Goals with the lanes behind, where they are in front."""
+    return Goal(jnp.moveaxis(goal.position, 0, -1), jnp.moveaxis(goal.rotation, 0, -1))
+
+
 class ChainSearch(eqx.Module):
     """Levenberg-Marquardt steps with a damping proportional to the squared error, projected into the box.
 
@@ -44,6 +55,7 @@ class ChainSearch(eqx.Module):
 
     Attributes:
         rows: of each frame, the rows that count: x, y, z, rotation about x, y, z (static).
+        turns: of each coordinate, whether a whole turn of it changes no pose (static).
         chain: geometry.
         lower: of the chain's coordinates, -inf where free. (n,)
         upper: (n,)
@@ -62,6 +74,7 @@ class ChainSearch(eqx.Module):
     """
 
     rows: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
+    turns: tuple[bool, ...] = eqx.field(static=True)
     chain: Chain
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
@@ -90,7 +103,7 @@ class ChainSearch(eqx.Module):
 
     def advance(self, x: Float[Array, "lanes n"], goal: Goal, steps: int) -> tuple[Array, Array, Errors]:
         """Some steps: where the last one set out, where it led, and the errors of where it set out."""
-        turned = Goal(jnp.moveaxis(goal.position, 0, -1), jnp.moveaxis(goal.rotation, 0, -1))
+        turned = lanes_last(goal)
 
         def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
             at = carry[1]
@@ -129,16 +142,63 @@ class ChainSearch(eqx.Module):
         step = _transposed_times(matrix, solve_positive(_gram(matrix, ridge), error))
         return forced - step[:, 0]
 
+    def unwound(self, x: Float[Array, "*lanes n"]) -> Float[Array, "*lanes n"]:
+        """The same poses, each joint as near to the first configuration as whole turns within its limits bring it."""
+        return unwound(x, self.first, self.lower, self.upper, self.turns)
+
     def distance(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         """From where search 0 starts."""
         return jnp.sqrt(jnp.sum((x - self.first) ** 2))
 
-    def finishing(self) -> ChainSearch:
-        """The same search without the term that draws it to the first configuration, for the last steps."""
-        return dataclasses.replace(self, near=False)
+    def finishing(self, exact: bool) -> ChainSearch:
+        """The same search without the term that draws it to the first configuration, for the last steps.
+
+        ``exact``: it goes on beyond what the tolerances ask for.
+        """
+        enough = jnp.zeros_like(self.enough) if exact else self.enough
+        return dataclasses.replace(self, near=False, enough=enough)
+
+    def isolated(self, x: Float[Array, "lanes n"], goal: Goal) -> Bool[Array, " lanes"]:
+        """Whether a solution is the only one around: every motion of the joints takes a frame off its target."""
+        matrix = self.linearised(x.T, lanes_last(goal))[1]
+        if len(matrix) < x.shape[1]:
+            return jnp.zeros(len(x), bool)
+        squares = jnp.sum(matrix[:, :, None] * matrix[:, None], 0)
+        _, pivot = solve_with_pivots(squares, jnp.zeros_like(x.T))
+        return pivot > (_ISOLATED * self.length) ** 2
+
+    def costs(self, x: Float[Array, "lanes n"], goal: Goal) -> Float[Array, " lanes"]:
+        """What ``local_optima`` minimises."""
+        return 0.5 * self._measuring().linearised(x.T, lanes_last(goal))[2].cost
+
+    def local_optima(
+        self, x: Float[Array, "lanes n"], goal: Goal, open_: Bool[Array, " lanes"]
+    ) -> tuple[Float[Array, "lanes n"], Float[Array, " lanes"], Int[Array, " lanes"]]:
+        """Local optima from some starts, their errors [m], and the steps taken; lanes that are not open stay."""
+        own, turned, gain = self._measuring(), lanes_last(goal), _GAIN * self.tolerance[0]
+        found = minimum(lambda x: own.model(x, turned), x.T, self.lower, self.upper, open_, gain)
+        return found.x.T, jnp.sqrt(2.0 * found.cost), found.steps
+
+    def _measuring(self) -> ChainSearch:
+        """The same errors, with a radian for as many metres as the tolerances say."""
+        return dataclasses.replace(self, length=self.tolerance[0] / self.tolerance[1])
+
+    def model(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Array]:
+        """Error of each row that counts [m], its derivative, and its second derivatives times it (n, n, lanes)."""
+        error, matrix, (kinematics, linear, angular) = self._rows(x, goal)
+        kept = np.array(self.rows)[..., None]
+        linear, angular = jnp.where(kept[:, :3], linear, 0.0), jnp.where(kept[:, 3:], angular, 0.0)
+        return error, matrix, curvature(self.chain, kinematics, linear, angular, self.length)
 
     def linearised(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
         """Error of each row that counts [m], its derivative (rows, n, lanes), and the errors of the frames."""
+        error, matrix, (_, linear, angular) = self._rows(x, goal)
+        return error, matrix, self._errors(linear, angular, jnp.sum(error**2, 0))
+
+    def _rows(
+        self, x: Float[Array, "n lanes"], goal: Goal
+    ) -> tuple[Array, Array, tuple[ChainKinematics, Array, Array]]:
+        """Error of each row that counts, its derivative, and the kinematics and errors that they are taken from."""
         kinematics = chain_kinematics(self.chain, x)
         linear = kinematics.position - goal.position
         angular = rotation_error(kinematics.rotation, goal.rotation)
@@ -149,7 +209,7 @@ class ChainSearch(eqx.Module):
         lanes = x.shape[-1]
         error = rows.reshape(-1, lanes)[kept]
         matrix = matrix.reshape(-1, len(x), lanes)[kept]
-        return error, matrix, self._errors(linear, angular, jnp.sum(error**2, 0))
+        return error, matrix, (kinematics, linear, angular)
 
     def _errors(self, linear: Array, angular: Array, cost: Array) -> Errors:
         kept = np.array(self.rows)

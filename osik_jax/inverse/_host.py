@@ -60,5 +60,22 @@ def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
     return jax.tree.map(lambda *own: np.concatenate(own), *parts) if len(parts) > 1 else parts[0]
 
 
+def only(chosen: np.ndarray, function: Callable[..., Any], *args: Any) -> Any:
+    """``function(*args)`` of the chosen targets alone, which are filled up to a power of two; others get any numbers.
+
+    Args:
+        chosen: targets, at least one. (targets,)
+        function: of pytrees with the targets in front.
+        args: what it is called with for all targets.
+    """
+    number = np.flatnonzero(chosen)
+    size = _power_of_two(len(number))
+    here = np.pad(number, (0, size - len(number)), mode="edge")
+    out = jax.device_get(function(*jax.tree.map(lambda a: np.asarray(a)[here], args)))
+    place = np.zeros(len(chosen), int)
+    place[number] = np.arange(len(number))
+    return jax.tree.map(lambda a: a[place], out)
+
+
 def _power_of_two(count: int) -> int:
     return 1 << (count - 1).bit_length()

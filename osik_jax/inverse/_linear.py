@@ -8,16 +8,27 @@ from jaxtyping import Array, Float
 
 
 def solve_positive(matrix: Float[Array, "m m lanes"], vector: Float[Array, "m lanes"]) -> Float[Array, "m lanes"]:
-    """matrix^-1 vector by elimination without pivoting, which a positive definite matrix allows.
+    """matrix^-1 vector by elimination without pivoting, which a positive definite matrix allows."""
+    return solve_with_pivots(matrix, vector)[0]
+
+
+def solve_with_pivots(
+    matrix: Float[Array, "m m lanes"], vector: Float[Array, "m lanes"]
+) -> tuple[Float[Array, "m lanes"], Float[Array, " lanes"]]:
+    """Return matrix^-1 vector as ``solve_positive``, and the smallest pivot, which is positive if the matrix is.
 
     A loop over rows, each pass on all lanes: batched LAPACK calls on matrices of six rows cost many times as much.
     """
 
-    def eliminate(at: Array, both: Array) -> Array:
+    def eliminate(at: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        both, least = carry
         row = jax.lax.dynamic_index_in_dim(both, at, 0, keepdims=False)
         column = jax.lax.dynamic_index_in_dim(both, at, 1, keepdims=True)
-        row = row / jax.lax.dynamic_index_in_dim(row, at, 0, keepdims=False)
-        return jax.lax.dynamic_update_index_in_dim(both - column * row, row, at, 0)
+        pivot = jax.lax.dynamic_index_in_dim(row, at, 0, keepdims=False)
+        row = row / pivot
+        both = jax.lax.dynamic_update_index_in_dim(both - column * row, row, at, 0)
+        return both, jnp.minimum(least, pivot)
 
     both = jnp.concatenate([matrix, vector[:, None]], 1)
-    return jax.lax.fori_loop(0, len(matrix), eliminate, both)[:, -1]
+    both, least = jax.lax.fori_loop(0, len(matrix), eliminate, (both, jnp.full_like(vector[0], jnp.inf)))
+    return both[:, -1], least

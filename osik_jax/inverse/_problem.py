@@ -17,8 +17,8 @@ from ..tasks import FrameTask, Task
 from ._chain import is_plain
 from ._chain_problem import ChainRoute
 from ._poses import read_poses
-from ._task_problem import TaskParts, TaskRoute, read_limits, read_scheme, read_tasks
-from ._task_search import Aims
+from ._task_problem import TaskParts, TaskRoute, read_limits, read_tasks
+from ._task_search import CURVATURE, Aims, damped
 
 
 class Problem(NamedTuple):
@@ -84,7 +84,7 @@ def _of_tasks(
         aims[name] = jax.tree.map(lambda a: jnp.broadcast_to(a, (number, *a.shape[1:])), own)
     chosen = jax.tree.map(lambda a: a.astype(robot.q0.dtype), WeightedQP()) if scheme is None else scheme
     goals = Aims(jnp.arange(number, dtype=jnp.int32), aims)
-    return Problem(TaskRoute(), goals, TaskParts(known, read_scheme(chosen), read_limits(robot, limits)), many)
+    return Problem(TaskRoute(), goals, TaskParts(known, damped(chosen, CURVATURE), read_limits(robot, limits)), many)
 
 
 def _aims(targets: Any, tasks: Mapping[str, Task], count: int | None) -> tuple[dict[str, Any], int | None]:

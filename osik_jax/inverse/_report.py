@@ -15,10 +15,15 @@ if TYPE_CHECKING:
 
 
 def print_found(console: Console, robot: Robot, found: InverseKinematicsSolution) -> None:
-    """What was found for one target, or what stops the robot, and the configurations joint by joint."""
+    """What was found for one target, or what stops the robot, and the configurations joint by joint.
+
+    Of several, those that differ by more than whole turns.
+    """
     console.print(found.explain(), markup=False, highlight=False)
     several = found.solutions is not None and found.converged
-    solutions = list(found.solutions[: int(found.count)]) if several else [found.q]  # pyright: ignore
+    solutions = list(found.solutions[: int(found.branches)]) if several else [found.q]  # pyright: ignore
+    if several and found.count > found.branches:  # pyright: ignore
+        console.print(f"beside these, {int(found.count - found.branches)} that differ by whole turns")  # pyright: ignore
     for q in solutions:
         console.print(configuration_table(robot, q))
 

@@ -31,14 +31,17 @@ class InverseKinematicsSolution(eqx.Module):
             would reduce the error; else 0. (..., nv)
         beyond_reach: how far the target is at least from all that the frame could ever reach, from the lengths of the
             links alone [m]: more than 0 proves that there is no solution. (...)
-        solutions: with ``all=True``, the distinct solutions, ``q`` first; rows from ``count`` on are NaN.
-            (..., seeds, nq)
+        solutions: with ``all=True``, the distinct solutions: ``q``, then the other branches, then copies of these by
+            whole turns of joints whose limits allow it. Each branch is as near to ``q0`` as whole turns bring it. Rows
+            from ``count`` on are NaN. (..., seeds, nq)
         count: with ``all=True``, how many there are. (...)
+        branches: with ``all=True``, how many differ by more than whole turns: the first rows of ``solutions``. (...)
         clearance: with a ``CollisionAvoidanceLimit``, the distance of the nearest pair less ``minimum_distance`` [m].
             (...)
         nearest_pair: number of that pair in ``pairs``. (...)
         joints: names of the joints, for each entry of v (static).
         pairs: names of the shapes that are kept apart (static).
+        advice: what to ask for instead, where frames have more rows than joints carry them (static).
     """
 
     q: Float[Array, "*n nq"]
@@ -52,10 +55,12 @@ class InverseKinematicsSolution(eqx.Module):
     beyond_reach: Float[Array, "*n"]
     solutions: Float[Array, "*n seeds nq"] | None = None
     count: Int[Array, "*n"] | None = None
+    branches: Int[Array, "*n"] | None = None
     clearance: Float[Array, "*n"] | None = None
     nearest_pair: Int[Array, "*n"] | None = None
     joints: tuple[str, ...] = eqx.field(default=(), static=True)
     pairs: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
+    advice: tuple[str, ...] = eqx.field(default=(), static=True)
 
     def explain(self, index: int | None = None) -> str:
         """What was found for a target, in words: the errors, and what stops the robot where it does not get there.
@@ -91,6 +96,7 @@ class InverseKinematicsSolution(eqx.Module):
         if self.clearance is not None and self.nearest_pair is not None and pick(self.clearance) < _NEAR:
             one, other = self.pairs[int(pick(self.nearest_pair))]
             reasons.append(f"{one} and {other} are {float(pick(self.clearance)):+.3g} m from as near as they may be")
+        reasons = [*self.advice, *reasons]
         return reasons or ["no limit stops a joint: the links are stretched, folded or turned as far as they go"]
 
 

@@ -19,15 +19,18 @@ from ..robot._balls import ball_rotation, independent_balls, with_balls_inside
 from ..robot._joint_selection import dof_names, dofs_of
 from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
-from ..tasks import Task
+from ..tasks import AxisAlignTask, ComTask, ContactTask, FrameTask, LookAtTask, RelativeFrameTask, Task
 from ._chain_problem import Settings, allowed
 from ._fixed import at_solution
 from ._pool import Errors
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
-from ._task_search import CURVATURE, Aims, TaskSearch, entry_limits, is_goal
+from ._task_search import Aims, TaskSearch, entry_limits, is_goal
+from ._turns import TURN, one_turn
 
 _KEPT = (ConfigurationLimit, CollisionAvoidanceLimit, PositionBarrier)
+_ON_PLACES = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask, ComTask, ContactTask)
+"""Tasks that see where bodies are and not by which joints."""
 _ENOUGH = 0.01
 _RADIUS = 1.0
 """What the positions' rounding is counted by [m]."""
@@ -59,10 +62,12 @@ class TaskRoute(NamedTuple):
         del warm, near
         parts: TaskParts = settings.parts
         lower, upper = entry_limits(robot, settings.lower, settings.upper)
+        box, turns = starting_box(lower, upper), turning(robot, parts.tasks)
         first = with_balls_inside(robot.tree, jnp.clip(settings.home, lower, upper), settings.upper)
-        low, high = _starts(robot, *starting_box(lower, upper), first)
+        low, high = _starts(robot, turns, *box, first)
         return TaskSearch(
             robot=robot,
+            turns=turns,
             tasks=parts.tasks,
             scheme=parts.scheme,
             limits=parts.limits,
@@ -75,6 +80,7 @@ class TaskRoute(NamedTuple):
             shift=shift_of(settings.key, robot.nq),
             tolerance=allowed(settings.tolerance, jnp.asarray(_RADIUS, first.dtype)),
             enough=jnp.asarray(_ENOUGH, first.dtype),
+            preferred=jnp.ones((), first.dtype),
         )
 
     def beyond(self, search: TaskSearch, goal: Aims) -> Float[Array, " targets"]:
@@ -85,9 +91,18 @@ class TaskRoute(NamedTuple):
         """Entries of q that a search moves."""
         return np.arange(robot.nq)
 
+    def asked(self, settings: Settings) -> dict[str, tuple[bool, ...]]:
+        """The rows of each frame that a task asks for."""
+        tasks = settings.parts.tasks.values()
+        return {task.frame: task.kept for task in tasks if isinstance(task, FrameTask) and not task.bounded}
+
+    def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
+        """Whether a whole turn of each of these entries changes no task."""
+        return np.array(turning(robot, settings.parts.tasks))
+
     def answer(self, robot: Robot, search: TaskSearch, goal: Any, x: Array, seed: Array, steps: Array) -> Any:
         """What was found for many targets, its errors computed anew, with the derivative of a solution."""
-        q = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
+        q = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
         fixed, here, aim = jax.lax.stop_gradient((search, q, goal))
         residual, at_limit, errors = jax.vmap(lambda q, goal: _evaluated(fixed, q, goal))(here, aim)
         limit = next((limit for limit in search.limits if isinstance(limit, CollisionAvoidanceLimit)), None)
@@ -128,13 +143,6 @@ def read_tasks(robot: Robot, given: Mapping[str, Any]) -> dict[str, Task]:
     return tasks
 
 
-def read_scheme(scheme: Scheme) -> Scheme:
-    """The scheme with its curvature damping as a search takes it."""
-    if "curvature_damping" not in scheme.replaceable:
-        return scheme
-    return scheme.replace(curvature_damping=CURVATURE * scheme.curvature_damping)  # pyright: ignore
-
-
 def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ...]:
     """Return the limits on configurations, the robot's own among them; limits on speeds do not bind a search.
 
@@ -151,14 +159,31 @@ def _unhurried(robot: Robot, limit: Limit) -> Limit:
     return limit if "gain" not in limit.replaceable else limit.replace(gain=1.0)
 
 
-def _starts(robot: Robot, lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
+def turning(robot: Robot, tasks: Mapping[str, Task]) -> tuple[bool, ...]:
+    """Whether a whole turn of each entry of q brings the robot to the same place, and all tasks are on places alone."""
+    turns = np.zeros(robot.nq, bool)
+    if not all(isinstance(task, _ON_PLACES) for task in tasks.values()):
+        return tuple(turns.tolist())
+    for joint, at in robot.tree.qpos_address.items():
+        turns[at] = robot.tree.joint_types[joint] == HINGE
+    index, factor = robot.tree.qpos_source
+    for entry, share in zip(index.tolist(), factor.tolist(), strict=True):
+        if share and share % 1.0:
+            turns[entry] = False
+    return tuple(turns.tolist())
+
+
+def _starts(robot: Robot, turns: tuple[bool, ...], lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
     """Where searches start, of each entry of q: within the limits, or half a turn; free and ball joints stay."""
+    once, again = one_turn(lower, upper, first)
+    wide = np.array(turns) & (upper - lower > TURN)
     width = np.zeros(robot.nq)
     for joint, at in robot.tree.qpos_address.items():
         width[at] = {HINGE: np.pi, SLIDE: 1.0}.get(robot.tree.joint_types[joint], 0.0)
     free = jnp.isinf(lower) | jnp.isinf(upper)
     low = jnp.where(free, jnp.maximum(first - width, lower), lower)
-    return low.astype(first.dtype), jnp.where(free, jnp.minimum(first + width, upper), upper).astype(first.dtype)
+    high = jnp.where(free, jnp.minimum(first + width, upper), upper)
+    return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, again, high).astype(first.dtype)
 
 
 def _evaluated(

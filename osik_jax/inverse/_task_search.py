@@ -9,15 +9,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from ..control._step import velocity_problem
-from ..kinematics import difference, forward_kinematics, integrate
+from ..kinematics import Kinematics, difference, forward_kinematics, integrate
 from ..limits import ConfigurationLimit, Limit, limit_rows
 from ..robot import Robot
 from ..robot._balls import with_balls_inside
 from ..robot._joint_selection import scalar_layout
-from ..schemes import Scheme, VelocityProblem
+from ..schemes import Scheme, VelocityProblem, WeightedQP
 from ..tasks import (
     AxisAlignTask,
     ComTask,
@@ -35,6 +35,7 @@ from ..tasks._pose import PoseTask
 from ..tasks._rows import rows_of
 from ._pool import Errors
 from ._seeds import unit_points
+from ._turns import unwound
 
 GOALS = (
     FrameTask,
@@ -55,6 +56,12 @@ CURVATURE = 0.1
 """Factor of the schemes' curvature damping: with all of it steps are safe and short, and a search may go astray."""
 _PREFERENCES = 0.05
 """Gain of the preferences, for each tolerance that the goals are off: 0 at the end."""
+_FAINT = 0.01
+"""The largest gain of the preferences on the way to a local optimum, which they are not to move."""
+_ABOVE = 1e6
+"""What a squared error counts relative to those of the next lower level."""
+_LOOK, _MOST, _PROGRESS = 20, 400, 1e-4
+"""On the way to a local optimum: steps between two looks, steps at most, and the share of the cost they take off."""
 _CLEAR = 0.1
 """Fraction of the position tolerance by which limits with rows may be off."""
 _SPREADS = 8
@@ -81,6 +88,7 @@ class TaskSearch(eqx.Module):
 
     Attributes:
         robot: the robot.
+        turns: of each entry of q, whether a whole turn of it changes no task (static).
         tasks: all of them, gains 1.
         scheme: whose steps are taken.
         limits: on configurations.
@@ -93,9 +101,11 @@ class TaskSearch(eqx.Module):
         shift: of the sequence of starts. (nq,)
         tolerance: of position [m] and orientation [rad]. (2,)
         enough: score at which a search stays where it is. ()
+        preferred: largest gain of the preferences. ()
     """
 
     robot: Robot
+    turns: tuple[bool, ...] = eqx.field(static=True)
     tasks: dict[str, Task]
     scheme: Scheme
     limits: tuple[Limit, ...]
@@ -108,6 +118,7 @@ class TaskSearch(eqx.Module):
     shift: UInt[Array, " nq"]
     tolerance: Float[Array, "2"]
     enough: Float[Array, ""]
+    preferred: Float[Array, ""]
 
     def begin(self, seed: Int[Array, " lanes"], goal: Aims) -> Float[Array, "lanes nq"]:
         """Where a search with this number starts: the first configuration, then points ever further from it."""
@@ -130,7 +141,7 @@ class TaskSearch(eqx.Module):
     def step(self, q: Float[Array, " nq"], goal: Aims) -> tuple[Float[Array, " nq"], Errors]:
         """Where a step leads, and the errors of where it sets out. A search that is done stays."""
         errors = self.errors(q, goal)[1]
-        gain = jnp.minimum(_PREFERENCES * errors.score, 1.0)
+        gain = jnp.minimum(_PREFERENCES * errors.score, self.preferred)
         faded = {
             name: task if is_goal(task) else task.replace(gain=gain.astype(q.dtype))
             for name, task in self.aimed(goal).items()
@@ -157,13 +168,32 @@ class TaskSearch(eqx.Module):
         sizes = [sizes_of(goals[name], own) for name, own in rows.items()]
         position, orientation = (jnp.max(jnp.stack(part)) for part in zip(*sizes, strict=True))
         score = jnp.maximum(position / self.tolerance[0], orientation / self.tolerance[1])
-        others = [limit for limit in self.limits if not isinstance(limit, ConfigurationLimit)]  # ranges hold always
-        bounds = limit_rows(self.robot, kinematics, q, others, 1.0)
-        if bounds is not None:
-            missed = jnp.max(bounds.violation(jnp.zeros(self.robot.nv, q.dtype)), initial=0.0)
-            score = jnp.maximum(score, missed / (_CLEAR * self.tolerance[0]))
+        score = jnp.maximum(score, self._beyond_limits(kinematics, q) / (_CLEAR * self.tolerance[0]))
         cost = sum((p / self.tolerance[0]) ** 2 + (o / self.tolerance[1]) ** 2 for p, o in sizes)
         return rows, Errors(position, orientation, score, jnp.asarray(cost))
+
+    def _cost(self, q: Float[Array, " nq"], goal: Aims) -> Float[Array, ""]:
+        rows, _ = self.errors(q, goal)
+        ranked = not isinstance(self.scheme, WeightedQP)
+        rank = {name: -1 if task.hard else task.priority if ranked else 0 for name, task in self.tasks.items()}
+        lowest = max(rank[name] for name in rows)
+        levels = sorted({rank[name] for name in rows} | {lowest})
+        squares = [
+            _ABOVE ** (len(levels) - 1 - levels.index(rank[name])) * jnp.sum(own.weight * own.pull**2)
+            for name, own in rows.items()
+        ]
+        beyond = jnp.maximum(
+            self._beyond_limits(forward_kinematics(self.robot, q), q) - _CLEAR * self.tolerance[0], 0.0
+        )
+        return sum(squares, _ABOVE ** len(levels) * beyond**2)
+
+    def _beyond_limits(self, kinematics: Kinematics, q: Float[Array, " nq"]) -> Float[Array, ""]:
+        """By how much the rows of limits are violated at most; 0 where there are none."""
+        others = [limit for limit in self.limits if not isinstance(limit, ConfigurationLimit)]  # ranges hold always
+        bounds = limit_rows(self.robot, kinematics, q, others, 1.0)
+        if bounds is None:
+            return jnp.zeros((), q.dtype)
+        return jnp.max(bounds.violation(jnp.zeros(self.robot.nv, q.dtype)), initial=0.0)
 
     def aimed(self, goal: Aims) -> dict[str, Task]:
         """The tasks with a goal's targets."""
@@ -176,9 +206,47 @@ class TaskSearch(eqx.Module):
         """From the first configuration, over v."""
         return jnp.sqrt(jnp.sum(difference(self.robot, self.first, q) ** 2))
 
-    def finishing(self) -> TaskSearch:
+    def finishing(self, exact: bool) -> TaskSearch:
         """The same search, for the last steps."""
-        return self
+        return dataclasses.replace(self, enough=jnp.zeros_like(self.enough)) if exact else self
+
+    def isolated(self, x: Float[Array, "lanes nq"], goal: Aims) -> Bool[Array, " lanes"]:
+        """Nothing is known of whether solutions by tasks are isolated: no."""
+        del goal
+        return jnp.zeros(len(x), bool)
+
+    def unwound(self, q: Float[Array, "*lanes nq"]) -> Float[Array, "*lanes nq"]:
+        """The same poses, each joint as near to the first configuration as whole turns within its limits bring it."""
+        return unwound(q, self.first, self.lower, self.upper, self.turns)
+
+    def costs(self, q: Float[Array, "lanes nq"], goal: Aims) -> Float[Array, " lanes"]:
+        """What ``local_optima`` lowers: the goals' weighted errors, those of higher levels above all."""
+        return jax.vmap(self._cost)(q, goal)
+
+    def local_optima(
+        self, q: Float[Array, "lanes nq"], goal: Aims, open_: Bool[Array, " lanes"]
+    ) -> tuple[Float[Array, "lanes nq"], Float[Array, " lanes"], Int[Array, " lanes"]]:
+        """Where steps of the scheme with all of its damping come to rest, the errors there, and the steps taken."""
+        calm = dataclasses.replace(
+            self,
+            scheme=damped(self.scheme, 1.0 / CURVATURE),
+            enough=jnp.zeros_like(self.enough),
+            preferred=_FAINT * jnp.ones_like(self.preferred),
+        )
+
+        def go_on(state: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array, Array]:
+            best, lowest, at, moving, taken = state
+            _, there, _ = calm.advance(at, goal, _LOOK)
+            cost = calm.costs(there, goal)
+            better = moving & (cost < lowest)
+            still = moving & (cost < (1.0 - _PROGRESS) * lowest)
+            taken = taken + jnp.where(moving, _LOOK, 0)
+            return jnp.where(better[:, None], there, best), jnp.where(better, cost, lowest), there, still, taken
+
+        start = q, calm.costs(q, goal), q, open_, jnp.zeros(len(q), jnp.int32)
+        within = lambda state: (state[3] & (state[4] < _MOST)).any()  # noqa: E731
+        end, cost, _, _, taken = jax.lax.while_loop(within, go_on, start)
+        return end, jnp.sqrt(cost), taken
 
     def _problem(self, q: Array, tasks: dict[str, Task]) -> VelocityProblem:
         return velocity_problem(self.robot, forward_kinematics(self.robot, q), q, tasks, self.limits, 1.0)
@@ -188,6 +256,13 @@ class TaskSearch(eqx.Module):
         bounded = jnp.isfinite(self.lower) | jnp.isfinite(self.upper)
         clipped = jnp.where(bounded, jnp.clip(after, self.lower, self.upper), after)
         return with_balls_inside(self.robot.tree, clipped, self.angles)
+
+
+def damped(scheme: Scheme, factor: float) -> Scheme:
+    """The scheme with so many times its curvature damping."""
+    if "curvature_damping" not in scheme.replaceable:
+        return scheme
+    return scheme.replace(curvature_damping=factor * scheme.curvature_damping)  # pyright: ignore
 
 
 def is_goal(task: Task) -> bool:

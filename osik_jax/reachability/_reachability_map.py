@@ -158,7 +158,7 @@ def _reached(frame: Frame, positions: np.ndarray, rotations: np.ndarray, setting
     """Which orientations are reached at each position; of their configurations, the most manipulable one."""
     count, number = len(positions), len(rotations)
     poses = np.repeat(positions, number, 0), np.tile(rotations, (count, 1, 1))
-    found = inverse_kinematics(frame.robot, {frame.name: poses}, restarts=0, **settings)
+    found = inverse_kinematics(frame.robot, {frame.name: poses}, restarts=0, closest=False, **settings)
     reached = np.asarray(found.converged).reshape(count, number)
     index = np.where(reached, frame.manipulability(found.q).reshape(count, number), -1.0)
     best, some = index.argmax(1), np.any(reached, 1)

@@ -1,0 +1,101 @@
+"""All solutions of a target: those that differ by more than whole turns, and their copies by turns."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ._fixed import Outcomes
+from ._solution import InverseKinematicsSolution
+from ._turns import TURN, apart
+
+_SEPARATION = 0.1
+"""Solutions that differ by less in every joint [rad or m] are one."""
+_ISOLATED_SEPARATION = 0.01
+"""The same where the solutions are isolated points, as most poses of an arm with six joints have them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinates:
+    """The entries of q that a search moves.
+
+    Attributes:
+        entries: their numbers.
+        turns: whether a whole turn of each changes no pose.
+        lower: limits, -inf where free [rad or m].
+        upper: likewise.
+        first: the configuration that solutions are near to.
+    """
+
+    entries: np.ndarray
+    turns: Bool[np.ndarray, " n"]
+    lower: Float[np.ndarray, " n"]
+    upper: Float[np.ndarray, " n"]
+    first: Float[np.ndarray, " n"]
+
+
+def with_all(
+    found: InverseKinematicsSolution, outcomes: Outcomes, isolated: Bool[Array, "targets seeds"], own: Coordinates
+) -> InverseKinematicsSolution:
+    """Add the solutions that differ, ``q`` first, then the other branches, then their copies by whole turns."""
+    score, x, q = np.asarray(outcomes.errors.score), np.asarray(outcomes.x), np.asarray(found.q)
+    separation = np.where(isolated, _ISOLATED_SEPARATION, _SEPARATION)
+    rows = score.shape[1]
+    solutions = np.full((*score.shape, q.shape[1]), np.nan, q.dtype)
+    counts, branches = np.zeros(len(q), np.int32), np.zeros(len(q), np.int32)
+    for target in np.flatnonzero(np.asarray(found.converged)):
+        good = score[target] <= 1.0
+        solved = np.concatenate([q[target, own.entries][None], x[target][good]])
+        alone = np.append(separation[target, found.seed[target]], separation[target][good])
+        distinct = _distinct(solved, alone, own.turns)[:rows]
+        every = np.concatenate([distinct, _copies(distinct, own, rows)])[:rows]
+        branches[target], counts[target] = len(distinct), len(every)
+        solutions[target, : len(every)] = q[target]
+        solutions[target, : len(every), own.entries] = every.T
+    return dataclasses.replace(
+        found, solutions=jnp.asarray(solutions), count=jnp.asarray(counts), branches=jnp.asarray(branches)
+    )
+
+
+def _distinct(
+    x: Float[np.ndarray, "k n"], separation: Float[np.ndarray, " k"], turns: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, "m n"]:
+    """The first of each set of configurations that differ by less than their separation, whole turns left out."""
+    kept: list[np.ndarray] = []
+    while len(x):
+        kept.append(x[0])
+        different = apart(x, x[0], turns) > np.maximum(separation, separation[0])
+        x, separation = x[different], separation[different]
+    return np.stack(kept)
+
+
+def _copies(branches: Float[np.ndarray, "k n"], own: Coordinates, most: int) -> Float[np.ndarray, "m n"]:
+    """Other configurations by whole turns of joints whose limits allow it, those near the first configuration first.
+
+    A joint without limits has no copies: there is no end to them.
+    """
+    copies = branches[:, None]
+    for at in np.flatnonzero(own.turns & np.isfinite(own.lower) & np.isfinite(own.upper)):
+        number = np.arange(-(reach := int((own.upper[at] - own.lower[at]) // TURN)), reach + 1)
+        turned = copies[:, :, None].repeat(len(number), 2)
+        turned[..., at] += TURN * number
+        inside = (turned[..., at] >= own.lower[at]) & (turned[..., at] <= own.upper[at])
+        flat = turned.reshape(len(branches), -1, len(own.first)), inside.reshape(len(branches), -1)
+        copies = _nearest(*flat, own, most)
+    every = copies.reshape(-1, copies.shape[-1])
+    others = ~(every[:, None] == branches).all(-1).any(1) & np.isfinite(every[:, 0])
+    every = every[others]
+    return every[np.argsort(np.linalg.norm(every - own.first, axis=1), kind="stable")]
+
+
+def _nearest(
+    x: Float[np.ndarray, "k m n"], inside: Bool[np.ndarray, "k m"], own: Coordinates, most: int
+) -> Float[np.ndarray, "k some n"]:
+    """Of each branch at most so many copies, the nearest ones; those that are outside the limits become NaN, last."""
+    away = np.where(inside & np.isfinite(x[..., 0]), np.linalg.norm(x - own.first, axis=-1), np.inf)
+    kept = np.argsort(away, 1, kind="stable")[:, : min(most, int(np.isfinite(away).sum(1).max(initial=1)))]
+    out = np.take_along_axis(x, kept[..., None], 1)
+    return np.where(np.isfinite(np.take_along_axis(away, kept, 1))[..., None], out, np.nan)

@@ -1,0 +1,48 @@
+"""Whole turns of hinges, which change no pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+TURN = 2.0 * np.pi
+
+
+def unwound(
+    x: Float[Array, "*lanes n"],
+    about: Float[Array, " n"],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    turns: Sequence[bool],
+) -> Float[Array, "*lanes n"]:
+    """Add whole turns to coordinates within their limits, so that they are as near as possible to a configuration.
+
+    Args:
+        x: coordinates within the limits [rad or m].
+        about: the configuration [rad or m].
+        lower: limits, -inf where free.
+        upper: likewise.
+        turns: of each coordinate, whether a whole turn changes no pose.
+    """
+    fewest, most = jnp.ceil((lower - x) / TURN), jnp.floor((upper - x) / TURN)
+    number = jnp.clip(jnp.round((about - x) / TURN), fewest, most)
+    moved = jnp.clip(x + TURN * number, lower, upper)
+    return jnp.where(np.array(turns) & (number != 0.0), moved, x).astype(x.dtype)
+
+
+def one_turn(
+    lower: Float[Array, " n"], upper: Float[Array, " n"], about: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Ends of one turn within limits that are further apart, around a configuration as far as they allow."""
+    low = jnp.clip(about - 0.5 * TURN, lower, upper - TURN)
+    return low, low + TURN
+
+
+def apart(x: Float[np.ndarray, "*k n"], other: Float[np.ndarray, " n"], turns: np.ndarray) -> Float[np.ndarray, "*k"]:
+    """Largest difference of a coordinate, whole turns left out [rad or m]."""
+    difference = x - other
+    turned = difference - TURN * np.round(difference / TURN)
+    return np.abs(np.where(turns, turned, difference)).max(-1)

@@ -1,0 +1,125 @@
+"""Inverse kinematics out of reach: the least error, beside SciPy's bounded minimiser on MuJoCo's kinematics."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import osik_jax as osik
+from osik_jax.inverse._chain_problem import ChainRoute, Settings
+from osik_jax.inverse._chain_search import Goal, lanes_last
+from osik_jax.inverse._inverse_kinematics import joint_box
+
+FINGER = (
+    '<body pos="0 {y} 0"><joint name="{n}1" axis="0 1 0" range="-1.5 1.5"/><geom size=".01"/><body pos="0 0 .05">'
+    '<joint name="{n}2" axis="0 1 0" range="-1.5 1.5"/><geom size=".01"/><site name="{n}" pos="0 0 .05"/></body></body>'
+)
+HEAD = "<mujoco><compiler angle='radian' autolimits='true'/><worldbody>"
+CART = """<mujoco><compiler angle="radian" autolimits="true"/><worldbody>
+<body pos="0 0 .2"><joint name="rail" type="slide" axis="1 0 0" range="-.4 .6"/><geom size=".05"/>
+<body pos=".1 0 .1"><joint name="lift" axis="0 1 0" pos="0 .02 0" range="-2 2"/><geom size=".05"/>
+<body pos=".3 0 0"><joint name="bend" axis="0 1 .2" range="-2 2"/><geom size=".05"/>
+<body pos=".2 0 0"><joint name="wrist" axis="1 0 0" range="-2 2"/><joint name="coupled" axis="0 0 1"/><geom size=".05"/>
+<site name="tip" pos=".1 .02 0"/></body></body></body></body></worldbody>
+<equality><joint joint1="coupled" joint2="bend" polycoef="0.1 0.5 0 0 0"/></equality></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+def least_distance(robot, site, target, rng, starts=30):
+    """By many bounded searches, each with MuJoCo's position and Jacobian."""
+    model = robot.mj_model
+    data, jacobian = mujoco.MjData(model), np.zeros((3, model.nv))
+
+    def cost(q):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacSite(model, data, jacobian, None, data.site(site).id)
+        error = data.site(site).xpos - target
+        return 0.5 * error @ error, jacobian.T @ error
+
+    low, high = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
+    found = [
+        minimize(
+            cost,
+            rng.uniform(low, high),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=list(zip(low, high, strict=True)),
+            tol=1e-14,
+        ).fun
+        for _ in range(starts)
+    ]
+    return np.sqrt(2.0 * min(found))
+
+
+def test_least_error_beside_scipy(arm, rng):
+    """Positions beyond the links, one proven so, and one inside the arm's base, by numbers and while tracing."""
+    targets = np.array([[1.4, 0.1, 0.3], [0.0, 0.0, -1.5], [-0.4, 0.3, 1.2], [0.02, 0.01, -0.55]])
+    least = [least_distance(arm, "hand", target, rng) for target in targets]
+    found = osik.inverse_kinematics(arm, {"hand": targets})
+    assert not np.asarray(found.converged).any() and np.asarray(found.beyond_reach)[0] > 0.0
+    np.testing.assert_allclose(found.position_error, least, atol=1e-5)
+    traced = jax.jit(lambda p: osik.inverse_kinematics(arm, {"hand": p}).position_error)(jnp.asarray(targets))
+    np.testing.assert_allclose(traced, least, atol=1e-5)
+    quick = osik.inverse_kinematics(arm, {"hand": targets}, closest=False, restarts=0)
+    assert (np.asarray(quick.position_error) >= np.array(least) - 1e-5).all()
+    q = np.asarray(found.q)
+    assert (q >= np.asarray(arm.position_lower)).all() and (q <= np.asarray(arm.position_upper)).all()
+
+
+def test_limbs_that_share_no_joint_stay_on_their_targets():
+    robot = osik.Robot.from_mjcf(
+        HEAD + FINGER.format(y=0, n="a") + FINGER.format(y=0.1, n="b") + "</worldbody></mujoco>"
+    )
+    q = np.array([0.4, 0.5, 0.4, 0.5])
+    goal = {name: np.array(osik.forward_kinematics(robot, q).frame_pose(robot, name)[0]) for name in "ab"}
+    goal["a"] = goal["a"] + [0.0, 0.0, 0.2]
+    straight = np.linalg.norm(goal["a"]) - 0.1  # the links in one line towards the target
+    for options in ({}, {"q0": q}):
+        found = osik.inverse_kinematics(robot, goal, **options)
+        off = {name: float(np.linalg.norm(found.residual[name])) for name in "ab"}
+        assert not found.converged and off["b"] < 1e-6
+        assert off["a"] == pytest.approx(straight, abs=1e-6)
+
+
+@pytest.mark.parametrize("rows", [(True,) * 6, (True,) * 3 + (False,) * 3])
+def test_hessian_of_the_error_by_central_differences(rng, rows):
+    """A slide, hinges off their origins, two joints on a body and a follower."""
+    robot = osik.Robot.from_mjcf(CART)
+    settings = Settings(robot.q0, *joint_box(robot, None), 0, jnp.array([1e-3, 1e-2]), 8)
+    search = ChainRoute(("tip",), (rows,)).search(robot, settings, warm=False, near=False)
+    rotation = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    rotation *= np.linalg.det(rotation)
+    goal = lanes_last(Goal(jnp.asarray(rng.standard_normal((1, 1, 3))), jnp.asarray(rotation[None, None])))
+
+    def gradient(x):
+        error, matrix, _ = search.linearised(x, goal)
+        return np.einsum("mnl,ml->n", matrix, error)
+
+    x = rng.uniform(-0.4, 0.4, (len(search.lower), 1))
+    _, matrix, curved = search.model(jnp.asarray(x), goal)
+    hessian = np.einsum("mil,mjl->ij", matrix, matrix) + np.asarray(curved)[..., 0]
+    step = 1e-5
+    columns = [(gradient(x + step * e[:, None]) - gradient(x - step * e[:, None])) / (2 * step) for e in np.eye(len(x))]
+    np.testing.assert_allclose(hessian, np.stack(columns, 1), atol=1e-8)
+
+
+def test_explain_counts_rows_and_names_those_to_leave_out(arm):
+    robot = osik.load_robot("arm7", locked_joints={"joint3": 0.0, "joint5": 0.0})
+    pose = (np.array([0.4, 0.2, 0.3]), np.array([0.5, 0.5, 0.5, 0.5]))
+    said = osik.inverse_kinematics(robot, {"hand": pose}, restarts=0).explain()
+    assert "hand asks for 6 rows and 5 joints carry it" in said and "leave out 1 row" in said
+    rows, axes = eval(said.split("rows=")[1].split(")")[0] + ")"), said.split("axes='")[1].split("'")[0]
+    assert sum(rows) == 5 and rows[:3] == (True, True, True)
+    task = osik.FrameTask(robot, "hand", target=pose, rows=rows, axes=axes)
+    assert osik.inverse_kinematics(robot, {"hand": task}, seeds=16, restarts=1).converged
+    both = osik.inverse_kinematics(arm, {"hand": pose, "link6": pose}, seeds=4, restarts=0).explain()
+    assert "12 rows of 7 joints" in both
+    assert "rows" not in osik.inverse_kinematics(arm, {"hand": (np.array([0.0, 0.0, 9.0]), pose[1])}, seeds=4).explain()
