@@ -62,6 +62,11 @@ class ChainRoute(NamedTuple):
     frames: tuple[str, ...]
     rows: tuple[tuple[bool, ...], ...]
 
+    @property
+    def starts_anew(self) -> bool:
+        """Whether the way to the least error begins with new searches, and is part of traced programs."""
+        return True
+
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
         """The search for these frames."""
         return chain_search(robot, self, settings, warm=warm, near=near)

@@ -65,8 +65,8 @@ def inverse_kinematics(
 
     A target that is not found gets the configuration with the least error: the best of some local optima, each from the
     best of a group of searches. For poses that is the least sum of squared errors, where a radian counts as
-    ``position_tolerance / orientation_tolerance`` metres. For tasks their weights count, and priorities where the
-    scheme has them.
+    ``position_tolerance / orientation_tolerance`` metres. With tasks it is the local optimum by their weights that the
+    best search leads to; while tracing, and with ``nearest`` or ``all``, it is where that search ends.
 
     Called with numbers, it runs as long as it has to. Where one of its arguments is traced, so inside ``jit``, ``vmap``
     or ``grad``, it takes ``seeds`` searches of ``steps`` steps each: a pure function of a limited amount of work. ``q``
@@ -136,8 +136,9 @@ def inverse_kinematics(
         raise OsikTypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
     if traced or nearest or all:
         run = partial(explored, robot, settings=settings, seeds=seeds, steps=steps, near=nearest, every=all, **start)
-        found, *every = run(problem.goals) if traced else in_chunks(lambda goals, _: run(goals), problem.goals)
-        found = with_all(found, *every, _coordinates(robot, route, settings)) if all else found
+        results = run(problem.goals) if traced else in_chunks(lambda goals, _: run(goals), problem.goals)
+        found, outcomes, isolated = results
+        found = with_all(found, outcomes, isolated, _coordinates(robot, route, settings)) if all else found
     else:
         found = searched(robot, problem.goals, settings, seeds * (1 + restarts), steps, **start)
     if not (traced or np.all(found.converged)):

@@ -48,14 +48,14 @@ def searched(
     hopeless = np.int32(1 if go_on else _HOPELESS)
 
     def chunk(goals: Any, wanted: np.ndarray) -> InverseKinematicsSolution:
-        found = None
-        for most in (1, seeds) if warm else (seeds,):
-            left = wanted if found is None else wanted & ~np.asarray(found.converged)
-            if not left.any():
-                return found  # pyright: ignore
-            own = run(goals, settings, left, np.int32(most), hopeless, np.int32(steps))
-            found = own if found is None else _with(found, left, own)
+        def by(most: int, left: np.ndarray) -> InverseKinematicsSolution:
+            return run(goals, settings, left, np.int32(most), hopeless, np.int32(steps))
+
+        found = by(1 if warm else seeds, wanted)
         left = wanted & ~np.asarray(found.converged)
+        if warm and left.any():
+            found = _with(found, left, by(seeds, left))
+            left &= ~np.asarray(found.converged)
         if not (go_on and left.any()):
             return found
         starts = min(seeds, _STARTS)
@@ -107,13 +107,15 @@ def _approached(
     search = route.search(robot, settings, warm=warm, near=False)
 
     def some(goals: Any, best: Array) -> Closest:
-        outcomes = search_all(search, goals, seeds=starts, steps=_GLANCE)
-        x = jnp.concatenate([outcomes.x, best[:, None]], 1)
+        x = best[:, None]
+        if route.starts_anew:
+            x = jnp.concatenate([search_all(search, goals, seeds=starts, steps=_GLANCE).x, x], 1)
         return closest(search, goals, x, jnp.ones(len(x), bool), near=False)
 
     found = in_blocks(some, (goals, q[:, route.entries(robot)]), _TOGETHER)
-    steps = before + starts * _GLANCE + found.steps
-    number = jnp.where(found.seed == starts, seed, found.seed)
+    new = starts if route.starts_anew else 0
+    steps = before + new * _GLANCE + found.steps
+    number = jnp.where(found.seed == new, seed, found.seed)
     return route.answer(robot, search, goals, found.x, number, steps)
 
 
@@ -149,7 +151,7 @@ def explored(
         away = jax.vmap(jax.vmap(fixed_search.distance))(outcomes.x) if near else None
         best = choose(outcomes, away)
         x = jnp.take_along_axis(outcomes.x, best[:, None, None], 1)[:, 0]
-        if not go_on:
+        if not (go_on and route.starts_anew):
             return outcomes, alone, Closest(x, best, jnp.zeros_like(best))
         unmet = jnp.take_along_axis(outcomes.errors.score, best[:, None], 1)[:, 0] > 1.0
         further = closest(fixed_search, goals, outcomes.x, unmet, near=near)

@@ -57,6 +57,11 @@ class _ProjectedRange(ConfigurationLimit):
 class TaskRoute(NamedTuple):
     """Tasks and limits of any kind; hashable."""
 
+    @property
+    def starts_anew(self) -> bool:
+        """No: each copy of a scheme's step in a program takes long to compile."""
+        return False
+
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> TaskSearch:
         """The search for these tasks."""
         del warm, near
