@@ -159,7 +159,7 @@ def limits(add: Add) -> None:
     )
     add(
         "collisions of neighbours alone",
-        lambda: osik.CollisionAvoidanceLimit(arm(), pairs=[("geom3", "geom6")]),
+        lambda: osik.CollisionAvoidanceLimit(arm(), pairs=[("geom3", "geom[6]")]),
         V,
         "neighbouring",
     )
