@@ -33,7 +33,6 @@ import numpy as np
 import pytest
 
 from osik_jax.core import _build
-from osik_jax.kernels.numba._target import register
 from osik_jax.runtime import configure_cpu
 
 configure_cpu()
@@ -44,9 +43,6 @@ gc.set_threshold(50_000, 20, 20)
 
 MOST_MEMORY = 4 * 2**30
 """What a process may hold after a file of tests, in bytes, before it drops its compiled programs."""
-MANY_TESTS = 500
-LARGE_KERNELS = ("_plan",)
-"""In an order in which every second one takes as long to compile as the others."""
 WITH_TORCH = "test_beside_pytorch_kinematics.py"
 WITH_BROWSER = "test_live_browser.py"
 NOT_INSTALLED = {} if find_spec("pytorch_kinematics") else {WITH_TORCH: "pytorch-kinematics"}
@@ -79,14 +75,6 @@ def pytest_report_header() -> list[str]:
     """Says with which JAX, and what is left out where an oracle or a browser is not installed."""
     without = [f"NOT RUN, for {missing} is not installed: {name}" for name, missing in NOT_INSTALLED.items()]
     return [f"jax {version('jax')}, jaxlib {version('jaxlib')}, mujoco {version('mujoco')}", *without]
-
-
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Has the processes of a whole run compile the large kernels of Numba once: each some, which the others read."""
-    worker = getattr(session.config, "workerinput", None)
-    if worker and len(session.items) > MANY_TESTS and find_spec("numba"):
-        for name in LARGE_KERNELS[int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]:
-            register(name)
 
 
 def pytest_sessionfinish() -> None:

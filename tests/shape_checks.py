@@ -4,7 +4,7 @@ pytest --jaxtyping-packages=osik_jax,shape_checks.checked
 
 Arguments are looked at when a function has returned, together with its result: what it refuses in words of its own, it
 still refuses in those. Not checked: functions that give ``Any``, results annotated ``Self`` (beartype does not see the
-class), all items of a list but one, and what Numba compiles.
+class), and all items of a list but one.
 """
 
 from collections.abc import Callable

@@ -168,7 +168,7 @@ def test_derivatives_are_those_of_differences():
 
 
 def test_a_backend_that_is_not_there(monkeypatch):
-    with pytest.raises(ValueError, match="backend is 'cuda'; backends: auto, jax, core, numba, warp"):
+    with pytest.raises(ValueError, match="backend is 'cuda'; backends: auto, jax, core, warp"):
         HierarchicalQP(backend="cuda")  # pyright: ignore[reportArgumentType]
     with (
         pytest.raises(RuntimeError, match="CUDA device")

@@ -191,7 +191,7 @@ def test_saturation_lane_by_lane_as_the_plain_method(name, on_emulated_gpu):
 
 @pytest.mark.parametrize("number", range(len(test_saturation.FAMILIES)), ids=test_saturation.FAMILIES)
 def test_saturation_decides_as_the_plain_method(number, on_emulated_gpu):
-    """Where Numba's kernel does too (``tests/test_saturation.py``): infinite bounds, pinned joints, conflicts, ties."""
+    """Where the core does too (``tests/test_saturation.py``): infinite bounds, pinned joints, conflicts, ties."""
     name = test_saturation.FAMILIES[number]
     p = test_saturation.family(name, np.random.default_rng(100 + number))
     found = inspect.unwrap(test_saturation.solve_full)(p)  # traced here, where a GPU seems to be

@@ -82,13 +82,13 @@ def test_the_cube_has_no_part_in_the_centre_of_mass(nao, scene):
 def test_kernels_leave_the_cube_out_too(nao, scene):
     _, whole = posed(nao, scene, seed=1)
     plain = moving_center(scene, osik.forward_kinematics(scene, whole))
-    by_kernel = jax.jit(lambda q: moving_center(scene, kinematics_by("numba", scene, q)))(whole)
+    by_kernel = jax.jit(lambda q: moving_center(scene, kinematics_by("core", scene, q)))(whole)
     for got, want in zip(by_kernel, plain, strict=True):
         np.testing.assert_allclose(got, want, atol=1e-12)
     tasks = {"com": osik.ComTask(scene, target=np.array([0.02, 0.0, 0.25]))}
     velocities = [
         osik.solve(scene, whole, tasks, scheme=osik.WeightedQP(backend=backend), dt=0.01).velocity
-        for backend in ("jax", "numba")
+        for backend in ("jax", "core")
     ]
     np.testing.assert_allclose(*velocities, atol=1e-7)
     assert not np.delete(np.asarray(velocities[1]), own(scene)[1]).any()

@@ -23,8 +23,8 @@ constexpr int KERNEL_REFINEMENTS = 10, MAX_EXCHANGES = 2, MAX_DUAL_STARTS = 8;
 constexpr double KERNEL_CORRECTION = 1e-10, MIN_DECREASE = 0.25, KERNEL_PIVOT = 1e2,
                  ZERO_TOL = 100.0, BOUND_MULTIPLIER = 1.0, KERNEL_DEPENDENCE = 1e-14, REDUNDANCY_TOL = 1e3;
 
-// rotations
-constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2;
+// rotations, collision
+constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2, SMALL_TURN_SQUARED = 1e-6, PARALLEL = 1e-6;
 
 // null space
 constexpr double INDEPENDENT_ROWS = 1e-7;

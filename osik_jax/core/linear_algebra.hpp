@@ -234,14 +234,15 @@ OSIK_UNROLL
   }
 
   // out[b, j] = factor_b sum_i r_b[i column] Z[i, j] over from <= i < to, for start <= j < n and the first `rows` of
-  // four rows, so that each entry of Z is read once for four.
+  // four rows, so that each entry of Z is read once for four. `add`: added to what out has; `lower`: Z is lower
+  // triangular, and the sums begin at the first column of a pack.
   OSIK_FN static void four_rows(const Team& t, const Real* const (&r)[4], const Real (&factor)[4], int column,
                                 const Real* Z, Real* out, int ld, int ld_out, int rows, int from, int to, int start,
-                                int n) {
+                                int n, bool add = false, bool lower = false) {
     t.narrow_columns(start, n, [&](auto c) {
       using P = typename decltype(c)::P;
       P total[4] = {P(0), P(0), P(0), P(0)};
-      for (int i = from; i < to; ++i) {
+      for (int i = lower && c.at > from ? c.at : from; i < to; ++i) {
         const P z = c.load(Z + i * ld);
 OSIK_UNROLL
         for (int b = 0; b < 4; ++b) total[b].fma(r[b][i * column], z);
@@ -249,7 +250,7 @@ OSIK_UNROLL
 OSIK_UNROLL
       for (int b = 0; b < 4; ++b)
         if (b < rows) {
-          P out_b(0);
+          P out_b = add ? c.load(out + b * ld_out) : P(0);
           c.store(out + b * ld_out, out_b.fma(factor[b], total[b]));
         }
     });
@@ -266,6 +267,19 @@ OSIK_UNROLL
       for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first) * row;
       four_rows(t, r, factor, column, M, out + first * ld_out, ld, ld_out, rows - first, 0, inner, upper ? first : 0,
                 n);
+    }
+  }
+
+  // S <- S - A'M in `rows` rows and the columns [from, to) of S, over `inner` rows of A and M; all strides are ld.
+  // lower: M is lower triangular; upper: S is symmetric, and its packs of 8 columns on and above the diagonal are done
+  OSIK_CALL static void subtract_product(Team t, const Real* A, const Real* M, Real* S, int ld, int rows, int inner,
+                                         int from, int to, bool lower = false, bool upper = false) {
+    const Real factor[4] = {-1, -1, -1, -1};
+    for (int first = 0; first < rows; first += 4) {
+      const Real* r[4];
+      for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first);
+      four_rows(t, r, factor, ld, M, S + first * ld, ld, ld, rows - first, 0, inner, upper ? first / 8 * 8 : from, to,
+                true, lower);
     }
   }
 

@@ -12,7 +12,6 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
               hard rows, n <= 64, <= 32 soft rows  fit into shared memory              precision, levels that fit
     "core"    CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
                                                                                        any shape
-    "numba"   as "core"                            as "core"                           as "core"
     "jax"     none: plain JAX alone, on any platform
 
     of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks
@@ -20,9 +19,9 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
 
     of retargeting                            iterations of a plan                a plan's banded systems
     "warp"                                    none                                CUDA: float32, about 40 dofs at most
-    "numba"                                   CPUs: any robot, any precision      inside the former
+    "core"                                    CPUs: any robot, any precision      inside the former
 
-"core" is the compiled C++ of ``osik_jax/core``, which takes over the methods of Numba and Warp one by one.
+"core" is the compiled C++ of ``osik_jax/core``, which takes over the methods of Warp one by one.
 "auto" takes what is installed and fits, and the search elsewhere. Which platform a program runs on is decided when it
 is lowered, not when it is traced (``on_platforms``).
 """
@@ -30,8 +29,6 @@ is lowered, not when it is traced (``on_platforms``).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
@@ -41,15 +38,11 @@ import numpy as np
 from .._errors import OsikValueError
 from ..core import _library
 
-Backend = Literal["auto", "jax", "core", "numba", "warp"]
+Backend = Literal["auto", "jax", "core", "warp"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
 
-_PLATFORM = {"core": "cpu", "core-cuda": "cuda", "numba": "cpu", "warp": "cuda"}
+_PLATFORM = {"core": "cpu", "core-cuda": "cuda", "warp": "cuda"}
 CPU_KERNELS = {name for name, platform in _PLATFORM.items() if platform == "cpu"}
-_MISSING = {
-    "numba": "backend='numba' needs Numba: pip install 'osik-jax[numba]'",
-    "warp": "backend='warp' needs Warp: pip install 'osik-jax[cuda]'",
-}
 
 
 def check_backend(backend: Any) -> Backend:
@@ -60,12 +53,14 @@ def check_backend(backend: Any) -> Backend:
         ModuleNotFoundError: the package of its kernels is not installed; the message says how to install it.
         RuntimeError: "warp" without a CUDA device.
     """
+    if backend == "numba":
+        raise OsikValueError("backend='numba' is gone: the compiled core has its kernels; take 'auto' or 'core'")
     if backend not in BACKENDS:
         raise OsikValueError(f"backend is {backend!r}; backends: {', '.join(BACKENDS)}")
     if backend == "core" and not _library.installed():
         raise ModuleNotFoundError(f"backend='core': {_library.core().reason}", name="osik_jax.core")
-    if backend in _MISSING and not installed(backend):
-        raise ModuleNotFoundError(_MISSING[backend], name=backend)
+    if backend == "warp" and not installed(backend):
+        raise ModuleNotFoundError("backend='warp' needs Warp: pip install 'osik-jax[cuda]'", name=backend)
     if backend == "warp" and not cuda_is_default():
         raise RuntimeError("backend='warp' needs a CUDA device, and JAX's default device is none (jax.devices())")
     return backend
@@ -98,15 +93,13 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
 
     Args:
         backend: what was asked for.
-        kernel: "numba" or "warp".
+        kernel: "core", "core-cuda" or "warp".
         fits: whether the solver has such a kernel for problems of this kind, precision and shape.
 
     Raises:
         ValueError: this very kernel was asked for and does not fit.
         Exception: it was asked for and is not there, as ``check_backend``.
     """
-    if backend == "numba" and kernel == "core":  # while other methods are Numba's
-        return fits and _library.installed()
     if kernel == "core-cuda":
         return backend in ("auto", "core") and fits and cuda_is_default()
     if backend == kernel:
@@ -116,23 +109,11 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
                 f"backend={kernel!r} has no kernel for problems of this kind, precision or shape; take 'auto'"
             )
         return True
-    if backend == "core" and kernel == "numba":  # while the core lacks this method
-        return fits and _can_be_imported(kernel)
     if backend != "auto" or not fits:
         return False
     if kernel == "core":
         return _library.installed()
-    return installed(kernel) and (cuda_is_default() if kernel == "warp" else _can_be_imported(kernel))
-
-
-@cache
-def _can_be_imported(package: str) -> bool:
-    """Check that a package can be imported: Numba refuses releases of NumPy and Python newer than itself."""
-    try:
-        import_module(package)
-    except Exception:
-        return False
-    return True
+    return installed(kernel) and cuda_is_default()
 
 
 def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., Any], *args: Any) -> Any:

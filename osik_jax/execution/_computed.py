@@ -21,19 +21,18 @@ from ._lanes import lanes_of, no_lanes
 from ._rules import custom_jvp
 
 
-def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], backend: str = "core") -> Callable[..., Any]:
+def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[..., Any]:
     """Return the plain function, on CPUs by a kernel of a batch. What is given by name is static.
 
     Args:
         plain: of one problem: pytrees of arrays by position.
         kernel: the same for arrays with a leading axis, of the lanes or of length 1 where all lanes share one.
-        backend: whose kernel it is, "core" or "numba".
     """
 
     @cache
     def anywhere(**options: Any) -> Callable[..., Any]:
         wide = over_lanes(partial(plain, **options))
-        return in_shared_lanes(partial(on_platforms, {backend: partial(kernel, **options)}, wide))
+        return in_shared_lanes(partial(on_platforms, {"core": partial(kernel, **options)}, wide))
 
     @custom_jvp
     def computed(*args: Any, **options: Any) -> Any:

@@ -130,7 +130,7 @@ MAX_DETOUR = 100.0
 DEPENDENCE_TOL = 100.0
 """In units of machine epsilon: a constraint of whose diagonal the active ones leave less depends on them."""
 KERNEL_DEPENDENCE = 1e-14
-"""The same in Numba's kernel, which has orthogonal factors: relative to the square of the constraint's normal."""
+"""The same in the core, which has orthogonal factors: relative to the square of the constraint's normal."""
 REDUNDANCY_TOL = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
 """In units of roundoff: a dependent constraint that is violated by less is redundant, by more infeasible."""
 
@@ -169,7 +169,7 @@ ROW_SPACE_CORRECTION, ROW_SPACE_ACCURACY = 1e-6, 1e-13
 GRADIENT_STEPS = 100
 """Steps of the projected gradient behind an answer that is MAX_ITERATIONS."""
 
-# ---- weighted QPs in kernels: double precision is Numba's, single precision CUDA's
+# ---- weighted QPs in kernels: double precision is the core's, single precision CUDA's
 
 KERNEL_REFINEMENTS = {jnp.dtype("float64"): 10, jnp.dtype("float32"): 6}
 """Corrections at most."""

@@ -208,7 +208,7 @@ def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq
 
 
 def _descended(clip: _Clip, q: Float[Array, "F nq"], most: Int[Array, ""] | int, *, until: _Ending) -> Plan:
-    """Iterations from some configurations on: on CPUs by a kernel, where Numba is installed.
+    """Iterations from some configurations on: on CPUs by the compiled core, where it is installed.
 
     Args:
         clip: what for.
@@ -216,7 +216,7 @@ def _descended(clip: _Clip, q: Float[Array, "F nq"], most: Int[Array, ""] | int,
         most: iterations, at most.
         until: what ends them before: bounds that are ready to get stiffer, steps that gain little, or nothing (static).
     """
-    descended = _by_kernel if takes("auto", "numba", fits=True) else _descended_plain
+    descended = _by_kernel if takes("auto", "core", fits=True) else _descended_plain
     return descended(clip, q, jnp.asarray(most), until=until)
 
 
@@ -231,7 +231,7 @@ def _descended_plain(clip: _Clip, q: Float[Array, "F nq"], most: Int[Array, ""],
     return Plan(last.q, jnp.stack(last.here.costs), last.iterations)
 
 
-def _descended_by_numba(
+def _descended_by_core(
     clip: _Clip, q: Float[Array, "lanes F nq"], most: Int[Array, " lanes"], *, until: _Ending
 ) -> Plan:
     """The same of a batch, on a CPU and in double precision; what all lanes share has an axis of length 1."""
@@ -241,7 +241,7 @@ def _descended_by_numba(
     return Plan(*_plan_kernel.descended(*clip, q, rules, most, endings))
 
 
-_by_kernel = by_kernel(_descended_plain, _descended_by_numba, "numba")
+_by_kernel = by_kernel(_descended_plain, _descended_by_core)
 
 
 def _improved(clip: _Clip, state: _State) -> _State:

@@ -1,4 +1,4 @@
-"""Plans on a CPU by a kernel of Numba's (``kernels/numba/_plan.py``), called from JAX.
+"""Plans on a CPU by the compiled core (``core/clip_plan.hpp``), called from JAX.
 
 It computes what ``_plan.py`` says, in double precision; that file is the definition, and what runs elsewhere.
 """
@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..core import _library
 from ..execution._computed import side_by_side
-from ..kernels.numba import _target
 from ..kinematics._kernels import dof_columns
 from ..kinematics._manifold import layout
 from ..numerics._dense import product
@@ -21,8 +21,6 @@ from ._roles import LIMBS
 from ._terms import CLEARANCE, PAIRS, SHORTEST, SWINGING, Body, Bounds
 
 _HIPS = ("left_hip", "right_hip")
-_ROWS, _POINTS = 61, 8
-"""As in ``kernels/numba/_clip_workspace.py``."""
 
 
 def descended(
@@ -50,20 +48,22 @@ def descended(
         endings: whether it ends when bounds are ready to get stiffer, and when steps gain little.
     """
     frames, nq = q.shape[1:]
-    counts, integers = _structure(body)
+    integers = _structure(body)
     wishes = goals.directions, goals.pelvis, goals.torso, goals.root, goals.feet, goals.contact, goals.present
     method = side_by_side(np.array([rules]), most.astype(q.dtype), np.array([endings]))
     given = [q, *wishes, free, _numbers(body, weights, bounds), method]
     lanes = max(len(a) for a in given)
-    shapes = (lanes, frames, nq), (lanes, 2), (lanes,), (_memory(counts, frames, nq),)
-    found, cost, count, _ = _target.call(
-        "_plan", [(shape, float) for shape in shapes], *(jnp.reshape(a, (len(a), -1)) for a in given), integers
+    found, cost, count = _library.call(
+        "clip_plan",
+        [((lanes, frames, nq), float), ((lanes, 2), float), ((lanes,), float)],
+        *(jnp.reshape(a, (len(a), -1)) for a in given),
+        integers,
     )
     return found, cost, count.astype(most.dtype)
 
 
-def _structure(body: Body) -> tuple[dict[str, int], np.ndarray]:
-    """The kernel's whole numbers, and by name those that count something."""
+def _structure(body: Body) -> np.ndarray:
+    """Return the core's integers, those of ``ClipRobot`` in ``core/clip_frames.hpp``."""
     tree = body.robot.tree
     places = np.array([tree.frame_bodies[tree.frame(name)] for name in body.frames])
     columns, _ = dof_columns(tree)
@@ -92,11 +92,11 @@ def _structure(body: Body) -> tuple[dict[str, int], np.ndarray]:
     parts = [list(counts.values()), tree.body_parents, tree.joint_types, tree.joint_bodies, tree.qpos_source[0]]
     parts += [columns, places, np.where(scalar, index, -1), limbs, body.above, body.pairs, tree.moves]
     parts += [scalar_q, scalar_v, np.array(quaternions).T]
-    return counts, np.concatenate([np.asarray(part, np.int32).ravel() for part in parts])
+    return np.concatenate([np.asarray(part, np.int32).ravel() for part in parts])
 
 
 def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"]:
-    """The kernel's numbers of robot, profile and weights; the stiffness, which comes and goes, is 0."""
+    """Return the core's numbers of robot, profile and weights, those of ``ClipRobot``; the stiffness is 0 here."""
     none = np.zeros(1)
     balance = (none, none) if body.inside is None else (weights.balance, body.inside)
     robot, ids = body.robot, np.array([body.robot.tree.frame(name) for name in body.frames])
@@ -111,14 +111,3 @@ def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"
         w.posture, w.stance, w.apart, w.limit, w.margin, np.array([[0.0, CLEARANCE, SWINGING, SHORTEST]]), w.smooth,
         w.smooth_base, w.speed, *balance,
     )  # fmt: skip
-
-
-def _memory(counts: dict[str, int], frames: int, nq: int) -> int:
-    """How many numbers the kernel works with."""
-    bodies, full, n = counts["bodies"], counts["full"], counts["dofs"]
-    rows, wide, long = _ROWS + 2 * counts["above"] + counts["most_pairs"], n // 8 * 8 + 8, (full + 7) // 8 * 8
-    frame = counts["values"] + 12 * bodies + 9 * full + (7 + bodies) * long + 3 * counts["places"] + 36
-    frame += 2 * counts["pairs"] + 4 * counts["capsules"] + 2 * rows * wide + 8 * _POINTS + 1
-    system = frames * (wide**2 + _POINTS * wide + _POINTS + 4 * n)
-    steps = 2 * n + frames * (1 + 2 * n + 2 * wide**2) + wide * (wide + 2 * _POINTS + 2)
-    return frame + 8 + 2 * system + steps + frames * nq + 19

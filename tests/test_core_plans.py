@@ -1,4 +1,4 @@
-"""Numba's kernel of retargeting's plans on a CPU: beside the plain method, which it follows iteration by iteration."""
+"""The core's plans of retargeting on a CPU: beside the plain method, which it follows iteration by iteration."""
 
 import dataclasses
 from functools import cache, partial
@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from core_checks import needs_core
 from motion_files import dancer, write_bvh
 
 import osik_jax as osik
 from osik_jax.retargeting import Retargeter, load_motion
 from osik_jax.retargeting._plan import _Clip, _descended, _descended_plain
 
-pytest.importorskip("numba")
+pytestmark = needs_core
 FRAMES = 9
 LOCKED = ("HeadYaw", "HeadPitch", "LWristYaw", "LHand", "RWristYaw", "RHand", "LElbowYaw")
 

@@ -1,0 +1,42 @@
+// Handler of the plans of clips on a CPU.
+#include <cstddef>
+#include <vector>
+
+#include "clip_plan.hpp"
+#include "xla.hpp"
+
+using namespace osik;
+
+namespace {
+using Team = Serial<double>;
+
+// Arguments, flat, with an axis of clips, or of length 1 where all clips share them: q [F, nq], the goals in the order of
+// ClipGoals, free [F], the numbers of ClipRobot, ClipMethod; and the integers of ClipRobot, which all clips share.
+// Results: q [F, nq], cost [2], iterations.
+void plan(const xla::Call& call) {
+  const int64_t* sizes = call.result(0).dimensions;
+  const int clips = int(sizes[0]), frames = int(sizes[1]), nq = int(sizes[2]);
+  auto numbers = [&](int k, int clip) {
+    return call.in<double>(k) + (call.size(k, 0) == 1 ? 0 : size_t(clip) * call.size(k, 1));
+  };
+  ClipRobot robot;
+  robot.read(call.in<int>(11));
+  const size_t size = size_t(frames) * nq;
+  std::vector<double> space(ClipPlan<Team>::doubles(robot, frames)), other(size);
+  for (int b = 0; b < clips; ++b) {
+    robot.read(numbers(9, b));
+    ClipMethod method;
+    __builtin_memcpy(&method, numbers(10, b), sizeof method);
+    const ClipGoals goals{numbers(1, b), numbers(2, b), numbers(3, b), numbers(4, b),
+                          numbers(5, b), numbers(6, b), numbers(7, b)};
+    double* q = call.out<double>(0) + b * size;
+    for (size_t e = 0; e < size; ++e) q[e] = numbers(0, b)[e];
+    ClipPlan<Team> clip(robot, goals, method, frames, nq, space.data());
+    call.out<double>(2)[b] = clip.descend(numbers(8, b), q, other.data(), call.out<double>(1) + 2 * b);
+  }
+}
+}  // namespace
+
+extern "C" {
+void* osik_clip_plan(xla::CallFrame* frame) { return xla::handle<plan>(frame); }
+}
