@@ -40,9 +40,9 @@ from osik_jax.retargeting import (
     load_profile,
     report,
 )
-from osik_jax.retargeting._described import DESCRIBED, described_urdf
 from osik_jax.retargeting._lanes import as_lane, solve_lanes
 from osik_jax.retargeting._live_command import replay
+from osik_jax.robot.loading import ROBOTS
 from osik_jax.runtime import configure_cpu
 
 from .machine import processor
@@ -270,8 +270,8 @@ def main() -> None:
     options = parser.parse_args()
     configure_cpu()
     jax.config.update("jax_enable_x64", not options.single)
-    path = described_urdf(options.robot) if options.robot in DESCRIBED else Path(options.robot)
-    robot = load_robot("nao") if options.robot == "nao" else Robot.from_urdf(path, floating_base=True)
+    by_name = options.robot in ROBOTS
+    robot = load_robot(options.robot) if by_name else Robot.from_urdf(Path(options.robot), floating_base=True)
     made = {"guess": guess_profile, "bundled": lambda _: None}
     profile = made.get(options.profile, lambda _: load_profile(options.profile))(robot)
     judge = Judge(*options.judge) if options.judge else own_figures
