@@ -47,8 +47,8 @@ def test_no_two_folders_know_each_other() -> None:
     assert order.index("kernels") < order.index("solvers") < order.index("control")
 
 
-def test_kernels_know_constants_alone() -> None:
-    assert graph()["kernels"] == {"numerics"}
+def test_kernels_import_nothing() -> None:
+    assert graph()["kernels"] == set()
 
 
 def test_the_viewer_knows_maps_and_maps_no_viewer() -> None:
