@@ -40,6 +40,8 @@ from .limits import limit_rows as limit_rows
 from .limits import no_limits as no_limits
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot
+from .saving import load_controller as load_controller
+from .saving import save_controller as save_controller
 from .schemes import HierarchicalQP as HierarchicalQP
 from .schemes import NullSpace as NullSpace
 from .schemes import Scheme as Scheme

@@ -1,0 +1,138 @@
+"""Controllers as files: every class of tasks, limits and schemes comes back to the last bit."""
+
+import inspect
+import json
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import osik_jax as osik
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return osik.load_robot("arm7")
+
+
+def all_tasks(arm) -> dict[str, osik.Task]:
+    normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    square = osik.SupportPolygon(jnp.asarray(normals), jnp.ones(4), jnp.asarray(corners))
+    return {
+        "frame": osik.FrameTask(arm, "hand", gain=osik.AdaptiveGain(9.0, 2.0, 1.0), error="se3", priority=2),
+        "bounds": osik.FrameTask(arm, "link4", rows="position", lower=-np.inf, upper=0.3, hard=True),
+        "between": osik.RelativeFrameTask(arm, "hand", "link2"),
+        "look": osik.LookAtTask(arm, "hand", target=[1.0, 0.0, 0.0]),
+        "axis": osik.AxisAlignTask(arm, "hand", target=[0.0, 0.0, 1.0]),
+        "com": osik.ComTask(arm, weight=[1.0, 2.0, 0.1]),
+        "over": osik.ComTask(arm, polygon=square),
+        "posture": osik.PostureTask(arm, weight={"joint1": 0.5}),
+        "couple": osik.JointCouplingTask(arm, {"joint1": 1.0, "joint2": -1.0}, target=0.5),
+        "velocity": osik.JointVelocityTask(arm, np.ones(7)),
+        "damping": osik.DampingTask(arm),
+        "smooth": osik.LowAccelerationTask(arm),
+        "freeze": osik.FreezeTask(arm, joints=("joint3",), hard=True),
+        "index": osik.ManipulabilityTask(arm, "hand"),
+        "momentum": osik.AngularMomentumTask(arm),
+        "energy": osik.KineticEnergyTask(arm),
+        "contact": osik.ContactTask(arm, "hand"),
+        "limit": osik.LimitTask(arm, osik.PositionBarrier(arm, "hand", upper=1.0), priority=3),
+    }
+
+
+def all_limits(arm) -> list[osik.Limit]:
+    hull = osik.CollisionShape.convex(np.random.default_rng(0).normal(size=(9, 3)), frame="hand")
+    post = osik.CollisionShape.sphere(0.05, np.array([3.0, 0.0, 0.0]))
+    return [
+        osik.ConfigurationLimit(arm, gain=0.5),
+        osik.VelocityLimit(arm, velocity={"*": np.inf}),
+        osik.AccelerationLimit(arm, {"*": 5.0}),
+        osik.PositionBarrier(arm, "hand", upper=(np.inf, 1.0, 2.0)),
+        osik.CollisionAvoidanceLimit(arm, shapes={"hull": hull, "post": post}, pairs=[("hull", "post")]),
+        osik.LinearLimit(arm, np.ones((1, 7)), upper=1.0),
+        osik.no_limits,
+    ]
+
+
+def same(a: Any, b: Any) -> bool:
+    first, second = jax.tree.flatten(a), jax.tree.flatten(b)
+    return first[1] == second[1] and all(np.array_equal(x, y) for x, y in zip(first[0], second[0], strict=True))
+
+
+@pytest.mark.parametrize("scheme", [osik.WeightedQP(2e-6), osik.HierarchicalQP(), osik.NullSpace(method="reverse")])
+def test_everything_comes_back(arm, tmp_path, scheme):
+    path, tasks, limits = tmp_path / "c.json", all_tasks(arm), all_limits(arm)
+    osik.save_controller(path, arm, tasks, scheme=scheme, limits=limits, dt=0.01, source="arm7")
+    found = osik.load_controller(path)
+    assert found.dt == 0.01 and same(found.scheme, scheme) and same(found.robot, arm)
+    assert list(found.tasks) == list(tasks) and all(same(found.tasks[name], task) for name, task in tasks.items())
+    assert all(same(*pair) for pair in zip(found.limits, limits, strict=True))
+
+
+def test_it_gives_the_same_velocity_and_keeps_changed_numbers(arm, tmp_path):
+    robot = arm.scaled(length=1.1).with_home(np.asarray(arm.q0) + 0.1)
+    tasks = {
+        "hand": osik.FrameTask(robot, "hand", rows="position", target=jnp.array([0.4, 0.1, 0.5])),
+        "p": osik.PostureTask(robot),
+    }
+    osik.save_controller(tmp_path / "c.json", robot, tasks, source="arm7")
+    found = osik.load_controller(tmp_path / "c.json")
+    one, other = (osik.solve(r, r.q0, t).velocity for r, t in ((robot, tasks), (found.robot, found.tasks)))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_class_of_ones_own_and_a_function_are_refused(arm, tmp_path):
+    class Mine(osik.DampingTask):
+        """Of somebody's own."""
+
+    with pytest.raises(ValueError, match=r"tasks\['mine'\] is a Mine, which is no class of osik_jax"):
+        osik.save_controller(tmp_path / "c.json", arm, {"mine": Mine(arm)}, source="arm7")
+    make: Any = osik.FunctionTask
+    own = make(arm, lambda robot, kinematics, q: q[:1], target=0.0)
+    with pytest.raises(ValueError, match=r"tasks\['own'\]\..* a file cannot hold"):
+        osik.save_controller(tmp_path / "c.json", arm, {"own": own}, source="arm7")
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_a_robot_from_text_and_a_file_that_changed(tmp_path):
+    text = """<mujoco><worldbody><body name="u"><joint name="a" axis="0 1 0" range="-60 60"/><geom size=".02"/>
+        <body name="l" pos=".3 0 0"><joint name="b" axis="0 1 0" range="-90 45"/><geom size=".02"/></body>
+        </body></worldbody></mujoco>"""
+    robot = osik.Robot.from_mjcf(text, floating_base=False)
+    tasks = {"tip": osik.FrameTask(robot, "l", rows="position")}
+    file = tmp_path / "robot.xml"
+    file.write_text(text)
+    osik.save_controller(tmp_path / "f.json", robot, tasks, source=file)
+    assert same(osik.load_controller(tmp_path / "f.json").robot, robot)
+    file.write_text(text.replace(".3 0 0", ".4 0 0"))
+    with pytest.raises(ValueError, match="has changed since"):
+        osik.load_controller(tmp_path / "f.json")
+
+
+def test_other_files_and_classes_are_refused(tmp_path, arm):
+    path = tmp_path / "c.json"
+    path.write_text("{}")
+    with pytest.raises(ValueError, match="no controller that save_controller wrote"):
+        osik.load_controller(path)
+    osik.save_controller(path, arm, {"p": osik.PostureTask(arm)}, source="arm7")
+    content = json.loads(path.read_text())
+    content["scheme"]["class"] = "os.system"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="'os.system' is no class of this version"):
+        osik.load_controller(path)
+
+
+def test_no_public_class_is_left_out(arm):
+    tried = {type(one) for one in (*all_tasks(arm).values(), *all_limits(arm))}
+    public = {c for c in vars(osik).values() if inspect.isclass(c) and issubclass(c, osik.Task | osik.Limit)}
+    assert public - tried <= {
+        osik.Task,
+        osik.Limit,
+        osik.FunctionTask,
+        osik.EqualityConstraintTask,
+        osik.WheelTask,
+        osik.FloatingBaseVelocityLimit,
+    }
