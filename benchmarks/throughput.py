@@ -1,7 +1,7 @@
 """Steps a second of the closed loop against the size of the batch, on the default device.
 
     python -m benchmarks.throughput [results.json] [--robot nao] [--batches 1,64,1024] [--schemes weighted,...]
-                                    [--precisions float64,float32]
+                                    [--precisions float64,float32] [--tasks polygon]
 
 The robot stands on both feet, keeps its centre of mass and reaches with one hand, each lane from other angles of its
 arms and for another point; joint position and velocity limits, dt 5 ms. One call is one jitted, vmapped step: solve,
@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,14 @@ from .descriptions import ROBOTS, lean_urdf
 from .device import device_bytes
 from .machine import processor
 
+TASKS = {
+    "equality": "the centre of mass over one point",
+    "polygon": "the centre of mass inside the support polygon (the paper's own set)",
+    "limits": "polygon, and the velocity limits at half speed as a task",
+    "cone": "polygon, and the hand's first axis within 30 degrees of a point ahead",
+    "collision": "polygon, and the collision rows of the hand's arm as a task",
+}
+"""Task sets: what is added to feet, hand and posture. All but the first have inequality rows."""
 SCHEMES = {"weighted": osik.WeightedQP, "null-space": osik.NullSpace, "hierarchical": osik.HierarchicalQP}
 PRECISIONS = ("float64", "float32")
 BATCHES = (1, 16, 64, 256, 1024, 4096, 16384, 65536)
@@ -62,13 +71,22 @@ class Setting(NamedTuple):
     targets: jax.Array
 
 
-def setting(name: str) -> Setting:
-    """Both feet, centre of mass, one hand's position, posture; in the precision that is JAX's default now."""
+def setting(name: str, tasks_of: str = "equality") -> Setting:
+    """Both feet, centre of mass, one hand's position, posture, and what ``TASKS`` adds; in JAX's default precision."""
     robot = loaded(name)
     feet, hand = ROBOTS[name].feet, ROBOTS[name].hand
     tasks: dict[str, osik.Task] = {foot: osik.FrameTask(robot, foot, weight=100.0, priority=1) for foot in feet}
     if feet:
-        tasks["com"] = osik.ComTask(robot, weight=10.0, priority=2)
+        polygon = None if tasks_of == "equality" else osik.support_polygon(robot, robot.q0, feet)
+        tasks["com"] = osik.ComTask(robot, polygon=polygon, weight=10.0, priority=2)
+    if tasks_of == "limits":
+        slow = osik.VelocityLimit(robot, 0.5 * robot.velocity_limit)
+        tasks["limits"] = osik.LimitTask(robot, slow, priority=2)
+    if tasks_of == "cone":
+        axis, angle = (1.0, 0.0, 0.0), np.radians(30.0)
+        tasks["cone"] = osik.LookAtTask(robot, hand, axis=axis, half_angle=angle, priority=2)
+    if tasks_of == "collision":
+        tasks["collision"] = osik.LimitTask(robot, osik.CollisionAvoidanceLimit(robot, max_pairs=4), priority=2)
     tasks["hand"] = osik.FrameTask(robot, hand, rows="position", priority=3)
     tasks["posture"] = osik.PostureTask(robot, weight=1e-3, gain=1.0, priority=4)
     starts, ends = (jnp.asarray(q) for q in arm_angles(robot, ROBOTS[name].arms))
@@ -143,10 +161,10 @@ def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
 
 
 @cache
-def reference(robot: str, scheme: str) -> dict[str, np.ndarray]:
+def reference(robot: str, scheme: str, tasks: str) -> dict[str, np.ndarray]:
     """Task errors of all lanes after the checked steps, in float64 on the CPU."""
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        step, arguments, state = batch_of(setting(robot), SCHEMES[scheme](), LANES)
+        step, arguments, state = batch_of(setting(robot, tasks), SCHEMES[scheme](), LANES)
         program, _ = compiled(step, *arguments, state)
         for _ in range(CHECKED):
             state, error, _ = program(*arguments, state)
@@ -187,13 +205,15 @@ def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, n
     )
 
 
-def sweep(robot: str, scheme: str, precision: str, batches: list[int]) -> Iterator[dict[str, Any]]:
+def sweep(
+    robot: str, scheme: str, precision: str, batches: list[int], tasks: str = "equality"
+) -> Iterator[dict[str, Any]]:
     """Rows of growing batches, until a call would take too long or memory runs out."""
-    label: dict[str, Any] = dict(robot=robot, scheme=scheme, precision=precision)
+    label: dict[str, Any] = dict(robot=robot, scheme=scheme, precision=precision, tasks=tasks)
     last: dict[str, Any] | None = None
-    wanted = reference(robot, scheme)
+    wanted = reference(robot, scheme, tasks)
     with jax.enable_x64(precision == "float64"):
-        given = setting(robot)
+        given = setting(robot, tasks)
         for batch in sorted(batches):
             if last and last["seconds"] * batch / last["batch"] > LONGEST:
                 return
@@ -229,7 +249,7 @@ def kept(path: Path | None) -> list[dict[str, Any]]:
 
 def identity(row: dict[str, Any]) -> tuple[Any, ...]:
     """What a row is of."""
-    return row["robot"], row["scheme"], row["precision"], row["batch"]
+    return row["robot"], row["scheme"], row["precision"], row["batch"], row.get("tasks", "equality")
 
 
 def show(rows: list[dict[str, Any]]) -> None:
@@ -241,10 +261,12 @@ def show(rows: list[dict[str, Any]]) -> None:
         for row in rows:
             print(json.dumps(row))
         return
-    table = Table("scheme", "precision", "batch", "ms a call", "steps/s", "solved", "error", "compile [s]", "MiB")
+    table = Table(
+        "scheme", "tasks", "precision", "batch", "ms a call", "steps/s", "solved", "error", "compile [s]", "MiB"
+    )
     for r in rows:
         table.add_row(
-            *(r["scheme"], r["precision"], f"{r['batch']:,}"),
+            *(r["scheme"], r.get("tasks", "equality"), r["precision"], f"{r['batch']:,}"),
             *(f"{1e3 * r['seconds']:.3g}", f"{r['steps_per_second']:,.0f}", f"{r['solved']:.4f}", f"{r['error']:.1e}"),
             *(f"{r['compile_seconds']:.1f}", f"{r['program_bytes'] / 2**20:.2g}"),
         )
@@ -259,12 +281,14 @@ def main() -> None:
     parser.add_argument("--batches", type=listed(int), default=list(BATCHES))
     parser.add_argument("--schemes", type=listed(str, SCHEMES), default=list(SCHEMES))
     parser.add_argument("--precisions", type=listed(str, PRECISIONS), default=list(PRECISIONS))
+    parser.add_argument("--tasks", type=listed(str, TASKS), default=["equality", "polygon"], help=", ".join(TASKS))
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     rows, new = {identity(row): row for row in kept(given.results)}, []
     for scheme in given.schemes:
         for precision in given.precisions:
-            for row in sweep(given.robot, scheme, precision, given.batches):
+            swept = (sweep(given.robot, scheme, precision, given.batches, tasks) for tasks in given.tasks)
+            for row in chain.from_iterable(swept):
                 print(json.dumps(row), flush=True)
                 rows[identity(row)] = row
                 new.append(row)

@@ -1,0 +1,34 @@
+"""The CUDA text of the core: one text without includes, which NVRTC takes where it is installed."""
+
+import ctypes
+
+import pytest
+from core_checks import needs_core
+
+from osik_jax.core import _cuda
+from osik_jax.solvers.hqp import _cuda as hierarchy
+from osik_jax.solvers.hqp._padding import Layout
+
+NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
+"""Two levels of three variables; the second has one inequality row."""
+
+
+def test_headers_become_one_text_whose_loops_stay_loops():
+    text = _cuda.text_of("hierarchy.hpp")
+    assert "#include" not in text and "#pragma once" not in text and "struct Serial" not in text
+    assert text.count("struct Warp :") == 1
+    lines = [line.strip() for line in text.splitlines()]
+    loops = [before for before, line in zip(lines, lines[1:], strict=False) if line.startswith(("for (", "while ("))]
+    assert len(loops) > 30 and all("unroll" in before.lower() for before in loops)
+
+
+@needs_core
+def test_nvrtc_compiles_the_hierarchy():
+    path = _cuda.nvrtc()
+    if path is None:
+        pytest.skip("NVRTC is not installed")
+    nvrtc, program = ctypes.CDLL(path), ctypes.c_void_p()
+    source = hierarchy._source(NAO, 50).encode()
+    assert nvrtc.nvrtcCreateProgram(ctypes.byref(program), source, b"osik.cu", 0, None, None) == 0
+    options = b"--gpu-architecture=sm_90", b"--std=c++20", b"--device-as-default-execution-space"
+    assert nvrtc.nvrtcCompileProgram(program, 3, (ctypes.c_char_p * 3)(*options)) == 0
