@@ -4,10 +4,10 @@
                                [--precision float32] [--radius 0.5] [--tasks polygon] [--sample sample.npz]
     python -m benchmarks.jumps --judge sample.npz
 
-The task sets are those of ``benchmarks.throughput``; the default is the paper's own. A scan is 50 steps of 5 ms with the
-warm start carried on; before each, every hand gets a new target, uniform in a ball of the radius around its place at
-home, so that many are out of reach and none is led up to. The first scan compiles and is not timed, its statuses count.
-With ``--radius 0.02`` it is easy work, to be held against.
+The task sets are those of ``benchmarks.throughput``; the default is the paper's own. A scan is 50 steps of 5 ms with
+the warm start carried on; before each, every hand gets a new target, uniform in a ball of the radius around its place
+at home, so that many are out of reach and none is led up to. The first scan compiles and is not timed, its statuses
+count. With ``--radius 0.02`` it is easy work, to be held against.
 
 ``--sample`` keeps configurations, targets and answers of single steps, each the first one after a jump. ``--judge``
 solves those that were SOLVED again in double precision, from the same numbers.

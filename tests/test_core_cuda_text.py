@@ -1,6 +1,7 @@
 """The CUDA text of the core: one text without includes, which NVRTC takes where it is installed."""
 
 import ctypes
+from itertools import pairwise
 
 import pytest
 from core_checks import needs_core
@@ -18,7 +19,7 @@ def test_headers_become_one_text_whose_loops_stay_loops():
     assert "#include" not in text and "#pragma once" not in text and "struct Serial" not in text
     assert text.count("struct Warp :") == 1
     lines = [line.strip() for line in text.splitlines()]
-    loops = [before for before, line in zip(lines, lines[1:], strict=False) if line.startswith(("for (", "while ("))]
+    loops = [before for before, line in pairwise(lines) if line.startswith(("for (", "while ("))]
     assert len(loops) > 30 and all("unroll" in before.lower() for before in loops)
 
 
