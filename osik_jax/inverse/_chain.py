@@ -298,7 +298,7 @@ def curvature(
         aside = cross(turn, angular[at][None], along=-2)
         squares = radian**2 * _log_curvature(angular[at]) * jnp.sum(aside[:, None] * aside[None], 2)
         parts.append(jnp.where(first, pairs, jnp.swapaxes(pairs, 0, 1)) - squares)
-    moved = _entry_factors(chain.layout)
+    moved = jnp.asarray(_entry_factors(chain.layout), linear.dtype)
     return jnp.einsum("ai,ijl,bj->abl", moved, sum(parts[1:], parts[0]), moved, precision="highest")
 
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._linear import solve_with_pivots
@@ -133,7 +132,7 @@ def _move(
     """A damped Newton step, or one of Gauss and Newton where the damped Hessian is not positive definite."""
     squares = jnp.sum(matrix[:, :, None] * matrix[:, None], 0)
     scale = jnp.maximum(jnp.max(jnp.sum(matrix**2, 0), 0), jnp.finfo(gradient.dtype).tiny)
-    ridged = squares + damping * scale * np.eye(len(gradient))[..., None]
+    ridged = squares + damping * scale * jnp.eye(len(gradient), dtype=gradient.dtype)[..., None]
     both = jnp.concatenate([ridged + curvature, ridged], -1)
     steps, pivots = solve_with_pivots(both, jnp.concatenate([gradient, gradient], -1))
     (newton, fallback), (pivot, _) = jnp.split(steps, 2, -1), jnp.split(pivots, 2)
