@@ -198,7 +198,7 @@ def frame_by_frame(
     profile: Profile | None,
     motions: list[HumanMotion],
     judge: Callable[[Retargeted], dict[str, Any]],
-    look_ahead: int,
+    look_ahead: float,
 ) -> None:
     """Prints the table of ``--live``."""
     titles = ["p50 [ms]", "p99 [ms]", "processor p50 [ms]", "processor p99 [ms]"]
@@ -218,7 +218,7 @@ def frame_by_frame(
         print(row(motion.name, judge(result), None, [str(len(frames)), *times]), flush=True)
     p50, p99, own50, own99 = (np.percentile(np.concatenate(x), p) for x in (clock, processor) for p in (50, 99))
     print(
-        f"\n{sum(map(len, clock))} frames with a look-ahead of {look_ahead}: half below {p50:.1f} ms and 99 % below "
+        f"\n{sum(map(len, clock))} frames with a look-ahead of {look_ahead} s: half below {p50:.1f} ms and 99 % below "
         f"{p99:.1f} ms by the clock, {own50:.1f} and {own99:.1f} ms of processor time"
     )
 
@@ -265,7 +265,7 @@ def main() -> None:
     parser.add_argument("--judge", nargs=3, metavar=("FILE", "ROBOT", "MODEL"), help="a judge, its JSON, its model")
     parser.add_argument("--peer", help="the judge's report of another program's motions")
     parser.add_argument("--live", action="store_true", help="frame by frame")
-    parser.add_argument("--look-ahead", type=int, default=8, help="with --live: frames that the robot is behind")
+    parser.add_argument("--look-ahead", type=float, default=0.27, help="with --live: time that the robot is behind [s]")
     parser.add_argument("--smooth", type=float, nargs="+", default=[], help="each clip with each smoothness [s]")
     options = parser.parse_args()
     configure_cpu()

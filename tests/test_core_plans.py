@@ -52,8 +52,8 @@ def nao():
     return osik.load_robot("nao")
 
 
-@pytest.mark.variants(slow=["settled"], release=["spent"])
-@pytest.mark.parametrize("until", ["ready", "settled", "spent"])
+@pytest.mark.variants(slow=["settled"], release=["mended"])
+@pytest.mark.parametrize("until", ["ready", "settled", "mended"])
 def test_a_plan_is_improved_as_by_the_plain_method(until, nao, motion):
     clip, q = clip_of(nao, motion)
     by_kernel, plainly = compiled(until)
@@ -75,7 +75,7 @@ def test_a_plan_ends_with_the_same_step_as_by_the_plain_method(nao, motion):
 
 def test_the_centre_of_mass_is_kept_as_by_the_plain_method(nao, motion):
     clip, q = clip_of(nao, motion, 0.02)
-    by_kernel, plainly = compiled("spent")
+    by_kernel, plainly = compiled("mended")
     for contact in ([1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.0]):
         goals = dataclasses.replace(clip.goals, contact=clip.goals.present[:, None] * jnp.array(contact))
         given = clip._replace(goals=goals), q, jnp.array(2)
@@ -90,14 +90,14 @@ def test_locked_joints_and_rows_of_whole_blocks(motion):
     robot = osik.load_robot("nao", locked_joints=dict.fromkeys(LOCKED, 0.1))
     assert robot.nv % 8 == 0
     clip, q = clip_of(robot, motion)
-    by_kernel, plainly = compiled("spent")
+    by_kernel, plainly = compiled("mended")
     agree(by_kernel(clip, q, jnp.array(2)), plainly(clip, q, jnp.array(2)))
 
 
 def test_a_batch_is_what_each_clip_is_alone(nao, motion):
     clip, q = clip_of(nao, motion)
     starts, stiffer = jnp.stack([q, q[::-1]]), jnp.array([1.0, 2.0])
-    by_kernel, _ = compiled("spent")
+    by_kernel, _ = compiled("mended")
 
     def one(start, factor):
         bounds = clip.bounds._replace(step=factor * clip.bounds.step)
@@ -113,7 +113,7 @@ def test_a_batch_is_what_each_clip_is_alone(nao, motion):
 def test_what_cannot_be_solved_moves_nothing(nao, motion):
     clip, q = clip_of(nao, motion, 0.02)
     wrong = clip._replace(bounds=clip.bounds._replace(lower=jnp.full_like(clip.bounds.lower, jnp.nan)))
-    for function in compiled("spent"):
+    for function in compiled("mended"):
         found = function(wrong, q, jnp.array(2))
         np.testing.assert_array_equal(found.q, q)
         assert int(found.iterations) == 2

@@ -5,6 +5,7 @@ import io
 import json
 from functools import partial
 
+import mujoco
 import numpy as np
 import pytest
 from motion_files import bent_forward, dancer, write_bvh
@@ -14,7 +15,7 @@ from osik_jax import cli
 from osik_jax.retargeting import LiveRetargeter, LiveStatus, load_motion, report, retarget
 from osik_jax.retargeting._live_command import replay, stream
 
-LOOK_AHEAD = 5
+FPS, LOOK_AHEAD = 30.0, 5
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +31,13 @@ def motion(tmp_path_factory):
 @pytest.fixture(scope="module")
 def live(nao, motion):
     """One retargeter for all tests, since each compiles for seconds; ``reset`` comes first."""
-    return LiveRetargeter(nao, motion, look_ahead=LOOK_AHEAD)
+    return LiveRetargeter(nao, motion, look_ahead=LOOK_AHEAD / FPS, budget=1.0)
 
 
 def streamed(live, frames):
     live.reset()
     found = [live.step(frame) for frame in frames]
-    assert all(frame is None for frame in found[:LOOK_AHEAD])
+    assert all(frame is None for frame in found[: live.frames_ahead])
     return [frame for frame in found if frame is not None] + live.finish()
 
 
@@ -58,7 +59,7 @@ def assert_limits_hold(robot, frames, fps, acceleration=240.0):
 def test_the_centre_of_mass_stays_over_the_feet_frame_by_frame(nao, motion):
     margins = []
     for balance in (None, 0.01):
-        make = partial(LiveRetargeter, nao, look_ahead=LOOK_AHEAD, balance=balance)
+        make = partial(LiveRetargeter, nao, look_ahead=LOOK_AHEAD / FPS, balance=balance, budget=1.0)
         margins.append(report(replay(make, bent_forward(motion), paced=False)[0])["balance"]["com_margin_mm_min"])
     assert margins[0] < -5.0 and margins[1] > 10.0 - 0.5
 
@@ -76,6 +77,44 @@ def test_frame_by_frame_is_near_the_whole_clip(nao, motion, live):
     assert figures["feet"]["float_mm_max"] < 0.1 and figures["feet"]["below_floor_mm_max"] < 0.1
     assert figures["tracking"]["segment_angle_deg_mean"] < best["tracking"]["segment_angle_deg_mean"] + 0.5
     assert_limits_hold(nao, frames, motion.fps)
+
+
+def test_feet_hold_exactly_at_any_rate_with_few_iterations(nao, motion):
+    """MuJoCo's feet, from the written positions; three iterations of a plan leave millimetres by themselves."""
+    fast = motion.resampled(120.0)
+    live = LiveRetargeter(nao, fast, iterations=3)
+    assert live.frames_ahead == 32 and live.latency == pytest.approx(32 / 120)
+    frames = streamed(live, fast.positions[:50])
+    assert len(frames) == 50 and max(frame.iterations for frame in frames) <= 3
+    data, corners = mujoco.MjData(nao.mj_model), []
+    for frame in frames:
+        data.qpos[:] = np.asarray(nao.mujoco_qpos(frame.q))
+        mujoco.mj_kinematics(nao.mj_model, data)
+        corners.append([data.site(f"{side}_sole_corner_{k}").xpos.copy() for side in "lr" for k in range(4)])
+    corners, stands = np.array(corners), np.array([frame.contact for frame in frames])
+    assert stands.all()
+    assert np.abs(corners[..., 2]).max() < 2e-6 and np.ptp(corners[..., :2], axis=0).max() < 4e-6
+    assert max(frame.feet_off for frame in frames) < 2e-6
+    assert_limits_hold(nao, frames, 120.0)
+
+
+def test_a_foot_that_cannot_land_in_time_is_told(nao, motion):
+    """A foot that was lifted is said to stand from one frame to the next; heights are MuJoCo's."""
+    live = LiveRetargeter(nao, motion, look_ahead=1 / FPS, acceleration=20.0, budget=1.0)
+    positions = np.repeat(motion.positions[:1], 24, 0)
+    for name, shift in (("LeftLeg", [0.3, 0.0, 0.2]), ("LeftFoot", [0.1, 0.0, 0.3]), ("LeftToeBase", [0.1, 0.0, 0.3])):
+        positions[:12, motion.joint_names.index(name)] += shift
+    live.reset()
+    found = [live.step(seen, [f >= 12, f >= 12, True, True]) for f, seen in enumerate(positions)]
+    frames = [frame for frame in found if frame is not None] + live.finish()
+    told = [f for f, frame in enumerate(frames) if frame.status is LiveStatus.FEET_OFF]
+    assert told[0] == 12 and all((frame.feet_off > 1e-3) == (f in told) for f, frame in enumerate(frames))
+    data = mujoco.MjData(nao.mj_model)
+    data.qpos[:] = np.asarray(nao.mujoco_qpos(frames[12].q))
+    mujoco.mj_kinematics(nao.mj_model, data)
+    heights = [data.site(f"{side}_sole_corner_{k}").xpos[2] for side in "lr" for k in range(4)]
+    assert frames[12].feet_off == pytest.approx(np.abs(heights).max(), abs=1e-3) and np.abs(heights).max() > 5e-3
+    assert_limits_hold(nao, frames, motion.fps, 20.0)
 
 
 class Frame:
@@ -116,8 +155,14 @@ def test_short_streams_and_wrong_frames(nao, motion, live):
         live.step(motion.positions[1])
     with pytest.raises(ValueError, match="balance is nan"):
         LiveRetargeter(nao, motion, balance=np.nan)
-    with pytest.raises(ValueError, match="look_ahead is 0"):
-        LiveRetargeter(live.robot, motion, look_ahead=0)
+    for wrong, message in (
+        (dict(look_ahead=0), "look_ahead is 0; it is a time in seconds"),
+        (dict(look_ahead=8), "look_ahead is 8; it is a time in seconds, over 0 and up to 2"),
+        (dict(iterations=0), "iterations is 0"),
+        (dict(budget=0.0), "budget is 0.0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            LiveRetargeter(live.robot, motion, **wrong)
 
 
 def lines_of(motion):
@@ -149,7 +194,8 @@ def test_json_lines_in_json_lines_out(motion, live):
 
 def test_the_command_replays_a_clip(tmp_path, capsys):
     clip = write_bvh(tmp_path / "short.bvh", dancer(12), 0.01)
-    arguments = [str(clip), "--live", "--look-ahead", str(LOOK_AHEAD), "--no-animation", "--out", str(tmp_path / "out")]
+    arguments = [str(clip), "--live", "--look-ahead", str(LOOK_AHEAD / FPS), "--no-animation"]
+    arguments += ["--iterations", "3", "--budget", "1.0", "--out", str(tmp_path / "out")]
     assert cli.main(["retarget", *arguments]) == 0
     told = capsys.readouterr().out
     assert "5 frames of look-ahead are 167 ms" in " ".join(told.split())

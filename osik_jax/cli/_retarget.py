@@ -76,8 +76,12 @@ class Retarget:
     live: bool = False
     """Frame by frame: CLIP is replayed at its own rate, as it would come from a person; - reads JSON lines from stdin
     and writes JSON lines to stdout, and nothing to a folder."""
-    look_ahead: int = 8
-    """With --live: how many frames the robot is behind the person."""
+    look_ahead: float = 0.27
+    """With --live: time that the robot is behind the person [s]."""
+    iterations: int = 20
+    """With --live: iterations of the plan at each frame, at most."""
+    budget: float | None = None
+    """With --live: time that computing a frame may take [s]. Default: 0.6 of the time from one frame to the next."""
 
     def run(self) -> int:
         """Runs the command; returns the exit code."""
@@ -237,6 +241,8 @@ def _retarget_live(command: Retarget) -> None:
                 acceleration=command.acceleration,
                 balance=command.balance,
                 look_ahead=command.look_ahead,
+                iterations=command.iterations,
+                budget=command.budget,
             )
 
         if command.clip == "-":
@@ -250,11 +256,15 @@ def _retarget_live(command: Retarget) -> None:
         result, frames = replay(make, motion)
         figures = write_folder(result, motion.name, command.out, animation=command.animation)
     spent = 1e3 * np.array([frame.seconds for frame in frames])
-    waiting = 1e3 * command.look_ahead / motion.fps
+    ahead = max(1, round(command.look_ahead * motion.fps))
+    waiting = 1e3 * ahead / motion.fps
     console.print(
-        f"the robot is {waiting + np.median(spent):.0f} ms behind: {command.look_ahead} frames of look-ahead are "
+        f"the robot is {waiting + np.median(spent):.0f} ms behind: {ahead} frames of look-ahead are "
         f"{waiting:.0f} ms, and computing took {np.median(spent):.1f} ms a frame ({spent.max():.1f} at most)"
     )
+    lost = sum(frame.status is retargeting.LiveStatus.FEET_OFF for frame in frames)
+    if lost:
+        console.print(f"in {lost} of {len(frames)} frames limits did not let the feet hold (status feet_off)")
     _print_retargeted(console, figures, command)
 
 

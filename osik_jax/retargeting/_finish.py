@@ -57,14 +57,34 @@ def inside_limits(
     dt: Float[Array, ""],
 ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
     """The next configuration, and the velocity that leads to it: from beside ``goal`` towards the one that follows."""
+    v, _, _ = velocity_inside(robot, q, velocity, goal, following, limits, dt)
+    return moved(robot, q, v, dt)
+
+
+def velocity_inside(
+    robot: Robot,
+    q: Float[Array, " nq"],
+    velocity: Float[Array, " nv"],
+    goal: Float[Array, " nq"],
+    following: Float[Array, " nq"],
+    limits: Sequence[Limit],
+    dt: Float[Array, ""],
+) -> tuple[Float[Array, " nv"], Float[Array, " nv"], Float[Array, " nv"]]:
+    """The next velocity, from beside ``goal`` towards the configuration that follows, and its bounds."""
     spare = _SPARE * _accelerations(robot, limits)
     lower, upper = limit_box(robot, q, remembering(tuple(limits), velocity, True), dt)
     behind = difference(robot, q, goal)
     back = jnp.sign(behind) * stopping_speed(jnp.abs(behind), spare, dt)
-    v = jnp.clip(difference(robot, goal, following) / dt + back, lower, upper)
-    after = integrate(robot, q, v, dt)
+    return jnp.clip(difference(robot, goal, following) / dt + back, lower, upper), lower, upper
+
+
+def moved(
+    robot: Robot, q: Float[Array, " nq"], velocity: Float[Array, " nv"], dt: Float[Array, ""]
+) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
+    """The configuration after a step, with ball joints inside their ranges, and the velocity that leads there."""
+    after = integrate(robot, q, velocity, dt)
     if not independent_balls(robot.tree):
-        return after, v
+        return after, velocity
     after = with_balls_inside(robot.tree, after, robot.position_upper)  # the box alone does not bound their angles
     return after, difference(robot, q, after) / dt
 

@@ -36,7 +36,7 @@ def replay(make: Make, motion: HumanMotion, *, paced: bool = True) -> tuple[Reta
     """
     live = make(motion)
     person = read_person(motion, live.roles)
-    for _ in range(live.look_ahead + 2):  # so that all is compiled when the first frame comes
+    for _ in range(live.frames_ahead + 2):  # so that all is compiled when the first frame comes
         live.step(motion.positions[0])
     live.reset()
     found, began = [], time.perf_counter()

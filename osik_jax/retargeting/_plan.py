@@ -48,13 +48,14 @@ _LITTLE, _SETTLED = 2e-3, 2
 as two, a refused one as one. Where bounds are broken by more than that share, a step counts as one and a refused one
 not at all: what gains little there may be damped and not done."""
 
-_Ending = Literal["ready", "settled", "spent"]
+_Ending = Literal["ready", "settled", "mended"]
 _START = {
-    "ready": (_SOFTEST, _FIRST_DAMPING),
-    "settled": (_SOFT, _FIRST_DAMPING),
-    "spent": (1.0, _STIFF_DAMPING),
+    "ready": (_SOFTEST, _FIRST_DAMPING, _LITTLE),
+    "settled": (_SOFT, _FIRST_DAMPING, _LITTLE),
+    "mended": (1.0, _STIFF_DAMPING, 0.1 * _LITTLE),
 }
-"""What ends iterations but for their number; stiffness and damping with which they begin."""
+"""What ends iterations but for their number; stiffness and damping with which they begin, and what gain is little: less
+in a stream, where the newest frame alone has much to gain."""
 
 _SMOOTHNESS = ("smooth", "smooth_base")
 _STRIDE, _COARSE_ITERATIONS = 4, 8
@@ -112,7 +113,7 @@ class _State(NamedTuple):
     iterations: Int[Array, ""]
 
     @classmethod
-    def at(cls, clip: _Clip, q: Float[Array, "F nq"], stiffness: float, damping: float) -> _State:
+    def at(cls, clip: _Clip, q: Float[Array, "F nq"], stiffness: float, damping: Float[Array, ""] | float) -> _State:
         """Before the first iteration."""
         hard, damped, growth = (jnp.asarray(x, q.dtype) for x in (stiffness, damping, _CAREFUL))
         here, none = _linearised(clip, q, hard), jnp.array(0)
@@ -149,8 +150,9 @@ def mend_plan(
     q: Float[Array, "F nq"],
     free: Float[Array, " F"],
     iterations: Int[Array, ""] | int,
+    damping: Float[Array, ""] | float = _STIFF_DAMPING,
 ) -> Plan:
-    """A plan that is nearly good, made better by some iterations with bounds at their full stiffness.
+    """A plan that is nearly good, made better until steps gain little, with bounds at their full stiffness.
 
     Args:
         body: the robot.
@@ -159,9 +161,10 @@ def mend_plan(
         bounds: of the joints.
         q: the plan. (F, nq)
         free: 1 for frames that may move, 0 for those that are past. (F,)
-        iterations: how many.
+        iterations: how many, at most.
+        damping: with which they begin, at least ``_STIFF_DAMPING``.
     """
-    return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, until="spent")
+    return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, damping, until="mended")
 
 
 def at_solution(
@@ -186,6 +189,8 @@ def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq
     too, and stays so once the bounds are stiff.
     """
     robot, frames = clip.body.robot, len(start)
+    if frames <= _STRIDE:  # one frame would be the part
+        return start
     part = slice(None, None, _STRIDE)
     wide = dataclasses.replace(
         clip.weights,
@@ -207,44 +212,68 @@ def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq
     return jax.vmap(lambda a, b: integrate(robot, a, b))(start, move)
 
 
-def _descended(clip: _Clip, q: Float[Array, "F nq"], most: Int[Array, ""] | int, *, until: _Ending) -> Plan:
+def _descended(
+    clip: _Clip,
+    q: Float[Array, "F nq"],
+    most: Int[Array, ""] | int,
+    damping: Float[Array, ""] | float | None = None,
+    *,
+    until: _Ending,
+) -> Plan:
     """Iterations from some configurations on: on CPUs by the compiled core, where it is installed.
 
     Args:
         clip: what for.
-        q: where they begin; with soft bounds and little damping, or stiff and damped for those that are ``spent``.
+        q: where they begin; with soft bounds and little damping, or stiff and damped for those that are ``mended``.
         most: iterations, at most.
-        until: what ends them before: bounds that are ready to get stiffer, steps that gain little, or nothing (static).
+        damping: with which they begin; None: what goes with their ending.
+        until: what ends them before: bounds that are ready to get stiffer, or steps that gain little (static).
     """
     descended = _by_kernel if takes("auto", "core", fits=True) else _descended_plain
-    return descended(clip, q, jnp.asarray(most), until=until)
+    damping = _START[until][1] if damping is None else damping
+    return descended(clip, q, jnp.asarray(most), jnp.asarray(damping, q.dtype), until=until)
 
 
-def _descended_plain(clip: _Clip, q: Float[Array, "F nq"], most: Int[Array, ""], *, until: _Ending) -> Plan:
+def _descended_plain(
+    clip: _Clip,
+    q: Float[Array, "F nq"],
+    most: Int[Array, ""],
+    damping: Float[Array, ""] | float | None = None,
+    *,
+    until: _Ending,
+) -> Plan:
     """The same in plain JAX."""
+    stiffness, usual, little = _START[until]
 
     def goes_on(state: _State) -> Bool[Array, ""]:
-        over = {"ready": state.ready, "settled": state.settled >= _SETTLED, "spent": jnp.array(False)}[until]
+        over = state.ready if until == "ready" else state.settled >= _SETTLED
         return ~over & (state.iterations < most)
 
-    last = jax.lax.while_loop(goes_on, partial(_improved, clip), _State.at(clip, q, *_START[until]))
+    first = _State.at(clip, q, stiffness, usual if damping is None else damping)
+    last = jax.lax.while_loop(goes_on, partial(_improved, clip, little=little), first)
     return Plan(last.q, jnp.stack(last.here.costs), last.iterations)
 
 
 def _descended_by_core(
-    clip: _Clip, q: Float[Array, "lanes F nq"], most: Int[Array, " lanes"], *, until: _Ending
+    clip: _Clip,
+    q: Float[Array, "lanes F nq"],
+    most: Int[Array, " lanes"],
+    damping: Float[Array, " lanes"],
+    *,
+    until: _Ending,
 ) -> Plan:
     """The same of a batch, on a CPU and in double precision; what all lanes share has an axis of length 1."""
-    endings = float(until == "ready"), float(until == "settled")
+    endings = float(until == "ready"), float(until != "ready")
+    stiffness, _, little = _START[until]
     rules = (_LARGEST_STEP, _STIFFENING, _SLOWING, _FIXED, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING, _CALMER)
-    rules += (_CAREFUL, _LITTLE, float(_SETTLED), *_START[until])
-    return Plan(*_plan_kernel.descended(*clip, q, rules, most, endings))
+    rules += (_CAREFUL, little, float(_SETTLED), stiffness)
+    return Plan(*_plan_kernel.descended(*clip, q, rules, damping, most, endings))
 
 
 _by_kernel = by_kernel(_descended_plain, _descended_by_core)
 
 
-def _improved(clip: _Clip, state: _State) -> _State:
+def _improved(clip: _Clip, state: _State, little: float = _LITTLE) -> _State:
     """One system solved, and its step taken if it makes things better."""
     robot, here = clip.body.robot, state.here
     free = clip.free[:, None]
@@ -262,9 +291,9 @@ def _improved(clip: _Clip, state: _State) -> _State:
     least = jnp.where(~better | (stiffer >= 1.0), _STIFF_DAMPING, _LEAST_DAMPING)
     damping = jnp.clip(state.damping * jnp.where(better, _CALMER, state.growth), least, _MOST_DAMPING)
     growth = jnp.where(better, _CAREFUL, 2.0 * state.growth)
-    little, kept = (state.stiffness >= 1.0) & (before - after < _LITTLE * soft), stiff < _LITTLE * soft
+    gains_little, kept = (state.stiffness >= 1.0) & (before - after < little * soft), stiff < little * soft
     counted = better.astype(int) + kept.astype(int)
-    settled = jnp.where(little, state.settled + counted, jnp.where(better, 0, state.settled))
+    settled = jnp.where(gains_little, state.settled + counted, jnp.where(better, 0, state.settled))
     settled = jnp.where(~better & (state.damping >= _MOST_DAMPING), _SETTLED, settled)
     ready = jnp.where(better, before - after < _SLOWING * before, state.ready)
     old, new = (state.q, here, state.stiffness), (candidate, there, stiffer)

@@ -31,6 +31,7 @@ def descended(
     free: Float[Array, "_ F"],
     q: Float[Array, "_ F nq"],
     rules: tuple[float, ...],
+    damping: Float[Array, " _"],
     most: Int[Array, " _"],
     endings: tuple[float, float],
 ) -> tuple[Array, Array, Array]:
@@ -44,13 +45,14 @@ def descended(
         free: 1 for frames that may move.
         q: where it begins.
         rules: numbers of the method.
+        damping: with which it begins.
         most: iterations, at most.
         endings: whether it ends when bounds are ready to get stiffer, and when steps gain little.
     """
     frames, nq = q.shape[1:]
     integers = _structure(body)
     wishes = goals.directions, goals.pelvis, goals.torso, goals.root, goals.feet, goals.contact, goals.present
-    method = side_by_side(np.array([rules]), most.astype(q.dtype), np.array([endings]))
+    method = side_by_side(np.array([rules]), damping, most.astype(q.dtype), np.array([endings]))
     given = [q, *wishes, free, _numbers(body, weights, bounds), method]
     lanes = max(len(a) for a in given)
     found, cost, count = _library.call(

@@ -213,6 +213,20 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
     )
 
 
+def soles(body: Body, kinematics: Kinematics) -> tuple[Float[Array, "8 3"], Float[Array, "8 3 nv"]]:
+    """Return the soles' corners in the world [m], and their derivatives."""
+    robot, first = body.robot, len(body.keys) + 4
+    frames, offsets = body.frames[first : first + 8], body.offsets[first : first + 8]
+    names = tuple(dict.fromkeys(frames))
+    index = np.array([names.index(name) for name in frames])
+    positions, rotations = kinematics.frame_poses(robot, names)
+    points = positions[index] + rotate(rotations[index], offsets)
+    moves = robot.tree.moves[np.repeat([robot.tree.frame_bodies[robot.tree.frame(name)] for name in frames], 3)]
+    axes = jnp.tile(jnp.eye(3, dtype=points.dtype), (8, 1))
+    rates = _Motion.of(robot, kinematics).rates(moves, axes, jnp.repeat(points, 3, 0))
+    return points, independent_columns(robot.tree, rates).reshape(8, 3, -1)
+
+
 class _Places(NamedTuple):
     """Points, how trunk and feet are turned, and which dofs move the bodies that the points are fixed to."""
 
