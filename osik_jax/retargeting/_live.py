@@ -287,8 +287,8 @@ def _advance(
     (velocity, stance, damping), dt = before, jnp.asarray(dt, q.dtype)
     mended = mend_plan(body, goals, weights, bounds, q, 1.0 * (jnp.arange(len(q)) >= _PAST), iterations, damping)
     # steps that were all refused need more damping from the start
-    moved = jnp.any(mended.q != q)
-    damping = jnp.clip(damping * jnp.where(moved, _LESS, _MORE), _DAMPING, _MOST_DAMPING)
+    taken = jnp.any(mended.q != q)
+    damping = jnp.clip(damping * jnp.where(taken, _LESS, _MORE), _DAMPING, _MOST_DAMPING)
     still = jnp.concatenate([q[:_PAST], jnp.broadcast_to(q[_PAST - 1], q[_PAST:].shape)])
     plan = jnp.where(jnp.isfinite(mended.q).all(), mended.q, still)
     goal = plan[_PAST - 1]
