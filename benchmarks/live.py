@@ -30,6 +30,7 @@ from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live import _open
 from osik_jax.viewer.live._default import find_hands
+from osik_jax.viewer.live._source import RobotSource
 from osik_jax.viewer.live._surfaces import part_triangles
 from osik_jax.viewer.live._timing import Stopwatch
 
@@ -145,7 +146,7 @@ def resident() -> float:
 
 def measure(name: str, seconds: float, obstacles: bool) -> dict[str, object]:
     """One session."""
-    source = _open.source_of(name, None)
+    source = RobotSource(name)
     robot = read_robot(source.robot)
     feet = guess_feet(robot) if robot.floating_base else ()
     load = os.getloadavg()[0]

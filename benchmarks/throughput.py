@@ -80,7 +80,7 @@ def setting(name: str, tasks_of: str = "equality") -> Setting:
         polygon = None if tasks_of == "equality" else osik.support_polygon(robot, robot.q0, feet)
         tasks["com"] = osik.ComTask(robot, polygon=polygon, weight=10.0, priority=2)
     if tasks_of == "limits":
-        slow = osik.VelocityLimit(robot, 0.5 * robot.velocity_limit)
+        slow = osik.VelocityLimit(robot, velocity=0.5 * robot.velocity_limit)
         tasks["limits"] = osik.LimitTask(robot, slow, priority=2)
     if tasks_of == "cone":
         axis, angle = (1.0, 0.0, 0.0), np.radians(30.0)

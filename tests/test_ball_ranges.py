@@ -22,7 +22,7 @@ def mjcf(degrees: float, more: str = "") -> str:
     </worldbody>{more}</mujoco>"""
 
 
-def angles(q: np.ndarray) -> np.ndarray:
+def angles(q: np.ndarray | jax.Array) -> np.ndarray:
     """Angle of the ball joint [rad], of configurations (..., nq)."""
     return Rotation.from_quat(np.asarray(q)[..., :4].reshape(-1, 4), scalar_first=True).magnitude()
 
@@ -60,6 +60,7 @@ def test_random_steps_at_the_end_of_the_range_stay_inside():
     def moved(q, corner, dt):
         lower, upper = limit.box(robot, q, dt)
         rows = limit.rows(robot, osik.forward_kinematics(robot, q), q, dt)
+        assert rows is not None
         v = jnp.where(corner > 0.0, upper, lower)
         v = jnp.where(jnp.isfinite(v), v, 0.0)
         axis, outward = rows.jacobian[0], rows.upper[0]
@@ -140,6 +141,7 @@ def test_derivatives_are_finite_where_the_axis_is_not_known():
 
         def numbers(q, dt):
             rows = limit.rows(robot, osik.forward_kinematics(robot, q), q, dt)
+            assert rows is not None
             kept = [limit.box(robot, q, dt)[1], rows.jacobian.ravel(), rows.upper]
             inside = with_balls_inside(robot.tree, q, robot.position_upper)
             return jnp.concatenate([*(jnp.where(jnp.isfinite(a), a, 0.0) for a in kept), inside])

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -32,6 +33,12 @@ def place(q):
     return np.array([np.cos(q[0]) + np.cos(q[0] + q[1]), np.sin(q[0]) + np.sin(q[0] + q[1]), 0.0])
 
 
+def counts(found):
+    """How many solutions there are, and how many of them are branches."""
+    assert found.count is not None and found.branches is not None
+    return int(found.count), int(found.branches)
+
+
 def modulo_turns(x, other):
     return np.abs(np.angle(np.exp(1j * (np.asarray(x) - other)))).max(-1)
 
@@ -40,8 +47,8 @@ def modulo_turns(x, other):
 def test_joints_without_limits_have_two_branches_next_to_q0(home):
     robot = two_links("")
     branch = np.array([1.2584, -1.7264])
-    found = osik.inverse_kinematics(robot, {"tip": place(branch)}, all=True, q0=np.array(home))
-    assert int(found.count) == int(found.branches) == 2
+    found = osik.inverse_kinematics(robot, {"tip": place(branch)}, all=True, q0=jnp.array(home))
+    assert counts(found) == (2, 2)
     solutions = np.asarray(found.solutions)[:2]
     mirrored = np.array([branch.sum(), -branch[1]])
     for expected in (branch, mirrored):
@@ -56,7 +63,7 @@ def test_configurations_by_whole_turns_within_limits_follow_the_branches():
     turns = 2 * np.pi * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
     expected = np.concatenate([branch + turns, np.array([branch.sum(), -branch[1]]) + turns])
     expected = expected[(np.abs(expected) <= 6.2832).all(1)]
-    assert int(found.branches) == 2 and int(found.count) == len(expected) == 8
+    assert counts(found) == (len(expected), 2) == (8, 2)
     solutions = np.asarray(found.solutions)
     assert max(np.abs(solutions[:8] - one).max(1).min() for one in expected) < 1e-4
     assert np.abs(solutions[:2]).max() <= np.pi and np.isnan(solutions[8:]).all()
@@ -67,8 +74,8 @@ def test_nearest_and_usual_answers_are_next_to_q0_across_turns(joint):
     robot = two_links(joint)
     for branch, turns in (((3.1, 0.4), 1), ((0.3, -0.8), -2), ((-3.1, 1.0), 2)):
         start = np.array(branch) + [2 * np.pi * turns, 0.0] + 0.02
-        for options in ({"nearest": True}, {}):
-            found = osik.inverse_kinematics(robot, {"tip": place(branch)}, q0=start, **options)
+        for nearest in (True, False):
+            found = osik.inverse_kinematics(robot, {"tip": place(branch)}, q0=jnp.asarray(start), nearest=nearest)
             np.testing.assert_allclose(found.q, start - 0.02, atol=2e-3)
 
 
@@ -78,7 +85,8 @@ def test_finds_all_analytic_solutions_of_a_ur10e():
     given = np.load(UR10E)
     found = osik.inverse_kinematics(robot, {"tip": (given["position"], given["rotation"])}, all=True)
     complete = 0
-    for own, count, expected in zip(np.asarray(found.solutions), found.branches, given["solutions"], strict=True):
+    solutions, branches = np.asarray(found.solutions), np.asarray(found.branches)
+    for own, count, expected in zip(solutions, branches, given["solutions"], strict=True):
         expected = expected[np.isfinite(expected[:, 0])]
         complete += max(modulo_turns(own[:count], one).min() for one in expected) < 5e-3
     assert complete >= 0.95 * len(given["solutions"])
@@ -93,6 +101,6 @@ def test_a_follower_of_half_the_angle_has_no_copies():
     )
     q = 2.0
     position = np.array([np.cos(q) + 0.5 * np.cos(1.5 * q), np.sin(q) + 0.5 * np.sin(1.5 * q), 0.0])
-    found = osik.inverse_kinematics(robot, {"tip": position}, q0=np.array([q - 2.5]), all=True)
-    assert found.converged and int(found.count) == 1  # a turn further the follower points the other way
+    found = osik.inverse_kinematics(robot, {"tip": position}, q0=jnp.array([q - 2.5]), all=True)
+    assert found.converged and counts(found)[0] == 1  # a turn further the follower points the other way
     np.testing.assert_allclose(found.q, [q], atol=2e-3)

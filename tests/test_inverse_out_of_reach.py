@@ -78,12 +78,12 @@ def test_limbs_that_share_no_joint_stay_on_their_targets():
     robot = osik.Robot.from_mjcf(
         HEAD + FINGER.format(y=0, n="a") + FINGER.format(y=0.1, n="b") + "</worldbody></mujoco>"
     )
-    q = np.array([0.4, 0.5, 0.4, 0.5])
+    q = jnp.array([0.4, 0.5, 0.4, 0.5])
     goal = {name: np.array(osik.forward_kinematics(robot, q).frame_pose(robot, name)[0]) for name in "ab"}
     goal["a"] = goal["a"] + [0.0, 0.0, 0.2]
     straight = np.linalg.norm(goal["a"]) - 0.1  # the links in one line towards the target
-    for options in ({}, {"q0": q}):
-        found = osik.inverse_kinematics(robot, goal, **options)
+    for q0 in (None, q):
+        found = osik.inverse_kinematics(robot, goal, q0=q0)
         off = {name: float(np.linalg.norm(found.residual[name])) for name in "ab"}
         assert not found.converged and off["b"] < 1e-6
         assert off["a"] == pytest.approx(straight, abs=1e-6)

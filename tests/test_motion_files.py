@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ def test_keypoints_with_another_axis_up_are_turned_and_told(tmp_path, up, rest):
     upright = load_motion(write_bvh(tmp_path / "clip.bvh", dancer()))
     turns = {"y": "0 1 0 0 0 1 1 0 0", "x": "0 0 1 1 0 0 0 1 0", "-y": "0 -1 0 0 0 -1 1 0 0"}
     turn = np.array(turns[up].split(), float).reshape(3, 3)
-    parts = dict(rest_positions=known(upright.rest_positions) @ np.transpose(turn)) if rest else {}
+    parts: Any = dict(rest_positions=known(upright.rest_positions) @ np.transpose(turn)) if rest else {}
     np.savez(
         tmp_path / "clip.npz",
         fps=30.0,
@@ -138,8 +139,9 @@ def test_keypoints_with_another_axis_up_are_turned_and_told(tmp_path, up, rest):
         kept = load_motion(tmp_path / "clip.npz", up="z")
     with pytest.warns(OsikWarning, match=f"looks as if {up} did"):
         measure(kept, find_roles(kept.joint_names))
+    no_axis: Any = "w"
     with pytest.raises(ValueError, match="up is 'w'; it is one of x, y, z, -x"):
-        load_motion(tmp_path / "clip.npz", up="w")
+        load_motion(tmp_path / "clip.npz", up=no_axis)
 
 
 def test_a_person_who_lies_or_crawls_stays_down(tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 from functools import partial
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -105,7 +106,7 @@ def test_a_foot_that_cannot_land_in_time_is_told(nao, motion):
     for name, shift in (("LeftLeg", [0.3, 0.0, 0.2]), ("LeftFoot", [0.1, 0.0, 0.3]), ("LeftToeBase", [0.1, 0.0, 0.3])):
         positions[:12, motion.joint_names.index(name)] += shift
     live.reset()
-    found = [live.step(seen, [f >= 12, f >= 12, True, True]) for f, seen in enumerate(positions)]
+    found = [live.step(seen, np.array([f >= 12, f >= 12, True, True])) for f, seen in enumerate(positions)]
     frames = [frame for frame in found if frame is not None] + live.finish()
     told = [f for f, frame in enumerate(frames) if frame.status is LiveStatus.FEET_OFF]
     assert told[0] == 12 and all((frame.feet_off > 1e-3) == (f in told) for f, frame in enumerate(frames))
@@ -155,6 +156,7 @@ def test_short_streams_and_wrong_frames(nao, motion, live):
         live.step(motion.positions[1])
     with pytest.raises(ValueError, match="balance is nan"):
         LiveRetargeter(nao, motion, balance=np.nan)
+    wrong: Any
     for wrong, message in (
         (dict(look_ahead=0), "look_ahead is 0; it is a time in seconds"),
         (dict(look_ahead=8), "look_ahead is 8; it is a time in seconds, over 0 and up to 2"),

@@ -1,5 +1,7 @@
 """Quaternions and matrices rounded to a few digits are rotations; zeros and NaN are none, traced or not."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,7 +84,7 @@ def test_inverse_kinematics_takes_what_is_rounded(arm):
     """The answer is that of the exact rotation, for one, many and traced targets; a traced zero is not found."""
     pose = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")
     rounded = np.asarray(pose[1]).round(3)
-    options = dict(seeds=4, restarts=0, q0=arm.q0)
+    options: Any = dict(seeds=4, restarts=0, q0=arm.q0)
     for rotations in (rounded[None], Rotation.from_matrix(rounded).as_quat(scalar_first=True)[None].round(3)):
         found = osik.inverse_kinematics(arm, {"hand": (np.asarray(pose[0])[None], rotations)}, **options)
         assert found.converged.all() and found.orientation_error.max() < 1e-2
@@ -95,6 +97,7 @@ def test_inverse_kinematics_takes_what_is_rounded(arm):
 def test_motions_of_people_are_normalised():
     exact = Rotation.random(6, random_state=1).as_quat(scalar_first=True).reshape(3, 2, 4)
     motion = HumanMotion("clip", 30.0, ("hips", "spine"), np.zeros((3, 2, 3)), exact.round(2))
+    assert motion.rotations is not None
     np.testing.assert_allclose(np.linalg.norm(motion.rotations, axis=-1), 1.0, atol=1e-15)
     assert np.abs(motion.rotations - exact).max() < 0.01
     for spoilt in (0.0 * exact, 1.1 * exact, np.nan * exact):

@@ -88,9 +88,10 @@ def test_a_class_of_ones_own_and_a_function_are_refused(arm, tmp_path):
     class Mine(osik.DampingTask):
         """Of somebody's own."""
 
+    make: Any = Mine
     with pytest.raises(ValueError, match=r"tasks\['mine'\] is a Mine, which is no class of osik_jax"):
-        osik.save_controller(tmp_path / "c.json", arm, {"mine": Mine(arm)}, source="arm7")
-    make: Any = osik.FunctionTask
+        osik.save_controller(tmp_path / "c.json", arm, {"mine": make(arm)}, source="arm7")
+    make = osik.FunctionTask
     own = make(arm, lambda robot, kinematics, q: q[:1], target=0.0)
     with pytest.raises(ValueError, match=r"tasks\['own'\]\..* a file cannot hold"):
         osik.save_controller(tmp_path / "c.json", arm, {"own": own}, source="arm7")

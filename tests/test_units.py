@@ -38,7 +38,7 @@ def test_degrees_of_a_configuration(arm, tasks):
         "configuration": lambda: arm.configuration({"joint2": 45.0, "joint4": -90.0}),
         "solve": lambda: osik.solve(arm, DEGREES, tasks),
         "rollout": lambda: osik.rollout(arm, DEGREES, tasks, steps=2),
-        "inverse": lambda: osik.inverse_kinematics(arm, {"hand": POINT}, q0=np.array(DEGREES), seeds=2, restarts=0),
+        "inverse": lambda: osik.inverse_kinematics(arm, {"hand": POINT}, q0=jnp.array(DEGREES), seeds=2, restarts=0),
     }
     for name, call in calls.items():
         (message,) = told(call)
