@@ -45,7 +45,7 @@ def targets(add: Add) -> None:
     add("a position for a pose", lambda: hand(target=np.zeros(3)), V, "(3, 3)")
     add("five numbers for a pose", lambda: hand(target=np.zeros(5)), V, "(4, 4)")
     add("a quaternion of zeros for a rotation", lambda: hand(target=(np.zeros(3), np.zeros(4))), V, "quaternion")
-    add("a 4 x 4 matrix of ones", lambda: hand(target=np.ones((4, 4))), V, "R R' = I")
+    add("a 4 x 4 matrix of ones", lambda: hand(target=np.ones((4, 4))), V, "0 0 0 1")
     add("a rotation of length 2", lambda: hand(target=(np.zeros(3), 2.0 * np.eye(3))), V, "R R' = I")
     add("a rotation of length 2, by replace", lambda: hand().replace(target=(np.zeros(3), 2.0 * np.eye(3))), V, "R R'")
     add("a reflection", lambda: hand(target=(np.zeros(3), np.diag([1.0, 1.0, -1.0]))), V, "det R = 1")

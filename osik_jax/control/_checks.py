@@ -147,7 +147,7 @@ _accepted_gains: tuple[Any, ...] = ()
 def warn_of_large_gains(tasks: Mapping[str, Task], dt: Any) -> None:
     """Give one ``OsikWarning`` that names the tasks whose gain times dt is above 2; nothing is said of traced numbers.
 
-    Their errors grow at each step.
+    A step uses 1 / dt in their place (``Task.during``); numbers as large as these are mostly other units.
     """
     global _accepted_gains
     gains = [getattr(task, "gain", 0.0) for task in tasks.values()]
@@ -162,7 +162,7 @@ def warn_of_large_gains(tasks: Mapping[str, Task], dt: Any) -> None:
         _accepted_gains = seen
         return
     warn(
-        f"gain times dt is above {_DIVERGES:g}, so that errors grow at each step of {float(dt):g} s: "
+        f"gain times dt is above {_DIVERGES:g}; a gain counts as 1 / dt at most in a step of {float(dt):g} s: "
         f"{', '.join(named)}. Gains are in 1/s, dt is in seconds"
     )
 

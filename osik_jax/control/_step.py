@@ -86,7 +86,7 @@ def solve(
 
     Warns:
         OsikWarning: a robot that has float32 numbers while ``jax_enable_x64`` is on; numbers that are probably in other
-            units: a joint far outside its range, or a gain times dt above 2, which makes errors grow.
+            units: a joint far outside its range, or a gain times dt above 2.
     """
     check_setting("solve(robot, q, tasks)", robot, scheme, dt)
     limits = checked_limits(robot, limits)
