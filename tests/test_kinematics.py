@@ -71,7 +71,7 @@ def quick_jit(function):
 
 
 def toy_robot(**options) -> osik.Robot:
-    return osik.Robot.from_mjmodel(mujoco.MjModel.from_xml_string(TOY), **options)
+    return osik.Robot.from_mjmodel(mujoco.MjModel.from_xml_string(TOY), root=("base", "crane"), **options)
 
 
 def make(name: str) -> osik.Robot:

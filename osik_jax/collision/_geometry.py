@@ -34,6 +34,9 @@ _FIRST_VERTICES = 32
 _VERTICES_A_ROUND = 16
 """How a large hull is thinned out: it begins with so many vertices, and each round adds those furthest outside."""
 
+_FLAT = 1e-12
+"""Heights above a face are roundoff below this, relative to the size of the points."""
+
 _MERGED = 1e-6
 """Normals and edge directions that differ by less are one."""
 
@@ -157,10 +160,16 @@ def _thinned(points: np.ndarray) -> scipy.spatial.ConvexHull:
 
 
 def _reach_outside(points: np.ndarray, hull: scipy.spatial.ConvexHull) -> float:
-    """Return a bound on how far outside a hull any of the points is: its distance to the face it is furthest out of."""
-    outside = points @ hull.equations[:, :3].T + hull.equations[:, 3]
-    corners = hull.points[hull.simplices[np.argmax(outside, 1)]]
-    return float(np.sqrt(_squares_to_triangles(points, corners).max()))
+    """Return the largest distance of a point to the hull [m].
+
+    The face whose plane a point is furthest above need not be the nearest one: triangles of one flat side share a plane.
+    """
+    height = (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(1)
+    outside = points[height > _FLAT * np.ptp(points)]
+    squares = np.full(len(outside), np.inf)
+    for corners in hull.points[hull.simplices]:
+        squares = np.minimum(squares, _squares_to_triangles(outside, np.broadcast_to(corners, (len(outside), 3, 3))))
+    return float(np.sqrt(squares.max(initial=0.0)))
 
 
 def _squares_to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
