@@ -77,7 +77,8 @@ def test_met_and_linear_tasks_bend_nothing(arm):
         met = osik.FrameTask(arm, "hand", target=kinematics.frame_pose(arm, "hand"))
         return [task.rows(arm, kinematics, q).curvature for task in (met, osik.PostureTask(arm, weight=1.0))]
 
-    assert curvatures(bent(arm)) == [0.0, 0.0]
+    met, linear = curvatures(bent(arm))
+    assert linear == 0.0 and met < 1e-14  # the target's rotation is normalised, which changes it by roundoff
 
 
 @pytest.fixture(scope="module")
