@@ -231,7 +231,7 @@ class TestLimitTask:
     def test_above_the_others_it_is_the_limit(self, arm):
         limit = osik.VelocityLimit(arm, velocity={"*": 0.5})
         tasks = self.tasks(arm, limit, 1)
-        ranked = solve(arm, tasks, osik.HierarchicalQP(), ())
+        ranked = solve(arm, tasks, osik.HierarchicalQP(), osik.no_limits)
         rest = {name: task for name, task in tasks.items() if name != "speed"}
         strict = solve(arm, rest, osik.HierarchicalQP(), (limit,))
         np.testing.assert_allclose(ranked.velocity, strict.velocity, atol=1e-9)
@@ -240,7 +240,7 @@ class TestLimitTask:
     def test_below_another_it_gives_way(self, arm):
         """The hand's task is met, and the speeds are as little beyond the limit as that allows."""
         limit = osik.VelocityLimit(arm, velocity={"*": 0.5})
-        s = solve(arm, self.tasks(arm, limit, 3), osik.HierarchicalQP(curvature_damping=0.0), ())
+        s = solve(arm, self.tasks(arm, limit, 3), osik.HierarchicalQP(curvature_damping=0.0), osik.no_limits)
         assert s.status == Status.SOLVED
         assert np.abs(s.slack["hand"]).max() < 1e-9
         v = np.asarray(s.velocity)

@@ -141,7 +141,7 @@ def test_adding_moving_and_removing_compiles_nothing(desk: Desk) -> None:
     assert list(desk.obstacles) == ["ball 1"]
     assert program is not None and desk.loop._job is not None and desk.loop._job.program is program.program
     off = dataclasses.replace(desk.session, limits_off=frozenset({3})).controller()
-    assert len(off.limits) == 3 and off.structure() != desk.session.controller().structure()
+    assert len(off.limits) == 4 and off.structure() != desk.session.controller().structure()
 
 
 def test_obstacles_are_kept_by_sessions_and_lines_of_python(desk: Desk) -> None:

@@ -81,7 +81,8 @@ def _repaired(form: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
     else:
         return form, ""
     try:
-        shell = _compiled({**form, "scale": (1.0, 1.0, 1.0), "inertia": mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL})
+        unit = {**form, "scale": (1.0, 1.0, 1.0), "inertia": mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL}
+        shell = _compiled(unit, with_hull=False)
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, shell.mesh_quat[0])
         points = shell.mesh_vert @ turn.reshape(3, 3).T + shell.mesh_pos[0]
@@ -92,11 +93,14 @@ def _repaired(form: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
     return thick, f"is flat, and {1e3 * _THICKNESS:g} mm thick here"
 
 
-def _compiled(form: dict[str, Any]) -> mujoco.MjModel:
-    """The mesh alone, with its hull, which a model of a URDF has too."""
+def _compiled(form: dict[str, Any], *, with_hull: bool = True) -> mujoco.MjModel:
+    """The mesh alone; by default with its hull, which a model of a URDF has too and which a flat mesh has not."""
     spec = mujoco.MjSpec()
     spec.add_mesh(**form)
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=form["name"])
+    collides = int(with_hull)
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_MESH, meshname=form["name"], contype=collides, conaffinity=collides
+    )
     return spec.compile()
 
 
