@@ -162,7 +162,7 @@ def _thinned(points: np.ndarray) -> scipy.spatial.ConvexHull:
 def _reach_outside(points: np.ndarray, hull: scipy.spatial.ConvexHull) -> float:
     """Return the largest distance of a point to the hull [m].
 
-    The face whose plane a point is furthest above need not be the nearest one: triangles of one flat side share a plane.
+    The face whose plane a point is furthest above need not be the nearest one: triangles of a flat side share a plane.
     """
     height = (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(1)
     outside = points[height > _FLAT * np.ptp(points)]
