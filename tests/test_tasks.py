@@ -313,7 +313,7 @@ class TestMistakes:
         with pytest.raises(ValueError, match=r"target has shape \(3,\), expected \(7,\)"):
             osik.PostureTask(arm, weight=1.0).replace(target=np.zeros(3))
         with pytest.raises(ValueError, match="rotation"):
-            osik.FrameTask(arm, "hand").replace(target=2 * np.eye(4))
+            osik.FrameTask(arm, "hand").replace(target=np.diag([2.0, 2.0, 2.0, 1.0]))
 
 
 def test_rows_of_all_tasks_together_are_those_of_each():
