@@ -22,8 +22,9 @@ class CoreHook(BuildHookInterface):
         except RuntimeError as problem:
             self.app.display_warning(f"osik_jax is installed without its compiled core, which is slower: {problem}")
             return
-        for library in libraries:
-            build_data["force_include"][str(library)] = f"osik_jax/core/{library.name}"
+        if version != "editable":  # there the libraries are used where they were built
+            for library in libraries:
+                build_data["force_include"][str(library)] = f"osik_jax/core/{library.name}"
         build_data["pure_python"] = False
         tag = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["tag"] = f"py3-none-{tag}"

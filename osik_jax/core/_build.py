@@ -64,7 +64,6 @@ def build(flags: tuple[str, ...] = ()) -> list[Path]:
     running = {}
     for level, own in levels().items():
         out = library_path(level)
-        out.unlink(missing_ok=True)
         command = [compiler, *_FLAGS, *own, *flags, f'-DOSIK_SOURCES="{mark}"', "-shared", "-fPIC", *text]
         running[out] = subprocess.Popen(
             [*command, "-o", str(part(out))], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
