@@ -65,7 +65,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if hasattr(config, "workerinput") or "OSIK_CORE_LIBRARY" in os.environ or "site-packages" in str(_build.FOLDER):
         return
     mark = _build.FOLDER / "built.part"
-    if not mark.exists() or mark.read_text() != _build.fingerprint():
+    built = all(_build.library_path(level).exists() for level in _build.levels())
+    if not built or not mark.exists() or mark.read_text() != _build.fingerprint():
         with contextlib.suppress(RuntimeError):  # no compiler: tests of the core are skipped
             _build.build()
             mark.write_text(_build.fingerprint())
