@@ -17,7 +17,7 @@ pytestmark = [needs_compiler, pytest.mark.slow]
 N, M, BELOW = 34, 7, 3
 """Variables, more than a warp has lanes; rows of a level; rows of the level below it."""
 TOLERANCES = np.array([1e-10, 1e-12, 1e-12, 1e-9])  # of rank, step, multipliers, feasibility
-BEGIN = "m = COUNT[0]; B = A; has_inequalities = HAS_INEQUALITIES[0] != 0; load_level();\n"
+BEGIN = "begin(); m = COUNT[0]; B = A; has_inequalities = HAS_INEQUALITIES[0] != 0; load_level();\n"
 
 
 @pytest.fixture(params=[False, True], ids=["forwards", "backwards"])
