@@ -245,7 +245,7 @@ assert hasty["joints"]["speed_over_limit_max"] <= 1.0 + 1e-9
 # the robot for each of the person. Here about every tenth frame is lost.
 
 # %%
-live = retargeting.LiveRetargeter(nao, motion, look_ahead=4 if FAST else 8)
+live = retargeting.LiveRetargeter(nao, motion, look_ahead=0.13 if FAST else 0.27)
 rng = np.random.default_rng(0)
 frames = [live.step(None if f > 0 and rng.random() < 0.1 else p) for f, p in enumerate(motion.positions)]
 frames = [frame for frame in frames if frame is not None] + live.finish()

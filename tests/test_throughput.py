@@ -24,6 +24,7 @@ def path(tmp_path_factory):
 
 def run(patch, path, batches):
     options = ["--robot", "arm7", "--schemes", "weighted", "--precisions", "float64", "--batches", batches]
+    options += ["--tasks", "equality"]
     patch.setattr(sys, "argv", ["throughput", str(path), *options])
     throughput.main()
 
@@ -57,7 +58,7 @@ def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
 def test_the_reference_is_the_rollout():
     """The carried step is ``rollout``'s: errors after the checked steps."""
     given = throughput.setting("arm7")
-    wanted = throughput.reference("arm7", "weighted")
+    wanted = throughput.reference("arm7", "weighted", "equality")
     hand: Any = given.tasks["hand"]
     for lane in (0, 7):
         tasks = given.tasks | {"hand": hand.replace(target=(given.targets[lane], hand.target[1]))}
