@@ -299,7 +299,7 @@ def _planned(at: _Parameters, given: _Given, most: Array) -> Array:
 @jax.jit
 def _settled(at: _Parameters, given: _Given, plan: Array, more: int) -> Array:
     """A plan after so many more iterations: (F, nq)."""
-    return mend_plan(*_asked(at, given), plan, jnp.ones(len(plan), plan.dtype), more).q
+    return mend_plan(*_asked(at, given), plan, jnp.ones(len(plan), plan.dtype), more, until="spent").q
 
 
 @jax.jit

@@ -48,11 +48,12 @@ _LITTLE, _SETTLED = 2e-3, 2
 as two, a refused one as one. Where bounds are broken by more than that share, a step counts as one and a refused one
 not at all: what gains little there may be damped and not done."""
 
-_Ending = Literal["ready", "settled", "mended"]
+_Ending = Literal["ready", "settled", "mended", "spent"]
 _START = {
     "ready": (_SOFTEST, _FIRST_DAMPING, _LITTLE),
     "settled": (_SOFT, _FIRST_DAMPING, _LITTLE),
     "mended": (1.0, _STIFF_DAMPING, 0.1 * _LITTLE),
+    "spent": (1.0, _STIFF_DAMPING, _LITTLE),
 }
 """What ends iterations but for their number; stiffness and damping with which they begin, and what gain is little: less
 in a stream, where the newest frame alone has much to gain."""
@@ -141,7 +142,7 @@ def make_plan(
     return _descended(clip, _from_a_part(clip, start), max_iterations, until="settled")
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="until")
 def mend_plan(
     body: Body,
     goals: Goals,
@@ -151,6 +152,8 @@ def mend_plan(
     free: Float[Array, " F"],
     iterations: Int[Array, ""] | int,
     damping: Float[Array, ""] | float = _STIFF_DAMPING,
+    *,
+    until: Literal["mended", "spent"] = "mended",
 ) -> Plan:
     """A plan that is nearly good, made better until steps gain little, with bounds at their full stiffness.
 
@@ -163,8 +166,9 @@ def mend_plan(
         free: 1 for frames that may move, 0 for those that are past. (F,)
         iterations: how many, at most.
         damping: with which they begin, at least ``_STIFF_DAMPING``.
+        until: "spent" for all iterations, whatever they gain (static).
     """
-    return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, damping, until="mended")
+    return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, damping, until=until)
 
 
 def at_solution(
@@ -246,7 +250,7 @@ def _descended_plain(
     stiffness, usual, little = _START[until]
 
     def goes_on(state: _State) -> Bool[Array, ""]:
-        over = state.ready if until == "ready" else state.settled >= _SETTLED
+        over = state.ready if until == "ready" else (state.settled >= _SETTLED) & (until != "spent")
         return ~over & (state.iterations < most)
 
     first = _State.at(clip, q, stiffness, usual if damping is None else damping)
@@ -263,7 +267,7 @@ def _descended_by_core(
     until: _Ending,
 ) -> Plan:
     """The same of a batch, on a CPU and in double precision; what all lanes share has an axis of length 1."""
-    endings = float(until == "ready"), float(until != "ready")
+    endings = float(until == "ready"), float(until in ("settled", "mended"))
     stiffness, _, little = _START[until]
     rules = (_LARGEST_STEP, _STIFFENING, _SLOWING, _FIXED, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING, _CALMER)
     rules += (_CAREFUL, little, float(_SETTLED), stiffness)
