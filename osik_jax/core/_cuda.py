@@ -62,7 +62,6 @@ def call(
     outputs: Sequence[tuple[tuple[int, ...], Any]],
     *inputs: Array,
     problems: int,
-    warps: int,
     shared: int,
 ) -> list[Array]:
     """Launch a kernel named ``osik_kernel`` with one warp for each problem.
@@ -71,8 +70,7 @@ def call(
         source: CUDA text.
         outputs: shape and dtype of each result.
         inputs: arrays, as the kernel wants them.
-        problems: how many there are.
-        warps: problems of one block.
+        problems: how many there are; each is a block of its own, for the workspace begins where shared memory does.
         shared: bytes of shared memory of one problem.
 
     Returns:
@@ -81,7 +79,7 @@ def call(
     _register()
     shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in outputs]
     key = hashlib.sha256(source.encode()).hexdigest()[:24]
-    numbers = dict(problems=problems, per_block=warps, threads=32 * warps, shared=warps * shared)
+    numbers = dict(problems=problems, per_block=1, threads=32, shared=shared)
     with jax.enable_x64(True):
         run = jax.ffi.ffi_call("osik_cuda", shapes)
         return list(run(*inputs, source=source, key=key, **{name: np.int32(n) for name, n in numbers.items()}))

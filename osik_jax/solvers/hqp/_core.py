@@ -30,7 +30,6 @@ def solve(
     batch, count, m, n = hierarchy.levels.matrix.shape
     h = hierarchy.hard.shape[1]
     guess = first_working_sets(hierarchy, warm_start)
-    row_of_hard = [layout.hard_of_row[layout.level_of_hard[q]].index(q) for q in range(n, h)]
     floats = dict(x=(n,), multipliers=(count, h), slack_norms=(count,), dampings=(count,), residual=())
     ints = dict(active_bounds=(n,), active=(count, h), frozen=(count, h), in_cost=(count, m), own=(count, m))
     ints |= dict(ranks=(count,), report=(3,))
@@ -41,6 +40,7 @@ def solve(
         *(hierarchy.hard_lower, hierarchy.hard_upper),
         *(jnp.stack(hierarchy.damping[:3], -1), hierarchy.damping.bends),
         *(jnp.stack(tolerances, -1), hierarchy.is_equality, hierarchy.hard_is_equality, *guess),
-        *(np.array(a, np.int32) for a in (layout.row_counts, layout.level_of_hard, row_of_hard, [max_iterations])),
+        *(np.array(a, np.int32) for a in (layout.row_counts, layout.level_of_hard, layout.row_of_hard)),
+        np.array([max_iterations], np.int32),
     )
     return result_of_kernel(KernelAnswers(**dict(zip((*floats, *ints), results, strict=True))))

@@ -54,8 +54,7 @@ def _source(layout: Layout, max_iterations: int) -> str:
     n, h = layout.variables, len(layout.level_of_hard)
     numbers = dict(N=n, M=layout.rows, H=h, L=layout.levels, ROWS=sum(layout.row_counts))
     numbers |= dict(MAX_ITERATIONS=max_iterations)
-    rows = [layout.hard_of_row[layout.level_of_hard[q]].index(q) for q in range(n, h)]
-    lists = dict(ROW_COUNTS=layout.row_counts, LEVEL_OF_HARD=layout.level_of_hard, ROW_OF_HARD=rows)
+    lists = dict(ROW_COUNTS=layout.row_counts, LEVEL_OF_HARD=layout.level_of_hard, ROW_OF_HARD=layout.row_of_hard)
     return _cuda.text_of("hierarchy.hpp") + _cuda.constants(**numbers, **lists) + _KERNEL
 
 
@@ -95,7 +94,6 @@ def solve(
         *map(_cuda.as_double, numbers),
         *(jnp.asarray(a, jnp.int32) for a in flags),
         problems=batch,
-        warps=1,
         shared=_bytes(layout),
     )
     dtype = hierarchy.levels.matrix.dtype

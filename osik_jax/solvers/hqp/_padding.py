@@ -28,6 +28,13 @@ class Layout(NamedTuple):
     level_of_hard: tuple[int, ...]  # level of each hard row; -1 for the box
     hard_of_row: tuple[tuple[int, ...], ...]  # index of each row of each level among the h hard rows; h for none
 
+    @property
+    def row_of_hard(self) -> list[int]:
+        """The index of each hard row beside the box among the rows of its level."""
+        first = self.variables
+        levels = self.level_of_hard[first:]
+        return [self.hard_of_row[level].index(q) for q, level in enumerate(levels, first)]
+
 
 class PaddedHierarchy(NamedTuple):
     """The numbers of a hierarchy.
