@@ -1,5 +1,6 @@
 """The loop: one control step, and many."""
 
+from ._clutch import Clutch as Clutch
 from ._rollout import rollout as rollout
 from ._solution import Solution as Solution
 from ._solution import Trajectory as Trajectory
