@@ -2,8 +2,8 @@
 
     python -m benchmarks.contact_sheet [--robots ur5,panda] [--out sheet] [--write]
 
-runs the command for each robot and keeps its folder in ``--out``. ``--write`` puts the table into docs/robots.md and
-the sheet into docs/images.
+runs the command for each robot and keeps its folder in ``--out``. ``--write`` writes
+docs/data/demonstrations.csv, and the sheet into docs/images.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,10 +23,10 @@ from osik_jax import cli, viewer
 from osik_jax.runtime import configure_cpu
 
 from .command_line import listed
-from .robots_table import PAGE, ROBOTS, file_of, load, write
+from .data_file import DATA, DOCS, write_csv
+from .robots_table import ROBOTS, file_of, load
 
-SHEET = PAGE.parent / "images" / "robots.png"
-START, END = "<!-- table of demonstrations -->\n", "<!-- end of the demonstrations -->\n"
+SHEET, TABLE = DOCS / "images" / "robots.png", DATA / "demonstrations.csv"
 HEAD = (
     "robot", "base", "dofs", "scheme", "what moves", "off its path [mm]", "once there [mm]", "feet drift [mm]",
     "limits broken", "steps solved", "CPU time [s]",
@@ -49,25 +48,24 @@ class Row(NamedTuple):
     figures: dict[str, Any]
     seconds: float
 
-    def text(self) -> str:
-        """As Markdown."""
+    def cells(self) -> tuple[str, ...]:
+        """Return the texts of the columns in ``HEAD``."""
         goal, limits, status = (self.figures[key] for key in ("goals", "limits", "solver"))
         feet = [figures["position_mm"] for figures in self.figures["standing"].values()]
         solved = status["status"]["SOLVED"]
-        cells = (
+        return (
             self.name,
             "floating" if self.robot.floating_base else "fixed",
-            self.robot.nv,
+            str(self.robot.nv),
             SCHEME,
             self.goal,
             f"{goal[self.goal]['position_mm']:.2g}",
             f"{goal[self.goal]['settled_position_mm']:.2g}",
             f"{max(feet):.1g}" if feet else "-",
-            limits["position_violations"] + limits["velocity_violations"],
+            str(limits["position_violations"] + limits["velocity_violations"]),
             f"{solved}/{sum(status['status'].values())}",
             f"{self.seconds:.0f}",
         )
-        return f"| {' | '.join(map(str, cells))} |"
 
 
 def demonstrate(name: str, folder: Path) -> Row:
@@ -113,28 +111,22 @@ def sheet(tiles: list[Image.Image]) -> Image.Image:
     return out
 
 
-def table(rows: Iterable[Row]) -> str:
-    """As Markdown."""
-    lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|", *(row.text() for row in rows)]
-    return "\n".join(lines) + "\n"
-
-
 def main() -> None:
     """Runs all robots, and writes the sheet and, where asked to, the page."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.contact_sheet", description=__doc__)
     parser.add_argument("--robots", type=listed(str, among=tuple(ROBOTS)), default=NAMES)
     parser.add_argument("--out", type=Path, default=Path("contact-sheet"))
-    parser.add_argument("--write", action="store_true", help="into docs/robots.md and docs/images/robots.png")
+    parser.add_argument("--write", action="store_true", help=f"write {TABLE.name} and {SHEET.name} in docs")
     given = parser.parse_args()
     rows, tiles = [], []
     for name in given.robots:
         rows.append(demonstrate(name, given.out))
         tiles.append(tile(rows[-1], given.out))
-        print(rows[-1].text(), flush=True)
+        print(*rows[-1].cells(), sep=", ", flush=True)
         jax.clear_caches()
     sheet(tiles).save(SHEET if given.write else given.out / "robots.png", optimize=True)
     if given.write:
-        write(table(rows), start=START, end=END)
+        write_csv(TABLE, HEAD, [row.cells() for row in rows])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The table on the page on robots: what loads, how large it is, whether its poses are right, and how fast it is.
+"""The table of tested robots: what loads, how large it is, whether its poses are right, and how fast it is.
 
     python -m benchmarks.robots_table [--robots g1,panda] [--write]
     python -m benchmarks.robots_table --robots g1_mj_description  # any name of robot_descriptions, which clones it
@@ -8,7 +8,7 @@ Poses of all links at random configurations are compared with Pinocchio's (URDFs
 
 A step is ``solve`` with ``WeightedQP`` and ``integrate`` for the pose of the last body, posture and
 limits, in float64: the 20th percentile of its calls, which a busy machine disturbs little. Pin the process to one core
-(``taskset -c 0``), as one robot is best run. ``--write`` puts the table into docs/robots.md.
+(``taskset -c 0``), as one robot is best run. ``--write`` writes docs/data/robots.csv.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,9 +29,9 @@ import osik_jax as osik
 from osik_jax.runtime import configure_cpu
 
 from .command_line import listed
+from .data_file import DATA, DOCS, write_csv
 
-PAGE = Path(__file__).parent.parent / "docs" / "robots.md"
-START, END = "<!-- table of robots -->\n", "<!-- end of the table -->\n"
+PAGE, TABLE = DOCS / "robots.md", DATA / "robots.csv"
 HEAD = ("robot", "base", "dofs", "mimic joints", "frames", "largest error of a pose", "one step [µs]")
 CONFIGURATIONS = 4
 TOLERANCE = 1e-12
@@ -102,11 +101,11 @@ class Row(NamedTuple):
     error: float
     step: float
 
-    def text(self) -> str:
-        """As Markdown."""
+    def cells(self) -> tuple[str, ...]:
+        """Return the texts of the columns in ``HEAD``."""
         base = "floating" if self.floating else "fixed"
-        numbers = f"{self.dofs} | {self.followers} | {self.frames} | {self.error:.0e} | {1e6 * self.step:.0f}"
-        return f"| {self.name} | {base} | {numbers} |"
+        sizes = str(self.dofs), str(self.followers), str(self.frames)
+        return self.name, base, *sizes, f"{self.error:.0e}", f"{1e6 * self.step:.0f}"
 
 
 def file_of(name: str) -> Path:
@@ -222,30 +221,11 @@ def row(name: str) -> Row:
     return Row(name, *sizes, error=pose_error(name, robot), step=step_seconds(robot))
 
 
-def table(rows: Iterable[Row]) -> str:
-    """As Markdown."""
-    lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|", *(one.text() for one in rows)]
-    return "\n".join(lines) + "\n"
-
-
-def read_table(page: str) -> list[list[str]]:
-    """The cells of the table on a page, without its head."""
-    text = page[page.index(START) + len(START) : page.index(END)]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.strip().splitlines()[2:]]
-
-
-def write(text: str, path: Path = PAGE, *, start: str = START, end: str = END) -> None:
-    """Puts a table into a page, in place of the one between two marks."""
-    page = path.read_text(encoding="utf-8")
-    before, after = page[: page.index(start) + len(start)], page[page.index(end) :]
-    path.write_text(f"{before}\n{text}\n{after}", encoding="utf-8")
-
-
 def main() -> None:
     """Prints the table line by line, and writes it where asked to."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.robots_table", description=__doc__)
     parser.add_argument("--robots", type=listed(str), default=tuple(ROBOTS), help="names, of robot_descriptions too")
-    parser.add_argument("--write", action="store_true", help="into docs/robots.md")
+    parser.add_argument("--write", action="store_true", help="write docs/data/robots.csv")
     given = parser.parse_args()
     if given.write and set(given.robots) != set(ROBOTS):
         parser.error("--write is for the table of all robots")
@@ -253,10 +233,10 @@ def main() -> None:
     rows = []
     for name in given.robots:
         rows.append(row(name))
-        print(rows[-1].text(), flush=True)
+        print(*rows[-1].cells(), sep=", ", flush=True)
         jax.clear_caches()
     if given.write:
-        write(table(rows))
+        write_csv(TABLE, HEAD, [one.cells() for one in rows])
 
 
 if __name__ == "__main__":

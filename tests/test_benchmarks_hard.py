@@ -8,6 +8,7 @@ import pinocchio as pin
 import pytest
 
 from benchmarks import curvature
+from benchmarks.data_file import read_csv
 from benchmarks.hard import _motion, _page, _results
 from benchmarks.hard._balance import balance
 from benchmarks.hard._cases import BEYOND, CHUNK, Case, cases, directions, without_turning
@@ -186,21 +187,33 @@ class TestResults:
         assert "µs a step" not in found["beyond"] and "µs a step" in _page.tables(rows, times=True)["beyond"]
 
 
-def test_the_page_has_the_tables_of_the_command():
-    """Every solver of the summary, and as many lines in each table as robots, solvers and postures."""
+def test_the_page_and_the_file_have_the_tables_of_the_command():
+    """All robots in each case, every solver in both tables of the page, and nothing that is not finite."""
+    head, rows = read_csv(_page.FILE)
+    assert tuple(head) == _page.HEAD
+    for case in _page.TABLES:
+        robots = {robot for name, robot, *_ in rows if name == case}
+        assert robots == set(_results.ROBOTS) - ({"arm7"} if case == "squat" else set())
     text = _page.PAGE.read_text(encoding="utf-8")
-    for name in (*_page.TABLES, "summary"):
+    for name, column in (("summary", 1), ("excerpt", 2)):
         table = text[text.index(f"<!-- table: {name} -->") : text.index(f"<!-- end: {name} -->")]
-        lines = [line for line in table.splitlines() if line.startswith("|")]
-        assert len(lines) > 2, name
-        if name != "summary":
-            robots = {line.split("|")[1].strip() for line in lines[2:]}
-            assert robots == set(_results.ROBOTS) - ({"arm7"} if name == "squat" else set())
-            assert (
-                lines[0]
-                == "| robot | solved by | posture | " + " | ".join(column.head for column in _page.TABLES[name]) + " |"
-            )
-    assert not re.search(r"\bnan\b|\binf\b", text)
+        cells = [line.split("|")[column].strip() for line in table.splitlines() if line.startswith("|")][2:]
+        assert {*_motion.OURS, *_motion.PEERS} <= set(cells)
+    assert not re.search(r"\bnan\b|\binf\b", text + _page.FILE.read_text(encoding="utf-8"))
+
+
+def test_a_row_is_written_to_the_page_and_the_file(tmp_path):
+    numbers = Numbers(**dict.fromkeys(Numbers._fields, 0.0) | dict(solved=1.0, rms=0.25))
+    rows = [_results.Row(Entrant("g1", "mink", "float64", True), "beyond", gain, numbers) for gain in (10.0, 200.0)]
+    page, file = tmp_path / "page.md", tmp_path / "file.csv"
+    marks = [f"<!-- table: {name} -->\nold\n<!-- end: {name} -->\n" for name in ("summary", "excerpt")]
+    page.write_text("".join(marks), encoding="utf-8")
+    _page.write(rows, page, file)
+    assert "| g1 | mink | yes | **0.25** / **0.25** |" in page.read_text(encoding="utf-8")
+    assert "old" not in page.read_text(encoding="utf-8")
+    head, (first, second) = read_csv(file)
+    assert dict(zip(head, first, strict=True))["rms speed [rad/s]"] == "0.25"
+    assert (first[:5], second[4]) == (["beyond", "g1", "mink", "yes", "10"], "200")
 
 
 def test_the_bound_on_the_curvature_is_near_it():

@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.data_file import read_csv, write_csv
+
 robots_table = importlib.import_module("benchmarks.robots_table")
-ROWS = robots_table.read_table(robots_table.PAGE.read_text(encoding="utf-8"))
+HEAD, ROWS = read_csv(robots_table.TABLE)
 
 
-def test_the_page_has_every_robot_and_no_other():
+def test_the_table_has_every_robot_and_no_other():
+    assert tuple(HEAD) == robots_table.HEAD
     assert [row[0] for row in ROWS] == list(robots_table.ROBOTS)
     assert len(ROWS) >= 20
     assert f"more than {robots_table.TOLERANCE:.0e}," in robots_table.PAGE.read_text(encoding="utf-8")
@@ -47,11 +50,8 @@ def test_a_row_is_measured_and_written(tmp_path: Path, monkeypatch: pytest.Monke
     row = robots_table.row("ur5")
     assert row[:5] == ("ur5", False, 6, 0, 11)
     assert row.error < robots_table.TOLERANCE and row.step > 0.0
-    page = tmp_path / "page.md"
-    page.write_text(f"above\n{robots_table.START}old\n{robots_table.END}below\n", encoding="utf-8")
-    robots_table.write(robots_table.table([row]), page)
-    text = page.read_text(encoding="utf-8")
-    (cells,) = robots_table.read_table(text)
-    assert cells[:5] == ["ur5", "fixed", "6", "0", "11"]
+    file = tmp_path / "robots.csv"
+    write_csv(file, robots_table.HEAD, [row.cells()])
+    head, (cells,) = read_csv(file)
+    assert (tuple(head), cells[:5]) == (robots_table.HEAD, ["ur5", "fixed", "6", "0", "11"])
     np.testing.assert_allclose(float(cells[6]) * 1e-6, row.step, atol=1e-6)
-    assert text.startswith("above\n") and text.endswith("below\n") and "old" not in text

@@ -72,7 +72,7 @@ def files(add: Add) -> None:
     )
     add("a joint that mimics itself", lambda: mimics('<mimic joint="j1"/>'), V, "j1 -> j1")
     add("a joint that mimics nothing", lambda: mimics('<mimic joint="zz"/>'), V, "joints: j1")
-    add("limits upside down", lambda: one_joint(inner='<limit lower="1" upper="-1"/>'), V, "lower 1.0 > upper -1.0")
+    add("a lower limit above the upper one", lambda: one_joint(inner='<limit lower="1" upper="-1"/>'), V, "lower 1.0 > upper -1.0")
     add("a limit that is NaN", lambda: one_joint(inner='<limit lower="nan" upper="1"/>'), V, "'nan'")
     add("a limit that is text", lambda: one_joint(inner='<limit lower="${-pi}" upper="1"/>'), V, "${-pi}")
     add(
@@ -96,14 +96,14 @@ def files(add: Add) -> None:
     add("a speed for a joint that does not exist", lambda: two_joints(velocity_limits={"zz": 1.0}), K, "j1, j2")
     add("a speed of 0", lambda: two_joints(velocity_limits={"j1": 0.0}), V, "positive")
     add("a range for a joint that does not exist", lambda: two_joints(position_limits={"zz": (0, 1)}), K, "j1, j2")
-    add("a range upside down", lambda: two_joints(position_limits={"j1": (1, -1)}), V, "'j1'")
+    add("a range with lower above upper", lambda: two_joints(position_limits={"j1": (1, -1)}), V, "'j1'")
     add("a home of the wrong length", lambda: two_joints(home=np.zeros(3)), V, "(2,)")
     add("a home in degrees", lambda: two_joints(home={"j1": 30.0}), osik.OsikWarning, "[-1, 1]")
     add("a home for a joint that does not exist", lambda: two_joints(home={"zz": 0.0}), K, "j1, j2")
     add("a keyframe that does not exist", lambda: arm().with_home("stand"), K, "keyframe")
-    add("entities that explode, URDF", lambda: read(bomb("robot")), V, "broken XML at line 1", foreign=True)
+    add("XML entities without end, URDF", lambda: read(bomb("robot")), V, "broken XML at line 1", foreign=True)
     add(
-        "entities that explode, MJCF",
+        "XML entities without end, MJCF",
         lambda: osik.Robot.from_mjcf(bomb("mujoco")),
         V,
         "broken XML at line 1",
@@ -133,5 +133,5 @@ def files(add: Add) -> None:
         "<inertial>",
         foreign=True,
     )
-    add("a robot with a slip of the pen", lambda: load("neo"), K, "'nao'")
+    add("a misspelt robot", lambda: load("neo"), K, "'nao'")
     add("load_robot(3)", lambda: load(3), T, "nao")

@@ -22,7 +22,7 @@ from ._tasks import configurations, targets, tasks
 
 PAGE = Path(__file__).parents[2] / "docs" / "dev" / "bad_inputs.md"
 PACKAGE = str(Path(osik.__file__).parent)
-_SHOWN = 230
+_SHOWN = 80
 """Characters of a message that the page shows."""
 
 
@@ -127,11 +127,10 @@ def _cell(text: str) -> str:
 
 _HEAD = """# Wrong inputs
 
-{count} inputs and what each gets. A test gives all of them (`tests/test_bad_inputs.py`) and fails where the page says
-something else; `python -m benchmarks.bad_inputs --write` makes it anew. Long messages are cut, and words of a parser
-or of MuJoCo in them are left out.
+{count} wrong inputs, and the exception or status of each. `python -m benchmarks.bad_inputs --write` writes this page, and a
+test compares it with what happens (`pytest tests/test_bad_inputs.py`). Long messages are cut.
 
-What can be known before a program runs raises an exception that names what is wrong and what there is instead. What is
-known only while it runs ends in a status, and all numbers of the answer are finite.
+An input that can be checked before a program runs raises an exception. Its message names what is wrong and what is allowed. An
+input that is known only inside a program gives a status, and all numbers of the answer are finite.
 """
-_BEFORE = {"Accepted": "Inputs that look wrong and are not, or that cannot be told from right ones.\n\n"}
+_BEFORE = {"Accepted": "Inputs that look wrong but are accepted, because they are valid or cannot be distinguished from valid ones.\n\n"}

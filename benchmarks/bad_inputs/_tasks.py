@@ -32,8 +32,8 @@ def configurations(add: Add) -> None:
         "jax.vmap",
     )
     add("v of another robot", lambda: osik.integrate(arm(), q, np.zeros(31)), V, "(7,)")
-    add("x64 switched off since, solve", lambda: with_double_off(solve), V, "robot.astype")
-    add("x64 switched off since, rollout", lambda: with_double_off(partial(rollout, steps=2)), V, "robot.astype")
+    add("x64 switched off after loading, solve", lambda: with_double_off(solve), V, "robot.astype")
+    add("x64 switched off after loading, rollout", lambda: with_double_off(partial(rollout, steps=2)), V, "robot.astype")
     add("astype(int)", lambda: arm().astype(int), T, "floating-point")
 
 
@@ -49,7 +49,7 @@ def targets(add: Add) -> None:
     add("a rotation of length 2", lambda: hand(target=(np.zeros(3), 2.0 * np.eye(3))), V, "R R' = I")
     add("a rotation of length 2, by replace", lambda: hand().replace(target=(np.zeros(3), 2.0 * np.eye(3))), V, "R R'")
     add("a reflection", lambda: hand(target=(np.zeros(3), np.diag([1.0, 1.0, -1.0]))), V, "det R = 1")
-    add("an object that is no pose", lambda: hand(target=Fraction()), T, "no pose")
+    add("an object that is not a pose", lambda: hand(target=Fraction()), T, "no pose")
     add("posture target of nv numbers", lambda: osik.PostureTask(nao(), target=np.zeros(31)), V, "(32,)")
     add("posture target with a NaN, by replace", lambda: posture().replace(target=np.full(7, np.nan)), V, "finite")
     add("centre of mass at NaN", lambda: osik.ComTask(nao(), target=nan), V, "finite")
@@ -83,7 +83,7 @@ def tasks(add: Add) -> None:
     add("a negative gain", lambda: hand(gain=-1.0), V, "not negative")
     add("two gains", lambda: hand(gain=(1.0, 2.0)), V, "scalar")
     add("gain=None", lambda: hand(gain=None), T, "gain")
-    add("a frame with a slip of the pen", lambda: osik.FrameTask(arm(), "hnd"), K, "did you mean 'hand'")
+    add("a misspelt frame", lambda: osik.FrameTask(arm(), "hnd"), K, "did you mean 'hand'")
     add("a frame of another robot", lambda: osik.FrameTask(nao(), "tool0"), K, "l_ankle")
     add("frame=None", lambda: osik.FrameTask(arm(), None), K, "hand")
     add("a frame's number", lambda: osik.FrameTask(arm(), 3), K, "hand")

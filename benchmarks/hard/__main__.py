@@ -6,12 +6,12 @@
     python -m benchmarks.hard --balance
 
 Pinocchio judges every motion from its configurations alone; docs/hard_work.md says what is asked and what each number
-is. Without ``--all`` it is a selection that takes some minutes; ``--only`` takes those whose names, such as
+is. Without ``--all`` it is a selection that takes some minutes. ``--only`` takes those whose names, such as
 "g1, hierarchy, float64, no posture", hold a text. Rows that the file of results has already are not made again.
-``--write`` puts the tables into the page, ``--times`` adds the time of a step (only on a machine with nothing else to
-do). ``--film`` films a G1 of ours beside mink's, with a target that is out of reach. ``--settling`` looks longer at
-targets out of reach, and puts into the page how the speed falls. ``--balance`` prints how far feet give way to such a
-target where the weights balance.
+``--write`` writes the page's two tables and docs/data/hard_work.csv. ``--times`` prints the time of a step too (only
+on a machine with nothing else to do). ``--film`` films a G1 of ours beside mink's, with a target that is out of reach.
+``--settling`` runs targets out of reach for 16 s, and writes docs/data/settling.csv. ``--balance`` prints how far feet
+give way to such a target where the weights balance.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from rich.console import Console
 
 from osik_jax.runtime import configure_cpu
 
+from ..data_file import write_csv
 from ..processes import PeerUnavailable
 from ..robots import workload
 from ._balance import balances
 from ._cases import cases
 from ._film import FILM, film
 from ._motion import Entrant
-from ._page import PAGE, tables, write, write_settling
+from ._page import FILE, PAGE, SETTLING, tables, write
 from ._results import ROBOTS, Row, entrants, keep, read, rows
 from ._settling import settling
 
@@ -44,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--only", default="", metavar="TEXT", help="part of the names of those that are wanted")
     made.add_argument("--python", action="append", default=[], metavar="PEER=PATH", help="interpreter of a peer")
     made.add_argument("--times", action="store_true", help="with the time of a step")
-    made.add_argument("--write", action="store_true", help=f"into {PAGE.name}")
+    made.add_argument("--write", action="store_true", help=f"write {PAGE.name} and {FILE.name}")
     made.add_argument("--film", nargs="?", type=Path, const=FILM, help=f"only the film, by default {FILM.name}")
     made.add_argument("--settling", action="store_true", help="only the table of speeds over 16 s")
     made.add_argument("--balance", action="store_true", help="only where the weights of feet and hand balance")
@@ -85,14 +86,15 @@ def main() -> None:
         film(given.film)
         return
     if given.settling:
-        print(write_settling(settling()))
+        head, *lines = settling()
+        write_csv(SETTLING, head, lines)
         return
     if given.balance:
         print("\n".join(map(" | ".join, balances())))
         return
     found = measure(given, console)
     if given.write:
-        write(found, times=given.times)
+        write(found)
     for name, text in tables(found, times=given.times).items():
         print(f"\n{name}\n\n{text}")
 

@@ -1,4 +1,4 @@
-"""The tables of docs/hard_work.md."""
+"""The tables of docs/hard_work.md, and the files with all numbers in docs/data."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from ..robots_table import write as write_between
+from ..data_file import DATA, DOCS, write_between, write_csv
 from ._judge import Numbers
-from ._motion import GAINS, OURS, PEERS
-from ._results import ROBOTS, Row, by_gain
+from ._motion import GAINS, OURS, PEERS, Entrant
+from ._results import REMEDIED, ROBOTS, Row, by_gain
 
-PAGE = Path(__file__).parents[2] / "docs" / "hard_work.md"
+PAGE = DOCS / "hard_work.md"
+FILE, SETTLING = DATA / "hard_work.csv", DATA / "settling.csv"
 CALM = 0.1
 """The rms joint speed of a robot at rest [rad/s]."""
 FEET = 2e-3
@@ -52,6 +53,9 @@ TABLES: Mapping[str, Sequence[Column]] = {
     "inside": (FASTEST, TURNS, FEET_OFF, HAND, SOLVED),
 }
 """Columns of each case's table."""
+COLUMNS = (MOVING, FASTEST, TURNS, AT_TOP, AT_RANGE, FEET_OFF, HAND, AT_END, BASE, SOLVED)
+"""Columns of the file with all numbers."""
+HEAD = ("case", "robot", "solved by", "posture", "gain [1/s]", *(column.head for column in COLUMNS))
 
 
 def tables(given: Sequence[Row], *, times: bool) -> dict[str, str]:
@@ -60,18 +64,34 @@ def tables(given: Sequence[Row], *, times: bool) -> dict[str, str]:
     return {case: _table(given, case, columns[case]) for case in TABLES} | {"summary": _summary(given)}
 
 
-def write(given: Sequence[Row], path: Path = PAGE, *, times: bool) -> None:
-    """Puts the tables into the page, between its marks."""
-    for name, text in tables(given, times=times).items():
+def write(given: Sequence[Row], path: Path = PAGE, file: Path = FILE) -> None:
+    """Write the summary and the excerpt into the page, between their marks, and all numbers into the file."""
+    for name, text in dict(summary=_summary(given), excerpt=_table(excerpt(given), "beyond", TABLES["beyond"])).items():
         write_between(text, path, start=f"<!-- table: {name} -->\n", end=f"<!-- end: {name} -->\n")
+    write_csv(file, HEAD, map(_cells, sorted(given, key=lambda row: tuple(TABLES).index(row.case))))
 
 
-def write_settling(rows: Iterable[Sequence[str]], path: Path = PAGE) -> str:
-    """Puts the table of ``settling`` into the page and returns it."""
-    head, *lines = map(_line, rows)
-    text = "\n".join([head, "|" + "---|" * (head.count("|") - 1), *lines]) + "\n"
-    write_between(text, path, start="<!-- table: settling -->\n", end="<!-- end: settling -->\n")
-    return text
+def excerpt(given: Iterable[Row]) -> list[Row]:
+    """Return the rows of one robot with a posture task, in double precision."""
+    solvers = {*OURS, *PEERS}
+    return [
+        row
+        for row in given
+        if row.entrant.robot == REMEDIED
+        and row.entrant.posture
+        and row.entrant.precision == "float64"
+        and row.entrant.solver in solvers
+    ]
+
+
+def _cells(row: Row) -> list[str]:
+    entrant = row.entrant
+    numbers = [_written(column._replace(most=float("inf")), column.shown(row.numbers)) for column in COLUMNS]
+    return [row.case, entrant.robot, _name(entrant), "yes" if entrant.posture else "no", f"{row.gain:g}", *numbers]
+
+
+def _name(entrant: Entrant) -> str:
+    return entrant.solver + ("" if entrant.precision == "float64" else f", {entrant.precision}")
 
 
 def _table(given: Iterable[Row], case: str, columns: Sequence[Column]) -> str:
@@ -80,9 +100,8 @@ def _table(given: Iterable[Row], case: str, columns: Sequence[Column]) -> str:
     lines = [_line(["robot", "solved by", "posture", *(column.head for column in columns)])]
     lines.append("|" + "---|" * (3 + len(columns)))
     for entrant in sorted(found, key=lambda e: ROBOTS.index(e.robot)):
-        name = entrant.solver + ("" if entrant.precision == "float64" else f", {entrant.precision}")
         cells = [_cell(column, found[entrant]) for column in columns]
-        lines.append(_line([entrant.robot, name, "yes" if entrant.posture else "no", *cells]))
+        lines.append(_line([entrant.robot, _name(entrant), "yes" if entrant.posture else "no", *cells]))
     return "\n".join(lines) + "\n"
 
 
