@@ -72,7 +72,7 @@ def files(add: Add) -> None:
     )
     add("a joint that mimics itself", lambda: mimics('<mimic joint="j1"/>'), V, "j1 -> j1")
     add("a joint that mimics nothing", lambda: mimics('<mimic joint="zz"/>'), V, "joints: j1")
-    add("a lower limit above the upper one", lambda: one_joint(inner='<limit lower="1" upper="-1"/>'), V, "lower 1.0 > upper -1.0")
+    add("limits, lower above upper", lambda: one_joint(inner='<limit lower="1" upper="-1"/>'), V, "lower 1.0 > upper")
     add("a limit that is NaN", lambda: one_joint(inner='<limit lower="nan" upper="1"/>'), V, "'nan'")
     add("a limit that is text", lambda: one_joint(inner='<limit lower="${-pi}" upper="1"/>'), V, "${-pi}")
     add(

@@ -127,10 +127,10 @@ def _cell(text: str) -> str:
 
 _HEAD = """# Wrong inputs
 
-{count} wrong inputs, and the exception or status of each. `python -m benchmarks.bad_inputs --write` writes this page, and a
-test compares it with what happens (`pytest tests/test_bad_inputs.py`). Long messages are cut.
+{count} wrong inputs, and the exception or status of each. `python -m benchmarks.bad_inputs --write` writes this page.
+`pytest tests/test_bad_inputs.py` compares it with what happens. Long messages are cut.
 
-An input that can be checked before a program runs raises an exception. Its message names what is wrong and what is allowed. An
-input that is known only inside a program gives a status, and all numbers of the answer are finite.
+An input that can be checked before a program runs raises an exception. Its message names what is wrong and what is
+allowed. An input that is known only inside a program gives a status, and all numbers of the answer are finite.
 """
-_BEFORE = {"Accepted": "Inputs that look wrong but are accepted, because they are valid or cannot be distinguished from valid ones.\n\n"}
+_BEFORE = {"Accepted": "Inputs that look wrong, and are valid or cannot be distinguished from valid ones.\n\n"}

@@ -32,8 +32,8 @@ def configurations(add: Add) -> None:
         "jax.vmap",
     )
     add("v of another robot", lambda: osik.integrate(arm(), q, np.zeros(31)), V, "(7,)")
-    add("x64 switched off after loading, solve", lambda: with_double_off(solve), V, "robot.astype")
-    add("x64 switched off after loading, rollout", lambda: with_double_off(partial(rollout, steps=2)), V, "robot.astype")
+    add("x64 switched off later, solve", lambda: with_double_off(solve), V, "robot.astype")
+    add("x64 switched off later, rollout", lambda: with_double_off(partial(rollout, steps=2)), V, "robot.astype")
     add("astype(int)", lambda: arm().astype(int), T, "floating-point")
 
 
