@@ -42,7 +42,7 @@ from osik_jax.retargeting import (
 )
 from osik_jax.retargeting._lanes import as_lane, solve_lanes
 from osik_jax.retargeting._live_command import replay
-from osik_jax.robot.loading import ROBOTS
+from osik_jax.robot.loading import NAMES
 from osik_jax.runtime import configure_cpu
 
 from .machine import processor
@@ -270,7 +270,7 @@ def main() -> None:
     options = parser.parse_args()
     configure_cpu()
     jax.config.update("jax_enable_x64", not options.single)
-    by_name = options.robot in ROBOTS
+    by_name = options.robot in NAMES
     robot = load_robot(options.robot) if by_name else Robot.from_urdf(Path(options.robot), floating_base=True)
     made = {"guess": guess_profile, "bundled": lambda _: None}
     profile = made.get(options.profile, lambda _: load_profile(options.profile))(robot)
