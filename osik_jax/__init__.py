@@ -48,7 +48,7 @@ from .schemes import NullSpace as NullSpace
 from .schemes import Scheme as Scheme
 from .schemes import WeightedQP as WeightedQP
 from .solvers import Status as Status
-from .solvers import raise_if_failed as raise_if_failed
+from .solvers._status import raise_if_failed as raise_if_failed
 from .tasks import AdaptiveGain as AdaptiveGain
 from .tasks import AngularMomentumTask as AngularMomentumTask
 from .tasks import AxisAlignTask as AxisAlignTask

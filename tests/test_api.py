@@ -1,5 +1,6 @@
 """The short way in: ``solve`` with targets, the assembled problem, frame poses, what is raised."""
 
+import warnings
 from typing import Any
 
 import jax
@@ -121,3 +122,53 @@ def test_a_posture_lets_other_tasks_win(arm, pose):
 
 def test_what_failed_is_raised_at_the_top_level_too(arm):
     osik.raise_if_failed(osik.solve(arm, arm.q0, {"p": osik.PostureTask(arm)}))
+
+
+class TestDefaultScheme:
+    @pytest.fixture
+    def make(self, arm, pose):
+        """Return a function that makes a hand that shall move and a posture that outweighs it."""
+
+        def make(hand: int, posture: int, hard: bool = False):
+            return {
+                "hand": osik.FrameTask(arm, "hand", target=pose, gain=5.0, priority=hand, hard=hard),
+                "posture": osik.PostureTask(arm, weight=1e3, priority=posture),
+            }
+
+        return make
+
+    def test_is_the_hierarchy_where_priorities_differ(self, arm, make):
+        ranked = make(1, 2)
+        found = osik.solve(arm, arm.q0, ranked)
+        assert float(jnp.abs(found.slack["hand"]).max()) < 1e-9
+        np.testing.assert_array_equal(
+            found.velocity, osik.solve(arm, arm.q0, ranked, scheme=osik.HierarchicalQP()).velocity
+        )
+
+    def test_is_the_weighted_qp_where_they_are_equal(self, arm, make):
+        level = make(3, 3)
+        found = osik.solve(arm, arm.q0, level)
+        assert float(jnp.abs(found.slack["hand"]).max()) > 0.1
+        np.testing.assert_array_equal(found.velocity, osik.solve(arm, arm.q0, level, scheme=osik.WeightedQP()).velocity)
+
+    def test_counts_no_hard_task(self, arm, make):
+        hard = make(1, 2, hard=True)
+        np.testing.assert_array_equal(
+            osik.solve(arm, arm.q0, hard).velocity, osik.solve(arm, arm.q0, hard, scheme=osik.WeightedQP()).velocity
+        )
+
+    def test_is_that_of_rollouts_with_a_function_of_time(self, arm, make):
+        ranked = make(1, 2)
+        path = osik.rollout(arm, arm.q0, lambda t: ranked, dt=0.01, steps=2)
+        step = osik.solve(arm, arm.q0, ranked, dt=0.01)
+        np.testing.assert_allclose(path.solution.velocity[0], step.velocity, atol=1e-12)
+
+    def test_a_weighted_qp_by_name_warns_once_of_priorities(self, arm, make):
+        hand, posture = make(1, 2).values()
+        tasks = {"warned_of": hand, "posture": posture}
+        with pytest.warns(osik.OsikWarning, match="ignores priorities .warned_of 1, posture 2."):
+            osik.solve(arm, arm.q0, tasks, scheme=osik.WeightedQP())
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            osik.solve(arm, arm.q0, tasks, scheme=osik.WeightedQP())
+            osik.solve(arm, arm.q0, {**tasks, "other": hand})

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from task_checks import kinematics_at
 
 import osik_jax as osik
-from osik_jax.solvers import raise_if_failed
+from osik_jax import raise_if_failed
 
 DT = 0.01
 STEPS = 20

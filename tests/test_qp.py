@@ -10,7 +10,8 @@ import pytest
 import quadprog
 from recorded import QP_DAMPING, recorded_qps
 
-from osik_jax.solvers import Status, raise_if_failed, solve_least_squares_qp, solve_qp
+from osik_jax import raise_if_failed
+from osik_jax.solvers import Status, solve_least_squares_qp, solve_qp
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
 from osik_jax.solvers.qp._solve import _with_placeholder

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
-from osik_jax.solvers import raise_if_failed
+from osik_jax import raise_if_failed
 
 from ._given import OK, Add, W, arm, hand, nao, posture, reach, rollout, solve
 from ._models import JOINT_IN_MJCF, LIMIT, MESH, joint, link, mimics, mjcf, one_joint, two_joints, urdf

@@ -22,7 +22,8 @@ from ..numerics._arguments import concrete
 from ..robot import Robot
 from ..robot._made_for import check_made_for, check_robot
 from ..robot._plausible import warn_of_far_joints
-from ..schemes import Scheme, SchemeAnswer, VelocityProblem
+from ..schemes import Scheme, SchemeAnswer, VelocityProblem, WeightedQP
+from ..schemes._default import priorities
 from ..tasks import Task, TaskRows
 
 _DIVERGES = 2.0
@@ -164,6 +165,25 @@ def warn_of_large_gains(tasks: Mapping[str, Task], dt: Any) -> None:
     warn(
         f"gain times dt is above {_DIVERGES:g}; a gain counts as 1 / dt at most in a step of {float(dt):g} s: "
         f"{', '.join(named)}. Gains are in 1/s, dt is in seconds"
+    )
+
+
+_said_ignored: set[tuple[tuple[str, int], ...]] = set()
+"""Names and priorities of the sets of tasks that ``warn_of_ignored_priorities`` has warned of."""
+
+
+def warn_of_ignored_priorities(scheme: Scheme | None, tasks: Mapping[str, Task]) -> None:
+    """Warn where a ``WeightedQP`` is asked for by name and the priorities differ: once for each set of tasks."""
+    if not isinstance(scheme, WeightedQP) or len(priorities(tasks)) < 2:
+        return
+    named = tuple((name, task.priority) for name, task in tasks.items() if not task.hard)
+    if named in _said_ignored:
+        return
+    _said_ignored.add(named)
+    shown = ", ".join(f"{name} {priority}" for name, priority in named)
+    warn(
+        f"a WeightedQP ignores priorities ({shown}): only weights count. For strict priorities use HierarchicalQP() or "
+        "leave scheme out; else give all tasks the same priority"
     )
 
 

@@ -28,6 +28,7 @@ from ._checks import (
     checked_configuration,
     checked_limits,
     checked_start,
+    warn_of_ignored_priorities,
     warn_of_large_gains,
 )
 from ._solution import Solution, Trajectory
@@ -97,6 +98,7 @@ def rollout(
     q0 = checked_start(robot, q0)
     if not callable(tasks):
         warn_of_large_gains(tasks, dt)
+        warn_of_ignored_priorities(scheme, tasks)
     path = _rollout(
         robot,
         q0,

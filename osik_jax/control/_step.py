@@ -20,7 +20,8 @@ from ..limits import ConfigurationLimit, Limit, Limits, limit_box, limit_rows, w
 from ..numerics._placeholder import positive, with_placeholder
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
-from ..schemes import Scheme, VelocityProblem, WeightedQP
+from ..schemes import Scheme, VelocityProblem
+from ..schemes._default import scheme_for
 from ..solvers import Status
 from ..tasks import Task
 from ..tasks._rows import rows_of
@@ -34,6 +35,7 @@ from ._checks import (
     checked_limits,
     solved_with,
     warn_of_degrees,
+    warn_of_ignored_priorities,
     warn_of_large_gains,
 )
 from ._solution import Solution
@@ -62,7 +64,8 @@ def solve(
         robot: the robot.
         q: configuration. (nq,)
         tasks: by name; the names come back in ``slack`` and ``error``.
-        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``. Default: ``WeightedQP()``.
+        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``. Default: ``HierarchicalQP()`` where the
+            priorities of the tasks differ, ``WeightedQP()`` where they are all the same.
         limits: hard bounds on the velocity beside the robot's own, ``ConfigurationLimit(robot)`` and
             ``VelocityLimit(robot)``. A given limit of one of these two classes replaces the robot's own;
             ``osik_jax.no_limits``, alone or in the sequence, switches both off. Limits that remember the last step's
@@ -75,7 +78,7 @@ def solve(
 
     Returns:
         The answer. What can be known of numbers only when they are there, such as a traced dt <= 0, raises nothing:
-        look at ``status``, or call ``osik_jax.solvers.raise_if_failed`` outside jit.
+        look at ``status``, or call ``osik_jax.raise_if_failed`` outside jit.
 
     Raises:
         KeyError: ``targets`` names a task that does not exist.
@@ -86,7 +89,8 @@ def solve(
 
     Warns:
         OsikWarning: a robot that has float32 numbers while ``jax_enable_x64`` is on; numbers that are probably in other
-            units: a joint far outside its range, or a gain times dt above 2.
+            units: a joint far outside its range, or a gain times dt above 2; once for each set of tasks, priorities
+            that differ while ``scheme`` is a ``WeightedQP``, which ignores them.
     """
     check_setting("solve(robot, q, tasks)", robot, scheme, dt)
     limits = checked_limits(robot, limits)
@@ -96,6 +100,7 @@ def solve(
     q = checked_configuration(robot, q)
     warn_of_degrees(robot, q)
     warn_of_large_gains(tasks, dt)
+    warn_of_ignored_priorities(scheme, tasks)
     solution = step(robot, q, aim(dict(tasks), targets), scheme, limits, in_type_of(dt, q), warm_start)
     watch_memory_maps("solve", step)
     return solution
@@ -147,7 +152,8 @@ def step(
     dt: Array | float,
     warm_start: Any = None,
 ) -> Solution:
-    chosen, bounds = _own_scheme(q, scheme), with_own_limits(robot, limits)
+    chosen = scheme_for(tasks, q.dtype) if scheme is None else scheme
+    bounds = with_own_limits(robot, limits)
     dt = positive(dt)
     raw_box = jax.lax.stop_gradient(limit_box(robot, q, bounds, dt))
     (robot, q), is_valid_pose = with_placeholder((robot, q))
@@ -254,8 +260,3 @@ def velocity_problem(
 def in_type_of(dt: Any, q: Array) -> Any:
     """Return dt in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
     return dt.astype(q.dtype) if isinstance(dt, jax.Array) else np.asarray(dt, q.dtype)
-
-
-def _own_scheme(q: Array, scheme: Scheme | None) -> Scheme:
-    """Return the scheme that is given, or a weighted QP in the precision of q."""
-    return jax.tree.map(lambda leaf: leaf.astype(q.dtype), WeightedQP()) if scheme is None else scheme

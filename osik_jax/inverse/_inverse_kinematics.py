@@ -82,7 +82,7 @@ def inverse_kinematics(
             its gain does not matter, nor do target velocities. Tasks on poses (frames, centre of mass, contacts, axes
             and the like) and hard tasks have to be met; others (postures) are preferences, which fade out on the way.
         targets: of tasks, by name, what ``replace(target=...)`` takes with one more axis in front, for many targets.
-        scheme: for tasks, as in ``solve``. Default: ``WeightedQP()``.
+        scheme: for tasks, as in ``solve``.
         limits: beside the robot's joint limits, as in ``solve``; ``osik_jax.no_limits``: none. With a
             ``CollisionAvoidanceLimit`` or ``PositionBarrier``, steps are those of the scheme. Limits on speeds and
             accelerations are passed over.

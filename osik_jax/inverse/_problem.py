@@ -12,7 +12,8 @@ import numpy as np
 from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..limits import CollisionAvoidanceLimit, Limit, PositionBarrier
 from ..robot import Robot
-from ..schemes import Scheme, WeightedQP
+from ..schemes import Scheme
+from ..schemes._default import scheme_for
 from ..tasks import FrameTask, Task
 from ._chain import is_plain
 from ._chain_problem import ChainRoute
@@ -82,7 +83,7 @@ def _of_tasks(
     for at, name in enumerate(poses):
         own = goal.position[:, at], goal.rotation[:, at]
         aims[name] = jax.tree.map(lambda a: jnp.broadcast_to(a, (number, *a.shape[1:])), own)
-    chosen = jax.tree.map(lambda a: a.astype(robot.q0.dtype), WeightedQP()) if scheme is None else scheme
+    chosen = scheme_for(known, robot.q0.dtype) if scheme is None else scheme
     goals = Aims(jnp.arange(number, dtype=jnp.int32), aims)
     return Problem(TaskRoute(), goals, TaskParts(known, damped(chosen, CURVATURE), read_limits(robot, limits)), many)
 

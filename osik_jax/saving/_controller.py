@@ -19,7 +19,8 @@ from ..control._checks import check_setting, check_tasks, checked_limits
 from ..limits import Limit, Limits
 from ..robot import Robot, load_robot
 from ..robot.loading import is_mjcf
-from ..schemes import Scheme, WeightedQP
+from ..schemes import Scheme
+from ..schemes._default import scheme_for
 from ..tasks import Task
 from ._parts import decode, encode
 
@@ -80,7 +81,7 @@ def save_controller(
         "format": _FORMAT,
         "robot": _source(robot, source),
         "dt": float(dt),
-        "scheme": encode(WeightedQP() if scheme is None else scheme, "scheme"),
+        "scheme": encode(scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme, "scheme"),
         "limits": [encode(limit, f"limits[{place}]") for place, limit in enumerate(given)],
         "tasks": [[name, encode(task, f"tasks[{name!r}]")] for name, task in tasks.items()],
     }

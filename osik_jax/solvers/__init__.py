@@ -4,7 +4,6 @@ from ..execution._backends import Backend as Backend
 from ._damping import Damping as Damping
 from ._level import Level as Level
 from ._status import Status as Status
-from ._status import raise_if_failed as raise_if_failed
 from .hqp import HQPSolution as HQPSolution
 from .hqp import Tolerances as Tolerances
 from .hqp import WorkingSet as WorkingSet

@@ -17,7 +17,8 @@ from ..control._checks import checked_limits
 from ..control._step import Targets, Tasks
 from ..limits import Limit, Limits, with_own_limits
 from ..robot import Robot
-from ..schemes import Scheme, WeightedQP
+from ..schemes import Scheme
+from ..schemes._default import scheme_for
 
 _PARTS = ("robot", "scheme", "limits", "dt")
 
@@ -32,7 +33,7 @@ class Loop(eqx.Module):
     Attributes:
         robot: the robot.
         tasks: by name; or a function of time that returns them, of which an ``equinox.Module``'s fields have names.
-        scheme: ``WeightedQP()``, ``NullSpace()`` or ``HierarchicalQP()``; default: the first.
+        scheme: as in ``solve``.
         limits: hard bounds on the velocity, as in ``rollout``: those given, then the robot's own that they do not
             replace.
         dt: time of one step [s].
@@ -61,8 +62,9 @@ class Loop(eqx.Module):
     ):
         self.robot, self.steps = robot, steps
         self.limits = with_own_limits(robot, checked_limits(robot, limits))
-        self.scheme = WeightedQP() if scheme is None else scheme
         self.tasks = tasks if callable(tasks) else dict(tasks)
+        at_start = self.tasks(jnp.zeros((), robot.q0.dtype)) if callable(self.tasks) else self.tasks
+        self.scheme = scheme_for(at_start, robot.q0.dtype) if scheme is None else scheme
         self.dt = jnp.asarray(dt, robot.q0.dtype)
         taken = [name for name in _PARTS if not callable(tasks) and name in tasks]
         if taken:

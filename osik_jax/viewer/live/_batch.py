@@ -16,7 +16,8 @@ from ..._errors import OsikValueError, unknown_name
 from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import Limits
 from ...robot import Robot
-from ...schemes import Scheme, WeightedQP
+from ...schemes import Scheme
+from ...schemes._default import scheme_for
 from ...tasks import FrameTask, Task
 from .._look import Look
 from .._mujoco import mujoco_poses
@@ -236,7 +237,6 @@ def serve_batch(
     """
     if not tasks:
         raise OsikValueError("there are no robots: tasks is empty")
-    scheme = WeightedQP() if scheme is None else scheme
     check_setting("serve_batch(robot, tasks)", robot, scheme, dt)
     given = checked_limits(robot, limits) or ()
     for own in tasks.values():
@@ -244,6 +244,8 @@ def serve_batch(
     start = np.asarray(robot.q0 if q0 is None else q0)
     if start.shape not in ((robot.nq,), (len(tasks), robot.nq)):
         raise OsikValueError(f"q0 has shape {start.shape}, expected ({robot.nq},) or ({len(tasks)}, {robot.nq})")
+    if scheme is None:
+        scheme = scheme_for(next(iter(tasks.values())), robot.q0.dtype)
     controllers = {name: Controller(dict(own), scheme, given) for name, own in tasks.items()}
     q0s = np.broadcast_to(start, (len(tasks), robot.nq)).copy()
     view = BatchView(robot, controllers, q0s, dt=dt, look=look, host=host, port=port, title="osik-jax")

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import Limits
 from ...robot import Robot
-from ...schemes import Scheme, WeightedQP
+from ...schemes import Scheme
+from ...schemes._default import scheme_for
 from ...tasks import ComTask, SupportPolygon, Task
 from .._look import Look
 from .._mujoco import robot_com
@@ -195,7 +196,7 @@ def serve(
     session = Session(
         robot=robot,
         tasks=dict(tasks),
-        scheme=WeightedQP() if scheme is None else scheme,
+        scheme=scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme,
         limits=checked_limits(robot, limits) or (),
         dt=dt,
         q=np.asarray(start),
