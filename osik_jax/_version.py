@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def installed_version() -> str:
-    """As ``pip`` knows it; ``"0+unknown"`` for sources that are imported without being installed."""
+    """Return the version that ``pip`` knows; ``"0+unknown"`` for sources that are imported without being installed."""
     try:
         return version("osik-jax")
     except PackageNotFoundError:

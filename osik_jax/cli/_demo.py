@@ -24,7 +24,7 @@ class Demo:
     """
 
     motion: Literal["double-support", "single-support"] | None = None
-    """What NAO does. Default: double-support. Any other robot sways."""
+    """Motion of the NAO; default: double-support. Other robots sway."""
     physics: bool = False
     """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every step."""
     robot: str | None = None

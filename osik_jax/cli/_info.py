@@ -78,7 +78,7 @@ def _print_system(console: Console) -> None:
 
 
 def _print_report(console: Console, robot: Robot) -> None:
-    """What the file asks for and the robot does not keep, as a table."""
+    """Print a table of what the file asks for and the robot does not keep."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -269,7 +269,7 @@ def _retarget_live(command: Retarget) -> None:
 
 
 def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarget) -> None:
-    """What came of a clip; last, what has to be known before it is used."""
+    """Print the figures of a clip; the last lines are warnings about its use."""
     from ..retargeting._notes import notes
 
     joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..robot import Robot
 
 FLOATING = {"auto": None, "floating": True, "fixed": False}
-"""What ``--base`` says of the root: whether it moves freely, None where the file is to say."""
+"""Values of ``--base``: whether the root moves freely; None: as the file says."""
 
 
 def read_robot(source: str, base: str = "auto") -> Robot:

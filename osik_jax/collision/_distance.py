@@ -26,7 +26,7 @@ _TRIANGLES = np.array([(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)], np.int32)
 
 
 class Nearest(NamedTuple):
-    """How far shape b is from shape a. World axes.
+    """Signed distance from shape a to shape b, in world axes.
 
     ``d distance / dt = normal @ (velocity of point_b - velocity of point_a)``, each point moving with its shape.
 

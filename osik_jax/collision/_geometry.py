@@ -1,4 +1,4 @@
-"""What shapes are made of: a unit core of each kind, scaled by a shape's sizes; convex hulls of points and meshes."""
+"""Geometry of shapes: a unit core of each kind, scaled by a shape's sizes; convex hulls of points and meshes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..kinematics._rigid import rotate
 from ._distance import Core
 
 CYLINDER_SIDES = 16
-"""Of the prism around a cylinder, whose corners stand out by 2 % of the radius."""
+"""Number of sides of the prism around a cylinder; its corners are 2 % of the radius outside."""
 
 MOST_EDGES = 24
 """Edge directions of a hull with more of them are left out of the search for separating axes."""

@@ -1,4 +1,4 @@
-"""Which shapes may meet: the pairs of a robot's geoms and added shapes, filtered by adjacency, masks and names."""
+"""Pairs of shapes that may meet: a robot's geoms and added shapes, filtered by adjacency, masks and names."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def _checked(pairs: Patterns) -> list[tuple[str, str]]:
 
 
 def _default_pairs(scene: Sequence[Member]) -> set[tuple[int, int]]:
-    """What MuJoCo would let collide."""
+    """Return the pairs that MuJoCo would let collide."""
     return {
         (i, j) for (i, a), (j, b) in itertools.combinations(enumerate(scene), 2) if a.solid and b.solid and _meet(a, b)
     }
@@ -156,7 +156,7 @@ def _meet(a: Member, b: Member) -> bool:
 
 
 def exact_pairs(scene: Sequence[Member], patterns: Patterns | None) -> set[tuple[int, int]]:
-    """Of the pairs that are asked for, those that are asked for by their names rather than by globs."""
+    """Return the pairs that are asked for by their names, not by globs."""
     names = {name for member in scene for name in (member.name, *member.aliases)}
     return _named_pairs(scene, [pair for pair in patterns or () if names.issuperset(pair)])
 
@@ -211,7 +211,7 @@ def _model_excludes(robot: Robot, scene: Sequence[Member]) -> set[tuple[int, int
 
 
 class _RigidParts:
-    """Which shapes cannot move against each other, and which of them one joint moves against each other.
+    """Rigid groups of shapes, and the groups that one joint moves against each other.
 
     A part is called by the number of its moving body in the tree, or, if it is fixed to the world, by minus the number
     of its first link below the world in the model. The world itself is part 0. Locked joints do not move.

@@ -106,7 +106,7 @@ class CollisionShape(eqx.Module):
 
     @classmethod
     def half_space(cls, point: ArrayLike | Array, normal: ArrayLike | Array, *, frame: str | None = None) -> Self:
-        """All that is behind a plane.
+        """Return the half-space behind a plane.
 
         Args:
             point: of the plane, in the frame [m]. (3,)

@@ -1,4 +1,4 @@
-"""What is looked at before a step is compiled and run: wrong input is told in words, outside of any program.
+"""Checks of a step's inputs before it is compiled and run; errors name what is wrong.
 
 Nothing here runs inside a program: what is traced is looked at as far as its type and shape go.
 """

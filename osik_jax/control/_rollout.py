@@ -36,7 +36,7 @@ from ._step import Targets, Tasks, aim, in_type_of, step
 
 Feedback = Callable[[Array, Array], Array]
 _Carry = tuple[Array, Any, Any]
-"""What a step leaves to the next: configuration, velocity and warm start."""
+"""State passed from step to step: configuration, velocity and warm start."""
 
 
 def rollout(

@@ -1,4 +1,4 @@
-"""What a control step and a rollout return."""
+"""Results of a control step and of a rollout."""
 
 from __future__ import annotations
 

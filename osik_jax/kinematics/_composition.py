@@ -1,4 +1,4 @@
-"""From poses in the parent's frame to poses in the world."""
+"""Composition of poses in parents' frames to poses in the world."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ Moving = tuple[Float[Array, "k 3"], Float[Array, "k 3 3"], Float[Array, "k 6 nv"
 
 
 class Kinematics(eqx.Module):
-    """Where everything is at one configuration. All in world axes.
+    """Poses of all bodies and axes of all dofs at one configuration, in world axes.
 
     Attributes:
         body_position: origin of each body [m]. (nbody, 3)
@@ -107,7 +107,7 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
 
 
 def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
-    """As ``forward_kinematics``, by a kernel where there is one; what is asked of the answer goes that way too.
+    """Return ``forward_kinematics``, by the compiled core where it can; Jacobians of the result take the same route.
 
     Raises:
         ModuleNotFoundError: the backend's package is not installed.
@@ -211,7 +211,7 @@ def _center_and_jacobian(robot: Robot, kinematics: Kinematics) -> tuple[Float[Ar
 
 
 def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"]) -> Float[Array, "... nv"]:
-    """From columns of all the model's dofs to columns of v: locked dofs drop out, followers join their leaders."""
+    """Return columns of v from columns of all the model's dofs: locked dofs drop out, followers join their leaders."""
     (own, _), *followers = tree.dof_columns
     reduced = jacobian if len(own) == jacobian.shape[-1] else jacobian[..., own]
     for index, coefficient in followers:
@@ -260,7 +260,7 @@ def body_masses(robot: Robot, subtree: str | None = None) -> Float[Array, " nbod
 
 
 def _fields(robot: Robot, q: Float[Array, " nq"]) -> tuple[Array, ...]:
-    """Of the kinematics, those that are arrays."""
+    """Return the arrays of the kinematics."""
     return tuple(jax.tree.leaves(forward_kinematics(robot, q)))
 
 

@@ -1,4 +1,4 @@
-"""Where everything is at a robot's home configuration: for work outside jit."""
+"""Kinematics at a robot's home configuration, for work outside jit."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ compiled_kinematics = jax.jit(forward_kinematics)
 
 
 def home_kinematics(robot: Robot) -> Kinematics:
-    """Where everything is at the robot's home configuration."""
+    """Return the kinematics at the robot's home configuration."""
     return compiled_kinematics(robot, robot.q0)

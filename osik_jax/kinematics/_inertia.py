@@ -22,7 +22,7 @@ class Composite(NamedTuple):
 
 
 class Momenta(NamedTuple):
-    """Of what each dof carries, when it moves at unit speed and all others rest; in world axes."""
+    """Centre, linear and angular momentum of the bodies that each dof carries, at unit speed; world axes."""
 
     center: Float[Array, "nvfull 3"]  # of mass [m]
     linear: Float[Array, "nvfull 3"]  # [kg m/s]

@@ -62,6 +62,6 @@ def _forest(
 
 
 def dof_kinds(tree: KinematicTree) -> tuple[np.ndarray, np.ndarray]:
-    """Of each full dof: its joint's type, and its number within the joint."""
+    """Return the joint type of each full dof, and the dof's number within its joint."""
     kinds = np.asarray(tree.joint_types, int)[tree.dof_joint]
     return kinds, np.arange(len(kinds)) - tree.full_dof_address[:-1][tree.dof_joint]

@@ -61,7 +61,7 @@ def center_of_mass(robot: Robot, kinematics: Any) -> tuple[Array, Array]:
 
 
 def center_arguments(robot: Robot, kinematics: Any) -> tuple[tuple[Array, ...], np.ndarray, int]:
-    """What kernels of the centre of mass take: the robot's and its bodies' numbers, integers; and how many lanes."""
+    """Return the arguments of the centre-of-mass kernels: arrays, integers, and the number of lanes."""
     tree = robot.tree
     columns, factors = dof_columns(tree)
     integers = np.concatenate([tree.body_parents, tree.dof_body, columns]).astype(np.int32)

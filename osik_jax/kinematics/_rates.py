@@ -1,4 +1,4 @@
-"""How kinematics change with the velocity."""
+"""Derivatives of the kinematics along the velocity."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def kinematics_rates(robot: Robot, kinematics: Kinematics) -> Kinematics:
 
 
 def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Bool[np.ndarray, "nvfull nvfull"]]:
-    """Which dofs (columns) turn the axis of each dof, and which move its anchor.
+    """Return which dofs (columns) turn the axis of each dof, and which move its anchor.
 
     Hinges and slides sit where the joints before them have brought their body; the axes of ball and free joints are
     those of the body itself. A free joint's anchor is its body's origin.
@@ -53,7 +53,7 @@ def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Boo
 def _velocity(
     kinematics: Kinematics, points: Float[Array, "k 3"], moved: Bool[np.ndarray, "k nvfull"]
 ) -> Float[Array, "k 3 nvfull"]:
-    """Of points, with each dof that moves them."""
+    """Return the velocity of points under unit speed of each dof that moves them."""
     axis = kinematics.dof_angular.T
     velocity = kinematics.dof_linear.T + cross(axis, points[:, :, None] - kinematics.dof_anchor.T, along=-2)
     return jnp.where(moved[:, None, :], velocity, 0.0)
@@ -62,6 +62,6 @@ def _velocity(
 def _turning(
     kinematics: Kinematics, vectors: Float[Array, "k 3 n"], turned: Bool[np.ndarray, "k nvfull"]
 ) -> Float[Array, "k 3 n nvfull"]:
-    """Of column vectors, with each dof that turns them."""
+    """Return the rate of column vectors under unit speed of each dof that turns them."""
     axis = kinematics.dof_angular.T[None, :, None, :]
     return jnp.where(turned[:, None, None, :], cross(axis, vectors[..., None], along=1), 0.0)

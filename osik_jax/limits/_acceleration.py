@@ -155,7 +155,7 @@ def _rounded(product: Float[Array, " nv"]) -> Float[Array, " nv"]:
 
 
 def _way(bound: Float[Array, " nv"], position: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """To the bound, rounded down; an infinite bound stays so, with gradients 0."""
+    """Return the distance to the bound, rounded down; an infinite bound stays infinite, with gradient 0."""
     free = jnp.isinf(bound)
     way = jnp.where(free, 0.0, bound) - position
     return jnp.where(free, bound, way - _ROUNDOFF * jnp.finfo(way.dtype).eps * jnp.abs(way))

@@ -1,4 +1,4 @@
-"""From limits to one box on the velocity, and to rows where a box does not do."""
+"""The velocity box of all limits, and the rows of limits that are no box."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ no_limits = NoLimits()
 """No limits of the robot's own: ``limits=osik.no_limits``; ``limits=(osik.no_limits, limit)`` is that limit alone."""
 
 Limits: TypeAlias = Sequence[Limit] | NoLimits
-"""What ``limits=`` takes beside None."""
+"""Types that ``limits=`` takes, besides None."""
 
 
 def keeps_own(limits: Sequence[Limit] | None, kind: type[Limit]) -> bool:

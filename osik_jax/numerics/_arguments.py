@@ -1,4 +1,4 @@
-"""From the numbers that a user gives to array leaves, checked where they can be looked at."""
+"""Conversion of a user's numbers to array leaves, with checks of concrete values."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _ONE_THREAD = 31
-"""Of as many numbers XLA makes a sum in one thread of a GPU."""
+"""Largest number of terms that XLA sums in one thread of a GPU."""
 
 
 def product(a: Float[Array, "*B m k"], b: Float[Array, "*B k n"]) -> Float[Array, "*B m n"]:

@@ -11,11 +11,11 @@ from .._errors import OsikValueError
 from ._arguments import concrete
 
 ROUNDED = 0.02
-"""By which lengths of quaternions and of a matrix's columns may differ from 1: the rounding to two or three digits."""
+"""Largest deviation from 1 of the length of a quaternion or a matrix column: numbers rounded to two or three digits."""
 _EXACT = 64.0
 """Machine epsilons: a matrix whose residual is not greater is taken as it is."""
 _ITERATIONS = 4
-"""Of the method of Newton and Schulz: each takes a residual e below e^2, so four take 0.04 below 1e-16."""
+"""Number of Newton-Schulz iterations: each takes a residual e below e^2, so four take 0.04 below 1e-16."""
 
 
 def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B 4"]:

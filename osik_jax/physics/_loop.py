@@ -28,7 +28,7 @@ from ._simulation import Simulation
 
 
 class Command(eqx.Module):
-    """How the velocity of a step becomes a servo target."""
+    """Conversion of a step's velocity to a servo target."""
 
     @abc.abstractmethod
     def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:

@@ -119,7 +119,7 @@ class Simulation:
         self.data.xfrc_applied[index, :3] = force
 
     def effort(self) -> Float[np.ndarray, " n"]:
-        """What each servo exerts [N m or N], in the order of ``world.servos``. (n,)."""
+        """Return the force or torque of each servo [N m or N], in the order of ``world.servos``. (n,)."""
         return self.data.actuator_force.copy()
 
     def frame_pose(self, frame: str) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
@@ -135,7 +135,7 @@ class Simulation:
         return self.world.own_masses @ self.data.xipos / self.world.own_masses.sum()
 
     def contact_points(self) -> Float[np.ndarray, "k 3"]:
-        """Where the contact points of all feet are [m], foot after foot. (k, 3)."""
+        """Return the contact points of all feet [m], foot after foot. (k, 3)."""
         radius = self.model.geom_size[self._points, :1]
         return self.data.geom_xpos[self._points] - radius * np.array([0.0, 0.0, 1.0])
 

@@ -23,7 +23,7 @@ Feet = Mapping[str, ArrayLike] | Sequence[str]
 """Frames that touch the floor: names with their contact points in the frame [m], or names alone (see ``World``)."""
 
 CONTACT_RADIUS = 0.004
-"""Of the spheres that touch the floor [m]; each sits on its contact point, so that it touches at the point itself."""
+"""Radius of the contact spheres [m]; each is placed so that it touches the floor at its contact point."""
 
 _COPIED = (
     *("body_gravcomp", "dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp"),
@@ -199,7 +199,7 @@ def _home(robot: Robot) -> mujoco.MjData:
 def frame_pose(
     robot: Robot, data: mujoco.MjData, frame: str
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Where MuJoCo has a frame: position [m] and rotation, in data of the robot's own model or of its world."""
+    """Return position [m] and rotation of a frame in MuJoCo's data of the robot's own model or of its world."""
     index = robot.tree.frame(frame)
     body = _model_body(robot, robot.tree.frame_bodies[index])
     turn = data.xmat[body].reshape(3, 3)
@@ -249,7 +249,7 @@ def _add_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[mujoco.MjsBo
 
 
 def _add_shape(body: mujoco.MjsBody, model: mujoco.MjModel, g: int) -> None:
-    """For the eye alone; meshes and height fields stay out."""
+    """Add a geom for display alone; meshes and height fields are left out."""
     kind = mujoco.mjtGeom(int(model.geom_type[g]))
     if kind in _SHAPES:
         look = dict(type=kind, pos=model.geom_pos[g], quat=model.geom_quat[g], size=model.geom_size[g])

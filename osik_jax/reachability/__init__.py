@@ -1,4 +1,4 @@
-"""Where a frame gets to, and how it can be turned there; import it by name."""
+"""Maps of the poses that a frame can reach; import it by name."""
 
 from ._grid import grid_around as grid_around
 from ._map import ReachabilityMap as ReachabilityMap

@@ -1,4 +1,4 @@
-"""What a frame can do, apart from any search: where random joints take it, and how far it could be drawn out."""
+"""A frame's workspace without any search: positions at random configurations, and a bound from link lengths."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class Frame(NamedTuple):
     settings: Settings
 
     def sampled_positions(self, count: int) -> Float[np.ndarray, "count 3"]:
-        """Where configurations that fill the joints' ranges evenly put it [m]."""
+        """Return the frame's positions [m] at configurations that fill the joints' ranges evenly."""
         return np.asarray(_sampled(self.robot, self.settings, jnp.arange(count, dtype=jnp.int32), route=self._route))
 
     def beyond_reach(self, positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """How far positions are at least from all that it could ever reach [m]; 0 where they may be within."""
+        """Return a lower bound on the distance from each position to the workspace [m]; 0 where it may be inside."""
         given = jnp.asarray(positions, self.robot.q0.dtype)
         return np.asarray(_beyond(self.robot, self.settings, given, route=self._route))
 
@@ -91,7 +91,7 @@ def _beyond(robot: Robot, settings: Settings, positions: Array, *, route: ChainR
 
 @partial(jax.jit, static_argnames="route")
 def _manipulability(robot: Robot, settings: Settings, q: Array, *, route: ChainRoute) -> Array:
-    """Of sqrt(det(J J')) and sqrt(det(J' J)), the one that is not 0 for the number of joints alone."""
+    """Return sqrt(det(J J')) for each configuration, or sqrt(det(J' J)) where J has fewer columns than rows."""
     chain = _search(robot, settings, route).chain
     matrix = jnp.moveaxis(jacobian(chain, chain_kinematics(chain, q.T[np.array(chain.layout.dofs, int)]))[0], -1, 0)
     rows = matrix if matrix.shape[1] <= matrix.shape[2] else jnp.swapaxes(matrix, 1, 2)

@@ -15,7 +15,8 @@ Grid = tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " ny"], Float[np.ndarra
 
 _SAMPLES = 4096
 _MARGIN = 0.05
-"""Of the longest side: how far the grid goes past the samples, of which none is quite at the edge."""
+"""Margin of the grid around the sampled positions, as a fraction of the longest side: no sample lies quite at the edge.
+"""
 _FLAT = 1e-6
 """Share of the longest side below which a side is a rounding."""
 
@@ -42,7 +43,7 @@ def grid_around(robot: Robot, frame: str, positions: int = 20_000) -> Grid:
 
 
 def around(frame: Frame, positions: int) -> Grid:
-    """As ``grid_around``."""
+    """Return a grid around a frame's workspace, as ``grid_around`` does."""
     check_count("positions", positions)
     places = frame.sampled_positions(_SAMPLES)
     low, high = places.min(0), places.max(0)

@@ -1,4 +1,4 @@
-"""What a frame gets to, position by position."""
+"""The map of a frame's reach: positions, orientations, manipulability and configurations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FORMAT = 1
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReachabilityMap:
-    """Which orientations a frame can take at each position of a grid; NumPy arrays.
+    """Orientations that a frame can take at each position of a grid; NumPy arrays.
 
     Attributes:
         frame: its name.

@@ -17,7 +17,7 @@ _PLANES = ((0, 1), (0, 2), (1, 2))
 
 
 def draw_slices(found: ReachabilityMap, at: tuple[float, float, float] | None = None) -> Figure:
-    """As ``ReachabilityMap.figure``."""
+    """Draw three slices of the map, as ``ReachabilityMap.figure`` does."""
     axes = found.x, found.y, found.z
     share = found.share
     spot = fullest(share) if at is None else nearest(axes, at)

@@ -1,4 +1,4 @@
-"""From a robot and a frame to a map of what the frame gets to."""
+"""Computation of a reachability map for a robot and a frame."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def reachability_map(
     out: str | os.PathLike[str] | None = None,
     progress: Progress = True,
 ) -> ReachabilityMap:
-    """At each position of a grid, the share of orientations that a frame reaches, and its best manipulability.
+    """Return the share of orientations that a frame reaches at each position of a grid, and its best manipulability.
 
     Each pose is searched for as in ``inverse_kinematics``, joints within their limits; positions that are proven to be
     beyond the links' lengths are not. So what is reached is certain, and what is not was not found by ``seeds``
@@ -130,7 +130,7 @@ def _run(
     out: Any,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """What is reached at the positions, in chunks."""
+    """Return the reached orientations at the positions, computed in chunks."""
     count, dtype = len(rotations), frame.robot.q0.dtype
     like = {"reached": (np.bool_, (count,)), "manipulability": (dtype, ()), "q": (dtype, (frame.robot.nq,))}
     if not len(positions):
@@ -155,7 +155,7 @@ def _run(
 
 
 def _reached(frame: Frame, positions: np.ndarray, rotations: np.ndarray, settings: dict[str, Any]) -> dict[str, Any]:
-    """Which orientations are reached at each position; of their configurations, the most manipulable one."""
+    """Return which orientations are reached at each position, and the most manipulable of their configurations."""
     count, number = len(positions), len(rotations)
     poses = np.repeat(positions, number, 0), np.tile(rotations, (count, 1, 1))
     found = inverse_kinematics(frame.robot, {frame.name: poses}, restarts=0, closest=False, **settings)

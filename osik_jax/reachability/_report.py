@@ -9,7 +9,7 @@ from ._map import ReachabilityMap
 
 
 def summary_table(found: ReachabilityMap) -> Table:
-    """How much of the grid is reached, and where the frame can be turned and moved best."""
+    """Return a table of the reached share of the grid, and of the best positions for turning and moving the frame."""
     share, some = found.share, found.reached.any(-1)
     table = Table(show_header=False)
     table.add_row("positions", f"{share.size} ({' x '.join(str(n) for n in share.shape)})")

@@ -16,7 +16,7 @@ evenly."""
 
 
 def spread_rotations(count: int) -> Float[np.ndarray, "count 3 3"]:
-    """So many rotations, each about as far from its neighbours as the others; the same ones every time.
+    """Return ``count`` evenly spread rotations; the same ones every time.
 
     They lie on a spiral around the unit quaternions, at constant density (M. Alexa, "Super-Fibonacci spirals: fast,
     low-discrepancy sampling of SO(3)", CVPR 2022). Sets of different sizes share no rotation.

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from ._map import ReachabilityMap
 
 NOTHING = "#e6e8eb"
-"""Where no orientation was found, and none is proven out of reach."""
+"""Colour of cells where no orientation was found and none is proven out of reach."""
 _PALE = 0.15
 """Share of the colours at the light end that is left out, so that a small share differs from none."""
 
 
 def share_colors() -> ListedColormap:
-    """Of the share of orientations that are reached, 0 to 1."""
+    """Return the colours of the share of orientations reached, from 0 to 1."""
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
@@ -30,13 +30,13 @@ def share_colors() -> ListedColormap:
 
 
 def fullest(share: Float[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
-    """Of each axis, where the slice across it holds most."""
+    """Return for each axis the index of the slice with the largest sum."""
     sums = (share.sum(tuple(j for j in range(3) if j != i)) for i in range(3))
     return tuple(int(values.argmax()) for values in sums)  # pyright: ignore[reportReturnType]
 
 
 def nearest(axes: Sequence[np.ndarray], at: Any) -> tuple[int, int, int]:
-    """Of each axis, the coordinate that is nearest to a point's.
+    """Return for each axis the index of the coordinate that is nearest to the point ``at``.
 
     Raises:
         ValueError: ``at`` is no point.
@@ -53,7 +53,7 @@ def nearest(axes: Sequence[np.ndarray], at: Any) -> tuple[int, int, int]:
 
 
 def cell_edges(axes: Sequence[Float[np.ndarray, " n"]]) -> list[Float[np.ndarray, " n_1"]]:
-    """Where the cells of each axis' coordinates end: halfway between them; a lone one is as wide as the smallest."""
+    """Return the edges of the cells along each axis; a single cell is as wide as the smallest cell."""
     width = min((float(np.diff(axis).min()) for axis in axes if len(axis) > 1), default=0.01)
     return [_edges(axis, width) for axis in axes]
 

@@ -112,7 +112,7 @@ def _to_disk(job: _Job, folder: Path, label: str, progress: Progress, unit: str)
 
 
 class _Job:
-    """What is run."""
+    """Function, batch and chunk size of a job."""
 
     def __init__(self, function: Callable[..., Any], batch: Any, shared: tuple[Any, ...], count: int, chunk: int):
         self.function, self.batch, self.shared, self.count, self.chunk = function, batch, tuple(shared), count, chunk

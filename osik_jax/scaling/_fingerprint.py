@@ -1,4 +1,4 @@
-"""What a job was started with, to tell whether it may go on."""
+"""Fingerprint of a job's inputs, which tells whether an interrupted job may go on."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _digest(data: Any) -> str:
 
 
 def differences(old: Any, new: Any, name: str = "") -> list[str]:
-    """What differs between two manifests, one line each."""
+    """Return the differences of two manifests, one line each."""
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         keys = [*old, *(key for key in new if key not in old)]
         return [line for key in keys for line in differences(old.get(key), new.get(key), f"{name}.{key}".lstrip("."))]

@@ -104,7 +104,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def _owner(path: Path) -> str:
-    """Who has a lock, as far as its file says."""
+    """Return the owner of a lock, as its file names it."""
     try:
         found = json.loads(path.read_text())
         return f"process {found['pid']} on {found['host']}"

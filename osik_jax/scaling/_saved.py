@@ -31,7 +31,7 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """What the chunks are of; None if there is no manifest.
+    """Return the manifest of a folder; None if there is none.
 
     Raises:
         DamagedFile: it is not as it was written.
@@ -94,7 +94,7 @@ class Saved:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the arrays: ``velocity``, ``slack.hand``."""
+        """Return the names of the arrays, such as ``velocity`` and ``slack.hand``."""
         for path in chunk_files(self.folder).values():
             with opened(path) as file:
                 return result_names(file)

@@ -16,7 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from .._errors import OsikTypeError, OsikValueError
 
 _SHARED = -1
-"""In the place of an axis: every device has all of it."""
+"""Marker in place of an axis: every device has the whole array."""
 
 
 def device_mesh(devices: Sequence[Any] | None = None) -> Mesh:

@@ -172,7 +172,7 @@ class ComTask(Task):
 
 
 def _fields(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
-    """Of the rows of a task with a target; both bounds are one."""
+    """Return the fields of ``TaskRows`` for a task with a target; ``lower`` is used for both bounds."""
     rows = task._plain_rows(robot, kinematics)
     return rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
 

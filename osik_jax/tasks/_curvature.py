@@ -1,4 +1,4 @@
-"""How much a task bends: bounds on the second derivative of its error along its own pull, the feedback ``gain e``.
+"""Bounds on the second derivative of a task's error along its own pull, the feedback ``gain e``.
 
 A step of dt changes the error by ``dt J v + dt^2/2 (grad^2 e)[v, v] + ...``, and a solver minimises
 ``1/2 w |J v + gain e|^2`` as if the second term were not there. What it leaves out of the cost is, to first order,

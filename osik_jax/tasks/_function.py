@@ -157,7 +157,7 @@ class FunctionTask(Task):
         return tuple(name for name in names if name != "numbers") + own
 
     def _numbers(self, function: Any) -> Any:
-        """Those of another function of the same structure, in the precision of the ones they replace."""
+        """Return the numbers of another function of the same structure, with the dtypes of the present ones."""
         numbers, structure = taken_apart(function)
         if structure != self.structure:
             raise OsikTypeError(

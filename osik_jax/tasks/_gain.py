@@ -1,4 +1,4 @@
-"""How fast an error is asked to vanish."""
+"""Gains: the rate at which a task's error decays."""
 
 from __future__ import annotations
 

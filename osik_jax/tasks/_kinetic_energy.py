@@ -41,7 +41,7 @@ class KineticEnergyTask(Task):
         self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """As many rows as v has entries: the square root of the mass matrix."""
+        """Return nv rows: the square root of the mass matrix."""
         del q
         root = _root(mass_matrix(robot, kinematics))
         zero = jnp.zeros(robot.nv, root.dtype)

@@ -1,4 +1,4 @@
-"""From the numbers that a user gives to the array leaves of a task, checked where they can be looked at."""
+"""Conversion of a user's numbers to a task's array leaves, with checks of concrete values."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def as_normal(value: Any, dtype: Any) -> Float[Array, "3"]:
 
 
 def as_offset(value: Any, dtype: Any) -> Float[Array, ""]:
-    """How far along its normal a plane lies from the world's origin [m].
+    """Offset of a plane along its normal from the world's origin [m].
 
     Raises:
         ValueError: not a scalar.

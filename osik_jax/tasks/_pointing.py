@@ -1,4 +1,4 @@
-"""What tasks share that point an axis of a frame: the angle to a direction, as two rows or as a cone."""
+"""Shared parts of tasks that point a frame's axis: the angle to a direction, as two rows or as a cone."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ._task import TaskRows, check_priority, task_rows
 _BEHIND = -0.5
 """Cosine below which a direction counts as behind: there the formulas divide by it, in front by one plus it."""
 _LEAST_SINE = 0.1
-"""What rows across the error are divided by at least, next to the opposite direction."""
+"""Lower bound on the divisor of rows across the error, near the opposite direction."""
 _TIP = 0.01
 """Angle [rad] below which that of a cone is rounded off, so that its gradient passes through 0."""
 

@@ -141,7 +141,7 @@ class PoseTask(FramedTask):
         )
 
     def _twist_parts(self, position: Array, rotation: Array, jacobian: Array) -> tuple[_Blocks, _Wrench]:
-        """Of the logarithm of the pose in the target."""
+        """Return error, Jacobian and feedforward of the logarithm of the pose in the target's frame."""
         wanted, own = self.target[1].T, rotation.T
         offset, between = dot(wanted, position - self.target[0]), dot(wanted, rotation)
         error, factor = pose_log(offset, between)
@@ -152,7 +152,7 @@ class PoseTask(FramedTask):
         return [(self.kept, (error, dot(factor, twist), feedforward, weight))], dot(_twice(rotation), factor.T)
 
     def _decoupled_parts(self, position: Array, rotation: Array, jacobian: Array) -> tuple[_Blocks, _Wrench]:
-        """Of the position and of the orientation, those that are kept."""
+        """Return the rows of position and of orientation that are kept."""
         parts = []
         if any(self.kept[:3]):
             linear = self._position_in_frame if self.axes == "frame" else self._position_outside

@@ -129,7 +129,7 @@ class PostureTask(Task):
         return all(is_scalar(robot, joint) for joint in self.joints)
 
     def _difference(self, robot: Robot, target: Array, q: Array, dofs: list[int]) -> Float[Array, " m"]:
-        """From the target to q, on the chosen dofs."""
+        """Return ``difference(target, q)`` on the chosen dofs."""
         if self._adds(robot):
             places = np.array([robot.tree.qpos_address[joint] for joint in self.joints])
             return (q - target)[places]

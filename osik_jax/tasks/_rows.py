@@ -53,7 +53,7 @@ def _manner(task: FramedTask) -> Hashable:
 
 
 def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, FramedTask]) -> dict[str, TaskRows]:
-    """Of tasks of one manner."""
+    """Return the rows of tasks with the same static structure, in one vmapped call."""
     first, *_ = tasks.values()
     frames = [frame for task in tasks.values() for frame in task.frames]
     stacked = [jnp.stack(leaves) for leaves in zip(*map(jax.tree.leaves, tasks.values()), strict=True)]

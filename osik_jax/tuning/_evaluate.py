@@ -24,7 +24,7 @@ from ._scenarios import Scenarios, run_one
 
 
 class Evaluation(eqx.Module):
-    """What a loop costs on scenarios.
+    """Losses of a loop on scenarios.
 
     Attributes:
         losses: of each; of no meaning where it was dropped. (n,)
@@ -41,12 +41,12 @@ class Evaluation(eqx.Module):
 
     @property
     def dropped(self) -> Array:
-        """How many were not kept."""
+        """Return the number of dropped scenarios."""
         return jnp.sum(~self.kept)
 
 
 class Problem(eqx.Module):
-    """What is minimised: a loss of a loop, over a space of parameters, its scenarios split over devices."""
+    """Minimisation problem: a loss of a loop, a space of parameters, and the devices that share the scenarios."""
 
     loss: LossFunction
     loop: Loop
@@ -162,7 +162,7 @@ def in_chunks(function: Callable[[Any], Any], batch: Any, chunk: int) -> Any:
 def evaluate(
     loss: LossFunction, loop: Loop, scenarios: Scenarios, *, chunk: int | None = None, mesh: Mesh | None = None
 ) -> Evaluation:
-    """What a loop costs on scenarios; compiled once for a loss and a structure.
+    """Return the losses of a loop on scenarios; compiled once for a loss and a structure.
 
     Args:
         loss: a function of a trajectory and a loop, a ready one or your own.
@@ -210,7 +210,7 @@ def check_mesh(mesh: Any) -> None:
 
 
 def chunk_size(chunk: int | None, count: int, mesh: Mesh | None = None) -> int:
-    """How many scenarios run at a time on a device: all on an accelerator, some on a CPU, whose cache holds no more."""
+    """Return the number of scenarios that run at a time on a device: all on an accelerator, at most 64 on a CPU."""
     count = -(-count // mesh.size) if mesh is not None else count
     if chunk is None:
         return min(count, 64) if jax.default_backend() == "cpu" else count

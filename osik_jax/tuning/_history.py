@@ -1,4 +1,4 @@
-"""What tuning went through, and its state on disk."""
+"""History of a tuning, and its state on disk."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class History:
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """All that tuning needs to go on: the next parameters, the optimiser's memory, and what there was.
+    """State from which tuning goes on: next parameters, optimiser state and history.
 
     Attributes:
         vector: parameters of the next iteration, in the space that the optimiser moves in. (p,)

@@ -1,4 +1,4 @@
-"""What is tuned: a robot, its tasks, a scheme and limits, run for some time."""
+"""The loop that is tuned: a robot, its tasks, a scheme and limits, run for some time."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Loop(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all numbers of the loop."""
+        """Return the names of all numbers of the loop."""
         return tuple(name.removeprefix("tasks.") for name in leaf_names(eqx.filter(self, is_number)))
 
     def replace(self, values: Mapping[str, Any]) -> Self:

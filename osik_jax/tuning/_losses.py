@@ -1,4 +1,4 @@
-"""What a trajectory costs."""
+"""Losses of trajectories."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class Effort(Loss):
 
 
 class JointLimitDistance(Loss):
-    """How far joints are into a margin before their limits: 0 outside it, 1 for a joint at its limit all the time.
+    """Depth of the joints in a margin before their limits: 0 outside it, 1 for a joint at its limit all the time.
 
     Mean over time of the squares, summed over the joints that have two limits (the robot's own).
 

@@ -1,4 +1,4 @@
-"""Which numbers are tuned, and the space without bounds that an optimiser moves in."""
+"""The numbers that are tuned, and the unbounded space in which an optimiser moves."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Parameter:
 
 
 class _Slot(eqx.Module):
-    """Where some entries of the vector go: into a leaf of the loop, at places of its raveled array."""
+    """Place of some entries of the parameter vector: a leaf of the loop, and indices into its raveled array."""
 
     leaf: int = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)

@@ -52,7 +52,7 @@ class Scenarios(eqx.Module):
             raise OsikValueError(f"scenarios are arrays with one leading axis of one length; lengths: {found}")
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of scenarios."""
         return jax.tree.leaves(self)[0].shape[0]
 
     def __getitem__(self, which: Any) -> Scenarios:

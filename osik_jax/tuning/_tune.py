@@ -31,12 +31,12 @@ except ImportError as missing:
     raise ImportError("osik_jax.tuning needs optax: pip install 'osik-jax[tuning]'") from missing
 
 LEARNING_RATE = 0.1
-"""Of the default optimiser: weights and gains change by up to 10 % an iteration."""
+"""Learning rate of the default optimiser: weights and gains change by up to 10 % an iteration."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """What came of a tuning. The best iteration has the lowest training loss; held-out scenarios have no say in it.
+    """Result of a tuning. The best iteration has the lowest training loss; held-out scenarios do not count.
 
     Attributes:
         loop: with the best parameters; ``loop.tasks``, ``loop.scheme``, ``loop.limits``.

@@ -34,7 +34,7 @@ Polygons = Sequence[Float[np.ndarray, "m 2"]]
 
 @dataclasses.dataclass(frozen=True)
 class Curves:
-    """What a panel beside the robot shows over time.
+    """Curves over time of one panel beside the robot.
 
     Attributes:
         title: its title, with the unit.
@@ -177,7 +177,7 @@ class _Film:
         self._under: tuple[Float[np.ndarray, "m 2"], np.ndarray] | None = None
 
     def _survey(self, trails: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """All that a camera has to see, the centres of mass and the trails' points, over the motion."""
+        """Return the points [m] that the camera must see, the centres of mass and the points of each trail."""
         points, com, paths = [], [], []
         for data in mujoco_poses(self._robot, self._q):
             points.append(self._shape.corners(data))

@@ -150,7 +150,7 @@ def _tidy(axes: Axes) -> None:
 
 
 def _add_legend(figure: Figure, grid: np.ndarray, palette: Mapping[str, str], used: int) -> None:
-    """In the empty place of the grid if there is one, else at the top right."""
+    """Add a legend in the empty cell of the grid if there is one, else at the top right."""
     handles, labels = {}, []
     for axes in grid[:used]:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

@@ -1,4 +1,4 @@
-"""What a URDF says that its links look like: visual shapes and mesh files, which ``Robot.from_urdf`` does not keep."""
+"""Appearance of a URDF's links: visual shapes and mesh files, which ``Robot.from_urdf`` does not keep."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..robot.loading._urdf import GEOMS, geom_size
 from ..robot.loading._urdf_elements import Link, Shape, Urdf, read_urdf
 
 _NEAR = 3
-"""So many folders above a URDF are searched for a mesh whose package has another name there."""
+"""Number of folders above a URDF that are searched for a mesh whose package has another name there."""
 _Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
@@ -48,7 +48,7 @@ class LinkShape:
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """What a robot's links look like.
+    """Visual shapes of a robot's links.
 
     Attributes:
         shapes: of all links.
@@ -103,7 +103,7 @@ class _Reader:
         return tuple(shape for link in self._urdf.links.values() for shape in self._link(link, visual=visual))
 
     def _from_joints(self, shapes: tuple[LinkShape, ...]) -> float:
-        """How far the joints of the links are from boxes about the links' meshes, in all [m]."""
+        """Return the sum of the distances [m] from the links' joints to the bounding boxes of the links' meshes."""
         ends: dict[str, list[np.ndarray]] = {link: [np.zeros(3)] for link in self._urdf.links}
         for joint in self._urdf.joints:
             ends[joint.parent].append(joint.origin.position)
@@ -143,7 +143,7 @@ class _Reader:
             )  # fmt: skip
 
     def _triangles(self, shape: Shape) -> list[Triangles]:
-        """Of a mesh file; none where it cannot be read."""
+        """Return the triangles of a mesh file; empty if the file cannot be read."""
         if shape.file not in self._read:
             try:
                 self._read[shape.file] = read_mesh(self._path(shape.file))

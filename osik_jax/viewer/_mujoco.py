@@ -1,4 +1,4 @@
-"""Where things are, as MuJoCo's own C code says: the viewer and the reports never ask our kinematics."""
+"""Poses and the centre of mass from MuJoCo's C code: pictures and reports do not use this package's kinematics."""
 
 from __future__ import annotations
 

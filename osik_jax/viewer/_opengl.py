@@ -18,7 +18,7 @@ _MANY = 1000
 """Triangles of meshes from which on they are drawn one by one, and no rays are cast."""
 
 _GL_ERRORS = (mujoco.FatalError, ImportError, AttributeError, OSError, RuntimeError)
-"""What MuJoCo's renderer raises without a GL library, without a screen, or with a broken driver."""
+"""Exceptions of MuJoCo's renderer without a GL library, without a screen, or with a broken driver."""
 
 
 _failures: list[str] = []

@@ -1,4 +1,4 @@
-"""How large a robot is, how low it reaches, and where its floor is."""
+"""Size of a robot, its lowest point, and the height of its floor."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _base_height(shape: RobotParts, heights: Float[np.ndarray, " parts"]) -> flo
 
 
 def floor_height(robot: Robot, shape: RobotParts, poses: Iterable[mujoco.MjData]) -> float:
-    """Where to put the floor [m]: under the lowest point that a floating robot has at first, else under the base.
+    """Return the height of the floor [m]: a floating robot's lowest point at first, else the base's height.
 
     Where a robot that is bolted down reaches below its base, the floor is under the lowest point of all poses.
     """

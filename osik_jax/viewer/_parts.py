@@ -1,4 +1,4 @@
-"""What a robot looks like: what its URDF shows, its geoms, or else sticks, placed by MuJoCo's kinematics."""
+"""Parts of a robot's picture: its URDF's visual shapes, its geoms, or else sticks, posed by MuJoCo's kinematics."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Part:
 
     @functools.cached_property
     def corners(self) -> Float[np.ndarray, "8 3"]:
-        """Of a box about it, in its own frame [m]."""
+        """Return the corners of the part's bounding box, in the part's frame [m]."""
         if self.mesh is None:
             low, high = -self._half_edges(), self._half_edges()
         else:
@@ -69,7 +69,7 @@ class Part:
 
     @functools.cached_property
     def hull(self) -> Float[np.ndarray, "k 3"]:
-        """Of a mesh: the points that can be its outermost, in its own frame [m]."""
+        """Return the vertices of a mesh's convex hull, in the part's frame [m]."""
         vertices = np.zeros((0, 3)) if self.mesh is None else self.mesh[0]
         try:
             return vertices[ConvexHull(vertices).vertices]
@@ -109,7 +109,7 @@ class RobotParts:
 
     @property
     def bodies(self) -> Int[np.ndarray, " parts"]:
-        """What each part moves with: MuJoCo's index of the body."""
+        """Return MuJoCo's index of the body that carries each part."""
         index = np.array([part.index for part in self.parts], int)
         match self.style:
             case "look":
@@ -256,7 +256,7 @@ def _tips(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 def _stick_ends(
     data: mujoco.MjData, parents: np.ndarray, tips: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the links start and end [m]: from each body's parent to it, then from the last bodies to their tips."""
+    """Return start and end of each stick [m]: parent to body for each body, then last bodies to their tips."""
     bodies, points = tips
     reach = data.xpos[bodies] + np.einsum("bij,bj->bi", data.xmat.reshape(-1, 3, 3)[bodies], points)
     return np.concatenate([data.xpos[parents], data.xpos[bodies]]), np.concatenate([data.xpos, reach])

@@ -18,15 +18,15 @@ _FINE = 2
 _SHADOW_SIZE = 0.6
 """Width of the lamp's depth buffer, in widths of the picture."""
 _SLACK = 0.012
-"""How far behind what the lamp sees a point has to be to lie in its shadow, in heights of the picture."""
+"""Distance behind the nearest lit surface from which a point is in shadow, in heights of the picture."""
 _DETAIL = 10
-"""Of round shapes: a sphere has four times as many meridians."""
+"""Number of rings of a round shape; a sphere has four times as many meridians."""
 _AT_ONCE = 4_000_000
 """Pixels of triangles' rectangles that are drawn at once: they take about 100 bytes each."""
 
 
 class _Buffer(NamedTuple):
-    """What is in front at each pixel: the inverse of its depth, 0 where nothing is, and the triangle, -1 likewise."""
+    """Depth buffer: for each pixel the inverse depth of the front surface (0 if none) and its triangle (-1 if none)."""
 
     nearness: Float[np.ndarray, "height width"]
     triangle: Int[np.ndarray, "height width"]
@@ -41,7 +41,7 @@ class _Surface(NamedTuple):
 
 
 class _Lamp(NamedTuple):
-    """What the lamp sees, looking at the robots."""
+    """Depth buffer of the lamp, which looks at the robots."""
 
     axes: Float[np.ndarray, "3 3"]
     low: Float[np.ndarray, "2"]
@@ -74,7 +74,7 @@ class Rasterizer(RayCaster):
         return (1.0 - cover[..., None]) * picture + color
 
     def _corners(self, data: mujoco.MjData) -> Float[np.ndarray, "triangles 3 3"]:
-        """Of all triangles, in the world [m]; the part k is on the body k + 1."""
+        """Return the corners of all triangles in the world [m]; part k belongs to body k + 1."""
         turns = data.xmat.reshape(-1, 3, 3)[1:]
         placed = [s.vertices @ R.T + p for s, p, R in zip(self._surfaces, data.xpos[1:], turns, strict=True)]
         return np.concatenate(placed)[self._faces]
@@ -115,7 +115,7 @@ class Rasterizer(RayCaster):
         return _Lamp(axes, low, step, buffer.nearness)
 
     def _unshaded(self, lamp: _Lamp, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """How much of the lamp each point sees, 0 to 1."""
+        """Return the fraction of the lamp that each point sees, 0 to 1."""
         right, up, depth = ((points - self._lamp) @ lamp.axes.T).T
         place = (np.stack([right, up], -1) / depth[:, None] - lamp.low) / lamp.step - 0.5
         corner, hidden = np.floor(place).astype(int), np.zeros(len(points))
@@ -176,7 +176,7 @@ def draw_triangles(
 
 
 def _cuts(counts: Int[np.ndarray, " n"]) -> np.ndarray:
-    """Where to cut a list so that no piece has many more than ``_AT_ONCE`` in all."""
+    """Return the indices that cut a list into pieces of about ``_AT_ONCE`` items in all."""
     return np.flatnonzero(np.diff(np.cumsum(counts) // _AT_ONCE)) + 1
 
 
@@ -192,7 +192,7 @@ class _Rows(NamedTuple):
 
 
 def _rows(places: np.ndarray, nearness: np.ndarray, first: np.ndarray, last: np.ndarray, index: np.ndarray) -> _Rows:
-    """Of some triangles, what each row of pixels has of them."""
+    """Return the horizontal runs of pixels that the given triangles cover, one run for each triangle and pixel row."""
     heights = last[index, 1] - first[index, 1] + 1
     place = np.repeat(np.arange(len(index)), heights)
     triangle = index[place]
@@ -223,7 +223,7 @@ def _rows(places: np.ndarray, nearness: np.ndarray, first: np.ndarray, last: np.
 
 
 def _fragments(rows: _Rows, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of all pixels in some rows: the triangle, the pixel's place in the picture line by line, and its nearness."""
+    """Return triangle, pixel index (row by row) and inverse depth of each pixel in the given runs."""
     kept = np.flatnonzero(rows.count)
     count = rows.count[kept]
     row = np.repeat(kept, count)

@@ -73,7 +73,7 @@ class RayCaster:
         return color, cover
 
     def _edges(self, rows: np.ndarray, columns: np.ndarray, hits: _Hits) -> np.ndarray:
-        """Which of the pixels touch another geom, or a face turned elsewhere."""
+        """Return whether each pixel touches a pixel of another geom or of a face with another normal."""
         if not len(rows):
             return np.zeros(0, bool)
         y, x = rows - rows.min(), columns - columns.min()
@@ -129,7 +129,7 @@ class RayCaster:
     def _shadow(
         self, data: mujoco.MjData, lit: Callable[[Float[np.ndarray, "n 3"]], np.ndarray]
     ) -> Float[np.ndarray, "height width"]:
-        """How much of the light each pixel of the floor keeps; shadows have soft edges.
+        """Return the fraction of the light that each pixel of the floor receives; shadows have soft edges.
 
         Args:
             data: from ``Stage.pose``.

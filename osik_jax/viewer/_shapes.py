@@ -118,14 +118,14 @@ def robot_surface(shape: RobotParts, data: mujoco.MjData, detail: int) -> tuple[
 
 
 def lowest_points(shape: RobotParts, data: mujoco.MjData) -> Float[np.ndarray, " parts"]:
-    """Of each part, the height of its lowest point in the world [m]; exact of meshes, boxes and round shapes."""
+    """Return the height of each part's lowest point in the world [m]; exact for meshes, boxes and round shapes."""
     position, rotation = shape.poses(data)
     down = -rotation[:, 2]  # in each part's frame
     return position[:, 2] - np.array([_reach(part, way) for part, way in zip(shape.parts, down, strict=True)])
 
 
 def _reach(part: Part, way: Float[np.ndarray, "3"]) -> float:
-    """How far the part goes from its origin along a unit vector [m]."""
+    """Return the largest coordinate of the part along a unit vector, from the part's origin [m]."""
     if part.mesh is not None:
         return float((part.hull @ way).max())
     radius, length, _ = part.size

@@ -15,7 +15,7 @@ FLOOR_GROUP = 5
 """The floor's geom group: MuJoCo's renderer shows it, the ray caster draws its own."""
 
 LENS = 3.6
-"""How far the camera is, in heights of what it sees."""
+"""Distance of the camera, in heights of the picture."""
 
 TO_LAMP = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
 
@@ -55,7 +55,7 @@ class Camera:
 
     @property
     def eye(self) -> Float[np.ndarray, "3"]:
-        """Where the lens is [m]."""
+        """Return the position of the camera [m]."""
         return np.asarray(self.center) - self.distance * self.axes[2]
 
     def rays(self, pixels: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> Float[np.ndarray, "n 3"]:
@@ -68,7 +68,7 @@ class Camera:
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def project(self, points: Float[np.ndarray, "*n 3"], size: tuple[int, int]) -> Float[np.ndarray, "*n 2"]:
-        """Where points of the world [m] appear in a picture of (width, height), in pixels."""
+        """Return the pixel coordinates of points of the world [m] in a picture of (width, height)."""
         width, height = size
         right, up, depth = np.moveaxis((np.asarray(points) - self.eye) @ self.axes.T, -1, 0)
         scale = self.distance / depth * height / self.height

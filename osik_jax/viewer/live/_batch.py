@@ -102,7 +102,7 @@ class BatchView(Served):
 
     @property
     def _tasks(self) -> list[dict[str, Task]]:
-        """Of each robot, its tasks as they are now."""
+        """Return the current tasks of each robot."""
         controller = self.loop.controller
         if self._told[0] is not controller:
             plain = jax.tree.map(np.asarray, dict(controller.tasks))
@@ -128,7 +128,7 @@ class BatchView(Served):
         motion.on_click(self._send_motion)
 
     def _send_motion(self, event: GuiEvent[Any]) -> None:
-        """What was recorded, in the layout of ``osik demo``."""
+        """Send the recording to the visitor, in the format of ``osik demo``."""
         recording, buffer = self.loop.recorded(), io.BytesIO()
         if len(recording.time) and event.client is not None:
             runs = {f"q_{name}": recording.q[:, lane] for lane, name in enumerate(self.names)}
@@ -166,7 +166,7 @@ class BatchView(Served):
         return "\n".join([f"| error | {' | '.join(self.names)} |", "|:--|" + "--:|" * len(self.names), *rows])
 
     def _dragging(self, lane: int) -> Any:
-        """What is called when a handle of one of the robots is dragged."""
+        """Return the callback for a drag of one of this robot's handles."""
 
         def drag(name: str, pose: Pose, visitor: int, phase: str) -> None:
             if phase != "end":

@@ -10,7 +10,7 @@ from ...robot import Robot
 from ._step import Controller, Program, compile_step
 
 _KEPT = 16
-"""So many programs stay in memory."""
+"""Number of compiled programs kept in memory."""
 
 
 class Compiler:

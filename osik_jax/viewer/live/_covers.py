@@ -1,4 +1,4 @@
-"""What links are taken for where collisions are avoided: a capsule or a box around what is drawn of each."""
+"""Collision shapes of links in a live view: a capsule or a box around what is drawn of each link."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a live view starts with: a robot's hands, feet, waist and centre of mass as tasks."""
+"""Default tasks of a live view: hands, feet, waist and centre of mass."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HANDS = (r"gripper|tcp|tool|end_?effector|\bee\b", r"rubber_hand|palm|hand(?!.*
 _SIDES = {"left": r"(^|_)(l|left)(_|$)|left|^L(?=[A-Z])", "right": r"(^|_)(r|right)(_|$)|right|^R(?=[A-Z])"}
 _GAIN = 15.0
 WEIGHTS = {"foot": 1e4, "balance": 1e3, "waist": 1e2, "com": 1e2, "hand": 1e2, "posture": 1e-2}
-"""For the weighted scheme; the others rank by priority."""
+"""Weights of the default tasks in the weighted scheme; the other schemes use priorities."""
 
 
 def default_session(
@@ -73,7 +73,7 @@ def default_session(
 
 
 def _led_later(robot: Robot, q: Float[Array, " nq"]) -> dict[str, Task]:
-    """Of a robot that moves freely: its waist and its centre of mass."""
+    """Return the tasks offered (switched off) for a floating-base robot: waist pose and centre of mass."""
     waist = robot.tree.body_names[robot.tree.root]
     task = FrameTask(robot, waist, weight=WEIGHTS["waist"], gain=_GAIN, priority=3).at(robot, q)
     com = ComTask(robot, weight=WEIGHTS["com"], gain=_GAIN, priority=3).at(robot, q)

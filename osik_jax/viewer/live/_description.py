@@ -115,7 +115,7 @@ def _takes_robot(cls: type) -> bool:
 
 
 def _argument(part: Any, robot: Robot, name: str) -> Any:
-    """What a constructor's argument has to be for this object, as plain data."""
+    """Return a constructor argument that reproduces this part of the object, as plain data."""
     if name == "rows" and isinstance(part, PoseTask):
         return _ROWS.get(part.kept, list(part.kept))
     if name == "joints" and isinstance(part, PostureTask):
@@ -141,7 +141,7 @@ def _plain(value: Any) -> Any:
 
 
 def _live(value: Any) -> Any:
-    """Of plain data, what constructors take."""
+    """Return the constructor argument that plain data describes."""
     if isinstance(value, Mapping) and "kind" in value:
         cls = _PARTS[value["kind"]]
         return cls(**{name: np.asarray(one, float) for name, one in value.items() if name != "kind"})

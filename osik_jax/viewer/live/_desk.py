@@ -27,7 +27,7 @@ from ._session import Session
 from ._step import Controller, with_targets
 
 _DAMPING = 1e-6
-"""Of the hierarchical scheme: without any, joints shake where an obstacle holds back a task of high priority."""
+"""Damping of the hierarchical scheme. Without it joints oscillate where an obstacle blocks a task of high priority."""
 
 SCHEMES: dict[str, Callable[[], Scheme]] = {
     "Weighted QP": WeightedQP,
@@ -139,7 +139,7 @@ class Desk:
 
     @property
     def obstacles(self) -> dict[str, Obstacle]:
-        """Those in use, by name."""
+        """Return the obstacles in use, by name."""
         with self._lock:
             if self._seen[0] is not self._session.limits:
                 self._seen = self._session.limits, obstacles_in(self._session.limits)
@@ -183,7 +183,7 @@ class Desk:
 
     @cached_property
     def _covers(self) -> dict[str, CollisionShape]:
-        """What links are taken for."""
+        """Return the collision shape of each link, by link."""
         return link_covers(self._session.robot, self._shapes)
 
     def _put_limit(self, limit: CollisionAvoidanceLimit) -> None:

@@ -23,7 +23,7 @@ _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def gizmo_pose(task: Task) -> Pose | None:
-    """Where a task's handle is; None where it has no target in space."""
+    """Return the pose of a task's handle; None if the task has no target in space."""
     if isinstance(task, FrameTask) and not task.bounded:
         position, rotation = (np.asarray(part, float) for part in task.target)
         if not turns(task):
@@ -57,7 +57,7 @@ class Gizmos:
 
     @property
     def held(self) -> Mapping[str, int]:
-        """Which task each is dragged for just now, by which visitor."""
+        """Return the visitor who drags each task's handle, by task."""
         return dict(self._held)
 
     def show(self, tasks: Mapping[str, Task]) -> None:
@@ -100,7 +100,7 @@ class Gizmos:
         self._handles[name], self._turns[name] = handle, turns(task)
 
     def _move(self, handle: TransformControlsHandle, pose: Pose) -> None:
-        """Where it is not there yet."""
+        """Move the handle to a pose, if it is not there yet."""
         if np.abs(np.asarray(handle.position) - pose[0]).max() > _MOVED:
             handle.position = pose[0]
         if np.abs(np.asarray(handle.wxyz) - pose[1]).max() > _MOVED:

@@ -16,7 +16,7 @@ from .._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 def targets_here(
     robot: Robot, q: Float[np.ndarray, " nq"], tasks: Mapping[str, Task], names: Iterable[str]
 ) -> dict[str, Any]:
-    """For some tasks, the target that holds at q; tasks that have none are left out."""
+    """Return the targets that the given tasks meet at q; tasks without a target are left out."""
     data = next(mujoco_poses(robot, q))
     found: dict[str, Any] = {}
     for name in names:

@@ -37,18 +37,18 @@ _SWITCH_INTERVAL = 5e-5
 _HALF_A_MICROSECOND = 5e-7
 """Python keeps that interval in whole microseconds, and cuts off."""
 _loops: set[int] = set()
-"""Those that run: the last of them gives Python's garbage collection its objects back."""
+"""Identities of the running loops. The last one to stop unfreezes the objects of Python's garbage collector."""
 
 
 class _Job(NamedTuple):
-    """What the control thread runs: a program and the numbers that it takes."""
+    """A compiled program and its numbers, as the control thread runs them."""
 
     program: Program
     numbers: list[Array]
 
 
 class _Lease(NamedTuple):
-    """Who leads the target of a task, and until when that counts as fresh [s]."""
+    """Owner of a task's target, and the time until which the target counts as fresh [s]."""
 
     owner: Hashable
     until: float
@@ -142,7 +142,7 @@ class ControlLoop:
 
     @property
     def snapshot(self) -> Snapshot:
-        """What the last step left; a new object for each step."""
+        """Return the state after the last step; a new object for each step."""
         return self._snapshot
 
     @property

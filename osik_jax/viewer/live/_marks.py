@@ -16,7 +16,7 @@ _IN, _OUT, _EDGE = (42, 157, 98), (215, 38, 61), (28, 111, 184)
 _LIFT = 0.002
 """Flat marks are so far above the floor [m]."""
 _TOUCHING = 1e-3
-"""On the edge, or so little beyond it, is inside [m]."""
+"""Distance beyond a polygon's edge up to which a point counts as inside [m]."""
 
 
 class BalanceMarks:

@@ -21,7 +21,7 @@ _MOVED = 1e-9
 
 
 class _Shown(NamedTuple):
-    """What the page has."""
+    """Handle and shape of one obstacle, as the page shows them."""
 
     handle: TransformControlsHandle
     kind: str
@@ -94,7 +94,7 @@ class ObstacleNodes:
 
 
 def _move(handle: TransformControlsHandle, one: Obstacle) -> None:
-    """Where it is not there yet."""
+    """Move the handle to the obstacle, if it is not there yet."""
     if np.abs(np.asarray(handle.position) - one.position).max() > _MOVED:
         handle.position = one.position
     quaternion = _quaternion(one)

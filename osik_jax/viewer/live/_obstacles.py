@@ -24,11 +24,11 @@ from ...robot import Robot
 from .._mujoco import mujoco_frame_pose, mujoco_poses
 
 SLOTS = {"ball": 3, "box": 3}
-"""So many of each kind may be in a page."""
+"""Number of obstacles of each kind that a page may have."""
 MARGIN = 0.01
 """Least distance; of a robot with itself, of pairs that are farther apart where the robot starts [m]."""
 PARKED = np.array([0.0, 0.0, -1e3])
-"""Where what is not in use is [m]."""
+"""Position of obstacles that are not in use [m]."""
 _ROWS = {"itself": 12, "world": 12}
 
 

@@ -1,4 +1,4 @@
-"""What ``osik view`` opens."""
+"""Choice of view for ``osik view``: session file, motion file, map or robot."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class LiveView(Served):
 
     @property
     def loop(self) -> ControlLoop:
-        """What runs the controller."""
+        """Return the control loop."""
         return self._desk.loop
 
     @property
@@ -116,7 +116,7 @@ class LiveView(Served):
                 self._marks.place(robot_com(session.robot, self._data))
 
     def _draw_session(self, session: Session) -> None:
-        """What changes only with the session."""
+        """Redraw the parts of the page that depend on the session alone."""
         on, self._drawn = session.active_tasks, session
         self._gizmos.show(on)
         polygon = _polygon(on)
@@ -231,6 +231,6 @@ def serve_session(
 
 
 def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:
-    """Of the first task that keeps the centre of mass over one."""
+    """Return the polygon of the first task that keeps the centre of mass inside one; None if there is none."""
     found = (task.polygon for task in tasks.values() if isinstance(task, ComTask) and task.polygon is not None)
     return next(found, None)

@@ -101,7 +101,7 @@ class Panel:
                     loop.push(self._shove())
 
     def _shove(self) -> np.ndarray:
-        """Of the base, in a random direction along the floor."""
+        """Return a velocity of the base in a random horizontal direction, shape (nv,)."""
         angle = np.random.default_rng().uniform(0.0, 2.0 * np.pi)
         velocity = np.zeros(self._desk.session.robot.nv)
         velocity[:2] = _PUSH * self._size * np.array([np.cos(angle), np.sin(angle)])
@@ -189,7 +189,7 @@ class Panel:
         self._show_obstacle()
 
     def _add_obstacle(self, kind: str) -> None:
-        """In front of the robot, at half its height."""
+        """Add an obstacle in front of the robot, at half its height."""
         low, high = self._seen.min(0), self._seen.max(0)
         place = 0.5 * (low + high) + np.array([0.5 * (high - low)[0] + 0.2 * self._size, 0.0, 0.0])
         count = len(self._desk.obstacles)
@@ -246,7 +246,7 @@ class Panel:
         self._fill_obstacles(None)
 
     def _send_motion(self, event: Any) -> None:
-        """What was recorded, in the layout of ``osik demo``."""
+        """Send the recording to the visitor, in the format of ``osik demo``."""
         recording = self._desk.loop.recorded()
         if not len(recording.time):
             raise OsikValueError("nothing was recorded")
@@ -255,7 +255,7 @@ class Panel:
         self._send(event, "motion.npz", buffer.getvalue())
 
     def _send(self, event: Any, name: str, content: bytes) -> None:
-        """To the visitor who asked for it."""
+        """Send a file to the visitor who asked for it."""
         (event.client or self._server).send_file_download(name, content, save_immediately=True)
 
     def _show_python(self, event: Any) -> None:
@@ -265,7 +265,7 @@ class Panel:
 
     @property
     def _name(self) -> str:
-        """Of the task chosen."""
+        """Return the name of the chosen task."""
         return self._chosen.value
 
     def _add_switch(self, name: str, on: bool) -> None:
@@ -305,7 +305,7 @@ class Panel:
 
 
 def _words(limit: Limit) -> str:
-    """What a switch is called."""
+    """Return the label of a limit's switch."""
     if isinstance(limit, CollisionAvoidanceLimit):
         return _WORLD if keeps_off_world(limit) else _ITSELF
     kind = type(limit).__name__

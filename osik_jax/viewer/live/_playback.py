@@ -25,7 +25,7 @@ _FRAME = 1.0 / 30.0
 """Time between pictures [s]."""
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _RATE = 200.0
-"""Of an array without times [Hz]."""
+"""Sample rate of an array without times [Hz]."""
 
 
 class Motion:
@@ -42,7 +42,7 @@ class Motion:
 
     @property
     def duration(self) -> float:
-        """Of the longest run [s]."""
+        """Return the duration of the longest run [s]."""
         return max(float(time[-1]) for time in self.times.values())
 
     def at(self, name: str, now: float) -> Float[np.ndarray, " nq"]:
@@ -101,7 +101,7 @@ def _retargeted(arrays: Mapping[str, np.ndarray], robot: Robot, path: Any) -> di
 
 
 def _times(name: str, count: int, arrays: Mapping[str, np.ndarray]) -> Float[np.ndarray, " T"]:
-    """Of each configuration of a run, from 0 [s]."""
+    """Return the time of each configuration of a run, from 0 [s]."""
     time = arrays.get(f"time_{name}", arrays.get("time"))
     if time is None or time.ndim != 1 or len(time) not in (count, count - 1) or len(time) < 2:
         return np.arange(count) / _RATE

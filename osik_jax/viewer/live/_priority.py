@@ -1,4 +1,4 @@
-"""Which of a live view's threads the system runs first: the control loop before what draws."""
+"""Thread priorities of a live view: the control loop runs before the drawing threads."""
 
 from __future__ import annotations
 

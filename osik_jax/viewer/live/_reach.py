@@ -134,7 +134,7 @@ class ReachView(Served):
             self._draw()
 
     def _draw(self) -> None:
-        """What has changed since it was drawn."""
+        """Redraw what changed since the last drawing."""
         across = _AXES.index(self._across.value)
         index = int(np.abs(self._axes[across] - self._sliders[_AXES[across]].value).argmin())
         if (across, index) != self._drawn:
@@ -201,14 +201,14 @@ def slice_picture(found: ReachabilityMap, across: int, index: int) -> Slice:
 
 
 def _cell_of_pixels(edges: Float[np.ndarray, " n_1"], number: float) -> np.ndarray:
-    """Which cell each of so many pixels side by side belongs to."""
+    """Return the index of the cell that each pixel of a row belongs to."""
     count = max(round(number), 1)
     places = edges[0] + (np.arange(count) + 0.5) / count * (edges[-1] - edges[0])
     return np.clip(np.searchsorted(edges, places) - 1, 0, len(edges) - 2)
 
 
 def slice_words(found: ReachabilityMap, across: int, index: int) -> str:
-    """How much of a slice is reached."""
+    """Return a line of text that says how much of a slice is reached."""
     share, beyond = (np.take(field, index, across) for field in (found.share, found.beyond_reach > 0.0))
     at, some = (found.x, found.y, found.z)[across][index], share > 0.0
     mean = f", on average in {share[some].mean():.0%} of the orientations" if some.any() else ""
@@ -227,7 +227,7 @@ def _cell_words(found: ReachabilityMap, cell: tuple[int, int, int]) -> str:
 
 
 def _slider(gui: Any, name: str, axis: Float[np.ndarray, " n"], at: float, *, visible: bool) -> Any:
-    """Of the coordinates of an axis; one alone cannot be moved."""
+    """Return a slider over the coordinates of an axis; it is disabled if the axis has one coordinate."""
     spacing = float(np.diff(axis).min()) if len(axis) > 1 else 1.0
     digits = max(3, int(np.ceil(1.0 - np.log10(spacing))))
     step, (low, high, start) = 10.0**-digits, (round(float(value), digits) for value in (axis[0], axis[-1], at))

@@ -1,4 +1,4 @@
-"""What a page tells of a loop, in short lines of Markdown."""
+"""Readout of a control loop as short lines of Markdown."""
 
 from __future__ import annotations
 

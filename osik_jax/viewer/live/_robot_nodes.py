@@ -76,7 +76,7 @@ class RobotNodes:
 
 
 def side_by_side(span: Float[np.ndarray, "points 3"], count: int, least: float = 0.0) -> list[Float[np.ndarray, "3"]]:
-    """By how much to move each of so many robots [m], whose points these are: from left to right in the page.
+    """Return the offsets [m] that place ``count`` copies of a robot with these points side by side, from left to right.
 
     ``least`` is the least distance of neighbours [m].
     """
@@ -91,7 +91,7 @@ def add_label(scene: SceneApi, name: str, span: Float[np.ndarray, "points 3"]) -
 
 
 def _by_body(shapes: RobotParts, data: mujoco.MjData) -> dict[int, dict[tuple[int, int, int, int], Surface]]:
-    """Of each body, its surfaces by colour (0 to 255), in the body's frame."""
+    """Return the surfaces of each body by colour (0 to 255), in the body's frame."""
     out: dict[int, dict[tuple[int, int, int, int], Surface]] = {}
     positions, rotations = shapes.poses(data)
     for part, body, position, rotation in zip(shapes.parts, shapes.bodies, positions, rotations, strict=True):

@@ -90,7 +90,7 @@ class Session:
         Path(path).write_text(self.to_json(), encoding="utf-8")
 
     def to_json(self) -> str:
-        """What ``save`` writes.
+        """Return the session as JSON, the content of the file that ``save`` writes.
 
         Raises:
             ValueError: as in ``save``.

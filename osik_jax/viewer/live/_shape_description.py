@@ -68,7 +68,7 @@ def shape_python(described: Mapping[str, Any]) -> str:
 
 
 def describe_pairs(limit: CollisionAvoidanceLimit, *, short: bool) -> dict[str, list[list[str]]]:
-    """Which pairs are kept apart: by their names, or in short with a glob for what links are taken for."""
+    """Return the pairs that are kept apart: by name, or in short form with a glob for the shapes of links."""
     if not short:
         return {"pairs": [list(pair) for pair in limit.pairs], "exclude": []}
 

@@ -1,4 +1,4 @@
-"""What a control loop tells of itself."""
+"""State of a control loop, as other threads read it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ...solvers import Status
 
 @dataclasses.dataclass(frozen=True)
 class Snapshot:
-    """What the last step left.
+    """State after the last step.
 
     Attributes:
         time: simulated since the start or the last reset [s].

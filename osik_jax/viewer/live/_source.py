@@ -1,4 +1,4 @@
-"""Where a robot comes from: what a session file keeps in the place of the robot itself."""
+"""Source of a robot: the name or file that a session file stores in place of the robot."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def load_source(source: RobotSource) -> Robot:
 
 
 def source_look(source: RobotSource) -> Look | None:
-    """What a URDF shows; None of robots whose shapes are in their model already."""
+    """Return the visual shapes of the robot's URDF; None if its model already has shapes."""
     if source.is_file:
         return None if source.is_mjcf else read_look(source.robot)
     if source.robot in ROBOTS:

@@ -1,4 +1,4 @@
-"""How a robot stands at first, where its file does not say: legs a little bent, soles flat, the lowest point at 0."""
+"""Initial stance where the file gives none: legs slightly bent, soles flat, lowest point at height 0."""
 
 from __future__ import annotations
 
@@ -25,10 +25,12 @@ _BEND = 0.05
 """Joints first go towards the middle of their range by this part of it, so that knees bend the way they can."""
 _STEPS = 60
 _SOLE = 0.006
-"""What of a foot is so little above its lowest point stands on the ground [m]."""
+"""Height above a foot's lowest point up to which its points count as sole [m]."""
 _MARGIN = 0.01
 _CORNERS = 8
-"""Of a sole; each is a point of it, so that the polygon is nowhere larger than the soles."""
+"""Number of polygon corners for each sole; corners are points of the sole, so the polygon is never larger than the
+soles.
+"""
 
 
 def standing(robot: Robot, shapes: RobotParts, feet: Sequence[str]) -> Float[np.ndarray, " nq"]:

@@ -22,12 +22,12 @@ from ...schemes import Scheme
 from ...tasks import Task
 
 State = tuple[Array, Array, Any]
-"""What a step leaves to the next: configuration (nq,), velocity (nv,) and warm start."""
+"""State passed from step to step: configuration (nq,), velocity (nv,) and warm start."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """What a step is made of.
+    """Tasks, scheme and limits of a control step.
 
     Attributes:
         tasks: by name.
@@ -44,12 +44,12 @@ class Controller:
         return dict(self.tasks), self.scheme, tuple(self.limits)
 
     def numbers(self) -> list[Array]:
-        """All that may change without compiling, in a fixed order."""
+        """Return the numbers that may change without compiling, in a fixed order."""
         leaves = jax.tree.leaves(self.parts())
         return [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves]
 
     def structure(self) -> tuple[Any, ...]:
-        """All that is compiled: two controllers of one structure share a program."""
+        """Return a key of the compiled program: controllers with equal structure share a program."""
         leaves, tree = jax.tree.flatten(self.parts())
         return (tree, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
 

@@ -14,9 +14,9 @@ from .._shapes import Quads, part_surface
 _CREASE = np.cos(np.deg2rad(35.0))
 """Faces that meet at less than this angle look like one round surface."""
 _DETAIL = 8
-"""Of round shapes: four times as many meridians."""
+"""Number of rings of a round shape; a sphere has four times as many meridians."""
 _MOST_FACES = 4000
-"""Of a mesh; more are made fewer by merging vertices that are close."""
+"""Maximum number of faces of a mesh; larger meshes are simplified by merging close vertices."""
 _CELLS = (160, 120, 96, 80, 64, 48, 40, 32, 24, 16, 12, 8)
 """Cells along a mesh's longest side, from fine to coarse."""
 
@@ -54,7 +54,7 @@ def _merged(surface: Surface, *, decimals: int) -> Surface:
 
 
 def _proper(vertices: np.ndarray, faces: np.ndarray) -> Surface:
-    """Without faces that are lines, and without vertices that no face has."""
+    """Return the surface without degenerate faces and without unused vertices."""
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     used, index = np.unique(faces, return_inverse=True)
@@ -62,7 +62,7 @@ def _proper(vertices: np.ndarray, faces: np.ndarray) -> Surface:
 
 
 def _fewer(surface: Surface) -> Surface:
-    """At most so many faces, on the finest grid whose cells merge enough vertices."""
+    """Return the surface with at most ``_MOST_FACES`` faces, by clustering vertices on a grid."""
     for cells in _CELLS:
         if len(surface.faces) <= _MOST_FACES:
             break

@@ -1,4 +1,4 @@
-"""What is around the robot in a page: floor, light, sky and the first camera."""
+"""Surroundings of the robot in a page: floor, light, sky and the first camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 _AZIMUTH, _ELEVATION, _VIEW_ANGLE = 32.0, 16.0, 32.0
-"""Of the first camera [deg]."""
+"""Angles of the first camera [deg]."""
 _FLOOR, _LINE, _SECTION = (232, 236, 242), (217, 223, 231), (201, 209, 219)
 
 

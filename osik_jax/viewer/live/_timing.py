@@ -1,4 +1,4 @@
-"""How regular a loop is: periods and times of its last steps."""
+"""Regularity of a loop: periods and computing times of its last steps."""
 
 from __future__ import annotations
 
