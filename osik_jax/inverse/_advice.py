@@ -1,4 +1,4 @@
-"""What to ask for instead, where an arm has fewer joints than its frames have rows."""
+"""Advice on the rows to free, where an arm has fewer joints than its frames have rows."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def _copies(branches: Float[np.ndarray, "k n"], own: Coordinates, most: int) -> 
 def _nearest(
     x: Float[np.ndarray, "k m n"], inside: Bool[np.ndarray, "k m"], own: Coordinates, most: int
 ) -> Float[np.ndarray, "k some n"]:
-    """Of each branch at most so many copies, the nearest ones; those that are outside the limits become NaN, last."""
+    """Return at most ``most`` copies of each branch, nearest first; copies outside the limits become NaN, last."""
     away = np.where(inside & np.isfinite(x[..., 0]), np.linalg.norm(x - own.first, axis=-1), np.inf)
     kept = np.argsort(away, 1, kind="stable")[:, : min(most, int(np.isfinite(away).sum(1).max(initial=1)))]
     out = np.take_along_axis(x, kept[..., None], 1)

@@ -23,7 +23,7 @@ _SMALL_ANGLE_SQUARED = 1e-6
 
 
 class Layout(NamedTuple):
-    """Which joints take part, and how they hang together; hashable.
+    """Joints of the chain and their structure; hashable.
 
     Attributes:
         joints: the robot's joints, parents first.
@@ -215,7 +215,7 @@ def _local_poses(chain: Chain, x: Float[Array, "n lanes"]) -> Float[Array, "k 3 
 
 
 def _world_poses(layout: Layout, local: Float[Array, "k 3 4 lanes"]) -> Float[Array, "k_1 3 4 lanes"]:
-    """Of each joint's far side, one after the other; the world is last. A loop, or XLA computes parents again."""
+    """Return the pose of each joint's far side in the world, then the world's own."""
     world = jnp.concatenate([jnp.eye(3, dtype=local.dtype), jnp.zeros((3, 1), local.dtype)], -1)
     world = jnp.broadcast_to(world[..., None], local.shape[1:])
     serial = layout.parents == (len(layout.joints), *range(len(layout.joints) - 1))
@@ -250,7 +250,7 @@ def _times(a: Float[Array, "*k m 3 lanes"], b: Float[Array, "*k 3 n lanes"]) -> 
 
 
 def jacobian(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames 6 n lanes"]:
-    """Of each frame over the chain's coordinates: rows [linear; angular] in world axes, linear at its origin."""
+    """Return each frame's Jacobian over the chain's coordinates: rows [linear; angular], world axes, at its origin."""
     own, layout = _joint_columns(chain, kinematics), chain.layout
     return jnp.stack([_column(layout, own, dof) for dof in layout.dofs], 2)
 
@@ -275,7 +275,7 @@ def curvature(
     angular: Float[Array, "frames 3 lanes"],
     radian: Float[Array, ""],
 ) -> Float[Array, "n n lanes"]:
-    """What the Hessian of half the squared errors has beside J'J, with J as in ``jacobian``.
+    """Return the Hessian of half the squared errors less J'J, with J as in ``jacobian``.
 
     Where joint a comes before joint b, ``d^2 p / da db = w_a x (dp / db)``, w_a being the axis of a hinge and 0 for a
     slide. The derivative of the angular error is ``I - K / 2 + c K^2`` times the angular velocity, K being its cross
@@ -310,7 +310,7 @@ def _log_curvature(angular: Float[Array, "3 lanes"]) -> Float[Array, " lanes"]:
 
 
 def _entry_factors(layout: Layout) -> Float[np.ndarray, "n k"]:
-    """By how much each coordinate moves each joint."""
+    """Return the factor by which each coordinate moves each joint."""
     out = np.zeros((len(layout.dofs), len(layout.joints)))
     for at, entry in enumerate(layout.entries):
         if entry >= 0:
@@ -319,7 +319,7 @@ def _entry_factors(layout: Layout) -> Float[np.ndarray, "n k"]:
 
 
 def _column(layout: Layout, own: Float[Array, "frames k 6 lanes"], dof: int) -> Float[Array, "frames 6 lanes"]:
-    """Of one coordinate: its joint's, and those of the joints that follow it."""
+    """Return the Jacobian column of one coordinate: the sum over its joint and the joints that follow it."""
     moved = [at for at, entry in enumerate(layout.entries) if entry == dof]
     parts = [own[:, at] if layout.factors[at] == 1.0 else own[:, at] * layout.factors[at] for at in moved]
     return sum(parts[1:], parts[0])

@@ -24,7 +24,7 @@ _ROUNDOFF = 64.0
 _ENOUGH = 0.01
 """Score at which a search is done; the next step would be a rounding."""
 _RADIAN = 0.1
-"""What a radian counts as, relative to the length of the chain."""
+"""Length that a radian counts as, relative to the length of the chain."""
 _STOPPED = 1e-3
 """A joint is stopped by its limit where the gradient is at least this, relative to its largest value for the error."""
 
@@ -72,7 +72,7 @@ class ChainRoute(NamedTuple):
         return chain_search(robot, self, settings, warm=warm, near=near)
 
     def beyond(self, search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
-        """How far each target is at least from all that can be reached [m]; 0 where it may be within."""
+        """Return a lower bound on the distance from each target to the workspace [m]; 0 where it may be inside."""
         return _beyond(search, goal)
 
     def entries(self, robot: Robot) -> np.ndarray:
@@ -89,7 +89,7 @@ class ChainRoute(NamedTuple):
         return np.array(turning(chain_layout(robot.tree, self.frames)))
 
     def answer(self, robot: Robot, search: ChainSearch, goal: Goal, x: Array, seed: Array, steps: Array) -> Any:
-        """What was found for many targets, its errors computed anew, with the derivative of a solution."""
+        """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
         return answer(robot, self, search, goal, x, seed, steps)
 
 
@@ -183,7 +183,7 @@ def answer(
     seed: Int[Array, " targets"],
     steps: Int[Array, " targets"],
 ) -> InverseKinematicsSolution:
-    """What was found for many targets, its errors computed anew, with the derivative of a solution."""
+    """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
     x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
     fixed_search, fixed_x = jax.lax.stop_gradient((search, x))
     turned = lanes_last(goal)
@@ -220,7 +220,7 @@ def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> t
 
 
 def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
-    """How far targets are at least from what the links can reach, 0 where they may be within."""
+    """Return a lower bound on the distance from each target to the workspace, 0 where it may be inside."""
     length, root = reaches(search.chain, search.first, *starting_box(search.lower, search.upper))
     asked = np.array(search.rows)[:, :3].all(-1)
     longest = length * (1.0 + _ROUNDOFF * float(jnp.finfo(length.dtype).eps))

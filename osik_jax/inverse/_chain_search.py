@@ -20,9 +20,10 @@ from ._seeds import unit_points
 from ._turns import unwound
 
 _DAMPING = 0.03
-"""Of the squared error: with less, steps from afar go too far; with more, they are short."""
+"""Damping, as a fraction of the squared error: less overshoots from afar, more makes steps short."""
 _LEAST_DAMPING = 1e-5
-"""Of the squared length that a radian counts as: keeps singular arms from long steps where the error is small."""
+"""Least damping, as a fraction of the squared length of a radian: bounds the steps of a singular arm near its target.
+"""
 _ISOLATED = 0.01
 """An arm is not singular where each motion by 1 rad moves a frame by this, relative to what a radian counts as."""
 _GAIN = 1e-4
@@ -30,7 +31,7 @@ _GAIN = 1e-4
 
 
 class Goal(NamedTuple):
-    """Where the frames have to be.
+    """Wanted poses of the frames.
 
     Attributes:
         position: [m]. (..., frames, 3)
@@ -91,7 +92,7 @@ class ChainSearch(eqx.Module):
     enough: Float[Array, ""]
 
     def begin(self, seed: Int[Array, " lanes"], goal: Goal) -> Float[Array, "lanes n"]:
-        """Where a search with this number starts."""
+        """Return the starts of the searches with these numbers."""
         del goal
         points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
         if self.near:
@@ -116,7 +117,7 @@ class ChainSearch(eqx.Module):
         return here.T, there.T, errors
 
     def step(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Float[Array, "n lanes"], Errors]:
-        """Where a step leads, and the errors of where it sets out; lanes last. A search that is done stays."""
+        """Return the next point, and the errors at the present one; lanes last. A finished search does not move."""
         error, matrix, errors = self.linearised(x, goal)
         gradient = _transposed_times(matrix, error)
         lower, upper = self.lower[:, None], self.upper[:, None]
@@ -147,7 +148,7 @@ class ChainSearch(eqx.Module):
         return unwound(x, self.first, self.lower, self.upper, self.turns)
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        """From where search 0 starts."""
+        """Return the distance from the start of search 0."""
         return jnp.sqrt(jnp.sum((x - self.first) ** 2))
 
     def finishing(self, exact: bool) -> ChainSearch:
@@ -168,7 +169,7 @@ class ChainSearch(eqx.Module):
         return pivot > (_ISOLATED * self.length) ** 2
 
     def costs(self, x: Float[Array, "lanes n"], goal: Goal) -> Float[Array, " lanes"]:
-        """What ``local_optima`` minimises."""
+        """Return the costs that ``local_optima`` minimises."""
         return 0.5 * self._measuring().linearised(x.T, lanes_last(goal))[2].cost
 
     def local_optima(

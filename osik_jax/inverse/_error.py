@@ -23,7 +23,7 @@ def rotation_error(
 
 
 def _quaternion(m: Float[Array, "frames 3 3 lanes"]) -> Float[Array, "frames 4 lanes"]:
-    """Of a rotation, w x y z of either sign: from the largest of its four entries (Shepperd 1978)."""
+    """Return the quaternion of a rotation, from the largest of its four entries (Shepperd 1978)."""
     x, y, z = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
     squares = jnp.stack([x + y + z, x - y - z, y - x - z, z - x - y], 1)  # 4 times the square of each, less 1
     less = [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]]

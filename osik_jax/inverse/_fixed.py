@@ -18,7 +18,7 @@ _SETTLED = 0.1
 
 
 class Outcomes(NamedTuple):
-    """Where each search of a target has led.
+    """End points of all searches of each target.
 
     Attributes:
         x: coordinates. (targets, seeds, n)
@@ -30,7 +30,7 @@ class Outcomes(NamedTuple):
 
 
 def search_all(search: Search, goals: Any, *, seeds: int, steps: int, last: Search | None = None) -> Outcomes:
-    """So many searches of so many steps for each target.
+    """Run ``seeds`` searches of ``steps`` steps for each target.
 
     Args:
         search: the method.

@@ -1,4 +1,4 @@
-"""How a batch of targets runs: in chunks of one shape, several at a time on a CPU."""
+"""Execution of a batch of targets: in chunks of one shape, several at a time on a CPU."""
 
 from __future__ import annotations
 

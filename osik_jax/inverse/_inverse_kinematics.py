@@ -1,4 +1,4 @@
-"""From where frames should be to a configuration."""
+"""Inverse kinematics: configurations that bring frames to poses, or meet tasks."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ _PROGRESS = 0.7
 
 
 class Errors(NamedTuple):
-    """How far configurations are from what is asked.
+    """Errors of configurations.
 
     Attributes:
         position: largest of the distances [m].
@@ -37,7 +37,7 @@ class Search(Protocol):
     """A search method: a pytree, whose methods take arrays with the lanes in front."""
 
     def begin(self, seed: Int[Array, " lanes"], goal: Any) -> Float[Array, "lanes n"]:
-        """Where a search with this number starts."""
+        """Return the starts of the searches with these numbers."""
         ...
 
     def advance(self, x: Float[Array, "lanes n"], goal: Any, steps: int) -> tuple[Array, Array, Errors]:
@@ -169,7 +169,7 @@ def _refill(search: Search, goals: Any, open_: Array, seeds: Array, enough: Arra
 
 
 def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
-    """What is best of each target so far; of equals, what was there, then the lowest lane."""
+    """Update the best result of each target; ties keep the present result, then the lowest lane."""
     least = found.errors.score.at[lanes.target].min(errors.score)
     number = jnp.arange(len(lanes.target), dtype=jnp.int32)
     wins = (errors.score == least[lanes.target]) & (errors.score < found.errors.score[lanes.target])

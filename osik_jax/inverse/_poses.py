@@ -1,4 +1,4 @@
-"""From the poses that a user gives, one or many, to arrays."""
+"""Conversion of a user's poses, one or many, to arrays."""
 
 from __future__ import annotations
 

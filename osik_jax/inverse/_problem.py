@@ -1,4 +1,4 @@
-"""From poses and tasks by name to what is searched for, and by which method."""
+"""Conversion of a user's poses and tasks to a search problem and its method."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ._task_search import CURVATURE, Aims, damped
 
 
 class Problem(NamedTuple):
-    """What is searched for.
+    """A search problem.
 
     Attributes:
         route: the search method (static).
@@ -41,7 +41,7 @@ class Problem(NamedTuple):
 def read_problem(
     robot: Robot, tasks: Any, targets: Any, scheme: Scheme | None, limits: tuple[Limit, ...] | None
 ) -> Problem:
-    """From what a user gives.
+    """Return the search problem for a user's poses, tasks and targets.
 
     Raises:
         TypeError, KeyError, ValueError: as ``inverse_kinematics``.

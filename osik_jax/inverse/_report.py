@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def print_found(console: Console, robot: Robot, found: InverseKinematicsSolution) -> None:
-    """What was found for one target, or what stops the robot, and the configurations joint by joint.
+    """Print the answer for one target, or why there is none, and the configurations joint by joint.
 
     Of several, those that differ by more than whole turns.
     """

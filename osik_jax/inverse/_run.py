@@ -1,4 +1,4 @@
-"""How the searches of many targets run: as many as each target needs, or a fixed number of each."""
+"""Execution of the searches of many targets: as many as each target needs, or a fixed number of each."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def searched(
     warm: bool,
     go_on: bool,
 ) -> InverseKinematicsSolution:
-    """By as many searches as each target needs; where there is a configuration to start from, from that alone first.
+    """Run as many searches as each target needs; with a start configuration, that search alone first.
 
     ``go_on``: to the configuration with the least error, for targets that are not met.
     """

@@ -28,7 +28,7 @@ def described(robot: RobotModel) -> str:
 
 
 def model_name(robot: RobotModel) -> str:
-    """What the file calls the robot; empty where it does not, and of robots of different files."""
+    """Return the robot's name in its file; empty if it has none, or for robots of different files."""
     return "" if robot.holder.model is None else robot.mj_model.names.split(b"\0")[0].decode(errors="replace")
 
 
@@ -49,7 +49,7 @@ def _mass(robot: RobotModel) -> str:
 
 
 def _limited(robot: RobotModel) -> str:
-    """Of the dofs of joints, how many have a range and how many a greatest speed."""
+    """Return a phrase that counts the dofs with a range and the dofs with a speed limit."""
     own = (robot.position_lower, robot.position_upper, robot.velocity_limit)
     if any(isinstance(array, Tracer) or np.ndim(array) > 1 for array in own):
         return "of each robot its own"

@@ -1,4 +1,4 @@
-"""Which frames look like feet: what decides whether a robot stands freely where nobody says so."""
+"""Recognition of feet among frames, which decides whether a robot stands freely if nobody says so."""
 
 from __future__ import annotations
 

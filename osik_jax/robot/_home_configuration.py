@@ -1,4 +1,4 @@
-"""Where a robot starts and what its tasks aim at by default: from what a user gives to a configuration."""
+"""Conversion of a user's home configuration: start of the robot and default target of its posture."""
 
 from __future__ import annotations
 

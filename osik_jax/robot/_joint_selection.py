@@ -1,4 +1,4 @@
-"""From the joint names and globs that a user gives to the entries of q and v."""
+"""Selection of entries of q and v by joint names and globs."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def is_scalar(robot: Robot, joint: int) -> bool:
 
 
 def scalar_layout(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Which dofs are hinges or slides, and where each of those sits in q (0 for the others). (nv,) each."""
+    """Return which dofs are hinges or slides, and the index of each in q (0 for other dofs). (nv,) each."""
     mask, index = np.zeros(robot.nv, bool), np.zeros(robot.nv, int)
     for joint, dof in robot.tree.dof_address.items():
         if is_scalar(robot, joint):
@@ -73,7 +73,7 @@ def scalar_layout(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def dof_names(robot: Robot) -> list[str]:
-    """For messages: the joint that each entry of v belongs to. (nv,)."""
+    """Return the joint name of each entry of v, for messages. (nv,)."""
     return [
         robot.tree.joint_names[j] for j in robot.tree.independent for _ in range(DOF_WIDTH[robot.tree.joint_types[j]])
     ]

@@ -12,7 +12,7 @@ from ._robot import Robot
 from .loading import LoadOptions, LockedJoints, PositionLimits
 
 _OF_FILES = (".urdf", ".xml", ".mjcf")
-"""How names end that are paths."""
+"""Endings of names that are paths."""
 
 
 def load_robot(

@@ -1,4 +1,4 @@
-"""What a reader makes of a file: a robot's names and numbers, and what follows from them alone."""
+"""Names and numbers of a robot, as read from a file, and properties that follow from them alone."""
 
 from __future__ import annotations
 
@@ -94,11 +94,11 @@ class RobotModel(eqx.Module):
 
     @property
     def load_report(self) -> LoadReport:
-        """What the file asks for and the robot does not keep: element, name, and what was done instead, each."""
+        """Return what the file asks for and the robot does not keep: element, name, and what was done instead."""
         return self.holder.report
 
     def joint_qpos_index(self, name: str) -> int:
-        """Where a joint's values start in q; a follower sits where its leader sits.
+        """Return the index in q of a joint's first value; a follower has its leader's.
 
         Raises:
             KeyError: no such joint, or it is locked.
@@ -106,7 +106,7 @@ class RobotModel(eqx.Module):
         return self.tree.qpos_address[self.tree.owner(name)]
 
     def joint_dof_index(self, name: str) -> int:
-        """Where a joint's velocities start in v; a follower sits where its leader sits.
+        """Return the index in v of a joint's first velocity; a follower has its leader's.
 
         Raises:
             KeyError: no such joint, or it is locked.

@@ -53,7 +53,7 @@ class UnreadMesh:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ModelHolder:
-    """What a robot was made from: its MuJoCo model, and the collision meshes that the model does not hold.
+    """Sources of a robot: its MuJoCo model, and the collision meshes that the model does not hold.
 
     Two holders are equal if their models have equal content, so a function of ``jax.jit`` is compiled anew for a robot
     of another file. What a function reads from the model while it is traced is then that robot's own.
@@ -173,23 +173,23 @@ class KinematicTree:
 
     @cached_arrays
     def full_qpos_address(self) -> np.ndarray:
-        """Where each joint starts in the MuJoCo model's qpos; one past the end is last."""
+        """Return the index of each joint in the MuJoCo model's qpos, then one past the end."""
         return np.cumsum([0, *(QPOS_WIDTH[t] for t in self.joint_types)])
 
     @cached_arrays
     def full_dof_address(self) -> np.ndarray:
-        """Where each joint starts in the MuJoCo model's qvel; one past the end is last."""
+        """Return the index of each joint in the MuJoCo model's qvel, then one past the end."""
         return np.cumsum([0, *(DOF_WIDTH[t] for t in self.joint_types)])
 
     @cached_property
     def qpos_address(self) -> dict[int, int]:
-        """Where each independent joint starts in q."""
+        """Return the index in q of each independent joint."""
         widths = [QPOS_WIDTH[self.joint_types[j]] for j in self.independent]
         return dict(zip(self.independent, np.cumsum([0, *widths])[:-1].tolist(), strict=True))
 
     @cached_property
     def dof_address(self) -> dict[int, int]:
-        """Where each independent joint starts in v."""
+        """Return the index in v of each independent joint."""
         widths = [DOF_WIDTH[self.joint_types[j]] for j in self.independent]
         return dict(zip(self.independent, np.cumsum([0, *widths])[:-1].tolist(), strict=True))
 
@@ -225,7 +225,7 @@ class KinematicTree:
 
     @cached_arrays
     def dof_columns(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """How full Jacobian columns add up to columns of v: ``sum of J_full[:, index] * coefficient``.
+        """Return the terms that sum full Jacobian columns to columns of v: ``sum of J_full[:, index] * coefficient``.
 
         The first pair takes each independent joint's own columns; each further pair adds one follower to its leader.
         """
@@ -293,7 +293,7 @@ class KinematicTree:
 
     @cached_arrays
     def is_own(self) -> np.ndarray:
-        """Which bodies are the robot's, rather than the scene's. (nbody,), bool.
+        """Return which bodies belong to the robot and not to the scene. (nbody,), bool.
 
         Raises:
             ValueError: as in ``tops``.
@@ -312,7 +312,7 @@ class KinematicTree:
 
     @cached_arrays
     def doublings(self) -> np.ndarray:
-        """Of each body its parent, then the ancestor 2 above it, 4, ... until that is the world for all. (k, nbody)."""
+        """Return each body's parent, then its ancestor 2, 4, ... levels up, until all are the world. (k, nbody)."""
         rounds, above = [], self.parents
         while above.any():
             rounds.append(above)

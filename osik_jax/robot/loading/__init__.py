@@ -1,4 +1,4 @@
-"""From files and MuJoCo models to the names and numbers of a robot (``RobotModel``). Host code, run once per robot."""
+"""Readers of files and MuJoCo models, which return a ``RobotModel``. Host code, run once per robot."""
 
 from ._descriptions import described as described
 from ._descriptions import urdf_of_description as urdf_of_description

@@ -122,7 +122,7 @@ class _Document:
         return None if texture is None or effect is None else self._mean_color(self._linked(effect), texture)
 
     def _mean_color(self, effect: _Element, texture: _Element) -> _Color | None:
-        """Of a texture: its sampler names a surface, which names an image, which names a file."""
+        """Return a texture's mean colour: its sampler names a surface, an image and at last a file."""
         parameters = {e.attrib["sid"]: e for e in effect.iter("newparam")}
         name = texture.attrib["texture"]
         for kind in ("sampler2D/source", "surface/init_from"):

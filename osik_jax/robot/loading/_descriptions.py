@@ -73,6 +73,6 @@ def _unknown(name: str, known: Iterable[str]) -> KeyError:
 
 
 def _package_dirs(module: ModuleType) -> list[str]:
-    """Where the description's ``package://`` addresses may lead."""
+    """Return the folders that the description's ``package://`` addresses may refer to."""
     roots = [getattr(module, name) for name in ("PACKAGE_PATH", "REPOSITORY_PATH") if hasattr(module, name)]
     return [*roots, *map(os.path.dirname, roots)]

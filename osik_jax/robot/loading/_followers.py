@@ -14,11 +14,11 @@ from ..._errors import OsikTypeError, OsikValueError, unknown_name
 from .._tree import BALL, FREE, QPOS_WIDTH
 
 _LOCK_TOLERANCE = 1e-9
-"""How far the value asked of a locked follower may be from where its leader puts it [rad or m]."""
+"""Tolerance between the value asked of a locked follower and the value its leader implies [rad or m]."""
 
 
 class Follower(NamedTuple):
-    """By joint index, ``q_joint = multiplier * q_leader + offset``."""
+    """A follower and its leader, by joint index: ``q_joint = multiplier * q_leader + offset``."""
 
     joint: int
     leader: int
@@ -70,7 +70,7 @@ def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[st
 
 
 def equality_followers(model: mujoco.MjModel) -> tuple[list[Follower], dict[int, np.ndarray]]:
-    """What the active joint equality constraints say: linear in another joint, or (second result) constant.
+    """Return the followers, linear in another joint, and the constant joints of the active joint equality constraints.
 
     Those of a higher degree are left out.
     """

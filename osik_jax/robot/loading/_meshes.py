@@ -19,7 +19,7 @@ _TEXT_STL = b"facet"
 
 
 def read_mesh(path: Path) -> list[Triangles]:
-    """What a mesh file holds that can be drawn, in its own axes.
+    """Return the triangles of a mesh file, in the file's axes.
 
     Raises:
         ValueError: the file is of another kind, broken, or empty.
@@ -85,7 +85,7 @@ def _text_stl(path: Path) -> Triangles:
 
 
 def _by_mujoco(path: Path) -> Triangles:
-    """Where MuJoCo has moved a mesh to its own centre and axes, it is put back."""
+    """Return the triangles of a file that MuJoCo reads, moved back from the mesh's own centre and axes."""
     spec = mujoco.MjSpec()
     mesh = spec.add_mesh(name="mesh", file=str(path.absolute()))
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # the others want a closed surface

@@ -1,4 +1,4 @@
-"""From a compiled MuJoCo model to the names and numbers of a robot."""
+"""Reader of a compiled MuJoCo model."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ _ONE_VALUE = 1e-10
 
 
 _NOTES_SHOWN = 8
-"""So many lines of the load report are in the warning."""
+"""Number of lines of the load report in the warning."""
 
 _KEY_ROUNDING = 1e-3
-"""By which a keyframe may have a joint outside its range [rad or m]: files are rounded."""
+"""Distance by which a keyframe's joint may be outside its range [rad or m]: files are rounded."""
 
 
 class Placement(NamedTuple):

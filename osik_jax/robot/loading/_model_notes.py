@@ -1,4 +1,4 @@
-"""What a MuJoCo model has to say of motion that a robot does not keep.
+"""Report of the motion properties of a MuJoCo model that a robot does not keep.
 
 Forces are no part of it: damping, friction, armature, gravity compensation, force ranges and torque motors do not
 bound where a robot may go or how fast it may be asked to.

@@ -1,4 +1,4 @@
-"""What may be asked for when a robot is loaded: one record that all readers hand on."""
+"""Options of loading: one record that all readers pass on."""
 
 from __future__ import annotations
 

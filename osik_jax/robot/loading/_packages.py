@@ -19,7 +19,7 @@ def is_uri(given: object) -> bool:
 
 
 class Packages:
-    """Where ROS packages lie: in folders given, then in those of ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
+    """Folders of ROS packages: those given, then those of ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
 
     A folder is either a package itself, by its own name, or holds packages. An address is taken as it is, then with
     ``%20`` and the like decoded, then with its backslashes as slashes.

@@ -1,4 +1,4 @@
-"""Which trees of a scene are the robot: those with joints that something drives or that have a range."""
+"""Choice of the trees of a scene that are the robot: those with driven or limited joints."""
 
 from __future__ import annotations
 

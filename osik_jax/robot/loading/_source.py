@@ -86,7 +86,7 @@ def _edited(content: str | bytes, edit: Callable[[str], str]) -> str | bytes:
 
 
 def _well_formed(text: str) -> str:
-    """Without comments, whose line breaks stay so that line numbers do; ampersands escaped, prefixes declared."""
+    """Return the text without comments (line breaks stay), with ampersands escaped and prefixes declared."""
     text = re.sub("<!--.*?-->", lambda comment: "\n" * comment.group().count("\n"), text, flags=re.DOTALL)
     text = re.sub(r"&(?!#?\w+;)", "&amp;", text)
     used = {prefix for prefix in re.findall(r"<(\w+):\w", text)} | set(re.findall(r"\s(\w+):\w+\s*=", text))

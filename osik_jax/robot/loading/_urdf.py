@@ -218,7 +218,7 @@ def _compiled(urdf: Urdf, packages: Packages, beside: Path | None, *, checked: b
 
 
 def _compiled_with_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> _Compiled:
-    """As the files are; if MuJoCo does not take them so, each is tried alone."""
+    """Compile the model with its meshes as they are; if MuJoCo refuses, try each mesh alone."""
     try:
         return _compiled(urdf, packages, beside, checked=False)
     except OsikValueError:

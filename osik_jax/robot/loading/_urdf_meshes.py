@@ -16,7 +16,7 @@ from ._packages import Packages
 from ._urdf_elements import Shape, Urdf
 
 _THICKNESS = 1e-3
-"""What a flat mesh is made thick by [m]."""
+"""Thickness given to a flat mesh [m]."""
 _LINE = 1e-6
 """A mesh whose extent in a second direction is less than this share of its extent in the first is a line."""
 
@@ -73,7 +73,7 @@ def _source(path: Path) -> dict[str, Any]:
 
 
 def _repaired(form: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
-    """What can be added in place of a mesh, None for nothing; and what was done, empty for a mesh that is as it was."""
+    """Return the geom to add in place of a mesh (None for nothing), and what was done (empty if unchanged)."""
     try:
         _compiled(form)
     except ValueError as error:

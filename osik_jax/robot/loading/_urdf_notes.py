@@ -1,4 +1,4 @@
-"""What a URDF has to say of motion that a robot does not keep.
+"""Report of the motion properties of a URDF that a robot does not keep.
 
 Forces are no part of it: efforts, damping, friction and calibration do not bound where a robot may go. The numbers that
 are kept are read by ``_urdf_elements``; what neither reads nor knows is named here, so that nothing is dropped unseen.

@@ -23,7 +23,7 @@ _SHAPES = {
     for name in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box")
 }
 _ROUNDOFF = 1e-9
-"""Of its greatest moment of inertia, by which a body may break the triangle inequality for rounding alone."""
+"""Fraction of a body's greatest moment of inertia by which it may break the triangle inequality through rounding."""
 
 _SAME = 1e-6
 """Up to this, a frame and what it is the frame of are in one place [m, or entries of a rotation matrix]."""
@@ -87,7 +87,7 @@ def _body(robot: RobotModel, body: int, parent: ElementTree.Element) -> ElementT
 
 
 def _pose_and_joints(robot: RobotModel, body: int) -> tuple[Pose, list[_JointPlace]]:
-    """Where the body sits in its parent, locked joints at their values, and the joints that are left.
+    """Return the body's pose in its parent, locked joints at their values, and the joints that remain.
 
     A locked joint moves the body's frame, so the anchors and axes of the joints before it are told from there.
     """
