@@ -41,7 +41,7 @@ class Demo:
     frequency: float = 200.0
     """Control steps a second [Hz]."""
     schemes: tuple[Literal["weighted", "null-space", "hierarchical"], ...] = ("weighted", "null-space", "hierarchical")
-    """Which schemes to run, one after the other; the film shows the last."""
+    """Schemes to run, one after the other; the film shows the last."""
     out: Path = Path("osik-demo")
     """Folder to write to."""
     animation: bool = True

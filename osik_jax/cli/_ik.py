@@ -27,15 +27,15 @@ class Ik:
     frame: str
     """The frame: a link, body, site or geom."""
     position: tuple[float, float, float]
-    """Where its origin should be, in world axes [m]."""
+    """Wanted position of the frame's origin, in world axes [m]."""
     quaternion: tuple[float, float, float, float] | None = None
-    """How it should be turned: w x y z. Default: anyhow."""
+    """Wanted orientation as a quaternion w x y z. Default: any."""
     hold: tuple[str, ...] = ()
     """Frames that stay where they are at the robot's home configuration, such as feet."""
     base: Literal["auto", "floating", "fixed"] = "auto"
     """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     nearest: bool = False
-    """Of the solutions that are found, the one nearest to the home configuration."""
+    """Return the solution that is nearest to the home configuration."""
     all: bool = False
     """Print all solutions that differ."""
     seeds: int | None = None
@@ -74,7 +74,7 @@ class Ik:
 
 
 def _home_poses(robot: Robot, frames: Sequence[str]) -> dict[str, Any]:
-    """Where frames are at the home configuration."""
+    """Return the poses of frames at the home configuration."""
     from ..kinematics import forward_kinematics
 
     if not frames:

@@ -1,4 +1,4 @@
-"""What a command says to the one who typed it: wrong input in one line, notes, progress."""
+"""Messages of the commands: errors in one line, notes and progress."""
 
 from __future__ import annotations
 

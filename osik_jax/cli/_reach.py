@@ -29,7 +29,7 @@ class Reach:
     positions: int = 20_000
     """About how many positions."""
     orientations: int = 64
-    """How many orientations at each."""
+    """Number of orientations at each position."""
     seeds: int = 64
     """Number of searches for a pose, at most."""
     key: int = 0

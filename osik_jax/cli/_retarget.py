@@ -144,7 +144,7 @@ def _fit(command: Retarget, file: Path) -> None:
 
 
 def _retargeter(command: Retarget) -> Retargeter:
-    """What retargets whole clips as the command says."""
+    """Return the retargeter of whole clips that the command describes."""
     from .. import retargeting
 
     profile = None if command.profile is None else retargeting.load_profile(command.profile)

@@ -1,4 +1,4 @@
-"""Which candidate runs: the one table of backends.
+"""Choice of the candidate that runs: the one table of backends.
 
 A solver takes a candidate for the answer, certifies it in plain JAX, and searches where that fails. Candidates come
 from kernels; the search needs none and is the definition. ``backend``, a static option of solvers and schemes, chooses.

@@ -12,7 +12,7 @@ from ._backends import CPU_KERNELS, cpu_is_default, on_platforms
 
 
 class Candidates(NamedTuple):
-    """How a solver uses one kernel. All functions are of a batch: arrays have a leading axis of problems.
+    """Functions with which a solver uses one kernel. All take batches: arrays have a leading axis of problems.
 
     Attributes:
         certified: from the problems to the kernel's candidates, with a flag where the certificate holds.

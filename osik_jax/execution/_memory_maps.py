@@ -10,7 +10,7 @@ from .._errors import warn
 
 _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _SHARE = 0.75
-"""Of the kernel's maximum, from which on a warning is given: some 25 programs before the process would end."""
+"""Fraction of the system's maximum at which a warning is given, about 25 programs before the process would end."""
 _seen: dict[str, int] = {}
 
 

@@ -31,7 +31,7 @@ from .._errors import OsikValueError
 from ._blocks import in_blocks
 
 FOUND = "found by a search"
-"""By this name ``jax.checkpoint`` may keep what the reverse mode needs and only a search could compute anew."""
+"""Name under which ``jax.checkpoint`` keeps what the reverse mode needs and only a search could compute anew."""
 
 
 def found(tree: Any) -> Any:

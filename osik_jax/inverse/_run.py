@@ -103,7 +103,7 @@ def _approached(
     warm: bool,
     starts: int,
 ) -> InverseKinematicsSolution:
-    """For targets that are not met the configuration with the least error, from new searches and the best so far."""
+    """Return the least-error configuration for unmet targets, from new searches and the best so far."""
     search = route.search(robot, settings, warm=warm, near=False)
 
     def some(goals: Any, best: Array) -> Closest:

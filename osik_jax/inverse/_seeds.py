@@ -1,4 +1,4 @@
-"""Where searches start: points that fill a box evenly, however many of them are taken."""
+"""Starts of searches: a sequence of points whose every prefix fills a box evenly."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _UNLIMITED = 100.0
 
 
 def shift_of(key: int | Array, dimensions: int) -> UInt[Array, " n"]:
-    """Where the sequence begins in each dimension, from an integer or a key of ``jax.random``."""
+    """Return the shift of the sequence in each dimension, from an integer or a key of ``jax.random``."""
     made = jax.random.key(key) if jnp.issubdtype(jnp.result_type(key), jnp.integer) and jnp.ndim(key) == 0 else key
     return jax.random.bits(made, (dimensions,), jnp.uint32)
 

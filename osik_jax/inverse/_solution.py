@@ -1,4 +1,4 @@
-"""What inverse kinematics answers, and why it says no."""
+"""Answers of inverse kinematics, and the reasons of a failure."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class InverseKinematicsSolution(eqx.Module):
     advice: tuple[str, ...] = eqx.field(default=(), static=True)
 
     def explain(self, index: int | None = None) -> str:
-        """What was found for a target, in words: the errors, and what stops the robot where it does not get there.
+        """Return the answer for one target in words: its errors, and what stops the robot if the target is not met.
 
         Args:
             index: of the target, where there are many.
@@ -87,7 +87,7 @@ class InverseKinematicsSolution(eqx.Module):
         return "\n".join([*lines, *(f"  {reason}" for reason in self._reasons(pick))])
 
     def _reasons(self, pick: Callable[[Any], np.ndarray]) -> list[str]:
-        """What stops the robot, line by line."""
+        """Return the reasons that stop the robot, one line each."""
         beyond, at_limit = float(pick(self.beyond_reach)), pick(self.at_limit)
         if beyond > 0.0:
             return [f"out of reach: {beyond:.3g} m further away than all links in one line"]

@@ -33,14 +33,14 @@ _ON_PLACES = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask, ComTask, 
 """Tasks that see where bodies are and not by which joints."""
 _ENOUGH = 0.01
 _RADIUS = 1.0
-"""What the positions' rounding is counted by [m]."""
+"""Length by which the rounding of positions is judged [m]."""
 _STOPPED = 1e-3
 _AT = 1e-6
 """A joint that is nearer to its limit is at it [rad or m]."""
 
 
 class TaskParts(NamedTuple):
-    """What a ``TaskSearch`` is made of."""
+    """Tasks, scheme and limits of a ``TaskSearch``."""
 
     tasks: dict[str, Task]
     scheme: Scheme
@@ -89,7 +89,7 @@ class TaskRoute(NamedTuple):
         )
 
     def beyond(self, search: TaskSearch, goal: Aims) -> Float[Array, " targets"]:
-        """Nothing is known of what tasks cannot reach: 0."""
+        """Return 0: no bound is known on what tasks can reach."""
         return jnp.zeros(goal.number.shape, search.first.dtype)
 
     def entries(self, robot: Robot) -> np.ndarray:
@@ -106,7 +106,7 @@ class TaskRoute(NamedTuple):
         return np.array(turning(robot, settings.parts.tasks))
 
     def answer(self, robot: Robot, search: TaskSearch, goal: Any, x: Array, seed: Array, steps: Array) -> Any:
-        """What was found for many targets, its errors computed anew, with the derivative of a solution."""
+        """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
         q = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
         fixed, here, aim = jax.lax.stop_gradient((search, q, goal))
         residual, at_limit, errors = jax.vmap(lambda q, goal: _evaluated(fixed, q, goal))(here, aim)
@@ -179,7 +179,7 @@ def turning(robot: Robot, tasks: Mapping[str, Task]) -> tuple[bool, ...]:
 
 
 def _starts(robot: Robot, turns: tuple[bool, ...], lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
-    """Where searches start, of each entry of q: within the limits, or half a turn; free and ball joints stay."""
+    """Return the box of starts: limits or half a turn; free and ball joints keep their values."""
     once, again = one_turn(lower, upper, first)
     wide = np.array(turns) & (upper - lower > TURN)
     width = np.zeros(robot.nq)

@@ -59,9 +59,9 @@ _PREFERENCES = 0.05
 _FAINT = 0.01
 """The largest gain of the preferences on the way to a local optimum, which they are not to move."""
 _ABOVE = 1e6
-"""What a squared error counts relative to those of the next lower level."""
+"""Factor of a level's squared errors over those of the next lower level."""
 _LOOK, _MOST, _PROGRESS = 20, 400, 1e-4
-"""On the way to a local optimum: steps between two looks, steps at most, and the share of the cost they take off."""
+"""Search for a local optimum: steps between checks, most steps, and the least relative decrease of the cost."""
 _CLEAR = 0.1
 """Fraction of the position tolerance by which limits with rows may be off."""
 _SPREADS = 8
@@ -69,7 +69,7 @@ _SPREADS = 8
 
 
 class Aims(NamedTuple):
-    """What one of many targets is.
+    """One of many targets.
 
     Attributes:
         number: of the target.
@@ -121,7 +121,7 @@ class TaskSearch(eqx.Module):
     preferred: Float[Array, ""]
 
     def begin(self, seed: Int[Array, " lanes"], goal: Aims) -> Float[Array, "lanes nq"]:
-        """Where a search with this number starts: the first configuration, then points ever further from it."""
+        """Return the starts of the searches: the first configuration, then points ever further from it."""
         del goal
         points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
         ratio = ((seed + _SPREADS - 1) % _SPREADS + 1).astype(points.dtype) / _SPREADS
@@ -139,7 +139,7 @@ class TaskSearch(eqx.Module):
         return jax.lax.fori_loop(0, steps, step, (x, x, Errors(nothing, nothing, nothing, nothing)))
 
     def step(self, q: Float[Array, " nq"], goal: Aims) -> tuple[Float[Array, " nq"], Errors]:
-        """Where a step leads, and the errors of where it sets out. A search that is done stays."""
+        """Return the next configuration, and the errors at the present one. A finished search does not move."""
         errors = self.errors(q, goal)[1]
         gain = jnp.minimum(_PREFERENCES * errors.score, self.preferred)
         faded = {
@@ -188,7 +188,7 @@ class TaskSearch(eqx.Module):
         return sum(squares, _ABOVE ** len(levels) * beyond**2)
 
     def _beyond_limits(self, kinematics: Kinematics, q: Float[Array, " nq"]) -> Float[Array, ""]:
-        """By how much the rows of limits are violated at most; 0 where there are none."""
+        """Return the largest violation of the limits' rows; 0 if there are none."""
         others = [limit for limit in self.limits if not isinstance(limit, ConfigurationLimit)]  # ranges hold always
         bounds = limit_rows(self.robot, kinematics, q, others, 1.0)
         if bounds is None:
@@ -203,7 +203,7 @@ class TaskSearch(eqx.Module):
         }
 
     def distance(self, q: Float[Array, " nq"]) -> Float[Array, ""]:
-        """From the first configuration, over v."""
+        """Return the distance from the first configuration, over v."""
         return jnp.sqrt(jnp.sum(difference(self.robot, self.first, q) ** 2))
 
     def finishing(self, exact: bool) -> TaskSearch:
@@ -211,7 +211,7 @@ class TaskSearch(eqx.Module):
         return dataclasses.replace(self, enough=jnp.zeros_like(self.enough)) if exact else self
 
     def isolated(self, x: Float[Array, "lanes nq"], goal: Aims) -> Bool[Array, " lanes"]:
-        """Nothing is known of whether solutions by tasks are isolated: no."""
+        """Return False: whether solutions by tasks are isolated is not known."""
         del goal
         return jnp.zeros(len(x), bool)
 
@@ -220,13 +220,13 @@ class TaskSearch(eqx.Module):
         return unwound(q, self.first, self.lower, self.upper, self.turns)
 
     def costs(self, q: Float[Array, "lanes nq"], goal: Aims) -> Float[Array, " lanes"]:
-        """What ``local_optima`` lowers: the goals' weighted errors, those of higher levels above all."""
+        """Return the costs that ``local_optima`` lowers: weighted errors, those of higher levels above all."""
         return jax.vmap(self._cost)(q, goal)
 
     def local_optima(
         self, q: Float[Array, "lanes nq"], goal: Aims, open_: Bool[Array, " lanes"]
     ) -> tuple[Float[Array, "lanes nq"], Float[Array, " lanes"], Int[Array, " lanes"]]:
-        """Where steps of the scheme with all of its damping come to rest, the errors there, and the steps taken."""
+        """Return the points where fully damped steps come to rest, the costs there, and the steps taken."""
         calm = dataclasses.replace(
             self,
             scheme=damped(self.scheme, 1.0 / CURVATURE),
@@ -280,7 +280,7 @@ def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:
 
 
 def position_rows(task: Task, count: int) -> np.ndarray:
-    """Which rows of a task are in metres, the others being in radians."""
+    """Return the indices of the rows of a task that are in metres; the other rows are in radians."""
     number = np.arange(count)
     if isinstance(task, PoseTask):
         return np.flatnonzero(task.kept) < 3

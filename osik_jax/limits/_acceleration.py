@@ -113,7 +113,7 @@ class AccelerationLimit(Limit):
 
 
 class _Reachable(Limit):
-    """What one step can make of the last velocity."""
+    """Velocities reachable from the last velocity in one step."""
 
     kind: ClassVar[Kind] = "acceleration"
     acceleration: Float[Array, " nv"]
@@ -149,7 +149,7 @@ class _Stopping(Limit):
 
 
 def _rounded(product: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """To one bit less, so that no compiler makes one operation of it and of the sum that it goes into."""
+    """Return the product rounded to one bit less, so that no compiler fuses it with the sum that it goes into."""
     precision = jnp.finfo(product.dtype)
     return jax.lax.reduce_precision(product, precision.nexp, precision.nmant - 1)
 

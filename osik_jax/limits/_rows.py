@@ -1,4 +1,4 @@
-"""What a limit asks for beside its box: bounds on linear functions of the velocity."""
+"""Rows of limits that are no box: bounds on linear functions of the velocity."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..numerics._dense import apply
 
 
 class LimitRows(eqx.Module):
-    """What a limit asks for at one configuration beside its box: ``lower <= jacobian @ v <= upper``, hard.
+    """Rows of a limit at one configuration, beside its box: ``lower <= jacobian @ v <= upper``, hard.
 
     Attributes:
         jacobian: of what is bounded. (m, nv)

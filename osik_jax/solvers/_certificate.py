@@ -1,4 +1,4 @@
-"""What a status rests on: the relative KKT residual of an answer, and Farkas certificates of infeasible rows."""
+"""Certificates behind a status: the relative KKT residual of an answer, and Farkas certificates of infeasible rows."""
 
 from __future__ import annotations
 

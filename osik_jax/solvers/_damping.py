@@ -44,7 +44,7 @@ class Rows(Protocol):
 
     @property
     def equal(self) -> Bool[Array, " m"]:
-        """Which rows are equalities."""
+        """Return which rows are equalities."""
         ...
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:

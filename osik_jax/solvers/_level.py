@@ -64,7 +64,7 @@ class Level(eqx.Module):
 
     @property
     def equal(self) -> Bool[Array, " m"]:
-        """Which rows are equalities: those known to be, and those with lower >= upper, (m,)."""
+        """Return which rows are equalities: those known to be, and those with lower >= upper, (m,)."""
         # a row of weight 0 has no bounds, so it is no equality
         has_weight = True if self.weight is None else self.weight > 0.0
         return jnp.array(self.equalities, bool) | ((self.lower >= self.upper) & has_weight)

@@ -1,4 +1,4 @@
-"""What a solver says of its own answer."""
+"""Status codes of solvers."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class AxisAlignTask(PointingTask):
 def _pointed(
     robot: Robot, kinematics: Kinematics, frame: str, target_frame: str | None, axis: ArrayLike | Array
 ) -> Float[Array, "3"]:
-    """Where the axis points."""
+    """Return the direction of the axis, in the world or in the target frame."""
     names = (frame,) if target_frame is None else (frame, target_frame)
     _, rotations = kinematics.frame_poses(robot, names)
     direction = dot(rotations[0], unit(as_direction(axis, "axis", rotations.dtype)))

@@ -80,9 +80,9 @@ class EqualityConstraintTask(Task):
     relative: Float[Array, "w 3 3"]
     """Rotation from the axes in which the second end of each weld should be to the first end's."""
     torque_scale: Float[Array, " w"]
-    """Of the rotation rows of each weld."""
+    """Factor of each weld's rotation rows."""
     coefficients: Float[Array, "j 5"]
-    """Of the polynomial of each joint constraint, the constant first."""
+    """Polynomial coefficients of each joint constraint, the constant first."""
 
     def __init__(
         self,
@@ -125,7 +125,7 @@ class EqualityConstraintTask(Task):
         return len(self.constraints)
 
     def _spatial_rows(self, robot: Robot, kinematics: Kinematics) -> dict[str, Any]:
-        """Of connects, and of welds."""
+        """Return the parts of the rows of connects and welds."""
         spatial = [constraint for constraint in self.constraints if constraint.kind != "joint"]
         if not spatial:
             return {}

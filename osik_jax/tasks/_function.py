@@ -189,7 +189,7 @@ def _check_signature(function: Function) -> None:
 
 
 def _length(robot: Robot, function: Function) -> int:
-    """How many rows a function makes."""
+    """Return the number of rows of a function."""
     x = jax.eval_shape(lambda r, q: function(r, forward_kinematics(r, q), q), robot, robot.q0)
     shape = getattr(x, "shape", None)
     if shape is None or len(shape) > 1 or 0 in shape:

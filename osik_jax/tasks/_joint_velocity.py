@@ -221,7 +221,7 @@ class LowAccelerationTask(VelocityTask):
         self.velocity = as_vector(velocity, (robot.nv,), "velocity", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """What the dofs had."""
+        """Return the last velocity of the dofs."""
         return self.velocity[np.array(dofs, int)]
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:

@@ -163,7 +163,7 @@ class ManipulabilityTask(Task):
 
 
 def _moving_dofs(tree: KinematicTree, body: int, joints: Sequence[int]) -> tuple[int, ...]:
-    """Of the joints' entries of v, those that move the body, be it by a follower."""
+    """Return the joints' entries of v that move the body, directly or by a follower."""
     moves = np.zeros(tree.nv, bool)
     for index, coefficient in tree.dof_columns:
         moves |= tree.moves[body][index] & (coefficient != 0.0)

@@ -1,4 +1,4 @@
-"""What tasks on poses share."""
+"""Common parts of tasks on poses."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ _ROWS = {
 }
 _Parts = tuple[Float[Array, "3"], Float[Array, "3 nv"], Float[Array, "3"]]
 _Blocks = list[tuple[Sequence[bool], tuple[Array, Array, Array, Array]]]
-"""Which rows of a block are kept; their error, Jacobian, feed-forward and weight."""
+"""Blocks of rows: which rows are kept, then error, Jacobian, feed-forward and weight."""
 _Wrench = Float[Array, "6 6"] | None
-"""From a pull on all six rows to force and torque on the frame, in the outer axes; None: they are the pull."""
+"""Matrix from a pull on all six rows to force and torque on the frame, in the outer axes; None for the identity."""
 
 
 class PoseTask(FramedTask):
@@ -163,7 +163,7 @@ class PoseTask(FramedTask):
         return parts, _twice(rotation) if self.axes == "frame" else None
 
     def _curvature(self, pull: Float[Array, " m"], wrench: _Wrench, jacobian: Float[Array, "6 nv"]) -> Float[Array, ""]:
-        """From the weighted pull of the rows that are kept."""
+        """Return the curvature of the task for the weighted pull of the rows that are kept."""
         whole = jnp.zeros(6, pull.dtype).at[np.flatnonzero(self.kept)].set(pull)
         whole = whole if wrench is None else dot(wrench, whole)
         return pose_curvature(whole[:3], whole[3:], jacobian)
@@ -214,7 +214,7 @@ class PoseTask(FramedTask):
 
 
 def _fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
-    """Of the rows of a task that asks for a pose; both bounds are one."""
+    """Return the fields of ``TaskRows`` for an equality pose task; ``lower`` is used for both bounds."""
     rows = task._plain_rows(position, rotation, jacobian)
     return rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
 

@@ -1,4 +1,4 @@
-"""From the many ways in which a pose is written to a position and a rotation matrix."""
+"""Conversion of the many forms of a pose to a position and a rotation matrix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every task is, and what it hands to a solver."""
+"""Base class of tasks, and the rows that a task gives to a solver."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DEFAULT_GAIN = 10.0
 
 
 class TaskRows(eqx.Module):
-    """What a task asks for at one configuration: ``lower <= jacobian @ v <= upper``.
+    """Rows of a task at one configuration: ``lower <= jacobian @ v <= upper``.
 
     Attributes:
         error: an equality task's ``e = x (-) x*``; an inequality task's value, the x that is bounded. (m,)
@@ -132,7 +132,7 @@ class Task(MadeForRobot, Replaceable):
 
     @property
     def _weight_rows(self) -> int | None:
-        """How many numbers ``weight`` may be; None: one alone."""
+        """Return the number of weights that ``weight`` may have; None for one alone."""
         return None
 
     def _convert(self, name: str, value: Any) -> Any:

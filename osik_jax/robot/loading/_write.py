@@ -110,7 +110,7 @@ def _pose_and_joints(robot: RobotModel, body: int) -> tuple[Pose, list[_JointPla
 
 
 def _values(robot: RobotModel, joint: int) -> np.ndarray:
-    """What a locked joint is locked at."""
+    """Return the values at which a locked joint is locked."""
     start = robot.tree.full_qpos_address[joint]
     return np.asarray(robot.qpos_offset, float)[start : start + QPOS_WIDTH[robot.tree.joint_types[joint]]]
 
@@ -125,7 +125,7 @@ def _free_pose(robot: RobotModel, joint: int) -> Pose:
 
 
 def _motion(robot: RobotModel, place: _JointPlace) -> Pose:
-    """By what a locked joint moves its body's frame, in that frame."""
+    """Return the fixed transform of a locked joint, in its body's frame."""
     kind, values = robot.tree.joint_types[place.joint], _values(robot, place.joint)
     if kind == BALL:
         return _about(place.anchor, rotation_matrix(values))

@@ -52,7 +52,7 @@ def first_working_sets(hierarchy: PaddedHierarchy, warm_start: WorkingSet | None
 
 
 class KernelAnswers(NamedTuple):
-    """What a kernel writes for a batch of hierarchies, of L levels with m rows each and h hard rows."""
+    """Output of a kernel for a batch of hierarchies, of L levels with m rows each and h hard rows."""
 
     x: Float[Array, "B n"]
     multipliers: Float[Array, "B L h"]

@@ -1,4 +1,4 @@
-"""Which backend solves a hierarchy: a kernel's candidates, certified in plain JAX, and the search for the others.
+"""Choice of backend for a hierarchy: a kernel's candidates, certified in plain JAX, and the search for the others.
 
 A kernel judges each level as ``solve_on_working_set`` does, by feasibility and multipliers. What is certified here is
 what needs no factorisation: numbers are finite, x is in its box, and no level lost its optimum to those below. Problems

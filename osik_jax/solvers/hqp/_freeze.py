@@ -1,4 +1,4 @@
-"""What a level at its optimum freezes for the levels below (docs/derivations.md, "The freezing rule").
+"""Constraints that a level at its optimum freezes for lower levels (docs/derivations.md, "The freezing rule").
 
 Active hard rows with a nonzero multiplier and the level's own rows in its cost have the same values at all minimisers
 of the level. They become equalities, and their row space is taken out of the projector.
@@ -23,7 +23,7 @@ from ._working_set_solve import gradient_roundoff
 
 
 class CascadeState(NamedTuple):
-    """What the levels so far have fixed."""
+    """State between levels: x, bounds of the hard rows, and what the levels so far have frozen."""
 
     x: Float[Array, " n"]
     lower: Float[Array, " h"]  # of the hard rows; those of solved levels are widened to the values reached
@@ -41,7 +41,7 @@ class CascadeState(NamedTuple):
 
 
 class LevelOutcome(NamedTuple):
-    """What is reported of one level."""
+    """Reported results of one level."""
 
     active_sets: ActiveSets
     working_set: WorkingSet
@@ -50,7 +50,7 @@ class LevelOutcome(NamedTuple):
 
 
 class _Determined(NamedTuple):
-    """What all minimisers of a level have in common."""
+    """Common properties of all minimisers of a level."""
 
     slack: Float[Array, " m"]
     in_cost: Bool[Array, " m"]  # own rows that are equalities or outside their interval

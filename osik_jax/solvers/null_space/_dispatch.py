@@ -1,4 +1,4 @@
-"""Which backend computes the classical projection: on a CPU, the core for all levels of one problem after another.
+"""Choice of backend for the classical projection: on a CPU, the core for all levels of one problem after another.
 
 ``core/null_space.hpp`` computes what ``_projection.py`` defines, in double precision; nothing is searched, so nothing
 is certified. That file is the definition, what runs elsewhere, and the derivative.

@@ -1,4 +1,4 @@
-"""What the methods share: the answer, the residual of a level at a point, and the check of the data."""
+"""Common parts of the methods: the answer, the residual of a level at a point, and the check of the data."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def solve_saturated(
 
 
 class _State(NamedTuple):
-    """What the levels so far have determined."""
+    """State between levels: x, its bounds, and the projector on the freedom that is left."""
 
     x: Float[Array, " n"]
     lower: Float[Array, " n"]  # of the levels to come

@@ -1,4 +1,4 @@
-"""What a kernel answers to a batch of QPs."""
+"""Output of a kernel for a batch of QPs."""
 
 from __future__ import annotations
 

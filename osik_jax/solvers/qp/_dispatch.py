@@ -1,4 +1,4 @@
-"""Which backend solves a QP: a kernel's candidates, certified in plain JAX, and the search for the others.
+"""Choice of backend for a QP: a kernel's candidates, certified in plain JAX, and the search for the others.
 
 The certificate is that of the search itself (``violated_conditions``, ``kkt_residual``), on the data as they were
 given, so that answers do not rest on the kernel. It costs two products with the rows. Problems whose candidate fails
@@ -41,7 +41,7 @@ from ._row_space import has_few_rows, try_row_space
 from ._search import SearchResult, initial_result, search, usable_guess, violated_conditions
 
 _BLOCKS, _MIN_BLOCK = 16, 1024
-"""On a GPU, problems that are left are searched in blocks of a 16th of the batch, of 1,024 problems at least."""
+"""Block size of the search on a GPU: a 16th of the batch, at least 1,024 problems."""
 
 Solve = Callable[[QP, Array, Array, int], Candidate]
 

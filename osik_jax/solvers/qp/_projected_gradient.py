@@ -1,4 +1,4 @@
-"""What is returned where no answer was found: a step that is bounded, in its box, and no worse than none."""
+"""Fallback where no answer was found: a bounded step in the box that is no worse than none."""
 
 from __future__ import annotations
 

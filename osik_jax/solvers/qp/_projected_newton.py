@@ -78,7 +78,7 @@ class Linearisation(NamedTuple):
 
 
 class NewtonResult(NamedTuple):
-    """Where the method ended."""
+    """End point of the method."""
 
     x: Float[Array, " n"]
     row_multipliers: Float[Array, " p"]

@@ -56,7 +56,7 @@ class SearchResult(NamedTuple):
 
 
 FirstTry = Callable[[QP, SearchResult, Array], SearchResult]
-"""From a batch of problems, where their search begins and tolerances to results, ``done`` where the guess was right."""
+"""Function from problems, starts and tolerances to results; ``done`` where the first guess was right."""
 
 
 def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
