@@ -188,17 +188,16 @@ class TestResults:
 
 
 def test_the_page_and_the_file_have_the_tables_of_the_command():
-    """All robots in each case, every solver in both tables of the page, and nothing that is not finite."""
+    """All robots in each case, every solver in the table of the page, and nothing that is not finite."""
     head, rows = read_csv(_page.FILE)
     assert tuple(head) == _page.HEAD
     for case in _page.TABLES:
         robots = {robot for name, robot, *_ in rows if name == case}
         assert robots == set(_results.ROBOTS) - ({"arm7"} if case == "squat" else set())
     text = _page.PAGE.read_text(encoding="utf-8")
-    for name, column in (("summary", 1), ("excerpt", 2)):
-        table = text[text.index(f"<!-- table: {name} -->") : text.index(f"<!-- end: {name} -->")]
-        cells = [line.split("|")[column].strip() for line in table.splitlines() if line.startswith("|")][2:]
-        assert {*_motion.OURS, *_motion.PEERS} <= set(cells)
+    table = text[text.index("<!-- table: summary -->") : text.index("<!-- end: summary -->")]
+    cells = [line.split("|")[1].strip() for line in table.splitlines() if line.startswith("|")][2:]
+    assert {*_motion.OURS, *_motion.PEERS} <= set(cells)
     assert not re.search(r"\bnan\b|\binf\b", text + _page.FILE.read_text(encoding="utf-8"))
 
 
@@ -206,10 +205,9 @@ def test_a_row_is_written_to_the_page_and_the_file(tmp_path):
     numbers = Numbers(**dict.fromkeys(Numbers._fields, 0.0) | dict(solved=1.0, rms=0.25))
     rows = [_results.Row(Entrant("g1", "mink", "float64", True), "beyond", gain, numbers) for gain in (10.0, 200.0)]
     page, file = tmp_path / "page.md", tmp_path / "file.csv"
-    marks = [f"<!-- table: {name} -->\nold\n<!-- end: {name} -->\n" for name in ("summary", "excerpt")]
-    page.write_text("".join(marks), encoding="utf-8")
+    page.write_text("<!-- table: summary -->\nold\n<!-- end: summary -->\n", encoding="utf-8")
     _page.write(rows, page, file)
-    assert "| g1 | mink | yes | **0.25** / **0.25** |" in page.read_text(encoding="utf-8")
+    assert "| mink | 0 of 2 | 2 of 2 | 2 of 2 | 0 of 0 |" in page.read_text(encoding="utf-8")
     assert "old" not in page.read_text(encoding="utf-8")
     head, (first, second) = read_csv(file)
     assert dict(zip(head, first, strict=True))["rms speed [rad/s]"] == "0.25"

@@ -8,7 +8,7 @@
 Pinocchio judges every motion from its configurations alone; docs/hard_work.md says what is asked and what each number
 is. Without ``--all`` it is a selection that takes some minutes. ``--only`` takes those whose names, such as
 "g1, hierarchy, float64, no posture", hold a text. Rows that the file of results has already are not made again.
-``--write`` writes the page's two tables and docs/data/hard_work.csv. ``--times`` prints the time of a step too (only
+``--write`` writes the page's table and docs/data/hard_work.csv. ``--times`` prints the time of a step too (only
 on a machine with nothing else to do). ``--film`` films a G1 of ours beside mink's, with a target that is out of reach.
 ``--settling`` runs targets out of reach for 16 s, and writes docs/data/settling.csv. ``--balance`` prints how far feet
 give way to such a target where the weights balance.

@@ -1,4 +1,4 @@
-"""The tables of docs/hard_work.md, and the files with all numbers in docs/data."""
+"""The table of docs/hard_work.md, and the files with all numbers in docs/data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 from ..data_file import DATA, DOCS, write_between, write_csv
 from ._judge import Numbers
 from ._motion import GAINS, OURS, PEERS, Entrant
-from ._results import REMEDIED, ROBOTS, Row, by_gain
+from ._results import ROBOTS, Row, by_gain
 
 PAGE = DOCS / "hard_work.md"
 FILE, SETTLING = DATA / "hard_work.csv", DATA / "settling.csv"
@@ -65,23 +65,9 @@ def tables(given: Sequence[Row], *, times: bool) -> dict[str, str]:
 
 
 def write(given: Sequence[Row], path: Path = PAGE, file: Path = FILE) -> None:
-    """Write the summary and the excerpt into the page, between their marks, and all numbers into the file."""
-    for name, text in dict(summary=_summary(given), excerpt=_table(excerpt(given), "beyond", TABLES["beyond"])).items():
-        write_between(text, path, start=f"<!-- table: {name} -->\n", end=f"<!-- end: {name} -->\n")
+    """Write the summary into the page, between its marks, and all numbers into the file."""
+    write_between(_summary(given), path, start="<!-- table: summary -->\n", end="<!-- end: summary -->\n")
     write_csv(file, HEAD, map(_cells, sorted(given, key=lambda row: tuple(TABLES).index(row.case))))
-
-
-def excerpt(given: Iterable[Row]) -> list[Row]:
-    """Return the rows of one robot with a posture task, in double precision."""
-    solvers = {*OURS, *PEERS}
-    return [
-        row
-        for row in given
-        if row.entrant.robot == REMEDIED
-        and row.entrant.posture
-        and row.entrant.precision == "float64"
-        and row.entrant.solver in solvers
-    ]
 
 
 def _cells(row: Row) -> list[str]:
