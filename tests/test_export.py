@@ -44,7 +44,7 @@ def test_a_step_is_exported(name, step):
 
 
 def test_a_hierarchy_is_not_exported_unasked(step):
-    """``docs/solvers.md`` says what to ask for; where this fails, it need not any more."""
+    """``docs/deploying.md`` says what to ask for; where this fails, it need not any more."""
     made, q = step
     with pytest.raises(ValueError, match="lapack_dgeqp3_ffi"):
         jax.export.export(made("hierarchical"))(q)
