@@ -374,6 +374,9 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
     assert {path.name for path in (out / "short").iterdir()} == {"motion.npz", "motion.csv", "report.json"}
     summary = json.loads((out / "report.json").read_text())
     assert set(summary["figures"]) == {"dance", "short"} and set(summary["failed"]) == {"broken"}
+    index = [line.split(",") for line in (out / "index.csv").read_text().splitlines()]
+    assert [row[0] for row in index] == ["clip", "broken", "dance", "short"] and "NAME.x" in ",".join(index[1])
+    assert float(index[2][index[0].index("slip_mm_max")]) == summary["figures"]["dance"]["slip_mm_max"]
     slips = [json.loads((out / name / "report.json").read_text())["feet"]["slip_mm_max"] for name in ("dance", "short")]
     assert summary["worst"]["slip_mm_max"] == max(slips) < 0.1
     np.testing.assert_allclose(load_robot_motion(out / "dance" / "motion.npz").qpos, danced.motion.qpos, atol=1e-5)

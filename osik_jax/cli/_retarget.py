@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ..retargeting import Retargeter
+    from ..retargeting._load import Reader
     from ..robot import Robot
 
 _COLUMNS = {
@@ -44,9 +45,15 @@ class Retarget:
     """
 
     clip: Annotated[str, tyro.conf.Positional]
-    """A BVH file, or keypoints as .npz or .csv; or a folder with such files."""
+    """A BVH file, or keypoints as .npz or .csv; or a folder with such files; with --source, motions of that robot."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
+    source: str | None = None
+    """The robot whose motion CLIP is (motion.npz, or a CSV with --source-fps), by file or name. Default: a person."""
+    source_fps: float | None = None
+    """Of a CSV with --source: its frames a second."""
+    source_profile: str | None = None
+    """As --profile, of the robot of --source."""
     out: Path = Path("osik-retarget")
     """Folder to write to."""
     profile: str | None = None
@@ -96,13 +103,11 @@ class Retarget:
         from rich.console import Console
         from rich.markup import escape
 
-        from .. import retargeting
         from ..retargeting._command import retarget_to_folder
 
         console = Console()
         with told():
-            unit = None if self.unit is None else _number_or_name(self.unit)
-            motion = retargeting.load_motion(self.clip, unit=unit, up=self.up, trim=self.trim)
+            motion = _reader(self)(Path(self.clip))
             retargeter = _retargeter(self)
             mapping = _mapping(self.mapping)
             console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
@@ -113,6 +118,19 @@ class Retarget:
         return 0
 
 
+def _reader(command: Retarget) -> Reader:
+    """What reads a clip as the command says."""
+    from .. import retargeting
+    from ..retargeting._load import Reader
+
+    if command.source is None:
+        unit = None if command.unit is None else _number_or_name(command.unit)
+        return Reader(unit=unit, up=command.up, trim=command.trim)
+    profile = None if command.source_profile is None else retargeting.load_profile(command.source_profile)
+    source = _robot_to_retarget(command.source)
+    return Reader(source=source, profile=profile or retargeting.find_profile(source), fps=command.source_fps)
+
+
 def _fit(command: Retarget, file: Path) -> None:
     """Writes a profile found by a folder's clips."""
     from rich.console import Console
@@ -121,6 +139,8 @@ def _fit(command: Retarget, file: Path) -> None:
     from ..retargeting._command import fit_to_file
 
     with told():
+        if command.source is not None:
+            raise OsikValueError("--fit takes clips of people, not --source")
         if command.live:
             raise OsikValueError("--fit goes with whole clips, not with --live")
         if not os.path.isdir(command.clip):
@@ -132,9 +152,7 @@ def _fit(command: Retarget, file: Path) -> None:
             profile=None if command.profile is None else retargeting.load_profile(command.profile),
             mapping=_mapping(command.mapping),
             acceleration=command.acceleration,
-            unit=None if command.unit is None else _number_or_name(command.unit),
-            up=command.up,
-            trim=command.trim,
+            reader=_reader(command),
         )
     step, losses = found.step, found.losses
     said = f"step {step} of {len(losses) - 1}: the loss of {learned} clips is {losses[step]:.3f} times what it was"
@@ -168,11 +186,9 @@ def _retarget_folder(command: Retarget) -> int:
             _retargeter(command),
             Path(command.clip),
             command.out,
+            _reader(command),
             mapping=_mapping(command.mapping),
             fps=command.fps,
-            unit=None if command.unit is None else _number_or_name(command.unit),
-            up=command.up,
-            trim=command.trim,
         )
     failed: dict[str, str] = summary["failed"]
     noted = [f"{name}: {note}" for name, notes in summary["notes"].items() for note in notes]
@@ -225,6 +241,8 @@ def _retarget_live(command: Retarget) -> None:
 
     console = Console()
     with told():
+        if command.source is not None:
+            raise OsikValueError("--source goes with whole clips, not with --live")
         if command.smooth:
             raise OsikValueError("--smooth goes with whole clips, not with --live")
         if os.path.isdir(command.clip):
@@ -248,8 +266,7 @@ def _retarget_live(command: Retarget) -> None:
         if command.clip == "-":
             stream(make, sys.stdin, sys.stdout)
             return
-        unit = None if command.unit is None else _number_or_name(command.unit)
-        motion = retargeting.load_motion(command.clip, unit=unit, up=command.up, trim=command.trim)
+        motion = _reader(command)(Path(command.clip))
         motion = motion if command.fps is None else motion.resampled(command.fps)
         command.out.mkdir(parents=True, exist_ok=True)
         console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")

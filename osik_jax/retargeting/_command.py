@@ -10,7 +10,7 @@ from typing import Any
 from ..robot import Robot
 from ._film import film
 from ._fit import Fit, fit
-from ._load import clips_in, load_clip
+from ._load import Reader, clips_in
 from ._motion import HumanMotion
 from ._profile import Profile
 from ._profile_file import save_profile
@@ -18,7 +18,7 @@ from ._report import report
 from ._retarget import Retargeter
 from ._retargeted import Retargeted
 from ._robot_motion import write_csv
-from ._up import Up
+from ._robot_source import RobotSource
 
 _HELD_OUT = 4
 """One clip in so many has a say in which step of a fit is taken, and none in the steps."""
@@ -26,7 +26,7 @@ _HELD_OUT = 4
 
 def retarget_to_folder(
     retargeter: Retargeter,
-    motion: HumanMotion,
+    motion: HumanMotion | RobotSource,
     out: Path,
     *,
     mapping: dict[str, str] | None,
@@ -55,9 +55,7 @@ def fit_to_file(
     profile: Profile | None,
     mapping: Mapping[str, str] | None,
     acceleration: float,
-    unit: str | float | None,
-    up: Up | None,
-    trim: bool,
+    reader: Reader,
 ) -> tuple[Fit, int, int]:
     """Finds a profile by the clips of a folder (``fit``) and writes it.
 
@@ -73,7 +71,7 @@ def fit_to_file(
     motions = []
     for name, path in clips_in(folder).items():
         try:
-            motions.append(load_clip(path, unit, up, trim))
+            motions.append(reader(path))
         except (ValueError, KeyError) as error:
             raise type(error)(f"{name}: {error.args[0]}") from error
     held_out = motions[_HELD_OUT - 1 :: _HELD_OUT]

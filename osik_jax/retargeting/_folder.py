@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,12 +20,10 @@ from ..scaling._lock import only_job
 from ..scaling._progress import Progress, reported
 from ._command import write_json, write_motion
 from ._lanes import Clip, one_a_core, shared_length
-from ._load import clips_in, load_clip
-from ._motion import HumanMotion
+from ._load import Reader, clips_in
 from ._profile_file import profile_text, save_profile
 from ._report import report
-from ._retarget import Retargeter
-from ._up import Up
+from ._retarget import Retargeter, Source
 
 FIGURES = {
     "off_plan_rad": ("off_plan_rad",),
@@ -50,19 +49,18 @@ def retarget_folder(
     retargeter: Retargeter,
     folder: Path,
     out: Path,
+    reader: Reader | None = None,
     *,
     mapping: Mapping[str, str] | None = None,
     fps: float | None = None,
-    unit: str | float | None = None,
-    up: Up | None = None,
-    trim: bool = True,
     chunk: int = 32,
     progress: Progress = True,
 ) -> dict[str, Any]:
     """Retargets every ``.bvh``, ``.npz`` and ``.csv`` of a folder, those in its folders left out.
 
     Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``; beside
-    them are ``profile.toml``, ``job.json`` (what the job was started with) and the summary, ``report.json``. Clips that
+    them are ``profile.toml``, ``job.json`` (what the job was started with), the summary, ``report.json``, and
+    ``index.csv``, a line for each clip with its figures and what there is to look at. Clips that
     are there already, of the same file and the same options, are left as they are. A clip that cannot be read is named
     in the summary with its error, and tried again the next time.
 
@@ -70,11 +68,9 @@ def retarget_folder(
         retargeter: for the robot.
         folder: with the clips.
         out: where to.
+        reader: reads a clip. None: as ``load_motion`` does.
         mapping: as of ``Retargeter.retarget``, the same for all.
         fps: as of ``Retargeter.retarget``, the same for all.
-        unit: of the BVH files among them, as of ``load_motion``.
-        up: of all files, as of ``load_motion``.
-        trim: of the BVH files among them, as of ``load_motion``.
         chunk: clips that a GPU works on at once; on a CPU each core works on one.
         progress: whether to show a bar; or a function of the number of clips that are done and of all.
 
@@ -87,8 +83,8 @@ def retarget_folder(
         BlockingIOError: another process works in ``out``.
         OSError: something cannot be written.
     """
-    files = clips_in(folder)
-    job = _job(retargeter, {"mapping": mapping, "fps": fps, "unit": unit, "up": up, "trim": trim})
+    files, reader = clips_in(folder), Reader() if reader is None else reader
+    job = _job(retargeter, {"mapping": mapping, "fps": fps, **reader.options()})
     with only_job(out):
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
@@ -97,11 +93,12 @@ def retarget_folder(
             # the longest first: what is compiled for them does for shorter ones too
             todo = [name for name in files if name not in work.found]
             for name in sorted(todo, key=lambda name: -files[name].stat().st_size):
-                advance(work.add(name, partial(load_clip, files[name], unit, up, trim), mapping, fps))
+                advance(work.add(name, partial(reader, files[name]), mapping, fps))
             for done in work.rest():
                 advance(done)
         summary = _summary(work.found, work.failed, [*files])
         write_json(summary, out / "report.json")
+        _write_index(summary, out / "index.csv")
     return summary
 
 
@@ -122,7 +119,11 @@ class _Work:
         self._waiting: dict[int, list[tuple[str, Clip]]] = {}
 
     def add(
-        self, name: str, read: Callable[[], HumanMotion], mapping: Mapping[str, str] | None, fps: float | None
+        self,
+        name: str,
+        read: Callable[[], Source],
+        mapping: Mapping[str, str] | None,
+        fps: float | None,
     ) -> int:
         """Reads a clip, and retargets it if it has no others to wait for; returns how many clips are done by that."""
         try:
@@ -249,6 +250,18 @@ def _summary(found: Mapping[str, dict[str, Any]], failed: Mapping[str, str], ord
         "notes": {name: own["notes"] for name, own in figures.items() if own.get("notes")},
         "figures": rows,
     }
+
+
+def _write_index(summary: dict[str, Any], path: Path) -> None:
+    """Write a line for each clip: its figures, and what there is to look at; clips to look at come first."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(["clip", "look at", "frames", "fps", *FIGURES])
+        table.writerows([name, reason] for name, reason in summary["failed"].items())
+        notes: dict[str, list[str]] = summary["notes"]
+        for name in sorted(summary["figures"], key=lambda name: name not in notes):
+            row = summary["figures"][name]
+            table.writerow([name, "; ".join(notes.get(name, ())), *(row[key] for key in ("frames", "fps", *FIGURES))])
 
 
 def _picked(figures: Any) -> dict[str, float | None]:

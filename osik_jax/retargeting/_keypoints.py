@@ -12,7 +12,9 @@ import numpy as np
 from .._errors import OsikValueError
 from .._npz import open_npz
 from ._motion import CONTACT_POINTS, LARGEST, HumanMotion
+from ._optitrack import is_optitrack, read_optitrack
 from ._rotations import continuous
+from ._smpl import is_smpl, read_smpl
 from ._up import Up, checked_up, find_rest_up, standing_up
 
 _AXES = ("x", "y", "z")
@@ -28,6 +30,9 @@ def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> Hum
     ``.csv``: a line of headings, ``time`` and ``NAME.x``, ``NAME.y``, ``NAME.z`` of each joint, optionally
     ``contact.left_heel`` and so on (0 or 1); then a line for each frame, at a constant rate.
 
+    A ``.npz`` with ``poses`` and ``trans`` is read as AMASS has them (SMPL, SMPL-H or SMPL-X), and a ``.csv`` that
+    begins with ``Format Version`` as OptiTrack's Motive exports it, with y up as it does by default.
+
     Args:
         path: the file.
         up: the axis that points up, ``"x"``, ``"y"``, ``"z"``, or ``"-y"`` and so on. None: z, unless the motion stands
@@ -38,8 +43,11 @@ def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> Hum
         ValueError: the file is broken; the message says which array, or which line and column, and what is wrong.
     """
     up, source = checked_up(up), Path(path)
-    motion = _from_csv(source) if str(path).lower().endswith(".csv") else _from_npz(source)
-    return standing_up(str(path), motion, up, "z", find_rest_up(motion))
+    if str(path).lower().endswith(".csv"):
+        motion, expected = _from_csv(source)
+    else:
+        motion, expected = _from_npz(source), "z"
+    return standing_up(str(path), motion, up, expected, find_rest_up(motion))
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -57,6 +65,8 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def _from_npz(path: Path) -> HumanMotion:
     arrays = load_arrays(path)
+    if is_smpl(arrays):
+        return read_smpl(path, arrays)
     missing = [name for name in ("fps", "positions", "joint_names") if name not in arrays]
     if missing:
         raise OsikValueError(f"{path} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
@@ -98,7 +108,8 @@ def _number(path: Path, arrays: dict[str, np.ndarray], name: str) -> float:
     return float(values[0])
 
 
-def _from_csv(path: Path) -> HumanMotion:
+def _from_csv(path: Path) -> tuple[HumanMotion, Up]:
+    """Return the motion in a table, and the axis that such tables have up."""
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")
     try:
@@ -108,6 +119,8 @@ def _from_csv(path: Path) -> HumanMotion:
         raise OsikValueError(f"{path} is no table in UTF-8: {error}") from None
     if len(rows) < 3:
         raise OsikValueError(f"{path} has {len(rows)} lines; it needs one of headings and two of numbers at least")
+    if is_optitrack(rows):
+        return read_optitrack(path, rows), "y"
     headings = [name.strip() for name in rows[0][1]]
     names = _joints(path, headings)
     values = np.array([_row(path, number, row, headings) for number, row in rows[1:]])
@@ -115,13 +128,14 @@ def _from_csv(path: Path) -> HumanMotion:
     positions = np.stack([values[:, [column[f"{name}.{axis}"] for axis in _AXES]] for name in names], 1)
     flags = [f"contact.{point}" for point in CONTACT_POINTS]
     known = all(flag in column for flag in flags)
-    return HumanMotion(
+    motion = HumanMotion(
         name=path.stem,
         fps=_rate(path, values[:, column["time"]], [number for number, _ in rows[1:]]),
         joint_names=names,
         positions=positions,
         contact=values[:, [column[flag] for flag in flags]] > 0.5 if known else None,
     )
+    return motion, "z"
 
 
 def _joints(path: Path, headings: list[str]) -> tuple[str, ...]:

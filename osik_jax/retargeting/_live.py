@@ -41,6 +41,9 @@ _CALMER = 0.2
 """Weight of the last frame in the mean time of an iteration."""
 _LEAST_ITERATIONS = 5
 """Iterations that a frame gets whatever they take: with fewer, plans fall behind the person and feet give way."""
+_BROKEN = 0.5
+"""Cost of broken bounds from which a plan gets all its iterations whatever they take: feet give way some frames later,
+for limits leave them no way back."""
 _DAMPING, _MOST_DAMPING, _LESS, _MORE = 1.0, 1e6, 0.25, 64.0
 """Damping of a frame's first iteration, at least and at most, and what it is multiplied with where a step of the frame
 before was taken, and where none was."""
@@ -90,7 +93,10 @@ class LiveFrame(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """The window that is planned, what is past first, the robot's velocity, where its feet stand, and the damping."""
+    """The window that is planned, what is past first, the robot's velocity, where its feet stand, and the damping.
+
+    ``penalty`` is the cost of bounds that the plan breaks: 0.5 for a point that stands and is 1 mm off.
+    """
 
     q: Float[Array, "W nq"]
     velocity: Float[Array, " nv"]
@@ -99,6 +105,7 @@ class _Plan(NamedTuple):
     off: Float[Array, ""]
     feet_off: Float[Array, ""]
     iterations: Int[Array, ""]
+    penalty: Float[Array, ""]
 
 
 class LiveRetargeter(OnRobot):
@@ -118,8 +125,8 @@ class LiveRetargeter(OnRobot):
         balance: as of ``Retargeter``.
         look_ahead: time that the robot is behind the person, up to 2 s; a frame at least [s].
         iterations: of the plan at each frame, at most. They end before where the bounds hold and steps gain little.
-        budget: time that computing a frame may take [s]: iterations that would take longer are not begun. None: 0.6 of
-            the time from one frame to the next.
+        budget: time that computing a frame may take [s]: iterations that would take longer are not begun, but for the
+            first five and those of a plan that breaks a bound. None: 0.6 of the time from one frame to the next.
 
     Raises:
         ValueError: no two legs and two arms are found, joints are missing, or a number is out of range.
@@ -261,8 +268,13 @@ class LiveRetargeter(OnRobot):
         start, first = time.perf_counter(), self._plan is None
         left = self.budget - (start - began)
         most = min(max(int(left // max(self._iteration_seconds, 1e-9)) - 1, _LEAST_ITERATIONS), self.iterations)
-        before = velocity, stance, damping
-        plan = _advance(self._body, goals, weights, bounds, q, before, contact, self.limits, self._dt, most)
+        known = self._body, goals, weights, bounds
+        plan = _advance(*known, q, (velocity, stance, damping), contact, self.limits, self._dt, most)
+        more = self.iterations - int(plan.iterations)
+        if float(plan.penalty) > _BROKEN and more > 0:
+            before = velocity, stance, plan.damping
+            plan = _advance(*known, plan.q, before, contact, self.limits, self._dt, more)
+            plan = plan._replace(iterations=plan.iterations + self.iterations - more)
         spent = (time.perf_counter() - start) / (int(plan.iterations) + 1)
         mean = self._iteration_seconds
         if not first:  # which may have been compiled
@@ -297,7 +309,9 @@ def _advance(
     limited, _ = moved(body.robot, goal, velocity, dt)
     q, velocity = moved(body.robot, goal, held.step / dt, dt)
     off = jnp.abs(difference(body.robot, limited, plan[_PAST])).max()
-    return _Plan(plan.at[_PAST].set(q), velocity, held.stance, damping, off, held.off, mended.iterations)
+    return _Plan(
+        plan.at[_PAST].set(q), velocity, held.stance, damping, off, held.off, mended.iterations, mended.cost[1]
+    )
 
 
 def _filled(seen: Float[np.ndarray, "F J 3"], known: Float[np.ndarray, "J 3"]) -> Float[np.ndarray, "F J 3"]:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
+from typing import Any
 
 from .._errors import OsikValueError
+from ..robot import Robot
+from ..scaling._fingerprint import fingerprint, identifier
 from ._bvh import read_bvh
 from ._keypoints import read_keypoints
 from ._motion import HumanMotion
+from ._profile import Profile
+from ._profile_file import find_profile, profile_text
+from ._robot_source import RobotSource, load_source
 from ._up import Up
 
 ENDINGS = (".bvh", ".npz", ".csv")
@@ -43,9 +50,40 @@ def load_motion(
     return read_keypoints(path, up=up)
 
 
-def load_clip(path: Path, unit: str | float | None, up: Up | None, trim: bool) -> HumanMotion:
-    """A clip; the unit goes with BVH files alone."""
-    return load_motion(path, unit=unit if path.suffix.lower() == ".bvh" else None, up=up, trim=trim)
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """Reads the clips of a job: of a person, or of a robot where ``source`` is given.
+
+    Attributes:
+        unit: of the BVH files among them, as of ``load_motion``.
+        up: of all files, as of ``load_motion``.
+        trim: of the BVH files among them, as of ``load_motion``.
+        source: the robot whose motions the files are; None: a person's.
+        profile: of the source, as of ``load_source``.
+        fps: of the source's CSV files, as of ``load_source``.
+    """
+
+    unit: str | float | None = None
+    up: Up | None = None
+    trim: bool = True
+    source: Robot | None = None
+    profile: Profile | None = None
+    fps: float | None = None
+
+    def __call__(self, path: Path) -> HumanMotion | RobotSource:
+        """Read a clip; the unit goes with BVH files alone."""
+        if self.source is not None:
+            return load_source(path, self.source, profile=self.profile, fps=self.fps)
+        unit = self.unit if path.suffix.lower() == ".bvh" else None
+        return load_motion(path, unit=unit, up=self.up, trim=self.trim)
+
+    def options(self) -> dict[str, Any]:
+        """What its results depend on, in numbers and words."""
+        if self.source is None:
+            return {"unit": self.unit, "up": self.up, "trim": self.trim}
+        profile = find_profile(self.source) if self.profile is None else self.profile
+        source = {"robot": identifier(fingerprint(self.source)), "profile": identifier({"text": profile_text(profile)})}
+        return {"source": source, "source_fps": self.fps}
 
 
 def clips_in(folder: Path) -> dict[str, Path]:

@@ -104,16 +104,12 @@ class HumanMotion:
         Raises:
             ValueError: a rate that is not positive.
         """
-        if not (np.isfinite(fps) and fps > 0.0):
-            raise OsikValueError(f"fps is {fps}; it is frames a second, more than 0")
-        if fps == self.fps or self.frames == 1:
+        if check_rate(fps) == self.fps or self.frames == 1:
             return dataclasses.replace(self, fps=float(fps))
-        at = np.arange(int(np.floor(self.seconds * fps + 1e-9)) + 1) / fps * self.fps
-        before = np.minimum(at.astype(int), self.frames - 2)
-        part = np.clip(at - before, 0.0, 1.0)
+        before, part = instants(self.frames, self.fps, fps)
         rotations, contact = self.rotations, self.contact
         if rotations is not None:
-            share = np.broadcast_to(part[:, None], (len(at), rotations.shape[1]))
+            share = np.broadcast_to(part[:, None], (len(part), rotations.shape[1]))
             rotations = continuous(slerp(rotations[before], rotations[before + 1], share))
         if contact is not None:
             contact = np.where((part < 0.5)[:, None], contact[before], contact[before + 1])
@@ -125,6 +121,20 @@ class HumanMotion:
             rotations=rotations,
             contact=contact,
         )
+
+
+def check_rate(fps: float) -> float:
+    """Return a rate; raise ValueError where it is not positive."""
+    if not (np.isfinite(fps) and fps > 0.0):
+        raise OsikValueError(f"fps is {fps}; it is frames a second, more than 0")
+    return fps
+
+
+def instants(frames: int, fps: float, wanted: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames before the instants of another rate, and how far these are to the next frames in [0, 1]."""
+    at = np.arange(int(np.floor((frames - 1) / fps * wanted + 1e-9)) + 1) / wanted * fps
+    before = np.minimum(at.astype(int), frames - 2)
+    return before, np.clip(at - before, 0.0, 1.0)
 
 
 def _check_array(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> None:

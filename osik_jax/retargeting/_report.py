@@ -13,6 +13,7 @@ from ..physics._world import frame_pose
 from ..tasks._polygon import hull
 from ._body import JOINTS_APART, joints_between
 from ._notes import notes
+from ._places import Places, find_places
 from ._profile import Profile
 from ._retargeted import Retargeted
 from ._roles import LIMBS, SIDES
@@ -39,45 +40,25 @@ def report(result: Retargeted) -> dict[str, Any]:
     between the person's segments and the robot's.
     ``notes``: sentences on bounds that gave way, and on feet that stand in less than 20 % of the frames.
     """
-    places = _places(result)
+    places = find_places(result.robot, result.profile, _in_model(result))
     figures = {
         "frames": len(result.q),
         "fps": result.motion.fps,
         "iterations": result.iterations,
         "off_plan_rad": float(result.off_plan.max()),
         "joints": _joints(result),
-        "feet": _feet(places["soles"], result.contact, result.motion.fps),
-        "balance": _balance(places["soles"], places["center"], result.contact),
-        "shapes": {"penetration_mm_max": _penetration(result, places["capsules"])},
-        "tracking": _tracking(result, places["keypoints"]),
+        "feet": _feet(places, result.contact, result.motion.fps),
+        "balance": _balance(places.soles, places.center, result.contact),
+        "shapes": {"penetration_mm_max": _penetration(result, places.capsules)},
+        "tracking": _tracking(result, places.keypoints),
     }
     return {**figures, "notes": notes(figures)}
 
 
-def _places(result: Retargeted) -> dict[str, Any]:
-    """Keypoints by role, soles' corners (F, 8, 3), capsules' ends (F, k, 2, 3), centre of mass (F, 3): MuJoCo's."""
-    robot, profile = result.robot, result.profile
-    data = mujoco.MjData(robot.mj_model)
-    index, coefficient = robot.tree.qpos_source
-    wanted = [*profile.keypoints.values(), *profile.corners]
-    wanted += [(c.frame, point) for c in profile.capsules for point in (c.start, c.end)]
-    points, center = np.zeros((len(result.q), len(wanted), 3)), np.zeros((len(result.q), 3))
-    root = robot.mj_model.body(robot.tree.body_names[robot.tree.root]).id
-    frames = tuple(dict.fromkeys(frame for frame, _ in wanted))
-    for f, q in enumerate(result.q):
-        data.qpos[:] = q[index] * coefficient + np.asarray(robot.qpos_offset)
-        mujoco.mj_kinematics(robot.mj_model, data)
-        poses = {frame: frame_pose(robot, data, frame) for frame in frames}
-        mujoco.mj_comPos(robot.mj_model, data)
-        center[f] = data.subtree_com[root]
-        points[f] = [poses[frame][0] + poses[frame][1] @ np.array(point) for frame, point in wanted]
-    keys = len(profile.keypoints)
-    return {
-        "keypoints": dict(zip(profile.keypoints, np.moveaxis(points[:, :keys], 1, 0), strict=True)),
-        "soles": points[:, keys : keys + 8],
-        "center": center,
-        "capsules": points[:, keys + 8 :].reshape(len(points), -1, 2, 3),
-    }
+def _in_model(result: Retargeted) -> Float[np.ndarray, "F nq"]:
+    """Configurations of the robot's MuJoCo model."""
+    index, coefficient = result.robot.tree.qpos_source
+    return result.q[:, index] * coefficient + np.asarray(result.robot.qpos_offset)
 
 
 def _joints(result: Retargeted) -> dict[str, Any]:
@@ -105,8 +86,8 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
-def _feet(corners: Float[np.ndarray, "F 8 3"], contact: Bool[np.ndarray, "F 4"], fps: float) -> dict[str, Any]:
-    points = corners.reshape(len(corners), 4, 2, 3).mean(2)
+def _feet(places: Places, contact: Bool[np.ndarray, "F 4"], fps: float) -> dict[str, Any]:
+    points = places.standing
     slip = [0.0]
     for k in range(4):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], contact[:, k], [False]]).astype(int)))
@@ -118,7 +99,7 @@ def _feet(corners: Float[np.ndarray, "F 8 3"], contact: Bool[np.ndarray, "F 4"],
         "contact_share": float(contact.any(1).mean()),
         "slip_mm_max": 1e3 * max(slip),
         "float_mm_max": 1e3 * float(max(0.0, heights.max(initial=0.0))),
-        "below_floor_mm_max": 1e3 * float(max(0.0, -corners[..., 2].min())),
+        "below_floor_mm_max": 1e3 * float(max(0.0, -places.soles[..., 2].min())),
     }
 
 

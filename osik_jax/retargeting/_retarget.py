@@ -37,9 +37,11 @@ from ._person import read_person
 from ._plan import make_plan
 from ._profile import Profile
 from ._retargeted import Retargeted, as_retargeted
+from ._robot_source import RobotSource
 from ._skeletons import find_roles
 
-_Checked = tuple[HumanMotion, Mapping[str, str]]
+Source = HumanMotion | RobotSource
+_Checked = tuple[Source, Mapping[str, str]]
 
 
 class Retargeter(OnRobot):
@@ -77,7 +79,7 @@ class Retargeter(OnRobot):
         self.max_iterations = max_iterations
 
     def retarget(
-        self, motion: HumanMotion, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
+        self, motion: Source, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
     ) -> Retargeted:
         """The robot does what a person did; see ``retarget``."""
         clip = self._prepared(motion, mapping, fps)
@@ -88,7 +90,7 @@ class Retargeter(OnRobot):
 
     def retarget_all(
         self,
-        motions: Sequence[HumanMotion],
+        motions: Sequence[Source],
         *,
         mapping: Mapping[str, str] | None = None,
         fps: float | None = None,
@@ -143,13 +145,13 @@ class Retargeter(OnRobot):
                 found[i] = self._finished(clips[i], jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
         return [found[i] for i in range(len(clips))]
 
-    def _prepared(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
+    def _prepared(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
         """What a clip asks for, in the form that is computed with."""
         return self._read(*_checked(motion, mapping, fps))
 
-    def _read(self, motion: HumanMotion, roles: Mapping[str, str]) -> Clip:
+    def _read(self, motion: Source, roles: Mapping[str, str]) -> Clip:
         """The same of a clip that can be read, whose joints have these names."""
-        person = read_person(motion, roles)
+        person = motion.person() if isinstance(motion, RobotSource) else read_person(motion, roles)
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
         dt = 1.0 / motion.fps
@@ -192,15 +194,15 @@ class Retargeter(OnRobot):
         return dataclasses.replace(made, iterations=int(solved.iterations), cost=cost)
 
 
-def _checked(motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+def _checked(motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
     """A clip at the rate that is asked for, if it can be retargeted, and its joints by role."""
     motion = motion if fps is None else motion.resampled(fps)
     if motion.frames < 3:
         raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
-    return motion, find_roles(motion.joint_names, mapping)
+    return motion, {} if isinstance(motion, RobotSource) else find_roles(motion.joint_names, mapping)
 
 
-def checked_by_name(motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+def checked_by_name(motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
     try:
         return _checked(motion, mapping, fps)
     except (ValueError, KeyError) as error:
@@ -209,7 +211,7 @@ def checked_by_name(motion: HumanMotion, mapping: Mapping[str, str] | None, fps:
 
 def retarget(
     robot: Robot,
-    motion: HumanMotion,
+    motion: Source,
     *,
     profile: Profile | None = None,
     mapping: Mapping[str, str] | None = None,
@@ -229,7 +231,7 @@ def retarget(
 
     Args:
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
-        motion: the clip.
+        motion: the clip of a person, or of another robot (``RobotSource``).
         profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
         mapping: role to the clip's name of it, see ``find_roles``. None: by the names that files use.
         fps: frames a second of the result; None: the clip's.

@@ -8,12 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .._errors import OsikValueError
 from ..robot import Robot
 from ..robot._tree import FREE
 from ._keypoints import load_arrays
+from ._motion import check_rate, instants
+from ._rotations import slerp
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +26,7 @@ class RobotMotion:
         fps: frames a second.
         joint_names: in the order of the columns of ``qpos`` after the free joint's seven.
         qpos: position of the base [m], its quaternion w x y z, then one number a joint [rad or m]. (F, 7 + joints)
+        contact: whether left heel, left toe, right heel and right toe stand; None: not known. (F, 4)
 
     Raises:
         ValueError: shapes that do not agree, numbers that are not finite, or quaternions that are not of unit length.
@@ -32,6 +35,7 @@ class RobotMotion:
     fps: float
     joint_names: tuple[str, ...]
     qpos: Float[np.ndarray, "F nq"]
+    contact: Bool[np.ndarray, "F 4"] | None = None
 
     def __post_init__(self) -> None:
         if self.qpos.ndim != 2 or self.qpos.shape[1] != 7 + len(self.joint_names) or not len(self.qpos):
@@ -46,8 +50,32 @@ class RobotMotion:
             raise OsikValueError(
                 f"the base's quaternion (columns 3 to 6) is not of unit length in frame {off.argmax()}"
             )
-        if not (np.isfinite(self.fps) and self.fps > 0.0):
-            raise OsikValueError(f"fps is {self.fps}; it is frames a second, more than 0")
+        check_rate(self.fps)
+        if self.contact is not None and np.shape(self.contact) != (len(self.qpos), 4):
+            raise OsikValueError(f"contact has shape {np.shape(self.contact)}, expected {(len(self.qpos), 4)}")
+
+    def resampled(self, fps: float) -> RobotMotion:
+        """The same motion at another rate: joints by straight lines, the base's turn by spherical interpolation.
+
+        Raises:
+            ValueError: a rate that is not positive.
+        """
+        if check_rate(fps) == self.fps or len(self.qpos) == 1:
+            return dataclasses.replace(self, fps=float(fps))
+        before, part = instants(len(self.qpos), self.fps, fps)
+        low, high = self.qpos[before], self.qpos[before + 1]
+        qpos = low + part[:, None] * (high - low)
+        qpos[:, 3:7] = slerp(low[:, 3:7], high[:, 3:7], part)
+        contact = self.contact
+        if contact is not None:
+            contact = np.where((part < 0.5)[:, None], contact[before], contact[before + 1])
+        return RobotMotion(float(fps), self.joint_names, qpos, contact)
+
+
+def joints_in_mujoco_order(robot: Robot) -> tuple[str, ...]:
+    """Return the joints of the columns of a ``RobotMotion`` with all joints of the robot's model."""
+    tree = robot.tree
+    return tuple(name for name, kind in zip(tree.joint_names, tree.joint_types, strict=True) if kind != FREE)
 
 
 def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
@@ -60,7 +88,7 @@ def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> R
     addresses = tree.full_qpos_address
     at = int(addresses[base])
     columns = [*range(at, at + 7), *(int(addresses[j]) for j in joints)]
-    return RobotMotion(float(fps), tuple(tree.joint_names[j] for j in joints), qpos[:, columns])
+    return RobotMotion(float(fps), joints_in_mujoco_order(robot), qpos[:, columns])
 
 
 def load_robot_motion(
@@ -84,7 +112,8 @@ def load_robot_motion(
         if missing:
             raise OsikValueError(f"{source} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
         names = tuple(str(name) for name in arrays["joint_names"].ravel())
-        return RobotMotion(float(arrays["fps"]), names, arrays["qpos"].astype(float))
+        contact = None if "contact" not in arrays else arrays["contact"].astype(bool)
+        return RobotMotion(float(arrays["fps"]), names, arrays["qpos"].astype(float), contact)
     if joint_names is None or fps is None:
         raise OsikValueError(f"{source}: a CSV holds numbers alone; say joint_names and fps")
     if not source.is_file():

@@ -1,0 +1,70 @@
+"""Where a robot's motion has the places of its profile, by MuJoCo's own C code."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ..physics._world import frame_pose
+from ..robot import Robot
+from ._profile import Profile
+
+
+class Places(NamedTuple):
+    """Places of a profile in the world.
+
+    Attributes:
+        keypoints: by role [m]. (F, 3) each
+        turns: of pelvis, chest (the pelvis where the trunk does not bend), left and right foot. (F, 4, 3, 3)
+        soles: corners of the soles [m]. (F, 8, 3)
+        center: centre of mass [m]. (F, 3)
+        capsules: both ends of each [m]. (F, k, 2, 3)
+    """
+
+    keypoints: dict[str, Float[np.ndarray, "F 3"]]
+    turns: Float[np.ndarray, "F 4 3 3"]
+    soles: Float[np.ndarray, "F 8 3"]
+    center: Float[np.ndarray, "F 3"]
+    capsules: Float[np.ndarray, "F k 2 3"]
+
+    @property
+    def standing(self) -> Float[np.ndarray, "F 4 3"]:
+        """Middles of left heel, left toe, right heel and right toe [m]."""
+        return self.soles.reshape(len(self.soles), 4, 2, 3).mean(2)
+
+
+def find_places(robot: Robot, profile: Profile, qpos: Float[np.ndarray, "F nq"]) -> Places:
+    """Return the places of a profile.
+
+    Args:
+        robot: the robot.
+        profile: how it is seen.
+        qpos: configurations of its MuJoCo model. (F, nq)
+    """
+    data = mujoco.MjData(robot.mj_model)
+    wanted = [*profile.keypoints.values(), *profile.corners]
+    wanted += [(c.frame, point) for c in profile.capsules for point in (c.start, c.end)]
+    turned = [profile.pelvis, profile.torso or profile.pelvis, profile.feet["left"].frame, profile.feet["right"].frame]
+    points, center = np.zeros((len(qpos), len(wanted), 3)), np.zeros((len(qpos), 3))
+    turns = np.zeros((len(qpos), len(turned), 3, 3))
+    root = robot.mj_model.body(robot.tree.body_names[robot.tree.root]).id
+    frames = tuple(dict.fromkeys([*turned, *(frame for frame, _ in wanted)]))
+    for f, own in enumerate(qpos):
+        data.qpos[:] = own
+        mujoco.mj_kinematics(robot.mj_model, data)
+        poses = {frame: frame_pose(robot, data, frame) for frame in frames}
+        mujoco.mj_comPos(robot.mj_model, data)
+        center[f] = data.subtree_com[root]
+        points[f] = [poses[frame][0] + poses[frame][1] @ np.array(point) for frame, point in wanted]
+        turns[f] = [poses[frame][1] for frame in turned]
+    keys = len(profile.keypoints)
+    return Places(
+        keypoints=dict(zip(profile.keypoints, np.moveaxis(points[:, :keys], 1, 0), strict=True)),
+        turns=turns,
+        soles=points[:, keys : keys + 8],
+        center=center,
+        capsules=points[:, keys + 8 :].reshape(len(points), -1, 2, 3),
+    )

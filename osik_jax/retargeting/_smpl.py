@@ -1,0 +1,106 @@
+"""Body poses of SMPL and its relatives, as AMASS has them: rotations of joints, and where the root is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from .._errors import OsikValueError
+from ._motion import HumanMotion
+from ._rotations import continuous, multiply, rotate
+
+_TREE = (
+    ("pelvis", -1, (0.0, 0.0, 0.0)),
+    ("left_hip", 0, (0.09, -0.05, 0.0)),
+    ("right_hip", 0, (-0.09, -0.05, 0.0)),
+    ("spine1", 0, (0.0, 0.11, 0.0)),
+    ("left_knee", 1, (0.0, -0.41, 0.0)),
+    ("right_knee", 2, (0.0, -0.41, 0.0)),
+    ("spine2", 3, (0.0, 0.13, 0.0)),
+    ("left_ankle", 4, (0.0, -0.41, 0.0)),
+    ("right_ankle", 5, (0.0, -0.41, 0.0)),
+    ("spine3", 6, (0.0, 0.06, 0.0)),
+    ("left_foot", 7, (0.0, -0.06, 0.13)),
+    ("right_foot", 8, (0.0, -0.06, 0.13)),
+    ("neck", 9, (0.0, 0.21, 0.0)),
+    ("left_collar", 9, (0.07, 0.12, 0.0)),
+    ("right_collar", 9, (-0.07, 0.12, 0.0)),
+    ("head", 12, (0.0, 0.08, 0.04)),
+    ("left_shoulder", 13, (0.11, 0.03, 0.0)),
+    ("right_shoulder", 14, (-0.11, 0.03, 0.0)),
+    ("left_elbow", 16, (0.26, 0.0, 0.0)),
+    ("right_elbow", 17, (-0.26, 0.0, 0.0)),
+    ("left_wrist", 18, (0.25, 0.0, 0.0)),
+    ("right_wrist", 19, (-0.25, 0.0, 0.0)),
+)
+"""Name, parent and offset [m] of the body's joints, y up and facing z, arms to the sides: the order is SMPL's, the
+lengths are round numbers of a person of 1.7 m and not those of SMPL's mesh. Joints of the hands follow, unused."""
+_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
+_REST = ("rest_joints", "J")
+
+
+def is_smpl(arrays: Mapping[str, np.ndarray]) -> bool:
+    """Whether a file holds poses of SMPL's joints."""
+    return "trans" in arrays and ("poses" in arrays or {"root_orient", "pose_body"} <= set(arrays))
+
+
+def read_smpl(path: Path, arrays: Mapping[str, np.ndarray]) -> HumanMotion:
+    """Return the motion in a file of SMPL, SMPL-H or SMPL-X poses.
+
+    Lengths of bones are the file's (``rest_joints`` or ``J``: joints in the rest pose [m], the body's 22 first), or
+    those of one person of 1.7 m: ``betas`` needs the model's own data, which the file does not have.
+
+    Args:
+        path: of the file.
+        arrays: ``poses`` (F, 3 k), rotation vectors of k joints, 22 at least, or ``root_orient`` (F, 3) and
+            ``pose_body`` (F, 63); ``trans`` (F, 3) in metres; ``mocap_framerate``, ``mocap_frame_rate`` or ``fps``.
+
+    Raises:
+        ValueError: the rate is missing, or arrays do not agree.
+    """
+    count = len(_TREE)
+    poses = arrays["poses"] if "poses" in arrays else np.concatenate([arrays["root_orient"], arrays["pose_body"]], -1)
+    trans, rate = arrays["trans"], next((arrays[name] for name in _RATES if name in arrays), None)
+    if rate is None or np.size(rate) != 1:
+        raise OsikValueError(f"{path} has no rate; poses come with one of {', '.join(_RATES)}")
+    if poses.ndim != 2 or poses.shape[1] < 3 * count or poses.shape[1] % 3 or trans.shape != (len(poses), 3):
+        raise OsikValueError(
+            f"{path}: poses has shape {poses.shape} and trans {trans.shape}; they are (F, 3 k), k joints of {count} or "
+            "more, and (F, 3)"
+        )
+    given = next((arrays[name] for name in _REST if name in arrays), None)
+    if given is not None and (given.ndim != 2 or len(given) < count or given.shape[1] != 3):
+        raise OsikValueError(f"{path}: joints of the rest pose have shape {given.shape}; they are ({count} or more, 3)")
+    parents = [parent for _, parent, _ in _TREE]
+    offsets = np.array([offset for _, _, offset in _TREE])
+    root = np.asarray(trans, float)
+    if given is not None:
+        rest = np.asarray(given[:count], float)
+        offsets = rest - np.where(np.array(parents)[:, None] >= 0, rest[parents], 0.0)
+        root, offsets[0] = root + rest[0], 0.0
+    for name, values in (("poses", poses), ("trans", trans), ("joints of the rest pose", offsets)):
+        if not np.isfinite(np.asarray(values, float)).all():
+            raise OsikValueError(f"{path}: {name} has numbers that are not finite")
+    vectors = np.asarray(poses[:, : 3 * count], float).reshape(-1, 3)
+    local = Rotation.from_rotvec(vectors).as_quat(scalar_first=True).reshape(-1, count, 4)
+    positions, rotations = _forward(parents, offsets, root, local)
+    rest, _ = _forward(parents, offsets, np.zeros((1, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (1, count, 1)))
+    names = tuple(name for name, _, _ in _TREE)
+    return HumanMotion(path.stem, float(np.ravel(rate)[0]), names, positions, continuous(rotations), rest[0])
+
+
+def _forward(
+    parents: list[int], offsets: Float[np.ndarray, "J 3"], root: Float[np.ndarray, "F 3"], local: np.ndarray
+) -> tuple[Float[np.ndarray, "F J 3"], Float[np.ndarray, "F J 4"]]:
+    """Return positions and rotations in the world, of rotations relative to the parents."""
+    positions, rotations = np.zeros((*local.shape[:2], 3)), local.copy()
+    positions[:, 0] = root
+    for joint, parent in enumerate(parents[1:], 1):
+        turn = rotations[:, parent]
+        positions[:, joint] = positions[:, parent] + rotate(turn, np.tile(offsets[joint], (len(root), 1)))
+        rotations[:, joint] = multiply(turn, local[:, joint])
+    return positions, rotations

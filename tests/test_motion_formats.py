@@ -1,0 +1,142 @@
+"""Files of other programs, made here: poses of SMPL as AMASS has them, and tables of OptiTrack's Motive."""
+
+import numpy as np
+import pytest
+from motion_files import dancer
+from scipy.spatial.transform import Rotation
+
+from osik_jax.retargeting import find_roles, load_motion
+from osik_jax.retargeting._smpl import _TREE
+
+TURN = Rotation.from_euler("x", 90, degrees=True)  # y up becomes z up
+
+
+def smpl_arrays(frames=20, joints=52):
+    """A person who bends a knee and an elbow and turns, with z up, by SciPy's rotations."""
+    phase = np.linspace(0.0, 1.0, frames)
+    local = np.zeros((frames, joints, 3))
+    local[:, 4, 0], local[:, 18, 1] = 1.2 * phase, -0.9 * phase
+    local[:, 0] = (Rotation.from_euler("z", phase[:, None]) * TURN).as_rotvec()
+    return {"poses": local.reshape(frames, -1), "trans": np.stack([phase, 0 * phase, 0.9 + 0 * phase], 1),
+            "mocap_framerate": np.array(120.0), "betas": np.zeros(16), "gender": np.array("neutral")}  # fmt: skip
+
+
+def expected_joints(arrays, offsets):
+    """Positions of the body's joints, one frame and one joint at a time."""
+    out = np.zeros((len(arrays["trans"]), len(_TREE), 3))
+    for f, row in enumerate(arrays["poses"].reshape(len(out), -1, 3)):
+        turns = []
+        for j, (_, parent, _) in enumerate(_TREE):
+            own = Rotation.from_rotvec(row[j])
+            turns.append(own if parent < 0 else turns[parent] * own)
+            out[f, j] = arrays["trans"][f] if parent < 0 else out[f, parent] + turns[parent].apply(offsets[j])
+    return out
+
+
+@pytest.mark.parametrize("joints", [24, 52, 55])
+def test_poses_of_smpl(tmp_path, joints):
+    arrays = smpl_arrays(joints=joints)
+    np.savez(tmp_path / "walk_poses.npz", **arrays)
+    motion = load_motion(tmp_path / "walk_poses.npz")
+    offsets = np.array([offset for _, _, offset in _TREE])
+    np.testing.assert_allclose(motion.positions, expected_joints(arrays, offsets), atol=1e-12)
+    assert motion.fps == 120.0 and find_roles(motion.joint_names)["left_toe"] == "left_foot"
+    assert motion.rest_positions is not None and np.argmax(np.ptp(motion.rest_positions, axis=0)) in (1, 2)
+    head, foot = (motion.joint_names.index(name) for name in ("head", "left_foot"))
+    assert motion.rest_positions[head, 2] - motion.rest_positions[foot, 2] > 1.3  # the rest pose stands along z too
+
+
+def test_split_poses_and_bones_of_the_file(tmp_path):
+    arrays = smpl_arrays()
+    rest = np.zeros((52, 3))
+    for j, (_, parent, offset) in enumerate(_TREE):
+        rest[j] = (rest[parent] if parent >= 0 else np.array([0.0, 0.05, 0.02])) + 1.1 * np.array(offset)
+    split = {"root_orient": arrays["poses"][:, :3], "pose_body": arrays["poses"][:, 3:66], "trans": arrays["trans"]}
+    np.savez(tmp_path / "stage.npz", **split, mocap_frame_rate=60, rest_joints=rest)
+    motion = load_motion(tmp_path / "stage.npz")
+    offsets = rest[:22] - np.array([rest[parent] if parent >= 0 else np.zeros(3) for _, parent, _ in _TREE])
+    moved = {**arrays, "trans": arrays["trans"] + rest[0]}
+    np.testing.assert_allclose(motion.positions, expected_joints(moved, offsets), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mocap_framerate": None}, "has no rate; poses come with one of mocap_framerate"),
+        ({"poses": np.zeros((20, 60))}, r"poses has shape \(20, 60\)"),
+        ({"trans": np.full((20, 3), np.nan)}, "trans has numbers that are not finite"),
+        ({"J": np.zeros((10, 3))}, r"joints of the rest pose have shape \(10, 3\)"),
+    ],
+)
+def test_broken_poses_are_told(tmp_path, change, message):
+    arrays = {name: value for name, value in {**smpl_arrays(), **change}.items() if value is not None}
+    np.savez(tmp_path / "broken.npz", **arrays)
+    with pytest.raises(ValueError, match=message):
+        load_motion(tmp_path / "broken.npz")
+
+
+BONES = {"Hips": "Hip", "Spine": "Ab", "Neck": "Neck", "Head": "Head"}
+BONES |= {
+    f"{side}{own}": f"{side[0]}{theirs}"
+    for side in ("Left", "Right")
+    for own, theirs in {
+        "Arm": "UArm", "ForeArm": "FArm", "Hand": "Hand", "UpLeg": "Thigh", "Leg": "Shin", "Foot": "Foot",
+        "ToeBase": "Toe",
+    }.items()
+}  # fmt: skip
+
+
+def motive_table(figure, unit="Millimeters", scale=1e-3, turns=True):
+    """The lines of a table as Motive writes it: a skeleton's bones, and a marker that does not count."""
+    positions, matrices = figure.forward()
+    quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat().reshape(*matrices.shape[:2], 4)
+    columns = [
+        ("Bone", f"Me:{BONES[name]}", kind, axis)
+        for name, _, _ in figure.joints
+        for kind, axes in ((("Rotation", "XYZW"),) if turns else ()) + (("Position", "XYZ"),)
+        for axis in axes
+    ]
+    columns += [("Marker", "Me:m1", "Position", axis) for axis in "XYZ"]  # fmt: skip
+    head = f"Format Version,1.23,Take Name,dance,Capture Frame Rate,{figure.fps},Export Frame Rate,{figure.fps},"
+    lines = [f"{head}Rotation Type,Quaternion,Length Units,{unit},Coordinate Space,Global", ""]
+    lines += [",".join(["", first, *(column[i] for column in columns)]) for i, first in ((0, "Type"), (1, "Name"))]
+    lines.append(",".join(["", "ID", *["1"] * len(columns)]))
+    lines.append(",".join(["", "", *(column[2] for column in columns)]))
+    lines.append(",".join(["Frame", "Time (Seconds)", *(column[3] for column in columns)]))
+    for f in range(len(positions)):
+        numbers = [x for j in range(len(figure.joints))
+                   for x in ([*quaternions[f, j]] if turns else []) + [*(positions[f, j] / scale)]]  # fmt: skip
+        lines.append(",".join([str(f), repr(f / figure.fps), *map(repr, map(float, numbers)), "", "", ""]))
+    return lines
+
+
+@pytest.mark.parametrize(("unit", "scale", "turns"), [("Millimeters", 1e-3, True), ("Meters", 1.0, False)])
+def test_tables_of_motive(tmp_path, unit, scale, turns):
+    figure = dancer(12)
+    file = tmp_path / "take.csv"
+    file.write_text("\n".join(motive_table(figure, unit, scale, turns)) + "\n")
+    motion = load_motion(file)
+    positions, matrices = figure.forward()
+    z_up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # facing z becomes facing x
+    np.testing.assert_allclose(motion.positions, positions @ z_up.T, atol=1e-9)
+    assert motion.fps == figure.fps and len(find_roles(motion.joint_names)) >= 12
+    assert (motion.rotations is not None) == turns
+    if motion.rotations is not None:
+        turned = Rotation.from_quat(motion.rotations.reshape(-1, 4), scalar_first=True)
+        expected = z_up @ matrices.reshape(-1, 3, 3) @ z_up.T
+        np.testing.assert_allclose(turned.as_matrix(), expected, atol=1e-9)
+
+
+def test_gaps_and_wrong_headings_of_motive_are_told(tmp_path):
+    lines, file = motive_table(dancer(5)), tmp_path / "take.csv"
+    cells = lines[8].split(",")
+    cells[6] = ""
+    for changed, message in (
+        ([*lines[:8], ",".join(cells), *lines[9:]], "line 9, column 7: no finite number; fill gaps"),
+        ([lines[0].replace("Millimeters", "Feet"), *lines[1:]], "line 1: Length Units is Feet"),
+        ([line.replace("Bone", "Marker") for line in lines], "has no bones; export a skeleton's bones"),
+        ([line for line in lines if not line.startswith("Frame")], "no line of headings that begins with Frame"),
+    ):
+        file.write_text("\n".join(changed) + "\n")
+        with pytest.raises(ValueError, match=message):
+            load_motion(file)
