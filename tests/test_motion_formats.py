@@ -140,3 +140,83 @@ def test_gaps_and_wrong_headings_of_motive_are_told(tmp_path):
         file.write_text("\n".join(changed) + "\n")
         with pytest.raises(ValueError, match=message):
             load_motion(file)
+
+
+ASF = """# made for a test
+:version 1.10
+:name figure
+:units
+  mass 1.0
+  length 0.45
+  angle deg
+:root
+  order TX TY TZ RX RY RZ
+  axis XYZ
+  position 0 0 0
+  orientation 0 0 0
+:bonedata
+"""
+ASF_NAMES = {"Spine": "lowerback", "Neck": "thorax", "Head": "head"} | {
+    f"{side}{own}": f"{side[0].lower()}{theirs}"
+    for side in ("Left", "Right")
+    for own, theirs in {"Arm": "humerus", "ForeArm": "radius", "Hand": "wrist", "UpLeg": "femur", "Leg": "tibia",
+                        "Foot": "foot", "ToeBase": "toes"}.items()
+}  # fmt: skip
+
+
+def write_amc(folder, figure):
+    """ASF and AMC of a figure: a bone of zero angles before each joint's own, along the way to it, and twisted axes."""
+    unit = 0.0254 / 0.45
+    rng = np.random.default_rng(3)
+    bones, hierarchy, order = [], [], []
+    for i, (name, parent, offset) in enumerate(figure.joints[1:], 1):
+        way, own = f"{ASF_NAMES[name]}_way", ASF_NAMES[name]
+        up = "root" if parent == 0 else ASF_NAMES[figure.joints[parent][0]]
+        axes = rng.uniform(-90, 90, 3)
+        length = float(np.linalg.norm(offset))
+        along = " ".join(repr(float(x) / length) for x in offset)
+        turned = " ".join(repr(float(x)) for x in axes)
+        for bone, direction, size, axis, dofs in (
+            (way, along, length / unit, "0 0 0", ""),
+            (own, "0 -1 0", 0.0, turned, " dof rx ry rz\n limits (-180 180)\n"),
+        ):
+            head = f"begin\n name {bone}\n direction {direction}\n length {size!r}"
+            bones.append(f"{head}\n axis {axis} XYZ\n{dofs}end")
+        hierarchy += [f"{up} {way}", f"{way} {own}"]
+        order.append((i, own, Rotation.from_euler("xyz", axes, degrees=True)))
+    text = ASF + "\n".join(bones) + "\n:hierarchy\nbegin\n" + "\n".join(hierarchy) + "\nend\n"
+    (folder / "07.asf").write_text(text)
+    lines = [":FULLY-SPECIFIED", ":DEGREES"]
+    for f in range(len(figure.root)):
+        local = [Rotation.from_euler(o, a, degrees=True) for o, a in zip(figure.orders, figure.angles[f], strict=True)]
+        hips = [*(figure.root[f] / unit), *local[0].as_euler("xyz", degrees=True)]
+        lines += [str(f + 1), " ".join(["root", *(repr(float(x)) for x in hips)])]
+        for i, own, axes in order:
+            angles = (axes.inv() * local[i] * axes).as_euler("xyz", degrees=True)
+            lines.append(" ".join([own, *(repr(float(x)) for x in angles)]))
+    (folder / "07_01.amc").write_text("\n".join(lines) + "\n")
+    return folder / "07_01.amc"
+
+
+def test_asf_and_amc(tmp_path):
+    figure = dancer(10)
+    file = write_amc(tmp_path, figure)
+    motion = load_motion(file)
+    positions, _ = figure.forward()
+    z_up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    at = [motion.joint_names.index(ASF_NAMES[name]) for name, _, _ in figure.joints[1:]]
+    np.testing.assert_allclose(motion.positions[:, at], positions[:, 1:] @ z_up.T, atol=1e-9)
+    roles = find_roles(motion.joint_names)
+    assert roles["left_hip"] == "lfemur" and roles["right_wrist"] == "rwrist" and motion.fps == 120.0
+    text = file.read_text()
+    for changed, message in (
+        (text.replace("lfemur 0", "lfemur x 0", 1).replace("lfemur -", "lfemur x -", 1), "line 1?[0-9]: lfemur with 4"),
+        (":DEGREES\n", "has no frames"),
+        (text.replace("ltibia", "nothing", 1), "nothing with 3 numbers is not expected here"),
+    ):
+        file.write_text(changed)
+        with pytest.raises(ValueError, match=message):
+            load_motion(file)
+    (tmp_path / "07.asf").unlink()
+    with pytest.raises(ValueError, match=r"needs its skeleton, an .asf file beside it; there are 0"):
+        load_motion(file)

@@ -394,7 +394,7 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
     assert f"the same command goes on where it was ({out})" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"another job in it.*smoothness was 0\.0, is 0\.1"):
         retarget_folder(Retargeter(nao, smoothness=0.1), clips, out, progress=False)
-    with pytest.raises(ValueError, match=r"has no clips \(.bvh, .npz, .csv\); in it: dance, short"):
+    with pytest.raises(ValueError, match=r"has no clips \(.bvh, .amc, .npz, .csv\); in it: dance, short"):
         (out / "job.json").unlink()
         for path in [*out.glob("*.*")]:
             path.unlink()

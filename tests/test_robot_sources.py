@@ -11,7 +11,7 @@ from osik_jax import cli
 from osik_jax.retargeting import (
     Retargeter,
     RobotMotion,
-    RobotSource,
+    SourceMotion,
     load_motion,
     load_robot_motion,
     load_source,
@@ -54,16 +54,16 @@ def test_a_robot_that_follows_itself_does_the_same(nao, danced):
 
 
 def test_a_motion_goes_to_another_robot_and_comes_back(nao, danced):
-    g1 = pytest.importorskip("example_robot_data") and osik.load_robot("g1")
+    g1 = osik.load_robot("g1")
     first, file, retargeter = danced
     there = Retargeter(g1).retarget(load_source(file, nao))
-    back = retargeter.retarget(RobotSource(g1, dataclasses.replace(there.motion, contact=there.contact)))
+    back = retargeter.retarget(SourceMotion(g1, dataclasses.replace(there.motion, contact=there.contact)))
     for result in (there, back):
         figures = report(result)
         np.testing.assert_array_equal(result.contact, first.contact)
         assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
         assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["jump_frames"] == 0
-    own, returned = (RobotSource(nao, result.motion).person().points for result in (first, back))
+    own, returned = (SourceMotion(nao, result.motion).person().points for result in (first, back))
     assert np.mean([angle(own[b] - own[a], returned[b] - returned[a]) for a, b in LIMBS]) < 1.0
 
 
@@ -71,7 +71,7 @@ def test_feet_of_a_source_without_labels_are_found(nao, danced):
     first, _, _ = danced
     assert first.motion.contact is None
     raised = dataclasses.replace(first.motion, qpos=first.motion.qpos + np.eye(first.motion.qpos.shape[1])[2] * 0.3)
-    person = RobotSource(nao, raised).person()
+    person = SourceMotion(nao, raised).person()
     assert person.contact.all() and person.points["left_heel"][:, 2] == pytest.approx(0.0, abs=2e-3)
 
 
@@ -93,8 +93,8 @@ def test_other_rates_and_tables(nao, danced, tmp_path):
 def test_wrong_sources_are_told(nao, danced):
     motion = RobotMotion(30.0, ("elbow",), np.tile([0.0, 0, 0, 1, 0, 0, 0, 0], (4, 1)))
     with pytest.raises(KeyError, match="no joint 'elbow'"):
-        RobotSource(nao, motion)
+        SourceMotion(nao, motion)
     with pytest.raises(ValueError, match="load the robot with floating_base=True"):
-        RobotSource(osik.load_robot("arm7"), motion)
+        SourceMotion(osik.load_robot("arm7"), motion)
     with pytest.raises(ValueError, match=r"contact has shape \(3, 4\), expected \(4, 4\)"):
         dataclasses.replace(motion, contact=np.ones((3, 4), bool))

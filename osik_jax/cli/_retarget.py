@@ -45,7 +45,7 @@ class Retarget:
     """
 
     clip: Annotated[str, tyro.conf.Positional]
-    """A BVH file, or keypoints as .npz or .csv; or a folder with such files; with --source, motions of that robot."""
+    """A BVH or AMC file, keypoints as .npz or .csv, or a folder of such files; with --source, motions of that robot."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
     source: str | None = None
@@ -267,6 +267,7 @@ def _retarget_live(command: Retarget) -> None:
             stream(make, sys.stdin, sys.stdout)
             return
         motion = _reader(command)(Path(command.clip))
+        assert isinstance(motion, retargeting.HumanMotion)  # without --source
         motion = motion if command.fps is None else motion.resampled(command.fps)
         command.out.mkdir(parents=True, exist_ok=True)
         console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")

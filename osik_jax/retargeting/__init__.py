@@ -25,6 +25,6 @@ from ._retargeted import Retargeted as Retargeted
 from ._robot_motion import RobotMotion as RobotMotion
 from ._robot_motion import load_robot_motion as load_robot_motion
 from ._robot_motion import write_csv as write_csv
-from ._robot_source import RobotSource as RobotSource
-from ._robot_source import load_source as load_source
 from ._skeletons import find_roles as find_roles
+from ._source_motion import SourceMotion as SourceMotion
+from ._source_motion import load_source as load_source

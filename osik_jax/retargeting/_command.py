@@ -18,7 +18,7 @@ from ._report import report
 from ._retarget import Retargeter
 from ._retargeted import Retargeted
 from ._robot_motion import write_csv
-from ._robot_source import RobotSource
+from ._source_motion import SourceMotion
 
 _HELD_OUT = 4
 """One clip in so many has a say in which step of a fit is taken, and none in the steps."""
@@ -26,7 +26,7 @@ _HELD_OUT = 4
 
 def retarget_to_folder(
     retargeter: Retargeter,
-    motion: HumanMotion | RobotSource,
+    motion: HumanMotion | SourceMotion,
     out: Path,
     *,
     mapping: dict[str, str] | None,

@@ -56,7 +56,7 @@ def retarget_folder(
     chunk: int = 32,
     progress: Progress = True,
 ) -> dict[str, Any]:
-    """Retargets every ``.bvh``, ``.npz`` and ``.csv`` of a folder, those in its folders left out.
+    """Retargets every ``.bvh``, ``.amc``, ``.npz`` and ``.csv`` of a folder, those in its folders left out.
 
     Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``; beside
     them are ``profile.toml``, ``job.json`` (what the job was started with), the summary, ``report.json``, and

@@ -10,21 +10,22 @@ from typing import Any
 from .._errors import OsikValueError
 from ..robot import Robot
 from ..scaling._fingerprint import fingerprint, identifier
+from ._amc import read_amc
 from ._bvh import read_bvh
 from ._keypoints import read_keypoints
 from ._motion import HumanMotion
 from ._profile import Profile
 from ._profile_file import find_profile, profile_text
-from ._robot_source import RobotSource, load_source
-from ._up import Up
+from ._source_motion import SourceMotion, load_source
+from ._up import Up, checked_up, find_rest_up, standing_up
 
-ENDINGS = (".bvh", ".npz", ".csv")
+ENDINGS = (".bvh", ".amc", ".npz", ".csv")
 
 
 def load_motion(
     path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
 ) -> HumanMotion:
-    """Reads a person's motion: BVH, or keypoints as ``.npz`` or ``.csv``, told apart by the file's ending.
+    """Read a person's motion: BVH, AMC with its ASF beside it, ``.npz`` or ``.csv``, told apart by the ending.
 
     Args:
         path: the file.
@@ -41,12 +42,15 @@ def load_motion(
     ending = Path(path).suffix.lower()
     if ending == ".bvh":
         return read_bvh(path, unit=unit, up=up, trim=trim)
+    if ending == ".amc" and unit is None:
+        motion = read_amc(Path(path))
+        return standing_up(str(path), motion, checked_up(up), "y", find_rest_up(motion))
     if ending not in ENDINGS:
         if not ending and not Path(path).exists():  # perhaps a folder's name with a letter wrong
             raise FileNotFoundError(f"no such file: {path}")
-        raise OsikValueError(f"{path} is none of .bvh, .npz and .csv")
+        raise OsikValueError(f"{path} is none of {', '.join(ENDINGS)}")
     if unit is not None:
-        raise OsikValueError("unit goes with BVH files; keypoints are metres")
+        raise OsikValueError("unit goes with BVH files; keypoints are metres, and an .asf says its unit")
     return read_keypoints(path, up=up)
 
 
@@ -70,7 +74,7 @@ class Reader:
     profile: Profile | None = None
     fps: float | None = None
 
-    def __call__(self, path: Path) -> HumanMotion | RobotSource:
+    def __call__(self, path: Path) -> HumanMotion | SourceMotion:
         """Read a clip; the unit goes with BVH files alone."""
         if self.source is not None:
             return load_source(path, self.source, profile=self.profile, fps=self.fps)

@@ -37,10 +37,10 @@ from ._person import read_person
 from ._plan import make_plan
 from ._profile import Profile
 from ._retargeted import Retargeted, as_retargeted
-from ._robot_source import RobotSource
 from ._skeletons import find_roles
+from ._source_motion import SourceMotion
 
-Source = HumanMotion | RobotSource
+Source = HumanMotion | SourceMotion
 _Checked = tuple[Source, Mapping[str, str]]
 
 
@@ -151,7 +151,7 @@ class Retargeter(OnRobot):
 
     def _read(self, motion: Source, roles: Mapping[str, str]) -> Clip:
         """The same of a clip that can be read, whose joints have these names."""
-        person = motion.person() if isinstance(motion, RobotSource) else read_person(motion, roles)
+        person = motion.person() if isinstance(motion, SourceMotion) else read_person(motion, roles)
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
         dt = 1.0 / motion.fps
@@ -199,7 +199,7 @@ def _checked(motion: Source, mapping: Mapping[str, str] | None, fps: float | Non
     motion = motion if fps is None else motion.resampled(fps)
     if motion.frames < 3:
         raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
-    return motion, {} if isinstance(motion, RobotSource) else find_roles(motion.joint_names, mapping)
+    return motion, {} if isinstance(motion, SourceMotion) else find_roles(motion.joint_names, mapping)
 
 
 def checked_by_name(motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
@@ -231,7 +231,7 @@ def retarget(
 
     Args:
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
-        motion: the clip of a person, or of another robot (``RobotSource``).
+        motion: the clip of a person, or of another robot (``SourceMotion``).
         profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
         mapping: role to the clip's name of it, see ``find_roles``. None: by the names that files use.
         fps: frames a second of the result; None: the clip's.

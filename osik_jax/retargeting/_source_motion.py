@@ -23,7 +23,7 @@ from ._roles import LIMBS, SIDES
 
 
 @dataclasses.dataclass(frozen=True)
-class RobotSource:
+class SourceMotion:
     """A motion of one robot, for another to follow: ``retarget`` takes it in place of a ``HumanMotion``.
 
     Attributes:
@@ -63,7 +63,7 @@ class RobotSource:
         """How many frames there are."""
         return len(self.motion.qpos)
 
-    def resampled(self, fps: float) -> RobotSource:
+    def resampled(self, fps: float) -> SourceMotion:
         """The same motion at another rate; see ``HumanMotion.resampled``."""
         return dataclasses.replace(self, motion=self.motion.resampled(fps))
 
@@ -113,19 +113,19 @@ class RobotSource:
 
 def load_source(
     path: str | os.PathLike[str], robot: Robot, *, profile: Profile | None = None, fps: float | None = None
-) -> RobotSource:
+) -> SourceMotion:
     """Read a motion of a robot, ``motion.npz`` or a CSV, for another robot to follow.
 
     Args:
         path: the file; a CSV has the robot's joints in MuJoCo's order.
         robot: the robot that moves.
-        profile: as of ``RobotSource``.
+        profile: as of ``SourceMotion``.
         fps: of a CSV, which does not say it.
 
     Raises:
-        FileNotFoundError, ValueError, KeyError: as of ``load_robot_motion`` and ``RobotSource``.
+        FileNotFoundError, ValueError, KeyError: as of ``load_robot_motion`` and ``SourceMotion``.
     """
     table = Path(path).suffix.lower() == ".csv"
     names = joints_in_mujoco_order(robot) if table else None
     motion = load_robot_motion(path, joint_names=names, fps=fps if table else None)
-    return RobotSource(robot, motion, profile, Path(path).stem)
+    return SourceMotion(robot, motion, profile, Path(path).stem)

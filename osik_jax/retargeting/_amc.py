@@ -1,0 +1,177 @@
+"""ASF skeletons and AMC motions, as the CMU database has them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .._errors import OsikValueError
+from ._motion import HumanMotion
+from ._rotations import continuous
+
+_INCH = 0.0254
+_FPS = 120.0
+"""Frames a second of the CMU database; the format does not say them."""
+
+
+@dataclasses.dataclass
+class _Bone:
+    """A bone: its rest pose in the world, and the axes and letters of its angles."""
+
+    name: str
+    parent: str = ""
+    offset: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    axes: Rotation = dataclasses.field(default_factory=Rotation.identity)
+    dofs: tuple[str, ...] = ()
+
+
+def read_amc(path: Path, skeleton: Path | None = None, fps: float = _FPS) -> HumanMotion:
+    """Return the motion in an AMC file; a joint is where the bone of its name starts, y up.
+
+    Args:
+        path: the AMC file.
+        skeleton: the ASF file. None: the one beside it with whose name its own begins, or the only one.
+        fps: frames a second, which the file does not say.
+
+    Raises:
+        ValueError: no skeleton is found, or a file is broken; the message says which line and what is wrong.
+    """
+    asf = _skeleton_beside(path) if skeleton is None else skeleton
+    bones, scale, degrees = _read_asf(asf)
+    frames = _read_frames(path, bones)
+    values = {name: np.array([frame[name] for frame in frames]) for name in bones if bones[name].dofs}
+    count = len(frames)
+    turns: dict[str, Rotation] = {}
+    starts: dict[str, np.ndarray] = {}
+    for name, bone in bones.items():
+        own = dict(zip(bone.dofs, values[name].T, strict=True)) if bone.dofs else {}
+        angles = np.stack([own.get(f"r{axis}", np.zeros(count)) for axis in "xyz"], 1)
+        local = bone.axes * Rotation.from_euler("xyz", angles, degrees=degrees) * bone.axes.inv()
+        if not bone.parent:
+            moves = np.stack([own.get(f"t{axis}", np.zeros(count)) for axis in "xyz"], 1)
+            starts[name], turns[name] = moves + bone.offset, local
+            continue
+        parent = bones[bone.parent]
+        reach = parent.offset if parent.parent else np.zeros(3)
+        starts[name] = starts[bone.parent] + turns[bone.parent].apply(reach)
+        turns[name] = turns[bone.parent] * local
+    return HumanMotion(
+        path.stem,
+        fps,
+        tuple(bones),
+        scale * np.stack(list(starts.values()), 1),
+        continuous(np.stack([turn.as_quat(scalar_first=True) for turn in turns.values()], 1)),
+        scale * _rest(bones),
+    )
+
+
+def _rest(bones: dict[str, _Bone]) -> np.ndarray:
+    """Return where the bones start in the rest pose, the root at the origin. (J, 3)."""
+    starts: dict[str, np.ndarray] = {}
+    for name, bone in bones.items():
+        parent = bones.get(bone.parent)
+        reach = parent.offset if parent is not None and parent.parent else np.zeros(3)
+        starts[name] = np.zeros(3) if parent is None else starts[bone.parent] + reach
+    return np.array(list(starts.values()))
+
+
+def _skeleton_beside(path: Path) -> Path:
+    found = [file for file in sorted(path.parent.iterdir()) if file.suffix.lower() == ".asf"]
+    named = [file for file in found if path.stem.startswith(file.stem)]
+    if named:
+        return max(named, key=lambda file: len(file.stem))
+    if len(found) == 1:
+        return found[0]
+    raise OsikValueError(f"{path} needs its skeleton, an .asf file beside it; there are {len(found)}")
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {path}")
+    text = path.read_text(encoding="utf-8", errors="replace")
+    rows = [(number, line.split("#")[0].split()) for number, line in enumerate(text.splitlines(), 1)]
+    return [(number, words) for number, words in rows if words]
+
+
+def _numbers(path: Path, number: int, words: list[str]) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = [np.nan]
+    if not np.isfinite(values).all():
+        raise OsikValueError(f"{path}, line {number}: not finite numbers: {' '.join(words)[:60]}")
+    return values
+
+
+def _read_asf(path: Path) -> tuple[dict[str, _Bone], float, bool]:
+    """Return the bones, parents first, metres a unit, and whether angles are in degrees."""
+    bones, section, children = {"root": _Bone("root")}, "", []
+    scale, degrees, name, along, length = _INCH, True, "root", np.zeros(3), 0.0
+    for number, words in _lines(path):
+        key, rest = words[0].lower(), words[1:]
+        if key.startswith(":"):
+            section = key
+        elif section == ":units" and key == "length":
+            scale = _INCH / _numbers(path, number, rest[:1])[0]
+        elif section == ":units" and key == "angle":
+            degrees = rest[:1] != ["rad"]
+        elif section == ":root" and key == "order":
+            bones["root"].dofs = tuple(word.lower() for word in rest)
+        elif section == ":root" and key == "position":
+            bones["root"].offset = np.array(_numbers(path, number, rest[:3]))
+        elif section == ":root" and key == "orientation":
+            bones["root"].axes = Rotation.from_euler("xyz", _numbers(path, number, rest[:3]), degrees=degrees)
+        elif section == ":bonedata" and key == "name":
+            name = rest[0]
+            bones[name] = _Bone(name)
+        elif section == ":bonedata" and key == "direction":
+            along = np.array(_numbers(path, number, rest[:3]))
+        elif section == ":bonedata" and key == "length":
+            length = _numbers(path, number, rest[:1])[0]
+        elif section == ":bonedata" and key == "axis":
+            order = rest[3].lower() if len(rest) > 3 else "xyz"
+            bones[name].axes = Rotation.from_euler(order, _numbers(path, number, rest[:3]), degrees=degrees)
+        elif section == ":bonedata" and key == "dof":
+            bones[name].dofs = tuple(word.lower() for word in rest)
+        elif section == ":bonedata" and key == "end":
+            bones[name].offset = length * along / max(float(np.linalg.norm(along)), 1e-12)
+        elif section == ":hierarchy" and key not in ("begin", "end"):
+            unknown = [word for word in words if word not in bones]
+            if unknown:
+                raise OsikValueError(f"{path}, line {number}: no bone {unknown[0]}; bones: {', '.join(bones)}")
+            children.append(words)
+    ordered = {"root": bones["root"]}
+    for parent, *own in children:
+        for child in own:
+            bones[child].parent = parent
+            ordered[child] = bones[child]
+    late = [bone.name for bone in ordered.values() if bone.parent and bone.parent not in ordered]
+    if len(ordered) < 2 or late:
+        raise OsikValueError(f"{path}: the hierarchy does not connect {', '.join(late) or 'any bone'} to the root")
+    return ordered, scale, degrees
+
+
+def _read_frames(path: Path, bones: dict[str, _Bone]) -> list[dict[str, list[float]]]:
+    frames: list[dict[str, list[float]]] = []
+    moving = [name for name, bone in bones.items() if bone.dofs]
+    for number, words in _lines(path):
+        if words[0].startswith(":"):
+            continue
+        if len(words) == 1 and words[0].isdigit():
+            frames.append({})
+        elif not frames or words[0] not in bones or len(words) - 1 != len(bones[words[0]].dofs):
+            raise OsikValueError(
+                f"{path}, line {number}: {words[0]} with {len(words) - 1} numbers is not expected here"
+            )
+        else:
+            frames[-1][words[0]] = _numbers(path, number, words[1:])
+    for number, frame in enumerate(frames, 1):
+        missing = [name for name in moving if name not in frame]
+        if missing:
+            raise OsikValueError(f"{path}: frame {number} has no {', '.join(missing)}")
+    if not frames:
+        raise OsikValueError(f"{path} has no frames")
+    return frames
