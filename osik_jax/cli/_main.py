@@ -1,4 +1,4 @@
-"""The command line: ``osik demo``, ``ik``, ``reach``, ``retarget``, ``view`` and ``info``."""
+"""The command line: ``osik demo``, ``ik``, ``reach``, ``retarget``, ``ros2``, ``view`` and ``info``."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from ._info import Info
 from ._messages import CommandError, notes
 from ._reach import Reach
 from ._retarget import Retarget
+from ._ros2 import Ros2
 from ._view import View
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
-_Command = Demo | Ik | Reach | Retarget | View | Info
+_Command = Demo | Ik | Reach | Retarget | Ros2 | View | Info
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"osik-jax {importlib.metadata.version('osik-jax')}")
         return 0
     command = tyro.extras.subcommand_cli_from_dict(
-        {"demo": Demo, "ik": Ik, "reach": Reach, "retarget": Retarget, "view": View, "info": Info},
+        {"demo": Demo, "ik": Ik, "reach": Reach, "retarget": Retarget, "ros2": Ros2, "view": View, "info": Info},
         prog="osik",
         description=_DESCRIPTION,
         args=arguments or ["--help"],

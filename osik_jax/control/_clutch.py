@@ -88,7 +88,7 @@ class Clutch(Replaceable):
             frame: pose of the frame now, of the commanded configuration: a measured one has noise, and moves always.
         """
         dtype = self.scale.dtype
-        return _step(self, jnp.asarray(engaged, bool), _numbers(device, dtype), as_pose(frame, dtype))
+        return _step(self, jnp.asarray(engaged, bool), _numbers(device, dtype), _numbers(frame, dtype))
 
     def _check(self) -> None:
         scale = concrete(self.scale)
@@ -97,8 +97,8 @@ class Clutch(Replaceable):
 
 
 @jax.jit
-def _step(clutch: _Own, engaged: Array, device: PoseLike, frame: Pose) -> tuple[_Own, Pose]:
-    device = as_pose(device, clutch.scale.dtype)
+def _step(clutch: _Own, engaged: Array, device: PoseLike, frame: PoseLike) -> tuple[_Own, Pose]:
+    device, frame = as_pose(device, clutch.scale.dtype), as_pose(frame, clutch.scale.dtype)
     tracked = jnp.isfinite(device[0]).all() & jnp.isfinite(device[1]).all()
     pressed, device = engaged & tracked, _choose(tracked, device, clutch.device)
     here = _choose(_is_at_rest(frame, clutch.frame), clutch.target, frame)

@@ -1,0 +1,84 @@
+"""``osik ros2``."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import signal
+import threading
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Literal
+
+from ._messages import CommandError, told
+from ._robots import read_robot
+
+if TYPE_CHECKING:
+    from ..interop.ros2 import Controller
+
+
+@dataclasses.dataclass(frozen=True)
+class Ros2:
+    """Leads a robot over ROS 2 topics, without ROS on this machine: joint states and targets in, commands out.
+
+    Needs the extra ros2. It starts at the measured configuration, stays there until a target comes, and holds where
+    states stop. With --replay it gives a recorded bag to the controller instead, and compares the commands.
+    """
+
+    robot: str | None = None
+    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions. Default: the robot
+    of the controller that the settings name."""
+    config: Path | None = None
+    """A TOML file with settings: topics, frames, limits, names of joints."""
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+    domain: int | None = None
+    """Number of the DDS domain. Default: ROS_DOMAIN_ID, or 0."""
+    loopback: bool = False
+    """Speak with this machine alone, as with ROS_LOCALHOST_ONLY=1 or ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST."""
+    duration: float | None = None
+    """Seconds after which it ends. Default: Ctrl-C ends it."""
+    record: Path | None = None
+    """An MCAP file for all messages that come in, and the commands."""
+    replay: Path | None = None
+    """An MCAP file whose messages the controller is given."""
+    tolerance: float = 1e-9
+    """With --replay: largest difference of a joint from the recorded command for exit code 0 [rad or m]."""
+
+    def run(self) -> int:
+        """Runs the command; returns the exit code: 1 where a replay does not reproduce its commands."""
+        with told():
+            from ..interop.ros2 import Controller, Settings, dds, read_settings
+
+            settings = Settings() if self.config is None else read_settings(self.config)
+            if (self.robot is None) == (settings.controller is None):
+                raise CommandError("give --robot, or a controller in the settings of --config")
+            robot = None if self.robot is None else read_robot(self.robot, self.base)
+            controller = Controller(robot, settings)
+            return self._lead(dds, controller) if self.replay is None else self._replay(dds, controller)
+
+    def _replay(self, dds: ModuleType, controller: Controller) -> int:
+        found = dds.replay(controller, self.replay)
+        print(
+            f"{len(found.recorded)} commands of {len(found.names)} joints, largest difference {found.difference:.3g}; "
+            f"tolerance {self.tolerance:g}"
+        )
+        return 0 if found.difference <= self.tolerance else 1
+
+    def _lead(self, dds: ModuleType, controller: Controller) -> int:
+        stop = threading.Event()
+        with contextlib.ExitStack() as stack:
+            bag = None if self.record is None else stack.enter_context(dds.BagWriter(self.record))
+            node = dds.Node(
+                controller, dds.Endpoints(self.domain, self.loopback or None), None if bag is None else bag.add
+            )
+            for number in (signal.SIGINT, signal.SIGTERM):
+                stack.callback(signal.signal, number, signal.signal(number, lambda *_: stop.set()))
+            if self.duration is not None:
+                timer = threading.Timer(self.duration, stop.set)
+                stack.callback(timer.cancel)
+                timer.start()
+            print(f"osik ros2: {1.0 / controller.dt:g} Hz, targets of {', '.join(controller.frames)}", flush=True)
+            node.run(stop)
+        print(f"osik ros2: {node.periods} periods, {node.missed} missed")
+        return 0

@@ -1,0 +1,280 @@
+"""The control loop without its messages' transport: what one period makes of what was received."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from ..._errors import OsikValueError, unknown_name
+from ...control import Clutch
+from ...robot import Robot
+from ...solvers import Status
+from ._joints import JointNames, Refused, joint_names, pose_of, stamp_of
+from ._settings import Settings, topic_of_frame
+from ._steps import Steps
+
+Phase = Literal["waiting", "moving", "holding"]
+OK, WARN, ERROR = 0, 1, 2
+_NEVER = np.iinfo(np.int64).min // 2
+_SHOWN_NS = 1_000_000_000
+"""Time for which a refused message is told [ns]."""
+
+
+class Received(NamedTuple):
+    """A message that came in.
+
+    Attributes:
+        kind: what it is for.
+        frame: the frame of a target or clutch; empty for joint states.
+        time_ns: when it was received, by the clock of stamps [ns].
+        message: JointState, PoseStamped or Bool, of any library: its attributes are read.
+    """
+
+    kind: Literal["state", "target", "clutch"]
+    frame: str
+    time_ns: int
+    message: Any
+
+
+class Command(NamedTuple):
+    """Positions and velocities that joints are sent.
+
+    Attributes:
+        names: ROS names. (n,)
+        positions: [rad or m]. (n,)
+        velocities: [rad/s or m/s]. (n,)
+    """
+
+    names: tuple[str, ...]
+    positions: np.ndarray
+    velocities: np.ndarray
+
+
+class Output(NamedTuple):
+    """What a period sends: a command once the robot was seen whole, and the state of the controller.
+
+    Attributes:
+        command: None until every joint was measured.
+        phase: whether it waits for the first states, moves, or holds because states stopped.
+        level: 0 OK, 1 WARN, 2 ERROR, as in a DiagnosticStatus.
+        message: one sentence.
+        values: what there is to know, by name.
+    """
+
+    command: Command | None
+    phase: Phase
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """What a period leaves for the next one.
+
+    Attributes:
+        measured: position of each joint [rad or m], NaN until it is measured. (n,)
+        measured_ns: when that was received. (n,)
+        stamps_ns: last stamps, by joint (as arrays (n,)) under ``""``, and by frame.
+        targets: target of each frame, world axes.
+        devices: pose of each held device, and when it was received.
+        pressed: whether the clutch of a frame is pressed.
+        clutches: of each frame.
+        unknown: names that came and that no joint has.
+        refused: number of refused messages, the time of the last one and the reason.
+        phase: see ``Output``.
+        q: the commanded configuration; None before the start. (nq,)
+        velocity: the last one. (nv,)
+        warm_start, tasks, poses: of ``Steps``.
+    """
+
+    measured: np.ndarray
+    measured_ns: np.ndarray
+    stamps_ns: Mapping[str, Any]
+    targets: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    devices: Mapping[str, tuple[int, Any]] = dataclasses.field(default_factory=dict)
+    pressed: Mapping[str, bool] = dataclasses.field(default_factory=dict)
+    clutches: Mapping[str, Clutch] = dataclasses.field(default_factory=dict)
+    unknown: frozenset[str] = frozenset()
+    refused: tuple[int, int, str] = (0, _NEVER, "")
+    phase: Phase = "waiting"
+    q: Any = None
+    velocity: Any = None
+    warm_start: Any = None
+    tasks: Any = None
+    poses: Any = None
+
+
+class Controller:
+    """A robot's control loop as a function of what was received, for ``osik ros2`` and for bags that are replayed.
+
+        memory = controller.memory()
+        memory, output = controller.tick(memory, now_ns, received)
+
+    Every state is of a joint by its name. It begins at the measured configuration once all joints were measured, and
+    again after each time that it held: targets from before then are forgotten, and frames stay until new ones come.
+    Between, it integrates its own velocities, within all limits, and waits where the robot does not follow.
+
+    Args:
+        robot: the robot; None where the settings name a controller's file.
+        settings: the settings.
+
+    Raises:
+        FileNotFoundError, KeyError, TypeError, ValueError: see ``Steps`` and ``joint_names``; frames that share a
+            topic; joints of a Float64MultiArray that are not the robot's, each once.
+    """
+
+    def __init__(self, robot: Robot | None, settings: Settings):
+        self.settings, self.steps = settings, Steps(robot, settings)
+        self.robot, self.dt = self.steps.robot, self.steps.dt
+        self.joints: JointNames = joint_names(self.robot, settings)
+        self.frames = tuple(self.steps.task_names)
+        self.order = self._order()
+        topics = [topic_of_frame("", frame) for frame in self.frames]
+        shared = [frame for frame, topic in zip(self.frames, topics, strict=True) if topics.count(topic) > 1]
+        if shared:
+            raise OsikValueError(f"these frames have one topic name; lead one of them: {', '.join(shared)}")
+        self._rehearse()
+
+    def _rehearse(self) -> None:
+        """Go through a start and a step with a press of the clutch, so that nothing is compiled while a robot moves."""
+        memory = dataclasses.replace(self.memory(), measured=np.asarray(self.robot.q0)[self.joints.index])
+        devices = {frame: (0, (np.zeros(3), np.eye(3))) for frame in self.frames} if self.settings.clutch else {}
+        self._moved(dataclasses.replace(self._begun(memory), devices=devices), 0)
+
+    def _order(self) -> np.ndarray:
+        """Return the place of each commanded joint."""
+        names, wanted = self.joints.names, self.settings.joints
+        for name in wanted:
+            if name not in names:
+                raise unknown_name("joint", name, names)
+        if wanted and sorted(wanted) != sorted(set(wanted)):
+            raise OsikValueError("the setting joints names a joint twice")
+        return np.array([names.index(name) for name in wanted or names], int)
+
+    def memory(self) -> Memory:
+        """Return the memory of a controller that has seen nothing."""
+        count = len(self.joints.names)
+        return Memory(np.full(count, np.nan), np.full(count, _NEVER), {"": np.full(count, _NEVER)})
+
+    def tick(self, memory: Memory, now_ns: int, received: Sequence[Received]) -> tuple[Memory, Output]:
+        """Return the memory and the output after one period.
+
+        Args:
+            memory: that of the last period.
+            now_ns: time now, by the clock of stamps [ns].
+            received: the messages since the last period, in the order in which they came.
+        """
+        for item in received:
+            try:
+                memory = self._take(memory, item)
+            except Refused as reason:
+                count = memory.refused[0] + 1
+                memory = dataclasses.replace(memory, refused=(count, item.time_ns, str(reason)))
+        if (now_ns - memory.measured_ns > self.settings.state_timeout * 1e9).any():
+            return self._without_states(memory, now_ns)
+        if memory.phase != "moving":
+            memory = self._begun(memory)
+        behind = np.abs(np.asarray(memory.q)[self.joints.index] - memory.measured)
+        if behind.max() > self.settings.following_error:
+            memory = dataclasses.replace(memory, velocity=np.zeros(self.robot.nv))
+            late = self.joints.names[int(behind.argmax())]
+            return memory, self._output(memory, now_ns, WARN, f"joint {late} does not follow: the command waits")
+        memory, status = self._moved(memory, now_ns)
+        level, text = (OK, "moving") if status == Status.SOLVED else (WARN, f"the step is {Status(status).name}")
+        return memory, self._output(memory, now_ns, level, text)
+
+    def _take(self, memory: Memory, item: Received) -> Memory:
+        if item.kind == "clutch":
+            return dataclasses.replace(memory, pressed={**memory.pressed, item.frame: bool(item.message.data)})
+        stamp = stamp_of(item.message, item.time_ns, self.settings)
+        if item.kind == "state":
+            return self._take_state(memory, item, stamp)
+        if stamp <= memory.stamps_ns.get(item.frame, _NEVER):
+            raise Refused(f"a target of {item.frame} is not newer than the last one")
+        pose = pose_of(item.message)
+        memory = dataclasses.replace(memory, stamps_ns={**memory.stamps_ns, item.frame: stamp})
+        if self.settings.clutch:
+            return dataclasses.replace(memory, devices={**memory.devices, item.frame: (item.time_ns, pose)})
+        if memory.phase != "moving":
+            raise Refused(f"a target of {item.frame} came while the robot was not moving")
+        target = self._in_world(memory, item.message.header.frame_id, pose)
+        return dataclasses.replace(memory, targets={**memory.targets, item.frame: target})
+
+    def _take_state(self, memory: Memory, item: Received, stamp: int) -> Memory:
+        places, positions, unknown = self.joints.read(item.message)
+        memory = dataclasses.replace(memory, unknown=memory.unknown | set(unknown))
+        if (stamp <= memory.stamps_ns[""][places]).any():
+            raise Refused("a joint state is not newer than the last one")
+        measured, times, stamps = memory.measured.copy(), memory.measured_ns.copy(), memory.stamps_ns[""].copy()
+        measured[places], times[places], stamps[places] = positions, item.time_ns, stamp
+        stamps_ns = {**memory.stamps_ns, "": stamps}
+        return dataclasses.replace(memory, measured=measured, measured_ns=times, stamps_ns=stamps_ns)
+
+    def _in_world(self, memory: Memory, frame_id: str, pose: Any) -> Any:
+        """Return a pose that is given in a frame as one in the world."""
+        if frame_id == self.settings.world_frame:
+            return pose
+        if frame_id not in self.steps.references:
+            known = ", ".join(dict.fromkeys((self.settings.world_frame, *self.steps.references)))
+            raise Refused(f"a target's frame_id is {frame_id!r}; it is one of {known}")
+        position, rotation = (np.asarray(part) for part in memory.poses[frame_id])
+        return position + rotation @ pose[0], rotation @ pose[1]
+
+    def _without_states(self, memory: Memory, now_ns: int) -> tuple[Memory, Output]:
+        late = now_ns - memory.measured_ns > self.settings.state_timeout * 1e9
+        names = ", ".join(name for name, is_late in zip(self.joints.names, late, strict=True) if is_late)
+        if memory.phase == "waiting":
+            return memory, self._output(memory, now_ns, WARN, f"waiting for states of {names}")
+        memory = dataclasses.replace(memory, phase="holding", velocity=np.zeros(self.robot.nv))
+        return memory, self._output(memory, now_ns, ERROR, f"holding: no new state of {names}")
+
+    def _begun(self, memory: Memory) -> Memory:
+        """Return the memory at rest in the measured configuration, with frames that stay where they are."""
+        q = np.array(self.robot.q0)
+        q[self.joints.index] = memory.measured
+        q, tasks, poses = self.steps.begin(q)
+        targets = {frame: poses[frame] for frame in self.frames}
+        scale = self.settings.clutch_scale
+        clutches = {f: Clutch(poses[f], scale=scale) for f in self.frames} if self.settings.clutch else {}
+        return dataclasses.replace(
+            memory,
+            phase="moving",
+            q=q,
+            velocity=np.zeros(self.robot.nv),
+            warm_start=self.steps.no_warm_start,
+            tasks=tasks,
+            poses=poses,
+            targets=targets,
+            clutches=clutches,
+        )
+
+    def _moved(self, memory: Memory, now_ns: int) -> tuple[Memory, int]:
+        """Return the memory after one control step, and its status."""
+        targets, clutches = dict(memory.targets), dict(memory.clutches)
+        for frame, (time_ns, device) in memory.devices.items():
+            tracked = now_ns - time_ns <= self.settings.state_timeout * 1e9
+            pressed = memory.pressed.get(frame, False) and tracked
+            clutches[frame], targets[frame] = clutches[frame].step(pressed, device, memory.poses[frame])
+        step = self.steps.advance(memory.q, memory.velocity, memory.warm_start, memory.tasks, targets)
+        new = dict(q=step.q, velocity=step.velocity, warm_start=step.warm_start, poses=step.poses)
+        return dataclasses.replace(memory, targets=targets, clutches=clutches, **new), int(step.status)
+
+    def _output(self, memory: Memory, now_ns: int, level: int, message: str) -> Output:
+        count, refused_ns, reason = memory.refused
+        if now_ns - refused_ns <= _SHOWN_NS:
+            level, message = max(level, WARN), f"{message}; refused: {reason}"
+        if memory.unknown:
+            level, message = max(level, WARN), f"{message}; unknown joints: {', '.join(sorted(memory.unknown))}"
+        values = {"phase": memory.phase, "refused messages": str(count), "last refusal": reason}
+        command = None
+        if memory.q is not None:
+            positions = np.asarray(memory.q)[self.joints.index]
+            values["largest following error"] = f"{np.abs(positions - memory.measured).max():.4g}"
+            names = tuple(self.joints.names[place] for place in self.order)
+            velocities = np.asarray(memory.velocity)[self.joints.dofs]
+            command = Command(names, positions[self.order], velocities[self.order])
+        return Output(command, memory.phase, level, message, values)

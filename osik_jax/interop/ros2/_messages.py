@@ -1,0 +1,117 @@
+"""The ROS 2 messages that are spoken, made from their definitions in ROS 2's own language.
+
+ROS 2 serialises a message as plain CDR (XCDR1, final types) under the type name ``package::msg::dds_::Name_``.
+"""
+
+from __future__ import annotations
+
+import types
+from dataclasses import dataclass, field
+from typing import Any
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import types as idl
+from cyclonedds.idl.annotations import final
+
+_DEFINITIONS = {
+    "builtin_interfaces/Time": "int32 sec, uint32 nanosec",
+    "builtin_interfaces/Duration": "int32 sec, uint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp, string frame_id",
+    "std_msgs/Bool": "bool data",
+    "std_msgs/MultiArrayDimension": "string label, uint32 size, uint32 stride",
+    "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim, uint32 data_offset",
+    "std_msgs/Float64MultiArray": "std_msgs/MultiArrayLayout layout, float64[] data",
+    "sensor_msgs/JointState": (
+        "std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort"
+    ),
+    "geometry_msgs/Point": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Quaternion": "float64 x, float64 y, float64 z, float64 w",
+    "geometry_msgs/Pose": "geometry_msgs/Point position, geometry_msgs/Quaternion orientation",
+    "geometry_msgs/PoseStamped": "std_msgs/Header header, geometry_msgs/Pose pose",
+    "trajectory_msgs/JointTrajectoryPoint": (
+        "float64[] positions, float64[] velocities, float64[] accelerations, float64[] effort, "
+        "builtin_interfaces/Duration time_from_start"
+    ),
+    "trajectory_msgs/JointTrajectory": (
+        "std_msgs/Header header, string[] joint_names, trajectory_msgs/JointTrajectoryPoint[] points"
+    ),
+    "diagnostic_msgs/KeyValue": "string key, string value",
+    "diagnostic_msgs/DiagnosticStatus": (
+        "byte level, string name, string message, string hardware_id, diagnostic_msgs/KeyValue[] values"
+    ),
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header, diagnostic_msgs/DiagnosticStatus[] status",
+}
+"""Fields of each type, in their order; types of fields come before those that have them. Constants are left out."""
+_PLAIN: dict[str, tuple[Any, Any]] = {
+    "bool": (bool, bool),
+    "byte": (idl.byte, int),
+    "int32": (idl.int32, int),
+    "uint32": (idl.uint32, int),
+    "float64": (idl.float64, float),
+    "string": (str, str),
+}
+"""Type of DDS and maker of the default."""
+_TYPES: dict[str, Any] = {}
+
+
+def _made(name: str) -> Any:
+    """Return the class of a type: a dataclass with zeros, empty text and empty lists as defaults."""
+    package, _, short = name.partition("/")
+    namespace: dict[str, Any] = {"__doc__": f"{name} of ROS 2.", "__annotations__": {}, "__module__": __name__}
+    for text, own in _fields(name):
+        kind, empty = _PLAIN.get(text.removesuffix("[]")) or (_TYPES[text.removesuffix("[]")],) * 2
+        listed = text.endswith("[]")
+        namespace["__annotations__"][own] = idl.sequence[kind] if listed else kind
+        namespace[own] = field(default_factory=list if listed else empty)
+    options = {"typename": f"{package}::msg::dds_::{short}_"}
+    return dataclass(final(types.new_class(short, (IdlStruct,), options, lambda body: body.update(namespace))))
+
+
+def _fields(name: str) -> list[tuple[str, str]]:
+    return [(text, own) for text, own in (part.split() for part in _DEFINITIONS[name].split(", "))]
+
+
+for _name in _DEFINITIONS:
+    _TYPES[_name] = _made(_name)
+
+Bool: Any = _TYPES["std_msgs/Bool"]
+DiagnosticArray: Any = _TYPES["diagnostic_msgs/DiagnosticArray"]
+DiagnosticStatus: Any = _TYPES["diagnostic_msgs/DiagnosticStatus"]
+Duration: Any = _TYPES["builtin_interfaces/Duration"]
+Float64MultiArray: Any = _TYPES["std_msgs/Float64MultiArray"]
+Header: Any = _TYPES["std_msgs/Header"]
+JointState: Any = _TYPES["sensor_msgs/JointState"]
+JointTrajectory: Any = _TYPES["trajectory_msgs/JointTrajectory"]
+JointTrajectoryPoint: Any = _TYPES["trajectory_msgs/JointTrajectoryPoint"]
+KeyValue: Any = _TYPES["diagnostic_msgs/KeyValue"]
+MultiArrayDimension: Any = _TYPES["std_msgs/MultiArrayDimension"]
+MultiArrayLayout: Any = _TYPES["std_msgs/MultiArrayLayout"]
+Point: Any = _TYPES["geometry_msgs/Point"]
+Pose: Any = _TYPES["geometry_msgs/Pose"]
+PoseStamped: Any = _TYPES["geometry_msgs/PoseStamped"]
+Quaternion: Any = _TYPES["geometry_msgs/Quaternion"]
+Time: Any = _TYPES["builtin_interfaces/Time"]
+
+
+def ros_name(kind: Any) -> str:
+    """Return the name that ROS 2 has for a type, such as ``sensor_msgs/msg/JointState``."""
+    return _short_name(kind).replace("/", "/msg/")
+
+
+def definition(kind: Any) -> str:
+    """Return the definition of a type in ROS 2's own language, those of its fields' types after it."""
+    parts, names = [], [_short_name(kind)]
+    for name in names:  # grows
+        fields = _fields(name)
+        names += [text for text in dict.fromkeys(t.removesuffix("[]") for t, _ in fields) if _is_new(text, names)]
+        head = f"MSG: {name}\n" if parts else ""
+        parts.append(head + "".join(f"{text} {own}\n" for text, own in fields))
+    return (("=" * 80) + "\n").join(parts)
+
+
+def _is_new(name: str, names: list[str]) -> bool:
+    return name in _DEFINITIONS and name not in names
+
+
+def _short_name(kind: Any) -> str:
+    return next(name for name, own in _TYPES.items() if own is kind)

@@ -1,0 +1,13 @@
+"""Nodes over DDS, their messages, and bags. Needs the extra ``ros2``."""
+
+try:
+    from . import _messages as messages
+    from ._bag import BagWriter as BagWriter
+    from ._bag import Replay as Replay
+    from ._bag import replay as replay
+    from ._node import Endpoints as Endpoints
+    from ._node import Node as Node
+except ImportError as missing:
+    raise ImportError("ROS 2 topics need cyclonedds and mcap: pip install 'osik-jax[ros2]'") from missing
+
+__all__ = ["BagWriter", "Endpoints", "Node", "Replay", "messages", "replay"]

@@ -1,0 +1,239 @@
+"""``osik ros2`` over DDS on this machine, and its messages byte for byte beside those of rosbags.
+
+A second process plays the robot in MuJoCo (``ros2_robot.py``), and is killed.
+"""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax import cli
+from osik_jax.interop.ros2 import Controller, Settings
+
+pytest.importorskip("cyclonedds")
+dds = pytest.importorskip("osik_jax.interop.ros2.dds")
+msg = dds.messages
+
+ROBOT = Path(__file__).parent / "ros2_robot.py"
+COMMANDS = "/joint_trajectory_controller/joint_trajectory"
+
+
+def examples():
+    """A message of each type with every field filled, and lengths that need padding."""
+    head = msg.Header(msg.Time(1_700_000_000, 987_654_321), "wörld")
+    pose = msg.Pose(msg.Point(0.1, -2.0, 1e-300), msg.Quaternion(0.1, 0.2, 0.3, 0.9))
+    point = msg.JointTrajectoryPoint([0.1, np.pi], [1.0, -0.0], [], [3.0], msg.Duration(-1, 5_000_000))
+    layout = msg.MultiArrayLayout([msg.MultiArrayDimension("a,b", 2, 2)], 0)
+    status = [
+        msg.DiagnosticStatus(level, "osik", "x" * level, "arm", [msg.KeyValue("k", "v")] * level) for level in range(4)
+    ]
+    return [
+        msg.JointState(head, ["a", "bc", ""], [0.1, 2.0, -1e9], [], [np.inf]),
+        msg.JointState(),
+        msg.PoseStamped(head, pose),
+        msg.JointTrajectory(head, ["joint1", "j"], [point, msg.JointTrajectoryPoint()]),
+        msg.Float64MultiArray(layout, [1.0, 2.0]),
+        msg.DiagnosticArray(head, status),
+        msg.Bool(True),
+    ]
+
+
+def as_rosbags(store, message):
+    """The message in rosbags' own classes, field by field."""
+    values = {}
+    for name, value in vars(message).items():
+        if isinstance(value, list):
+            nested = bool(value) and hasattr(value[0], "__idl_typename__")
+            texts = not value and name in ("name", "joint_names", "status", "values", "points", "dim")
+            if nested:
+                value = [as_rosbags(store, part) for part in value]
+            elif not texts and not (value and isinstance(value[0], str)):
+                value = np.array(value, np.float64)
+        elif hasattr(value, "__idl_typename__"):
+            value = as_rosbags(store, value)
+        values[name] = value
+    return store.types[msg.ros_name(type(message))](**values)
+
+
+@pytest.mark.parametrize("release", ["ROS2_HUMBLE", "ROS2_JAZZY"])
+@pytest.mark.parametrize("message", examples(), ids=lambda message: type(message).__name__)
+def test_bytes_are_those_of_rosbags(message, release):
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores[release])
+    name = msg.ros_name(type(message))
+    theirs = bytes(store.serialize_cdr(as_rosbags(store, message), name))
+    assert message.serialize() == theirs
+    assert type(message).deserialize(theirs) == message
+    big = bytes(store.serialize_cdr(as_rosbags(store, message), name, little_endian=False))
+    assert type(message).deserialize(big) == message
+
+
+@pytest.mark.parametrize("kind", {type(message) for message in examples()}, ids=lambda kind: kind.__name__)
+def test_definitions_in_bags_are_those_of_rosbags(kind):
+    """By the hash that ROS has of a definition, where constants do not count for the bytes and are left out of both."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    theirs, _ = store.generate_msgdef(msg.ros_name(kind), ros_version=2)
+    theirs = re.sub(r"^byte (OK|WARN|ERROR|STALE)=\d\n", "", theirs, flags=re.MULTILINE)
+    assert sorted(msg.definition(kind).split("=" * 80 + "\n")) == sorted(theirs.split("=" * 80 + "\n"))
+
+
+def test_type_and_topic_names_are_those_of_ros_2():
+    assert msg.JointState.__idl_typename__ == "sensor_msgs::msg::dds_::JointState_"
+    assert msg.ros_name(msg.JointTrajectoryPoint) == "trajectory_msgs/msg/JointTrajectoryPoint"
+
+
+class Session:
+    """``osik ros2`` and a robot as processes; this one gives a target and listens."""
+
+    def __init__(self, folder: Path, seconds: float, rate: float = 200.0):
+        domain = 100 + os.getpid() % 100
+        self.bag = folder / "bag.mcap"
+        (folder / "settings.toml").write_text(f"rate = {rate}\n")
+        command = [
+            sys.executable,
+            "-m",
+            "osik_jax.cli",
+            "ros2",
+            "--robot",
+            "arm7",
+            "--config",
+            folder / "settings.toml",
+        ]
+        options = ["--domain", str(domain), "--loopback", "--record", self.bag]
+        robot = subprocess.Popen([sys.executable, ROBOT, str(domain), str(rate)])
+        node = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True)
+        try:
+            self._listen(domain, seconds, robot, node)
+        finally:
+            robot.kill()
+            robot.wait()
+            if node.poll() is None:
+                node.send_signal(signal.SIGINT)
+            self.said = node.communicate(timeout=20)[0]
+        self.exit_code = node.returncode
+
+    def _listen(self, domain, seconds, robot, node):
+        endpoints = dds.Endpoints(domain, True)
+        # as a node with ROS 2's default settings
+        self.commands, commands = [], endpoints.reader(COMMANDS, msg.JointTrajectory, reliable=True)
+        self.states, states = [], endpoints.reader("/joint_states", msg.JointState, reliable=True)
+        self.told, told = [], endpoints.reader("/diagnostics", msg.DiagnosticArray, reliable=True)
+        targets = endpoints.writer("/osik/targets/hand", msg.PoseStamped)
+        assert node.stdout is not None and "targets of hand" in node.stdout.readline()
+        asked, began, killed = time.monotonic(), 0.0, 0.0
+        while not began:  # the robot may be the last to be there
+            began = time.monotonic() if commands.read(N=1) else 0.0
+            assert time.monotonic() - asked < 60.0, "no command has come"
+            time.sleep(0.01)
+        while not killed or time.monotonic() - killed < 0.7:
+            now = time.monotonic() - began
+            self.commands += [m for m in commands.take(N=100) if isinstance(m, msg.JointTrajectory)]
+            self.states += [m for m in states.take(N=100) if isinstance(m, msg.JointState)]
+            self.told += [m.status[0] for m in told.take(N=100) if isinstance(m, msg.DiagnosticArray)]
+            if now > 0.5:
+                turn = [0.0, 1.0, 0.0, 0.0]
+                place = [0.45, 0.25 * float(np.sin(2.0 * now)), 0.5]
+                stamp = msg.Time(*divmod(time.time_ns(), 1_000_000_000))
+                pose = msg.Pose(msg.Point(*place), msg.Quaternion(*turn))
+                targets.write(msg.PoseStamped(msg.Header(stamp, "world"), pose))
+            if now > seconds and not killed:
+                robot.kill()
+                killed, self.killed_ns = time.monotonic(), time.time_ns()
+            time.sleep(0.01)
+
+    def recorded(self):
+        """Times [s] since the robot was killed, positions (n, 7) and velocities (n, 7) of all commands in the bag."""
+        from osik_jax.interop.ros2._bag import _messages
+
+        found = list(_messages(self.bag, {COMMANDS: msg.JointTrajectory}))
+        times = np.array([time_ns - self.killed_ns for _, time_ns, _ in found]) * 1e-9
+        points = [message.points[0] for _, _, message in found]
+        return times, np.array([p.positions for p in points]), np.array([p.velocities for p in points])
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    return Session(tmp_path_factory.mktemp("ros2"), seconds=3.0)
+
+
+def test_a_robot_in_another_process_follows_targets_by_name(session):
+    assert session.exit_code == 0
+    assert session.commands[-1].joint_names == [f"joint{number}" for number in range(1, 8)]
+    assert session.states[-1].name == [f"joint{number}" for number in range(7, 0, -1)]
+    arm = osik.load_robot("arm7")
+    last = dict(zip(session.states[-1].name, session.states[-1].position, strict=True))
+    hand = osik.frame_pose(arm, osik.forward_kinematics(arm, arm.configuration(last)), "hand")[0]
+    np.testing.assert_allclose(hand[[0, 2]], [0.45, 0.5], atol=0.05)
+    assert np.ptp([m.points[0].positions[0] for m in session.commands]) > 0.2
+
+
+def test_it_starts_where_the_robot_is_and_keeps_its_limits(session):
+    from ros2_robot import START
+
+    _, q, _ = session.recorded()
+    np.testing.assert_allclose(q[0], START, atol=2e-3)
+    speed = np.diff(q, axis=0) * 200.0
+    assert np.abs(speed).max() <= 1.0 + 1e-9 and np.abs(speed).max() > 0.3
+
+
+def test_a_robot_that_is_killed_is_held_within_100_ms(session):
+    times, q, velocity = session.recorded()
+    moving = np.abs(velocity).max(1) > 0.0
+    assert (moving[times < 0.0]).mean() > 0.5
+    held = times[moving].max()
+    assert held + 0.02 >= 0.0 and held <= 0.1
+    still = q[times > 0.1]
+    assert len(still) > 30 and np.ptp(still, axis=0).max() == 0.0
+    last = session.told[-1]
+    assert last.level == 2 and last.message.startswith("holding: no new state of joint1")
+    assert {"phase", "periods", "missed periods", "refused messages"} <= {value.key for value in last.values}
+
+
+def test_a_bag_gives_the_same_commands_again_to_the_last_bit(session, capsys):
+    found = dds.replay(Controller(osik.load_robot("arm7"), Settings()), session.bag)
+    assert len(found.recorded) > 300 and np.ptp(found.recorded, axis=0).max() > 0.2
+    assert found.difference == 0.0
+    assert cli.main(["ros2", "--robot", "arm7", "--replay", str(session.bag)]) == 0
+    assert "largest difference 0;" in capsys.readouterr().out
+    other = Controller(osik.load_robot("arm7"), Settings(speed=0.3))
+    assert dds.replay(other, session.bag).difference > 0.01
+
+
+def test_another_reader_reads_the_bag(session):
+    decoder = pytest.importorskip("mcap_ros2.decoder")
+    from mcap.reader import make_reader
+
+    with open(session.bag, "rb") as file:
+        reader = make_reader(file, decoder_factories=[decoder.DecoderFactory()])
+        found = {channel.topic: message for _, channel, _, message in reader.iter_decoded_messages()}
+    assert set(found) == {"/joint_states", "/osik/targets/hand", COMMANDS}
+    assert list(found["/joint_states"].name) == session.states[-1].name
+    assert found["/osik/targets/hand"].pose.position.x == 0.45
+
+
+@pytest.mark.slow
+def test_a_minute_at_200_hz_misses_at_most_one_period_in_200(tmp_path):
+    session = Session(tmp_path, seconds=60.0)
+    periods, missed = map(int, re.findall(r"(\d+) periods, (\d+) missed", session.said)[0])
+    print(json.dumps({"periods": periods, "missed": missed}))
+    assert periods > 11_900 and missed <= 0.005 * periods
+    times, _, velocity = session.recorded()
+    assert times[np.abs(velocity).max(1) > 0.0].max() <= 0.1
+
+
+def test_what_is_no_bag_is_told_in_one_line(tmp_path, capsys):
+    (tmp_path / "a.mcap").write_bytes(b"nothing of the kind")
+    assert cli.main(["ros2", "--robot", "arm7", "--replay", str(tmp_path / "a.mcap")]) == 2
+    assert "is no MCAP file" in capsys.readouterr().err
+    assert cli.main(["ros2"]) == 2
+    assert "give --robot, or a controller" in capsys.readouterr().err
