@@ -173,7 +173,7 @@ def test_a_robot_in_another_process_follows_targets_by_name(session):
     arm = osik.load_robot("arm7")
     last = dict(zip(session.states[-1].name, session.states[-1].position, strict=True))
     hand = osik.frame_pose(arm, osik.forward_kinematics(arm, arm.configuration(last)), "hand")[0]
-    np.testing.assert_allclose(hand[[0, 2]], [0.45, 0.5], atol=0.05)
+    np.testing.assert_allclose(np.asarray(hand)[[0, 2]], [0.45, 0.5], atol=0.05)
     assert np.ptp([m.points[0].positions[0] for m in session.commands]) > 0.2
 
 
@@ -225,10 +225,11 @@ def test_another_reader_reads_the_bag(session):
 def test_a_minute_at_200_hz_misses_at_most_one_period_in_200(tmp_path):
     session = Session(tmp_path, seconds=60.0)
     periods, missed = map(int, re.findall(r"(\d+) periods, (\d+) missed", session.said)[0])
-    print(json.dumps({"periods": periods, "missed": missed}))
-    assert periods > 11_900 and missed <= 0.005 * periods
     times, _, velocity = session.recorded()
-    assert times[np.abs(velocity).max(1) > 0.0].max() <= 0.1
+    held = times[np.abs(velocity).max(1) > 0.0].max()
+    print(json.dumps({"periods": periods, "missed": missed, "held after [ms]": round(1e3 * held, 1)}))
+    assert periods > 11_900 and missed <= 0.005 * periods
+    assert held <= 0.1
 
 
 def test_what_is_no_bag_is_told_in_one_line(tmp_path, capsys):

@@ -128,7 +128,7 @@ def _made(kind: Any, table: Any, what: str) -> Any:
     for name, value in table.items():
         if name not in fields:
             raise unknown_name(what, name, tuple(fields))
-        expected, fits = _CHECKS.get(fields[name], ("", lambda _: True))
+        expected, fits = _CHECKS.get(str(fields[name]), ("", lambda _: True))
         if not fits(value):
             raise OsikTypeError(f"{name} is {value!r}; it is {expected}")
     return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in table.items()})

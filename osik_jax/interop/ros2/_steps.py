@@ -129,7 +129,7 @@ def _default_tasks(robot: Robot, settings: Settings) -> tuple[dict[str, Task], t
     for frame in frames:
         if frame in tasks:
             raise OsikValueError(f"{frame!r} stands on the ground and is to be led: name it in support or in frames")
-        weights = dict(position_weight=_POSITION, orientation_weight=_ORIENTATION)
+        weights: Any = dict(position_weight=_POSITION, orientation_weight=_ORIENTATION)
         tasks[frame] = FrameTask(robot, frame, gain=_GAIN, **weights)
     return tasks | {"posture": PostureTask(robot, gain=1.0, weight=background_weight(robot))}, tuple(frames)
 
