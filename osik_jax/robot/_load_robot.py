@@ -27,8 +27,9 @@ def load_robot(
 ) -> Robot:
     """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
 
-    ``"g1"`` (Unitree's, 29 joints) and ``"talos"`` (PAL's) are URDFs of the package example-robot-data, where that is
-    installed, else of robot_descriptions. Every command of ``osik`` takes the same names.
+    ``"g1"``, ``"talos"``, ``"go2"`` (floating base), ``"ur5"``, ``"panda"``, ``"xarm7"``, ``"so101"``, ``"baxter"``,
+    ``"tiago"`` and ``"allegro"`` (fixed base) are URDFs of the package example-robot-data, which has to be installed.
+    Without it, ``"g1"`` and ``"talos"`` are taken from robot_descriptions. All commands of ``osik`` take these names.
 
     Any other name is one of the package robot_descriptions (the extra ``descriptions``): MuJoCo Menagerie as
     ``panda_mj_description``, ``g1_mj_description`` and so on, URDFs as ``panda_description``. That package clones the
@@ -47,7 +48,7 @@ def load_robot(
         KeyError: no such robot; the message lists those with names like it, and of a path says what reads files. No
             such joint or keyframe.
         ImportError: the robot is one of robot_descriptions, which is not installed.
-        FileNotFoundError: the robot is ``"g1"`` or ``"talos"``, and neither package is installed.
+        FileNotFoundError: the robot's URDF comes with a package that is not installed.
         ValueError: the robot comes as xacro alone, its file cannot be read, or ``home`` does not fit.
 
     Warns:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +13,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from ..collision import CollisionShape
 from ..robot import Robot
 from ._animate import paint_over
+from ._fixed import fixed_parts
 from ._look import Look
 from ._mujoco import mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
 from ._overlay import Canvas, ComMark, polygon_layer
 from ._parts import robot_parts
-from ._scene import INK
+from ._scene import BLUE, INK
 from ._stage import Camera, Stage, frame_camera
 
 SCHEME_COLORS = ("#f08c3a", "#8a8f98", "#1565c0", "#2a9d62", "#7b3fa0")
@@ -180,6 +182,8 @@ def hero_picture(
     configurations: Sequence[Float[np.ndarray, " nq"]],
     *,
     support: Sequence[Float[np.ndarray, "m 2"]] | None = None,
+    shapes: Iterable[CollisionShape] = (),
+    paths: Iterable[Float[np.ndarray, "n 3"]] = (),
     labels: Sequence[str] = (),
     look: Look | None = None,
     spacing: float | None = None,
@@ -195,9 +199,11 @@ def hero_picture(
         robot: the robot.
         configurations: one a figure, left to right. Each (nq,)
         support: of each, the vertices of its support polygon [m]; with it the centre of mass is drawn.
+        shapes: of the world, drawn with each figure: spheres, capsules, boxes and cylinders.
+        paths: points in the world [m], drawn with each figure as lines. Each (n, 3)
         labels: a line below each.
         look: what the robot's URDF shows, from ``read_look``.
-        spacing: between neighbours' middles [m]; ``None``: a little more than the widest is wide.
+        spacing: between neighbours' middles [m]; ``None``: a little more than the widest is wide; 0: all in one place.
         size: width and height [pixels].
         azimuth: of the camera about the vertical, 0 from +x [deg].
         elevation: of the camera above the horizon [deg].
@@ -208,17 +214,21 @@ def hero_picture(
     floor = floor_height(robot, shape, sources)
     corners = [shape.corners(source) for source in sources]
     shifts = _side_by_side(corners, azimuth, spacing)
-    seen = [points + shift for points, shift in zip(corners, shifts, strict=True)]
+    fixed, lines = fixed_parts(shapes), [np.asarray(path, float) for path in paths]
+    around = np.concatenate([fixed.corners(), *lines])
+    seen = [np.concatenate([points, around]) + shift for points, shift in zip(corners, shifts, strict=True)]
     window = (0.03, 0.97, 0.05, 0.90 if labels else 0.95)
     camera = frame_camera(np.concatenate(seen), size, azimuth, elevation, window, lens=_LONG_LENS)
-    stage = Stage([shape] * len(sources), camera, floor=floor)
-    data = stage.pose(sources, shifts)
+    stage = Stage([shape] * len(sources) + [fixed] * len(sources), camera, floor=floor)
+    data = stage.pose([*sources, *sources], np.concatenate([shifts, shifts]))
     drawer = make_renderer(renderer, stage, camera, size, floor=floor)
     moved = [corners + shift[:2] for corners, shift in zip(support or (), shifts, strict=False)]
     base = drawer.image(data, polygon_layer(moved, camera, size, floor=floor))
     canvas = Canvas(size, scale=size[1] / 450)
     for source, shift in zip(sources if support else (), shifts, strict=False):
         ComMark(canvas, camera, floor=floor, moving=False).place(robot_com(robot, source) + shift)
+    for points in (line + shift for shift in shifts for line in lines):
+        canvas.page.plot(*camera.project(points, size).T, color=BLUE, lw=2.2, solid_capstyle="round")
     for label, points in zip(labels, seen, strict=False):
         across = camera.project(points, size)[:, 0]
         x = 0.5 * (across.min() + across.max())
@@ -235,6 +245,8 @@ def _side_by_side(
     right = Camera((0.0, 0.0, 0.0), 1.0, azimuth, 0.0, 1.0).axes[0]
     low = np.array([(points @ right).min() for points in instants])
     high = np.array([(points @ right).max() for points in instants])
-    gap = spacing or 1.08 * float((high - low).max())
+    gap = 1.08 * float((high - low).max()) if spacing is None else spacing
+    if gap == 0.0:
+        return np.zeros((len(instants), 3))
     places = gap * (np.arange(len(instants)) - 0.5 * (len(instants) - 1))
     return (places - 0.5 * (low + high))[:, None] * right

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ..robot.loading import EXAMPLES, example_urdf
 from ..robot.loading._collada import Triangles
 from ..robot.loading._meshes import read_mesh
 from ..robot.loading._packages import Packages
@@ -69,7 +70,7 @@ def read_look(urdf: str | os.PathLike[str], *, package_dirs: Iterable[str | os.P
     shapes are taken.
 
     Args:
-        urdf: path of the file.
+        urdf: path of the file, or a name of ``load_robot`` whose URDF comes with example-robot-data, such as ``"ur5"``.
         package_dirs: as in ``Robot.from_urdf``. Last of all, the rest of a ``package://`` address is looked for in the
             folders above the file, whatever the package is called there.
 
@@ -77,7 +78,7 @@ def read_look(urdf: str | os.PathLike[str], *, package_dirs: Iterable[str | os.P
         FileNotFoundError: no such URDF.
         ValueError: the URDF is broken.
     """
-    source = read_source(urdf, "URDF")
+    source = read_source(example_urdf(str(urdf)) if str(urdf) in EXAMPLES else urdf, "URDF")
     root = parse_xml(source)
     check_root(root, "robot", source)
     return _Reader(read_urdf(root), Packages(package_dirs), source.path).look()

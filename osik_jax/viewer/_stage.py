@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ._fixed import FixedParts
 from ._parts import Part, RobotParts
 
 FLOOR_GROUP = 5
@@ -133,7 +134,7 @@ class Stage:
         colors: of each geom but the floor, red, green and blue. (geoms, 3)
     """
 
-    def __init__(self, robots: Sequence[RobotParts], camera: Camera, *, floor: float) -> None:
+    def __init__(self, robots: Sequence[RobotParts | FixedParts], camera: Camera, *, floor: float) -> None:
         """Builds the model; ``floor`` is the height of the floor [m]."""
         spec = mujoco.MjSpec()
         for robot in robots:

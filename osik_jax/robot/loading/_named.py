@@ -12,10 +12,6 @@ from ._embedded import EXAMPLES, ROBOTS, embedded
 from ._options import LoadOptions
 from ._urdf import from_urdf
 
-_URDFS = {
-    "g1": "g1_description/urdf/g1_29dof_rev_1_0.urdf",
-    "talos": "talos_data/robots/talos_full_v2.urdf",
-}
 ELSEWHERE = {"g1": "g1_mj_description", "talos": "talos_description"}
 """The same robots in robot_descriptions, taken where example-robot-data is not installed."""
 
@@ -27,11 +23,11 @@ def example_urdf(name: str) -> Path:
         KeyError: no such robot.
         FileNotFoundError: example-robot-data is not installed.
     """
-    if name not in _URDFS:
+    if name not in EXAMPLES:
         raise unknown_name("robot", name, EXAMPLES)
     for folder in sys.path:
         for share in ("cmeel.prefix/share", "share"):
-            found = Path(folder) / share / "example-robot-data" / "robots" / _URDFS[name]
+            found = Path(folder) / share / "example-robot-data" / "robots" / EXAMPLES[name][0]
             if found.is_file():
                 return found
     raise FileNotFoundError(
@@ -53,8 +49,12 @@ def named(name: str, options: LoadOptions) -> RobotModel:
     if name not in EXAMPLES:
         return described(name, options)
     try:
+        if options.floating_base is None:
+            options = options._replace(floating_base=EXAMPLES[name][1])
         return from_urdf(example_urdf(name), options)
     except FileNotFoundError as missing:
+        if name not in ELSEWHERE:
+            raise
         try:
             return described(ELSEWHERE[name], options)
         except ImportError:
