@@ -11,9 +11,8 @@ jax.config.update("jax_enable_x64", True)
 dt, tip = 0.01, "gripper_frame_link"
 arm = osik.load_robot("so101")
 
-# the encoders report an elbow 0.1 rad beyond its limit: allowed, it returns at return_speed [rad/s]
+# the elbow is measured 0.1 rad beyond its limit; accelerations are limited from rest on, so nothing jumps
 measured = jnp.zeros(arm.nq).at[2].set(arm.position_upper[2] + 0.1)
-# from rest, with limited accelerations: nothing jumps at the start
 speeds = osik.VelocityLimit(arm, velocity={"*": 1.5})
 limits = (speeds, osik.AccelerationLimit(arm, {"*": 8.0}, return_speed={"*": 0.1}))
 start = osik.forward_kinematics(arm, measured).frame_pose(arm, tip)
