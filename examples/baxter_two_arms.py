@@ -48,7 +48,7 @@ viewer.hero_picture(
     [motion.q[310]],
     look=viewer.read_look("baxter"),
     shapes=[box],
-    paths=[at[:, 0], at[:, 1]],
+    trails=[at[:, 0]],
     azimuth=35.0,
     size=(900, 600),
 )

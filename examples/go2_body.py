@@ -49,7 +49,7 @@ viewer.hero_picture(
     dog,
     [motion.q[k] for k in (0, 400, 550)],
     look=viewer.read_look("go2"),
-    paths=[where[100:, 4]],
+    trails=[where[100:, 4]] * 3,
     azimuth=30.0,
     size=(1400, 480),
 )

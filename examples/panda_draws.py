@@ -40,7 +40,7 @@ viewer.hero_picture(
     [motion.q[k] for k in (steps // 4, steps // 2, 3 * steps // 4)],
     look=viewer.read_look("panda"),
     shapes=[osik.CollisionShape.box([0.25, 0.35, 0.01], start - jnp.array([0.0, 0.0, 0.03]))],
-    paths=[drawn + jnp.array([0.0, 0.0, -0.015])],
+    trails=[drawn] * 3,
     azimuth=35.0,
     elevation=25.0,
     size=(1400, 480),

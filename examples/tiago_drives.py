@@ -45,7 +45,7 @@ viewer.hero_picture(
     [motion.q[k] for k in (0, 120, 1000)],
     look=viewer.read_look("tiago"),
     shapes=[osik.CollisionShape.sphere(0.05, goal)],
-    paths=[path[:, 0], path[:, 1]],
+    trails=[path[:, 0], path[:, 1]],
     spacing=0.0,
     azimuth=60.0,
     elevation=25.0,

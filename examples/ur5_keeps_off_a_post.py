@@ -45,7 +45,7 @@ viewer.hero_picture(
     [motion.q[k] for k in (0, 60, 400)],
     look=viewer.read_look("ur5"),
     shapes=[shapes["post"]],
-    paths=[path],
+    trails=[path] * 3,
     azimuth=40.0,
     size=(1400, 520),
 )

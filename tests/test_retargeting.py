@@ -486,7 +486,7 @@ def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
         (["none"], "no such file: none"),
         (
             ["DANCE", "--robot", "g2"],
-            "no such file: g2 (robots by name: nao, arm7, g1, talos; names of robot_descriptions",
+            "no such file: g2 (robots by name: nao, arm7, g1, talos, ",
         ),
         (["DANCE", "--smooth", "-1"], "smoothness is -1.0; it is a time in seconds, 0 or more"),
         (["DANCE", "--balance", "-0.01"], "balance is -0.01; it is a length in metres, 0 or more"),

@@ -1,6 +1,7 @@
 """Names of robots: ``load_robot`` and every command take the same ones."""
 
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -18,12 +19,12 @@ def test_every_way_loads_the_same_robot(name: str):
     for other in (read_robot(name), load_source(RobotSource(name))):
         assert other.tree == robot.tree
         np.testing.assert_array_equal(other.q0, robot.q0)
-    if robot.floating_base:
+    if name in ("nao", "g1", "talos"):
         assert _robot_to_retarget(name).tree == robot.tree
     assert RobotSource(name).python() == f"osik.load_robot({name!r})"
 
 
-@pytest.mark.parametrize("name", ["g1", "talos"])
+@pytest.mark.parametrize("name", ["g1", "talos", "ur5", "so101"])
 def test_urdfs_of_example_robot_data(name: str):
     """The same as its file, with a base as asked; the page finds the meshes' shapes."""
     robot = osik.Robot.from_urdf(example_urdf(name), floating_base=False)
@@ -39,6 +40,20 @@ def test_without_the_packages_both_are_named(monkeypatch):
         osik.load_robot("g1")
     with pytest.raises(CommandError, match="pip install example-robot-data"):
         read_robot("g1")
+    with pytest.raises(FileNotFoundError, match="the URDF of ur5 comes with example-robot-data"):
+        osik.load_robot("ur5")
+
+
+@pytest.mark.parametrize(
+    ("name", "floats"), [("g1", True), ("go2", True), ("ur5", False), ("tiago", False), ("allegro", False)]
+)
+@pytest.mark.filterwarnings("ignore:the robot does not keep:osik_jax.OsikWarning")
+def test_the_base_is_known_by_name(name, floats):
+    """No warning asks whether an arm is bolted down, and what is asked for holds."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*floating_base", category=osik.OsikWarning)
+        assert osik.load_robot(name).floating_base is floats
+    assert osik.load_robot(name, floating_base=not floats).floating_base is not floats
 
 
 def test_unknown_names_list_those_that_are_known():

@@ -389,6 +389,33 @@ def test_comparison_draws_the_curves_it_gets(tmp_path):
         assert picture.size == tuple(int(x) for x in figure.get_size_inches() * figure.dpi)
 
 
+def test_hero_picture_shows_shapes_and_trails_where_they_are(tmp_path):
+    """A ball and a line beside the arm, both in colours of their own, and all robots in one place."""
+    arm, ball = osik.load_robot("arm7"), osik.CollisionShape.sphere(0.1, [0.0, 0.8, 0.5])
+    trail = np.array([[0.0, -0.8, 0.2], [0.0, -0.8, 0.8]])
+    path = viewer.hero_picture(
+        tmp_path / "h.png", arm, [arm.q0] * 2, shapes=[ball], trails=[trail], spacing=0.0, size=(300, 135)
+    )
+    with Image.open(path) as image:
+        red, green, blue = np.moveaxis(np.asarray(image.convert("RGB"), int), -1, 0)
+    is_ball, is_trail = (red > blue + 90) & (red > green + 40), (blue > red + 90)
+    left, right = np.flatnonzero(is_trail.any(0)), np.flatnonzero(is_ball.any(0))
+    assert 0 < len(left) < 10
+    assert right.min() > 200 > 100 > left.max()
+    assert 0.5 < np.ptp(np.flatnonzero(is_ball.any(1))) / np.ptp(right) < 2.0  # round
+
+
+@pytest.mark.parametrize("shape", ["plane", "palm"])
+def test_hero_picture_refuses_what_it_cannot_draw(tmp_path, shape):
+    arm = osik.load_robot("arm7")
+    bad = {
+        "plane": osik.CollisionShape.half_space([0.0, 0.0, 0.0], [0.0, 0.0, 1.0]),
+        "palm": osik.CollisionShape.sphere(0.1, frame="hand"),
+    }[shape]
+    with pytest.raises(ValueError, match="is not drawn; shapes are spheres, capsules, boxes and cylinders"):
+        viewer.hero_picture(tmp_path / "h.png", arm, [arm.q0], shapes=[bad], size=(300, 135))
+
+
 def test_hero_picture_shows_every_instant(tmp_path, nao):
     path = viewer.hero_picture(tmp_path / "h.png", nao, [nao.q0] * 3, labels=("a", "b", "c"), size=(300, 135))
     pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)

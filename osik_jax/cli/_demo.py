@@ -28,7 +28,7 @@ class Demo:
     physics: bool = False
     """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every step."""
     robot: str | None = None
-    """A URDF or MJCF file to move instead, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
+    """A URDF or MJCF file to move instead, or a robot by name: nao, ur5, g1 and others, or of robot_descriptions."""
     base: Literal["auto", "floating", "fixed"] = "auto"
     """With --robot: whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has
     feet (or --support)."""

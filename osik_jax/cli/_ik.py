@@ -23,7 +23,7 @@ class Ik:
     """
 
     robot: Annotated[str, tyro.conf.Positional]
-    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
+    """A URDF or MJCF file, or a robot by name: nao, ur5, g1 and others, or one of robot_descriptions."""
     frame: str
     """The frame: a link, body, site or geom."""
     position: tuple[float, float, float]

@@ -22,7 +22,7 @@ class Info:
     """Prints a robot's joints with their limits, its frames and its mass, and what it does not keep of its file."""
 
     robot: Annotated[str, tyro.conf.Positional] = ""
-    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
+    """A URDF or MJCF file, or a robot by name: nao, ur5, g1 and others, or one of robot_descriptions."""
     system: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the versions and devices in use, and which compiled core is loaded and why."""
     base: Literal["auto", "floating", "fixed"] = "auto"

@@ -19,7 +19,7 @@ class Reach:
     """
 
     robot: str
-    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
+    """A URDF or MJCF file, or a robot by name: nao, ur5, g1 and others, or one of robot_descriptions."""
     frame: str
     """The frame: a link, body, site or geom, carried by hinges and slides."""
     out: Path = Path("map.npz")

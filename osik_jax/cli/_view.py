@@ -28,7 +28,7 @@ class View:
     file: Annotated[Path | None, tyro.conf.Positional] = None
     """A motion.npz to play, a session.json to open, or a map.npz. Default: drag the robot."""
     robot: str = "nao"
-    """A URDF or MJCF file, or a robot by name: nao, arm7, g1, talos, or one of robot_descriptions."""
+    """A URDF or MJCF file, or a robot by name: nao, ur5, g1 and others, or one of robot_descriptions."""
     base: Literal["auto", "floating", "fixed"] = "auto"
     """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     support: tuple[str, ...] = ()

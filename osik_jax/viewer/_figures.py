@@ -183,8 +183,8 @@ def hero_picture(
     *,
     support: Sequence[Float[np.ndarray, "m 2"]] | None = None,
     shapes: Iterable[CollisionShape] = (),
-    paths: Iterable[Float[np.ndarray, "n 3"]] = (),
     labels: Sequence[str] = (),
+    trails: Sequence[Float[np.ndarray, "n 3"]] = (),
     look: Look | None = None,
     spacing: float | None = None,
     size: tuple[int, int] = (1600, 720),
@@ -200,8 +200,8 @@ def hero_picture(
         configurations: one a figure, left to right. Each (nq,)
         support: of each, the vertices of its support polygon [m]; with it the centre of mass is drawn.
         shapes: of the world, drawn with each figure: spheres, capsules, boxes and cylinders.
-        paths: points in the world [m], drawn with each figure as lines. Each (n, 3)
         labels: a line below each.
+        trails: path of a point of each, drawn as a line, world axes [m]. Each (n, 3)
         look: what the robot's URDF shows, from ``read_look``.
         spacing: between neighbours' middles [m]; ``None``: a little more than the widest is wide; 0: all in one place.
         size: width and height [pixels].
@@ -214,11 +214,11 @@ def hero_picture(
     floor = floor_height(robot, shape, sources)
     corners = [shape.corners(source) for source in sources]
     shifts = _side_by_side(corners, azimuth, spacing)
-    fixed, lines = fixed_parts(shapes), [np.asarray(path, float) for path in paths]
-    around = np.concatenate([fixed.corners(), *lines])
-    seen = [np.concatenate([points, around]) + shift for points, shift in zip(corners, shifts, strict=True)]
+    paths = [np.asarray(points, float) + shift for points, shift in zip(trails, shifts, strict=False)]
+    fixed = fixed_parts(shapes)
+    seen = [np.concatenate([points, fixed.corners()]) + shift for points, shift in zip(corners, shifts, strict=True)]
     window = (0.03, 0.97, 0.05, 0.90 if labels else 0.95)
-    camera = frame_camera(np.concatenate(seen), size, azimuth, elevation, window, lens=_LONG_LENS)
+    camera = frame_camera(np.concatenate([*seen, *paths]), size, azimuth, elevation, window, lens=_LONG_LENS)
     stage = Stage([shape] * len(sources) + [fixed] * len(sources), camera, floor=floor)
     data = stage.pose([*sources, *sources], np.concatenate([shifts, shifts]))
     drawer = make_renderer(renderer, stage, camera, size, floor=floor)
@@ -227,8 +227,8 @@ def hero_picture(
     canvas = Canvas(size, scale=size[1] / 450)
     for source, shift in zip(sources if support else (), shifts, strict=False):
         ComMark(canvas, camera, floor=floor, moving=False).place(robot_com(robot, source) + shift)
-    for points in (line + shift for shift in shifts for line in lines):
-        canvas.page.plot(*camera.project(points, size).T, color=BLUE, lw=2.2, solid_capstyle="round")
+    for path_of_point in paths:
+        canvas.page.plot(*camera.project(path_of_point, size).T, color=BLUE, lw=1.6)
     for label, points in zip(labels, seen, strict=False):
         across = camera.project(points, size)[:, 0]
         x = 0.5 * (across.min() + across.max())
