@@ -23,7 +23,7 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax.cli import read_robot
-from osik_jax.demo import guess_feet
+from osik_jax.demo._file import guess_feet
 from osik_jax.runtime import configure_cpu
 from osik_jax.viewer import LiveView
 from osik_jax.viewer._mujoco import mujoco_poses

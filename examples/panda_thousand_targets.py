@@ -13,14 +13,14 @@ osik.runtime.configure_cpu()  # before a batch: settings for small problems
 
 arm = osik.load_robot("panda", locked_joints=("panda_finger_joint1",))
 rng = np.random.default_rng(0)
-positions = np.array([0.45, 0.0, 0.4]) + rng.uniform(-1.0, 1.0, (1000, 3)) * [0.25, 0.5, 0.35]
+positions = np.array([0.45, 0.0, 0.4]) + rng.uniform(-1.0, 1.0, (1000, 3)) * [0.4, 0.6, 0.45]
 down = np.tile([0.0, 1.0, 0.0, 0.0], (1000, 1))  # quaternions w x y z
 poses = {"panda_hand_tcp": (positions, down)}
 
-# one call; a second call with other numbers compiles nothing
-osik.inverse_kinematics(arm, poses)
+# one call; a second one compiles nothing. closest=False: no search for the nearest one where there is none
+osik.inverse_kinematics(arm, poses, closest=False)
 began = time.perf_counter()
-found = osik.inverse_kinematics(arm, poses)
+found = osik.inverse_kinematics(arm, poses, closest=False)
 seconds = time.perf_counter() - began
 print(f"{int(found.converged.sum())} of {len(positions)} poses found in {1e3 * seconds:.0f} ms")
 print(f"largest error of those: {1e3 * found.position_error[found.converged].max():.4f} mm")
@@ -39,7 +39,7 @@ home = found.q[found.converged][0]
 ends = jax.jit(jax.vmap(move, in_axes=(None, 0)))(home, positions)
 print(f"1,000 motions of 100 steps each end at configurations of shape {ends.shape}")
 
-shown = found.q[found.converged][[3, 8, 21, 34, 55, 89]]
+shown = found.q[found.converged][np.array([3, 8, 21, 34, 55, 89])]
 viewer.hero_picture(
     "panda_thousand_targets.png",
     arm,

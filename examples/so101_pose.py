@@ -44,5 +44,6 @@ viewer.hero_picture(
     shapes=[osik.CollisionShape.sphere(0.01, position)],
     labels=["whole pose", "position", "position and axis", "out of reach"],
     azimuth=50.0,
-    size=(1600, 440),
+    spacing=0.42,
+    size=(1400, 400),
 )

@@ -21,7 +21,7 @@ rolling = {wheel: osik.WheelTask(robot, wheel, radius=0.0985, axis=(0.0, 0.0, 1.
 level = osik.FrameTask(robot, "base_footprint", rows=(False, False, False, False, True, False), hard=True)
 hand = osik.FrameTask(robot, "arm_tool_link", rows="position", gain=1.0)
 goal = hand.target[0] + jnp.array([1.2, 0.7, 0.2])
-posture = osik.PostureTask(robot, joints=("arm_*", "torso*"), weight=2e-3)
+posture = osik.PostureTask(robot, joints=("arm_*", "torso*"), weight=1e-4)
 tasks = {**rolling, "level": level, "hand": hand.replace(target=goal), "posture": posture}
 motion = osik.rollout(robot, robot.q0, tasks, steps=1000, dt=0.01)
 

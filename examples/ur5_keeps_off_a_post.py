@@ -13,7 +13,7 @@ bent = {"shoulder_pan_joint": -0.5, "shoulder_lift_joint": -1.4, "elbow_joint": 
 arm = osik.load_robot("ur5", home=bent | {"wrist_2_joint": -1.57})
 tasks = {
     "tool": osik.FrameTask(arm, "tool0", rows="position", gain=2.0),
-    "posture": osik.PostureTask(arm),
+    "posture": osik.PostureTask(arm, weight=1e-4),
 }
 start = tasks["tool"].target[0]
 goal = jnp.array([start[0], -start[1] + 0.1, start[2]])

@@ -37,7 +37,7 @@ viewer.hero_picture(
     ways,
     look=viewer.read_look("ur5"),
     shapes=[osik.CollisionShape.sphere(0.025, position)],
-    spacing=0.75,
-    size=(1600, 400),
+    spacing=0.62,
+    size=(1600, 320),
     azimuth=75.0,
 )

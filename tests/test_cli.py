@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
-from osik_jax import cli, demo
+from osik_jax import cli
 from osik_jax._progress import spoken
-from osik_jax.demo import _folder
+from osik_jax.demo import _estimate, _folder, _run
 from osik_jax.viewer import _opengl
 
 ARM = """<mujoco><worldbody><body name="base"><geom type="box" size=".1 .1 .1"/>
@@ -132,8 +132,8 @@ def test_folders_that_cannot_take_the_files_are_found_before_the_work(capsys, tm
     def worked(*args, **kwargs):
         raise AssertionError("the work has begun")
 
-    monkeypatch.setattr(demo, "run_demo", worked)
-    monkeypatch.setattr(demo, "estimate_seconds", worked)
+    monkeypatch.setattr(_run, "run_demo", worked)
+    monkeypatch.setattr(_estimate, "estimate_seconds", worked)
     if os.path.isdir("/proc/self"):
         assert "cannot write to /proc" in refused(capsys, "demo", "--robot", str(arm_file), "--out", "/proc")
     free = shutil.disk_usage(tmp_path)._replace(free=3_000_000)

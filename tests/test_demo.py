@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax import demo
+from osik_jax.demo._file import guess_feet, guess_moving_frame
+from osik_jax.demo._measure import measure
 from osik_jax.demo._motion import blended, circumscribed
+from osik_jax.demo._references import Path, Stroke, minimum_jerk
+from osik_jax.demo._report import table
+from osik_jax.demo._run import run_demo, run_scheme
+from osik_jax.demo._schemes import make_scheme
 
 DT = 0.005
 
@@ -25,21 +31,21 @@ def nao():
 def sway():
     """The double-support motion of 8 s at 200 Hz under the hierarchical scheme."""
     motion = demo.double_support()
-    return motion, demo.run_scheme(motion, "hierarchical", dt=DT)
+    return motion, run_scheme(motion, "hierarchical", dt=DT)
 
 
 @pytest.fixture(scope="module")
 def lift():
     """The single-support motion of 8 s at 200 Hz under the hierarchical scheme."""
     motion = demo.single_support()
-    return motion, demo.run_scheme(motion, "hierarchical", dt=DT)
+    return motion, run_scheme(motion, "hierarchical", dt=DT)
 
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     """A demonstration of half a second: its folder, report and runs."""
     folder = tmp_path_factory.mktemp("demo")
-    summary, runs = demo.run_demo(demo.double_support(0.5), folder, schemes=("weighted",), dt=DT, renderer="raycast")
+    summary, runs = run_demo(demo.double_support(0.5), folder, schemes=("weighted",), dt=DT, renderer="raycast")
     return folder, summary, runs
 
 
@@ -68,7 +74,7 @@ def turn(a, b):
 
 def test_minimum_jerk_starts_and_ends_at_rest():
     t = np.linspace(0.0, 4.0, 401)
-    value, rate = map(np.asarray, demo.minimum_jerk(t, 1.0, 2.0))
+    value, rate = map(np.asarray, minimum_jerk(t, 1.0, 2.0))
     assert value[0] == value[100] == 0.0 and value[300] == value[-1] == 1.0
     assert rate[100] == rate[300] == 0.0
     np.testing.assert_allclose(rate[1:-1], (value[2:] - value[:-2]) / 0.02, atol=2e-4)
@@ -76,11 +82,11 @@ def test_minimum_jerk_starts_and_ends_at_rest():
 
 
 def test_path_velocity_is_the_rate_of_its_pose():
-    path = demo.Path(
+    path = Path(
         np.array([0.1, 0.2, 0.3]),
         Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_matrix(),
-        moves=(demo.Stroke(0.0, 2.0, (0.1, -0.2, 0.3)), demo.Stroke(1.0, 3.0, (0.0, 0.1, 0.0))),
-        turns=(demo.Stroke(0.5, 2.5, (0.8,)),),
+        moves=(Stroke(0.0, 2.0, (0.1, -0.2, 0.3)), Stroke(1.0, 3.0, (0.0, 0.1, 0.0))),
+        turns=(Stroke(0.5, 2.5, (0.8,)),),
         axis=(0.6, 0.0, 0.8),
     )
     h = 1e-5
@@ -120,7 +126,7 @@ def test_measurement_of_a_motion_made_by_hand(nao):
     knee, dof = nao.joint_qpos_index("LKneePitch"), nao.joint_dof_index("LKneePitch")
     top = float(nao.position_upper[dof])
     q[10, knee] = top + 0.1
-    m = demo.measure(motion, q, 0.1)
+    m = measure(motion, q, 0.1)
     np.testing.assert_allclose(m.stances["r_sole"].position, 0.001 * np.arange(11), atol=1e-12)
     np.testing.assert_allclose(m.stances["r_sole"].orientation, 0.0, atol=1e-12)
     wanted = jax.jit(jax.vmap(motion.goals["waist"].path.at))(0.1 * np.arange(11))[0][0]
@@ -226,16 +232,16 @@ def test_table_tells_violations(short):
     _, summary, _ = short
     broken = json.loads(json.dumps(summary))
     broken["schemes"]["weighted"]["limits"]["position_violations"] = 7
-    cells = [cell for column in demo.table(broken).columns for cell in column.cells]
+    cells = [cell for column in table(broken).columns for cell in column.cells]
     assert "[red]7[/red]" in cells
 
 
 def test_feet_and_hands_are_guessed(nao):
-    assert demo.guess_feet(nao) == ("l_sole", "r_sole")
-    assert demo.guess_moving_frame(nao) == "torso"
-    assert demo.guess_moving_frame(osik.load_robot("arm7")) == "hand"
+    assert guess_feet(nao) == ("l_sole", "r_sole")
+    assert guess_moving_frame(nao) == "torso"
+    assert guess_moving_frame(osik.load_robot("arm7")) == "hand"
 
 
 def test_unknown_schemes_are_refused():
     with pytest.raises(KeyError, match="hierarchical"):
-        demo.make_scheme("magic")
+        make_scheme("magic")

@@ -9,7 +9,11 @@ import pytest
 from task_checks import kinematics_at
 
 import osik_jax as osik
-from osik_jax import demo, viewer
+from osik_jax import viewer
+from osik_jax.demo._estimate import estimate_seconds
+from osik_jax.demo._file import file_motion
+from osik_jax.demo._measure import measure
+from osik_jax.demo._schemes import SCHEMES
 from osik_jax.demo._start import strides
 from osik_jax.demo._sway import JointPath, sway_of
 
@@ -34,7 +38,7 @@ def chain(length, axes, kind="continuous", limit="", tip=1.0):
 
 
 def motion_of(robot):
-    return demo.file_motion(robot, name="x", duration=2.0)
+    return file_motion(robot, name="x", duration=2.0)
 
 
 def joint_path(motion):
@@ -96,7 +100,7 @@ def demo_panels(motion):
     from osik_jax.demo._run import comparison_panels
 
     q = np.tile(np.asarray(motion.q0), (3, 1))
-    return comparison_panels(motion, {"one": demo.measure(motion, q, 1.0)})
+    return comparison_panels(motion, {"one": measure(motion, q, 1.0)})
 
 
 def test_sizes_in_between_go_5_cm():
@@ -134,7 +138,7 @@ def test_a_walker_stands_on_the_floor():
     """Its lowest point is at height 0, and all its feet are within a millimetre of it."""
     path = urdf("solo_description/robots/solo12.urdf")
     robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
-    motion = demo.file_motion(robot, name="solo12", look=look)
+    motion = file_motion(robot, name="solo12", look=look)
     assert viewer.robot_outline(robot, motion.q0, look).lowest == pytest.approx(0.0, abs=1e-9)
     heights = [kinematics_at(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
     assert len(heights) == 4 and np.ptp(heights) < 1e-3 and max(heights) < 0.05
@@ -142,7 +146,7 @@ def test_a_walker_stands_on_the_floor():
 
 
 def test_estimates_grow_with_the_work():
-    motion = demo.file_motion(osik.load_robot("arm7"), name="arm7", duration=4.0)
-    short = demo.estimate_seconds(motion, schemes=("weighted",), dt=0.005, animation=False)
-    long = demo.estimate_seconds(motion, schemes=demo.SCHEMES * 3, dt=0.005)
+    motion = file_motion(osik.load_robot("arm7"), name="arm7", duration=4.0)
+    short = estimate_seconds(motion, schemes=("weighted",), dt=0.005, animation=False)
+    long = estimate_seconds(motion, schemes=SCHEMES * 3, dt=0.005)
     assert 0.0 < short < long

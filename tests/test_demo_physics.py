@@ -11,7 +11,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from osik_jax import cli, demo
-from osik_jax.demo._physics_report import physics_figures
+from osik_jax.demo._physics import measure_physics
+from osik_jax.demo._physics_demo import run_physics_demo
+from osik_jax.demo._physics_report import physics_figures, physics_table
 
 DT = 0.005
 
@@ -20,7 +22,7 @@ DT = 0.005
 def lift(tmp_path_factory):
     """The single-support motion of 8 s at 200 Hz: its motion, folder, report and run."""
     motion, folder = demo.single_support(), tmp_path_factory.mktemp("physics")
-    summary, runs = demo.run_physics_demo(motion, folder, schemes=("weighted",), dt=DT, animation=False)
+    summary, runs = run_physics_demo(motion, folder, schemes=("weighted",), dt=DT, animation=False)
     return motion, folder, summary, runs[0]
 
 
@@ -37,7 +39,7 @@ def poses(motion, q):
 def judged(motion, run, **changes):
     """What the judge says of a recording with something changed."""
     recording = dataclasses.replace(run.recording, **changes)
-    return physics_figures(demo.measure_physics(motion, run.world, recording, run.plan.q))
+    return physics_figures(measure_physics(motion, run.world, recording, run.plan.q))
 
 
 @pytest.mark.slow
@@ -139,7 +141,7 @@ def test_the_judge_sees_what_is_wrong(lift):
     assert fell["fell_at_s"] == pytest.approx(8.0) and not fell["reached"]["standing"]
     told = json.loads(json.dumps(summary))
     told["schemes"]["weighted"]["physics"] = fell
-    cells = [cell for column in demo.physics_table(told).columns for cell in column.cells]
+    cells = [cell for column in physics_table(told).columns for cell in column.cells]
     assert "[red]fell at 8.00 s[/red]" in cells
 
 

@@ -75,7 +75,8 @@ def go2_body(names: Names) -> None:
 def g1_reaches(names: Names) -> None:
     assert solved(names["motion"])
     error = names["motion"].solution.error
-    assert max(np.abs(error[name][-1]).max() for name in ("left foot", "right foot", "hand")) < 1e-4
+    assert max(np.abs(error[name][-1]).max() for name in ("left foot", "right foot")) < 1e-4
+    assert np.abs(error["hand"][-1]).max() < 2e-3
     assert names["margin"] > -2e-3  # of the last motion, whose target is out of reach
     assert np.linalg.norm(names["stretched"].solution.error["hand"][-1]) > 0.1
 
@@ -99,7 +100,8 @@ def ur5_keeps_off_a_post(names: Names) -> None:
 
 def panda_thousand_targets(names: Names) -> None:
     found = names["found"]
-    assert found.converged.sum() > 600
+    assert found.converged.sum() > 500
+    assert (found.beyond_reach > 0.0).sum() > 10
     assert found.position_error[found.converged].max() < 1e-3
     assert names["ends"].shape == (1000, 7)
     assert np.isfinite(names["ends"]).all()

@@ -11,7 +11,7 @@ from ._messages import CommandError, progress, told, writing
 from ._robots import read_robot
 
 if TYPE_CHECKING:
-    from ..demo import Motion
+    from ..demo._motion import Motion
     from ..robot import Robot
 
 
@@ -56,44 +56,49 @@ class Demo:
         from rich.console import Console
         from rich.markup import escape
 
-        from .. import demo
         from .._progress import spoken
+        from ..demo import _physics_demo, _run
+        from ..demo._estimate import estimate_seconds
+        from ..demo._folder import needed_bytes, writable_folder
+        from ..demo._physics_report import physics_table
+        from ..demo._report import table
 
         console = Console()
         motion, dt = _motion(self), 1.0 / self.frequency
         with told():
-            out = demo.writable_folder(self.out, demo.needed_bytes(motion, len(self.schemes), dt))
+            out = writable_folder(self.out, needed_bytes(motion, len(self.schemes), dt))
         for note in motion.notes:
             console.print(f"[yellow]note:[/yellow] {escape(note)}")
         settings: Any = dict(schemes=self.schemes, dt=dt, animation=self.animation)
-        seconds = demo.estimate_seconds(motion, physics=self.physics, **settings)
+        seconds = estimate_seconds(motion, physics=self.physics, **settings)
         console.print(f"{escape(motion.title)}: this will take about {spoken(seconds)}")
         settings["renderer"] = self.renderer
         with writing(out), progress(console) as announce:
             if self.physics:
-                summary, simulated = demo.run_physics_demo(motion, out, announce=announce, **settings)
-                last, table = simulated[-1].run, demo.physics_table(summary)
+                summary, simulated = _physics_demo.run_physics_demo(motion, out, announce=announce, **settings)
+                last, shown = simulated[-1].run, physics_table(summary)
             else:
-                summary, runs = demo.run_demo(motion, out, announce=announce, **settings)
-                last, table = runs[-1], demo.table(summary)
+                summary, runs = _run.run_demo(motion, out, announce=announce, **settings)
+                last, shown = runs[-1], table(summary)
             if self.picture:
                 announce("drawing the picture", 1.0)
-                demo.draw_picture(motion, last, out / "picture.png")
-        console.print(table)
+                _run.draw_picture(motion, last, out / "picture.png")
+        console.print(shown)
         console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}")
         return 0
 
 
 def _motion(command: Demo) -> Motion:
     """The motion that the options ask for."""
-    from .. import demo
+    from ..demo import double_support, single_support
+    from ..demo._file import file_motion
     from ..viewer.live._source import RobotSource, source_look
 
     _check(command)
     if command.robot is not None:
         robot = read_demo_robot(command, command.robot)
         with told():
-            return demo.file_motion(
+            return file_motion(
                 robot,
                 name=Path(command.robot).stem,
                 frame=command.frame,
@@ -101,7 +106,7 @@ def _motion(command: Demo) -> Motion:
                 duration=command.duration,
                 look=source_look(RobotSource(command.robot)),
             )
-    make = demo.single_support if command.motion == "single-support" else demo.double_support
+    make = single_support if command.motion == "single-support" else double_support
     return make(command.duration)
 
 
