@@ -14,6 +14,8 @@ from osik_jax.runtime import configure_cpu
 FOLDER = Path(__file__).parent
 PICTURES = FOLDER.parent / "docs" / "images" / "examples"
 NAMES = sorted(path.stem for path in FOLDER.glob("[!_]*.py"))
+WIDTH = 900
+"""Width of a picture of the gallery [pixels]."""
 MOST_BYTES = 60_000
 """Size of a picture of the gallery [bytes]."""
 
@@ -30,11 +32,13 @@ def run(name: str, folder: Path) -> Path:
 
 
 def shrink(picture: Path, out: Path) -> int:
-    """Write the picture 800 pixels wide, in as many colours as fit into ``MOST_BYTES``; return its size [bytes]."""
+    """Write the picture ``WIDTH`` pixels wide, in as many colours as ``MOST_BYTES`` allows; return its size [bytes]."""
     with Image.open(picture) as image:
-        small = image.convert("RGB").resize((800, round(image.height * 800 / image.width)), Image.Resampling.LANCZOS)
-    for colors in (256, 128, 64, 32, 16):
-        small.quantize(colors, dither=Image.Dither.NONE).save(out, optimize=True)
+        small = image.convert("RGB").resize(
+            (WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS
+        )
+    for colors in (256, 128, 96, 64, 48, 32, 24):
+        small.quantize(colors, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(out, optimize=True)
         if out.stat().st_size <= MOST_BYTES:
             break
     return out.stat().st_size

@@ -35,8 +35,8 @@ def reach(distance):
 
 
 near, motion = reach(0.25)
-far, stretched = reach(0.7)  # beyond reach: the hand comes as near as balance allows, and stops
-for name, path in (("near", motion), ("far", stretched)):
+far, bent_down = reach(0.45)
+for name, path in (("near", motion), ("far", bent_down)):
     error = {task: np.linalg.norm(values[-1]) for task, values in path.solution.error.items() if task != "balance"}
     com = jax.vmap(lambda q: osik.center_of_mass(robot, osik.forward_kinematics(robot, q)))(path.q)
     margin = min(float(polygon.distance(c)) for c in com[::10, :2])
@@ -46,11 +46,11 @@ for name, path in (("near", motion), ("far", stretched)):
 viewer.hero_picture(
     "g1_reaches.png",
     robot,
-    [robot.q0, motion.q[-1], stretched.q[-1]],
+    [robot.q0, motion.q[-1], bent_down.q[-1]],
     look=viewer.read_look("g1"),
     support=[polygon.vertices] * 3,
-    shapes=[osik.CollisionShape.sphere(0.03, near)],
-    labels=["home", "target within reach", "target out of reach"],
+    shapes=[osik.CollisionShape.sphere(0.03, goal) for goal in (near, far)],
+    labels=["home", "25 cm ahead, 15 cm down", "45 cm ahead, 27 cm down"],
     azimuth=-50.0,
     size=(1400, 600),
 )

@@ -13,8 +13,8 @@ arm = osik.load_robot("so101")
 
 # the elbow is measured 0.1 rad beyond its limit; accelerations are limited from rest on, so nothing jumps
 measured = jnp.zeros(arm.nq).at[2].set(arm.position_upper[2] + 0.1)
-speeds = osik.VelocityLimit(arm, velocity={"*": 1.5})
-limits = (speeds, osik.AccelerationLimit(arm, {"*": 8.0}, return_speed={"*": 0.1}))
+calm = osik.ConfigurationLimit(arm, return_speed={"*": 0.1}), osik.VelocityLimit(arm, velocity={"*": 1.5})
+limits = (*calm, osik.AccelerationLimit(arm, {"*": 8.0}, return_speed={"*": 0.1}))
 start = osik.forward_kinematics(arm, measured).frame_pose(arm, tip)
 tasks = {  # five joints: the position comes first, the orientation gets what is left
     "position": osik.FrameTask(arm, tip, rows="position", gain=10.0, priority=1),
@@ -37,7 +37,7 @@ def step(q, clutch, limits, t):
     clutch, goal = clutch.step(pressed, held, osik.forward_kinematics(arm, q).frame_pose(arm, tip))
     aimed = tasks | {name: tasks[name].replace(target=goal) for name in ("position", "orientation")}
     sol = osik.solve(arm, q, aimed, scheme=osik.HierarchicalQP(), limits=limits, dt=dt)
-    limits = (speeds, limits[1].after(sol.velocity))
+    limits = (*calm, limits[2].after(sol.velocity))
     return osik.integrate(arm, q, sol.velocity, dt), clutch, limits, (q, pressed, goal[0], sol.error["position"])
 
 

@@ -98,6 +98,7 @@ LONG = {
         "tasks_and_limits",
         "the_loop",
         "tuning",
+        "tutorial",
         "viewer",
     )
 }
@@ -111,8 +112,11 @@ LONG = {
         if BLOCK.search(page.read_text())
     ],
 )
-def test_code_runs(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_code_runs(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = page.read_text()
+    monkeypatch.chdir(tmp_path)  # for the files that a page writes
     namespace: dict[str, Any] = {"__name__": "documentation"}
     try:
         for block in BLOCK.finditer(text):

@@ -51,6 +51,8 @@ def so101_teleoperation(names: Names) -> None:
     steps = np.diff(names["angles"], axis=0)
     assert names["angles"][0, 2] > names["arm"].position_upper[2] + 0.09
     assert names["angles"][-1, 2] <= names["arm"].position_upper[2]
+    inside = np.flatnonzero(names["angles"][:, 2] <= names["arm"].position_upper[2])[0]
+    assert inside > 90  # steps of 10 ms, for 0.1 rad at return_speed
     assert np.abs(steps[:5]).max() < 5 * 8.0 * 0.01**2 + 1e-9  # starts from rest, by its accelerations
     assert np.ptp(names["goals"], axis=0).max() > 0.05
 
@@ -62,7 +64,7 @@ def allegro_grasp(names: Names) -> None:
 
 def tiago_drives(names: Names) -> None:
     assert solved(names["motion"])
-    assert np.linalg.norm(names["path"][-1, 1] - names["goal"]) < 1e-3
+    assert np.linalg.norm(names["path"][-1, 1] - names["goal"]) < 2e-3
     assert np.linalg.norm(names["path"][-1, 0, :2]) > 0.5
     assert np.abs(names["path"][:, 0, 2]).max() < 1e-3
 
@@ -77,8 +79,11 @@ def g1_reaches(names: Names) -> None:
     error = names["motion"].solution.error
     assert max(np.abs(error[name][-1]).max() for name in ("left foot", "right foot")) < 1e-4
     assert np.abs(error["hand"][-1]).max() < 2e-3
-    assert names["margin"] > -2e-3  # of the last motion, whose target is out of reach
-    assert np.linalg.norm(names["stretched"].solution.error["hand"][-1]) > 0.1
+    assert names["margin"] > -2e-3  # of the last motion
+    assert solved(names["bent_down"])
+    feet = [names["bent_down"].solution.error[name] for name in ("left foot", "right foot")]
+    assert np.abs(feet).max() < 3e-4  # at any time
+    assert np.linalg.norm(names["bent_down"].solution.error["hand"][-1]) < 3e-3
 
 
 def nao_one_foot(names: Names) -> None:
@@ -100,8 +105,7 @@ def ur5_keeps_off_a_post(names: Names) -> None:
 
 def panda_thousand_targets(names: Names) -> None:
     found = names["found"]
-    assert found.converged.sum() > 500
-    assert (found.beyond_reach > 0.0).sum() > 10
+    assert found.converged.sum() > 700
     assert found.position_error[found.converged].max() < 1e-3
     assert names["ends"].shape == (1000, 7)
     assert np.isfinite(names["ends"]).all()
