@@ -24,7 +24,7 @@ def example_urdf(name: str) -> Path:
         FileNotFoundError: example-robot-data is not installed.
     """
     if name not in EXAMPLES:
-        raise unknown_name("robot", name, EXAMPLES)
+        raise unknown_name("robot", name, tuple(EXAMPLES))
     for folder in sys.path:
         for share in ("cmeel.prefix/share", "share"):
             found = Path(folder) / share / "example-robot-data" / "robots" / EXAMPLES[name][0]
