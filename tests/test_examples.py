@@ -128,6 +128,7 @@ CHECKS: list[Callable[[Names], None]] = [
 ]  # fmt: skip
 
 
+@pytest.mark.variants(slow=["so101_pose", "nao_one_foot", "go2_body"])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.filterwarnings("error::osik_jax.OsikWarning")
 def test_runs(
