@@ -533,7 +533,8 @@ template <class Team> struct Saturation : NullSpace<Team> {
         const double part = damped_part();
         at = its_scale = part * scale;
         keep(POINT, part, blocker);
-        if (part == 1.0 || !(at > 0.0)) break;
+        if (part == 1.0) ended = WHOLE;
+        if (ended == WHOLE || !(at > 0.0)) break;
         continue;
       }
       if (at == 1.0) {  // the end once more

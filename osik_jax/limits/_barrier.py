@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..kinematics import Kinematics, frame_jacobian
 from ..numerics._arguments import as_bounds, as_scalar, check_bounds, concrete
+from ..numerics._guarded import at_most_inverse
 from ..robot import Robot
 from ._box import Limit
 from ._rows import LimitRows
@@ -74,7 +75,7 @@ class PositionBarrier(Limit):
     ) -> LimitRows:
         """One row for each normal."""
         del q
-        rate = jnp.minimum(self.gain, 1.0 / dt)
+        rate = at_most_inverse(self.gain, dt)
         position, _ = kinematics.frame_pose(robot, self.frame)
         value = jnp.matmul(self.normals, position, precision="highest")
         jacobian = jnp.matmul(self.normals, frame_jacobian(robot, kinematics, self.frame)[:3], precision="highest")

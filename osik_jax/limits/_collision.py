@@ -22,6 +22,7 @@ from ..collision._shape import CollisionShape
 from ..kinematics import Kinematics
 from ..kinematics._home import home_kinematics
 from ..numerics._arguments import as_scalar, as_vector, concrete
+from ..numerics._guarded import at_most_inverse
 from ..robot import Robot
 from ._box import Limit
 from ._rows import LimitRows
@@ -141,7 +142,7 @@ class CollisionAvoidanceLimit(Limit):
         jacobian = separation_jacobian(robot.tree, kinematics, near, self.scene.pair_bodies)
         gap = near.distance - self.minimum_distance
         soonest = jax.lax.top_k(-_time_to_meet(gap, jacobian), self.max_pairs)[1]
-        lower = jnp.minimum(-jnp.minimum(self.gain, 1.0 / dt) * gap, self.recovery_speed)
+        lower = jnp.minimum(-at_most_inverse(self.gain, dt) * gap, self.recovery_speed)
         lower = jnp.where(near.distance < self.detection_distance, lower, -jnp.inf)[soonest]
         return LimitRows(jacobian[soonest], lower, jnp.full_like(lower, jnp.inf))
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..numerics._arguments import check_bounds, concrete, entries
+from ..numerics._guarded import rate_of_way
 from ..robot import Robot
 from ..robot._balls import independent_balls
 from ..robot._joint_selection import dof_names, dof_values, dofs_of, scalar_layout
@@ -125,7 +126,7 @@ class ConfigurationLimit(Limit):
         free = jnp.isinf(bound)
         way = jnp.where(free, 0.0, bound) - position
         way = way + inward * _ROUNDOFF * jnp.finfo(way.dtype).eps * jnp.abs(way)
-        return jnp.where(free, bound, self.gain * way / dt)
+        return jnp.where(free, bound, rate_of_way(self.gain * way, dt))
 
     def _convert(self, name: str, value: Any) -> Any:
         if name == "gain" and np.shape(value) == self.lower.shape:

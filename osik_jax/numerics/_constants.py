@@ -58,8 +58,7 @@ FULL_STEP = 1.0 - 1e-9
 """Step lengths from here on are a full step but for roundoff."""
 STRAIGHT, PART, WHOLE = 1, 2, 3
 """Where a level that is done ends: at the part of the straight way to the end of its path at which its damped cost is
-least, that is at the end where all of it is worth its cost; at the scale of least cost on the path; at the end, though
-less of the straight way would cost less. 0 is one that is not done."""
+least; at the scale of least cost on the path; at the end. 0 is one that is not done."""
 PATH_SEARCHES = 6
 """Searches at most for the scale at which a level's damped cost is least; two or three are the rule."""
 PATH_STEP = 1e-9

@@ -6,15 +6,45 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+_FASTEST = 1e12
+"""[1/s]: no joint moves so fast; a derivative by dt, the rate over dt, would soon be infinite in single precision."""
 
+
+@jax.custom_jvp
 def quotient(a: Float[Array, "*#S"], b: Float[Array, "*#S"]) -> Float[Array, "*S"]:
     """Return a / b for a b that is not 0; its derivatives need no square of b.
 
     The derivative of ``a / b`` itself divides by b^2. In single precision that is 0 for a b of 1e-23, and the
-    derivative NaN.
+    derivative NaN. Dividing both by a constant of b's size does not help: XLA turns ``(a / s) / (b / s)`` into
+    ``(a s) / (s b)`` when it compiles.
     """
-    size = jax.lax.stop_gradient(b)
-    return (a / size) / (b / size)
+    return a / b
+
+
+@quotient.defjvp
+def _quotient_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (a, b), (da, db) = primals, tangents
+    value = quotient(a, b)
+    return value, (da - value * db) / b
+
+
+def at_most_inverse(gain: Float[Array, ""], dt: Float[Array, ""] | float) -> Float[Array, ""]:
+    """Return the gain, at most 1 / dt; where they are equal, the derivative is that of the gain.
+
+    The derivative of 1 / dt is infinite for a dt of 1e-20 in single precision, and 0 times that is NaN: it is not taken
+    where the gain is the smaller one.
+    """
+    dt = jnp.asarray(dt, jnp.result_type(gain))
+    is_capped = gain > 1.0 / jax.lax.stop_gradient(dt)
+    return jnp.where(is_capped, 1.0 / jnp.where(is_capped, dt, 1.0), gain)
+
+
+def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, ""] | float) -> Float[Array, "*S"]:
+    """Return way / dt; a rate so fast that it is no bound (``_FASTEST``) has a derivative of 0, not an infinite one."""
+    dt = jnp.asarray(dt, way.dtype)
+    is_far = jnp.abs(way) > _FASTEST * dt
+    far = jax.lax.stop_gradient(way / dt)
+    return jnp.where(is_far, far, jnp.where(is_far, 0.0, way) / jnp.where(is_far, 1.0, dt))
 
 
 def safe_norm(vector: Float[Array, " m"]) -> Float[Array, ""]:

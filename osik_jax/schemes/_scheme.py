@@ -85,19 +85,20 @@ class VelocityProblem(eqx.Module):
             return safe_norm(self._bounds(rest))
         # what each row adds to its task's distance and stiffness: few operations whatever the number of tasks;
         # weights and Jacobians are NaN where the step is not valid, and times NaN a derivative of 0 is NaN
-        divisors = [jnp.where(own.curvature > 0.0, own.curvature, 1.0) for own in equal]
-        pull_per_curvature = jnp.concatenate(
-            [
-                jnp.broadcast_to(quotient(own.pull, divisor), own.error.shape)
-                for own, divisor in zip(equal, divisors, strict=True)
-            ]
+        divisor, pull = (
+            jnp.concatenate([jnp.broadcast_to(a, own.error.shape) for own, a in zip(equal, of_each, strict=True)])
+            for of_each in (
+                [jnp.where(own.curvature > 0.0, own.curvature, 1.0) for own in equal],
+                [own.pull for own in equal],
+            )
         )
         weight, error, jacobian = (
             jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "error", "jacobian")
         )
         squared = short_sum(jacobian**2)
         weight, squared = (jnp.where(jnp.isnan(a), 0.0, a) for a in (weight, squared))
-        parts = jnp.stack([error * (weight * pull_per_curvature), weight * squared])
+        # both terms of the quotient have the weight as a factor: that of the pull alone is infinite for a small weight
+        parts = jnp.stack([error * quotient(weight * pull, divisor), weight * squared])
         of_task = np.repeat(np.eye(len(equal), dtype=bool), [len(own.error) for own in equal], axis=1)
         distance, stiffness = jnp.sum(jnp.where(of_task, parts[:, None], 0.0), axis=2)
         bounds = self._bounds(equal)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from ..numerics._guarded import safe_norm
+from ..numerics._guarded import at_most_inverse, safe_norm
 from ._leaves import as_scalar, concrete
 
 
@@ -51,15 +51,15 @@ class AdaptiveGain(eqx.Module):
 
 
 class _CappedGain(AdaptiveGain):
-    """An adaptive gain that is at most ``cap`` [1/s]."""
+    """An adaptive gain that is at most ``1 / dt`` [1/s]."""
 
-    cap: Float[Array, ""]
+    dt: Float[Array, ""]
 
-    def __init__(self, gain: AdaptiveGain, cap: Float[Array, ""]):
-        self.maximum, self.minimum, self.decay, self.cap = gain.maximum, gain.minimum, gain.decay, cap
+    def __init__(self, gain: AdaptiveGain, dt: Float[Array, ""]):
+        self.maximum, self.minimum, self.decay, self.dt = gain.maximum, gain.minimum, gain.decay, dt
 
     def __call__(self, error: Float[Array, " m"]) -> Float[Array, ""]:
-        return _at_most(super().__call__(error), self.cap)
+        return at_most_inverse(super().__call__(error), self.dt)
 
 
 Gain = Float[Array, ""] | AdaptiveGain
@@ -78,13 +78,8 @@ def as_gain(value: Any, dtype: Any = None) -> Gain:
 def capped_gain(gain: Gain, dt: Float[Array, ""] | float) -> Gain:
     """Return the gain, at most 1 / dt [1/s]: with this gain, one step of dt [s] takes all of an error."""
     if isinstance(gain, AdaptiveGain):
-        return _CappedGain(gain, 1.0 / jnp.asarray(dt, gain.maximum.dtype))
-    return _at_most(gain, 1.0 / jnp.asarray(dt, gain.dtype))
-
-
-def _at_most(gain: Float[Array, ""], cap: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the smaller one; where they are equal, the derivative is that of the gain."""
-    return jnp.where(gain > cap, cap, gain)
+        return _CappedGain(gain, jnp.asarray(dt, gain.maximum.dtype))
+    return at_most_inverse(gain, dt)
 
 
 def evaluate_gain(gain: Gain, error: Float[Array, " m"]) -> Float[Array, ""]:

@@ -22,7 +22,7 @@ from ...numerics._dense import apply, product
 from .._damping import narrow_box
 from ._padding import Problem, initial_point
 from ._projection import damped_step_length, level_motion
-from ._scale_path import at_bounds, best_scale, dual_basis
+from ._scale_path import best_scale, dual_basis, step_to_bounds
 from ._scaled_motion import ScaledMotion, blocked_scale
 
 
@@ -86,10 +86,10 @@ def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend
         motion, projector, total = level_motion(level, start, projector, damping, problem.rank_tol, backend)
         way = ScaledMotion(start, motion, target, projector, lower, upper)
         best = partial(best_scale, way, level, total, problem.rank_tol, joints.active)
-        x, projector, scale = _level(joints, way, best)
-        length = damped_step_length(level, start, x, total, problem.rank_tol)
+        step, projector, scale = _level(joints, way, best)
+        length = damped_step_length(level, start, step, total, problem.rank_tol)
         length = jnp.where(joints.ending == STRAIGHT, length, 1.0)
-        x, scale = start + length * (x - start), length * scale
+        x, scale = start + length * step, length * scale
         return (x, projector, *narrow_box(damping, level, curvature, x, lower, upper)), scale
 
     across = sets, problem.levels, problem.damping, problem.targets
@@ -101,14 +101,14 @@ def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend
 def _level(
     joints: ActiveJoints, problem: ScaledMotion, best: Callable[[Float[Array, "n n"]], Float[Array, ""]]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
-    """Return x, the projector, and the scale of one level; ``best`` is its scale if that is where its cost is least."""
+    """Return the step, the projector and the scale of one level; ``best`` is its scale where the cost is least."""
     scale, projector = _scale_and_projector(problem, joints)
     # one factorisation after another: see docs/installation.md
     scale, active = jax.lax.optimization_barrier((scale, joints.active))
     dual = dual_basis(problem.projector, active)
     scale = jnp.where(joints.ending == PART, best(dual), scale)
-    x = jnp.where(active != 0, problem.bound(active), at_bounds(problem, scale, active, dual))
-    return jnp.where(joints.done, x, problem.start), projector, jnp.where(joints.done, scale, 0.0)
+    step = step_to_bounds(problem, scale, active, dual)
+    return jnp.where(joints.done, step, 0.0), projector, jnp.where(joints.done, scale, 0.0)
 
 
 def _scale_and_projector(problem: ScaledMotion, joints: ActiveJoints) -> tuple[Float[Array, ""], Float[Array, "n n"]]:

@@ -106,25 +106,24 @@ def level_motion(
 def damped_step_length(
     level: Level | PaddedLevel,
     start: Float[Array, " n"],
-    end: Float[Array, " n"],
+    step: Float[Array, " n"],
     damping: Float[Array, ""],
     rank_tol: Array | float,
 ) -> Float[Array, ""]:
-    """Return the step length from start to end, 1 at most, that minimises the damped cost of a level.
+    """Return the length of a step from start, 1 at most, that minimises the damped cost of a level.
 
     The motion of a level without bounds is the damped optimum; the bounds of some joints may ask far larger motions of
-    the others for the same motion of the rows, and that is not worth its cost. With ``d = end - start`` the cost
-    ``1/2 |t A d - error|^2 + 1/2 damping t^2 |d|^2`` is least at ``t = error'A d / (|A d|^2 + damping |d|^2)``.
+    the others for the same motion of the rows, and that is not worth its cost. The cost of a part t of the step d,
+    ``1/2 |t A d - error|^2 + 1/2 damping t^2 |d|^2``, is least at ``t = error'A d / (|A d|^2 + damping |d|^2)``.
 
     Args:
         level: the level, A the rows of it that take part at ``start``.
         start: what the levels above have reached.
-        end: where the bounds let the level go at most.
+        step: d, to where the bounds let the level go at most.
         damping: of the level, in squared singular values.
         rank_tol: as in ``level_motion``.
     """
     task = ActiveTask.at(level, start, rank_tol)
-    step = end - start
     change = apply(task.rows, step)
     square = jnp.sum(step**2)
     cost = jnp.sum(change**2) + damping * square

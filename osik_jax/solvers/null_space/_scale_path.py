@@ -54,7 +54,7 @@ def least_cost(
         rank_tol: as in ``level_motion``.
         max_iterations: limit on the changes of the active set (static).
     """
-    chord = jax.vmap(damped_step_length)(level, problem.start, end.x, damping, rank_tol)
+    chord = jax.vmap(damped_step_length)(level, problem.start, end.x - problem.start, damping, rank_tol)
     wanted = end.done & (chord < 1.0) & (chord * end.scale > 0.0)
 
     def is_running(carry: tuple[Any, ...]) -> Array:
@@ -78,9 +78,10 @@ def least_cost(
         middle = jnp.where(to_end, end.scale * (1.0 - 0.5 * PATH_END), 0.5 * (low + high))
         return number + 1, running, jnp.where(inside, best, middle), low, high, now, ending
 
-    first, straight = jnp.where(wanted, end.scale * chord, 0.0), jnp.full(wanted.shape[0], STRAIGHT, jnp.int32)
+    first = jnp.where(wanted, end.scale * chord, 0.0)
+    unsearched = jnp.where(chord < 1.0, STRAIGHT, WHOLE).astype(jnp.int32)
     nothing = jnp.zeros_like(first)
-    start: tuple[Any, ...] = (jnp.zeros((), jnp.int32), wanted, first, nothing, end.scale, end, straight)
+    start: tuple[Any, ...] = (jnp.zeros((), jnp.int32), wanted, first, nothing, end.scale, end, unsearched)
     *_, result, ending = jax.lax.while_loop(is_running, search, start)
     # joints that stop the whole motion can move no more, as if all of it were done
     result = result._replace(blocking=end.blocking, blocker=end.blocker)
@@ -107,8 +108,11 @@ def best_scale(
     """
     known = dual_basis(problem.projector, active) if dual is None else dual
     none = jnp.zeros((), problem.start.dtype)
-    begin = at_bounds(problem, none, active, known)
-    along = at_bounds(problem, none + 1.0, active, known) - begin
+    begin = problem.start + step_to_bounds(problem, none, active, known)
+    # x(s) is linear in s: the motion alone, with bounds, target and start at 0; a difference would be roundoff
+    zero = jnp.zeros_like(problem.start)
+    homogeneous = ScaledMotion(zero, problem.motion, zero, problem.projector, zero, zero)
+    along = step_to_bounds(homogeneous, none + 1.0, active, known)
     task = ActiveTask.at(level, problem.start, rank_tol)
     change = apply(task.rows, problem.motion)
     cost = jnp.sum(change**2) + damping * jnp.sum(along**2)
@@ -117,15 +121,16 @@ def best_scale(
     return jnp.where(moves, quotient(gain, jnp.where(moves, cost, 1.0)), 1.0)
 
 
-def at_bounds(
+def step_to_bounds(
     problem: ScaledMotion, scale: Array, active: Int[Array, " n"], dual: Float[Array, "n n"]
 ) -> Float[Array, " n"]:
-    """Return x with the active joints at their bounds, refined once."""
-    x = problem.unbounded(scale)
+    """Return the step from start to x(scale), which brings the active joints to their bounds; refined once."""
+    goal = problem.bound(active) - problem.start
+    step = problem.unbounded_step(scale)
     for _ in range(2):
-        step = apply(dual.T, jnp.where(active != 0, problem.bound(active) - x, 0.0))
-        x = x + apply(problem.projector, step)
-    return x
+        gap = jnp.where(active != 0, goal - step, 0.0)
+        step = step + apply(problem.projector, apply(dual.T, gap))
+    return jnp.where(active != 0, goal, step)
 
 
 @custom_jvp

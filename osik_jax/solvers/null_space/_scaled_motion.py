@@ -72,7 +72,11 @@ class ScaledMotion(NamedTuple):
 
     def unbounded(self, scale: Array) -> Float[Array, " n"]:
         """Return the answer without bounds."""
-        return self.start + scale * self.motion + apply(self.projector, self.target - self.start)
+        return self.start + self.unbounded_step(scale)
+
+    def unbounded_step(self, scale: Array) -> Float[Array, " n"]:
+        """Return the step from the start to that answer."""
+        return scale * self.motion + apply(self.projector, self.target - self.start)
 
     def size(self, scale: Array) -> Float[Array, ""]:
         """Return the size of the terms that x is made of."""

@@ -42,6 +42,7 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
       blocker = find_blocking(), ended = STRAIGHT;
       part = damped_part();
       above = whole = scale, its_scale = part * scale;
+      if (part == 1.0) ended = WHOLE;
     } else if (at == 1.0) {                           // the end once more
       if (!done) break;
       blocker = find_blocking(), ended = WHOLE, its_scale = scale;
@@ -62,7 +63,7 @@ auto go_along = [&](int& ended, int& blocker, int& its_changes) {
     if (ended == WHOLE) break;
     if (ended == STRAIGHT) {
       at = its_scale;
-      if (part == 1.0 || !(at > 0.0)) break;
+      if (!(at > 0.0)) break;
       continue;
     }
     if (best >= whole * (1.0 - PATH_STEP) && above == whole) {
