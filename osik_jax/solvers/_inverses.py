@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from ..execution._backends import Backend
 from ..execution._rules import custom_jvp
 from ..numerics._dense import apply, product
+from ..numerics._guarded import largest
 from ._row_factors import RowFactors, row_factors
 
 
@@ -76,7 +77,10 @@ def _by_row_factors_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, 
 def _row_space_and_motion_jvp(
     primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend = "jax"
 ) -> tuple[Any, Any]:
-    (a, target, cutoff, damping), (da, d_target, _, d_damping) = primals, tangents
+    # with rows of size 1: products of four inverses would overflow for rows of 1e-10 in single precision
+    size = largest(primals[0])
+    (a, target, cutoff), (da, d_target) = ([each / size for each in some] for some in (primals[:3], tangents[:2]))
+    damping, d_damping = primals[3] / size**2, tangents[3] / size**2
     space, X, D = _by_row_factors(a, cutoff, damping, backend=backend)
     rate = _damped_rate(a, X, D, damping, da, d_damping, target) + apply(D, d_target)
     return (space, apply(D, target)), (_space_rate(space, X, da), rate)
@@ -117,6 +121,8 @@ def _by_pivots_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple
 @row_space_and_motion_of_rank.defjvp
 def _row_space_and_motion_of_rank_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
     (a, target, rank, cutoff), (da, d_target, *_) = primals, tangents
+    size = largest(a)  # as above: rows of size 1
+    a, target, cutoff, da, d_target = (each / size for each in (a, target, cutoff, da, d_target))
     space, X = _by_pivots(a, rank, cutoff)
     rate = _inverse_rate(a, X, da, target) + apply(X, d_target)
     return (space, apply(X, target)), (_space_rate(space, X, da), rate)
@@ -143,7 +149,11 @@ def _damped_rate(
     d_damping: Array,
     w: Float[Array, " m"],
 ) -> Float[Array, " n"]:
-    """Return the derivative of D w, from that of (I + damping X X') D = X."""
+    """Return the derivative of D w, from that of (I + damping X X') D = X; where damping is strong, of D alone."""
+    # rows are at most of size 1: with more damping than that, D is small, and differences of X would be roundoff
+    is_strong = damping > 1.0
+    strong = _strongly_damped_rate(a, D, jnp.where(is_strong, damping, 1.0), da, d_damping, w)
+    damping = jnp.where(is_strong, 0.0, damping)
     # with M = X X': dD w = (I + damping M)^-1 (dX w - d_damping M D w - damping dM D w)
     y = apply(D, w)
     z = apply(X.T, y)
@@ -151,7 +161,21 @@ def _damped_rate(
     right = _inverse_rate(a, X, da, w) - damped
     # D = (I + damping X X')^-1 X, so
     # (I + damping X X')^-1 = I - damping D X'
-    return right - damping * apply(D, apply(X.T, right))
+    return jnp.where(is_strong, strong, right - damping * apply(D, apply(X.T, right)))
+
+
+def _strongly_damped_rate(
+    a: Float[Array, "m n"],
+    D: Float[Array, "n m"],
+    damping: Array,
+    da: Float[Array, "m n"],
+    d_damping: Array,
+    w: Float[Array, " m"],
+) -> Float[Array, " n"]:
+    """Return the derivative of D w, D = K A' with K = (A'A + damping I)^-1 = (I - D A) / damping."""
+    y = apply(D, w)
+    right = apply(da.T, w - apply(a, y)) - d_damping * y
+    return (right - apply(D, apply(a, right))) / damping - apply(D, apply(da, y))
 
 
 def _inverse_rate(

@@ -64,12 +64,11 @@ def _step_length(
     x: Float[Array, " n"], motion: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]
 ) -> Float[Array, ""]:
     """Return the largest step length, 1 at most, in the box that levels out of reach leave to those below."""
-    moves = motion != 0.0
     gap = jnp.where(motion > 0.0, upper - x, x - lower)
-    finite = moves & jnp.isfinite(gap)
-    # the double where keeps 0 / 0 and inf / 0 out of the derivative
-    lengths = jnp.where(finite, jnp.where(finite, gap, 1.0) / jnp.where(finite, jnp.abs(motion), 1.0), 1.0)
-    return jnp.minimum(jnp.min(lengths), 1.0)
+    stops = gap < jnp.abs(motion)
+    # the double where keeps quotients by tiny numbers, whose derivatives are infinite, out of the derivative
+    lengths = jnp.where(stops, quotient(jnp.where(stops, gap, 1.0), jnp.where(stops, jnp.abs(motion), 1.0)), 1.0)
+    return jnp.min(lengths)
 
 
 def level_motion(
