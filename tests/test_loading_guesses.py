@@ -16,8 +16,9 @@ import pytest
 from task_checks import kinematics_at
 
 import osik_jax as osik
-from osik_jax import cli, demo
+from osik_jax import cli
 from osik_jax.cli._demo import read_demo_robot
+from osik_jax.demo._file import guess_feet
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
@@ -100,7 +101,7 @@ class TestBase:
         with warnings.catch_warnings():
             warnings.simplefilter("error", osik.OsikWarning)
             robot = osik.Robot.from_urdf(known(ending))
-        assert robot.floating_base and sole in demo.guess_feet(robot)
+        assert robot.floating_base and sole in guess_feet(robot)
 
     def test_every_command_follows_the_rule(self, tmp_path, capsys):
         for name, text in (("arm", ARM), ("biped", biped("l_sole", "r_sole"))):

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from ..._errors import OsikValueError, unknown_name
 from ...control import solve
-from ...demo import guess_feet
+from ...demo._file import guess_feet
 from ...kinematics import Kinematics, forward_kinematics, integrate
 from ...limits import AccelerationLimit, ConfigurationLimit, Limit, VelocityLimit, limit_box, with_own_limits
 from ...limits._own import keeps_own
