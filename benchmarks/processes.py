@@ -88,7 +88,7 @@ def started(
         options: of its runner, and ``core``.
         workload: file of the workload.
         python: its interpreter.
-        cache: folder of compiled programs, of JAX and of Warp.
+        cache: folder of compiled programs, of JAX, and of Warp for mink-warp.
 
     Raises:
         PeerUnavailable: it did not come up.

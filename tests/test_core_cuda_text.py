@@ -7,8 +7,11 @@ import pytest
 from core_checks import needs_core
 
 from osik_jax.core import _cuda
+from osik_jax.retargeting import _banded_kernel as banded
 from osik_jax.solvers.hqp import _cuda as hierarchy
 from osik_jax.solvers.hqp._padding import Layout
+from osik_jax.solvers.null_space import _cuda as null_space
+from osik_jax.solvers.qp import _cuda as weighted_qp
 
 NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
 """Two levels of three variables; the second has one inequality row."""
@@ -23,13 +26,23 @@ def test_headers_become_one_text_whose_loops_stay_loops():
     assert len(loops) > 30 and all("unroll" in before.lower() for before in loops)
 
 
+TEXTS = {
+    "hierarchy": lambda: hierarchy._source(NAO, 50),
+    "weighted QP, double": lambda: weighted_qp._source(5, 7, 2, False, 100, 1),
+    "weighted QP, single": lambda: weighted_qp._source(5, 7, 0, True, 100, 4),
+    "more rows than variables": lambda: weighted_qp._source(40, 33, 3, False, 100, 1),
+    "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
+    "banded": lambda: banded._source(13, 2),
+}
+
+
 @needs_core
-def test_nvrtc_compiles_the_hierarchy():
+@pytest.mark.parametrize("name", TEXTS)
+def test_nvrtc_compiles_every_text(name):
     path = _cuda.nvrtc()
     if path is None:
         pytest.skip("NVRTC is not installed")
     nvrtc, program = ctypes.CDLL(path), ctypes.c_void_p()
-    source = hierarchy._source(NAO, 50).encode()
-    assert nvrtc.nvrtcCreateProgram(ctypes.byref(program), source, b"osik.cu", 0, None, None) == 0
+    assert nvrtc.nvrtcCreateProgram(ctypes.byref(program), TEXTS[name]().encode(), b"osik.cu", 0, None, None) == 0
     options = b"--gpu-architecture=sm_90", b"--std=c++20", b"--device-as-default-execution-space"
     assert nvrtc.nvrtcCompileProgram(program, 3, (ctypes.c_char_p * 3)(*options)) == 0

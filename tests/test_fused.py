@@ -1,4 +1,4 @@
-"""Candidates of the CUDA kernel, without a GPU: they are taken only where they are right."""
+"""Candidates of the weighted QP on a GPU, without one: they are taken only where they are right."""
 
 import functools
 from typing import Any, NamedTuple
@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from recorded import QP_DAMPING, recorded_qps
 
+from osik_jax.core import _cuda as core_cuda
+from osik_jax.core import _library
 from osik_jax.execution import _backends
 from osik_jax.execution._lanes import first_set, with_the_rest
+from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp import _dispatch, _search, _warp
+from osik_jax.solvers.qp import _cuda, _dispatch, _search
 from osik_jax.solvers.qp._candidate import Candidate
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
-from osik_jax.solvers.qp._warp import Shape
 
 CAP = 1000
 SOFT = 3
@@ -60,7 +62,9 @@ def candidate_of(found: _search.SearchResult) -> Candidate:
 def searched_from(candidate: Candidate, *given: Any, smallest: int) -> _search.SearchResult:
     """One program for all candidates, and another where the blocks are of another size."""
     assert smallest == _dispatch._MIN_BLOCK
-    return _dispatch.warp_candidates(lambda *_: candidate, CAP).answers(*given)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_cuda, "solve", lambda *_: candidate)
+        return _dispatch.cuda_candidates(KKT_TOLERANCE[np.dtype("float32")], CAP).answers(*given)
 
 
 def completed(batch: Batch, candidate: Candidate) -> tuple[_search.SearchResult, np.ndarray]:
@@ -166,7 +170,7 @@ def solved(batch: Batch, **options: Any) -> Any:
 
 @pytest.fixture
 def beside_a_gpu(monkeypatch):
-    """JAX with a CUDA device and Warp installed, as far as the choice can see; returns what the kernel is asked."""
+    """JAX with a CUDA device and NVRTC, as far as the choice can see; returns what the kernel is asked."""
     asked = []
 
     def solve(qp, guess, tolerance, max_iterations):
@@ -175,8 +179,8 @@ def beside_a_gpu(monkeypatch):
         return Candidate(jnp.full_like(qp.cost.damping, jnp.nan), jnp.zeros_like(qp.compliance), guess, *[nothing] * 3)
 
     monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
-    monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
-    monkeypatch.setattr(_warp, "solve", solve)
+    monkeypatch.setattr(core_cuda, "nvrtc", lambda: "libnvrtc.so")
+    monkeypatch.setattr(_cuda, "solve", solve)
     jax.clear_caches()
     yield asked
     jax.clear_caches()
@@ -191,52 +195,37 @@ def test_a_cpu_beside_a_gpu_keeps_to_xla(batch, beside_a_gpu):
     np.testing.assert_allclose(answer.x, batch.answers.x, atol=1e-6)
 
 
-@pytest.mark.parametrize("why", ["switched off", "no warp", "double", "hard rows", "large", "many rows"])
-def test_when_the_kernel_is_not_asked(batch, beside_a_gpu, monkeypatch, why):
+@pytest.mark.parametrize("why", ["switched off", "no NVRTC", "no core", "many rows"])
+def test_when_the_kernel_is_not_asked(beside_a_gpu, monkeypatch, why):
     A, n, options = np.ones((4, 5), np.float32), 5, {}
     if why == "switched off":
         options = dict(backend="jax")
-    if why == "no warp":
-        monkeypatch.setattr(_backends, "installed", lambda name: False)
-    if why == "double":
-        A = A.astype(float)
-    if why == "hard rows":
-        options = dict(rows=A[:1], rows_lower=-np.ones(1), rows_upper=np.ones(1))
-    if why == "large":
-        A, n = np.ones((4, 65), np.float32), 65
+    if why == "no NVRTC":
+        monkeypatch.setattr(core_cuda, "nvrtc", lambda: None)
+    if why == "no core":
+        monkeypatch.setattr(_library, "core", lambda: _library.Core(None, None, "none"))
     if why == "many rows":
-        A = np.ones((2000, 5), np.float32)
+        A = np.ones((20_000, 5), np.float32)
     bound = np.ones(n, A.dtype)
     jax.jit(lambda: solve_least_squares_qp(A, A[:, 0], A[:, 0], -bound, bound, **options)).lower()
     assert beside_a_gpu == []
 
 
-def test_the_kernel_is_asked_for_soft_rows_and_none(beside_a_gpu):
-    A, bound = np.ones((4, 5), np.float32), np.ones(5, np.float32)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("rows", ["none", "soft", "hard"])
+def test_when_the_kernel_is_asked(beside_a_gpu, rows, dtype):
+    A, bound = np.ones((4, 5), dtype), np.ones(5, dtype)
     b, one = A[:, 0], bound[:1]
-    jax.jit(lambda: solve_least_squares_qp(A, b, b, -bound, bound)).lower()
+    options = {} if rows == "none" else dict(rows=A[:1], rows_lower=-one, rows_upper=one)
+    options |= dict(rows_compliance=one) if rows == "soft" else {}
+    jax.jit(lambda: solve_least_squares_qp(A, b, b, -bound, bound, **options)).lower()
     assert set(beside_a_gpu) == {(4, 5)}
-    soft = dict(rows=A[:1], rows_lower=-one, rows_upper=one, rows_compliance=one)
-    A = np.ones((6, 5), np.float32)
-    jax.jit(
-        lambda: jax.vmap(lambda b: solve_least_squares_qp(A, b, b, -bound, bound, **soft))(A[:3, :1] * A.T[:1])
-    ).lower()
-    assert set(beside_a_gpu) == {(4, 5), (6, 5)}
 
 
 def test_no_gpu_no_kernel():
     assert not _backends.cuda_is_default()
     with jax.default_device(jax.devices("cpu")[0]):
         assert not _backends.cuda_is_default()
-
-
-@pytest.mark.parametrize("shape", [Shape(35, 50, 0), Shape(32, 47, 32), Shape(64, 90, 8), Shape(1, 1, 0)])
-def test_what_the_text_is_compiled_for(shape):
-    assert 1 <= shape.warps <= 4
-    first = _warp.source(shape).splitlines()[0]
-    n, m, p = shape
-    assert first == f"constexpr int N = {n}, M = {m}, P = {p}, WARPS = {shape.warps};"
-    assert Shape(65, 10, 0).warps == Shape(64, 1000, 0).warps == Shape(10, 10, 33).warps == 0
 
 
 @pytest.mark.parametrize("set_", [[], [0], [6], [1, 4], [0, 1, 2, 3, 4, 5, 6]])

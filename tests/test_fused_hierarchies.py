@@ -6,14 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from core_checks import needs_core
 from hierarchy_families import inequality_levels
 
+from osik_jax.core import _cuda as core_cuda
 from osik_jax.execution import _backends
 from osik_jax.solvers import Level, Tolerances, solve_hqp
 from osik_jax.solvers._damping import per_level
-from osik_jax.solvers.hqp import _cascade, _dispatch, _warp
+from osik_jax.solvers.hqp import _cascade, _cuda, _dispatch
 from osik_jax.solvers.hqp._padding import Layout, PaddedHierarchy, pad_hierarchy
-from osik_jax.solvers.hqp._warp import Shape
 
 COUNT, CAP = 12, 200
 
@@ -115,15 +116,16 @@ def test_wrong_answers_are_not(batch, wrong, monkeypatch):
     np.testing.assert_allclose(end.x, batch.answers.x, rtol=0, atol=1e-12)
 
 
+@needs_core
 def test_when_the_kernel_is_asked(monkeypatch):
     asked = []
 
     def solve(layout, hierarchy, tolerances, warm_start, max_iterations):
-        asked.append(Shape.of(layout))
+        asked.append(layout.variables)
         return _cascade.solve_cascade(layout, max_iterations, hierarchy, tolerances, warm_start)
 
-    monkeypatch.setattr(_warp, "solve", solve)
-    monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
+    monkeypatch.setattr(_cuda, "solve", solve)
+    monkeypatch.setattr(core_cuda, "nvrtc", lambda: "libnvrtc.so")
 
     def trace(n=3, backend="auto"):
         _dispatch.hierarchy_solver.cache_clear()
@@ -135,30 +137,12 @@ def test_when_the_kernel_is_asked(monkeypatch):
     assert asked == []  # no GPU
     monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
     trace()
-    assert asked[-1] == Shape(3, 2, (1, 2, 0), (True, False, False), (0,), (0,))
+    trace(backend="core")
+    assert asked[-1] == 3
     count = len(asked)
-    trace(130)  # too many variables
+    trace(170)  # too many variables for the memory of a block
     trace(backend="jax")
-    with pytest.raises(ValueError, match="backend='warp' has no kernel"):
-        trace(130, backend="warp")
+    trace(170, backend="core")
     assert len(asked) == count
     _dispatch.hierarchy_solver.cache_clear()
     jax.clear_caches()
-
-
-@pytest.mark.parametrize(
-    ("shape", "warps"),
-    [
-        (Shape(31, 12, (12, 3, 3, 0), (False,) * 4, (), ()), 2),
-        (Shape(31, 25, (12, 3, 3, 25, 0), (False,) * 5, (), ()), 1),
-        (Shape(10, 4, (4, 0), (True, False), (0, 1, 2, 3), (0,) * 4), 2),
-        (Shape(64, 65, (65, 0), (False,) * 2, (), ()), 0),
-        (Shape(10, 40, (40, 0), (True, False), tuple(range(40)), (0,) * 40), 0),
-        (Shape(10, 0, (0,), (False,), (), ()), 0),
-    ],
-)
-def test_what_the_text_is_compiled_for(shape, warps):
-    assert shape.warps == warps
-    if warps:
-        head = _warp.source(shape).splitlines()[:6]
-        assert head[0] == f"constexpr int N = {shape.variables};" and head[5] == f"constexpr int WARPS = {warps};"

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from emulated_warp import emulated, needs_compiler
 from motion_files import bent_forward, dancer, with_first, write_bvh
 from other_processes import finish, start
 from scipy.spatial import ConvexHull
@@ -24,7 +23,6 @@ from osik_jax.kinematics._home import home_kinematics
 from osik_jax.retargeting import (
     HumanMotion,
     Retargeter,
-    _banded,
     _banded_kernel,
     _plan,
     find_profile,
@@ -108,24 +106,15 @@ def test_a_banded_system_is_solved_as_the_dense_one():
     np.testing.assert_allclose(x, np.linalg.solve(dense, right.ravel()).reshape(frames, n), rtol=1e-10, atol=1e-12)
 
 
-@needs_compiler
-@pytest.mark.parametrize("backwards", [False, True])
-def test_the_gpu_kernel_solves_a_banded_system_as_the_dense_one(backwards, tmp_path, monkeypatch):
-    """Its text on a CPU, thread by thread, in both orders."""
+@pytest.mark.skipif(not _backends.cuda_is_default(), reason="needs a CUDA device")
+def test_the_gpu_kernel_solves_a_banded_system_as_the_dense_one():
     rng = np.random.default_rng(3)
-    lanes, frames, n = 2, 5, 13
+    lanes, frames, n = 20, 5, 13
     systems, dense = zip(*(banded_and_dense(rng, frames, n) for _ in range(lanes)), strict=True)
     right = rng.normal(size=(lanes, frames, n))
-    text, given, made = _banded_kernel.source(n, 2), _banded_kernel._INPUTS, _banded_kernel._OUTPUTS
-    kernel = emulated(text, given, made, tmp_path, backwards=backwards, scalar="most_changes")
-    monkeypatch.setattr(_banded_kernel, "_kernel", lambda *shape: kernel)
-    monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
-    monkeypatch.setattr(_backends, "installed", lambda name: name == "warp")
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
-    _banded._anywhere.cache_clear()
     single = jax.tree.map(lambda *a: jnp.stack(a).astype(jnp.float32), *systems)
+    assert _banded_kernel.fits(single)
     x = jax.vmap(solve_banded)(single, jnp.asarray(right, jnp.float32))
-    _banded._anywhere.cache_clear()
     for lane in range(lanes):
         exact = np.linalg.solve(dense[lane], right[lane].ravel()).reshape(frames, n)
         np.testing.assert_allclose(x[lane], exact, atol=2e-6 * np.abs(exact).max())

@@ -21,6 +21,7 @@ from . import _build, _library
 
 SHARED_BYTES = 227 * 1024
 """Shared memory of one block at most, on devices of compute capability 9.0; less on others, which take the search."""
+_MOST_SPACES = 1 << 14
 _LOCAL_INCLUDE = re.compile(r'^#include "(.*)"\n', re.MULTILINE)
 # a loop stays a loop unless the line before it asks to unroll it: unrolled, the text exceeds the instruction cache
 _LOOP = re.compile(r"(?<!unroll\n)(?<!unroll \d\n)(?<!OSIK_UNROLL\n)^ *(?:for|while) \(", re.MULTILINE)
@@ -54,7 +55,12 @@ def text_of(header: str) -> str:
         text = _SYSTEM_INCLUDE.sub("", (_build.FOLDER / name).read_text())
         return _LOCAL_INCLUDE.sub(lambda match: inlined(match[1]), text.replace("#pragma once\n", ""))
 
-    return _LOOP.sub(r"#pragma unroll 1\n\g<0>", inlined(header))
+    return rolled(inlined(header))
+
+
+def rolled(text: str) -> str:
+    """Return CUDA text whose loops stay loops, except for those that ask to be unrolled."""
+    return _LOOP.sub(r"#pragma unroll 1\n\g<0>", text)
 
 
 def call(
@@ -63,15 +69,19 @@ def call(
     *inputs: Array,
     problems: int,
     shared: int,
+    per_block: int = 1,
+    warps: int = 1,
 ) -> list[Array]:
-    """Launch a kernel named ``osik_kernel`` with one warp for each problem.
+    """Launch a kernel named ``osik_kernel``.
 
     Args:
         source: CUDA text.
         outputs: shape and dtype of each result.
         inputs: arrays, as the kernel wants them.
-        problems: how many there are; each is a block of its own, for the workspace begins where shared memory does.
-        shared: bytes of shared memory of one problem.
+        problems: how many there are.
+        shared: bytes of shared memory of one problem, which begin where shared memory does.
+        per_block: how many problems a block solves.
+        warps: how many warps of 32 threads a block has.
 
     Returns:
         The results.
@@ -79,10 +89,15 @@ def call(
     _register()
     shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in outputs]
     key = hashlib.sha256(source.encode()).hexdigest()[:24]
-    numbers = dict(problems=problems, per_block=1, threads=32, shared=shared)
+    numbers = dict(problems=problems, per_block=per_block, threads=32 * warps, shared=shared)
     with jax.enable_x64(True):
         run = jax.ffi.ffi_call("osik_cuda", shapes)
         return list(run(*inputs, source=source, key=key, **{name: np.int32(n) for name, n in numbers.items()}))
+
+
+def problems_of_a_block(problems: int) -> int:
+    """Return how many problems a block solves whose kernel has space in global memory: so that few blocks have some."""
+    return -(-problems // _MOST_SPACES)
 
 
 @cache

@@ -18,9 +18,9 @@ constexpr double STATIONARITY_TOL = 10.0, DAMPED_RANK = 1e-14, EXTRA_DAMPING = 1
 // labels of constraints
 constexpr int INACTIVE = 0, AT_LOWER = -1, AT_UPPER = 1, EQUALITY = 2, REDUNDANT = 3;
 
-// weighted QP, in double precision
-constexpr int KERNEL_REFINEMENTS = 10, MAX_EXCHANGES = 2, MAX_DUAL_STARTS = 8;
-constexpr double KERNEL_CORRECTION = 1e-10, MIN_DECREASE = 0.25, KERNEL_PIVOT = 1e2,
+// weighted QP; SINGLE_... in single precision
+constexpr int KERNEL_REFINEMENTS = 10, SINGLE_REFINEMENTS = 6, MAX_EXCHANGES = 2, MAX_DUAL_STARTS = 8;
+constexpr double KERNEL_CORRECTION = 1e-10, SINGLE_CORRECTION = 1e-6, VIOLATION_TOL = 10.0, SINGLE_RIDGE = 1.0, MIN_DECREASE = 0.25, KERNEL_PIVOT = 1e2,
                  ZERO_TOL = 100.0, BOUND_MULTIPLIER = 1.0, KERNEL_DEPENDENCE = 1e-14, REDUNDANCY_TOL = 1e3;
 
 // rotations, collision

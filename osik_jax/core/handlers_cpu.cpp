@@ -41,7 +41,7 @@ void* osik_hierarchy(xla::CallFrame* frame) { return xla::handle<solve_hierarchi
 // Bytes of shared memory that a warp needs for one problem, a multiple of 16.
 int osik_hierarchy_bytes(int L, int m, int n, int h) {
   const Sizes s{L, m, n, h, 0, nullptr, nullptr, nullptr};
-  using Method = Hierarchy<WarpSizes>;
+  using Method = Hierarchy<WarpSizes<>>;
   return Method::bytes(s);
 }
 

@@ -78,10 +78,11 @@ template <class Team> struct LinearAlgebra {
   }
 
   // S = L D L': the inverse M of L, with its ones and zeros, and inverse[k] = 1 / D_k. S has its upper triangle, which is
-  // used up. diagonal: [count] space. Returns whether every pivot D_k is at least `smallest` of the diagonal's S_kk.
+  // used up, or has M in the end if the team spares space. diagonal: [count] space. Returns whether every pivot D_k is at least `smallest` of the diagonal's S_kk.
   OSIK_CALL static bool inverse_factor(Team t, Real* S, Real* M, Real* inverse, Real* diagonal, int ld, int count,
                                        Real smallest) {
     t.are_shared(S, M, inverse, diagonal);
+    if constexpr (Team::SPARES_SPACE) return t.inverse_factor(S, inverse, diagonal, ld, count, smallest);
     const int end = Team::padded(count);
     t.each(0, count, [&](int i) {
       diagonal[i] = S[i * ld + i];

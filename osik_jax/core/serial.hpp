@@ -88,6 +88,7 @@ template <class R> struct Serial {
   using Bits = typename Vector<R>::Bits;
   static constexpr int LANES = Vector<R>::LANES;
   static constexpr bool COPIES = true;  // a method copies the rows that it is given, so that they are padded
+  static constexpr bool SPARES_SPACE = false;
   static constexpr int BLOCK = 2 * 64 / int(sizeof(R));  // columns of a large pack
   static constexpr int WIDE = 64 / int(sizeof(R));  // the widest vector of any instruction set
   static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
@@ -254,6 +255,10 @@ template <class R> struct Serial {
     if (j < n && n >= LANES) j = n - LANES, *(Loaded*)(to + j) = by * *(const Loaded*)(from + j);
     else
       for (; j < n; ++j) to[j] = by * from[j];
+  }
+  // row a of `to` [rows, ld] = factor[a] times row a of `from` [rows, n]
+  OSIK_FN void scaled_rows(Real* to, int ld, const Real* factor, const Real* from, int rows, int n) const {
+    for (int a = 0; a < rows; ++a) scaled_copy(to + a * ld, factor[a], from + a * n, n);
   }
   // products of A rows with LANES other rows, over the columns [start, n)
   template <int A> OSIK_FN static void products(const Real* const* a, const Real* const* b, int start, int n, Value* out) {

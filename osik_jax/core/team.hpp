@@ -8,8 +8,8 @@
 //   narrow_columns(a, b, f)  the same with smaller packs, for an f that works on several at once
 //   sum, count, most, best   reductions of f(i); every thread gets the result
 //   dot, axpy, forward, backward, reflect   vector operations of the whole team
-//   scaled_copy, rows_times, weighted_gram, largest   a row that gets its padding; products of all rows with a vector,
-//                        and with each other; the largest product
+//   scaled_copy, scaled_rows   a row, or rows, that get their padding
+//   rows_times, weighted_gram, largest   products of all rows with a vector, and with each other; the largest product
 // The functions own_... are those of one thread, for use inside f.
 //
 // Rows are padded: a row of n numbers has Team::stride(n) places, and the places after the n-th hold zeros.
@@ -41,12 +41,14 @@ template <class Real> struct Best {
 // How a warp lays out its workspace. The host uses it to compute the size of one.
 template <class T, class At, class Sizes> struct NoArray {};
 
-struct WarpSizes {
+template <class R = double> struct WarpSizes {
   using Int = short;
-  using Real = double;
+  using Real = R;
   template <class T, class At, class Sizes> using Array = NoArray<T, At, Sizes>;
-  static constexpr bool COPIES = false;  // rows are read from global memory
+  static constexpr bool COPIES = false;        // rows are read from global memory
+  static constexpr bool SPARES_SPACE = true;   // inverse_factor is in place; what is seldom used is in global memory
   static constexpr OSIK_HOST int stride(int n) { return n | 1; }  // odd: threads read different banks of memory
+  static constexpr OSIK_HOST int padded(int n) { return n; }
   static constexpr OSIK_HOST int variables(int n) { return n; }
   static constexpr OSIK_HOST int level_rows(int m) { return m; }
   static constexpr OSIK_HOST int hard_rows(int h) { return h; }

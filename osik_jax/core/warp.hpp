@@ -11,6 +11,9 @@ struct Column {
     OSIK_FN Number() {}
     OSIK_FN Number(Real a) : v(a) {}
     OSIK_FN Number& operator+=(const Number& o) { return v += o.v, *this; }
+    OSIK_FN Number& operator-=(const Number& o) { return v -= o.v, *this; }
+    OSIK_FN Number& operator*=(const Number& o) { return v *= o.v, *this; }
+    OSIK_FN Number inverse() const { return Real(1) / v; }
     OSIK_FN Number& fma(Real a, const Number& o) { return v += a * o.v, *this; }
     OSIK_FN Number& square(const Number& o) { return v += o.v * o.v, *this; }
   };
@@ -27,14 +30,19 @@ extern __shared__ double shared_space[];  // of one problem: a block is one warp
 // An array of a workspace in shared memory. Its address is a constant, so that no register and no member holds it.
 template <class T, class At, class Sizes> struct SharedArray {
   OSIK_FN void place(char*, const Sizes&) {}
-  OSIK_FN operator T*() const { return reinterpret_cast<T*>(reinterpret_cast<char*>(shared_space) + At::of(Sizes{})); }
+  OSIK_FN operator T*() const {
+    constexpr int at = At::of(Sizes{});
+    return reinterpret_cast<T*>(reinterpret_cast<char*>(shared_space) + at);
+  }
 };
 
 // Space is laid out for N variables, M rows of a level and H hard rows, which are constants of a compilation.
-template <class R, int N, int M, int H> struct Warp : WarpSizes {
+template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   using Real = R;
+  using typename WarpSizes<R>::Int;
   template <class T, class At, class Sizes> using Array = SharedArray<T, At, Sizes>;
   static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
+  static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
   static constexpr unsigned ALL = 0xffffffffu;
   static constexpr OSIK_HOST int variables(int) { return N; }
   static constexpr OSIK_HOST int level_rows(int) { return M; }
@@ -144,6 +152,11 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes {
     return r;
   }
 
+  // the largest |a_j b_j|; NaN counts as none
+  OSIK_FN Real largest(const Real* a, const Real* b, int n) const {
+    return best(Real(0), 0, n, [&](int j) { return fabs(a[j] * b[j]); }).value;
+  }
+
   // ---- vectors
   OSIK_FN static Real own_dot(const Real* a, const Real* b, int start, int stop, int step = 1) {
     Real even = 0, odd = 0;
@@ -170,6 +183,42 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes {
 #pragma unroll 2
     for (int j = start; j < stop; ++j) a[j] += by * b[j];
   }
+  OSIK_FN static void own_axpy_on(Real* a, Real by, const Real* b, int start, int n) { own_axpy(a, by, b, start, n); }
+  OSIK_FN static int own_end(const Real*, int n) { return n; }
+  OSIK_FN void scaled_copy(Real* to, Real by, const Real* from, int n) const {
+    each(0, n, [&](int j) { to[j] = by * from[j]; });
+  }
+  OSIK_FN void scaled_rows(Real* to, int ld, const Real* factor, const Real* from, int rows, int n) const {
+    constexpr int AHEAD = 8;  // loads from global memory that wait together
+    __syncwarp();
+    for (int first = me(); first < rows * N; first += 32 * AHEAD) {
+      Real entry[AHEAD];
+OSIK_UNROLL
+      for (int u = 0; u < AHEAD; ++u) entry[u] = first + 32 * u < rows * N ? from[first + 32 * u] : Real(0);
+OSIK_UNROLL
+      for (int u = 0; u < AHEAD; ++u) {
+        const int e = first + 32 * u, a = e / N;
+        if (e < rows * N) to[a * ld + e - a * N] = factor[a] * entry[u];
+      }
+    }
+    __syncwarp();
+  }
+  template <class Row, class End> OSIK_FN void rows_times(Row row, End end, const Real* v, Real* out, int count) const {
+    each(0, count, [&](int a) { out[a] = own_dot(row(a), v, 0, end(a)); });
+  }
+  // S[a, b] = sum_j row(a)_j weight_j row(b)_j for a <= b < count
+  template <class Row, class End>
+  OSIK_FN void weighted_gram(Row row, End, const Real* weight, Real* S, Real*, int ld_S, int, int count) const {
+    pairs(count, [&](int a, int b) {
+      const Real *first = row(a), *second = row(b);
+      Real even = 0, odd = 0;
+#pragma unroll 4
+      for (int j = 0; j + 1 < N; j += 2)
+        even += first[j] * weight[j] * second[j], odd += first[j + 1] * weight[j + 1] * second[j + 1];
+      if (N % 2) even += first[N - 1] * weight[N - 1] * second[N - 1];
+      S[a * ld_S + b] = even + odd;
+    });
+  }
   OSIK_CALL Real dot(const Real* a, const Real* b, int start, int stop) const {
     __syncwarp();
     return sum(start, stop, [&](int j) { return a[j] * b[j]; });
@@ -184,6 +233,37 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes {
       const Real by = -scale * own_dot(r, v, at, n);
       if (by != Real(0)) own_axpy(r, by, v, at, n);
     });
+  }
+
+  // LinearAlgebra::inverse_factor, in the place of S. Thread j has column j: of what is left of S from row k on, of the
+  // inverse M in the columns before k.
+  OSIK_FN bool inverse_factor(Real* S, Real* inverse, Real* diagonal, int ld, int count, Real smallest) const {
+    each(0, count, [&](int j) {
+      diagonal[j] = S[j * ld + j];
+#pragma unroll 4
+      for (int i = j + 1; i < count; ++i) S[i * ld + j] = S[j * ld + i];
+    });
+    bool regular = true;
+#pragma unroll 1
+    for (int k = 0; k < count && regular; ++k) {
+      const Real* row = S + k * ld;
+      const Real pivot = row[k], by = Real(1) / pivot;
+      regular = pivot > 0 && pivot >= smallest * diagonal[k];
+      each(0, count, [&](int j) {
+        const bool is_pivot = j == k;  // whose column of S is done, so that that of M begins
+        const Real factor = is_pivot ? by : by * row[j];
+        Real* column = S + j;
+        if (is_pivot) inverse[k] = by;
+#pragma unroll 4
+        for (int i = k + 1; i < count; ++i)
+          column[i * ld] = (is_pivot ? Real(0) : column[i * ld]) - row[i] * factor;
+      });
+    }
+    each(0, count, [&](int j) {
+      for (int i = 0; i < j; ++i) S[i * ld + j] = 0;
+      S[j * ld + j] = 1;
+    });
+    return regular;
   }
 
   // ---- triangular systems of at most 64 equations; entry k of y stays in a register of thread k % 32

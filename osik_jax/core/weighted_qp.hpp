@@ -48,65 +48,117 @@ template <class Team> struct WeightedQP {
   using Data = QPData<Real>;
   using Answer = QPAnswer<Real>;
   static constexpr Real EPS = sizeof(Real) == 8 ? EPSILON : 1.1920929e-07;
+  static constexpr bool IS_SINGLE = sizeof(Real) == 4;
+  static constexpr Real VIOLATION = sizeof(Real) == 8 ? 1 : VIOLATION_TOL;
   static constexpr int VECTORS = 24, INTEGERS = 4;
   Team t;
-  int m, n, p, k, N, ld, lk, max_changes;  // k = m + p rows; strides of rows of n and of k numbers
-  int used, changes, factorizations;       // rows in the system of the active set
+  int m, n, p, k, N, ld, lk, lq, max_changes;  // k = m + p rows; strides of rows of n, of k and of order(k, n) numbers
+  int used, changes, factorizations;           // rows in the system of the active set
   Real tolerance;
   const Real *lower, *upper;
-  Real *B;           // [k, ld] the rows
-  Real *S, *M;       // [q, lq] the system of the active set and the inverse of its factor, q = k or n
-  Real *V, *T, *TM;  // [p, ld] M times the active rows of C, and their Schur complement [p, lk] with its inverse factor
-  int lq;
-  // vectors, as long as the longest of k and N
-  Real *TARGET, *COMPLIANCE, *DAMPING, *CENTER, *ROOT, *INVERSE_ROOT, *INVERSE, *X, *Z, *STEP, *GRADIENT, *GAP, *RIGHT,
-      *SOLVED, *PIVOT, *TERMS, *VALUE, *VALUE_ROUNDOFF, *MULTIPLIER_ROUNDOFF, *DIAGONAL, *SMALL, *SMALL_PIVOT,
-      *SCALED, *ALSO_SCALED;  // these two, one after the other, are [2, ld]
-  Int *LABEL, *NEXT, *USED, *END;  // END: a row of B is 0 from this column on
-  DualActiveSet<Team> dual;
 
+  // ---- the workspace: where each array begins, in bytes. The numbers begin as zeros.
   static constexpr OSIK_HOST int width(const QPSizes& s) {
-    const int k = s.m + s.p, N = s.n + s.p;
+    const int k = Team::level_rows(s.m) + Team::hard_rows(s.p), N = Team::variables(s.n) + Team::hard_rows(s.p);
     return Team::stride(k > N ? k : N);
   }
-  static constexpr OSIK_HOST int order(const QPSizes& s) { return s.m + s.p > s.n ? s.m + s.p : s.n; }
-  // numbers and integers of the workspace; the numbers begin as zeros
-  static constexpr OSIK_HOST int doubles(const QPSizes& s) {
-    const int k = s.m + s.p, q = order(s);
-    return (k + s.p) * Team::stride(s.n) + 2 * q * Team::stride(q) + 2 * s.p * Team::stride(k) + VECTORS * width(s) +
-           DualActiveSet<Team>::doubles(s.n, s.p) + Team::stride(0);
+  // the order of the system of the active set. In single precision it is the Hessian's: the rows' needs a damping that is
+  // far above roundoff.
+  static constexpr OSIK_HOST int order(int k, int n) { return k < n && !IS_SINGLE ? k : n; }
+  // the numbers before matrix `which`, in the order of the matrices below; the last two are the dual method and an end
+  static constexpr OSIK_HOST int numbers_before(int which, const QPSizes& s) {
+    const int n = Team::variables(s.n), p = Team::hard_rows(s.p), k = Team::level_rows(s.m) + p, q = order(k, n);
+    const int kept = q < k || IS_SINGLE ? p : 0;  // rows that are kept where the system is the Hessian's
+    const int dual = Team::SPARES_SPACE ? 0 : DualActiveSet<Team>::doubles(n, p);
+    const int size[] = {k * Team::stride(n), kept * Team::stride(n), q * Team::stride(q),
+                        Team::SPARES_SPACE ? 0 : q * Team::stride(q), kept * Team::stride(k),
+                        Team::SPARES_SPACE ? 0 : kept * Team::stride(k), dual, Team::stride(0)};
+    int count = VECTORS * width(s);
+    for (int i = 0; i < which; ++i) count += size[i];
+    return count;
   }
-  static constexpr OSIK_HOST int integers(const QPSizes& s) {
-    return INTEGERS * width(s) + DualActiveSet<Team>::integers(s.n, s.p);
+  static constexpr OSIK_HOST int bytes_of_numbers(const QPSizes& s) { return int(sizeof(Real)) * numbers_before(8, s); }
+  static constexpr OSIK_HOST int bytes(const QPSizes& s) {
+    const int integers = INTEGERS * width(s) + Team::variables(s.n) + Team::hard_rows(s.p);
+    return (bytes_of_numbers(s) + integers * int(sizeof(Int)) + 15) / 16 * 16;
   }
+  template <int K> struct MatrixAt {
+    static constexpr OSIK_HOST int of(const QPSizes& s) { return int(sizeof(Real)) * numbers_before(K, s); }
+  };
+  template <int K> struct VectorAt {
+    static constexpr OSIK_HOST int of(const QPSizes& s) { return int(sizeof(Real)) * K * width(s); }
+  };
+  template <int K> struct LabelsAt {
+    static constexpr OSIK_HOST int of(const QPSizes& s) { return bytes_of_numbers(s) + int(sizeof(Int)) * K * width(s); }
+  };
+  template <int K> using Matrix = typename Team::template Array<Real, MatrixAt<K>, QPSizes>;
+  template <int K> using Numbers = typename Team::template Array<Real, VectorAt<K>, QPSizes>;
+  template <int K> using Labels = typename Team::template Array<Int, LabelsAt<K>, QPSizes>;
+  Matrix<0> B;   // [k, ld] the rows
+  Matrix<1> V;   // [p, ld] where the system is the Hessian's: M times the active rows of C
+  Matrix<2> S;   // [q, lq] the system of the active set, q = order(k, n)
+  Matrix<(Team::SPARES_SPACE ? 2 : 3)> M;  // [q, lq] the inverse of its factor, perhaps in the place of S
+  Matrix<4> T;   // [p, lk] with V: the Schur complement of the active rows of C
+  Matrix<(Team::SPARES_SPACE ? 4 : 5)> TM;  // [p, lk] the inverse of its factor
+  Matrix<6> DUAL;
+  // vectors, as long as the longest of k and N
+  Numbers<0> TARGET;
+  Numbers<1> COMPLIANCE;
+  Numbers<2> DAMPING;
+  Numbers<3> CENTER;
+  Numbers<4> ROOT;
+  Numbers<5> INVERSE_ROOT;
+  Numbers<6> INVERSE;
+  Numbers<7> X;
+  Numbers<8> Z;
+  Numbers<9> STEP;
+  Numbers<10> GRADIENT;
+  Numbers<11> GAP;
+  Numbers<12> RIGHT;
+  Numbers<13> SOLVED;
+  Numbers<14> PIVOT;
+  Numbers<15> TERMS;
+  Numbers<16> VALUE;
+  Numbers<17> VALUE_ROUNDOFF;
+  Numbers<18> MULTIPLIER_ROUNDOFF;
+  Numbers<19> DIAGONAL;
+  Numbers<20> SMALL;
+  Numbers<21> SMALL_PIVOT;
+  Numbers<22> SCALED;
+  Numbers<23> ALSO_SCALED;  // after SCALED, with which it is [2, ld]
+  Labels<0> LABEL;
+  Labels<1> NEXT;
+  Labels<2> USED;
+  Labels<3> END;  // a row of B is 0 from this column on
+  Labels<4> ORDER;
+  DualActiveSet<Team> dual;
 
-  OSIK_FN WeightedQP(const QPSizes& s, Real* F, Int* J)
+  template <class... Arrays> OSIK_FN void place(char* space, const QPSizes& s, Arrays&... arrays) {
+    (arrays.place(space, s), ...);
+  }
+  // outside: space of the dual method, if the team spares space
+  OSIK_FN WeightedQP(const QPSizes& s, char* space, Real* outside = nullptr)
       : m(s.m), n(s.n), p(s.p), k(s.m + s.p), N(s.n + s.p), ld(Team::stride(s.n)), lk(Team::stride(s.m + s.p)),
-        max_changes(s.max_changes), lq(Team::stride(order(s))) {
-    const int w = width(s), q = order(s);
-    for (Real** v : {&TARGET, &COMPLIANCE, &DAMPING, &CENTER, &ROOT, &INVERSE_ROOT, &INVERSE, &X, &Z, &STEP, &GRADIENT,
-                     &GAP, &RIGHT, &SOLVED, &PIVOT, &TERMS, &VALUE, &VALUE_ROUNDOFF, &MULTIPLIER_ROUNDOFF, &DIAGONAL,
-                     &SMALL, &SMALL_PIVOT, &SCALED, &ALSO_SCALED})
-      *v = F, F += w;
-    B = F, V = B + k * ld, S = V + p * ld, M = S + q * lq, T = M + q * lq, TM = T + p * lk;
-    for (Int** v : {&LABEL, &NEXT, &USED, &END}) *v = J, J += w;
-    dual.begin(n, p, TM + p * lk, J);
-    t.each(n, w, [&](int j) { DAMPING[j] = 1; });  // which has an inverse
+        lq(Team::stride(order(s.m + s.p, s.n))), max_changes(s.max_changes) {
+    place(space, s, B, V, S, M, T, TM, DUAL, TARGET, COMPLIANCE, DAMPING, CENTER, ROOT, INVERSE_ROOT, INVERSE, X, Z, STEP,
+          GRADIENT, GAP, RIGHT, SOLVED, PIVOT, TERMS, VALUE, VALUE_ROUNDOFF, MULTIPLIER_ROUNDOFF, DIAGONAL, SMALL,
+          SMALL_PIVOT, SCALED, ALSO_SCALED, LABEL, NEXT, USED, END, ORDER);
+    dual.begin(n, p, Team::SPARES_SPACE ? outside : DUAL, ORDER);
+    t.each(n, width(s), [&](int j) { DAMPING[j] = 1; });  // which has an inverse
   }
 
   // ---- one problem
   OSIK_METHOD void begin(const Data& d) {
     lower = d.lower, upper = d.upper, tolerance = d.tolerance, changes = factorizations = 0;
     t.each(n, ld, [&](int j) { X[j] = STEP[j] = GRADIENT[j] = SOLVED[j] = TERMS[j] = RIGHT[j] = 0; });
-    for (int i = 0; i < k; ++i) {
+    t.each(0, k, [&](int i) {
       const Real root = i < m ? sqrt(d.weight[i]) : Real(1);
-      const Real* row = i < m ? d.matrix + i * n : d.rows + (i - m) * n;
-      t.scaled_copy(B + i * ld, root, row, n);
-      t.once([&] {
-        TARGET[i] = i < m ? root * d.target[i] : 0, COMPLIANCE[i] = i < m ? Real(1) : d.compliance[i - m];
-        Z[i] = 0, END[i] = t.own_end(B + i * ld, n);
-      });
-    }
+      GAP[i] = root, TARGET[i] = i < m ? root * d.target[i] : 0, COMPLIANCE[i] = i < m ? Real(1) : d.compliance[i - m];
+      Z[i] = 0;
+    });
+    t.scaled_rows(B, ld, GAP, d.matrix, m, n);
+    t.scaled_rows(B + m * ld, ld, GAP + m, d.rows, p, n);
+    t.each(0, k, [&](int i) { END[i] = t.own_end(B + i * ld, n); });
     t.scaled_copy(DAMPING, 1, d.damping, n);
     t.scaled_copy(CENTER, 1, d.center, n);
     t.columns(0, n, [&](auto c) {
@@ -148,15 +200,17 @@ template <class Team> struct WeightedQP {
       c.store(GRADIENT, total);
     });
   }
-  // Whether a correction is the last: it is roundoff, or shrinks no more. `before`: the size of the one before it.
+  // Whether a correction is the last: it is roundoff (in single precision the next one is, for they shrink alike), or
+  // shrinks no more. `before`: the size of the one before it.
   OSIK_FN bool is_last(Real& before) const {
     const Real moved = t.largest(STEP, ROOT, n), far = t.largest(X, ROOT, n);
-    const bool last = before < Real(INFINITE) && (moved <= CORRECTION * far || moved > Real(MIN_DECREASE) * before);
+    const bool is_roundoff = IS_SINGLE ? moved * moved <= CORRECTION * far * before : moved <= CORRECTION * far;
+    const bool last = before < Real(INFINITE) && (is_roundoff || moved > Real(MIN_DECREASE) * before);
     before = moved;
     return last;
   }
-  static constexpr Real CORRECTION = sizeof(Real) == 8 ? KERNEL_CORRECTION : 1e-6;
-  static constexpr int REFINEMENTS = sizeof(Real) == 8 ? KERNEL_REFINEMENTS : 6;
+  static constexpr Real CORRECTION = sizeof(Real) == 8 ? KERNEL_CORRECTION : SINGLE_CORRECTION;
+  static constexpr int REFINEMENTS = sizeof(Real) == 8 ? KERNEL_REFINEMENTS : SINGLE_REFINEMENTS;
 
   // ---- the minimiser on the active set; returns whether the factors are regular
   OSIK_METHOD bool solve_on_active_set() {
@@ -167,8 +221,9 @@ template <class Team> struct WeightedQP {
       t.once([&] { in ? void(USED[used] = i) : void(Z[i] = 0); });
       used += in;
     }
-    return used <= n ? solve_by_rows() : solve_by_hessian();
+    return used <= n && !IS_SINGLE ? solve_by_rows() : solve_by_hessian();
   }
+  static constexpr Real RIDGE = IS_SINGLE ? SINGLE_RIDGE * EPS : 0;
   OSIK_METHOD bool solve_by_rows() {
     t.columns(0, n, [&](auto c) { c.store(X, c.load(CENTER)), c.store(INVERSE, c.load(DAMPING).inverse()); });
     t.each(0, n, [&](int j) {
@@ -206,19 +261,21 @@ template <class Team> struct WeightedQP {
   }
   // H_F = B_F' B_F + D_F, with a row and a column of the identity for active variables; V = M C_F' and V D^-1 V' + E
   OSIK_METHOD bool factor_hessian() {
-    for (int a = 0; a < n; ++a) {
-      const bool free = LABEL[a] == INACTIVE;
-      t.columns(0, n, [&](auto c) {
-        auto total = typename decltype(c)::P(0);
-        if (free)
-          for (int i = 0; i < m; ++i) total.fma(B[i * ld + a], c.load(B + i * ld));
-        c.store(S + a * lq, total);
+    if constexpr (Team::SPARES_SPACE)
+      t.pairs(n, [&](int a, int b) {
+        Real even = 0, odd = 0;
+        int i = 0;
+        for (; i + 1 < m; i += 2)
+          even += B[i * ld + a] * B[i * ld + b], odd += B[(i + 1) * ld + a] * B[(i + 1) * ld + b];
+        S[a * lq + b] = i < m ? even + odd + B[i * ld + a] * B[i * ld + b] : even + odd;
       });
-      t.each(a, n, [&](int b) {
-        if (b == a) S[a * lq + a] = free ? S[a * lq + a] + DAMPING[a] : Real(1);
-        else if (LABEL[b] != INACTIVE) S[a * lq + b] = 0;
-      });
-    }
+    else Algebra::product(t, B, 1, ld, B, ld, S, lq, n, m, n, true);
+    t.each(0, n, [&](int b) {
+      const bool free = LABEL[b] == INACTIVE;
+      for (int a = 0; a < b; ++a)
+        if (!free || LABEL[a] != INACTIVE) S[a * lq + b] = 0;
+      S[b * lq + b] = free ? (S[b * lq + b] + DAMPING[b]) * (1 + RIDGE) : Real(1);
+    });
     if (!Algebra::inverse_factor(t, S, M, PIVOT, DIAGONAL, lq, n, EPS)) return false;
     for (int a = 0; a < used - m; ++a) {
       t.each(0, n, [&](int j) { STEP[j] = LABEL[j] == INACTIVE ? row(m + a)[j] : Real(0); });
@@ -276,7 +333,7 @@ template <class Team> struct WeightedQP {
       reach = most * per_root < longest * unit ? most * per_root : longest * unit;
       const Real low = fabs(lower[i]), high = fabs(upper[i]), nearest = low < high ? low : high;
       const Real scale = reach + fabs(value) + (nearest < Real(INFINITE) ? nearest : Real(0));
-      VALUE[i] = value, VALUE_ROUNDOFF[i] = tolerance * scale;
+      VALUE[i] = value, VALUE_ROUNDOFF[i] = VIOLATION * tolerance * scale;
       if (i >= n) MULTIPLIER_ROUNDOFF[i] = tolerance * scale / square(larger(per_root, Team::SMALLEST_ROOT));
     });
     if (t.count(0, n, [&](int j) { return LABEL[j] != INACTIVE; })) find_bound_roundoff();
@@ -348,7 +405,7 @@ template <class Team> struct WeightedQP {
       if (steps < 0) return false;
       changes += steps;
     }
-    t.each(0, N, [&](int i) { LABEL[i] = NEXT[i] ? REDUNDANT : LABEL[i]; });
+    t.each(0, N, [&](int i) { LABEL[i] = NEXT[i] ? Int(REDUNDANT) : LABEL[i]; });
     return true;
   }
   OSIK_METHOD void solve(const Data& d, const Answer& to) {

@@ -13,9 +13,8 @@ void solve_weighted_qps(const xla::Call& call) {
   using Method = WeightedQP<Serial<double>>;
   const int batch = call.size(0, 0), m = call.size(0, 1), n = call.size(0, 2), N = call.size(2, 1), p = N - n;
   const QPSizes s{m, n, p, call.in<int>(4)[0]};
-  std::vector<double> space(Method::doubles(s));
-  std::vector<int> labels(Method::integers(s));
-  Method method(s, space.data(), labels.data());
+  std::vector<double> space(Method::bytes(s) / sizeof(double));
+  Method method(s, reinterpret_cast<char*>(space.data()));
   const double *matrix = call.in<double>(0), *packed = call.in<double>(1), *tolerance = call.in<double>(3);
   const int* guess = call.in<int>(2);
   QPAnswer<double> a{call.out<double>(0), call.out<double>(1), call.out<int>(2), call.out<int>(3)};
@@ -33,4 +32,12 @@ void solve_weighted_qps(const xla::Call& call) {
 }
 }  // namespace
 
-extern "C" void* osik_weighted_qp(xla::CallFrame* frame) { return xla::handle<solve_weighted_qps>(frame); }
+extern "C" {
+void* osik_weighted_qp(xla::CallFrame* frame) { return xla::handle<solve_weighted_qps>(frame); }
+
+// Bytes of shared memory that a warp needs for one problem, a multiple of 16.
+int osik_weighted_qp_bytes(int m, int n, int p, int single) {
+  const QPSizes s{m, n, p, 0};
+  return single ? WeightedQP<WarpSizes<float>>::bytes(s) : WeightedQP<WarpSizes<double>>::bytes(s);
+}
+}

@@ -8,20 +8,21 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
 (``_computed.py``).
 
     backend   weighted QP                          hierarchy                           null space
-    "warp"    CUDA: float32, least squares, no     CUDA: any precision, levels that    CUDA: with bounds, any
-              hard rows, n <= 64, <= 32 soft rows  fit into shared memory              precision, levels that fit
     "core"    CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
                                                                                        any shape
+              CUDA: any precision, least squares   CUDA: any precision                 CUDA: with bounds,
+                                                                                       any precision
     "jax"     none: plain JAX alone, on any platform
 
     of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks
     "core"    where JAX's default is a CPU: any robot, any precision
 
     of retargeting                            iterations of a plan                a plan's banded systems
-    "warp"                                    none                                CUDA: float32, about 40 dofs at most
-    "core"                                    CPUs: any robot, any precision      inside the former
+    "core"                                    CPUs: any robot, any precision      CPUs: inside the former
+                                                                                  CUDA: float32, about 40 dofs at most
 
-"core" is the compiled C++ of ``osik_jax/core``, which takes over the methods of Warp one by one.
+"core" is the text of ``osik_jax/core``, compiled for CPUs when the package is installed and for a GPU at the first
+call. There a problem has to fit into shared memory; what does not fit is plain JAX's.
 "auto" takes what is installed and fits, and the search elsewhere. Which platform a program runs on is decided when it
 is lowered, not when it is traced (``on_platforms``).
 """
@@ -29,7 +30,6 @@ is lowered, not when it is traced (``on_platforms``).
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import jax
@@ -38,10 +38,10 @@ import numpy as np
 from .._errors import OsikValueError
 from ..core import _library
 
-Backend = Literal["auto", "jax", "core", "warp"]
+Backend = Literal["auto", "jax", "core"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
 
-_PLATFORM = {"core": "cpu", "core-cuda": "cuda", "warp": "cuda"}
+_PLATFORM = {"core": "cpu", "core-cuda": "cuda"}
 CPU_KERNELS = {name for name, platform in _PLATFORM.items() if platform == "cpu"}
 
 
@@ -51,24 +51,14 @@ def check_backend(backend: Any) -> Backend:
     Raises:
         ValueError: it is none.
         ModuleNotFoundError: the package of its kernels is not installed; the message says how to install it.
-        RuntimeError: "warp" without a CUDA device.
     """
-    if backend == "numba":
-        raise OsikValueError("backend='numba' is gone: the compiled core has its kernels; take 'auto' or 'core'")
+    if backend in ("numba", "warp"):
+        raise OsikValueError(f"backend={backend!r} is gone: the compiled core has its kernels; take 'auto' or 'core'")
     if backend not in BACKENDS:
         raise OsikValueError(f"backend is {backend!r}; backends: {', '.join(BACKENDS)}")
     if backend == "core" and not _library.installed():
         raise ModuleNotFoundError(f"backend='core': {_library.core().reason}", name="osik_jax.core")
-    if backend == "warp" and not installed(backend):
-        raise ModuleNotFoundError("backend='warp' needs Warp: pip install 'osik-jax[cuda]'", name=backend)
-    if backend == "warp" and not cuda_is_default():
-        raise RuntimeError("backend='warp' needs a CUDA device, and JAX's default device is none (jax.devices())")
     return backend
-
-
-def installed(package: str) -> bool:
-    """Return whether a package can be imported, without doing so."""
-    return find_spec(package) is not None
 
 
 def cuda_is_default() -> bool:
@@ -93,7 +83,7 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
 
     Args:
         backend: what was asked for.
-        kernel: "core", "core-cuda" or "warp".
+        kernel: "core" for that of CPUs, "core-cuda" for that of GPUs.
         fits: whether the solver has such a kernel for problems of this kind, precision and shape.
 
     Raises:
@@ -109,11 +99,7 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
                 f"backend={kernel!r} has no kernel for problems of this kind, precision or shape; take 'auto'"
             )
         return True
-    if backend != "auto" or not fits:
-        return False
-    if kernel == "core":
-        return _library.installed()
-    return installed(kernel) and cuda_is_default()
+    return backend == "auto" and fits and _library.installed()
 
 
 def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., Any], *args: Any) -> Any:

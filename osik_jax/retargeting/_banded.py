@@ -41,20 +41,20 @@ class BandedSystem(NamedTuple):
 
 
 def solve_banded(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Array, "F n"]:
-    """The solution x of ``system x = right``: on a GPU in single precision by a kernel, where Warp is installed.
+    """The solution x of ``system x = right``: on a GPU in single precision by a kernel, where the core is installed.
 
     It is not finite where the matrix is not positive definite in the precision of its numbers.
     """
     weight, first = (a.at[0].set(0.0) for a in (system.weight, system.first))
     system = system._replace(weight=weight, first=first, second=system.second.at[:2].set(0.0))
-    if takes("auto", "warp", fits=_banded_kernel.fits(system)):
+    if takes("auto", "core-cuda", fits=_banded_kernel.fits(system)):
         return _anywhere()(system, right)
     return solve_banded_plain(system, right)
 
 
 @cache
 def _anywhere() -> Callable[[BandedSystem, Array], Array]:
-    return in_lanes(partial(on_platforms, {"warp": _banded_kernel.solve}, jax.vmap(solve_banded_plain)))
+    return in_lanes(partial(on_platforms, {"core-cuda": _banded_kernel.solve}, jax.vmap(solve_banded_plain)))
 
 
 def solve_banded_plain(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Array, "F n"]:

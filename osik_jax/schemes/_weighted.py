@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._errors import OsikValueError
+from ..core import _cuda
 from ..execution._backends import check_backend, takes
 from ..numerics._arguments import concrete
 from ..numerics._constants import DIAGONAL_RATIO, SINGLE_DAMPING
@@ -84,7 +85,7 @@ def _least_damping(problem: VelocityProblem, backend: Backend) -> Float[Array, "
     """Return the weakest damping that a kernel of single precision tells from the Hessian's roundoff; 0 without one."""
     rows = list(problem.soft().values())
     dtype = problem.lower.dtype
-    if dtype != jnp.float32 or not rows or not takes(backend, "warp", fits=True):
+    if dtype != jnp.float32 or not rows or not takes(backend, "core-cuda", fits=_cuda.installed()):
         return jnp.zeros((), dtype)
     # a row on one dof is a row of the identity, of length 1
     squared = [1.0 if r.dofs is not None else short_sum(r.jacobian**2) for r in rows]

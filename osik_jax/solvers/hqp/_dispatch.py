@@ -19,7 +19,7 @@ from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_the_rest
 from ...numerics._constants import BOX_TOLERANCE
-from . import _core, _cuda, _warp
+from . import _core, _cuda
 from ._cascade import CascadeResult, certify_levels, solve_cascade
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
@@ -56,23 +56,20 @@ def _solve_on_platform(
 ) -> CascadeResult:
     kernels = {}
     if takes(backend, "core-cuda", fits=_cuda.fits(layout)):
-        kernels["core-cuda"] = kernel_candidates(layout, max_iterations, _cuda.solve, by_guesses=False)
-    elif takes(backend, "warp", fits=_warp.Shape.of(layout).warps > 0):
-        kernels["warp"] = kernel_candidates(layout, max_iterations, _warp.solve)
+        kernels["core-cuda"] = kernel_candidates(layout, max_iterations, _cuda.solve)
     if takes(backend, "core", fits=True):
-        kernels["core"] = kernel_candidates(layout, max_iterations, _core.solve, by_guesses=False)
+        kernels["core"] = kernel_candidates(layout, max_iterations, _core.solve)
     search = partial(solve_cascade, layout, max_iterations)
     return certified_or_searched(kernels, search, hierarchy, tolerances, warm_start)
 
 
-def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve, *, by_guesses: bool = True) -> Candidates:
+def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve) -> Candidates:
     """Return how a kernel is used: its certified candidates, and the search for the rest, a block at a time.
 
     Args:
         layout: sizes and row indices.
         max_iterations: limit on the active-set iterations of one level.
         solve: calls the kernel.
-        by_guesses: whether the search has guesses of its own (``solve_cascade``).
     """
 
     def certified(hierarchy: PaddedHierarchy, tolerances: Tolerances, warm_start: WorkingSet | None) -> CascadeResult:
@@ -87,7 +84,7 @@ def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve, *, by_g
     ) -> CascadeResult:
         def search_block(at: Array, result: CascadeResult) -> CascadeResult:
             block = jax.tree.map(lambda a: a[at], (hierarchy, tolerances, warm_start))
-            return solve_cascade(layout, max_iterations, *block, by_guesses=by_guesses)
+            return solve_cascade(layout, max_iterations, *block, by_guesses=False)
 
         return with_the_rest(result, result.done, search_block, min(_BLOCK, len(result.done)))
 

@@ -58,8 +58,7 @@ def solve_hqp(
         max_iterations: limit on the active-set iterations of one level (static); default 10 (n + rows of the level).
         tolerances: what counts as zero; the default rank tolerance depends on the precision of the data.
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
-            the platform, "jax" for none, "core" (CPUs) or "warp" (CUDA) for those or an error. It changes the time,
-            not the answer.
+            the platform, "jax" for none, "core" for those or an error. It changes the time, not the answer.
 
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.

@@ -14,9 +14,9 @@ no admissible scale, and then drops the whole task. The motion d always has one.
 joints that block it can move no more whatever comes after: they are removed from the null space of the levels below,
 whose scale would otherwise be 0.
 
-Kernels take a problem through all levels, on CPUs one after another (``core/saturation.hpp``), on CUDA devices
-by a warp of threads each (``kernels/warp/null_space``); problems without an answer of theirs are searched here, which
-is the definition, what runs elsewhere, and the derivative.
+The core takes a problem through all levels (``core/saturation.hpp``), on CPUs one after another, on CUDA devices by a
+warp of threads each; problems without an answer of its are searched here, which is the definition, what runs elsewhere,
+and the derivative.
 
 When not to use it: where a large motion along a wrong direction is better than a small one along the right, and where
 rows are inequalities. One unreachable row scales its whole level down; ``solve_hqp`` fits it by least squares.
@@ -44,7 +44,7 @@ from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
-from . import _warp
+from . import _cuda
 from ._implicit_diff import ActiveJoints, SaturatedResult, with_derivative
 from ._padding import PaddedLevel, Problem, initial_point, pad_levels, without_roundoff
 from ._projection import level_motion
@@ -112,8 +112,8 @@ class _State(NamedTuple):
 def _solve_on_platform(max_iterations: int, backend: Backend, problem: Problem) -> SaturatedResult:
     search = partial(_solve_levels, max_iterations, backend)
     kernels = {}
-    if takes(backend, "warp", fits=_warp.Shape.of(problem).warps > 0):
-        kernels["warp"] = _kernel_candidates(max_iterations, search, _warp.solve, None)
+    if takes(backend, "core-cuda", fits=_cuda.fits(problem)):
+        kernels["core-cuda"] = _kernel_candidates(max_iterations, search, _cuda.solve, None)
     if takes(backend, "core", fits=True):
         kernels["core"] = _kernel_candidates(max_iterations, search, _by_core, BLOCK)
     return certified_or_searched(kernels, search, problem)
@@ -171,14 +171,13 @@ def _by_core(problem: Problem, max_iterations: int) -> SaturatedResult:
     batch, count, _, n = problem.levels.matrix.shape
     floats = (batch, n), (batch, n, n), (batch, count)
     ints = (batch, count), (batch, count, n), (batch, count, n), (batch, count), (batch, n), (batch, 2)
-    x, projector, scales, done, at_bound, blocking, blocker, active, report = _library.call(
+    results = _library.call(
         "saturation",
         [*((s, float) for s in floats), *((s, int) for s in ints)],
         *(*problem.levels, *problem.damping, problem.targets, problem.lower, problem.upper, problem.rank_tol),
         np.array([max_iterations], np.int32),
     )
-    joints = ActiveJoints(done != 0, at_bound, blocking, blocker, done)
-    return SaturatedResult(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)
+    return _cuda.of_core(results)
 
 
 def _level_problem(

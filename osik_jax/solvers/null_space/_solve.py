@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._errors import OsikValueError
-from ...execution._backends import Backend, check_backend, takes
+from ...execution._backends import Backend, check_backend
 from ...numerics._constants import NULL_SPACE_RANK
 from .._box import clip_to_box, ordered_bounds
 from .._damping import Damping, per_level
@@ -68,15 +68,12 @@ def solve_nullspace(
             rank 0, not the rank of its rounding.
         max_iterations: limit on the search for the saturated joints, for each level (static); default 10 (n + 2).
         backend: whose kernels compute (static): "auto" for those that are there for the platform, "jax" for none,
-            "core" (CPUs) or, with bounds, "warp" (CUDA) for those or an error. It changes the time, not the answer.
+            "core" for those or an error. It changes the time, not the answer.
 
     Raises:
-        ValueError: an order that does not exist, bounds in reverse order, a damping too many or few, or a backend that
-            has no kernels for this.
+        ValueError: an order that does not exist, bounds in reverse order, or a damping too many or few.
     """
     backend = check_backend(backend)
-    if lower is None and upper is None:
-        takes(backend, "warp", fits=False)
     n = levels[0].matrix.shape[1]
     dtype = jnp.result_type(*(level.matrix for level in levels))
     box = _bounds(lower, upper, n, dtype)

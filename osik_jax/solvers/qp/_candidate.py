@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+from ...numerics._constants import INACTIVE, REDUNDANT
 
 
 class Candidate(NamedTuple):
@@ -17,3 +20,12 @@ class Candidate(NamedTuple):
     iterations: Int[Array, " B"]
     factorizations: Int[Array, " B"]
     redundant: Bool[Array, "B n+p"] | None = None  # constraints that the active ones imply; None for none
+
+
+def of_core(
+    x: Float[Array, "B n"], row_multipliers: Float[Array, "B p"], active: Int[Array, "B n+p"], report: Int[Array, "B 3"]
+) -> Candidate:
+    """Return the candidates that the core answers, in which labels may be REDUNDANT."""
+    redundant = active == REDUNDANT
+    active = jnp.where(redundant, INACTIVE, active)
+    return Candidate(x, row_multipliers, active, *(report[:, i] for i in range(3)), redundant=redundant)

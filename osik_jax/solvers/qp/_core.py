@@ -7,8 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from ...core import _library
 from ...execution._computed import side_by_side
-from ...numerics._constants import INACTIVE, REDUNDANT
-from ._candidate import Candidate
+from ._candidate import Candidate, of_core
 from ._cost import LeastSquares
 from ._problem import QP, arrays
 
@@ -33,7 +32,4 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
         [((batch, n), float), ((batch, p), float), ((batch, n + p), int), ((batch, 3), int)],
         *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
-    redundant = active == REDUNDANT
-    return Candidate(
-        x, y, jnp.where(redundant, INACTIVE, active), *(report[:, i] for i in range(3)), redundant=redundant
-    )
+    return of_core(x, y, active, report)

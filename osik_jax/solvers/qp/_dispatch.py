@@ -32,7 +32,7 @@ from ...numerics._constants import (
 )
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
-from . import _core, _warp
+from . import _core, _cuda
 from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
@@ -47,25 +47,22 @@ Solve = Callable[[QP, Array, Array, int], Candidate]
 
 
 @cache
-def qp_solver(max_iterations: int, has_soft_rows: bool, backend: Backend) -> Callable[[QP, Array, Array], SearchResult]:
+def qp_solver(max_iterations: int, backend: Backend) -> Callable[[QP, Array, Array], SearchResult]:
     """Return the function that solves one problem, from its data, a guess of the active set and the tolerance.
 
     Args:
         max_iterations: limit on the changes of the active set.
-        has_soft_rows: whether rows may be soft; where all are hard, Warp's kernel is not asked.
         backend: whose candidates are taken.
     """
-    return in_lanes(partial(_solve_on_platform, max_iterations, has_soft_rows, backend))
+    return in_lanes(partial(_solve_on_platform, max_iterations, backend))
 
 
-def _solve_on_platform(
-    max_iterations: int, has_soft_rows: bool, backend: Backend, qp: QP, guess: Array, tolerance: Array
-) -> SearchResult:
-    kernels = {}
-    if takes(backend, "warp", fits=has_soft_rows and _fits_warp(qp)):
-        kernels["warp"] = warp_candidates(_warp.solve, max_iterations)
+def _solve_on_platform(max_iterations: int, backend: Backend, qp: QP, guess: Array, tolerance: Array) -> SearchResult:
+    kernels, kkt_tol = {}, KKT_TOLERANCE[tolerance.dtype]
+    if takes(backend, "core-cuda", fits=_cuda.fits(qp)):
+        kernels["core-cuda"] = cuda_candidates(kkt_tol, max_iterations)
     if takes(backend, "core", fits=isinstance(qp.cost, LeastSquares)):
-        kernels["core"] = core_candidates(KKT_TOLERANCE[tolerance.dtype], max_iterations)
+        kernels["core"] = core_candidates(kkt_tol, max_iterations)
     # in a batch on a CPU, problems of few rows are tried in the space of the rows first: it costs less than a round
     lanes = tolerance.shape[0]
     by_rows = not is_symbolic(lanes) and lanes > 1 and cpu_is_default() and has_few_rows(qp)
@@ -73,22 +70,20 @@ def _solve_on_platform(
     return certified_or_searched(kernels, search_all, qp, guess, tolerance, no_candidates=initial_result)
 
 
-def warp_candidates(solve: Solve, max_iterations: int) -> Candidates:
-    """Return how the CUDA kernel in single precision is used.
+def cuda_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
+    """Return how the core is used on a GPU: in the precision of the data; the rest is searched, a block at a time.
 
     Args:
-        solve: calls the kernel.
+        kkt_tol: the largest residual that is certified.
         max_iterations: limit on the changes of the active set.
     """
 
     def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
-        start, single = jax.vmap(usable_guess)(qp, guess), jnp.maximum(tolerance, SINGLE_TOL)
-        candidate = solve(qp, start, single, max_iterations)
-        result = _as_result(qp, candidate)
-        is_certified = (candidate.converged != 0) & (candidate.iterations <= max_iterations)
-        is_certified &= jax.vmap(_is_certified)(qp, result, single).all(1)
-        is_certified &= result.residual <= KKT_TOLERANCE[single.dtype]
-        return result._replace(done=is_certified, optimal=is_certified)
+        if tolerance.dtype == jnp.float32:
+            tolerance = jnp.maximum(tolerance, SINGLE_TOL)
+        start = jax.vmap(usable_guess)(qp, guess)
+        candidate = _cuda.solve(qp, start, tolerance, max_iterations)
+        return _certified(qp, start, tolerance, candidate, kkt_tol, max_iterations)
 
     def search_rest(result: SearchResult, qp: QP, guess: Array, tolerance: Float[Array, " B"]) -> SearchResult:
         def search_block(at: Array, result: SearchResult) -> SearchResult:
@@ -102,19 +97,12 @@ def warp_candidates(solve: Solve, max_iterations: int) -> Candidates:
 
 
 def core_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
-    """Return how the compiled core is used; ``kkt_tol`` is the largest residual that is certified."""
+    """Return how the core is used on a CPU: in double precision; arguments as for ``cuda_candidates``."""
 
     def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
         start = jax.vmap(usable_guess)(qp, guess)
         candidate = _core.solve(qp, start, tolerance, max_iterations)
-        result, within_limit = _as_result(qp, candidate), candidate.iterations <= max_iterations
-        is_certified = (candidate.converged != 0) & within_limit
-        conditions = [jax.vmap(_is_certified)(qp, result, tolerance), jax.vmap(_is_stationary)(qp, result)]
-        is_certified &= jnp.concatenate(conditions, 1).all(1)
-        is_certified &= result.residual <= kkt_tol
-        # the search has the limit too: it may not begin where more changes than that have led
-        active = jnp.where(within_limit[:, None], result.active, start)
-        return result._replace(done=is_certified, optimal=is_certified, active=active)
+        return _certified(qp, start, tolerance, candidate, kkt_tol, max_iterations)
 
     def search_rest(result: SearchResult, qp: QP, guess: Array, tolerance: Float[Array, " B"]) -> SearchResult:
         def search_block(given: tuple[QP | tuple[Array, Array], Array], result: SearchResult) -> SearchResult:
@@ -129,6 +117,21 @@ def core_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
         return with_a_few((data, tolerance), result, result.done, search_block, FEW_ON_CPU)
 
     return Candidates(in_double(certified), search_rest)
+
+
+def _certified(
+    qp: QP, start: Array, tolerance: Float[Array, " B"], candidate: Candidate, kkt_tol: float, max_iterations: int
+) -> SearchResult:
+    """Return candidates, ``done`` where they are certified; ``start`` has the labels that they began with."""
+    result, within_limit = _as_result(qp, candidate), candidate.iterations <= max_iterations
+    is_certified = (candidate.converged != 0) & within_limit & (result.residual <= kkt_tol)
+    conditions = [jax.vmap(_is_certified)(qp, result, tolerance)]
+    if tolerance.dtype == jnp.float64:  # in single precision the conditions above are as sharp as roundoff
+        conditions.append(jax.vmap(_is_stationary)(qp, result))
+    is_certified &= jnp.concatenate(conditions, 1).all(1)
+    # the search has the limit too: it may not begin where more changes than that have led
+    active = jnp.where(within_limit[:, None], result.active, start)
+    return result._replace(done=is_certified, optimal=is_certified, active=active)
 
 
 def _block(batch: int) -> int:
@@ -190,9 +193,8 @@ def _is_stationary(qp: QP, result: SearchResult) -> Bool[Array, " n"]:
 
 
 def kkt_solver(qp: QP, active: Int[Array, " m"], backend: Backend) -> Callable[[Array], Array]:
-    """Return ``kkt_inverse`` at an active set, computed by Warp's kernel where that fits."""
-    batch = jax.tree.map(lambda a: jax.ShapeDtypeStruct((1, *a.shape), a.dtype), qp)
-    if not takes(backend, "warp", fits=_fits_warp(batch)):
+    """Return ``kkt_inverse`` at an active set; on a GPU, in single precision, the core computes it."""
+    if not takes(backend, "core-cuda", fits=qp.lower.dtype == jnp.float32 and _cuda.fits(qp)):
         return kkt_inverse(qp, active)
     return lambda right: _solve_kkt_on_platform()(qp, active, right)
 
@@ -202,10 +204,10 @@ def _solve_kkt_on_platform() -> Callable[[QP, Array, Array], Array]:
     def plain(qp: QP, active: Array, right: Array) -> Array:
         return kkt_inverse(qp, active)(right)
 
-    return in_lanes(partial(on_platforms, {"warp": _solve_kkt_by_warp}, jax.vmap(plain)))
+    return in_lanes(partial(on_platforms, {"core-cuda": _solve_kkt}, jax.vmap(plain)))
 
 
-def _solve_kkt_by_warp(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
+def _solve_kkt(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
     """Solve the KKT system as a QP on one active set: its constraints are equalities, the others have no bounds."""
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
@@ -222,7 +224,7 @@ def _solve_kkt_by_warp(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B
         upper=jnp.where(is_equality, bound, jnp.inf),
     )
     tolerance = jnp.full(active.shape[0], SINGLE_TOL, center.dtype)
-    candidate = _warp.solve(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
+    candidate = _cuda.solve(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
     point = jnp.concatenate([candidate.x, jnp.where(active_rows, candidate.row_multipliers, 0.0)], 1)
     done = (candidate.converged != 0) & jnp.isfinite(point).all(1)
 
@@ -231,11 +233,3 @@ def _solve_kkt_by_warp(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B
         return jax.vmap(lambda qp, active, right: kkt_inverse(qp, active)(right))(*block)
 
     return with_the_rest(point, done, solve_block, _block(len(active)))
-
-
-def _fits_warp(qp: QP) -> bool:
-    """Return whether Warp's kernel takes such problems: least squares in single precision, of a size that fits."""
-    if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float32:
-        return False
-    _, m, n = qp.cost.matrix.shape
-    return _warp.Shape(n, m, qp.rows.shape[1]).warps > 0

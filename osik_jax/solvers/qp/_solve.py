@@ -115,16 +115,14 @@ def solve_least_squares_qp(
         max_iterations: limit on the changes of the active set (static).
         tolerance: relative violation that counts as none.
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
-            the platform, "jax" for none, "core" (CPUs) or "warp" (CUDA) for that or an error. It changes the time,
-            not the answer.
+            the platform, "jax" for none, "core" for that or an error. It changes the time, not the answer.
     """
     matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)
     n = matrix.shape[1]
     diagonal = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
     cost = LeastSquares(matrix, target, weight, *diagonal)
     qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance, rows_equalities)
-    has_soft_rows = rows is None or (rows_compliance is not None and not any(rows_equalities or ()))
-    return _solve(qp, warm_start, max_iterations, tolerance, backend, has_soft_rows=has_soft_rows)
+    return _solve(qp, warm_start, max_iterations, tolerance, backend)
 
 
 def _problem(
@@ -171,8 +169,6 @@ def _solve(
     max_iterations: int | None,
     tolerance: ArrayLike | None,
     backend: Backend,
-    *,
-    has_soft_rows: bool = False,
 ) -> QPSolution:
     """Solve, certify, and differentiate nothing but the answer.
 
@@ -182,7 +178,6 @@ def _solve(
         max_iterations: limit on the changes of the active set, or None.
         tolerance: violation that counts as none, or None.
         backend: whose candidates are taken.
-        has_soft_rows: whether rows may be soft, or there are none (static).
     """
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
@@ -193,7 +188,7 @@ def _solve(
     safe, is_valid = _with_placeholder(replace(qp, lower=low, upper=high))
     start = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
     limit = 20 * m if max_iterations is None else max_iterations
-    solve = qp_solver(limit, has_soft_rows, check_backend(backend))
+    solve = qp_solver(limit, check_backend(backend))
     # the search is not differentiated: its answer is, at the active set that was found
     result = _rules.found(solve(*jax.lax.stop_gradient((safe, start, tolerance))))
     x, y, is_finite = _differentiable(safe, result, is_valid, backend)

@@ -1,7 +1,7 @@
 // One level: its numbers, its rows at a point and in the coordinates that are left.
 int level = 0, m = 0, rank = 0;                       // m: rows before those that only fill up
 size_t here = 0;                                      // of the level, among those of all problems
-const double* A = matrix.data;                        // column i of its rows is at A + i * M
+const double* A = matrix;                        // column i of its rows is at A + i * M
 double* gram = room;                                  // Gram matrix above, its Cholesky factor below the diagonal
 int VD = 1;                                           // length of its rows
 double constant = 0.0, unmet = 0.0, demand = 0.0, damping = 0.0;  // as in _damping.py
@@ -27,8 +27,8 @@ auto squared_norm = [&](const double* w, int apart, int count) {
   return total;
 };
 auto distance = [&](int a, double at) {               // from a value of row a to its interval
-  const double least = rows_lower.data[here * M + a], most = rows_upper.data[here * M + a];
-  return (rows_equal.data[here * M + a] != 0 ? least : clip(at, least, most)) - at;
+  const double least = rows_lower[here * M + a], most = rows_upper[here * M + a];
+  return (rows_equal[here * M + a] != 0 ? least : clip(at, least, most)) - at;
 };
 // the level's numbers; `beside` becomes the columns of A
 auto load_level = [&]() {
@@ -41,13 +41,13 @@ auto load_level = [&]() {
   for (int a = lane; a < M; a += 32) {
     row_square[a] = squared_norm(beside + a, MD, N);
     const size_t at = here * M + a;
-    const bool is_bounded = rows_lower.data[at] > -INFINITY || rows_upper.data[at] < INFINITY;
-    if (rows_equal.data[at] != 0 || row_square[a] > 0.0 || is_bounded) count = a + 1;
+    const bool is_bounded = rows_lower[at] > -INFINITY || rows_upper[at] < INFINITY;
+    if (rows_equal[at] != 0 || row_square[a] > 0.0 || is_bounded) count = a + 1;
     total += row_square[a], longest = fmax(longest, row_square[a]);
   }
   m = (int)warp_max(count);
   longest = warp_max(longest), frobenius = sqrt(warp_sum(total));
-  const double* const given = dampings.data + problem * (3 * LEVELS) + level;
+  const double* const given = dampings + problem * (3 * LEVELS) + level;
   constant = given[0], unmet = given[LEVELS], demand = given[2 * LEVELS];
   __syncwarp();
 };
@@ -55,7 +55,7 @@ auto load_level = [&]() {
 auto look = [&]() {
   for (int a = lane; a < m; a += 32) {
     value[a] = dot(x, beside + a, MD, N), wanted[a] = distance(a, value[a]);
-    counts[a] = rows_equal.data[here * M + a] != 0 || wanted[a] != 0.0 ? AT_X : 0;
+    counts[a] = rows_equal[here * M + a] != 0 || wanted[a] != 0.0 ? AT_X : 0;
   }
   __syncwarp();
 };
@@ -96,5 +96,5 @@ auto set_beside = [&]() {
   const int side = unmet != 0.0 || m < N - first ? m : N - first;
   VD = side | 1;
   const bool fits = !HAS_ROOM_ELSEWHERE || (N - first) * MD + side * VD <= ROOM;
-  gram = fits ? beside + (N - first) * MD : projectors.data + problem * (N * N);
+  gram = fits ? beside + (N - first) * MD : projectors + problem * (N * N);
 };

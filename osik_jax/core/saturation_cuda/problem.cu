@@ -1,7 +1,7 @@
 // One problem: the point of its box that is nearest to 0, and the joints that can move in coordinates of their own.
 const size_t problem = pid;
-const double* const given_low = lower.data + problem * N;
-const double* const given_high = upper.data + problem * N;
+const double* const given_low = lower + problem * N;
+const double* const given_high = upper + problem * N;
 int first = 0;                                        // coordinates that are taken
 
 for (int i = lane; i < N; i += 32) {

@@ -10,7 +10,7 @@ auto look_at_base = [&]() {
   for (int a = lane; a < m; a += 32) {
     value_at_base[a] = value[a] - dot(place + first, beside + a, MD, N - first);
     wanted_at_base[a] = distance(a, value_at_base[a]);
-    if (rows_equal.data[here * M + a] != 0 || wanted_at_base[a] != 0.0) counts[a] |= AT_BASE;
+    if (rows_equal[here * M + a] != 0 || wanted_at_base[a] != 0.0) counts[a] |= AT_BASE;
   }
   __syncwarp();
 };

@@ -1,7 +1,7 @@
 // Sizes and shared memory of one warp: the coordinates, the rows of a level in them, and vectors to work with.
 //
 // Joint i belongs to lane i % 32, and so do coordinate i, saturated joint i and row i of the level. Constants from
-// _warp.py: N joints, LEVELS, M rows of the longest level, WARPS of a block, and those of numerics/_constants.py that
+// _cuda.py: N joints, LEVELS, M rows of the longest level, WARPS of a block, and those of numerics/_constants.py that
 // it shares with the core.
 constexpr int WIDE = N > M ? N : M;
 constexpr int D = N | 1, MD = M | 1;                  // row lengths in shared memory: odd, to meet every bank

@@ -79,7 +79,7 @@ auto narrow_box = [&]() {
   const double least = NEGLIGIBLE_DAMPING * longest;
   __syncwarp();
   for (int i = lane; i < N; i += 32)
-    bent[i] = fmax(bent[i], bends.data[here * N + i] / (frobenius > 0.0 ? frobenius : 1.0));
+    bent[i] = fmax(bent[i], bends[here * N + i] / (frobenius > 0.0 ? frobenius : 1.0));
   if (!(unmet > least)) return;
   const double missed = fmin(missed_at(x), demand);
   if (!(unmet * (missed / (demand > 0.0 ? demand : 1.0)) > least)) return;

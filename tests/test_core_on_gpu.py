@@ -1,4 +1,4 @@
-"""The CUDA kernels, where there is a CUDA device, against float64 answers and the XLA route.
+"""The core on a GPU, where there is one, against float64 answers and the XLA route.
 
 Recorded and random QPs, and saturation in the null space.
 """
@@ -15,19 +15,20 @@ from null_space_families import FAMILIES, check_derivatives_of_saturation, satur
 from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, check_recorded_saturated, recorded_qps, recorded_saturated
 
+from osik_jax.core import _cuda as core_cuda
 from osik_jax.execution import _backends
 from osik_jax.solvers import Damping, Level, Status, solve_least_squares_qp, solve_nullspace
-from osik_jax.solvers.null_space import _warp as null_space_kernel
+from osik_jax.solvers.null_space import _cuda as null_space_kernel
 from osik_jax.solvers.null_space._padding import pad_levels
-from osik_jax.solvers.qp import _warp
+from osik_jax.solvers.qp import _cuda
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
 
-usable = _backends.cuda_is_default() and _backends.installed("warp")
-pytestmark = pytest.mark.skipif(not usable, reason="needs a CUDA device, JAX for it and Warp (extra cuda)")
+usable = _backends.cuda_is_default() and core_cuda.installed()
+pytestmark = pytest.mark.skipif(not usable, reason="needs a CUDA device, JAX for it and the compiled core")
 
 
-@pytest.fixture(params=["warp", "jax"])
+@pytest.fixture(params=["core", "jax"])
 def backend(request):
     """Both have to pass."""
     return request.param
@@ -69,7 +70,7 @@ def test_whole_body_family(backend, rng):
     s = solve(backend)(*single(*p[:5]))
     with jax.default_device(jax.devices("cpu")[0]):
         expected = np.asarray(solve("jax")(*p[:5]).x)
-    assert (np.asarray(s.status) == Status.SOLVED).mean() > 0.85  # in single precision; Warp's candidates give more
+    assert (np.asarray(s.status) == Status.SOLVED).mean() > 0.85  # in single precision
     fine = np.asarray(s.status) == Status.SOLVED
     error = off(np.sqrt(p.weight)[..., None] * p.A, s.x, expected, np.sqrt(p.weight) * p.b)
     assert error[fine].max() < 5e-5
@@ -146,7 +147,7 @@ def test_derivatives_are_those_of_the_search():
         solve = jax.vmap(lambda *a: solve_least_squares_qp(*a, damping=QP_DAMPING, backend=backend).x)
         return jnp.sum(jnp.einsum("bmn,bn->bm", A, solve(A, b, jnp.ones_like(b), lower, upper)) ** 2)
 
-    slopes = [np.asarray(jax.jit(partial(jax.grad(cost), backend=backend))(b)) for backend in ("warp", "jax")]
+    slopes = [np.asarray(jax.jit(partial(jax.grad(cost), backend=backend))(b)) for backend in ("core", "jax")]
     np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-4 * np.abs(slopes[1]).max())
 
 
@@ -165,7 +166,7 @@ def test_the_kernel_settles_alone(rng):
         upper,
     )
     guess, tolerance = jnp.asarray(at, jnp.int32), jnp.full(count, 1e-7, jnp.float32)
-    kernel = jax.jit(lambda *a: _warp.solve(a[0], a[1], a[2], 1000))
+    kernel = jax.jit(lambda *a: _cuda.solve(a[0], a[1], a[2], 1000))
     found = kernel(qp, guess, tolerance)
     assert found.converged.all() and (found.factorizations == 1).all() and (found.iterations == 0).all()
     np.testing.assert_array_equal(found.active, guess)
@@ -179,7 +180,7 @@ def test_the_kernel_settles_alone(rng):
 @pytest.mark.parametrize("name", ["damped inequalities", "dependent", "nothing left", "a humanoid's"])
 def test_saturation_lane_by_lane_as_the_plain_method(name, precision):
     p = jax.tree.map(lambda a: jnp.asarray(a, precision), FAMILIES[name])
-    found, expected = (saturated(p, backend=backend) for backend in ("warp", "jax"))
+    found, expected = (saturated(p, backend=backend) for backend in ("core", "jax"))
     assert (found.status == Status.SOLVED).all() and (expected.status == Status.SOLVED).all()
     atol = 1e-8 if precision == "float64" else 1e-6
     np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=atol)
@@ -192,14 +193,14 @@ def test_saturation_lane_by_lane_as_the_plain_method(name, precision):
 def test_saturation_decides_as_the_plain_method(number):
     """And as a loop over the problems."""
     p = test_saturation.family(test_saturation.FAMILIES[number], np.random.default_rng(100 + number))
-    found, expected = (test_saturation.solve_full(p, backend=backend) for backend in ("warp", "jax"))
+    found, expected = (test_saturation.solve_full(p, backend=backend) for backend in ("core", "jax"))
     assert (found.status == Status.SOLVED).all()
     assert ((found.x >= p.lower) & (found.x <= p.upper)).all()
     size = 1.0 + np.abs(expected.x).max(1)
     assert (np.abs(found.x - expected.x).max(1) < 1e-8 * size).all()
     np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-9)
     for lane in (0, 99, 199):
-        alone = test_saturation.solve_full(jax.tree.map(lambda a, i=lane: a[i : i + 1], p), backend="warp")
+        alone = test_saturation.solve_full(jax.tree.map(lambda a, i=lane: a[i : i + 1], p), backend="core")
         np.testing.assert_allclose(alone.x[0], found.x[lane], rtol=0, atol=1e-12 * size[lane])
 
 
@@ -225,22 +226,21 @@ def test_recorded_saturated_problems_whatever_rounding_does():
 
 
 def test_derivatives_of_saturation(rng):
-    check_derivatives_of_saturation(rng, "warp")
+    check_derivatives_of_saturation(rng, "core")
 
 
 def test_a_bad_lane_of_saturation_disturbs_no_other():
     p = jax.tree.map(np.copy, test_saturation.family("tight", np.random.default_rng(1)))
-    good = test_saturation.solve_full(p, backend="warp")
+    good = test_saturation.solve_full(p, backend="core")
     p.levels[1][0][3, 0, 0] = np.nan
-    bad = test_saturation.solve_full(p, backend="warp")
+    bad = test_saturation.solve_full(p, backend="core")
     others = np.arange(len(p.lower)) != 3
     assert bad.status[3] == Status.NUMERICAL_ERROR and np.isfinite(bad.x[3]).all()
     np.testing.assert_array_equal(np.asarray(bad.x)[others], np.asarray(good.x)[others])
 
 
-def test_problems_that_do_not_fit_have_no_kernel_of_saturation():
-    """Without bounds too there is none: the projection is a formula."""
+def test_problems_that_do_not_fit_are_searched():
     level = [Level(np.ones((1, 70)), np.ones(1))]
-    for bounds in ((-np.ones(70), np.ones(70)), ()):
-        with pytest.raises(ValueError, match="backend='warp' has no kernel"):
-            solve_nullspace(level, *bounds, backend="warp")
+    found = solve_nullspace(level, -np.ones(70), np.ones(70), backend="core")
+    assert found.status == Status.SOLVED
+    np.testing.assert_allclose(found.x, 1.0 / 70.0, rtol=0, atol=1e-12)

@@ -48,7 +48,7 @@ auto find_motion = [&]() {
     if ((counts[a] & AT_X) != 0) total += row_square[a];
     else for (int j = 0; j < N - first; ++j) beside[j * MD + a] = 0.0;
   }
-  rank = take_row_space(m, MD, rank_tolerance.data[problem] * sqrt(warp_sum(total)));
+  rank = take_row_space(m, MD, rank_tolerance[problem] * sqrt(warp_sum(total)));
   solve_on_basis();
   for (int i = lane; i < N; i += 32) motion[i] = column_times(place, i, first, first + rank);
   __syncwarp();

@@ -7,14 +7,14 @@
 // to the front of the coordinates, and orthogonal factors of its rows there.
 //
 // This is the end of the body of one function: the other files of this folder stand before it, in the order that
-// solvers/null_space/_warp.py says. Where its variables are declared: workspace.cu, problem.cu, level.cu, saturated.cu.
+// solvers/null_space/_cuda.py says. Where its variables are declared: workspace.cu, problem.cu, level.cu, saturated.cu.
 
 // finds the end of the level's motion, or what comes before it where that has the least damped cost, from a part of the
 // straight way to the end on; returns the scale. A search for the end has up to three attempts, the second and the
 // third with a compliance. `ended`: how (STRAIGHT, PART, WHOLE), 0 where the search has not
 auto go_along = [&](int& ended, int& blocker, int& its_changes) {
-  double* const kept = solution.data + problem * N;   // which is written last, and so are the labels
-  int* const kept_labels = joints_at_bounds.data + here * N;
+  double* const kept = solution + problem * N;   // which is written last, and so are the labels
+  int* const kept_labels = joints_at_bounds + here * N;
   double at = 1.0, below = 0.0, above = 1.0, whole = 1.0, its_scale = 0.0;
   int number = 0;                                     // of the attempt at this scale
   bool goes_on = false;                               // from the joints that the attempt before has saturated
@@ -102,15 +102,15 @@ bool all_done = true;
 int all_changes = 0;
 for (level = 0; level < LEVELS; ++level) {
   here = problem * LEVELS + level;
-  A = matrix.data + here * (N * M);
+  A = matrix + here * (N * M);
   int ended, blocker, its_changes;
   const double its_scale = solve_level(ended, blocker, its_changes);
   all_done = all_done && ended != 0, all_changes += its_changes;
   for (int i = lane; i < N; i += 32) {
     fixed[i] = fixed[i] == 0 ? blocking[i] : fixed[i];
-    joints_at_bounds.data[here * N + i] = at_bound[i], joints_blocking.data[here * N + i] = blocking[i];
+    joints_at_bounds[here * N + i] = at_bound[i], joints_blocking[here * N + i] = blocking[i];
   }
-  if (lane == 0) scales.data[here] = its_scale, dones.data[here] = ended, blockers.data[here] = blocker;
+  if (lane == 0) scales[here] = its_scale, dones[here] = ended, blockers[here] = blocker;
   __syncwarp();
 }
 
@@ -119,14 +119,14 @@ for (int i = lane; i < N; i += 32) {
   const int label = fixed[i] != 0 ? fixed[i] : at_bound[i];
   const double its_bound = label < 0 ? given_low[i] : given_high[i];
   const bool is_away = label * label == 1 && fabs(x[i] - its_bound) > BOUND_DISTANCE * (1.0 + fabs(its_bound));
-  solution.data[problem * N + i] = x[i];
-  active_joints.data[problem * N + i] = is_away ? 0 : label;
+  solution[problem * N + i] = x[i];
+  active_joints[problem * N + i] = is_away ? 0 : label;
 }
 for (int i = 0; i < N; ++i)
   for (int k = lane; k < N; k += 32) {
     double total = 0.0;
 #pragma unroll 4
     for (int j = first; j < N; ++j) total += turned[j * D + i] * turned[j * D + k];
-    projectors.data[(problem * N + i) * N + k] = total;
+    projectors[(problem * N + i) * N + k] = total;
   }
-if (lane == 0) report.data[problem * 2] = all_done, report.data[problem * 2 + 1] = all_changes;
+if (lane == 0) report[problem * 2] = all_done, report[problem * 2 + 1] = all_changes;

@@ -71,8 +71,8 @@ auto find_stop = [&]() {
 // With a compliance the motion may be missed in part, so that at any scale there is an answer, and joints that nearly
 // depend on each other need no decision; that coordinate takes the place of one which is taken
 auto attempt = [&](double most, double least, double compliance, bool goes_on) {
-  const double* const target = targets.data + here * N;
-  double* const before = projectors.data + problem * (N * N);  // which is written last
+  const double* const target = targets + here * N;
+  double* const before = projectors + problem * (N * N);  // which is written last
   const bool is_soft = compliance > 0.0;
   const int start = first - is_soft;
   const auto put_back = [&]() {

@@ -1,1 +1,0 @@
-"""Kernels that propose answers; what they propose is certified, and differentiated, in JAX."""

@@ -1,0 +1,122 @@
+"""Saturation in the null space on a GPU: the CUDA text in ``core/saturation_cuda``, one warp of 32 threads a problem.
+
+It is the method of ``core/saturation.hpp`` in half of its shared memory. Compiled for a GPU, that header takes more than
+twice the time, for half as many warps have room.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from ...core import _build, _cuda
+from ...numerics import _constants
+from ._implicit_diff import ActiveJoints, SaturatedResult
+from ._padding import Problem
+
+PARTS = (
+    *("workspace", "reductions", "calls", "problem", "level", "row_space", "cholesky", "damping", "motion"),
+    *("saturated", "stop", "choices", "search", "attempt", "after", "levels"),
+)
+"""The files of the kernel, in their order: each uses what those before it define."""
+_SHARED_BYTES = 48 * 1024
+"""Shared memory that any CUDA device gives a block without being asked for more."""
+_MAX_ROWS, _MAX_WARPS = 64, 2
+_WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "SIGN_CHECKS", "STRAIGHT", "WHOLE")
+_NUMBERS = (
+    *("BLOCKING_RANK", "BOUND_DISTANCE", "COST_FRACTION", "DAMPING_RIDGE", "FULL_STEP", "LARGEST_RATE"),
+    *("MIN_RADIUS", "NEGLIGIBLE_CURVATURE", "NEGLIGIBLE_DAMPING", "NEGLIGIBLE_ENTRY", "NEGLIGIBLE_STEP", "PATH_END"),
+    *("PATH_STEP", "SATURATION_LOSS", "SATURATION_RANK", "SATURATION_RESIDUAL", "SATURATION_ROUNDOFF"),
+    *("SATURATION_COMPLIANCE", "SOFT_SATURATION_RANK", "STIFFER_SATURATION_COMPLIANCE"),
+)
+"""Names of the constants that the text takes from ``numerics/_constants.py``."""
+_KERNEL = """
+#define INFINITY __longlong_as_double(0x7ff0000000000000ll)
+extern "C" __global__ void __launch_bounds__(32 * WARPS) osik_kernel(
+    const double* matrix, const double* rows_lower, const double* rows_upper, const double* dampings,
+    const double* bends, const double* targets, const double* lower, const double* upper,
+    const double* rank_tolerance, const int* rows_equal, double* solution, double* projectors, double* scales,
+    int* dones, int* joints_at_bounds, int* joints_blocking, int* blockers, int* active_joints, int* report,
+    int problems) {
+const int pid = (blockIdx.x * blockDim.x + threadIdx.x) / 32;
+if (pid >= problems) return;
+"""
+
+
+class Shape(NamedTuple):
+    """The numbers that a kernel is compiled for."""
+
+    variables: int
+    levels: int
+    rows: int  # of the longest level
+
+    @classmethod
+    def of(cls, problem: Problem) -> Shape:
+        """Return the shape of a batch of problems."""
+        _, levels, m, n = problem.levels.matrix.shape
+        return cls(n, levels, m)
+
+    @property
+    def warps(self) -> int:
+        """The number of warps of a block; 0 for a problem that is too large for this kernel."""
+        n, m = self.variables, self.rows
+        if m > _MAX_ROWS:
+            return 0
+        # rows have odd lengths, so that the threads of a warp read from different banks of memory
+        wide = max(n, m)
+        room = n * (wide | 1) + (0 if m * (m | 1) <= n * n else m * (m | 1))
+        doubles = n * (n | 1) + room + 14 * n + 6 * m + wide
+        return min(_MAX_WARPS, _SHARED_BYTES // (8 * doubles + 4 * (6 * n + m)))
+
+
+def fits(problem: Problem) -> bool:
+    """Return whether a GPU has room for a problem."""
+    return _cuda.installed() and Shape.of(problem).warps > 0
+
+
+@cache
+def _source(shape: Shape, max_iterations: int) -> str:
+    """Return the CUDA text for a shape: its numbers as constants, then the body of the kernel."""
+    n, levels, m = shape
+    numbers = dict(N=n, LEVELS=levels, M=m, WARPS=shape.warps, max_iterations=max_iterations)
+    numbers |= {name: getattr(_constants, name) for name in _WHOLE}
+    floats = [f"constexpr double {name} = {getattr(_constants, name)!r};" for name in _NUMBERS]
+    parts = [(_build.FOLDER / "saturation_cuda" / f"{part}.cu").read_text() for part in PARTS]
+    head = _cuda.constants(**numbers) + "\n".join(floats)
+    return head + _KERNEL + _cuda.rolled("\n".join(parts)) + "}\n"
+
+
+def solve(problem: Problem, max_iterations: int) -> SaturatedResult:
+    """Return answers for a batch of problems, on the GPU that the program runs on; ``done`` where it has one.
+
+    Args:
+        problem: the numbers, with a leading axis of problems; in double precision.
+        max_iterations: limit on the changes of the active set, for each level (static).
+    """
+    shape, levels, damping = Shape.of(problem), problem.levels, problem.damping
+    batch, (n, count, _) = len(problem.lower), shape
+    given = (jnp.swapaxes(levels.matrix, 2, 3), levels.lower, levels.upper, jnp.stack(damping[:3], 1), damping.bends)
+    given += (problem.targets, problem.lower, problem.upper, problem.rank_tol)
+    double, whole = jnp.float64, jnp.int32
+    shapes: list[tuple[tuple[int, ...], Any]] = [((n,), double), ((n, n), double), ((count,), double)]
+    shapes += [((count,), whole), ((count, n), whole), ((count, n), whole), ((count,), whole), ((n,), whole)]
+    results = _cuda.call(
+        _source(shape, max_iterations),
+        [((batch, *size), kind) for size, kind in [*shapes, ((2,), whole)]],
+        *map(_cuda.as_double, given),
+        levels.equal.astype(whole),
+        problems=batch,
+        shared=0,
+        per_block=shape.warps,
+        warps=shape.warps,
+    )
+    return of_core(results)
+
+
+def of_core(results: list[Any]) -> SaturatedResult:
+    """Return what a kernel answers, in the order of ``SaturationAnswer`` in ``core/saturation.hpp``."""
+    x, projector, scales, done, at_bound, blocking, blocker, active, report = results
+    joints = ActiveJoints(done != 0, at_bound, blocking, blocker, done)
+    return SaturatedResult(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)

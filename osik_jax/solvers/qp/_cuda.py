@@ -1,0 +1,86 @@
+"""Candidates for weighted QPs on a GPU: ``core/weighted_qp.hpp``, one warp of 32 threads for each problem."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ...core import _cuda, _library
+from ._candidate import Candidate, of_core
+from ._cost import LeastSquares
+from ._problem import QP
+
+_KERNEL = """
+using namespace osik;
+using Method = WeightedQP<Warp<Real, N, M, P>>;
+extern "C" __global__ void __launch_bounds__(32) osik_kernel(
+    const Real* matrix, const Real* target, const Real* weight, const Real* damping, const Real* center,
+    const Real* rows, const Real* compliance, const Real* lower, const Real* upper, const int* guess,
+    const Real* tolerance, Real* x, Real* multipliers, int* active, int* report, Real* outside, int problems) {
+  const QPSizes s{M, N, P, MAX_CHANGES};
+  Method method(s, nullptr, outside + size_t(blockIdx.x) * DualActiveSet<Warp<Real, N, M, P>>::doubles(N, P));
+  for (int b = 0; b < PER_BLOCK; ++b) {
+    const size_t k = size_t(blockIdx.x) * PER_BLOCK + b;
+    if (k >= problems) return;
+    const QPData<Real> d{matrix + k * M * N, target + k * M, weight + k * M, damping + k * N, center + k * N,
+                         rows + k * P * N, compliance + k * P, lower + k * (N + P), upper + k * (N + P),
+                         guess + k * (N + P), tolerance[k]};
+    method.solve(d, {x + k * N, multipliers + k * P, active + k * (N + P), report + k * 3});
+  }
+}
+"""
+
+
+def fits(qp: QP) -> bool:
+    """Return whether a GPU has room for a problem: least squares, of a size that fits."""
+    if not isinstance(qp.cost, LeastSquares) or not _cuda.installed():
+        return False
+    m, n = qp.cost.matrix.shape[-2:]
+    return _bytes(m, n, qp.rows.shape[-2], qp.lower.dtype == jnp.float32) <= _cuda.SHARED_BYTES
+
+
+@cache
+def _bytes(m: int, n: int, p: int, single: bool) -> int:
+    """Return the shared memory of one problem, a multiple of 16."""
+    library = _library.core().library
+    assert library is not None
+    return library.osik_weighted_qp_bytes(m, n, p, int(single))
+
+
+@cache
+def _source(m: int, n: int, p: int, single: bool, max_changes: int, per_block: int) -> str:
+    sizes = _cuda.constants(M=m, N=n, P=p, MAX_CHANGES=max_changes, PER_BLOCK=per_block)
+    kind = f"using Real = {'float' if single else 'double'};\n"
+    return _cuda.text_of("weighted_qp.hpp") + sizes + kind + _KERNEL
+
+
+def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
+    """Return candidates for a batch on the GPU that the program runs on, in the precision of the data.
+
+    Args:
+        qp: the problems, with a leading axis.
+        guess: labels of the active sets to try first.
+        tolerance: violation that counts as none, relative to the scale of the constraint.
+        max_iterations: limit on the changes of the active set (static).
+    """
+    cost = qp.cost
+    assert isinstance(cost, LeastSquares)
+    batch, m, n = cost.matrix.shape
+    p, kind = qp.rows.shape[1], cost.matrix.dtype
+    sizes = m, n, p, kind == jnp.float32
+    numbers = (cost.matrix, cost.target, cost.weight, cost.damping, cost.center, qp.rows, qp.compliance)
+    per_block, most = _cuda.problems_of_a_block(batch), n + p
+    outside = -(-batch // per_block), (2 * most + 6) * (most | 1)  # of the dual method, which few problems need
+    x, y, active, report, _ = _cuda.call(
+        _source(*sizes, max_iterations, per_block),
+        [((batch, n), kind), ((batch, p), kind), ((batch, most), jnp.int32), ((batch, 3), jnp.int32), (outside, kind)],
+        *(a.astype(kind) for a in (*numbers, qp.lower, qp.upper)),
+        guess.astype(jnp.int32),
+        tolerance.astype(kind),
+        problems=batch,
+        shared=_bytes(*sizes),
+        per_block=per_block,
+    )
+    return of_core(x, y, active, report)
