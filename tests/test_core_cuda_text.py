@@ -12,6 +12,7 @@ from osik_jax.solvers.hqp import _cuda as hierarchy
 from osik_jax.solvers.hqp._padding import Layout
 from osik_jax.solvers.null_space import _cuda as null_space
 from osik_jax.solvers.qp import _cuda as weighted_qp
+from osik_jax.solvers.qp import _single as single_qp
 
 NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
 """Two levels of three variables; the second has one inequality row."""
@@ -31,6 +32,7 @@ TEXTS = {
     "weighted QP, double": lambda: weighted_qp._source(5, 7, 2, False, 100, 1),
     "weighted QP, single": lambda: weighted_qp._source(5, 7, 0, True, 100, 4),
     "more rows than variables": lambda: weighted_qp._source(40, 33, 3, False, 100, 1),
+    "weighted QP without rows, single": lambda: single_qp._source(single_qp.Shape(7, 5), 100),
     "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
     "banded": lambda: banded._source(13, 2),
 }

@@ -1,7 +1,7 @@
 """Saturation in the null space on a GPU: the CUDA text in ``core/saturation_cuda``, one warp of 32 threads a problem.
 
-It is the method of ``core/saturation.hpp`` in half of its shared memory. Compiled for a GPU, that header takes more than
-twice the time, for half as many warps have room.
+It is the method of ``core/saturation.hpp`` in half of its shared memory. Compiled for a GPU, that header takes more
+than twice the time, for half as many warps have room.
 """
 
 from __future__ import annotations

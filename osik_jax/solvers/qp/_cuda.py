@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...core import _cuda, _library
+from . import _single
 from ._candidate import Candidate, of_core
 from ._cost import LeastSquares
 from ._problem import QP
@@ -65,6 +66,8 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
         tolerance: violation that counts as none, relative to the scale of the constraint.
         max_iterations: limit on the changes of the active set (static).
     """
+    if _single.fits(qp):
+        return _single.solve(qp, guess, tolerance, max_iterations)
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
     batch, m, n = cost.matrix.shape
