@@ -44,11 +44,11 @@ def graph() -> dict[str, set[str]]:
 
 def test_no_two_folders_know_each_other() -> None:
     order = list(TopologicalSorter(graph()).static_order())
-    assert order.index("kernels") < order.index("solvers") < order.index("control")
+    assert order.index("core") < order.index("solvers") < order.index("control")
 
 
-def test_kernels_import_nothing() -> None:
-    assert graph()["kernels"] == set()
+def test_the_core_knows_no_solver() -> None:
+    assert graph()["core"] == {"_errors"}
 
 
 def test_the_viewer_knows_maps_and_maps_no_viewer() -> None:
