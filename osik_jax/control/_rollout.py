@@ -142,7 +142,7 @@ def _rollout(
         todo = _checked(tasks(t), robot) if callable(tasks) else aim(tasks, target)
         todo, kept = remembering((todo, limits), velocity, t > 0.0)
         solution = step(robot, q, todo, scheme, kept, dt, warm_start)
-        q = _move(robot, q, solution.velocity, dt)
+        q = move(robot, q, solution.velocity, dt)
         return (q, solution.velocity, solution.warm_start), (q, solution)
 
     inputs = (time, targets, measured)
@@ -163,7 +163,7 @@ def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, mov
     return jax.tree.map(one, tasks_and_limits, is_leaf=lambda part: isinstance(part, Task | Limit))
 
 
-def _move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
+def move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
     """Return where a step leads; nowhere if q or dt is NaN."""
     (usable, usable_dt), is_valid = with_placeholder((q, jnp.asarray(dt)))
     return jnp.where(is_valid, integrate(robot, usable, v, usable_dt).astype(q.dtype), q)

@@ -1,1 +1,6 @@
-"""Controllers in other programs: ROS 2 topics in ``interop.ros2``."""
+"""Controllers in other programs: exported here; PyTorch in ``.torch``, action spaces in ``.action``, ROS 2 in ``.ros2``."""
+
+from ._export import export_controller as export_controller
+from ._exported import ExportedController as ExportedController
+from ._exported import Port as Port
+from ._exported import load_controller as load_controller

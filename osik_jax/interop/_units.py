@@ -1,0 +1,68 @@
+"""Names and units of the entries of configurations, velocities and the numbers of tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ..robot import Robot
+from ..robot._tree import BALL, FREE, HINGE, SLIDE
+from ..tasks import AngularMomentumTask, AxisAlignTask, ComTask, LookAtTask, PostureTask, Task
+from ..tasks._joint_velocity import VelocityTask
+from ..tasks._pose import PoseTask
+
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_IN_Q = {
+    FREE: ([*"xyz", *_QUATERNION], ["m"] * 3 + ["1"] * 4),
+    BALL: (list(_QUATERNION), ["1"] * 4),
+    SLIDE: ([""], ["m"]),
+    HINGE: ([""], ["rad"]),
+}
+_IN_V = {
+    FREE: (["vx", "vy", "vz", "wx", "wy", "wz"], ["m/s"] * 3 + ["rad/s"] * 3),
+    BALL: (["wx", "wy", "wz"], ["rad/s"] * 3),
+    SLIDE: ([""], ["m/s"]),
+    HINGE: ([""], ["rad/s"]),
+}
+_TARGETS: tuple[tuple[type[Task], str], ...] = (
+    (ComTask, "m"),
+    (PostureTask, "rad or m; quaternion w x y z"),
+    (LookAtTask, "m"),
+    (AxisAlignTask, "1 (direction)"),
+    (AngularMomentumTask, "kg m^2/s"),
+    (VelocityTask, "rad/s or m/s"),
+)
+
+
+def configuration_units(robot: Robot) -> tuple[list[str], list[str]]:
+    """Return the name and the unit of each entry of q: the joint's name, with a suffix for free and ball joints."""
+    return _entries(robot, _IN_Q)
+
+
+def velocity_units(robot: Robot) -> tuple[list[str], list[str]]:
+    """Return the name and the unit of each entry of v, as ``configuration_units``."""
+    return _entries(robot, _IN_V)
+
+
+def _entries(robot: Robot, parts: Mapping[int, tuple[list[str], list[str]]]) -> tuple[list[str], list[str]]:
+    tree = robot.tree
+    entries, units = [], []
+    for joint in tree.independent:
+        suffixes, own = parts[tree.joint_types[joint]]
+        entries += [f"{tree.joint_names[joint]}.{suffix}".removesuffix(".") for suffix in suffixes]
+        units += own
+    return entries, units
+
+
+def unit_of(tasks: Mapping[str, Task], name: str) -> str:
+    """Return the unit of a number of a task, by its name in ``leaf_names(tasks)``."""
+    owner = max((own for own in tasks if name.startswith(f"{own}.")), key=len)
+    task, field = tasks[owner], name.removeprefix(f"{owner}.")
+    if field.startswith("gain"):
+        return {"gain.decay": "1 / unit of the error"}.get(field, "1/s")
+    if "weight" in field:
+        return "1"
+    if isinstance(task, PoseTask):
+        units = {"target[0]": "m", "target[1]": "1 (rotation matrix)", "target_velocity": "m/s, rad/s"}
+        return units.get(field, "m or rad")
+    unit = next((unit for kind, unit in _TARGETS if isinstance(task, kind)), "the task's own")
+    return f"({unit})/s" if field == "target_velocity" else unit
