@@ -32,6 +32,7 @@ PACKAGES = (
     "osik_jax.scaling",
     "osik_jax.retargeting",
     "osik_jax.reachability",
+    "osik_jax.interop",
 )
 OPTIONAL = (
     "matplotlib",
@@ -47,11 +48,13 @@ OPTIONAL = (
     "osik_jax.scaling",
     "osik_jax.retargeting",
     "osik_jax.reachability",
+    "osik_jax.interop",
     "optax",
 )
 
 BLOCK = re.compile(r"^```python(?: title=\"([\w-]+)\")?\n(.*?)^```", re.MULTILINE | re.DOTALL)
-"""A block's title is the library that its code is for, and it runs where that is installed."""
+"""A block's title may be one of ``LIBRARIES``; the block runs where that is installed."""
+LIBRARIES = ("mink", "pink", "flatbuffers", "torch", "gymnasium")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 REPOSITORY = "https://github.com/osik-jax/osik-jax"
 IN_REPOSITORY = re.compile(  # as a package index shows the README, its links have to be whole
@@ -121,7 +124,7 @@ def test_code_runs(
     try:
         for block in BLOCK.finditer(text):
             title, code = block.groups()
-            if title in ("mink", "pink") and importlib.util.find_spec(title) is None:
+            if title in LIBRARIES and importlib.util.find_spec(title) is None:
                 continue
             line = text[: block.start(2)].count("\n")
             exec(compile("\n" * line + code, str(page), "exec"), namespace)
