@@ -1,5 +1,7 @@
 """Actions of a policy that become joint targets: poses, limits, and environments that use them."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -110,6 +112,7 @@ def test_a_nan_holds_the_robot_and_gradients_are_finite(arm):
 
 def test_what_does_not_fit_is_told(arm):
     robot, tasks = arm
+    options: Any
     for options, message in (
         (dict(mode="both"), "mode is 'both'"),
         (dict(commanded=("foot",)), "no task 'foot'"),

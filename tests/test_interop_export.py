@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -104,7 +105,7 @@ def run_elsewhere(folder, schemes, precision, counts, atol):
         robot, tasks = controller(priority=1 if schemes == ["weighted"] else 2)
         given = inputs(robot, tasks, max(counts))
         made = {name: SCHEMES[name]() for name in schemes}
-        options = dict(batch="symbolic", platforms=("cpu",))
+        options: dict[str, Any] = dict(batch="symbolic", platforms=("cpu",))
         cases = {
             name: (export_controller(robot, tasks, scheme=scheme, **options), given, counts)
             for name, scheme in made.items()
@@ -197,7 +198,8 @@ def test_what_does_not_fit_is_told(remembering):
         load_controller(b"something else")
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
         loaded(np.zeros(7))
-    for bad in ({"batch": 0}, {"batch": "many"}, {"batch": 2.5}, {"platforms": ("tpu",)}, {"platforms": "cpu"}):
+    refused: list[dict[str, Any]] = [{"batch": 0}, {"batch": "many"}, {"batch": 2.5}, {"platforms": ("tpu",)}]
+    for bad in [*refused, {"platforms": "cpu"}]:
         with pytest.raises((ValueError, TypeError), match=next(iter(bad))):
             export_controller(robot, tasks, **bad)
     with pytest.raises(osik.OsikError, match="no number 'hand.aim'"):

@@ -1,5 +1,7 @@
 """JAX steps on PyTorch tensors: the same numbers and memory, gradients, one compilation."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ import osik_jax as osik
 pytest.importorskip("torch", reason="the extra torch")
 
 import torch
+from jax.core import Tracer
 
 from osik_jax.interop.torch import StepLayer, _to_torch, wrap
 
@@ -55,7 +58,8 @@ def test_compiled_once_and_again_for_its_derivative():
         return jnp.sin(x) * y
 
     own = wrap(step)
-    x, y = torch.rand(4, dtype=torch.float64), torch.rand(4, dtype=torch.float64, requires_grad=True)
+    x: Any = torch.rand(4, dtype=torch.float64)
+    y: Any = torch.rand(4, dtype=torch.float64, requires_grad=True)
     for _ in range(3):
         own(x, y.detach())
     after_plain = len(traced)
@@ -73,7 +77,7 @@ def test_memory_is_shared_both_ways():
     seen = {}
 
     def look(x):
-        if not isinstance(x, jax.core.Tracer):
+        if not isinstance(x, Tracer):
             seen["array"] = x
         return x * 2.0
 
@@ -94,7 +98,7 @@ def test_strided_tensors_and_parts_of_a_tensor():
 
 
 def test_a_result_that_is_an_argument_has_its_own_memory():
-    x = torch.rand(8, dtype=torch.float64, requires_grad=True)
+    x: Any = torch.rand(8, dtype=torch.float64, requires_grad=True)
     own = wrap(lambda a: (a, a + 1.0))
     same, other = own(x)
     assert same.data_ptr() != x.data_ptr() != own(x.detach())[0].data_ptr()
@@ -121,8 +125,8 @@ def test_a_tensor_changed_in_place_before_backward_is_noticed():
 
 def test_constants_integers_and_unused_arguments():
     own = wrap(lambda tree, index, scale: {"x": tree["a"][index] * scale, "n": index + 1})
-    a = torch.rand(6, dtype=torch.float64, requires_grad=True)
-    b = torch.rand(2, dtype=torch.float64, requires_grad=True)
+    a: Any = torch.rand(6, dtype=torch.float64, requires_grad=True)
+    b: Any = torch.rand(2, dtype=torch.float64, requires_grad=True)
     out = own({"a": a, "b": b}, torch.tensor([1, 3]), 2.0)
     assert not out["n"].requires_grad and out["n"].tolist() == [2, 4]
     out["x"].sum().backward()
@@ -133,7 +137,8 @@ def test_constants_integers_and_unused_arguments():
 
 def test_what_cannot_be_is_told():
     with pytest.raises(osik.OsikError, match="step is a Tensor; it is a function of arrays"):
-        wrap(torch.zeros(3))
+        step: Any = torch.zeros(3)
+        wrap(step)
     with jax.enable_x64(False), pytest.raises(osik.OsikError, match=r"float64 tensor.*jax_enable_x64"):
         wrap(jnp.sin)(torch.zeros(3, dtype=torch.float64))
     x = torch.rand(3, dtype=torch.float64, requires_grad=True)

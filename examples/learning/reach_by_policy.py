@@ -1,4 +1,4 @@
-"""Train a policy that reaches with arm7 in MJX, by task-space actions and by joint actions.
+"""Train a policy that reaches with arm7 in MJX, by task-space actions and by joint actions (minutes on a GPU).
 
 python examples/learning/reach_by_policy.py [figure.png]
 """
