@@ -24,19 +24,19 @@
 
 # %%
 import os
+import tempfile
 import time
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import Markdown, display
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from IPython.display import Image, Markdown, display
 
 import osik_jax as osik
-from osik_jax.viewer import draw_robot, draw_target, draw_trail, mujoco_frame_pose, mujoco_poses, scene_axes
+from osik_jax.viewer import hero_picture, mujoco_frame_pose, mujoco_poses
 
 osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)
@@ -166,37 +166,29 @@ assert all(key[:2] == ("out of reach", "null space, saturated") for key in unsol
 assert min(unsolved.values(), default=1.0) > 0.95  # there some steps hold still: joints at limits depend on each other
 
 # %% [markdown]
-# Start (pale) and farthest point, of the calmed weighted scheme. Orange: where the hand should be; green: where the
-# elbow should be.
+# The farthest point of each situation, with the calmed weighted scheme. The line is the path of the hand; crosses mark
+# where the hand and the elbow should be.
 
 # %%
 WAITING = 275  # the step in the middle of the wait
-
-
-def drawn(situation):
-    """A picture of one situation, as an array."""
-    figure = Figure(figsize=(4.2, 3.8), dpi=85)
-    canvas = FigureCanvasAgg(figure)
-    axes = scene_axes(figure, center=(0.46, 0.0, 0.40), radius=0.60, azimuth=-62.0, elevation=18.0)
-    q = results[situation, "weighted", True]["q"]
-    draw_robot(axes, arm, q[0], color="#c9ced6", alpha=0.35, detail=3)
-    draw_robot(axes, arm, q[WAITING], detail=3, shadow=0.0)
-    goal, elbow, _ = SITUATIONS[situation]
-    draw_trail(axes, [mujoco_frame_pose(arm, pose, "hand")[0] for pose in mujoco_poses(arm, q[:WAITING:10])])
-    draw_target(axes, np.asarray(home) + goal, color="#e69f00")
-    if elbow:
-        draw_target(axes, tasks["elbow"].target[0], color="#009e73")
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())
-
-
-fig, grid = plt.subplots(2, 2, figsize=(9.0, 8.0))
-for axes, situation in zip(grid.ravel(), SITUATIONS, strict=True):
-    axes.imshow(drawn(situation))
-    axes.set_title(situation)
-    axes.axis("off")
-fig.tight_layout()
-plt.show()
+paths = [results[situation, "weighted", True]["q"] for situation in SITUATIONS]
+targets = [
+    [np.asarray(home) + goal, *([tasks["elbow"].target[0]] if elbow else [])] for goal, elbow, _ in SITUATIONS.values()
+]
+trails = [[mujoco_frame_pose(arm, pose, "hand")[0] for pose in mujoco_poses(arm, q[:WAITING:10])] for q in paths]
+with tempfile.TemporaryDirectory() as folder:
+    picture = hero_picture(
+        Path(folder) / "arms.png",
+        arm,
+        [q[WAITING] for q in paths],
+        labels=list(SITUATIONS),
+        targets=targets,
+        trails=trails,
+        size=(1100, 420),
+        azimuth=-62.0,
+        elevation=18.0,
+    )
+    display(Image(picture.read_bytes()))
 
 # %% [markdown]
 # ## 1. Tasks that conflict

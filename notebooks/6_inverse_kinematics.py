@@ -26,7 +26,6 @@
 import os
 import tempfile
 import time
-from io import BytesIO
 from pathlib import Path
 
 import jax
@@ -34,21 +33,10 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import Image, display
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 import osik_jax as osik
 from osik_jax import reachability
-from osik_jax.viewer import (
-    draw_robot,
-    draw_target,
-    draw_trail,
-    hero_picture,
-    mujoco_frame_pose,
-    mujoco_poses,
-    robot_com,
-    scene_axes,
-)
+from osik_jax.viewer import hero_picture, mujoco_frame_pose, mujoco_poses, robot_com
 
 osik.runtime.configure_cpu()  # small problems, and batches on all cores
 jax.config.update("jax_enable_x64", True)  # double precision
@@ -104,30 +92,13 @@ assert np.linalg.norm(place[0] - position) < 1e-3
 
 
 # %%
-def scene(width, height, center=(0.22, 0.0, 0.46), radius=0.5, **view):
-    """3-D axes for one picture of the arm."""
-    figure = Figure(figsize=(width, height), dpi=90)
-    return figure, scene_axes(figure, center=center, radius=radius, **{"azimuth": -60.0, "elevation": 16.0, **view})
+def show(configurations, targets, **settings):
+    """Show the arm at configurations, side by side, with crosses at their targets."""
+    given = {"size": (900, 380), "azimuth": -60.0, "elevation": 16.0, **settings}
+    display(Image(hero_picture(folder / "arm.png", arm, configurations, targets=targets, **given)))
 
 
-def pixels(figure):
-    """What is drawn, as an array."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())
-
-
-def show(figure):
-    """Shows what is drawn, below the cell."""
-    file = BytesIO()
-    figure.savefig(file)
-    display(Image(file.getvalue()))
-
-
-figure, axes = scene(5.5, 4.2)
-draw_robot(axes, arm, found.q, shadow=0.0)
-draw_target(axes, position, color=ORANGE)
-show(figure)
+show([found.q], [[position]], size=(480, 380))
 
 # %% [markdown]
 # ## All solutions
@@ -145,12 +116,8 @@ assert len(solutions) > 4 and away.max() < 1e-3
 assert ((solutions >= lower) & (solutions <= upper)).all()
 
 # %%
-figure, axes = scene(6.5, 5.0)
-for q in solutions[1:]:
-    draw_robot(axes, arm, q, alpha=0.16, detail=3, color="#5b7fa6")
-draw_robot(axes, arm, solutions[0], shadow=0.0)
-draw_target(axes, position, color=ORANGE)
-show(figure)
+shown = solutions[:6]
+show(shown, [[position]] * len(shown))
 
 # %%
 fig, panel = plt.subplots(figsize=(7.0, 3.0))
@@ -216,17 +183,13 @@ for name, pose in targets.items():
 assert answers["too far"].beyond_reach > 0.0 and answers["too near"].beyond_reach == 0.0
 
 # %%
-fig, panels = plt.subplots(1, 2, figsize=(9.5, 3.5))
-for panel, (name, (goal, _)) in zip(panels, targets.items(), strict=True):
-    figure, axes = scene(5.0, 3.4, center=(0.55, 0.0, 0.4), radius=0.56)
-    draw_robot(axes, arm, answers[name].q, shadow=0.0)
-    draw_target(axes, goal, color=RED)
-    draw_trail(axes, np.stack([hands(answers[name].q)[0][0], goal]), color=RED)
-    panel.imshow(pixels(figure))
-    panel.axis("off")
-    panel.set_title(f"{name}: {answers[name].position_error:.2f} m, {answers[name].orientation_error:.2f} rad off")
-fig.tight_layout()
-plt.show()
+errors = {name: f"{a.position_error:.2f} m, {a.orientation_error:.2f} rad off" for name, a in answers.items()}
+show(
+    [answers[name].q for name in targets],
+    [[goal] for goal, _ in targets.values()],
+    trails=[[hands(answers[name].q)[0][0], goal] for name, (goal, _) in targets.items()],
+    labels=[f"{name}: {errors[name]}" for name in targets],
+)
 
 # %% [markdown]
 # ## Along a path

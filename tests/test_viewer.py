@@ -9,9 +9,6 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 
 import osik_jax as osik
@@ -126,20 +123,6 @@ def robot_surface_of(robot, data, geom):
 def test_faces_close_and_point_outward(shapes, geom, volume):
     data = mujoco_data(shapes, shapes.q0)
     assert signed_volume(robot_surface_of(shapes, data, geom)) == pytest.approx(volume, rel=0.04)
-
-
-def test_draw_robot_returns_the_faces_it_draws(shapes):
-    q = random_configurations(shapes, 1, seed=1)[0]
-    figure = Figure(figsize=(3, 3), dpi=50)
-    FigureCanvasAgg(figure)
-    axes = viewer.scene_axes(figure, center=(0.1, 0.2, 1.0), radius=0.8)
-    assert isinstance(axes, Axes3D)
-    surface = viewer.draw_robot(axes, shapes, q, shadow=0.0)
-    expected, _ = robot_surface(robot_parts(shapes), mujoco_data(shapes, q), 5)
-    np.testing.assert_allclose(surface.quads, expected, atol=1e-12)
-    figure.canvas.draw()
-    seen = len(surface.get_facecolor())
-    assert 0.3 * len(expected) < seen < 0.7 * len(expected)  # about half of closed surfaces looks at the camera
 
 
 def test_nao_com_and_frames_are_mujocos(nao):

@@ -15,9 +15,8 @@ from osik_jax.viewer._animate import paint_over, write_gif
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._opengl import make_renderer
 from osik_jax.viewer._outline import floor_height
-from osik_jax.viewer._overlay import Canvas
+from osik_jax.viewer._overlay import INK, ORANGE, Canvas
 from osik_jax.viewer._parts import RobotParts, robot_parts
-from osik_jax.viewer._scene import INK, ORANGE
 from osik_jax.viewer._stage import Camera, Stage, frame_camera
 
 from ..peers.ours import places, standing

@@ -14,15 +14,6 @@ from ._opengl import RendererName as RendererName
 from ._opengl import check_opengl as check_opengl
 from ._outline import Outline as Outline
 from ._outline import robot_outline as robot_outline
-from ._scene import Surface as Surface
-from ._scene import draw_com as draw_com
-from ._scene import draw_ground as draw_ground
-from ._scene import draw_polygon as draw_polygon
-from ._scene import draw_robot as draw_robot
-from ._scene import draw_robot_with_com as draw_robot_with_com
-from ._scene import draw_target as draw_target
-from ._scene import draw_trail as draw_trail
-from ._scene import scene_axes as scene_axes
 from .live import BatchView as BatchView
 from .live import LiveView as LiveView
 from .live import ReachView as ReachView

@@ -23,10 +23,9 @@ from ._look import Look
 from ._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
-from ._overlay import Canvas, ComMark, CurvePanel, PlanPanel, polygon_layer
+from ._overlay import BLUE, INK, Canvas, ComMark, CurvePanel, PlanPanel, polygon_layer
 from ._parts import RobotParts, Style, robot_parts
 from ._raycast import RayCaster
-from ._scene import BLUE, INK
 from ._stage import Stage, frame_camera
 
 Polygons = Sequence[Float[np.ndarray, "m 2"]]

@@ -21,9 +21,8 @@ from ._look import Look
 from ._mujoco import mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
-from ._overlay import Canvas, ComMark, polygon_layer
+from ._overlay import BLUE, INK, ORANGE, Canvas, ComMark, polygon_layer
 from ._parts import robot_parts
-from ._scene import BLUE, INK
 from ._stage import Camera, Stage, frame_camera
 
 SCHEME_COLORS = ("#f08c3a", "#8a8f98", "#1565c0", "#2a9d62", "#7b3fa0")
@@ -184,6 +183,7 @@ def hero_picture(
     support: Sequence[Float[np.ndarray, "m 2"]] | None = None,
     shapes: Iterable[CollisionShape] = (),
     labels: Sequence[str] = (),
+    targets: Sequence[Float[np.ndarray, "k 3"]] = (),
     trails: Sequence[Float[np.ndarray, "n 3"]] = (),
     look: Look | None = None,
     spacing: float | None = None,
@@ -201,6 +201,7 @@ def hero_picture(
         support: of each, the vertices of its support polygon [m]; with it the centre of mass is drawn.
         shapes: of the world, drawn with each figure: spheres, capsules, boxes and cylinders.
         labels: a line below each.
+        targets: points of each that are marked with a cross, world axes [m]. Each (k, 3)
         trails: path of a point of each, drawn as a line, world axes [m]. Each (n, 3)
         look: what the robot's URDF shows, from ``read_look``.
         spacing: between neighbours' middles [m]; ``None``: a little more than the widest is wide; 0: all in one place.
@@ -214,11 +215,14 @@ def hero_picture(
     floor = floor_height(robot, shape, sources)
     corners = [shape.corners(source) for source in sources]
     shifts = _side_by_side(corners, azimuth, spacing)
-    paths = [np.asarray(points, float) + shift for points, shift in zip(trails, shifts, strict=False)]
+    crosses, paths = (
+        [np.asarray(points, float) + shift for points, shift in zip(own, shifts, strict=False)]
+        for own in (targets, trails)
+    )
     fixed = fixed_parts(shapes)
     seen = [np.concatenate([points, fixed.corners()]) + shift for points, shift in zip(corners, shifts, strict=True)]
     window = (0.03, 0.97, 0.05, 0.90 if labels else 0.95)
-    camera = frame_camera(np.concatenate([*seen, *paths]), size, azimuth, elevation, window, lens=_LONG_LENS)
+    camera = frame_camera(np.concatenate([*seen, *crosses, *paths]), size, azimuth, elevation, window, lens=_LONG_LENS)
     stage = Stage([shape] * len(sources) + [fixed] * len(sources), camera, floor=floor)
     data = stage.pose([*sources, *sources], np.concatenate([shifts, shifts]))
     drawer = make_renderer(renderer, stage, camera, size, floor=floor)
@@ -229,6 +233,8 @@ def hero_picture(
         ComMark(canvas, camera, floor=floor, moving=False).place(robot_com(robot, source) + shift)
     for path_of_point in paths:
         canvas.page.plot(*camera.project(path_of_point, size).T, color=BLUE, lw=1.6)
+    for points in crosses:
+        canvas.page.plot(*camera.project(points, size).T, "x", color=ORANGE, ms=9, mew=2.4)
     for label, points in zip(labels, seen, strict=False):
         across = camera.project(points, size)[:, 0]
         x = 0.5 * (across.min() + across.max())

@@ -13,9 +13,9 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from ._scene import BLUE, GREEN, INK, ORANGE
 from ._stage import Camera
 
+GREEN, ORANGE, BLUE, INK = "#2a9d62", "#e8590c", "#1c6fb8", "#2b2f36"
 DPI = 100
 _CURVE_COLORS = (BLUE, GREEN, ORANGE)
 _CARD = (1.0, 1.0, 1.0, 0.82)

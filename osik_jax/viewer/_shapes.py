@@ -56,14 +56,14 @@ def cylinder(radius: float, half_length: float, detail: int) -> Quads:
 
 
 def _inner_rings(radius: float, half_length: float, detail: int) -> np.ndarray:
-    """Rings between the ends of a long cylinder: quads that are not too long sort well by depth."""
+    """Return rings between the ends of a long cylinder, so that no quad is much longer than wide."""
     count = min(detail, int(half_length / max(radius, 1e-9)))
     height = np.linspace(-half_length, half_length, count + 2)[1:-1]
     return np.stack([np.full_like(height, radius), height], -1)
 
 
 def box(half_sizes: Float[np.ndarray, "3"], detail: int) -> Quads:
-    """A box whose faces are split into a few quads, so that they sort well by depth."""
+    """Return a box whose faces are split into a grid of quads."""
     grid = np.linspace(-1.0, 1.0, max(detail, 2))
     u, v = (a.ravel() for a in np.meshgrid(grid[:-1], grid[:-1], indexing="ij"))
     step = grid[1] - grid[0]
