@@ -339,7 +339,8 @@ print(f"most manipulable at {around.positions[best].round(2)} m: {around.manipul
 assert not some[around.beyond_reach > 0.0].any()
 
 # %%
-show(around.figure())
+around.figure().savefig(folder / "slices.png")
+display(Image(folder / "slices.png"))
 
 # %% [markdown]
 # `around.q` has a configuration for each position that is reached, `around.save("map.npz")` keeps it all, and
