@@ -20,7 +20,7 @@ def test_constants_are_those_of_python():
         SINGLE_REFINEMENTS="KERNEL_REFINEMENTS", SINGLE_CORRECTION="LAST_CORRECTION", SINGLE_RIDGE="KKT_RIDGE"
     )
     for name, value in found.items():
-        there, kind = getattr(_constants, single.get(name, name)), "float32" if name in single else "float64"
+        there, kind = getattr(_constants, single.get(name) or name), "float32" if name in single else "float64"
         assert value == (there[np.dtype(kind)] if isinstance(there, dict) else there), name
 
 

@@ -100,8 +100,10 @@ def _rates_of_saturated(precision, distances, directions, shifts):
 
         def rate(distance, direction, shift):
             def velocity(s):
-                own = {"hand": hand.replace(target=(p + (distance + s) * direction, R))}
-                own["posture"] = posture.replace(target=arm.q0 + s * shift)
+                own = {
+                    "hand": hand.replace(target=(p + (distance + s) * direction, R)),
+                    "posture": posture.replace(target=arm.q0 + s * shift),
+                }
                 return osik.solve(arm, arm.q0, own, scheme=scheme).velocity
 
             return jax.jvp(velocity, (jnp.zeros_like(distance),), (jnp.ones_like(distance),))[1]

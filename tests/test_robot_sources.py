@@ -16,6 +16,7 @@ from osik_jax.retargeting import (
     load_robot_motion,
     load_source,
     report,
+    write_csv,
 )
 from osik_jax.retargeting._roles import LIMBS
 
@@ -81,7 +82,7 @@ def test_other_rates_and_tables(nao, danced, tmp_path):
     assert fast.frames == 2 * len(first.q) - 1
     np.testing.assert_allclose(fast.motion.qpos[::2], first.motion.qpos, atol=1e-12)
     table = file.with_name("motion.csv")
-    osik.retargeting.write_csv(first.motion, table)
+    write_csv(first.motion, table)
     np.testing.assert_allclose(load_source(table, nao, fps=30.0).motion.qpos, first.motion.qpos, atol=1e-8)
     with pytest.raises(ValueError, match="a CSV holds numbers alone; say joint_names and fps"):
         load_source(table, nao)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -178,7 +178,7 @@ def _add_legend(figure: Figure, grid: np.ndarray, palette: Mapping[str, str], us
 def hero_picture(
     path: str | Path,
     robot: Robot,
-    configurations: Sequence[Float[np.ndarray, " nq"]],
+    configurations: Sequence[Float[ArrayLike, " nq"]],
     *,
     support: Sequence[Float[np.ndarray, "m 2"]] | None = None,
     shapes: Iterable[CollisionShape] = (),
