@@ -186,7 +186,7 @@ def test_a_name_without_its_extra_is_one_line(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "robot_descriptions", None)
     line = refused(capsys, "info", "panda_mj_description")
     assert "pip install 'osik-jax[descriptions]'" in line
-    assert "names of robot_descriptions end in _description" in refused(capsys, "info", "panda")
+    assert "names of robot_descriptions end in _description" in refused(capsys, "info", "atlas")
 
 
 def test_info_lists_joints_limits_frames_and_mass(capsys):

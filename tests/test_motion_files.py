@@ -374,7 +374,7 @@ def test_positions_in_millimetres_are_told(tmp_path):
 def test_files_that_are_not_there_and_options_that_do_not_go_with_them(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_motion(tmp_path / "none.npz")
-    with pytest.raises(ValueError, match=r"none of \.bvh, \.npz and \.csv"):
+    with pytest.raises(ValueError, match=r"none of \.bvh, \.amc, \.npz, \.csv"):
         load_motion(tmp_path / "clip.fbx")
     with pytest.raises(FileNotFoundError, match="no such file: .*clips"):
         load_motion(tmp_path / "clips")
