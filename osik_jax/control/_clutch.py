@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -79,7 +79,7 @@ class Clutch(Replaceable):
         self.device = origin, jnp.eye(3, dtype=dtype)
         self._check()
 
-    def step(self, engaged: ArrayLike, device: PoseLike, frame: PoseLike) -> tuple[Self, Pose]:
+    def step(self, engaged: ArrayLike, device: PoseLike, frame: PoseLike) -> tuple[Clutch, Pose]:
         """Return the clutch for the next step and the target of the frame, as position (3,) and rotation (3, 3).
 
         Args:
