@@ -168,8 +168,10 @@ import osik_jax as osik
 osik.runtime.configure_cpu()
 robot = osik.load_robot("arm7")
 tasks = {"hand": osik.FrameTask(robot, "hand", priority=1), "posture": osik.PostureTask(robot, priority=2)}
-for scheme in (osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace(method="saturated")):
+for scheme in (osik.HierarchicalQP(), osik.NullSpace(method="saturated")):
     osik.raise_if_failed(osik.solve(robot, robot.q0, tasks, scheme=scheme))
+equal = {"hand": osik.FrameTask(robot, "hand"), "posture": osik.PostureTask(robot)}
+osik.raise_if_failed(osik.solve(robot, robot.q0, equal, scheme=osik.WeightedQP()))
 osik.rollout(robot, robot.q0, tasks, steps=3)
 jax.grad(lambda q: osik.solve(robot, q, tasks).velocity.sum())(robot.q0)
 """
