@@ -24,7 +24,7 @@ tasks = {  # five joints: the position comes first, the orientation gets what is
 
 
 def device(t):
-    """What a tracker sends: whether the clutch is pressed, and the hand's position and rotation."""
+    """Return a tracker's message: whether the clutch is pressed, and the hand's position and rotation."""
     position = jnp.array([0.12 * jnp.sin(1.1 * t), 0.2 * jnp.sin(0.8 * t), -0.15 * (1.0 - jnp.cos(0.9 * t))])
     half = 0.2 * jnp.sin(0.7 * t)  # of the angle of a turn about x
     return (t % 4.0 > 1.0) & (t % 4.0 < 3.0), (position, jnp.array([jnp.cos(half), jnp.sin(half), 0.0, 0.0]))

@@ -16,7 +16,7 @@ posture = osik.PostureTask(arm)
 
 
 def loss(log_weight):
-    """How far the hand is from its target [cm], plus how far the joints are from home [rad], after one second."""
+    """Return the distance of the hand from its target [cm] plus that of the joints from home [rad], after 1 s."""
     tasks = {"hand": hand, "posture": posture.replace(weight=jnp.exp(log_weight))}
     motion = osik.rollout(arm, arm.q0, tasks, steps=100, dt=0.01)
     missed = 100.0 * jnp.linalg.norm(motion.solution.error["hand"][-1])

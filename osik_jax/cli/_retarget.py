@@ -51,9 +51,9 @@ class Retarget:
     source: str | None = None
     """The robot whose motion CLIP is (motion.npz, or a CSV with --source-fps), by file or name. Default: a person."""
     source_fps: float | None = None
-    """Of a CSV with --source: its frames a second."""
+    """Frames a second of a CSV with --source."""
     source_profile: str | None = None
-    """As --profile, of the robot of --source."""
+    """Profile (TOML) of the robot of --source, as --profile."""
     out: Path = Path("osik-retarget")
     """Folder to write to."""
     profile: str | None = None
@@ -65,16 +65,16 @@ class Retarget:
     acceleration: float = 240.0
     """Greatest acceleration of the joints [rad/s^2]."""
     smooth: float = 0.0
-    """What is faster than about this time is smoothed out [s]; 0: nothing."""
+    """Smooth out motion that is faster than about this time [s]; 0: none."""
     balance: float | None = None
     """Where both feet stand, keep the centre of mass this far inside their edge [m]. Default: it is where it falls."""
     unit: str | None = None
-    """Of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
+    """Unit of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """The clip's axis that points up, as --up=y. Default: found from the motion; where that does not say, the axis of a
     BVH's rest pose, and z of keypoints."""
     trim: bool = True
-    """Of a BVH: leave out its rest pose, where it begins with one from which it jumps."""
+    """Leave out the rest pose at the start of a BVH, if the motion jumps from it."""
     animation: bool = True
     """Write the film (motion.gif); of a folder none is written."""
     fit: Path | None = None
@@ -119,7 +119,7 @@ class Retarget:
 
 
 def _reader(command: Retarget) -> Reader:
-    """What reads a clip as the command says."""
+    """Return the function that reads a clip as the command says."""
     from .. import retargeting
     from ..retargeting._load import Reader
 

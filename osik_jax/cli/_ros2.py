@@ -43,7 +43,7 @@ class Ros2:
     replay: Path | None = None
     """An MCAP file whose messages the controller is given."""
     tolerance: float = 1e-9
-    """With --replay: largest difference of a joint from the recorded command for exit code 0 [rad or m]."""
+    """Largest difference of a joint from the recorded command for exit code 0, with --replay [rad or m]."""
 
     def run(self) -> int:
         """Runs the command; returns the exit code: 1 where a replay does not reproduce its commands."""

@@ -63,8 +63,10 @@ class Loop(eqx.Module):
         self.robot, self.steps = robot, steps
         self.limits = with_own_limits(robot, checked_limits(robot, limits))
         self.tasks = tasks if callable(tasks) else dict(tasks)
-        at_start = self.tasks(jnp.zeros((), robot.q0.dtype)) if callable(self.tasks) else self.tasks
-        self.scheme = scheme_for(at_start, robot.q0.dtype) if scheme is None else scheme
+        if scheme is None:
+            at_start = self.tasks(jnp.zeros((), robot.q0.dtype)) if callable(self.tasks) else self.tasks
+            scheme = scheme_for(at_start, robot.q0.dtype)
+        self.scheme = scheme
         self.dt = jnp.asarray(dt, robot.q0.dtype)
         taken = [name for name in _PARTS if not callable(tasks) and name in tasks]
         if taken:

@@ -54,7 +54,7 @@ class Command(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What a period sends: a command once the robot was seen whole, and the state of the controller.
+    """Output of a period: a command once every joint of the robot was seen, and the state of the controller.
 
     Attributes:
         command: None until every joint was measured.
@@ -73,7 +73,7 @@ class Output(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """What a period leaves for the next one.
+    """State passed from period to period.
 
     Attributes:
         measured: position of each joint [rad or m], NaN until it is measured. (n,)

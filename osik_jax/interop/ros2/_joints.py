@@ -1,4 +1,4 @@
-"""From messages to numbers: joint states by name, poses, stamps; and why a message is refused."""
+"""Conversion of messages to numbers: joint states by name, poses, stamps; and the reasons to refuse a message."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface addres
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 
 Record = Callable[[str, int, Any], None]
-"""What is told of each message that is used or sent: its topic, the time [ns] and the message."""
+"""Function that is called for each message used or sent, with its topic, the time [ns] and the message."""
 
 
 class Endpoints:

@@ -28,7 +28,7 @@ class Topics:
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What ``osik ros2`` does, and within which bounds.
+    """Settings of ``osik ros2``, with their bounds.
 
     Attributes:
         rate: control steps a second [Hz].

@@ -58,14 +58,7 @@ def _source(m: int, n: int, p: int, single: bool, max_changes: int, per_block: i
 
 
 def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
-    """Return candidates for a batch on the GPU that the program runs on, in the precision of the data.
-
-    Args:
-        qp: the problems, with a leading axis.
-        guess: labels of the active sets to try first.
-        tolerance: violation that counts as none, relative to the scale of the constraint.
-        max_iterations: limit on the changes of the active set (static).
-    """
+    """Return candidates for a batch from the GPU, in the precision of the data; arguments as for ``_core.solve``."""
     if _single.fits(qp):
         return _single.solve(qp, guess, tolerance, max_iterations)
     cost = qp.cost
