@@ -3,10 +3,11 @@
     python -m benchmarks.agreement --solver qp|hqp|nullspace|reverse|saturated [--count 1000000]
         [--backend core] [--precision float64] [--seed 0] [--batch 4096] [--keep FILE]
 
-Each family is drawn as often as the others: for weighted QPs those of ``tests/weighted_families.py`` and the planted
-ones of ``tests/problem_families.py`` as least squares, for the others those of ``tests/hierarchy_families.py``. Each
-line of the result is that of a family: its problems; by status, the kernel's first, those whose status differs; those
-of the others in which the rows of a QP's cost, or the norm of what a level misses, differ by more than 1e-7 of their
+Each family is drawn as often as the others: in ``tests/support``, for weighted QPs those of ``weighted_families.py``
+and the planted ones of ``problem_families.py`` as least squares, for the others those of ``hierarchy_families.py``.
+Each line of the result is that of a family: its problems; by status, the kernel's first, those whose status differs;
+those of the others in which the rows of a QP's cost, or the norm of what a level misses, differ by more than 1e-7 of
+their
 size, and the largest such difference; and those that the kernel left to the search. ``--keep`` writes the problems
 that differ to a file, for ``kept`` to read: who is right is a third method's to say.
 
@@ -32,9 +33,9 @@ from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, s
 from osik_jax.solvers.hqp import _dispatch as hqp_dispatch
 from osik_jax.solvers.null_space import _saturation
 from osik_jax.solvers.qp import _dispatch as qp_dispatch
-from tests.hierarchy_families import SMALL, Hierarchies
-from tests.problem_families import PLANTED, QPs
-from tests.weighted_families import MANY, M, Problems, problems
+from tests.support.hierarchy_families import SMALL, Hierarchies
+from tests.support.problem_families import PLANTED, QPs
+from tests.support.weighted_families import MANY, M, Problems, problems
 
 APART = 1e-7
 """Of a problem's size, a difference that counts."""

@@ -26,7 +26,7 @@ from rich.table import Table
 import osik_jax
 from osik_jax.runtime import configure_cpu
 from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_qp
-from tests.recorded import QP_DAMPING, RecordedHierarchies, recorded_hierarchies, recorded_qps
+from tests.support.recorded import QP_DAMPING, RecordedHierarchies, recorded_hierarchies, recorded_qps
 
 ROUNDS = 7
 FAR = 1e30

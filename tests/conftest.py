@@ -43,8 +43,8 @@ gc.set_threshold(50_000, 20, 20)
 
 MOST_MEMORY = 4 * 2**30
 """What a process may hold after a file of tests, in bytes, before it drops its compiled programs."""
-WITH_TORCH = "test_beside_pytorch_kinematics.py"
-WITH_BROWSER = "test_live_browser.py"
+WITH_TORCH = "kinematics/test_beside_pytorch_kinematics.py"
+WITH_BROWSER = "viewer/test_live_browser.py"
 NOT_INSTALLED = {} if find_spec("pytorch_kinematics") else {WITH_TORCH: "pytorch-kinematics"}
 if not (shutil.which("chromium") and find_spec("playwright")):
     NOT_INSTALLED[WITH_BROWSER] = "chromium or playwright"

@@ -128,7 +128,7 @@ def _cell(text: str) -> str:
 _HEAD = """# Wrong inputs
 
 {count} wrong inputs, and the exception or status of each. `python -m benchmarks.bad_inputs --write` writes this page.
-`pytest tests/test_bad_inputs.py` compares it with what happens. Long messages are cut.
+`pytest tests/cli/test_bad_inputs.py` compares it with what happens. Long messages are cut.
 
 An input that can be checked before a program runs raises an exception. Its message names what is wrong and what is
 allowed. An input that is known only inside a program gives a status, and all numbers of the answer are finite.

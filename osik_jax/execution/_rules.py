@@ -10,7 +10,7 @@ A primitive may also go through a batch in its own way. On a CPU, arrays of a th
 from one operation to the next; ``blocked`` runs all operations on some lanes, then on the next.
 
 This is the only file that uses ``jax.interpreters``, and a new release of jax breaks it first:
-``tests/test_rules.py`` takes each rule of the primitive through each transformation.
+``tests/execution/test_rules.py`` takes each rule of the primitive through each transformation.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_scaling import finish, free_port, start
+from other_processes import finish, free_port, start
 
 import osik_jax as osik
 from osik_jax import tuning

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -34,3 +35,10 @@ def finish(process: subprocess.Popen[str]) -> Any:
         process.kill()
     assert process.returncode == 0, errors
     return json.loads(out.splitlines()[-1])
+
+
+def free_port() -> int:
+    """A port of this machine that no program listens on."""
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return probe.getsockname()[1]

@@ -14,7 +14,7 @@ import jax
 import pytest
 from prose import assert_fit_to_read
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 NOTEBOOKS = ROOT / "docs" / "notebooks.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]

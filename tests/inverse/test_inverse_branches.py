@@ -8,7 +8,7 @@ import pytest
 
 import osik_jax as osik
 
-UR10E = Path(__file__).parent / "data" / "ur10e_branches.npz"
+UR10E = Path(__file__).parents[1] / "data" / "ur10e_branches.npz"
 """Poses of random configurations, and their solutions by EAIK 1.2.2, NaN where there are fewer than eight."""
 LINKS = ((0, 0, 0.1807), (0, 0.17415, 0), (0.6127, 0, 0), (0.57155, 0, 0), (0, 0, -0.11985), (0, 0.11655, 0))
 AXES = ((0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 1, 0), (0, 0, -1), (0, 1, 0))

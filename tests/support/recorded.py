@@ -15,7 +15,7 @@ from osik_jax.solvers import Damping
 from osik_jax.solvers.null_space._implicit_diff import SaturatedResult
 from osik_jax.solvers.null_space._padding import PaddedLevel, Problem
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 FULL = os.environ.get("OSIK_REFERENCE")
 QP_DAMPING = 1e-9
 

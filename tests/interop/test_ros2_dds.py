@@ -23,7 +23,7 @@ pytest.importorskip("cyclonedds")
 dds = pytest.importorskip("osik_jax.interop.ros2.dds")
 msg = dds.messages
 
-ROBOT = Path(__file__).parent / "ros2_robot.py"
+ROBOT = Path(__file__).parents[1] / "support" / "ros2_robot.py"
 COMMANDS = "/joint_trajectory_controller/joint_trajectory"
 
 

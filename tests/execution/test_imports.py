@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parent.parent / "osik_jax"
+PACKAGE = Path(__file__).parents[2] / "osik_jax"
 
 
 def imported(source: str, place: tuple[str, ...]) -> set[str]:

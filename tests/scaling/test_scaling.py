@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import socket
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.core import Tracer
-from other_processes import finish, start
+from other_processes import finish, free_port, start
 
 from osik_jax import scaling
 
@@ -116,12 +115,6 @@ uneven = split(x[:5], 2.0)["y"]
 total = float(jax.jit(lambda y: y.sum())(uneven))
 print(json.dumps([len(jax.devices()), len(jax.local_devices()), missing, kept, total]))
 """
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.mark.slow

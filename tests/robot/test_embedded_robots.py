@@ -15,7 +15,7 @@ from task_checks import kinematics_at
 
 import osik_jax as osik
 
-NAO = json.loads((Path(__file__).parent / "data" / "nao_reference.json").read_text(encoding="utf-8"))
+NAO = json.loads((Path(__file__).parents[1] / "data" / "nao_reference.json").read_text(encoding="utf-8"))
 CONFIGURATIONS = range(len(NAO["configurations"]))
 
 # Franka Control Interface documentation: modified Denavit-Hartenberg figures (a, d, alpha), last row the flange.

@@ -12,7 +12,7 @@ import pytest
 
 import osik_jax as osik
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "features.md").read_text(encoding="utf-8")
 NONE = "—"
 COLUMNS = 12
@@ -28,11 +28,16 @@ def rows(page: str) -> list[list[str]]:
 ROWS = rows(PAGE)
 
 
+def _test_file(name: str) -> Path:
+    """Return the path of a test file, which may stand in any folder of the tests."""
+    return next((ROOT / "tests").rglob(name))
+
+
 @cache
 def functions_of(name: str) -> frozenset[str]:
     """``test_x`` and ``TestClass::test_x`` of a file."""
     found = set()
-    for node in ast.parse((ROOT / "tests" / name).read_text(encoding="utf-8")).body:
+    for node in ast.parse(_test_file(name).read_text(encoding="utf-8")).body:
         inside = node.body if isinstance(node, ast.ClassDef) else [node]
         prefix = f"{node.name}::" if isinstance(node, ast.ClassDef) else ""
         found |= {prefix + part.name for part in inside if isinstance(part, ast.FunctionDef)}

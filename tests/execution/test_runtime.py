@@ -219,7 +219,7 @@ def test_this_jaxlib_waits_where_it_is_said_to():
 
 def test_flags_are_set_for_every_jax_that_may_be_installed():
     """A flag that XLA does not know ends the process, so a new jax is tried with ours before it is allowed."""
-    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     (bounds,) = [d.removeprefix("jax").split(",") for d in project["dependencies"] if d.startswith("jax>")]
     major, minor = _UNTRIED_JAXLIB
     assert f"<{major}.{minor}" in bounds

@@ -16,7 +16,7 @@ from nbconvert import HTMLExporter
 from PIL import Image, ImageSequence
 from prose import assert_fit_to_read
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "notebooks").glob("*.py"))
 PAGE = ROOT / "docs" / "notebooks.md"
 

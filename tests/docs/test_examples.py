@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-FOLDER = Path(__file__).parent.parent / "examples"
+FOLDER = Path(__file__).parents[2] / "examples"
 GALLERY = FOLDER.parent / "docs" / "gallery.md"
 Names = dict[str, Any]
 
