@@ -1,4 +1,4 @@
-"""From a person to a robot: motion retargeting."""
+"""Motion retargeting: a recorded human motion becomes a motion of a legged robot."""
 
 from ._bvh import read_bvh as read_bvh
 from ._fit import Fit as Fit

@@ -1,4 +1,4 @@
-"""ASF skeletons and AMC motions, as the CMU database has them."""
+"""Reader of ASF skeletons and AMC motions, the file formats of the CMU motion capture database."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from ._rotations import continuous
 
 _INCH = 0.0254
 _FPS = 120.0
-"""Frames a second of the CMU database; the format does not say them."""
+"""Frame rate of the CMU database [1/s]; the AMC format does not store a rate."""
 
 
 @dataclasses.dataclass
 class _Bone:
-    """A bone: its rest pose in the world, and the axes and letters of its angles."""
+    """One bone of an ASF skeleton, in file units: parent, rest vector to its end, joint axes and names of its dofs."""
 
     name: str
     parent: str = ""
@@ -29,7 +29,7 @@ class _Bone:
 
 
 def read_amc(path: Path, skeleton: Path | None = None, fps: float = _FPS) -> HumanMotion:
-    """Return the motion in an AMC file; a joint is where the bone of its name starts, y up.
+    """Return the motion in an AMC file. Each joint is placed at the start of the bone of the same name; y points up.
 
     Args:
         path: the AMC file.
@@ -69,7 +69,7 @@ def read_amc(path: Path, skeleton: Path | None = None, fps: float = _FPS) -> Hum
 
 
 def _rest(bones: dict[str, _Bone]) -> np.ndarray:
-    """Return where the bones start in the rest pose, the root at the origin. (J, 3)."""
+    """Return the positions of the bones' starts in the rest pose, root at the origin, in file units. (J, 3)."""
     starts: dict[str, np.ndarray] = {}
     for name, bone in bones.items():
         parent = bones.get(bone.parent)
@@ -107,7 +107,7 @@ def _numbers(path: Path, number: int, words: list[str]) -> list[float]:
 
 
 def _read_asf(path: Path) -> tuple[dict[str, _Bone], float, bool]:
-    """Return the bones, parents first, metres a unit, and whether angles are in degrees."""
+    """Return the bones (parents first), the length of one file unit [m], and whether angles are in degrees."""
     bones, section, children = {"root": _Bone("root")}, "", []
     scale, degrees, name, along, length = _INCH, True, "root", np.zeros(3), 0.0
     for number, words in _lines(path):

@@ -1,8 +1,8 @@
-"""The centre of mass over the feet: how far it is from the edge of what stands.
+"""Signed distance of the centre of mass from the edge of the support polygon.
 
-The distance of a point from the edge of a convex hull, positive outside and negative inside, is the most that it is
-beyond all of the hull's points along any direction. That direction is square to a line through two of the points, or
-goes from one of them to the point itself: no hull has to be made.
+For a point p and a convex hull, this distance (positive outside) is the maximum over unit directions n of ``n . p``
+minus the hull's support function. The maximum is at the normal of a line through two hull points, or at the direction
+from one hull point to p. So the hull itself is not constructed.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from jaxtyping import Array, Float
 from ..numerics._dense import product
 from ..robot import Robot
 
+# Guard of divisions: a line between corners shorter than this [m] counts as a point.
 _SHORTEST = 1e-6
 _FIRST, _SECOND = np.array(list(itertools.combinations(range(8), 2))).T
 _POINTS = np.arange(8)
-"""Numbers of the two corners on each line; of the soles' eight corners by themselves."""
+"""Corner indices: the two corners of each line through two corners, and each of the eight sole corners alone."""
 
 
 class Overhang(NamedTuple):
-    """A point and the edge of what stands.
+    """Position of a point relative to the edge of the support polygon.
 
     Attributes:
-        distance: from the edge, positive outside, -inf where nothing stands [m].
-        direction: in which that grows, a unit vector. (2,)
-        coefficients: of the corners in the nearest point of the edge, which is their convex combination. The distance
-            is from that point, along the direction. (8,)
-        width: of the hull where it is narrowest [m]. A third of it, a point can always be inside.
+        distance: signed distance from the edge, positive outside, -inf without contacts [m].
+        direction: unit vector along which the distance grows. (2,)
+        coefficients: weights of the corners whose convex combination is the nearest point of the edge. (8,)
+        width: least width of the hull [m]; a margin of a third of it can always be met.
     """
 
     distance: Float[Array, ""]
@@ -41,7 +41,11 @@ class Overhang(NamedTuple):
 
 
 def overhang(center: Float[Array, "2"], corners: Float[Array, "8 2"], stands: Float[Array, "8"]) -> Overhang:
-    """Return how far a point is beyond the edge of the hull of those corners that stand (1; others 0)."""
+    """Return the signed distance of a point from the convex hull of the corners in contact.
+
+    ``center``: the point in the floor plane [m]. ``corners``: the soles' corners [m]. ``stands``: 1 for a corner in
+    contact, else 0.
+    """
     edge, length = _unit_and_length(corners[_SECOND] - corners[_FIRST])
     from_corner, distance = _unit_and_length(center - corners)
     normal = jnp.stack([edge[:, 1], -edge[:, 0]], -1)
@@ -66,13 +70,13 @@ def overhang(center: Float[Array, "2"], corners: Float[Array, "8 2"], stands: Fl
 
 
 def _unit_and_length(vectors: Float[Array, "k 2"]) -> tuple[Float[Array, "k 2"], Float[Array, " k"]]:
-    """Return vectors at unit length, and their lengths [m]; with derivatives at 0 too."""
+    """Return vectors scaled to unit length, and their lengths [m]; both have finite derivatives at 0."""
     square = jnp.sum(vectors**2, -1)
     length = jnp.sqrt(jnp.where(square > 0.0, square, 1.0)) * (square > 0.0)
     return vectors / jnp.maximum(length, _SHORTEST)[:, None], length
 
 
 def mass_fractions(robot: Robot) -> Float[Array, "*B nbody"]:
-    """Return the fraction of the robot's mass that each body has."""
+    """Return each body's fraction of the robot's total mass. (nbody,)."""
     own = jnp.where(robot.tree.is_own, robot.body_mass, 0.0)
     return own / own.sum(-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Linear systems of a whole clip: frames that are coupled to the one and the two before."""
+"""Symmetric block-banded linear systems of a whole clip: each frame is coupled to the two frames before it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class BandedSystem(NamedTuple):
     Attributes:
         square: (F, n, n)
         alone: (F, n)
-        rows: what couples a frame to the next. (F, m, n)
+        rows: rows of the coupling between a frame and the next. (F, m, n)
         weight: entry 0 is not used. (F, m)
         first: entry 0 is not used. (F, n)
         second: entries 0 and 1 are not used. (F, n)
@@ -41,9 +41,10 @@ class BandedSystem(NamedTuple):
 
 
 def solve_banded(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Array, "F n"]:
-    """The solution x of ``system x = right``: on a GPU in single precision by a kernel, where the core is installed.
+    """Return the solution x of ``system x = right``.
 
-    It is not finite where the matrix is not positive definite in the precision of its numbers.
+    Runs the CUDA kernel in single precision on a GPU where the core is installed, else plain JAX. The result is not
+    finite if the matrix is not positive definite to rounding.
     """
     weight, first = (a.at[0].set(0.0) for a in (system.weight, system.first))
     system = system._replace(weight=weight, first=first, second=system.second.at[:2].set(0.0))
@@ -58,7 +59,7 @@ def _anywhere() -> Callable[[BandedSystem, Array], Array]:
 
 
 def solve_banded_plain(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Array, "F n"]:
-    """The same in plain JAX, where what is not used is 0, by a Cholesky factorisation from first block to last.
+    """Return the solution of a banded system by a block Cholesky factorisation in plain JAX; unused entries are 0.
 
     With L the factor, row t of blocks is ``L2 = S L[t-2]^-T`` (two frames back), ``L1 = (B - L2 L1[t-1]^T) L[t-1]^-T``
     and ``L L^T = A - L1 L1^T - L2 L2^T``. The blocks on the diagonal are kept as inverses: of blocks this small,

@@ -1,4 +1,4 @@
-"""Banded systems on a GPU: ``core/banded.cu``, one warp of 32 threads for each system, in single precision."""
+"""CUDA kernel for banded systems in single precision (``core/banded.cu``); one warp of 32 threads solves one system."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from ._banded import BandedSystem
 
 _SHARED_BYTES = 48 * 1024
-"""Shared memory that any CUDA device gives a block without being asked for more."""
+"""Shared memory [bytes] that every CUDA device offers a block by default."""
 
 
 def fits(system: BandedSystem) -> bool:
-    """Whether there is a kernel for systems of this shape and precision."""
+    """Return whether the kernel supports the shape and precision of a system."""
     m, n = system.rows.shape[-2:]
     is_small = 4 * (4 * n * (n | 1) + 2 * m * n + 6 * n) <= _SHARED_BYTES
     return system.rows.dtype == jnp.float32 and is_small and _cuda.installed()
 
 
 def solve(system: BandedSystem, right: Float[Array, "B F n"]) -> Float[Array, "B F n"]:
-    """The solutions of a batch, on the GPU that the program runs on."""
+    """Return the solutions of a batch of banded systems, computed on the default GPU."""
     lanes, frames, n = right.shape
     single, blocks = jnp.float32, (lanes, frames, n, n)
     x, *_ = _cuda.call(

@@ -1,4 +1,4 @@
-"""From a robot's profile to what is computed with: shapes that are kept apart, goals out of a person, a first guess."""
+"""Data derived from a robot and its profile: collision pairs, a person's goals, and the first guess of a plan."""
 
 from __future__ import annotations
 
@@ -28,16 +28,23 @@ from ._terms import Bounds
 
 JOINTS_APART = 3
 _CAPSULE = "capsule "
+# A plan stays 1 mrad (or 1 mm) inside the ranges and below 98 % of speed and acceleration limits, so that the
+# last pass, which holds the limits exactly, can follow it.
 _INSET, _SHARE = 1e-3, 0.98
 _LONG = 60
-"""For how many frames a point stands before it is held more firmly."""
+"""Number of frames of contact beyond which a contact point gets a larger weight."""
 _AT_END, _ARM_AT_END, _BENT = 0.01, 0.05, 1.0
-"""What counts as the end of a range, as a share of it, and that of an arm, whose elbow may be overstretched a little (a
-GR3's by 3 %); how far from there plans begin [rad], to the middle at most."""
+"""Shares of a joint's range: a leg joint within 1 % of an end, or an arm joint within 5 % (a GR3's elbow extends 3 %
+beyond straight), starts from a bent position. That position is 1 rad from the end, or the middle of the range if
+nearer.
+"""
 
 
 def shapes_apart(robot: Robot, profile: Profile) -> CollisionAvoidanceLimit | None:
-    """What keeps the profile's capsules apart: those with three joints and more between them that are apart at home."""
+    """Return the collision limit between the profile's capsules, or None if no pair is left.
+
+    A pair counts if at least three joints lie between the two capsules and they do not overlap at home.
+    """
     shapes = {
         f"{_CAPSULE}{i}": CollisionShape.capsule(c.radius, c.start, c.end, frame=c.frame)
         for i, c in enumerate(profile.capsules)
@@ -54,9 +61,10 @@ def shapes_apart(robot: Robot, profile: Profile) -> CollisionAvoidanceLimit | No
 
 
 def pairs_apart(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
-    """The pairs of ``shapes_apart``, as numbers of the profile's capsules.
+    """Return the pairs of ``shapes_apart`` as indices of the profile's capsules.
 
-    Those that follow are left out: of a capsule inside another that is kept from the same shape.
+    A pair is left out if it is implied by another: one capsule is inside a wider capsule that is kept from the same
+    shape.
     """
     apart = shapes_apart(robot, profile)
     named = [] if apart is None else apart.scene.pair_names
@@ -72,7 +80,7 @@ def pairs_apart(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
 
 
 def joints_between(robot: Robot, a: int, b: int) -> int:
-    """How many joints are between two bodies along the tree."""
+    """Return the number of joints on the tree path between two bodies."""
     parents = robot.tree.body_parents
 
     def chain(body: int) -> list[int]:
@@ -88,21 +96,21 @@ def joints_between(robot: Robot, a: int, b: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """How a robot with its profile is built, measured at home; NumPy throughout, for work clip by clip.
+    """Dimensions and limits of a robot with its profile, taken at its home configuration, as NumPy arrays.
 
     Attributes:
-        points: where the keypoints are [m]. (3,) each
-        leg: thigh and shank, the mean of both legs [m].
-        ankle: how far the ankles are above the soles [m].
-        hips: from the root body's origin to the midpoint of the hips [m]. (3,)
-        turn: of the root body. (3, 3)
-        scale: robot over person; None: the ratio of their legs, and stretch.
-        stretch: what that ratio is multiplied with.
-        start: the home configuration, limbs bent where they are at the end of a range (``_with_bent_limbs``). (nq,)
-        base: where the base's free joint starts in q.
-        lower: ends of the joints' ranges [rad or m]. (nv,)
-        upper: the other ends. (nv,)
-        speed: limits [rad/s or m/s]. (nv,)
+        points: world positions of the keypoints [m]. (3,) each
+        leg: length of thigh and shank, mean of both legs [m].
+        ankle: height of the ankles above the soles [m].
+        hips: vector from the root body's origin to the midpoint of the hips [m]. (3,)
+        turn: rotation matrix of the root body. (3, 3)
+        scale: factor on the person's path; None: the ratio of leg lengths times ``stretch``.
+        stretch: factor on the ratio of leg lengths.
+        start: the home configuration with limbs bent (``_with_bent_limbs``). (nq,)
+        base: index of the base's free joint in q.
+        lower: lower joint limits [rad or m]. (nv,)
+        upper: upper joint limits [rad or m]. (nv,)
+        speed: speed limits [rad/s or m/s]. (nv,)
     """
 
     points: Mapping[str, Float[np.ndarray, "3"]]
@@ -120,7 +128,7 @@ class Build:
 
     @classmethod
     def of(cls, robot: Robot, profile: Profile) -> Build:
-        """The measures of a robot."""
+        """Measure a robot at its home configuration."""
         kinematics = jax.tree.map(np.asarray, home_kinematics(robot))
         root = robot.tree.body_names[robot.tree.root]
         places = [*profile.keypoints.values(), *profile.corners, (root, (0.0, 0.0, 0.0))]
@@ -145,7 +153,7 @@ class Build:
         )
 
     def goals(self, person: Person) -> Goals:
-        """What a person asks of the robot: the path is scaled, and the ankles stand as high as the robot's do."""
+        """Return the goals for a person's motion: the hip path scaled by leg length, with the robot's ankle height."""
         scale = self.stretch * self.leg / person.leg if self.scale is None else self.scale
         root = scale * person.root
         root[:, 2] += self.ankle - scale * person.ankle
@@ -159,7 +167,7 @@ class Build:
         return Goals(**{name: part.astype(dtype) for name, part in parts.items()})
 
     def first_guess(self, goals: Goals) -> Float[np.ndarray, "F nq"]:
-        """One posture throughout, with the pelvis where and as the person's is."""
+        """Return configurations with the start posture in all frames and the pelvis at the goal pose. (F, nq)."""
         turn = np.asarray(goals.pelvis)
         q = np.tile(self.start, (len(turn), 1))
         base = self.base
@@ -168,7 +176,7 @@ class Build:
         return q
 
     def bounds(self, acceleration: Float[np.ndarray, " nv"], dt: float) -> Bounds:
-        """What joints may do in the plan: a little less than they can, so that the last pass has room."""
+        """Return the joint bounds of a plan, slightly inside the robot's limits so that the last pass has room."""
         inset = np.minimum(_INSET, 0.01 * (self.upper - self.lower))
         step, change = _SHARE * self.speed * dt, _SHARE * np.asarray(acceleration) * dt**2
         parts: list[Any] = [self.lower + inset, self.upper - inset, step, change]
@@ -176,11 +184,11 @@ class Build:
 
 
 def _firmness(contact: Bool[np.ndarray, "F 4"]) -> Float[np.ndarray, "F 4"]:
-    """1 where a point stands, and more where it does so for long.
+    """Return the weight factor of each contact point: 1 in contact, more in a long contact, 0 elsewhere. (F, 4).
 
-    What a standing point gives way adds up from frame to frame, while what pulls at it does too: as the square of the
-    frames. The weight of each step is ``stance`` times the square of this number, which grows as they do. Not in single
-    precision, to which such a weight beside those of limbs is too much.
+    Without the factor the drift of a standing point grows with the square of the contact's duration. The weight of a
+    step is ``stance`` times the square of this factor, which cancels that growth. Single precision gets no factor: such
+    a weight would lose the limb terms to rounding.
     """
     out = contact.astype(float)
     for k in range(contact.shape[1]):
@@ -190,10 +198,10 @@ def _firmness(contact: Bool[np.ndarray, "F 4"]) -> Float[np.ndarray, "F 4"]:
 
 
 def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]:
-    """Home, with joints of the limbs that are at an end of their range there moved inside it.
+    """Return the home configuration with limb joints that are at an end of their range moved inside it. (nq,).
 
-    A limb that is straight and can bend to one side alone is singular: as long as its hinge is turned the wrong way,
-    the end of the range holds it, and what would turn the hinge does not move the limb's end.
+    A straight limb that bends to one side only is singular. The range bound blocks its hinge, and a rotation of the
+    hinge does not move the limb's end to first order, so the solver cannot bend it.
     """
     q = np.array(robot.q0)
     scalar, index = scalar_layout(robot)

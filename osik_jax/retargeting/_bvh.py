@@ -1,7 +1,6 @@
-"""BVH files: a tree of joints with offsets and channels, then one row of numbers for each frame.
+"""Reader of BVH files: a tree of joints with offsets and channels, then one row of numbers per frame.
 
-The format is a description of its own, not a standard: no unit, no up axis. Both are told by the caller or found from
-the skeleton's rest pose.
+A BVH file states neither unit nor up axis. The caller gives them, or they are inferred from the rest pose.
 """
 
 from __future__ import annotations
@@ -22,18 +21,19 @@ from ._rotations import about, continuous, multiply, rotate
 from ._up import UPS, Up, checked_up, find_up, named, standing_up
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "cmu": 0.0254 / 0.45}
-"""Metres a unit. ``cmu``: that of the CMU database's skeletons."""
+"""Length of one file unit [m]; ``cmu`` is the unit of the CMU database's skeletons."""
+# Size of a rest pose that is believed to be a person's [m]: an unknown unit is the first that gives such a size.
 _HEIGHTS = (1.0, 2.3)
 _SLOWEST, _FASTEST = 1.0, 1e-5
-"""Times from one frame to the next that are believed [s]."""
+"""Longest and shortest accepted frame time [s]."""
 _UPRIGHT = 0.6
-"""How far the head is above the feet in a rest pose in which one stands, as a share of the way along the joints."""
+"""Least height of the head above the feet in an upright rest pose, as a share of the path length along the joints."""
 _CHANNELS = {f"{axis}{kind}": (kind, axis.lower()) for axis in "XYZ" for kind in ("position", "rotation")}
 
 
 @dataclasses.dataclass
 class _Joint:
-    """One joint of the tree, with the numbers of the file's axes and unit."""
+    """One joint of a BVH tree, in the file's axes and unit."""
 
     name: str
     parent: int
@@ -45,24 +45,22 @@ class _Joint:
 def read_bvh(
     path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
 ) -> HumanMotion:
-    """Reads a BVH file.
+    """Read a BVH file.
 
-    A joint's rotation is the product of its channels in the order in which the file lists them. The ends of chains
-    (``End Site``) become joints called ``PARENT_end``, where they are not where their parent is. ``rest_positions`` is
-    the pose with all rotations 0, its root at the origin; None where nobody stands in it, as in files that have all
-    bones along one axis. Facing z with y up becomes facing x with z up.
+    A joint's rotation is the product of its channels in the order in which the file lists them. Ends of chains
+    (``End Site``) become joints called ``PARENT_end`` unless their offset is 0. ``rest_positions`` is the pose with all
+    rotations 0 and the root at the origin; None if nobody stands in it, as in files with all bones along one axis.
+    Facing z with y up becomes facing x with z up.
 
     Args:
         path: the file.
-        unit: metres a unit, or ``"m"``, ``"cm"``, ``"mm"``, ``"inch"``, ``"cmu"``. None: the one of these in which
-            the rest pose is between 1 and 2.3 m large; the way from a foot to the head along the joints, where nobody
-            stands in that.
-        up: the file's axis that points up, ``"x"``, ``"y"``, ``"z"``, or ``"-y"`` and so on. None: the one along which
-            the person stands in the motion; where the motion does not say, the one along which the rest pose stands,
-            else y. An ``OsikWarning`` says where the motion stands along another axis than the rest pose.
-        trim: leave out frames at the start that are the rest pose and no motion, with an ``OsikWarning``: all joints
-            turned as the root, within 30 degrees, and a jump after them, at more than 5 m/s and three times as far as
-            in any other step.
+        unit: length of one file unit [m], or ``"m"``, ``"cm"``, ``"mm"``, ``"inch"``, ``"cmu"``. None: the one of
+            these in which the rest pose is 1 to 2.3 m large. If nobody stands in the rest pose, the path from a foot
+            to the head along the joints counts instead.
+        up: the file's axis that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. None: the axis
+            along which the person stands in the motion, else that of the rest pose, else y. An ``OsikWarning`` is given
+            if the motion and the rest pose disagree.
+        trim: leave out rest-pose frames at the start of the clip (``rest_frames``), with an ``OsikWarning``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -102,7 +100,7 @@ def read_bvh(
 
 
 def _text(path: Path) -> str:
-    """The file as text: UTF-8 or what is near it, or UTF-16 that says so at its start."""
+    """Return the file's text: UTF-8 with invalid bytes replaced, or UTF-16 if it starts with a byte order mark."""
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")
     content = path.read_bytes()
@@ -144,7 +142,7 @@ def _hierarchy(lines: Lines) -> list[_Joint]:
 
 
 def _check_place(lines: Lines, word: str, joints: list[_Joint], open_joints: list[int]) -> None:
-    """Whether a joint may start here: one ROOT first, all others inside it, and none inside an End Site."""
+    """Raise ValueError unless a joint may start here: exactly one ROOT, joints inside it, none inside an End Site."""
     if (word == "ROOT") == bool(joints) or (word == "ROOT") == bool(open_joints):
         raise lines.error("a skeleton is one ROOT, and every JOINT and End Site is inside it")
     if open_joints and joints[open_joints[-1]].is_end:
@@ -152,7 +150,7 @@ def _check_place(lines: Lines, word: str, joints: list[_Joint], open_joints: lis
 
 
 def _joint(lines: Lines, words: list[str], joints: list[_Joint], parent: int) -> int:
-    """Adds a joint whose first line was read, up to its opening brace; its place."""
+    """Append a joint after reading its opening brace; return its index."""
     if words[0].upper() == "END":
         name = f"{joints[parent].name}_end"
         name = name if all(joint.name != name for joint in joints) else f"{name}_{len(joints)}"
@@ -200,6 +198,7 @@ def _frames(lines: Lines, channels: int) -> tuple[float, Float[np.ndarray, "F C"
     if len(rows) != count or not rows:
         raise lines.error(f"the file says Frames: {count}, and has {len(rows)}")
     fps = 1.0 / step
+    # files round the frame time (0.0333333 s), so a rate within 0.01 of an integer is that integer
     return (float(round(fps)) if abs(fps - round(fps)) < 1e-2 else fps), np.array(rows)
 
 
@@ -212,7 +211,7 @@ def _rest(joints: list[_Joint]) -> Float[np.ndarray, "J 3"]:
 
 
 def _forward(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and rotations of all joints in the file's axes and unit."""
+    """Return positions (F, J, 3) and rotations (F, J, 4; w x y z) of all joints in the file's axes and unit."""
     frames, column = len(values), 0
     positions, rotations = np.zeros((frames, len(joints), 3)), np.zeros((frames, len(joints), 4))
     for i, joint in enumerate(joints):
@@ -235,18 +234,20 @@ def _forward(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _axis_up(feet_to_head: Float[np.ndarray, "3"], way: float) -> Up | None:
-    """Return the axis along which somebody stands in the rest pose: the head is above the feet by most of the way.
+    """Return the up axis of the rest pose, or None if nobody stands in it.
+
+    The person stands if the head is above the feet by at least 0.6 of the path length between them.
 
     Args:
         feet_to_head: in the rest pose. (3,)
-        way: length of the way along the joints.
+        way: path length along the joints from foot to head.
     """
     above = np.concatenate([feet_to_head, -feet_to_head])
     return UPS[int(np.argmax(above))] if above.max() > _UPRIGHT * way else None
 
 
 def _way(joints: list[_Joint], a: int, b: int) -> float:
-    """Length of the way along the joints from one to another, in the file's unit."""
+    """Return the length of the path along the joints from joint a to joint b, in file units."""
 
     def to_root(joint: int) -> list[int]:
         return [] if joint < 0 else [joint, *to_root(joints[joint].parent)]
@@ -255,7 +256,7 @@ def _way(joints: list[_Joint], a: int, b: int) -> float:
 
 
 def _scale(path: str, unit: str | float | None, size: float) -> float:
-    """Metres a unit."""
+    """Return the length of one file unit [m], as given or inferred from the size of the rest pose [file units]."""
     if isinstance(unit, str):
         if unit not in UNITS:
             raise OsikKeyError(f"no unit {unit!r}; units: {', '.join(UNITS)}, or metres a unit as a number")

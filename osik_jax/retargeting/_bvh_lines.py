@@ -1,4 +1,4 @@
-"""The text of a BVH file: its statements, and the lines that they are on."""
+"""Statements of a BVH file with their line numbers."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from .._errors import OsikValueError
 
 _LARGEST = 1e8
-"""Numbers that are believed, in any unit of length or degrees."""
+"""Largest accepted absolute value of a length in any unit, or of an angle [deg]."""
 _KEYWORDS = {"HIERARCHY", "ROOT", "JOINT", "OFFSET", "CHANNELS", "{", "}", "MOTION"}
 _MOTION_KEYWORDS = {"FRAMES:", "FRAMES", "FRAME"}
 
 
 def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the file's statements with the numbers of their lines; several may stand on one line, or one on several.
+    """Yield each statement with its line number; a line may hold several statements, and a statement may span lines.
 
     A statement of the tree starts with a keyword. Behind MOTION each line of numbers is one.
     """
@@ -42,7 +42,7 @@ def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def _behind_motion(lines: Iterable[tuple[int, str]]) -> Iterator[tuple[int, list[str]]]:
-    """Yield the statements behind MOTION: the number of frames, the frame time, and lines of numbers."""
+    """Yield the statements after MOTION: the number of frames, the frame time, and one row of numbers per frame."""
     for number, line in lines:
         words = line.split()
         starts = [i for i, word in enumerate(words) if word.upper() in _MOTION_KEYWORDS]
@@ -53,7 +53,7 @@ def _behind_motion(lines: Iterable[tuple[int, str]]) -> Iterator[tuple[int, list
 
 
 class Lines:
-    """The file's statements, and errors that say on which lines they are."""
+    """Iterator over the statements of a BVH file; its errors name the line."""
 
     def __init__(self, path: str, text: str):
         self.path, self._lines, self._at = path, list(_statements(text)), 0
@@ -66,7 +66,7 @@ class Lines:
         return self._lines[self._at - 1][1]
 
     def rewrap(self, columns: int, count: int) -> None:
-        """Wrap what is left into rows of some columns, where it is as many numbers and lines end elsewhere."""
+        """Split the remaining ``count * columns`` numbers into rows of ``columns``, wherever the file's lines end."""
         left = [(number, word) for number, words in self._lines[self._at :] for word in words]
         even = all(len(words) == columns for _, words in self._lines[self._at :])
         if not even and len(left) == count * columns:
@@ -74,17 +74,17 @@ class Lines:
             self._lines[self._at :] = [(row[0][0], [word for _, word in row]) for row in rows]
 
     def error(self, what: str) -> ValueError:
-        """The error of the line that was read last."""
+        """Return an error that names the line read last."""
         number, words = self._lines[max(self._at - 1, 0)] if self._lines else (1, [])
         return OsikValueError(f"{self.path}, line {number}: {what}; the line is {' '.join(words)[:60]!r}")
 
     def rest(self) -> Iterator[list[str]]:
-        """Yield the words of all statements that are left."""
+        """Yield the words of each remaining statement."""
         while self._at < len(self._lines):
             yield self.next("a frame")
 
     def numbers(self, words: list[str], count: int, what: str) -> list[float]:
-        """Words of the last line as this many finite numbers."""
+        """Return words as ``count`` finite numbers, or raise ValueError that names the line read last."""
         try:
             values = [float(word) for word in words]
         except ValueError:

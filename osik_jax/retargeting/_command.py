@@ -1,4 +1,4 @@
-"""What ``osik retarget`` does: from a clip to a folder, and from a folder of clips to a profile."""
+"""Implementation of ``osik retarget`` for one clip, and of ``osik retarget --fit`` for a folder of clips."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ._robot_motion import write_csv
 from ._source_motion import SourceMotion
 
 _HELD_OUT = 4
-"""One clip in so many has a say in which step of a fit is taken, and none in the steps."""
+"""Every fourth clip is held out of a fit: it selects the step that is kept but not its direction."""
 
 
 def retarget_to_folder(
@@ -33,10 +33,10 @@ def retarget_to_folder(
     fps: float | None,
     animation: bool,
 ) -> tuple[Retargeted, dict[str, Any]]:
-    """Retargets a clip; writes motion (.npz and .csv), report, profile and, with ``animation``, a film to a folder.
+    """Retarget a clip and write motion (.npz and .csv), report, profile and optionally a GIF to a folder.
 
     Returns:
-        what came of it, and the report that was written.
+        the retargeted motion and its report.
 
     Raises:
         OSError: the folder cannot be written to.
@@ -57,12 +57,12 @@ def fit_to_file(
     acceleration: float,
     reader: Reader,
 ) -> tuple[Fit, int, int]:
-    """Finds a profile by the clips of a folder (``fit``) and writes it.
+    """Fit a profile to the clips of a folder (``fit``) and write it to a TOML file.
 
-    Every fourth clip, by name, is held out; of fewer than four none is.
+    Every fourth clip in order of name is held out; none if there are fewer than four.
 
     Returns:
-        what came of it, and how many clips were learned from and held out.
+        the fit, the number of training clips and the number of held-out clips.
 
     Raises:
         OSError: the file cannot be written.
@@ -82,7 +82,7 @@ def fit_to_file(
 
 
 def write_folder(result: Retargeted, name: str, out: Path, *, animation: bool) -> dict[str, Any]:
-    """Writes what ``retarget_to_folder`` says, and returns the report."""
+    """Write the files of ``retarget_to_folder`` and return the report."""
     figures = {"clip": name, **report(result)}
     write_motion(result, figures, out)
     save_profile(result.profile, out / "profile.toml")
@@ -92,14 +92,14 @@ def write_folder(result: Retargeted, name: str, out: Path, *, animation: bool) -
 
 
 def write_motion(result: Retargeted, figures: dict[str, Any], out: Path) -> None:
-    """Writes ``motion.npz``, ``motion.csv`` and, when these are whole, ``report.json`` to a folder that is there."""
+    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to an existing folder."""
     result.save(out / "motion.npz")
     write_csv(result.motion, out / "motion.csv")
     write_json(figures, out / "report.json")
 
 
 def write_json(figures: dict[str, Any], path: Path) -> None:
-    """Writes a file of JSON, under its name only when complete."""
+    """Write a JSON file through a temporary file, so that a file of this name is always complete."""
     partial = path.with_name(f".{path.name}.partial")
     partial.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     partial.replace(path)

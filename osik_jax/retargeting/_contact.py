@@ -1,4 +1,4 @@
-"""Which heels and toes stand, where a clip does not say: those that are low and slow, as far as noise lets one see."""
+"""Detection of heel and toe contacts in clips without labels: points that are low and slow within the noise."""
 
 from __future__ import annotations
 
@@ -6,32 +6,36 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import gammaincinv
 
+# Thresholds for a person on a level floor: height [m] and speed [m/s] of a standing point, shortest contact and longest
+# gap [s], and motion within a closed gap [m].
 HEIGHT = 0.04
 SPEED = 0.3
 _SHORTEST = 0.06
 _STAYS = 0.01
+# The floor is a low percentile, not the minimum: single frames may have a foot in the floor.
 _LOW_SHARE = 10.0
 _FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
-"""Fourth differences, scaled so that white noise keeps its size."""
+"""Fourth-difference filter, scaled so that it preserves the standard deviation of white noise."""
+# Noise is read in the 15 % stillest frames of a point, and from the quieter quarter of the points.
 _STILLEST, _POINTS = 0.15, 0.25
 _AXES = 3
 _SPEED_SHARE = 0.35
-"""How large the noise of a speed may be, as a share of the speed that is asked for."""
+"""Largest standard deviation of a speed caused by noise, as a share of the speed threshold."""
 _LONGEST = 0.25
 _LINE = 0.999
-"""How sure it is that noise alone does not take points that far from a line, where they are not taken for one."""
+"""Quantile of the chi-square test: residuals from a straight line above it are not attributed to noise."""
 
 
 def _chi_square(share: float, freedoms: int) -> float:
-    """What this share of sums of so many squared normal numbers is below."""
+    """Return the quantile ``share`` of the chi-square distribution with ``freedoms`` degrees of freedom."""
     return 2.0 * float(gammaincinv(0.5 * freedoms, share))
 
 
 def find_noise(points: Float[np.ndarray, "F k 3"]) -> float:
-    """Standard deviation of white noise on each coordinate of some points [m].
+    """Return the standard deviation of white noise on each coordinate of some points [m].
 
-    From fourth differences from frame to frame, in the 15 % of the frames in which each point moves least: those of a
-    foot that stands are noise alone. The quieter points count. 0 for fewer than five frames.
+    It is estimated from fourth differences over the 15 % of frames in which a point moves least, because a standing
+    foot shows noise only. The quartile of the quieter points counts. 0 for fewer than five frames.
     """
     if len(points) < len(_FOURTH):
         return 0.0
@@ -41,10 +45,10 @@ def find_noise(points: Float[np.ndarray, "F k 3"]) -> float:
 
 
 def noise_steps(noise: float, fps: float, speed: float = SPEED) -> int:
-    """Over how many steps, from one frame to the next, a speed is taken, for noise to be a small share of it.
+    """Return the number of frame steps over which a speed is measured so that noise is a small share of it.
 
-    A straight line through n steps has a slope whose standard deviation is
-    ``noise * fps / sqrt(n (n + 1) (n + 2) / 12)``. 1 where that is enough, and 0.25 s at most.
+    A straight line fitted over n steps has a slope whose standard deviation is ``noise * fps / sqrt(n (n + 1) (n + 2) /
+    12)``. The result is 1 if that is enough, and at most 0.25 s.
     """
     steps = 1
     while steps < _LONGEST * fps and noise * fps > _SPEED_SHARE * speed * np.sqrt(_lever(steps)):
@@ -53,21 +57,21 @@ def noise_steps(noise: float, fps: float, speed: float = SPEED) -> int:
 
 
 def _lever(steps: int) -> float:
-    """Sum of the squares of the times of a window's frames, from its middle, in frames."""
+    """Return the sum of squared times of a window's n + 1 frames about its middle, in frames^2."""
     return steps * (steps + 1) * (steps + 2) / 12.0
 
 
 def find_ground(points: Float[np.ndarray, "F k 3"], steps: int = 1) -> float:
-    """Height of the floor: what the lowest of some points is above of in nine frames out of ten [m].
+    """Return the floor height [m]: the 10th percentile of the lowest point.
 
-    Heights are means over ``steps`` (``noise_steps``) where these are more than one, since the lowest of noisy heights
-    is too low.
+    With noise, heights are averaged over ``steps`` frames (``noise_steps``), because the lowest of noisy heights is
+    biased down.
     """
     return float(np.percentile(mean_over(points[..., 2], steps).min(1), _LOW_SHARE))
 
 
 def mean_over(values: Float[np.ndarray, "F k"], steps: int) -> Float[np.ndarray, "F k"]:
-    """Means over so many steps around each frame, over those that there are at the ends; as they are for one step."""
+    """Return the moving average over ``steps`` steps around each frame (fewer at the ends); unchanged for one step."""
     if steps == 1 or len(values) <= steps:
         return values
     before, after = (steps + 1) // 2, steps // 2
@@ -86,15 +90,15 @@ def find_contact(
     height: float = HEIGHT,
     speed: float = SPEED,
 ) -> Bool[np.ndarray, "F k"]:
-    """Whether each point stands on the ground.
+    """Return whether each point stands on the ground. (F, k).
 
-    A point stands that is nearer to the ground than ``height`` [m] and slower than ``speed`` [m/s], both to the frame
-    before and to the one after. With noise, these steps from one frame to the next become longer windows
-    (``noise_steps``): in two at least of those that a frame is in, a straight line through the point's places has to be
-    slow, and noise has to explain what is off the line. So it is seen to the frame where a foot lands or leaves.
+    A point stands if it is lower than ``height`` [m] above the ground and slower than ``speed`` [m/s], both since the
+    frame before and until the frame after. With noise, each step becomes a window of ``noise_steps``: in at least two
+    of the windows that contain a frame, a line fitted to the point's positions must be slow, and noise must explain the
+    residuals. So landing and lifting are found to the frame.
 
-    Gaps of up to 0.06 s, or as long as such a window, and a frame on both sides, in which the point stays low and comes
-    back to its place within 1 cm, are closed; what stands for less than 0.06 s is left out.
+    Gaps of up to 0.06 s (or one window) plus a frame are closed if the point stays low and returns to its place within
+    1 cm. Contacts shorter than 0.06 s are dropped.
 
     Args:
         points: [m]
@@ -108,6 +112,7 @@ def find_contact(
     low = mean_over(points[..., 2], steps) - ground < height
     stands = low & _still(points, fps, noise, speed, steps)
     least = max(2, round(_SHORTEST * fps))
+    # two means over ``steps`` frames differ by noise with a standard deviation of noise * sqrt(2 / steps) per axis
     longest, back = max(least, steps) + 1, _STAYS + 2.0 * noise * np.sqrt(2.0 / steps) * (steps > 1)
     for k in range(points.shape[1]):
         for start, end in stretches(~stands[:, k]):
@@ -125,13 +130,14 @@ def find_contact(
 def _still(
     points: Float[np.ndarray, "F k 3"], fps: float, noise: float, speed: float, steps: int
 ) -> Bool[np.ndarray, "F k"]:
-    """Whether at least two of the windows that a frame is in, or the one where there is one, are still."""
+    """Return whether at least two windows that contain a frame (or the only one) show a point at rest. (F, k)."""
     frames = len(points)
     if frames == 1:
         return np.zeros(points.shape[:2], bool)
     windows = np.lib.stride_tricks.sliding_window_view(points, steps + 1, axis=0)
     time = np.arange(steps + 1) - 0.5 * steps
     slope = windows @ time / _lever(steps)
+    # the threshold is lowered by the variance that noise gives a speed, up to its allowed share
     share = 0.0 if steps == 1 else min((noise * fps) ** 2 / _lever(steps), (_SPEED_SHARE * speed) ** 2)
     still = np.sum(slope**2, -1) * fps**2 + share < speed**2
     if steps > 1:
@@ -145,6 +151,6 @@ def _still(
 
 
 def stretches(flag: Bool[np.ndarray, " F"]) -> list[tuple[int, int]]:
-    """First frame, and the one after the last, of each stretch in which a flag holds."""
+    """Return the first frame and the frame after the last of each run of True in a flag."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flag, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

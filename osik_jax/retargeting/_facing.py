@@ -1,4 +1,4 @@
-"""Which way a robot faces at home: left is where its names say."""
+"""Heading of a robot at home, from the names of its left and right side."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _RIGHT = re.compile(r"(?i:right)|^[rR](?=[_A-Z0-9])|[_.][rR](?:$|[_.])")
 
 
 def by_name(names: list[str]) -> list[str]:
-    """The left one of two first, where their names tell; as they are elsewhere."""
+    """Return two names with the left one first if the names tell the sides; else unchanged."""
     left, right = ([bool(pattern.search(name)) for name in names] for pattern in (_LEFT, _RIGHT))
     return names[::-1] if left == [False, True] and right == [True, False] else names
 
 
 def facing_x(robot: Robot, left: str, right: str) -> Robot:
-    """The robot with its home turned by quarter turns about the vertical, so that what is left of it is along y.
+    """Return the robot with its home rotated by quarter turns about the vertical, so that its left points along y.
 
     Args:
         robot: with a free base.
-        left: a frame of its left side.
-        right: the same of its right side.
+        left: name of a frame on its left side.
+        right: name of the mirrored frame on its right side.
     """
     kinematics = home_kinematics(robot)
     across = np.asarray(kinematics.frame_pose(robot, left)[0] - kinematics.frame_pose(robot, right)[0])

@@ -1,4 +1,4 @@
-"""A film of the robot beside the person, both as sticks: what moves with what is seen best so."""
+"""Animated GIF of the person and the robot as stick figures, side by side."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _RATE = 15.0
 
 
 def film(result: Retargeted, path: str | os.PathLike[str]) -> Path:
-    """Writes a GIF: the person on the left, the robot, enlarged to the person's height, on the right.
+    """Write a GIF: the person on the left, the robot on the right, scaled to the person's height.
 
     Args:
         result: the retargeted motion.
@@ -73,7 +73,7 @@ def _person_sticks(result: Retargeted) -> Float[np.ndarray, "F k 2 3"]:
 
 
 def _robot_sticks(result: Retargeted) -> Float[np.ndarray, "F k 2 3"]:
-    """From each moving body to its parent, as MuJoCo has them."""
+    """Return the segment from each moving body to its parent, by MuJoCo's kinematics [m]."""
     model = result.robot.mj_model
     data, sticks = mujoco.MjData(model), []
     index, coefficient = result.robot.tree.qpos_source
@@ -87,7 +87,7 @@ def _robot_sticks(result: Retargeted) -> Float[np.ndarray, "F k 2 3"]:
 
 
 def _projected(points: Float[np.ndarray, "F k 2 3"]) -> Float[np.ndarray, "F k 2 2"]:
-    """Seen from the left and front, a little from above; the floor at height 0."""
+    """Return points projected to the picture plane, seen from the front left and above; the floor is at height 0."""
     across = -np.sin(_AZIMUTH) * points[..., 0] + np.cos(_AZIMUTH) * points[..., 1]
     away = np.cos(_AZIMUTH) * points[..., 0] + np.sin(_AZIMUTH) * points[..., 1]
     middle = away.mean(axis=(1, 2), keepdims=True)

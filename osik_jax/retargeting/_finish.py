@@ -1,4 +1,4 @@
-"""The last pass: a plan followed from frame to frame inside limits that hold exactly."""
+"""Last pass of retargeting: follow a plan frame by frame inside limits that hold exactly."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from ..robot._balls import independent_balls, with_balls_inside
 from ..robot._joint_selection import scalar_layout
 
 _SPARE = 0.1
-"""Share of the acceleration with which the motion comes back to the plan."""
+"""Share of the acceleration limit that is used to return to the plan."""
 
 
 @jax.jit
 def follow(
     robot: Robot, plan: Float[Array, "F nq"], limits: Sequence[Limit], dt: Float[Array, ""] | float
 ) -> tuple[Float[Array, "F nq"], Float[Array, " F"]]:
-    """Goes with a plan as far as the limits allow, and comes back to it without overshooting where they held it.
+    """Follow a plan as far as the limits allow, and return to it without overshoot after a limit was active.
 
-    A frame's velocity is the plan's, and the fastest towards the plan that a share of the acceleration can still stop
-    at it. The motion begins inside the joints' ranges, at the speed of the plan's first step.
+    The velocity of a frame is the plan's plus a correction towards the plan. The correction is the highest speed that
+    10 % of the acceleration limit can still stop at the plan. The motion starts inside the joint ranges at the speed of
+    the plan's first step.
 
     Returns:
         the configurations, and how far the farthest joint of each is from the plan's [rad or m]. (F, nq), (F,)
@@ -56,7 +57,7 @@ def inside_limits(
     limits: Sequence[Limit],
     dt: Float[Array, ""],
 ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-    """The next configuration, and the velocity that leads to it: from beside ``goal`` towards the one that follows."""
+    """Return the next configuration and the velocity that leads to it: from near ``goal`` towards ``following``."""
     v, _, _ = velocity_inside(robot, q, velocity, goal, following, limits, dt)
     return moved(robot, q, v, dt)
 
@@ -70,7 +71,7 @@ def velocity_inside(
     limits: Sequence[Limit],
     dt: Float[Array, ""],
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"], Float[Array, " nv"]]:
-    """The next velocity, from beside ``goal`` towards the configuration that follows, and its bounds."""
+    """Return the next velocity, from near ``goal`` to ``following``, and its lower and upper bounds. (nv,) each."""
     spare = _SPARE * _accelerations(robot, limits)
     lower, upper = limit_box(robot, q, remembering(tuple(limits), velocity, True), dt)
     behind = difference(robot, q, goal)
@@ -81,7 +82,7 @@ def velocity_inside(
 def moved(
     robot: Robot, q: Float[Array, " nq"], velocity: Float[Array, " nv"], dt: Float[Array, ""]
 ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-    """The configuration after a step, with ball joints inside their ranges, and the velocity that leads there."""
+    """Return the configuration after a step, ball joints inside their ranges, and the velocity that leads to it."""
     after = integrate(robot, q, velocity, dt)
     if not independent_balls(robot.tree):
         return after, velocity
@@ -90,7 +91,7 @@ def moved(
 
 
 def _accelerations(robot: Robot, limits: Sequence[Limit]) -> Float[Array, " nv"]:
-    """The least of what the limits allow of each dof's acceleration; infinite where none does."""
+    """Return the smallest acceleration limit of each dof [rad/s^2 or m/s^2]; infinite where none applies. (nv,)."""
     most = jnp.full(robot.nv, jnp.inf, robot.q0.dtype)
     for limit in limits:
         if isinstance(limit, AccelerationLimit):
@@ -99,7 +100,7 @@ def _accelerations(robot: Robot, limits: Sequence[Limit]) -> Float[Array, " nv"]
 
 
 def inside_ranges(robot: Robot, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
-    """A configuration with its joints inside their ranges."""
+    """Return a configuration with its joints clipped to their ranges. (nq,)."""
     scalar, index = scalar_layout(robot)
     at = index[scalar]
     q = q.at[at].set(jnp.clip(q[at], robot.position_lower[scalar], robot.position_upper[scalar]))

@@ -1,4 +1,4 @@
-"""A robot's scale, keypoints and weights, found by the gradient of a stated loss on some clips."""
+"""Fit of a profile's scale, keypoints and weights to clips, by the gradient of a loss through the plan."""
 
 from __future__ import annotations
 
@@ -29,29 +29,30 @@ from ._roles import LIMBS
 from ._terms import Body, Bounds, frame_rows
 
 TUNED = ("pelvis", "torso", "root", "foot", "posture", "smooth", "smooth_base")
-"""The weights that are tuned; that of limbs is the unit, and those of bounds are none of taste."""
+"""Names of the tuned weights. The weight of limbs is the unit; the weights of bounds are not a matter of preference."""
 _RATE = 0.05
-"""Of Adam: about what each parameter changes in a step, in its unit."""
+"""Learning rate of Adam: the approximate change of each parameter per step, in its unit."""
 _WEIGHT, _SCALE, _PLACE = 1.0, 0.1, 1e-3
-"""Units: of the logarithm of a weight, of that of the scale, of a keypoint's place [m]."""
+"""Parameter units: logarithm of a weight, logarithm of the scale, displacement of a keypoint [m]."""
 _MOST_WEIGHT, _MOST_SCALE, _MOST_PLACE = 3.0, 0.1, 0.02
-"""How far they may go."""
+"""Largest absolute change of each parameter, in the same quantities as the units."""
 _SETTLING, _FOLLOWING = 150, 40
-"""Iterations of a plan beyond where ``retarget`` ends: before the first step, and in each, from the plan before."""
+"""Extra plan iterations after ``retarget``'s stop: before the first step, and in each later step from the plan before.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class FitLoss:
-    """What is minimised: of each clip a sum of means over its frames, each with a weight.
+    """Weights of the loss, a sum of means over a clip's frames.
 
     Attributes:
-        tracking: of the squared angles between the person's limbs and the robot's [1/rad^2]. The robot's limbs are
-            between the places that the profile had before the fit: what is tuned cannot move the measure.
-        turning: of the squared angles by which pelvis, chest and feet are turned off the person's [1/rad^2].
-        slip: of the squared distance that standing points move in a frame [1/m^2].
-        bounds: of what is left of the plan's bounds, squares with the profile's weights: the height of standing points,
-            depth in the floor and in other shapes, and what is beyond ranges.
-        acceleration: of the squared acceleration of the joints [1/(rad/s^2)^2].
+        tracking: weight of the squared angles between the person's and the robot's limbs [1/rad^2]. The robot's limbs
+            connect the keypoints of the given profile, so that tuning keypoints cannot change the measure itself.
+        turning: weight of the squared orientation errors of pelvis, chest and feet [1/rad^2].
+        slip: weight of the squared distance that contact points move per frame [1/m^2].
+        bounds: weight of the plan's violated bounds, which are squares with the profile's weights: height of contact
+            points, depth in the floor and in other shapes, and excess beyond joint ranges.
+        acceleration: weight of the squared joint accelerations [1/(rad/s^2)^2].
     """
 
     tracking: float = 1.0
@@ -63,13 +64,13 @@ class FitLoss:
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """What came of ``fit``.
+    """Result of ``fit``.
 
     Attributes:
-        profile: with the scale, keypoints and weights of the best step.
-        step: which one that was; 0: the profile that was given.
-        losses: of each step, relative to step 0, means over the clips that are learned from. (steps + 1,)
-        held_out: the same of those that are held out; empty where there are none. (steps + 1,)
+        profile: the profile with scale, keypoints and weights of the best step.
+        step: index of the best step; 0 is the given profile.
+        losses: loss of each step relative to step 0, mean over the training clips. (steps + 1,)
+        held_out: the same for the held-out clips; empty without any. (steps + 1,)
     """
 
     profile: Profile
@@ -79,7 +80,7 @@ class Fit:
 
 
 class _Parameters(NamedTuple):
-    """What is tuned; all 0 is the profile as it was."""
+    """Parameters of the fit; all zeros is the given profile."""
 
     weights: Mapping[str, Array]
     scale: Float[Array, ""]
@@ -87,7 +88,7 @@ class _Parameters(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """A clip in the form that is computed with; the hips' path is not scaled yet."""
+    """One clip as arrays for planning; ``path`` is the hip path before scaling [m]."""
 
     goals: Goals
     path: Float[Array, "F 3"]
@@ -97,7 +98,7 @@ class _Problem(NamedTuple):
 
 
 class _Given(NamedTuple):
-    """What a clip's loss depends on beside the parameters and the plan."""
+    """Inputs of a clip's loss other than the parameters and the plan."""
 
     body: Body
     problem: _Problem
@@ -117,25 +118,24 @@ def fit(
     steps: int = 20,
     max_iterations: int = 40,
 ) -> Fit:
-    """Tunes a profile's scale, keypoints (by up to 2 cm) and weights on some clips.
+    """Tune a profile's scale, keypoints (by up to 2 cm) and weights on some clips.
 
-    The gradient is that of the plan's solution: where a sum of squares is least, a change of what it depends on moves
-    the solution by one step of Gauss and Newton, which is differentiated. For that a plan goes on far beyond where
-    ``retarget`` ends, and each step's begins with the one before: so the loss is that of the same minimum throughout,
-    and has no jumps. Adam goes down the mean of the clips' losses, each relative to what it was at first. Of the clips
-    that are held out the loss is that of what ``retarget`` gives, and the step where it is least is taken: few clips
-    are soon learned by heart. Where none is better than the profile that was given, that comes back.
+    The gradient is taken through the plan at its minimum, by one differentiated Gauss-Newton step (implicit function
+    theorem). Each plan therefore iterates far beyond ``retarget``'s stop and starts from the plan of the step before,
+    so that the loss follows one minimum without jumps. Adam descends the mean of the clips' losses, each relative to
+    its first value. The step with the smallest loss on the held-out clips is kept, because few clips are overfitted
+    quickly. If no step improves on the given profile, that profile is returned.
 
     Args:
         robot: as of ``retarget``.
-        motions: the clips that are learned from.
-        held_out: clips that choose the step; without any, those that are learned from do.
-        profile: where to start. None: as of ``retarget``.
-        mapping: as of ``retarget``, the same for all.
-        loss: None: ``FitLoss()``.
+        motions: the training clips.
+        held_out: clips that select the best step; if empty, the training clips do.
+        profile: the profile to start from. None: as of ``retarget``.
+        mapping: as of ``retarget``, the same for all clips.
+        loss: weights of the loss. None: ``FitLoss()``.
         acceleration: as of ``retarget``.
-        steps: of Adam.
-        max_iterations: of each plan that ``retarget`` would make.
+        steps: number of steps of Adam.
+        max_iterations: iterations of each plan as ``retarget`` computes it.
 
     Raises:
         ImportError: optax is not installed (the extra ``tuning``).
@@ -172,7 +172,7 @@ def fit(
         change, state = optimiser.update(slopes, state)
         now = optax.apply_updates(now, change)
     losses, held = _relative(learned), _relative(judged) if others else np.zeros(0)
-    best = int(np.nanargmin(held if others else losses))  # the last may be no number
+    best = int(np.nanargmin(held if others else losses))  # the last loss may be NaN
     chosen = own.profile if best == 0 else setting.profile(seen[best])
     return Fit(chosen, best, losses, held)
 
@@ -182,29 +182,29 @@ def _over(slope: Any, unit: float) -> Any:
 
 
 def _relative(losses: Sequence[Sequence[float]]) -> Float[np.ndarray, " steps"]:
-    """Of each step the mean over clips, each relative to its first."""
+    """Return the mean over clips of each step's loss, relative to each clip's first loss. (steps,)."""
     values = np.array(losses)
     return np.mean(values / values[0], 1)
 
 
 class _Setting:
-    """What all clips share."""
+    """Robot, profile and loss shared by all clips of a fit."""
 
     def __init__(self, own: Retargeter, terms: FitLoss):
         self.own, self.terms = own, dataclasses.astuple(terms)
         self.body, self.build, self.weights = own._body, own._build, own.profile.weights
 
     def origin(self) -> _Parameters:
-        """The profile as it is."""
+        """Return the parameters of the given profile."""
         weights = {name: jnp.zeros_like(getattr(self.weights, name)) for name in TUNED}
         return _Parameters(weights, jnp.zeros(()), jnp.zeros((len(self.body.keys), 3)))
 
     def problems(
         self, motions: Sequence[HumanMotion], held_out: Sequence[HumanMotion], mapping: Mapping[str, str] | None
     ) -> tuple[list[_Problem], list[_Problem]]:
-        """The clips, padded to one length, so that they share a program.
+        """Return the clips for training and for selection, padded to one length so that they share a compiled program.
 
-        The path of the hips is as the profile's scale has it, from the height of the ankles up.
+        The hip path is scaled by the profile's scale and counted from ankle height.
         """
         clips = [self.own._read(*checked_by_name(motion, mapping, None)) for motion in (*motions, *held_out)]
         length = max(len(clip.start) for clip in clips)
@@ -216,17 +216,17 @@ class _Setting:
         return found[: len(motions)], found[len(motions) :]
 
     def loss(self, at: _Parameters, problem: _Problem) -> float:
-        """Of what ``retarget`` gives for a clip."""
+        """Return the loss of a clip as ``retarget`` plans it."""
         most = jnp.asarray(self.own.max_iterations)
         return float(_value(at, self._given(problem), self.terms, most))
 
     def plan(self, at: _Parameters, problem: _Problem) -> Array:
-        """A clip's plan, at its minimum but for little: (F, nq)."""
+        """Return a clip's plan close to its minimum. (F, nq)."""
         given = self._given(problem)
         return _settled(at, given, _planned(at, given, jnp.asarray(self.own.max_iterations)), _SETTLING)
 
     def slope(self, at: _Parameters, problem: _Problem, plan: Array) -> tuple[float, Any, Array]:
-        """The loss at the minimum that is near a plan, its gradient, and the plan there."""
+        """Return the loss at the minimum near a plan, its gradient, and the plan at that minimum."""
         given = self._given(problem)
         plan = _settled(at, given, plan, _FOLLOWING)
         value, slope = _value_and_slope(at, given, self.terms, plan)
@@ -236,7 +236,7 @@ class _Setting:
         return _Given(self.body, problem, self.weights, self.build.ankle)
 
     def profile(self, at: _Parameters) -> Profile:
-        """The profile with what was tuned, in four digits."""
+        """Return the profile with the tuned values, rounded to four digits."""
 
         def rounded(value: Array) -> Any:
             return np.vectorize(lambda x: float(f"{x:.4g}"))(np.asarray(value, float))
@@ -252,28 +252,28 @@ class _Setting:
         moved = dataclasses.replace(own, keypoints=keypoints, weights=dataclasses.replace(own.weights, **weights))
         if own.scale is not None:
             return dataclasses.replace(moved, scale=round(own.scale * factor, 4))
-        # legs that were measured between other places are of another length
+        # moved keypoints change the measured leg length, which the stretch compensates
         longer = Build.of(self.own.robot, moved).leg / self.build.leg
         return dataclasses.replace(moved, stretch=round(own.stretch * factor / longer, 4))
 
 
 def _bounded(parameter: Array, unit: float, most: float) -> Array:
-    """So many units, and never more than the most."""
+    """Return ``unit * parameter``, limited smoothly to ``most`` in absolute value."""
     return most * jnp.tanh(unit * parameter / most)
 
 
 def _factor(scale: Float[Array, ""]) -> Float[Array, ""]:
-    """Of the path."""
+    """Return the factor on the hip path's scale."""
     return jnp.exp(_bounded(scale, _SCALE, _MOST_SCALE))
 
 
 def _moves(at: _Parameters) -> Float[Array, "keys 3"]:
-    """Of the keypoints, each in its frame [m]."""
+    """Return the displacement of each keypoint in its frame [m]."""
     return _bounded(at.offsets, _PLACE, _MOST_PLACE)
 
 
 def _tuned_weights(weights: Weights, at: _Parameters) -> dict[str, Array]:
-    """Weights by name, at most 20 times what they were or a twentieth."""
+    """Return the tuned weights by name; each changes by a factor of at most 20 up or down."""
     return {
         name: getattr(weights, name) * jnp.exp(_bounded(change, _WEIGHT, _MOST_WEIGHT))
         for name, change in at.weights.items()
@@ -281,7 +281,7 @@ def _tuned_weights(weights: Weights, at: _Parameters) -> dict[str, Array]:
 
 
 def _asked(at: _Parameters, given: _Given) -> tuple[Body, Goals, Weights, Bounds]:
-    """What a plan is made for."""
+    """Return the inputs of ``make_plan`` for some parameters."""
     body, problem = given.body, given.problem
     moved = eqx.tree_at(lambda b: b.offsets, body, body.offsets.at[: len(body.keys)].add(_moves(at)))
     tuned = dataclasses.replace(given.weights, **_tuned_weights(given.weights, at))
@@ -292,25 +292,25 @@ def _asked(at: _Parameters, given: _Given) -> tuple[Body, Goals, Weights, Bounds
 
 @jax.jit
 def _planned(at: _Parameters, given: _Given, most: Array) -> Array:
-    """As ``retarget`` plans: (F, nq)."""
+    """Return the plan that ``retarget`` computes for some parameters. (F, nq)."""
     return make_plan(*_asked(at, given), given.problem.start, most).q
 
 
 @jax.jit
 def _settled(at: _Parameters, given: _Given, plan: Array, more: int) -> Array:
-    """A plan after so many more iterations: (F, nq)."""
+    """Return a plan after ``more`` further iterations. (F, nq)."""
     return mend_plan(*_asked(at, given), plan, jnp.ones(len(plan), plan.dtype), more, until="spent").q
 
 
 @jax.jit
 def _value(at: _Parameters, given: _Given, terms: tuple[float, ...], most: Array) -> Float[Array, ""]:
-    """The loss of a clip as ``retarget`` plans it."""
+    """Return the loss of a clip as ``retarget`` plans it."""
     plan = _planned(at, given, most)
     return jnp.dot(jnp.array(terms, plan.dtype), _measured(given, plan))
 
 
 def _loss(at: _Parameters, given: _Given, terms: tuple[float, ...], plan: Array) -> Float[Array, ""]:
-    """The loss of a clip whose plan is at its minimum."""
+    """Return the loss of a clip at the minimum near ``plan``; differentiable by the parameters."""
     q = at_solution(*_asked(at, given), jax.lax.stop_gradient(plan))
     return jnp.dot(jnp.array(terms, q.dtype), _measured(given, q))
 
@@ -319,7 +319,7 @@ _value_and_slope = jax.jit(jax.value_and_grad(_loss))
 
 
 def _measured(given: _Given, q: Float[Array, "F nq"]) -> Float[Array, "5"]:
-    """What ``FitLoss`` weighs, in its order."""
+    """Return the five terms that ``FitLoss`` weighs, in its order."""
     body, problem, weights, _ = given
     robot, keys, goals = body.robot, len(body.keys), problem.goals
     names = tuple(dict.fromkeys(body.frames))
@@ -350,5 +350,5 @@ def _measured(given: _Given, q: Float[Array, "F nq"]) -> Float[Array, "5"]:
 
 
 def _weighted_mean(weight: Array, value: Array) -> Float[Array, ""]:
-    """0 where nothing has weight."""
+    """Return the weighted mean, or 0 if all weights are 0."""
     return jnp.sum(weight * value) / jnp.maximum(weight.sum(), 1.0)

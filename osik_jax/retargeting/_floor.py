@@ -1,4 +1,4 @@
-"""The floor under a clip: flat, but where what stands says that it is tilted, or that its height drifts."""
+"""Floor under a clip: flat, unless the standing points show a slope or a drift of its height."""
 
 from __future__ import annotations
 
@@ -10,24 +10,27 @@ from jaxtyping import Float
 from ._contact import HEIGHT, find_contact, find_ground, mean_over, noise_steps
 
 _LOW = 0.1
-"""The floor is what this share of the points that stand is below of."""
+"""Quantile of standing points' heights that defines the floor."""
 _OFF = 0.1
-"""A floor is not flat where more of what is still than this share is higher above it than what stands."""
+"""Largest share of resting points over 4 cm above a flat floor; above it a sloped or drifting floor is tried."""
 _HALF = 0.5
-"""How much less another floor has to leave unexplained."""
+"""A sloped or drifting floor is accepted if it leaves less than this share of the flat floor's residuals."""
+# A floor is fitted to at least 1 s of resting points, and to at most 2,000 of them, which bounds the cost.
 _SECONDS, _MOST = 1.0, 2000
+# Largest slope [m/m] and drift [m/s] of a floor that is accepted.
 _STEEPEST, _FASTEST = 0.1, 0.1
+# Residuals below 0.1 mm are treated as 0.1 mm in the reweighting, whose weights would be infinite otherwise.
 _ITERATIONS, _SMALLEST = 60, 1e-4
 
 
 @dataclasses.dataclass(frozen=True)
 class Floor:
-    """Height of the floor at each place and time.
+    """Height of the floor as a linear function of place and time.
 
     Attributes:
-        height: at the origin, in the first frame [m].
-        slope: along x and y [m/m].
-        drift: over time [m/s].
+        height: height at the origin in the first frame [m].
+        slope: slope along x and y [m/m].
+        drift: change of height over time [m/s].
     """
 
     height: float
@@ -35,21 +38,21 @@ class Floor:
     drift: float = 0.0
 
     def under(self, points: Float[np.ndarray, "F ... 3"], fps: float) -> Float[np.ndarray, "F ..."]:
-        """Height of the floor under each point [m]."""
+        """Return the height of the floor under each point [m]."""
         time = (np.arange(len(points)) / fps).reshape(-1, *[1] * (points.ndim - 2))
         return self.height + points[..., :2] @ np.array(self.slope) + self.drift * time
 
     def leveled(self, points: Float[np.ndarray, "F ... 3"], fps: float) -> Float[np.ndarray, "F ... 3"]:
-        """The points with heights above the floor."""
+        """Return the points with z replaced by the height above the floor [m]."""
         return np.concatenate([points[..., :2], points[..., 2:] - self.under(points, fps)[..., None]], -1)
 
 
 def find_floor(points: Float[np.ndarray, "F k 3"], fps: float, noise: float) -> Floor:
-    """The floor that some points, heels and toes, stand on.
+    """Return the floor that heels and toes stand on.
 
-    Flat (``find_ground``), unless more than a tenth of what is still, which is a second at least, is more than 4 cm
-    above that, and a plane that is tilted by up to 0.1, a height that drifts by up to 0.1 m/s, or both, leaves half as
-    many there, and half of the deviations from the floor.
+    The floor is flat (``find_ground``) by default. If over a tenth of at least 1 s of resting points lie more than 4 cm
+    above it, a plane with slope up to 0.1, a drift up to 0.1 m/s, or both are fitted. A fit is accepted if it halves
+    both that share and the quantile loss.
 
     Args:
         points: [m]
@@ -78,16 +81,16 @@ def find_floor(points: Float[np.ndarray, "F k 3"], fps: float, noise: float) -> 
 
 
 def _deviation(rest: Float[np.ndarray, " n"]) -> float:
-    """What a quantile makes least: deviations, of which those below it weigh more."""
+    """Return the mean quantile (pinball) loss of residuals; deviations below the quantile weigh more."""
     return float(np.mean(np.where(rest > 0.0, _LOW, _LOW - 1.0) * rest))
 
 
 def _fitted(
     places: Float[np.ndarray, "n 2"], height: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], columns: list[int]
 ) -> Floor:
-    """The floor of which ``_LOW`` of the heights are below, linear in some of x, y and time.
+    """Return the 10 % quantile regression of the heights, linear in some of x, y and time.
 
-    By least squares, weighted anew by their residuals until these are summed and not squared.
+    Solved by iteratively reweighted least squares.
     """
     all_columns = np.column_stack([places, time])[:, columns]
     middle = all_columns.mean(0)

@@ -1,4 +1,4 @@
-"""What ``osik retarget FOLDER`` does: every clip of a folder; a job that was killed goes on where it was."""
+"""Implementation of ``osik retarget FOLDER``: all clips of a folder, resumable after an interruption."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ FIGURES = {
     "limb_error_mm_mean": ("tracking", "limb_error_mm_mean"),
     "segment_angle_deg_mean": ("tracking", "segment_angle_deg_mean"),
 }
-"""What the summary has of each clip's report, and where that is."""
+"""Columns of the summary, and the path of each in a clip's report."""
 _JOB = "job.json"
 _COMPILING = 30_000
-"""Frames that a CPU plans in the time that it takes to compile a program."""
+"""Frames that a CPU plans in the time of one compilation."""
 
 
 def retarget_folder(
@@ -56,27 +56,26 @@ def retarget_folder(
     chunk: int = 32,
     progress: Progress = True,
 ) -> dict[str, Any]:
-    """Retargets every ``.bvh``, ``.amc``, ``.npz`` and ``.csv`` of a folder, those in its folders left out.
+    """Retarget every ``.bvh``, ``.amc``, ``.npz`` and ``.csv`` file directly inside a folder.
 
-    Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``; beside
-    them are ``profile.toml``, ``job.json`` (what the job was started with), the summary, ``report.json``, and
-    ``index.csv``, a line for each clip with its figures and what there is to look at. Clips that
-    are there already, of the same file and the same options, are left as they are. A clip that cannot be read is named
-    in the summary with its error, and tried again the next time.
+    Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``. ``out``
+    also holds ``profile.toml``, ``job.json`` (the job's options), the summary ``report.json``, and ``index.csv`` with
+    one line of figures and notes per clip. Finished clips of the same file and options are kept. A clip that cannot be
+    read is listed in the summary with its error, and tried again in the next run.
 
     Args:
-        retargeter: for the robot.
-        folder: with the clips.
-        out: where to.
-        reader: reads a clip. None: as ``load_motion`` does.
-        mapping: as of ``Retargeter.retarget``, the same for all.
-        fps: as of ``Retargeter.retarget``, the same for all.
-        chunk: clips that a GPU works on at once; on a CPU each core works on one.
-        progress: whether to show a bar; or a function of the number of clips that are done and of all.
+        retargeter: the retargeter of the robot.
+        folder: folder of the clips; folders inside it are not searched.
+        out: output folder.
+        reader: function that reads a clip. None: as ``load_motion`` does.
+        mapping: as of ``Retargeter.retarget``, the same for all clips.
+        fps: as of ``Retargeter.retarget``, the same for all clips.
+        chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
+        progress: whether to show a bar; or a function of the numbers of finished clips and of all clips.
 
     Returns:
-        the summary: ``clips`` (how many are finished), ``frames``, ``worst`` (the largest value of each figure),
-        ``failed`` (error by clip), ``notes`` (what ``report`` says in words, by clip) and ``figures`` (by clip).
+        the summary: ``clips`` (number finished), ``frames``, ``worst`` (the largest value of each figure), ``failed``
+        (error by clip), ``notes`` (those of ``report``, by clip) and ``figures`` (by clip).
 
     Raises:
         ValueError: no clips in the folder, or ``out`` has another job in it; the message says what differs.
@@ -90,7 +89,7 @@ def retarget_folder(
         save_profile(retargeter.profile, out / "profile.toml")
         work = _Work(retargeter, out, {name: _source(path, job) for name, path in files.items()}, chunk)
         with reported(len(files), len(work.found), progress, "clips") as advance:
-            # the longest first: what is compiled for them does for shorter ones too
+            # longest first: shorter clips can then use the program compiled for longer ones
             todo = [name for name in files if name not in work.found]
             for name in sorted(todo, key=lambda name: -files[name].stat().st_size):
                 advance(work.add(name, partial(reader, files[name]), mapping, fps))
@@ -103,11 +102,11 @@ def retarget_folder(
 
 
 class _Work:
-    """What is finished, what failed, and what was read and waits for others of its length.
+    """Progress of a folder job: finished and failed clips, and clips that wait for others of the same length.
 
     Attributes:
-        found: the reports of clips that are finished, by name.
-        failed: what is wrong with others.
+        found: reports of finished clips by name.
+        failed: error messages of failed clips by name.
     """
 
     def __init__(self, retargeter: Retargeter, out: Path, sources: Mapping[str, dict[str, str]], chunk: int):
@@ -125,10 +124,10 @@ class _Work:
         mapping: Mapping[str, str] | None,
         fps: float | None,
     ) -> int:
-        """Reads a clip, and retargets it if it has no others to wait for; returns how many clips are done by that."""
+        """Read a clip; retarget it with the waiting clips once a batch is full; return the number finished."""
         try:
             clip = self._retargeter._prepared(read(), mapping, fps)
-        except Exception as error:  # whatever a broken file leads a reader to: it does not end the others
+        except Exception as error:  # a broken file may raise anything in a reader; the job goes on with other clips
             self.failed[name] = _reason(error)
             return 1
         length = self._lengths.of(shared_length(clip))
@@ -137,7 +136,7 @@ class _Work:
         return self._finish(length, self._waiting.pop(length)) if len(waiting) == self._lanes else 0
 
     def rest(self) -> Iterator[int]:
-        """Retargets what waits, those of a length at once; yields how many they are."""
+        """Retarget all waiting clips, one batch per length; yield the number finished."""
         for length, waiting in self._waiting.items():
             yield self._finish(length, waiting)
 
@@ -156,9 +155,9 @@ class _Work:
 
 
 class _Lengths:
-    """For how many frames programs are compiled.
+    """Frame counts for which programs are compiled.
 
-    A clip takes one that is longer and is there, until what clips of its length have wasted so adds up to compiling.
+    A clip uses the next longer compiled length, until the padding of its length adds up to the cost of a compilation.
     """
 
     def __init__(self) -> None:
@@ -166,7 +165,7 @@ class _Lengths:
         self._wasted: dict[int, int] = {}
 
     def of(self, own: int) -> int:
-        """The number of frames that a clip of so many is filled up to."""
+        """Return the number of frames to which a clip of ``own`` frames is padded."""
         longer = min((length for length in self._compiled if length >= own), default=own)
         wasted = self._wasted.get(own, 0) + longer - own
         if wasted > _COMPILING:
@@ -177,7 +176,7 @@ class _Lengths:
 
 
 def _job(retargeter: Retargeter, options: Mapping[str, Any]) -> dict[str, Any]:
-    """What the results depend on, but for the clips."""
+    """Return all inputs of the results other than the clips, for comparison with an earlier job."""
     most = np.asarray(retargeter.limits[2].acceleration)
     finite = np.unique(most[np.isfinite(most)])
     return {
@@ -194,7 +193,7 @@ def _job(retargeter: Retargeter, options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _claim(out: Path, job: dict[str, Any]) -> None:
-    """Makes a folder that of a job, or raises ValueError where it is that of another."""
+    """Mark a folder as belonging to a job, or raise ValueError if it belongs to another."""
     path = out / _JOB
     old = _read(path)
     changed = differences(old, json.loads(json.dumps(job))) if old else []
@@ -204,16 +203,16 @@ def _claim(out: Path, job: dict[str, Any]) -> None:
 
 
 def _source(path: Path, job: dict[str, Any]) -> dict[str, str]:
-    """Which file a clip is, what is in it, and which job it is worked on in."""
+    """Return a clip's file name, content hash and job identifier."""
     try:
         content = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    except OSError:  # said when it is its turn to be read
+    except OSError:  # reported when the clip is read
         content = ""
     return {"source": path.name, "sha256": content, "job": identifier(job)}
 
 
 def _finished(folder: Path, source: dict[str, str]) -> dict[str, Any] | None:
-    """The report of a clip that is there already; None where it is not, or of another file or job."""
+    """Return the report of a finished clip, or None if there is none for this file and job."""
     figures = _read(folder / "report.json") or {}
     try:
         _picked(figures)
@@ -223,7 +222,7 @@ def _finished(folder: Path, source: dict[str, str]) -> dict[str, Any] | None:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """An object in a file of JSON; None where there is none."""
+    """Return the object in a JSON file, or None if there is none."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -232,13 +231,13 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _reason(error: Exception) -> str:
-    """What an exception says, in one line; with its type, where it is not of those that say what is wrong."""
+    """Return an exception's message on one line; prefixed with its type unless an OSError, ValueError or KeyError."""
     text = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())
     return text if text and isinstance(error, OSError | ValueError | KeyError) else f"{type(error).__name__}: {text}"
 
 
 def _summary(found: Mapping[str, dict[str, Any]], failed: Mapping[str, str], order: Sequence[str]) -> dict[str, Any]:
-    """What ``retarget_folder`` returns, clips in this order."""
+    """Return the summary of ``retarget_folder``, clips in the given order."""
     figures = {name: found[name] for name in order if name in found}
     rows = {name: {"frames": own["frames"], "fps": own["fps"], **_picked(own)} for name, own in figures.items()}
     seen = {key: [row[key] for row in rows.values() if row[key] is not None] for key in FIGURES}
@@ -253,7 +252,7 @@ def _summary(found: Mapping[str, dict[str, Any]], failed: Mapping[str, str], ord
 
 
 def _write_index(summary: dict[str, Any], path: Path) -> None:
-    """Write a line for each clip: its figures, and what there is to look at; clips to look at come first."""
+    """Write one CSV line per clip with its figures and notes; clips with notes come first."""
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["clip", "look at", "frames", "fps", *FIGURES])
@@ -265,7 +264,7 @@ def _write_index(summary: dict[str, Any], path: Path) -> None:
 
 
 def _picked(figures: Any) -> dict[str, float | None]:
-    """The figures of a report that the summary has."""
+    """Return the figures of a report that the summary shows."""
     out = {}
     for name, path in FIGURES.items():
         value = figures

@@ -1,4 +1,4 @@
-"""What the robot is asked for in each frame, and how much each wish weighs."""
+"""Goals of each frame, and the weights of all terms."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from jaxtyping import Array, Float
 
 
 def _number(value: Any) -> Array:
-    """A number, or several, in the precision that is on."""
+    """Return a number or array in JAX's default float precision."""
     return jnp.asarray(value, float)
 
 
 class Goals(eqx.Module):
-    """What one frame asks for; of a clip, every leaf has a leading axis of frames.
+    """Goals of one frame; for a clip every leaf has a leading axis of frames.
 
     Attributes:
-        directions: of each of ``LIMBS``, unit vectors. (8, 3)
+        directions: unit vectors along each of ``LIMBS``. (8, 3)
         pelvis: axes of the pelvis as columns. (3, 3)
         torso: axes of the chest as columns. (3, 3)
         root: midpoint of the hips [m]. (3,)
         feet: axes of the left and right foot as columns. (2, 3, 3)
-        contact: 1 where left heel, left toe, right heel and right toe stand, more where they do so for long, 0
-            elsewhere. (4,)
+        contact: for left heel, left toe, right heel, right toe: 1 in contact, more in a long contact, else 0. (4,)
         present: 1 for a frame of the clip, 0 for padding behind its end. ()
     """
 
@@ -39,24 +38,24 @@ class Goals(eqx.Module):
 
 
 class Weights(eqx.Module):
-    """Weights of squared residuals, and how far hard things are kept from their bounds.
+    """Weights of squared residuals, and the least distance between shapes.
 
     Attributes:
-        limb: of the error of a limb's direction [1/rad^2].
-        pelvis: of the pelvis' turn [1/rad^2].
-        torso: of the chest's turn [1/rad^2].
-        root: of the midpoint of the hips, along x, y and z [1/m^2]. (3,)
-        foot: of the direction of a foot [1/rad^2].
-        posture: of the joints' distance from home [1/rad^2].
-        smooth: of a joint's change of step from one frame to the next [1/rad^2].
-        smooth_base: the same of the base's position [1/m^2] and turn [1/rad^2].
-        stance: of what a standing point moves, and of its height [1/m^2]; two thousandths of it, of what is nearer to
-            the floor than 3 mm and does not stand.
-        apart: of the depth of shapes that are nearer than ``margin`` [1/m^2].
-        balance: of what the centre of mass is beyond its bound, where one is asked for [1/m^2].
-        limit: of what joints are beyond their ranges [1/rad^2].
-        speed: of what speeds and accelerations are beyond their limits, as shares of those [1].
-        margin: least distance of shapes [m].
+        limb: limb directions [1/rad^2].
+        pelvis: orientation of the pelvis [1/rad^2].
+        torso: orientation of the chest [1/rad^2].
+        root: midpoint of the hips along x, y and z [1/m^2]. (3,)
+        foot: orientation of a foot [1/rad^2].
+        posture: distance of the joints from home [1/rad^2].
+        smooth: second difference of a joint's position over frames [1/rad^2].
+        smooth_base: the same for the base's position [1/m^2] and orientation [1/rad^2].
+        stance: motion and height of contact points [1/m^2]. 0.2 % of it applies to other sole points and shapes that
+            are lower than 3 mm above the floor.
+        apart: depth by which shapes are closer than ``margin`` [1/m^2].
+        balance: distance of the centre of mass beyond its bound, if ``balance`` is used [1/m^2].
+        limit: excess of joints beyond their ranges [1/rad^2].
+        speed: excess of speeds and accelerations relative to their limits [1].
+        margin: least distance between shapes [m].
     """
 
     limb: Float[Array, ""] = eqx.field(default=1.0, converter=_number)
@@ -75,14 +74,14 @@ class Weights(eqx.Module):
     margin: Float[Array, ""] = eqx.field(default=0.005, converter=_number)
 
     def smoother(self, time: Float[Array, ""] | float, dt: Float[Array, ""] | float) -> Weights:
-        """With accelerations of all dofs weighing ``time**4`` [s^4] more, beside 1 for the direction of a limb.
+        """Return the weights with ``time**4`` [s^4] added to the weights of accelerations, relative to 1 for limbs.
 
-        Of one dof by itself, whose path x is to be followed, the minimum of ``(y - x)^2 + time^4 y''^2`` is x through a
-        filter without delay that halves what has an angular frequency of ``1 / time``.
+        For one dof with target path x, the minimum of ``(y - x)^2 + time^4 y''^2`` is x after a zero-phase low-pass
+        filter with gain 1/2 at the angular frequency ``1 / time``.
 
         Args:
-            time: [s]
-            dt: from one frame to the next [s].
+            time: time constant of the smoothing [s].
+            dt: time between frames [s].
         """
         more = (time / dt) ** 4
         return dataclasses.replace(self, smooth=self.smooth + more, smooth_base=self.smooth_base + more)

@@ -1,4 +1,4 @@
-"""A robot's profile out of its tree: legs and arms, and where they bend."""
+"""Profile inferred from a robot's kinematic tree: legs, arms, knees, elbows, feet and capsules."""
 
 from __future__ import annotations
 
@@ -23,24 +23,29 @@ from ._link_shapes import by_inertia, by_shapes, is_credible, shrunk
 from ._profile import Capsule, Foot, Place, Point, Profile
 from ._roles import SIDES
 
+# A foot without shapes, as shares of half the leg (ankle height: of the leg); the heel's share of its length.
 _FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
+# Radii of capsules without inertias, as shares of the segment's length (trunk: of the shoulders' width), and the
+# length of a hand as a share of the forearm.
 _LEG_RADIUS, _ARM_RADIUS, _TRUNK_RADIUS = 0.18, 0.18, 0.3
 _HAND = 0.6
 _LEAST_MASS, _LEAST_SIZE, _THINNEST, _WIDE, _LONG, _SHELL = 3e-3, 1e-3, 0.1, 1.6, 1.15, 1.2
-"""Links that count, as a share of the robot's mass; what is smaller [m] or flatter is not trusted; a trunk that is
-wider gets two capsules; how much of an ellipsoid's length and width a capsule has."""
+"""Thresholds of capsules: least link mass (share of the robot's), least half thickness [m] and least thickness over
+length, width over thickness above which a trunk gets two capsules, and capsule length and radius over the inertia
+ellipsoid's.
+"""
+# Gap that capsules have at home [m]: above the margin of ``Weights`` (5 mm), which would push them apart there.
 _ROOM = 6e-3
 
 
 def guess_profile(robot: Robot) -> Profile:
     """The profile of a robot with two legs and two arms, as its tree and its home configuration show it.
 
-    Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as what reaches furthest to the sides. A knee
-    or an elbow is the joint that bends its limb far from both ends, a wrist the last joint that turns the whole hand.
-    Where the elbow is the last joint the wrist is the end of its link: a fixed frame that is called a hand, or the far
-    end of its mesh or, without one, of its mass. Soles
-    are the feet's corner frames (``NAME_corner_0`` and so on), or their boxes or balls; a foot without is given a
-    length that goes with its leg. Look at it, and save it with ``save_profile`` to change it.
+    Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as the bodies that reach farthest to the
+    sides. A knee or elbow is the joint that bends its limb far from both ends. A wrist is the last joint that moves the
+    whole hand; if that is the elbow, the wrist is a fixed hand frame, or the far end of the link's mesh or mass. Soles
+    are corner frames (``NAME_corner_0`` and so on), boxes or spheres of the feet; a foot without them gets a length
+    after its leg. Check the profile, and save it with ``save_profile`` to edit it.
 
     Raises:
         ValueError: the base does not float, or two legs and two arms are not found.
@@ -82,7 +87,7 @@ def _y(position) -> float:
 
 
 def _hands(robot: Robot, kinematics: Kinematics, used: set[int]) -> list[int]:
-    """The outermost bodies that reach furthest to the left and to the right, legs left out; fingers shortened."""
+    """Return the outermost non-leg bodies that reach farthest to the left and to the right."""
     tree, position = robot.tree, np.asarray(kinematics.body_position)
     outermost = sorted(set(range(2, len(tree.body_parents))) - set(tree.body_parents) - used)
     named = [b for b in outermost if re.search(r"head|neck|camera", tree.body_names[b], re.IGNORECASE) is None]
@@ -97,7 +102,7 @@ def _hands(robot: Robot, kinematics: Kinematics, used: set[int]) -> list[int]:
 
 
 def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain) -> Foot:
-    """The sole's corners, or those of a foot that goes with the leg; at height 0 of a frame that is called a sole."""
+    """Return the sole's corners, else those of a foot sized after the leg (at height 0 of a frame called a sole)."""
     corners = _corners(robot, kinematics, frame)
     if len(corners) >= 4:
         ordered = corners[np.argsort(corners[:, 0])]
@@ -110,7 +115,7 @@ def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain) -> Foot:
 
 
 def _corners(robot: Robot, kinematics: Kinematics, frame: str) -> np.ndarray:
-    """Corner frames, else the lower corners of boxes, else the lowest points of balls. (k, 3)."""
+    """Return corner frames, else lower corners of boxes, else lowest points of spheres, in the frame [m]. (k, 3)."""
     for corners in (contact_corners(robot, frame), sole_points(robot, frame)):
         if len(corners):
             return corners
@@ -134,14 +139,14 @@ def _pair(points: np.ndarray) -> tuple[Point, Point]:
 
 
 def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[Capsule, ...]:
-    """Links as their masses show them; limbs whose links say nothing as capsules from joint to joint."""
+    """Return capsules from the links' inertias; limbs without usable inertias get capsules from joint to joint."""
     tree = robot.tree
     seen = _massive(robot, (profile.pelvis, profile.torso), _frames_of_hands(robot, profile))
     bodies = {tree.frame_bodies[tree.frame(capsule.frame)] for capsule in seen}
 
     def is_seen(frame: str, end: str | None) -> bool:
         first = tree.frame_bodies[tree.frame(frame)]
-        if end == profile.keypoints["left_shoulder"][0] and frame != end:  # what both arms hang from is the trunk
+        if end == profile.keypoints["left_shoulder"][0] and frame != end:  # the trunk carries both arms
             arms = [tree.frame_bodies[tree.frame(profile.keypoints[f"{side}_shoulder"][0])] for side in SIDES]
             return bool(
                 bodies & set(np.flatnonzero(tree.descendants[first] & tree.descendants[:, arms].all(1)).tolist())
@@ -160,11 +165,11 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
 
 
 def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule], floor: float) -> tuple[Capsule, ...]:
-    """Capsules, thinner where they reach below the soles, and inside those that overlap at home thinner ones.
+    """Return capsules thinned where they reach below the soles, with thinner copies where they overlap at home.
 
-    Pairs that overlap at home are not kept apart: the thinner ones, by up to a half, are in their place, and the others
-    keep all else away. What is below the soles would lift the feet; what would have to be thinner than half for that is
-    left out.
+    A pair that overlaps at home cannot be kept apart. Thinner copies (down to half the radius) take its place; the full
+    capsules still keep other shapes away. A capsule below the soles would lift the feet. If half the radius is still
+    too low, the capsule is left out.
     """
     tree, out = robot.tree, []
     bodies = [tree.frame_bodies[tree.frame(c.frame)] for c in capsules]
@@ -188,32 +193,32 @@ def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule]
 
 
 def _between(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float:
-    """How far the segment from a to b is from that from c to d, by 33 points of each [m]."""
+    """Return the distance between two segments a-b and c-d, sampled at 33 points of each [m]."""
     along = np.linspace(0.0, 1.0, 33)[:, None]
     first, second = a + along * (b - a), c + along * (d - c)
     return float(np.linalg.norm(first[:, None] - second[None], axis=-1).min())
 
 
 def _frames_of_hands(robot: Robot, profile: Profile) -> set[str]:
-    """What the wrists' last joints turn."""
+    """Return the frames moved by the wrists' last joints."""
     tree = robot.tree
     elbows, wrists = ({tree.frame_bodies[tree.frame(profile.keypoints[f"{side}_{role}"][0])] for side in SIDES}
                       for role in ("elbow", "wrist"))  # fmt: skip
-    wrists = sorted(wrists - elbows)  # without a wrist joint the hand is part of the forearm
+    wrists = sorted(wrists - elbows)  # without a wrist joint the hand belongs to the forearm
     turned = set(np.flatnonzero(tree.descendants[wrists].any(0)).tolist())
     return {name for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body in turned}
 
 
 def _massive(robot: Robot, trunk: tuple[str | None, ...], hands: set[str]) -> list[Capsule]:
-    """Each link as the solid ellipsoid of its inertia, and that as one capsule; a wide trunk as two side by side.
+    """Return one capsule per link from its inertia ellipsoid; a wide trunk gets two side by side.
 
-    Wider than the ellipsoid, for a link's mass is inside its shell: a G1's thighs are by 11 %, its hands by 30. Links
-    are as wide as the mean of their ellipsoids' widths and thicknesses, hands as the widths: they are flat, and touch
-    each other with thumbs and fingers. Two thin capsules side by side cover them less well, and such hands slip past
-    each other: plans stay where they cross.
+    Capsules are wider than the ellipsoid because a link's mass is inside its shell: a G1's thighs by 11 %, its hands by
+    30 %. Links are as wide as the mean of the ellipsoid's width and thickness. Hands are as wide as the width: they are
+    flat, and thumbs and fingers touch first. Two thin capsules side by side cover a hand worse, and hands then slip
+    past each other.
 
-    A link whose ellipsoid is not credible is as large as its collision shapes. Without such shapes its ellipsoid is
-    made smaller where it is too light; of the trunk it is left out.
+    A link without a credible ellipsoid takes the size of its collision shapes. Without shapes the ellipsoid is shrunk
+    if it is too light; a trunk gets no capsule then.
     """
     model, masses, out = robot.mj_model, own_masses(robot), []
     names, least = set(robot.frame_names), _LEAST_MASS * float(masses.sum())
@@ -253,9 +258,9 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...], hands: set[str]) -> li
 def _between_joints(
     model: mujoco.MjModel, body: int, along: np.ndarray, radius: float, spans: list[float]
 ) -> list[float]:
-    """A capsule's ends: of a link that is longer than wide between its joints, at most a radius beyond these.
+    """Return a capsule's ends, limited to one radius beyond the link's joints if it is longer than wide between them.
 
-    What carries limbs on both sides of its centre of mass ends at their joints.
+    A link with limbs on both sides of its centre of mass ends at their joints.
     """
     children = [c for c in range(1, model.nbody) if model.body_parentid[c] == body and model.body_jntnum[c]]
     limbs = [float((model.body_pos[child] - model.body_ipos[body]) @ along) for child in children]
@@ -267,11 +272,11 @@ def _between_joints(
 
 
 def _spanned(model: mujoco.MjModel, body: int, along: np.ndarray, radius: float, least: float) -> list[float]:
-    """How far a capsule goes from a body's centre of mass: to the joint that moves it, and to its children's.
+    """Return the positions along a capsule's axis of the joint that moves a body and of its children's joints [m].
 
-    The housing around a joint belongs to the body that it moves, and weighs too little beside a motor at the other end
-    to be seen in an ellipsoid. Of a body that is fixed to one of less than ``least`` [kg], which gets no capsule, it is
-    that one's joint.
+    The housing around a joint belongs to the body it moves. Beside a heavy motor at the other end it is too light to
+    show in the ellipsoid. If the body is fixed to one lighter than ``least`` [kg], which gets no capsule, that one's
+    joint counts.
     """
     own = [joint - model.body_ipos[body] for joint in _own_joint(model, body, least)]
     children = [c for c in range(1, model.nbody) if model.body_parentid[c] == body and model.body_jntnum[c]]
@@ -281,7 +286,7 @@ def _spanned(model: mujoco.MjModel, body: int, along: np.ndarray, radius: float,
 
 
 def _own_joint(model: mujoco.MjModel, body: int, least: float) -> list[np.ndarray]:
-    """Where the joint is that moves a body, in its frame [m]; none where it is fixed to a body that is not light."""
+    """Return the position of the joint that moves a body, in its frame [m]; empty if it is fixed to a heavy body."""
     at, turn, fixed = np.zeros(3), np.eye(3), body
     while not model.body_jntnum[fixed]:
         parent, own = int(model.body_parentid[fixed]), np.zeros(9)
@@ -295,9 +300,9 @@ def _own_joint(model: mujoco.MjModel, body: int, least: float) -> list[np.ndarra
 
 
 def _plain_capsules(kinematics: Kinematics, profile: Profile, robot: Robot) -> list[tuple[Capsule, str | None]]:
-    """Limbs as capsules from joint to joint, hands that go on, and the trunk as one that ends below its shoulders.
+    """Return capsules from joint to joint for limbs, longer ones for hands, and one trunk capsule.
 
-    With each, the frame where what it stands for ends; None: nowhere before the end of the limb.
+    Each comes with the frame where the part it stands for ends; None if that is the limb's end.
     """
 
     def place(role: str) -> np.ndarray:

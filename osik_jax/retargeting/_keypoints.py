@@ -1,4 +1,4 @@
-"""Keypoint files: joint positions as arrays (.npz) or as a table (.csv)."""
+"""Reader of keypoint files: joint positions as arrays (.npz) or as a table (.csv)."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ _AXES = ("x", "y", "z")
 
 
 def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> HumanMotion:
-    """Reads ``.npz`` or ``.csv`` keypoints, in metres, z up.
+    """Read ``.npz`` or ``.csv`` keypoints [m], z up.
 
     ``.npz``: ``fps``, ``positions`` (F, J, 3), ``joint_names`` (J,); optional ``rotations`` (F, J, 4; w x y z),
     ``rest_positions`` (J, 3), ``contact`` (F, 4; left heel, left toe, right heel, right toe, or F, 2; left, right) and
     ``ground``. Nothing is unpickled.
 
-    ``.csv``: a line of headings, ``time`` and ``NAME.x``, ``NAME.y``, ``NAME.z`` of each joint, optionally
-    ``contact.left_heel`` and so on (0 or 1); then a line for each frame, at a constant rate.
+    ``.csv``: a header line with ``time`` and ``NAME.x``, ``NAME.y``, ``NAME.z`` of each joint, optionally
+    ``contact.left_heel`` and so on (0 or 1); then one line per frame at a constant rate.
 
-    A ``.npz`` with ``poses`` and ``trans`` is read as AMASS has them (SMPL, SMPL-H or SMPL-X), and a ``.csv`` that
-    begins with ``Format Version`` as OptiTrack's Motive exports it, with y up as it does by default.
+    A ``.npz`` with ``poses`` and ``trans`` is read as in AMASS (SMPL, SMPL-H or SMPL-X). A ``.csv`` that starts with
+    ``Format Version`` is read as an export of OptiTrack Motive, whose default is y up.
 
     Args:
         path: the file.
-        up: the axis that points up, ``"x"``, ``"y"``, ``"z"``, or ``"-y"`` and so on. None: z, unless the motion stands
-            along another axis, which an ``OsikWarning`` says.
+        up: the file's axis that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. None: z, unless
+            the person stands along another axis; an ``OsikWarning`` reports that.
 
     Raises:
         FileNotFoundError: no such file.
@@ -51,7 +51,7 @@ def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> Hum
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of a ``.npz`` file; nothing is unpickled.
+    """Return all arrays of a ``.npz`` file; nothing is unpickled.
 
     Raises:
         FileNotFoundError: no such file.
@@ -93,7 +93,7 @@ def _from_npz(path: Path) -> HumanMotion:
 
 
 def _numbers(path: Path, arrays: dict[str, np.ndarray], name: str) -> Any:
-    """An array of floats, or None where the file has none of this name."""
+    """Return an array as floats, or None if the file has none of this name."""
     if name not in arrays:
         return None
     if arrays[name].dtype.kind not in "fiub":
@@ -109,7 +109,7 @@ def _number(path: Path, arrays: dict[str, np.ndarray], name: str) -> float:
 
 
 def _from_csv(path: Path) -> tuple[HumanMotion, Up]:
-    """Return the motion in a table, and the axis that such tables have up."""
+    """Return the motion in a CSV table, and the up axis expected of this kind of table."""
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")
     try:
@@ -139,7 +139,7 @@ def _from_csv(path: Path) -> tuple[HumanMotion, Up]:
 
 
 def _joints(path: Path, headings: list[str]) -> tuple[str, ...]:
-    """Names of the joints that the headings have all three coordinates of."""
+    """Return the joints for which the headings have all three coordinates."""
     if "time" not in headings:
         raise OsikValueError(f"{path}, line 1: no column is called time; columns: {', '.join(headings)}")
     twice = sorted({name for name in headings if headings.count(name) > 1})
@@ -175,7 +175,7 @@ def _row(path: Path, number: int, row: list[str], headings: list[str]) -> list[f
 
 
 def _rate(path: Path, time: np.ndarray, lines: list[int]) -> float:
-    """Frames a second; the times have to be evenly apart, to a tenth of a step."""
+    """Return the frame rate [1/s]; raise ValueError unless the times are evenly spaced to a tenth of a step."""
     steps = np.diff(time)
     step = np.median(steps)
     uneven = np.flatnonzero((np.abs(steps - step) > 0.1 * abs(step)) | (steps <= 0.0))

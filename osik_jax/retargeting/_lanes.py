@@ -1,4 +1,4 @@
-"""Clips as lanes of one program: padded to a length that they share, and solved side by side."""
+"""Batches of clips: padded to a shared length and solved side by side in one program."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from ._plan import make_plan
 from ._terms import Body, Bounds
 
 LENGTHS = 16
-"""Lengths of programs are multiples of this."""
+"""Programs are compiled for multiples of this number of frames."""
 
 
 class Solved(NamedTuple):
-    """What both passes give; of many clips, every leaf has a leading axis."""
+    """Results of both passes; for several clips every leaf has a leading axis."""
 
     q: Array
     off_plan: Array
@@ -36,7 +36,7 @@ class Solved(NamedTuple):
 
 
 class Clip(NamedTuple):
-    """A clip in the form that is computed with."""
+    """One clip as arrays for planning."""
 
     person: Person
     frames: int
@@ -47,25 +47,25 @@ class Clip(NamedTuple):
 
 
 def as_lane(clip: Clip, length: int) -> _Lane:
-    """A clip as one of a batch whose clips have this many frames, padding included."""
+    """Return a clip as one lane of a batch, padded to ``length`` frames."""
     frames = len(clip.start)
     goals, start = (clip.goals, clip.start) if frames >= length else padded(clip.goals, clip.start, length - frames)
     return jax.tree.map(np.asarray, (goals, start, clip.bounds, np.asarray(clip.dt)))
 
 
 def shared_length(clip: Clip) -> int:
-    """A length that clips of about as many frames share: at most a quarter more, and few different ones."""
+    """Return a padded length shared by clips of similar length: at most a quarter more, and few distinct values."""
     step = max(LENGTHS, (1 << (clip.frames - 1).bit_length()) // 8)
     return -(-clip.frames // step) * step
 
 
 def even(count: int, most: int) -> int:
-    """At most so many at once that every chunk has as many, but for the last, which has hardly fewer."""
+    """Return the largest chunk size up to ``most`` for which ``count`` items split into nearly equal chunks."""
     return -(-count // -(-count // most)) if most > 0 else most
 
 
 def one_a_core() -> bool:
-    """Whether clips are worked on one at a time by each core, and not all of them in one program."""
+    """Return whether each CPU core works on one clip at a time, instead of one program for all clips."""
     return jax.default_backend() == "cpu"
 
 
@@ -73,9 +73,10 @@ _Lane = tuple[Goals, Array, Bounds, Array]
 
 
 def solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
-    """All lanes: on CPUs as many at a time as there are cores, in threads: a program does not hold Python's lock.
+    """Solve all lanes: on CPUs in one thread per core, elsewhere in one program split over all devices.
 
-    Elsewhere in one program, split over all devices. ``shared`` is what ``solve_lane`` takes after the lane.
+    XLA programs release Python's lock, so threads run in parallel. ``shared``: the arguments of ``solve_lane`` after
+    the lane.
     """
     if not one_a_core() and len(jax.devices()) > 1:
         return _over_devices(len(shared))(lanes, *shared)
@@ -118,12 +119,12 @@ def solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
 
 @cache
 def _over_devices(shared: int) -> ShardedFunction:
-    """``solve_lanes`` with so many arguments that all lanes share, each device with its own part of the lanes."""
+    """Return ``solve_lane`` with its lanes split over all devices and ``shared`` replicated arguments."""
     return sharded(solve_lane, (0, *[None] * shared))
 
 
 def padded(goals: Goals, start: Float[np.ndarray, "F nq"], more: int) -> tuple[Goals, Float[np.ndarray, "T nq"]]:
-    """Goals and first guess with frames behind the end, so that clips of about one length share a program."""
+    """Return goals and first guess with ``more`` frames appended that do not count (``present`` is 0)."""
     frames = len(start)
 
     def longer(leaf: np.ndarray) -> np.ndarray:

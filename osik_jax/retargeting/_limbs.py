@@ -1,4 +1,4 @@
-"""A robot's legs and arms as its tree shows them: which joint is a knee or an elbow, and where a wrist is."""
+"""Legs and arms found in a robot's kinematic tree: which joint is a knee or an elbow, and the position of a wrist."""
 
 from __future__ import annotations
 
@@ -16,30 +16,33 @@ from ..robot._tree import BALL, HINGE
 from ._profile import Place, Point
 
 ORIGIN: Point = (0.0, 0.0, 0.0)
+# Joints closer than this [m] are at one place, as the three hinges of a hip.
 _SAME = 1e-6
 _BENDS = 0.5
-"""Sine of the angle between a hinge and the limb behind it above which the hinge bends the limb. Less twists it: a G1's
-shoulder yaw has 0.19."""
+"""A hinge bends a limb if the sine of the angle between its axis and the limb is above this; else it twists the limb
+(0.19 for a G1's shoulder yaw).
+"""
 _SHORTEST = 0.2
-"""Distance of a knee or an elbow from either end of its limb, as a share of the sum of both, at least."""
+"""Least distance of a knee or elbow from either end of its limb, as a share of the sum of both distances."""
 _LEAST_FOREARM = 0.2
-"""Distance of a frame that is called a hand from the joint before it, as a share of the upper arm, at least."""
+"""Least distance of a hand frame from the joint before it, as a share of the upper arm."""
 _MOST_FOREARM = 1.2
-"""The same, at most, where only masses say how long a forearm is: files have placeholders for inertias."""
+"""Largest forearm, as a share of the upper arm, where only masses tell its length; files contain placeholder inertias.
+"""
 _GRIPS = re.compile(r"grip|finger|thumb|hand$", re.IGNORECASE)
 _HANDS = ("wrist", "hand", "palm", "grip", "tool|tcp|effector", "tip")
 """Names of frames at the end of an arm, those nearest to the wrist first."""
 
 
 class Chain(NamedTuple):
-    """Bodies from the trunk to the end of a limb, and where the joint of each is at home [m]. (k,), (k, 3)."""
+    """Bodies from the trunk to the end of a limb (k,), and the position of each body's joint at home [m] (k, 3)."""
 
     bodies: tuple[int, ...]
     anchors: Float[np.ndarray, "k 3"]
 
 
 class Arm(NamedTuple):
-    """Bodies of the shoulder and the elbow, and the wrist."""
+    """Shoulder body, elbow body and wrist place of an arm."""
 
     shoulder: int
     elbow: int
@@ -47,7 +50,7 @@ class Arm(NamedTuple):
 
 
 def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int]) -> list[Chain]:
-    """Return the left and the right limb that end in two bodies.
+    """Return the left and the right limb that end in two given bodies.
 
     Raises:
         ValueError: a limb has fewer than three joints.
@@ -57,7 +60,7 @@ def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int]) -> list[C
 
 
 def _chain(robot: Robot, kinematics: Kinematics, end: int, other: int) -> Chain:
-    """Return the bodies from the first that the other side's limb does not hang from to the end."""
+    """Return the chain to ``end`` from the first body that is not shared with the other side's limb."""
     above = robot.tree.descendants[:, end] & ~robot.tree.descendants[:, other]
     bodies = tuple(int(b) for b in np.flatnonzero(above) if b != robot.tree.root)
     if len(bodies) < 3:
@@ -81,11 +84,10 @@ def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain) -> tuple[int, int
 
 
 def find_arm(robot: Robot, kinematics: Kinematics, arm: Chain) -> Arm:
-    """Return where an arm bends and where it ends.
+    """Return the shoulder, elbow and wrist of an arm.
 
-    The elbow is the joint that bends the arm far from the shoulder and from the last joint of the hand, and the wrist
-    is that last joint. Where no joint between them bends the arm, the arm has no wrist joint: the end of its last link
-    is the wrist.
+    The elbow is the joint that bends the arm far from the shoulder and from the last joint of the hand; that last joint
+    is the wrist. If no joint between them bends the arm, the wrist is the end of the last link.
 
     Raises:
         ValueError: no joint bends the arm.
@@ -124,13 +126,13 @@ def _apart(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _bend(robot: Robot, kinematics: Kinematics, limb: Chain, first: int) -> int | None:
-    """Return the joint that bends a limb farthest from both its ends: the knee or the elbow; None: there is none.
+    """Return the index of the knee or elbow (the bending joint farthest from both ends of a limb), or None.
 
     Args:
         robot: the robot.
         kinematics: at home.
         limb: the limb, from its first joint to its end.
-        first: the joint that counts as the limb's beginning.
+        first: index of the joint at which the limb begins.
     """
     first = min(first, len(limb.anchors) - 1)
     beginning, end = limb.anchors[first], limb.anchors[-1]
@@ -141,12 +143,13 @@ def _bend(robot: Robot, kinematics: Kinematics, limb: Chain, first: int) -> int 
     if not places:
         return None
     best = max(near[i] for i in places)
+    # the first of joints at one place, which differ by rounding
     bend = next(i for i in places if near[i] > 0.999 * best)
     return next(i for i in range(1, bend + 1) if not _apart(limb.anchors[i], limb.anchors[bend]))
 
 
 def _bends(robot: Robot, kinematics: Kinematics, limb: Chain, i: int) -> bool:
-    """Whether a joint moves what is behind it sideways, and does not twist it."""
+    """Return whether a joint moves the part behind it sideways rather than twisting it."""
     tree, behind = robot.tree, _after(limb.anchors, i)
     if behind is None:
         return False
@@ -163,14 +166,14 @@ def _bends(robot: Robot, kinematics: Kinematics, limb: Chain, i: int) -> bool:
 
 
 def _after(anchors: np.ndarray, joint: int) -> int | None:
-    """Return the first joint behind another that is elsewhere."""
+    """Return the index of the next joint at another position, or None."""
     return next((i for i in range(joint + 1, len(anchors)) if _apart(anchors[i], anchors[joint])), None)
 
 
 def _hand(robot: Robot, arm: Chain) -> int:
-    """Return the last body of an arm that is still one with the whole hand: fingers part behind it, or a gripper opens.
+    """Return the index of the last body that moves the whole hand; fingers or a gripper branch off behind it.
 
-    A gripper's joint leads or follows another, or is called so.
+    A gripper's joint is coupled to another joint, or its name says so.
     """
     tree = robot.tree
     coupled = {joint for follower, leader, _ in tree.followers for joint in (follower, leader)}
@@ -183,7 +186,7 @@ def _hand(robot: Robot, arm: Chain) -> int:
 
 
 def _end(robot: Robot, kinematics: Kinematics, arm: Chain, last: int) -> tuple[Place, np.ndarray]:
-    """Return the end of an arm's last link as a place and in the world [m]: a fixed hand frame, else its far end."""
+    """Return the end of an arm's last link as a place and in the world [m]: a hand frame, else its far end."""
     tree, body, anchor = robot.tree, arm.bodies[last], arm.anchors[last]
     least = _LEAST_FOREARM * float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
     names = [name for name, own in zip(tree.frame_names, tree.frame_bodies, strict=True) if own == body]
@@ -205,13 +208,13 @@ def _end(robot: Robot, kinematics: Kinematics, arm: Chain, last: int) -> tuple[P
 
 
 def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.ndarray:
-    """Return how far a body reaches from its joint, along the line to its middle: its meshes, else its masses [m].
+    """Return the end of a body along the line from its joint to its middle, by its meshes, else by its masses [m].
 
     Args:
         robot: the robot.
-        body: the body; what is fixed to it counts.
-        anchor: where its joint is [m]. (3,)
-        most: length that masses are believed [m].
+        body: index of the body; bodies fixed to it are included.
+        anchor: position of its joint in the world [m]. (3,)
+        most: largest length accepted from masses [m].
     """
     model = robot.mj_model
     data = mujoco.MjData(model)
@@ -228,13 +231,13 @@ def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.nda
 
 
 def _farthest(points: np.ndarray, middle: np.ndarray, anchor: np.ndarray, most: float) -> np.ndarray:
-    """Return the point on the line from an anchor through a middle that is level with the farthest of some points."""
+    """Return the projection of the farthest of ``points`` on the line from ``anchor`` through ``middle`` [m]."""
     along = (middle - anchor) / max(float(np.linalg.norm(middle - anchor)), _SAME)
     return anchor + np.clip(((points - anchor) @ along).max(), 0.0, most) * along
 
 
 def _vertices(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> Float[np.ndarray, "k 3"]:
-    """Return the vertices of the meshes of some bodies in the world [m]."""
+    """Return the mesh vertices of some bodies in the world [m]."""
     out = [np.zeros((0, 3))]
     for geom in np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) & np.isin(model.geom_bodyid, bodies)):
         mesh = model.geom_dataid[geom]
@@ -245,7 +248,7 @@ def _vertices(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> 
 
 
 def _rod(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Float[np.ndarray, "2 3"]:
-    """Return the ends of a rod with the mass and the inertia of a body [m].
+    """Return both ends of the rod with the mass and inertia of a body, in the world [m].
 
     A rod of half length h has the second moment ``m h^2 / 3`` along itself.
     """

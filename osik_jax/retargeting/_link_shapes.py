@@ -1,4 +1,4 @@
-"""How large links are by the collision shapes of the file, where their inertias say nothing credible."""
+"""Size of links from their collision shapes, used where their inertias are not credible."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from ..robot.loading._meshes import unread_points
 from ..robot.loading._mjmodel import rotation_matrix
 
 _LIGHTEST, _DENSEST = 200.0, 20_000.0
-"""Densities that links may have [kg/m^3]: of the links of a G1, a NAO, a Talos, a GR1T2 and a GR3 the lightest has 210
-(a Talos' head); no metal that links are made of has more than 20,000."""
+"""Accepted link densities [kg/m^3]. The lightest link of G1, NAO, Talos, GR1T2 and GR3 has 210 (a Talos' head); no
+metal used in robots exceeds 20,000.
+"""
 
 _USUAL = 1000.0
-"""Density that an ellipsoid is given where it is too light [kg/m^3]; more than half of those links have more."""
+"""Density given to an ellipsoid that is too light for its size [kg/m^3]; over half of those robots' links are denser.
+"""
 
 _ROUND = 1e-6
-"""Semi-axes that differ by a smaller share are equal."""
+"""Relative difference below which semi-axes count as equal."""
 
 _GEOM = mujoco.mjtGeom
 
@@ -40,18 +42,19 @@ def density(mass: float, half: Float[np.ndarray, "3"]) -> float:
 
 
 def is_credible(mass: float, half: Float[np.ndarray, "3"]) -> bool:
-    """Return whether an ellipsoid of a mass [kg] with these semi-axes [m] may be a link of a robot.
+    """Return whether an ellipsoid of a mass [kg] with these semi-axes [m] is plausible as a robot link.
 
-    Its density may not be absurd, and it may not be a ball: three equal moments of inertia are placeholders.
+    Its density must be within ``_LIGHTEST`` and ``_DENSEST``, and it must not be a ball, because three equal moments of
+    inertia are placeholders.
     """
     return _LIGHTEST <= density(mass, half) <= _DENSEST and np.ptp(half) > _ROUND * np.max(half)
 
 
 def shrunk(mass: float, half: Float[np.ndarray, "3"]) -> float:
-    """Return the factor for an ellipsoid's semi-axes [m] with which it weighs what a link may.
+    """Return the factor on an ellipsoid's semi-axes [m] that gives it a plausible density.
 
-    Inertias that files have about another point than the centre of mass, or as placeholders, are those of ellipsoids
-    that are far too large: too light for their size.
+    Placeholder inertias, or inertias about a point other than the centre of mass, belong to ellipsoids that are far too
+    large for their mass.
     """
     found = density(mass, half)
     return (found / _USUAL) ** (1.0 / 3.0) if found < _LIGHTEST else 1.0
@@ -70,7 +73,7 @@ def by_inertia(model: mujoco.MjModel, body: int) -> Extent:
 def by_shapes(robot: Robot, body: int) -> Extent | None:
     """Return the box around a body's collision shapes, along their principal axes; None if there are none.
 
-    Mesh files that the model does not hold are read; a file that cannot be read is left out.
+    Mesh files that the model does not contain are read from disk; unreadable files are left out.
     """
     clouds = [_geom_points(robot.mj_model, geom) for geom in _solid_geoms(robot.mj_model, body)]
     clouds += _unread_points(robot, body)

@@ -1,4 +1,4 @@
-"""From a person to a robot while the person moves: a plan of a short time ahead, mended at every frame."""
+"""Retargeting of a live stream: a plan over a short look-ahead, updated at every frame."""
 
 from __future__ import annotations
 
@@ -28,59 +28,60 @@ from ._stance import Stance, hold_feet
 from ._terms import Body, Bounds
 
 _PAST = 2
-"""Frames of the plan that are past: what speeds, accelerations and standing feet go on from."""
+"""Number of past frames in the plan; speeds, accelerations and contacts continue from them."""
 _HISTORY, _LEAST_HISTORY = 0.27, 4
-"""Time before the present frame that is kept of the person, for contacts and for joints that are missing [s]; frames at
-least."""
+"""History of the person that is kept for contacts and missing joints [s], and the least number of frames."""
 _LONGEST = 2.0
-"""Look-ahead that is allowed [s]."""
+"""Longest allowed look-ahead [s]."""
 _FIRST_ITERATIONS = 100
 _SHARE = 0.6
-"""Share of a frame's time that computing may take where nothing else is asked for."""
+"""Default share of a frame's time that computing may take."""
 _CALMER = 0.2
-"""Weight of the last frame in the mean time of an iteration."""
+"""Weight of the newest frame in the running mean of an iteration's time."""
 _LEAST_ITERATIONS = 5
-"""Iterations that a frame gets whatever they take: with fewer, plans fall behind the person and feet give way."""
+"""Iterations of every frame regardless of time: with fewer, plans fall behind the person and feet slip."""
 _BROKEN = 0.5
-"""Cost of broken bounds from which a plan gets all its iterations whatever they take: feet give way some frames later,
-for limits leave them no way back."""
+"""Cost of violated bounds above which a plan gets all its iterations regardless of time. Otherwise feet slip some
+frames later, because limits leave no way back.
+"""
 _DAMPING, _MOST_DAMPING, _LESS, _MORE = 1.0, 1e6, 0.25, 64.0
-"""Damping of a frame's first iteration, at least and at most, and what it is multiplied with where a step of the frame
-before was taken, and where none was."""
+"""Least and largest damping of a frame's first iteration, and the factors on it after a frame with and without an
+accepted step.
+"""
 _OFF = 1e-6
-"""How far from the plan is held back [rad or m]."""
+"""Distance from the plan above which a frame counts as held back [rad or m]."""
 _FEET_OFF = 1e-3
-"""How far feet that hold may be from where they landed and from the floor [m]."""
+"""Largest error of a standing foot: distance from its landing place or from the floor [m]."""
 
 
 class LiveStatus(enum.IntEnum):
-    """How a frame came about."""
+    """Outcome of one frame of a stream."""
 
     FOLLOWED = 0
-    """As planned."""
+    """The robot follows the plan."""
     HELD_BACK = 1
-    """Limits held the robot back from the plan; it comes back to it."""
+    """A limit keeps the robot off the plan; it returns to the plan later."""
     FILLED = 2
-    """Joints of the person were missing, and filled in from the frames around."""
+    """Joints of the person are missing and interpolated from neighbouring frames."""
     LOST = 3
-    """The person is missing in this frame and in all that are known after it; the robot comes to rest."""
+    """The person is missing in this frame and in all known later frames; the robot comes to rest."""
     FEET_OFF = 4
-    """Limits do not let feet hold: a point that stands is over 1 mm from where it landed or from the floor, or a sole
+    """Limits do not allow the contacts: a contact point is over 1 mm from its landing place or the floor, or a sole
     is over 1 mm below the floor."""
 
 
 class LiveFrame(NamedTuple):
-    """A frame of the robot's motion.
+    """One frame of the robot's motion.
 
     Attributes:
         q: configuration. (nq,)
         contact: whether left heel, left toe, right heel and right toe stand. (4,)
-        status: how it came about.
-        off_plan: how far the farthest joint is from the plan because a limit held it [rad or m].
-        feet_off: how far a point that stands is from where it landed or from the floor, or a sole below the floor, at
-            most [m].
-        iterations: of the plan.
-        seconds: what it took to compute.
+        status: outcome of the frame.
+        off_plan: largest distance of a joint from the plan because of a limit [rad or m].
+        feet_off: largest distance of a contact point from its landing place or the floor, or of a sole below the floor
+            [m].
+        iterations: iterations of the plan.
+        seconds: computing time [s].
     """
 
     q: Float[np.ndarray, " nq"]
@@ -93,9 +94,9 @@ class LiveFrame(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """The window that is planned, what is past first, the robot's velocity, where its feet stand, and the damping.
+    """State of a live plan: configurations (past frames first), velocity, stance, damping and figures.
 
-    ``penalty`` is the cost of bounds that the plan breaks: 0.5 for a point that stands and is 1 mm off.
+    ``penalty`` is the cost of the bounds that the plan violates: 0.5 for one standing point that is 1 mm off.
     """
 
     q: Float[Array, "W nq"]
@@ -109,24 +110,24 @@ class _Plan(NamedTuple):
 
 
 class LiveRetargeter(OnRobot):
-    """Retargets a stream frame by frame, some time behind the person: ``look_ahead`` of it is known ahead.
+    """Retargeter for a stream: each call takes a frame of the person and returns the robot's frame ``look_ahead`` ago.
 
-    Limits of position, speed and acceleration hold at every frame, whatever comes in. Inside them feet stay where they
-    landed, to a thousandth of a millimetre; ``LiveStatus.FEET_OFF`` says where limits do not allow that. The rest is as
-    near to what ``Retargeter`` makes of the whole clip as that much future allows.
+    Limits of position, speed and acceleration hold in every frame for any input. Within them, standing feet stay at
+    their landing place to 1 um; ``LiveStatus.FEET_OFF`` reports frames in which the limits do not allow that. Otherwise
+    the motion is as close to that of ``Retargeter`` as the look-ahead allows.
 
     Args:
         robot: with a free base, two legs and two arms; x forward, y left, z up at home.
-        standing: some frames of the person standing, with the joints and the rate of the stream: it is measured there
-            how long legs are, how high ankles, and where the floor is.
-        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
-        mapping: role to the stream's name of it, see ``find_roles``. None: by the names that files use.
-        acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+        standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
+            height and floor.
+        profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
+        mapping: role to joint name of the stream, see ``find_roles``. None: by common names.
+        acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         balance: as of ``Retargeter``.
-        look_ahead: time that the robot is behind the person, up to 2 s; a frame at least [s].
-        iterations: of the plan at each frame, at most. They end before where the bounds hold and steps gain little.
-        budget: time that computing a frame may take [s]: iterations that would take longer are not begun, but for the
-            first five and those of a plan that breaks a bound. None: 0.6 of the time from one frame to the next.
+        look_ahead: delay of the robot behind the person, one frame to 2 s [s].
+        iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
+        budget: computing time per frame [s]. An iteration that would exceed it is not started, except the first five
+            and those of a plan that violates a bound. None: 60 % of the time between frames.
 
     Raises:
         ValueError: no two legs and two arms are found, joints are missing, or a number is out of range.
@@ -165,11 +166,11 @@ class LiveRetargeter(OnRobot):
 
     @property
     def latency(self) -> float:
-        """How far the robot is behind the person, without what it takes to compute (``LiveFrame.seconds``) [s]."""
+        """Return the delay of the robot behind the person [s], without the computing time (``LiveFrame.seconds``)."""
         return self.frames_ahead * self._dt
 
     def reset(self) -> None:
-        """Forgets the person and the robot; the next frame is the first."""
+        """Forget the person and the robot, so that the next frame is the first."""
         self._seen: list[np.ndarray] = []
         self._stands: list[np.ndarray | None] = []
         self._known = self._standing.positions[-1]
@@ -178,11 +179,12 @@ class LiveRetargeter(OnRobot):
     def step(
         self, positions: Float[np.ndarray, "J 3"] | None, contact: Bool[np.ndarray, "4"] | None = None
     ) -> LiveFrame | None:
-        """Takes a frame of the person, and gives the robot's of ``frames_ahead`` frames before.
+        """Take a frame of the person and return the robot's frame of ``frames_ahead`` frames earlier.
 
         Args:
-            positions: of the joints, in the order of ``standing`` [m]; NaN where one is not seen. None: no frame came.
-            contact: whether left heel, left toe, right heel and right toe stand; None: to be found. All frames have
+            positions: joint positions in the order of ``standing`` [m], NaN for a joint that is not seen. None: the
+                frame is lost.
+            contact: whether left heel, left toe, right heel and right toe stand; None: detected. All frames must have
                 it, or none.
 
         Returns:
@@ -198,7 +200,7 @@ class LiveRetargeter(OnRobot):
         return self._next(began)
 
     def finish(self) -> list[LiveFrame]:
-        """The robot's last ``frames_ahead`` frames, when no more of the person come, who stays as seen last."""
+        """Return the robot's last ``frames_ahead`` frames at the end of a stream; the person holds the last pose."""
         if not self._seen:
             return []
         waiting = min(self.frames_ahead, len(self._seen) - self._history)
@@ -206,7 +208,7 @@ class LiveRetargeter(OnRobot):
         return [frame for frame in frames if frame is not None][-waiting:]
 
     def _take(self, positions: np.ndarray | None, contact: np.ndarray | None) -> None:
-        """Puts a frame at the end of what was seen."""
+        """Append a frame to the history, with NaN for joints that are not seen."""
         names = self._standing.joint_names
         seen = np.full((len(names), 3), np.nan) if positions is None else np.asarray(positions, float)
         if seen.shape != (len(names), 3):
@@ -250,11 +252,11 @@ class LiveRetargeter(OnRobot):
         return LiveFrame(q, person.contact[now], status, off, feet_off, int(plan.iterations), seconds)
 
     def _advanced(self, goals: Goals, contact: Bool[np.ndarray, "4"], began: float) -> _Plan:
-        """The window a frame further; ``began`` is when the frame came [s]."""
+        """Return the plan moved on by one frame; ``began`` is the arrival time of the frame [s]."""
         weights, bounds, guess = self.profile.weights, self._window_bounds, self._build.first_guess(goals)
         if self._plan is None:
             first = make_plan(self._body, goals, weights, bounds, guess, _FIRST_ITERATIONS).q
-            # at rest in the first frame, which is there _PAST times more
+            # start at rest: the first frame is repeated _PAST times
             q = np.concatenate([np.repeat(np.asarray(first)[:1], _PAST, 0), np.asarray(first)[_PAST:]])
             q[:_PAST] = inside_ranges(self.robot, jnp.asarray(q[0]))
             velocity: Any = np.zeros(self.robot.nv, q.dtype)
@@ -277,7 +279,7 @@ class LiveRetargeter(OnRobot):
             plan = plan._replace(iterations=plan.iterations + self.iterations - more)
         spent = (time.perf_counter() - start) / (int(plan.iterations) + 1)
         mean = self._iteration_seconds
-        if not first:  # which may have been compiled
+        if not first:  # the first call may include compilation
             self._iteration_seconds = spent if mean == 0.0 else mean + _CALMER * (min(spent, 2.0 * mean) - mean)
         return plan
 
@@ -295,10 +297,10 @@ def _advance(
     dt: Float[Array, ""] | float,
     iterations: Int[Array, ""] | int,
 ) -> _Plan:
-    """Mends the plan, and goes with it as far as the limits and the feet allow; not at all where it is not finite."""
+    """Update the plan and move one frame along it within limits and contacts; stay if the plan is not finite."""
     (velocity, stance, damping), dt = before, jnp.asarray(dt, q.dtype)
     mended = mend_plan(body, goals, weights, bounds, q, 1.0 * (jnp.arange(len(q)) >= _PAST), iterations, damping)
-    # steps that were all refused need more damping from the start
+    # if all steps were refused, the next frame starts with more damping
     taken = jnp.any(mended.q != q)
     damping = jnp.clip(damping * jnp.where(taken, _LESS, _MORE), _DAMPING, _MOST_DAMPING)
     still = jnp.concatenate([q[:_PAST], jnp.broadcast_to(q[_PAST - 1], q[_PAST:].shape)])
@@ -315,9 +317,9 @@ def _advance(
 
 
 def _filled(seen: Float[np.ndarray, "F J 3"], known: Float[np.ndarray, "J 3"]) -> Float[np.ndarray, "F J 3"]:
-    """Joints that are missing, on the line from where they were seen before to where they are seen next.
+    """Return positions with missing joints interpolated in time between the frames that show them.
 
-    Those that are missing in all frames are where they were known to be last.
+    A joint missing in all frames keeps its last known position.
     """
     out, frames = seen.copy(), np.arange(len(seen))
     gone = np.isnan(seen[..., 0])

@@ -1,4 +1,4 @@
-"""What ``osik retarget --live`` does: a clip replayed at its own rate, or a stream of JSON lines."""
+"""Implementation of ``osik retarget --live``: replay of a clip at its own rate, or a stream of JSON lines."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from ._retargeted import Retargeted, as_retargeted
 from ._robot_motion import in_mujoco_order
 
 Make = Callable[[HumanMotion], LiveRetargeter]
-"""A retargeter for a person who stands as in these frames."""
+"""Function that makes a live retargeter for the person standing in the given frames."""
 
 
 def replay(make: Make, motion: HumanMotion, *, paced: bool = True) -> tuple[Retargeted, list[LiveFrame]]:
-    """A clip frame by frame, each when it is due; the whole clip shows how the person is built.
+    """Retarget a clip frame by frame, each when it is due; the person is measured from the whole clip.
 
     Args:
         make: makes the retargeter.
@@ -32,7 +32,7 @@ def replay(make: Make, motion: HumanMotion, *, paced: bool = True) -> tuple[Reta
         paced: whether to wait until a frame is due.
 
     Returns:
-        what came of it, and its frames.
+        the retargeted motion and its frames.
     """
     live = make(motion)
     person = read_person(motion, live.roles)
@@ -53,13 +53,13 @@ def replay(make: Make, motion: HumanMotion, *, paced: bool = True) -> tuple[Reta
 
 
 def stream(make: Make, lines: Iterable[str], out: TextIO) -> int:
-    """Reads a person's frames as JSON lines, and writes the robot's as they come.
+    """Read a person's frames as JSON lines and write the robot's frames as they are computed.
 
-    The first line says ``{"fps": 30, "joint_names": [...]}``, with ``"standing": [[x, y, z], ...]`` where the person's
-    first frame does not show them standing. Each other line is a frame: ``{"positions": [[x, y, z], ...]}`` in metres,
-    z up, null for a joint that is not seen, with ``"contact": [...]`` where that is known; ``null`` is a frame that did
-    not come. Written is ``{"frame": 0, "qpos": [...], "contact": [...], "status": "followed"}``, in MuJoCo's order,
-    after a line with ``joint_names`` and ``latency`` in seconds.
+    The first input line is ``{"fps": 30, "joint_names": [...]}``, with ``"standing": [[x, y, z], ...]`` if the first
+    frame does not show the person standing. Each other line is a frame: ``{"positions": [[x, y, z], ...]}`` in metres,
+    z up, null for a joint that is not seen, optionally ``"contact": [...]``; ``null`` is a lost frame. The first output
+    line has ``joint_names`` and ``latency`` [s]; each other line is
+    ``{"frame": 0, "qpos": [...], "contact": [...], "status": "followed"}`` in MuJoCo's order.
 
     Returns:
         how many frames were written.
@@ -98,7 +98,7 @@ def _rows(lines: Iterable[str]) -> Iterator[tuple[int, Any]]:
 
 
 def _frame(row: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Positions and contact of a line."""
+    """Return positions (J, 3) and contacts (4,) of one line; None where missing."""
     if row is None:
         return None, None
     if not isinstance(row, dict) or "positions" not in row:
@@ -112,7 +112,7 @@ def _points(rows: Any) -> np.ndarray:
 
 
 def _standing(head: dict[str, Any], positions: np.ndarray | None) -> HumanMotion:
-    """The person as they stand: by the first line, or in the first frame."""
+    """Return the standing pose of the person, from the first line or else from the first frame."""
     still = positions if head.get("standing") is None else _points(head["standing"])
     if still is None or not np.isfinite(still).all():
         raise OsikValueError("the first frame has joints that are not seen; give a pose of standing in the first line")
@@ -120,7 +120,7 @@ def _standing(head: dict[str, Any], positions: np.ndarray | None) -> HumanMotion
 
 
 def _written(out: TextIO, robot: Robot, first: int, frames: Sequence[LiveFrame]) -> int:
-    """Writes frames, numbered from the first; returns how many."""
+    """Write frames as JSON lines numbered from ``first``; return their number."""
     for number, frame in enumerate(frames, first):
         qpos = in_mujoco_order(robot, frame.q[None], 1.0).qpos[0]
         row = {"frame": number, "qpos": qpos.tolist(), "contact": frame.contact.tolist()}

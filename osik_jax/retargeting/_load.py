@@ -1,4 +1,4 @@
-"""One function for every kind of motion file."""
+"""Reader for every kind of motion file."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def load_motion(
 
     Args:
         path: the file.
-        unit: of a BVH, see ``read_bvh``.
+        unit: unit of a BVH file, see ``read_bvh``.
         up: the file's axis that points up, see ``read_bvh`` and ``read_keypoints``. None: found from the motion.
-        trim: of a BVH, see ``read_bvh``.
+        trim: whether rest-pose frames of a BVH file are left out, see ``read_bvh``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -46,7 +46,7 @@ def load_motion(
         motion = read_amc(Path(path))
         return standing_up(str(path), motion, checked_up(up), "y", find_rest_up(motion))
     if ending not in ENDINGS:
-        if not ending and not Path(path).exists():  # perhaps a folder's name with a letter wrong
+        if not ending and not Path(path).exists():  # e.g. a misspelt folder, whose missing ending is not the fault
             raise FileNotFoundError(f"no such file: {path}")
         raise OsikValueError(f"{path} is none of {', '.join(ENDINGS)}")
     if unit is not None:
@@ -56,15 +56,15 @@ def load_motion(
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """Reads the clips of a job: of a person, or of a robot where ``source`` is given.
+    """Reader for the clips of a job: motions of a person, or of a robot if ``source`` is given.
 
     Attributes:
-        unit: of the BVH files among them, as of ``load_motion``.
-        up: of all files, as of ``load_motion``.
-        trim: of the BVH files among them, as of ``load_motion``.
-        source: the robot whose motions the files are; None: a person's.
-        profile: of the source, as of ``load_source``.
-        fps: of the source's CSV files, as of ``load_source``.
+        unit: unit of BVH files, as of ``load_motion``.
+        up: up axis of all files, as of ``load_motion``.
+        trim: for BVH files, as of ``load_motion``.
+        source: the robot whose motions the files hold; None: the files hold a person's motions.
+        profile: profile of ``source``, as of ``load_source``.
+        fps: frame rate of CSV files of ``source``, as of ``load_source``.
     """
 
     unit: str | float | None = None
@@ -75,14 +75,14 @@ class Reader:
     fps: float | None = None
 
     def __call__(self, path: Path) -> HumanMotion | SourceMotion:
-        """Read a clip; the unit goes with BVH files alone."""
+        """Read one clip; ``unit`` applies to BVH files only."""
         if self.source is not None:
             return load_source(path, self.source, profile=self.profile, fps=self.fps)
         unit = self.unit if path.suffix.lower() == ".bvh" else None
         return load_motion(path, unit=unit, up=self.up, trim=self.trim)
 
     def options(self) -> dict[str, Any]:
-        """What its results depend on, in numbers and words."""
+        """Return the options that its results depend on, as numbers and strings."""
         if self.source is None:
             return {"unit": self.unit, "up": self.up, "trim": self.trim}
         profile = find_profile(self.source) if self.profile is None else self.profile
@@ -91,7 +91,7 @@ class Reader:
 
 
 def clips_in(folder: Path) -> dict[str, Path]:
-    """The files that are read, by the names of their clips: without the ending, but where two would be called alike."""
+    """Return the motion files of a folder by clip name: the file's name, without its ending unless two would clash."""
     inside = sorted(folder.iterdir())
     files = [path for path in inside if path.is_file() and path.suffix.lower() in ENDINGS]
     if not files:

@@ -1,4 +1,4 @@
-"""The record of a person's motion: what every reader returns and everything else takes."""
+"""Record of a person's motion, returned by every reader."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..numerics._rotations import ROUNDED
 from ._rotations import continuous, slerp
 
 CONTACT_POINTS = ("left_heel", "left_toe", "right_heel", "right_toe")
-"""The columns of ``HumanMotion.contact``."""
+"""Columns of ``HumanMotion.contact``."""
 LARGEST = 1e6
-"""Coordinates that are believed [m]."""
+"""Largest accepted coordinate [m]."""
 _FASTEST = 1e5
-"""Frames a second that are believed."""
+"""Largest accepted frame rate [1/s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,15 +24,15 @@ class HumanMotion:
     """A person's motion: joint positions at a constant rate, in a world whose z axis points up.
 
     Attributes:
-        name: of the clip, for people.
-        fps: frames a second.
-        joint_names: of the joints, each once.
-        positions: of the joints in the world [m]. (F, J, 3)
-        rotations: of the joints in the world, quaternions w x y z of length 1 within 2 %, which are normalised; None:
-            not known. (F, J, 4)
-        rest_positions: of the joints in the pose in which all rotations are the identity [m]; None: not known. (J, 3)
-        contact: whether left heel, left toe, right heel and right toe stand on the ground; None: to be found. (F, 4)
-        ground: height of the floor [m]; None: to be found.
+        name: name of the clip, for display.
+        fps: frame rate [1/s].
+        joint_names: unique names of the joints.
+        positions: joint positions in the world [m]. (F, J, 3)
+        rotations: joint orientations in the world as quaternions w x y z, of length 1 within 2 % and then normalised;
+            None: unknown. (F, J, 4)
+        rest_positions: joint positions in the pose in which all rotations are the identity [m]; None: unknown. (J, 3)
+        contact: whether left heel, left toe, right heel and right toe stand on the ground; None: detected. (F, 4)
+        ground: height of the floor [m]; None: detected.
 
     Raises:
         ValueError: shapes that do not agree, numbers that are not finite or over 1e6 m, quaternions that are not of
@@ -78,16 +78,16 @@ class HumanMotion:
 
     @property
     def frames(self) -> int:
-        """How many frames there are."""
+        """Return the number of frames."""
         return len(self.positions)
 
     @property
     def seconds(self) -> float:
-        """Time from the first frame to the last."""
+        """Return the time from the first frame to the last [s]."""
         return (self.frames - 1) / self.fps
 
     def track(self, name: str) -> Float[np.ndarray, "F 3"]:
-        """Positions of one joint [m].
+        """Return the positions of one joint in the world [m]. (F, 3).
 
         Raises:
             KeyError: no such joint; the message lists those that exist.
@@ -97,9 +97,9 @@ class HumanMotion:
         return self.positions[:, self.joint_names.index(name)]
 
     def resampled(self, fps: float) -> HumanMotion:
-        """The same motion at another rate: positions by straight lines, rotations by spherical interpolation.
+        """Return the motion at another rate: linear interpolation of positions, spherical interpolation of rotations.
 
-        A point is in contact where it is in the nearer frame. Slower rates are not filtered first.
+        Contacts are those of the nearer frame. Lower rates are not low-pass filtered first.
 
         Raises:
             ValueError: a rate that is not positive.
@@ -124,21 +124,21 @@ class HumanMotion:
 
 
 def check_rate(fps: float) -> float:
-    """Return a rate; raise ValueError where it is not positive."""
+    """Return a frame rate [1/s], or raise ValueError if it is not positive and finite."""
     if not (np.isfinite(fps) and fps > 0.0):
         raise OsikValueError(f"fps is {fps}; it is frames a second, more than 0")
     return fps
 
 
 def instants(frames: int, fps: float, wanted: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames before the instants of another rate, and how far these are to the next frames in [0, 1]."""
+    """Return, for each instant of another rate, the frame before it and its fraction of the way to the next frame."""
     at = np.arange(int(np.floor((frames - 1) / fps * wanted + 1e-9)) + 1) / wanted * fps
     before = np.minimum(at.astype(int), frames - 2)
     return before, np.clip(at - before, 0.0, 1.0)
 
 
 def _check_array(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> None:
-    """Raises ValueError where an array that is there has another shape, or numbers that are not finite."""
+    """Raise ValueError if an array has another shape, or an entry that is not finite or above ``LARGEST``."""
     if value is None:
         return
     if np.shape(value) != shape:

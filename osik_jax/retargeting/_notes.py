@@ -1,4 +1,4 @@
-"""What a report has to say in words: bounds that gave way, and feet that hardly stand."""
+"""Notes of a report: bounds that are violated, and clips with almost no contacts."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ _BOUNDS = {
     ("joints", "beyond_range_max"): (1e-6, "a joint is {:.2g} rad or m beyond its range"),
     ("joints", "speed_over_limit_max"): (1.0 + 1e-6, "a joint has {:.3g} times its greatest speed"),
 }
-"""Figures of a report, what they are at most where the bounds hold, and what to say where they are more."""
+"""Figures of a report, the largest value where bounds hold, and the note for a larger value."""
 _LEAST_STANDING = 0.2
 
 
 def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]:
-    """Return sentences on what of a report has to be known before its motion is used; none where all is well.
+    """Return notes that a user must read before using a motion; empty if there are none.
 
     Args:
-        figures: of ``report``.
-        balance: how far inside the edge of the feet the centre of mass was asked for [m]; None: it was not.
+        figures: figures of ``report``.
+        balance: requested margin of the centre of mass inside the support polygon [m]; None: none.
     """
     found = [(figures[group][name], most, text) for (group, name), (most, text) in _BOUNDS.items()]
     out = [

@@ -1,4 +1,4 @@
-"""What retargeting a clip and retargeting a stream both know of a robot."""
+"""Base class of clip and stream retargeting: the robot, its profile and its limits."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ ACCELERATION = 240.0
 
 
 class OnRobot:
-    """A robot, how it is seen, its limits, and what is computed of them once.
+    """Robot with profile, limits and derived data, computed once for all clips.
 
     Args:
-        robot: with a free base, two legs and two arms.
-        profile: how the robot is seen. None: the package's own, or a guess (``find_profile``).
-        acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+        robot: robot with a free base, two legs and two arms.
+        profile: the robot's profile. None: a bundled one or a guess (``find_profile``).
+        acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         balance: as of ``Retargeter``.
 
     Attributes:
-        robot: the robot; where it faces another way at home, with that turned so that it faces x.
-        profile: how it is seen.
+        robot: the robot, with its home turned to face x if necessary.
+        profile: its profile.
         balance: as given.
-        limits: of position, speed and acceleration, which hold exactly.
+        limits: limits of position, speed and acceleration, which hold exactly.
 
     Raises:
         ValueError: the base does not float, no two legs and two arms are found, or a number is out of range.
@@ -62,12 +62,12 @@ class OnRobot:
         self._build = Build.of(robot, self.profile)
 
     def _bounds(self, dt: float) -> Bounds:
-        """What joints may do in a plan with a frame every ``dt`` seconds."""
+        """Return the joint bounds of a plan with one frame per ``dt`` seconds."""
         return self._build.bounds(self._acceleration, dt)
 
 
 def _on_joints(robot: Robot, acceleration: float | Mapping[str, float]) -> AccelerationLimit:
-    """A limit on accelerations of the joints, no greater than the robot's own; the base is free."""
+    """Return the acceleration limit of the joints, at most the robot's own; the base is free."""
     if isinstance(acceleration, Mapping):
         return AccelerationLimit(robot, acceleration)
     if not acceleration > 0.0:

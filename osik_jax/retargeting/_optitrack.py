@@ -1,4 +1,4 @@
-"""Tables that OptiTrack's Motive exports: bones of one person, in columns below five lines of headings."""
+"""Reader of CSV tables exported by OptiTrack Motive: bones of one person below five header lines."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Rows = list[tuple[int, list[str]]]
 
 
 def is_optitrack(rows: Rows) -> bool:
-    """Whether a table begins as Motive's do."""
+    """Return whether a table starts as an export of Motive does."""
     return rows[0][1][0].strip() == _FIRST
 
 
 def read_optitrack(path: Path, rows: Rows) -> HumanMotion:
-    """Return the motion in a table of Motive's.
+    """Return the motion in a table exported by Motive.
 
-    Bones count, markers and rigid bodies do not. Numbers that are missing are an error that says where.
+    Only bones are read, not markers or rigid bodies. A missing number raises ValueError with its line and column.
 
     Args:
-        path: of the file.
-        rows: number and cells of each line that is not empty.
+        path: path of the file, for error messages.
+        rows: line number and cells of each line that is not empty.
 
     Raises:
         ValueError: a heading is missing, the unit is unknown, or a cell is no number.

@@ -1,4 +1,4 @@
-"""The person: directions of limbs, turns of the trunk, feet, out of a clip's joints."""
+"""Person seen by retargeting: limb directions, trunk and foot orientations, and contacts, from a clip's joints."""
 
 from __future__ import annotations
 
@@ -15,23 +15,27 @@ from ._motion import CONTACT_POINTS, HumanMotion
 from ._roles import LIMBS, SIDES
 from ._up import find_up
 
+# Vectors shorter than this [m] have no direction; a spine shorter than 1 mm means chest and hips are one joint.
 _SHORTEST = 1e-9
 _SPINE = 1e-3
+# A missing toe is 0.35 shanks before and 0.12 shanks below the ankle; a missing heel is 0.3 feet behind it.
 _TOE, _SOLE, _HEEL = 0.35, 0.12, 0.3
+# Share of frames among which a flat foot is searched.
 _FLAT = 0.05
+# Lengths of a leg [m] outside which the file's unit must be wrong.
 _LEGS = (0.1, 3.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Person:
-    """A person's motion as retargeting sees it. World axes, z up, the floor at height 0.
+    """Motion of a person in world axes with z up and the floor at height 0.
 
     Attributes:
-        fps: frames a second.
-        points: by role, heels and toes among them [m]. (F, 3) each
-        directions: of each of ``LIMBS``, unit vectors. (F, 8, 3)
+        fps: frame rate [1/s].
+        points: positions by role, heels and toes included [m]. (F, 3) each
+        directions: unit vectors along each of ``LIMBS``. (F, 8, 3)
         pelvis: forward, left and up axes of the pelvis as columns. (F, 3, 3)
-        torso: the same of the chest. (F, 3, 3)
+        torso: forward, left and up axes of the chest as columns. (F, 3, 3)
         root: midpoint of the hips [m]. (F, 3)
         feet: forward, left and up axes of the left and right foot as columns. (F, 2, 3, 3)
         contact: whether left heel, left toe, right heel and right toe stand. (F, 4)
@@ -52,27 +56,27 @@ class Person:
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """Vectors of length 1; the x axis where there is no direction. (..., 3)."""
+    """Return vectors scaled to unit length; the x axis where the length is 0. (..., 3)."""
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.where(length > _SHORTEST, vector / np.maximum(length, _SHORTEST), np.eye(3)[0])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b, in half the time that NumPy takes for some hundred. (..., 3)."""
+    """Return the cross product a x b; twice as fast as NumPy's for about 100 vectors. (..., 3)."""
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     u, v, w = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
 
 
 def axes_from(left: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Right-handed axes as columns, with the y axis along ``left`` and z as near ``up`` as it can be. (..., 3, 3)."""
+    """Return right-handed axes as columns: y along ``left``, z as near to ``up`` as possible. (..., 3, 3)."""
     y = unit(left)
     x = unit(_cross(y, up))
     return np.stack([x, y, _cross(x, y)], -1)
 
 
 def foot_axes(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Axes as columns, with x along ``forward`` and z as near ``up`` as it can be. (..., 3, 3)."""
+    """Return right-handed axes as columns: x along ``forward``, z as near to ``up`` as possible. (..., 3, 3)."""
     x = unit(forward)
     y = unit(_cross(up, x))
     return np.stack([x, y, _cross(x, y)], -1)
@@ -80,15 +84,15 @@ def foot_axes(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Measures:
-    """What of a person does not change while they move.
+    """Constant measures of a person: leg length, ankle height, floor, noise and reference poses.
 
     Attributes:
         leg: length of a leg, thigh and shank [m].
         ankle: height of the ankles above the floor when standing [m].
-        floor: where the floor is.
-        noise: of heels and toes, standard deviation on each coordinate [m].
-        flat: of each side, knee, ankle and toe of a foot that is flat on the floor [m]. (1, 3) each
-        straight: axes of pelvis and chest in the rest pose; None where that is not known. (1, 3, 3) each
+        floor: the floor under the clip.
+        noise: standard deviation of each coordinate of heels and toes [m].
+        flat: per side, positions of knee, ankle and toe while the foot is flat on the floor [m]. (1, 3) each
+        straight: axes of pelvis and chest in the rest pose; None if unknown. (1, 3, 3) each
     """
 
     leg: float
@@ -100,16 +104,16 @@ class Measures:
 
 
 def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
-    """What a clip shows of the person's build.
+    """Measure a person and the floor from a clip.
 
     Args:
         motion: the clip.
-        roles: of each of a person's joints, what the clip calls it (``find_roles``).
+        roles: joint name of the clip for each role (``find_roles``).
 
-    An ``OsikWarning`` says where the motion does not look as if z were up.
+    An ``OsikWarning`` is given if z does not seem to point up.
 
     Raises:
-        ValueError: legs of a length that nobody's have: the clip is not in metres.
+        ValueError: the legs are shorter than 0.1 m or longer than 3 m, so the clip is not in metres.
     """
     points = {role: motion.track(name) for role, name in roles.items()}
     up, other = find_up(motion, "z", roles)
@@ -133,19 +137,21 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
     noise = find_noise(found)
     floor = find_floor(found, motion.fps, noise) if motion.ground is None else Floor(motion.ground)
     ankles = np.stack([points["left_ankle"], points["right_ankle"]], 1)
+    # the height of an ankle over a flat foot; single frames may be lower, so not the minimum
     ankle = float(np.percentile(floor.leveled(ankles, motion.fps)[..., 2].min(1), 5))
     return Measures(leg, ankle, floor, noise, flat, straight)
 
 
 def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measures | None = None) -> Person:
-    """The person in a clip.
+    """Return the person of a clip.
 
     Args:
         motion: the clip.
-        roles: of each of a person's joints, what the clip calls it (``find_roles``).
-        measures: of the person, where the clip is too short to show them; None: the clip's own.
+        roles: joint name of the clip for each role (``find_roles``).
+        measures: measures of the person if the clip is too short to show them; None: measured from the clip.
     """
     known = measure(motion, roles) if measures is None else measures
+    # a drift counts from the first frame of the measured clip, which another clip does not share
     floor = known.floor if measures is None else dataclasses.replace(known.floor, drift=0.0)
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
     points = {role: floor.leveled(track, motion.fps) for role, track in points.items()}
@@ -170,7 +176,7 @@ def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measure
 
 
 def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Axes of the pelvis and of the chest."""
+    """Return the axes of the pelvis and of the chest as columns. (F, 3, 3) each."""
     hips = 0.5 * (points["left_hip"] + points["right_hip"])
     shoulders = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
     neck = points.get("neck", shoulders)
@@ -182,13 +188,13 @@ def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _from_rest(axes: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Axes that are upright in the rest pose, whichever way the person faces in it."""
+    """Return axes relative to the rest pose, so that they are upright there whatever the heading. (F, 3, 3)."""
     heading = axes_from(rest[:, 1] * [1.0, 1.0, 0.0], np.array([0.0, 0.0, 1.0]))
     return axes @ rest.T @ heading
 
 
 def _foot(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
-    """Axes of a foot: along the sole, and up as the shank is."""
+    """Return the axes of a foot as columns: x along the sole, z as near to the shank as possible. (F, 3, 3)."""
     shank = points[f"{side}_knee"] - points[f"{side}_ankle"]
     return foot_axes(points[f"{side}_toe"] - points[f"{side}_heel"], shank)
 
@@ -196,7 +202,7 @@ def _foot(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
 def _with_soles(
     points: Mapping[str, np.ndarray], flat: Mapping[str, Mapping[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """The points with heels and toes, where the clip has none: fixed to the foot as they are in a flat one."""
+    """Return the points with missing heels and toes added, fixed to the foot as in its flat pose."""
     out = dict(points)
     for side in SIDES:
         out |= _toes(out, side)
@@ -210,7 +216,7 @@ def _toes(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
 
 
 def _toe(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
-    """Before and below the ankle, at right angles to the shank, as far as feet are long for a shank."""
+    """Return a toe below and in front of the ankle, at right angles to the shank, sized after the shank [m]. (F, 3)."""
     shank = points[f"{side}_ankle"] - points[f"{side}_knee"]
     forward = _cross(points["left_hip"] - points["right_hip"], -shank)
     length = np.linalg.norm(shank, axis=-1, keepdims=True)
@@ -218,10 +224,10 @@ def _toe(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
 
 
 def _flat(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
-    """One frame in which the foot is taken to be flat: of those with ankle and toe lowest, the one in the middle.
+    """Return knee, ankle and toe in one frame in which the foot is presumably flat [m]. (1, 3) each.
 
-    A twentieth of the frames, by how much higher the ankle is than the toe: some have the foot in the floor, or on its
-    tip.
+    Of the 5 % of frames with the lowest ankle and toe, the one with the median height difference is taken; others may
+    have the foot in the floor or on its tip.
     """
     ankle, toe = points[f"{side}_ankle"][:, 2], points[f"{side}_toe"][:, 2]
     low = np.argsort(ankle + toe, kind="stable")[: int(np.ceil(_FLAT * len(toe)))]
@@ -233,7 +239,7 @@ def _flat(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
 
 
 def _heel(points: Mapping[str, np.ndarray], flat: Mapping[str, np.ndarray], side: str) -> np.ndarray:
-    """The point that is a little behind the ankle and as low as the toe where the foot is flat."""
+    """Return the heel: slightly behind the ankle, and as low as the toe in the flat pose [m]. (F, 3)."""
 
     def axes(at: Mapping[str, np.ndarray]) -> np.ndarray:
         ankle = at[f"{side}_ankle"]

@@ -1,4 +1,4 @@
-"""Where a robot's motion has the places of its profile, by MuJoCo's own C code."""
+"""World positions of a profile's points along a robot's motion, by MuJoCo's C code."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ._profile import Profile
 
 
 class Places(NamedTuple):
-    """Places of a profile in the world.
+    """World positions of a profile's points in each frame.
 
     Attributes:
-        keypoints: by role [m]. (F, 3) each
-        turns: of pelvis, chest (the pelvis where the trunk does not bend), left and right foot. (F, 4, 3, 3)
+        keypoints: positions by role [m]. (F, 3) each
+        turns: rotation matrices of pelvis, chest (or pelvis again for a rigid trunk), left and right foot. (F, 4, 3, 3)
         soles: corners of the soles [m]. (F, 8, 3)
         center: centre of mass [m]. (F, 3)
-        capsules: both ends of each [m]. (F, k, 2, 3)
+        capsules: both ends of each capsule's axis [m]. (F, k, 2, 3)
     """
 
     keypoints: dict[str, Float[np.ndarray, "F 3"]]
@@ -32,16 +32,16 @@ class Places(NamedTuple):
 
     @property
     def standing(self) -> Float[np.ndarray, "F 4 3"]:
-        """Middles of left heel, left toe, right heel and right toe [m]."""
+        """Return the midpoints of left heel, left toe, right heel and right toe [m]. (F, 4, 3)."""
         return self.soles.reshape(len(self.soles), 4, 2, 3).mean(2)
 
 
 def find_places(robot: Robot, profile: Profile, qpos: Float[np.ndarray, "F nq"]) -> Places:
-    """Return the places of a profile.
+    """Return the world positions of a profile's points for some configurations.
 
     Args:
         robot: the robot.
-        profile: how it is seen.
+        profile: its profile.
         qpos: configurations of its MuJoCo model. (F, nq)
     """
     data = mujoco.MjData(robot.mj_model)

@@ -1,7 +1,8 @@
-"""The plan: configurations of a whole clip at once, by Gauss-Newton.
+"""Plan of a whole clip at once, by a damped Gauss-Newton method.
 
-What each frame asks for and what ties frames together (standing points that do not move, smooth joints, limits of speed
-and acceleration) is one sum of squares over all frames. Limits are met by leading, for every frame knows what comes.
+Goals of each frame and terms between frames (contacts that do not move, smoothness, limits of speed and acceleration)
+form one sum of squares over all frames. The plan can meet a limit by moving early, because each frame depends on the
+later ones.
 """
 
 from __future__ import annotations
@@ -26,27 +27,29 @@ from ._goals import Goals, Weights
 from ._terms import Body, Bounds, frame_rows
 
 _LARGEST_STEP = 0.5
-"""Of any dof in an iteration [rad or m]: what the linear model is good for."""
+"""Largest change of a dof in one iteration [rad or m]; the linear model is not accurate beyond it."""
 
 _SOFTEST, _SOFT, _STIFFENING, _SLOWING = 1e-4, 1e-3, 10.0, 0.5
-"""Stiffness of the bounds at first, in a part of the frames and in all, its growth, and the share of the cost below
-which a step's gain lets it grow."""
+"""Initial stiffness of the bounds (on a part of the frames, and on all), the factor by which it grows, and the relative
+gain of a step below which it grows.
+"""
 
 _FIXED = 1e15
-"""Damping of frames that do not move."""
+"""Damping of frames that must not move."""
 
 _FIRST_DAMPING, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING = 1e-2, 1e-3, 1.0, 1e8
 _CALMER, _CAREFUL = 0.3, 4.0
-"""Factors of the damping after a step that was good, and after one that was not; the latter doubles each time.
+"""Factors on the damping after an accepted and after a refused step; the second doubles with each refusal.
 
-With bounds at their full stiffness, and after a step that was refused, it is ``_STIFF_DAMPING`` at least: less lets
-stretched legs swing from one end of what the bounds leave them to the other.
+With bounds at full stiffness, and after a refused step, the damping is at least ``_STIFF_DAMPING``. With less,
+stretched legs swing between the ends of their bounds.
 """
 
 _LITTLE, _SETTLED = 2e-3, 2
-"""A gain that is little, as a share of what the wishes cost, and what makes an end: a step that gains so little counts
-as two, a refused one as one. Where bounds are broken by more than that share, a step counts as one and a refused one
-not at all: what gains little there may be damped and not done."""
+"""Relative gain below which a step counts as small, and the count that ends the iterations. A small step counts two, a
+refused step one. While bounds are violated by more than that share, a small step counts one and a refused step
+nothing, because a small gain may come from damping.
+"""
 
 _Ending = Literal["ready", "settled", "mended", "spent"]
 _START = {
@@ -55,21 +58,22 @@ _START = {
     "mended": (1.0, _STIFF_DAMPING, 0.1 * _LITTLE),
     "spent": (1.0, _STIFF_DAMPING, _LITTLE),
 }
-"""What ends iterations but for their number; stiffness and damping with which they begin, and what gain is little: less
-in a stream, where the newest frame alone has much to gain."""
+"""Per ending: initial stiffness, initial damping, and relative gain that counts as small. A stream uses a smaller gain,
+because only its newest frame has much to gain.
+"""
 
 _SMOOTHNESS = ("smooth", "smooth_base")
 _STRIDE, _COARSE_ITERATIONS = 4, 8
-"""The frames that are worked on first, one in so many, and for how long at most."""
+"""Stride of the frames that are solved first, and the largest number of iterations on them."""
 
 
 class Plan(NamedTuple):
-    """A plan.
+    """Plan of a clip.
 
     Attributes:
         q: configurations. (F, nq)
-        cost: what is left of the wishes, and of the bounds that have to hold. (2,)
-        iterations: systems solved.
+        cost: final cost of the goals, and of the violated bounds. (2,)
+        iterations: number of systems solved.
     """
 
     q: Float[Array, "F nq"]
@@ -78,7 +82,7 @@ class Plan(NamedTuple):
 
 
 class _Linearised(NamedTuple):
-    """Gauss-Newton's system at some configurations, with its gradient and what each frame costs."""
+    """Gauss-Newton system at some configurations, with gradient and cost of each frame."""
 
     system: BandedSystem
     gradient: Float[Array, "F nv"]
@@ -87,12 +91,12 @@ class _Linearised(NamedTuple):
 
     @property
     def costs(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """What the wishes cost, and the bounds."""
+        """Return the cost of the goals and the cost of the violated bounds."""
         return self.soft.sum(), self.stiff.sum()
 
 
 class _Clip(NamedTuple):
-    """What a plan is made for; ``free`` is 1 for frames that may move, 0 for those that are past."""
+    """Inputs of a plan; ``free`` is 1 for frames that may move, 0 for past frames."""
 
     body: Body
     goals: Goals
@@ -102,7 +106,7 @@ class _Clip(NamedTuple):
 
 
 class _State(NamedTuple):
-    """What an iteration leaves to the next."""
+    """State passed from one iteration to the next."""
 
     q: Float[Array, "F nq"]
     here: _Linearised
@@ -115,7 +119,7 @@ class _State(NamedTuple):
 
     @classmethod
     def at(cls, clip: _Clip, q: Float[Array, "F nq"], stiffness: float, damping: Float[Array, ""] | float) -> _State:
-        """Before the first iteration."""
+        """Return the state before the first iteration."""
         hard, damped, growth = (jnp.asarray(x, q.dtype) for x in (stiffness, damping, _CAREFUL))
         here, none = _linearised(clip, q, hard), jnp.array(0)
         return cls(q, here, hard, jnp.array(False), damped, growth, none, none)
@@ -130,13 +134,12 @@ def make_plan(
     start: Float[Array, "F nq"],
     max_iterations: Int[Array, ""] | int,
 ) -> Plan:
-    """The configurations that serve a clip's goals best, from a first guess.
+    """Return the configurations that minimise a clip's cost, starting from a first guess.
 
-    Levenberg and Marquardt's method. Bounds that have to hold begin soft and get stiffer with each step that is
-    taken, so that limbs find their way before feet and limits pin them down; they do so on a part of the frames first,
-    which is a quarter of the work. It ends when a step gains less than a small part of what the wishes cost, with all
-    bounds at their full stiffness, or when two are refused where the bounds are kept; where they are not, it takes two
-    steps of little gain with no better one between them.
+    Levenberg-Marquardt iterations. The bounds start soft and get stiffer with each accepted step, so that limbs take
+    their posture before contacts and limits fix them. This is done first on every fourth frame, at a quarter of the
+    cost. With all bounds stiff, the iterations end after a step of little gain or two refused steps; while bounds are
+    violated, after two consecutive steps of little gain.
     """
     clip = _Clip(body, goals, weights, bounds, jnp.ones(len(start), start.dtype))
     return _descended(clip, _from_a_part(clip, start), max_iterations, until="settled")
@@ -155,18 +158,18 @@ def mend_plan(
     *,
     until: Literal["mended", "spent"] = "mended",
 ) -> Plan:
-    """A plan that is nearly good, made better until steps gain little, with bounds at their full stiffness.
+    """Improve a nearly optimal plan until steps gain little, with bounds at full stiffness.
 
     Args:
         body: the robot.
-        goals: of the frames.
-        weights: of the goals.
-        bounds: of the joints.
+        goals: goals of the frames.
+        weights: weights of the cost terms.
+        bounds: joint bounds.
         q: the plan. (F, nq)
-        free: 1 for frames that may move, 0 for those that are past. (F,)
-        iterations: how many, at most.
-        damping: with which they begin, at least ``_STIFF_DAMPING``.
-        until: "spent" for all iterations, whatever they gain (static).
+        free: 1 for frames that may move, 0 for past frames. (F,)
+        iterations: largest number of iterations.
+        damping: initial damping, at least ``_STIFF_DAMPING``.
+        until: "spent" runs all iterations regardless of gain (static).
     """
     return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, damping, until=until)
 
@@ -174,10 +177,10 @@ def mend_plan(
 def at_solution(
     body: Body, goals: Goals, weights: Weights, bounds: Bounds, q: Float[Array, "F nq"]
 ) -> Float[Array, "F nq"]:
-    """A plan as a function of what it was made for: its value is q, its derivative that of the solution.
+    """Return q unchanged, with the derivative of the plan's minimum by its inputs.
 
-    At the solution a step of Gauss and Newton is 0, and its derivative, with the system held fixed, is how the solution
-    moves, but for second derivatives of residuals that are small (implicit function theorem).
+    At a minimum the Gauss-Newton step is 0. Its derivative with the system held fixed is the derivative of the minimum,
+    up to second derivatives of residuals, which are small (implicit function theorem).
     """
     clip = _Clip(body, goals, weights, bounds, jnp.ones(len(q), q.dtype))
     here = _linearised(clip, q, jnp.ones((), q.dtype))
@@ -187,18 +190,19 @@ def at_solution(
 
 
 def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq"]:
-    """A better first guess: one frame in four is worked on with soft bounds, and what it moves the others move too.
+    """Return a better first guess: solve every fourth frame with soft bounds and interpolate its changes. (F, nq).
 
-    Feet are turned as the person's at the weight of limbs here: one that lands on its back has its corners on the floor
-    too, and stays so once the bounds are stiff.
+    Foot orientations have the weight of limbs here. Otherwise a foot may land upside down with its corners on the
+    floor, and stay so once the bounds are stiff.
     """
     robot, frames = clip.body.robot, len(start)
-    if frames <= _STRIDE:  # one frame would be the part
+    if frames <= _STRIDE:  # the coarse problem would have a single frame
         return start
     part = slice(None, None, _STRIDE)
     wide = dataclasses.replace(
         clip.weights,
         foot=jnp.maximum(clip.weights.foot, clip.weights.limb),
+        # second differences over 4 frames are 4^2 as large, squared 4^4; a quarter as many of them are summed
         **{name: getattr(clip.weights, name) / _STRIDE**3 for name in _SMOOTHNESS},
     )
     less = clip._replace(
@@ -224,14 +228,14 @@ def _descended(
     *,
     until: _Ending,
 ) -> Plan:
-    """Iterations from some configurations on: on CPUs by the compiled core, where it is installed.
+    """Run the iterations of a plan: in the compiled core on CPUs if installed, else in plain JAX.
 
     Args:
-        clip: what for.
-        q: where they begin; with soft bounds and little damping, or stiff and damped for those that are ``mended``.
-        most: iterations, at most.
-        damping: with which they begin; None: what goes with their ending.
-        until: what ends them before: bounds that are ready to get stiffer, or steps that gain little (static).
+        clip: inputs of the plan.
+        q: initial configurations. (F, nq)
+        most: largest number of iterations.
+        damping: initial damping; None: that of ``_START[until]``.
+        until: what ends the iterations early: bounds ready to get stiffer, or steps of little gain (static).
     """
     descended = _by_kernel if takes("auto", "core", fits=True) else _descended_plain
     damping = _START[until][1] if damping is None else damping
@@ -246,7 +250,7 @@ def _descended_plain(
     *,
     until: _Ending,
 ) -> Plan:
-    """The same in plain JAX."""
+    """Run the iterations of a plan in plain JAX."""
     stiffness, usual, little = _START[until]
 
     def goes_on(state: _State) -> Bool[Array, ""]:
@@ -266,7 +270,10 @@ def _descended_by_core(
     *,
     until: _Ending,
 ) -> Plan:
-    """The same of a batch, on a CPU and in double precision; what all lanes share has an axis of length 1."""
+    """Run the iterations of a batch of plans in the core, on a CPU in double precision.
+
+    Arrays that all lanes share have an axis of length 1.
+    """
     endings = float(until == "ready"), float(until in ("settled", "mended"))
     stiffness, _, little = _START[until]
     rules = (_LARGEST_STEP, _STIFFENING, _SLOWING, _FIXED, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING, _CALMER)
@@ -278,7 +285,7 @@ _by_kernel = by_kernel(_descended_plain, _descended_by_core)
 
 
 def _improved(clip: _Clip, state: _State, little: float = _LITTLE) -> _State:
-    """One system solved, and its step taken if it makes things better."""
+    """Solve one damped system and take its step if it reduces the cost."""
     robot, here = clip.body.robot, state.here
     free = clip.free[:, None]
     held = jnp.where(free == 1.0, state.damping, _FIXED)
@@ -306,13 +313,13 @@ def _improved(clip: _Clip, state: _State, little: float = _LITTLE) -> _State:
 
 
 def _weights_between(goals: Goals, weights: Weights) -> Float[Array, "F 4"]:
-    """Of each frame's standing points, what their motion since the frame before weighs; 0 in the first."""
+    """Return the weight of each contact point's motion since the frame before; 0 in the first frame. (F, 4)."""
     both = goals.contact[1:] * goals.contact[:-1]
     return weights.stance * jnp.concatenate([jnp.zeros_like(both[:1]), both])
 
 
 class _Hinge(NamedTuple):
-    """Weight and gradient of what a quantity costs: smooth, and stiff beyond a bound."""
+    """Weight, gradient and cost of a quantity with a quadratic cost and a stiff penalty beyond a bound."""
 
     weight: Float[Array, "F nv"]
     gradient: Float[Array, "F nv"]
@@ -327,7 +334,10 @@ def _hinge(
     limit: Float[Array, ""],
     stiffness: Float[Array, ""],
 ) -> _Hinge:
-    """What is beyond a bound counts as a share of it: limits are kept as well at any rate of frames."""
+    """Return the cost terms of a quantity.
+
+    The excess counts relative to its bound, which makes it independent of the rate.
+    """
     over = value - jnp.clip(value, -bound, bound)
     beyond = jnp.where(over != 0.0, limit / bound**2, 0.0)
     pull = smooth * value + stiffness * beyond * over
@@ -335,12 +345,12 @@ def _hinge(
 
 
 def _halves(weight: Float[Array, "F n"] | Float[Array, " n"], residual: Float[Array, "F n"]) -> Float[Array, " F"]:
-    """Of each frame, half the weighted sum of squares."""
+    """Return half the weighted sum of squares of each frame. (F,)."""
     return 0.5 * jnp.sum(weight * residual**2, -1)
 
 
 def _between(body: Body, q, goals: Goals, weights: Weights, bounds: Bounds, stiffness):
-    """Steps from frame to frame, and their changes."""
+    """Return the cost terms of the steps between frames and of the changes of these steps."""
     robot = body.robot
     joints = scalar_layout(robot)[0]
     smooth = jnp.where(joints, weights.smooth, weights.smooth_base)
@@ -380,7 +390,7 @@ def _linearised(clip: _Clip, q: Float[Array, "F nq"], stiffness: Float[Array, ""
 
 
 def _with_steps(here: _Linearised, steps: _Hinge, changes: _Hinge) -> _Linearised:
-    """With what the dofs' speeds and accelerations cost.
+    """Add the cost terms of the dofs' speeds and accelerations to the system.
 
     ``step_t = q_t+1 - q_t`` has derivatives (-1, 1), ``change_t = q_t+2 - 2 q_t+1 + q_t`` has (1, -2, 1).
     """

@@ -1,6 +1,6 @@
-"""Plans on a CPU by the compiled core (``core/clip_plan.hpp``), called from JAX.
+"""Plans computed on a CPU by the compiled core (``core/clip_plan.hpp``) through XLA's FFI.
 
-It computes what ``_plan.py`` says, in double precision; that file is the definition, and what runs elsewhere.
+The result is that of ``_plan.py``, which is the definition, in double precision.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ def descended(
     most: Int[Array, " _"],
     endings: tuple[float, float],
 ) -> tuple[Array, Array, Array]:
-    """Configurations, costs and iterations of a batch of clips.
+    """Return configurations, costs and iteration counts of a batch of clips.
 
     Args:
         body: the robot.
-        goals: of the frames.
-        weights: of the goals.
-        bounds: of the joints.
-        free: 1 for frames that may move.
-        q: where it begins.
-        rules: numbers of the method.
-        damping: with which it begins.
-        most: iterations, at most.
-        endings: whether it ends when bounds are ready to get stiffer, and when steps gain little.
+        goals: goals of the frames.
+        weights: weights of the cost terms.
+        bounds: joint bounds.
+        free: 1 for frames that may move, 0 for past frames.
+        q: initial configurations.
+        rules: constants of the method, in the order of ``_plan.py``.
+        damping: initial damping.
+        most: largest number of iterations.
+        endings: whether it ends when bounds are ready to get stiffer, and when steps gain little (0 or 1 each).
     """
     frames, nq = q.shape[1:]
     integers = _structure(body)
@@ -65,7 +65,7 @@ def descended(
 
 
 def _structure(body: Body) -> np.ndarray:
-    """Return the core's integers, those of ``ClipRobot`` in ``core/clip_frames.hpp``."""
+    """Return the integer arrays of ``ClipRobot`` in ``core/clip_frames.hpp``."""
     tree = body.robot.tree
     places = np.array([tree.frame_bodies[tree.frame(name)] for name in body.frames])
     columns, _ = dof_columns(tree)
@@ -98,7 +98,7 @@ def _structure(body: Body) -> np.ndarray:
 
 
 def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"]:
-    """Return the core's numbers of robot, profile and weights, those of ``ClipRobot``; the stiffness is 0 here."""
+    """Return the float arrays of ``ClipRobot``: robot, profile and weights; the stiffness entry is 0. (_, k)."""
     none = np.zeros(1)
     balance = (none, none) if body.inside is None else (weights.balance, body.inside)
     robot, ids = body.robot, np.array([body.robot.tree.frame(name) for name in body.frames])

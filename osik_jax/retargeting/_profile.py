@@ -1,4 +1,4 @@
-"""What is known of a robot: which of its frames are a person's joints, where its soles are, what it is taken for."""
+"""Profile of a robot: frames that stand for a person's joints, soles, collision capsules, scale and weights."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Foot:
     """A foot's sole.
 
     Attributes:
-        frame: of the robot; x forward, z up when the foot stands.
-        heel: the rear left and the rear right corner [m].
-        toe: the front left and the front right corner [m].
+        frame: a frame of the robot with x forward and z up when the foot stands.
+        heel: the rear left and the rear right corner in that frame [m].
+        toe: the front left and the front right corner in that frame [m].
     """
 
     frame: str
@@ -31,7 +31,7 @@ class Foot:
 
 @dataclasses.dataclass(frozen=True)
 class Capsule:
-    """What a link is taken for: all points within a radius of a segment [m]."""
+    """Collision capsule of a link: all points within a radius of a segment in a frame [m]."""
 
     frame: str
     start: Point
@@ -39,23 +39,23 @@ class Capsule:
     radius: float
 
     def hides(self, other: Capsule) -> bool:
-        """Whether another is inside this one, about the same segment."""
+        """Return whether another capsule is inside this one, about the same segment."""
         return dataclasses.replace(other, radius=self.radius) == self and other.radius < self.radius
 
 
 @dataclasses.dataclass(frozen=True)
 class Profile:
-    """A robot as retargeting sees it.
+    """Mapping from a person to a robot, with shapes and weights.
 
     Attributes:
-        keypoints: of each of a person's joints, its place on the robot: hips, knees, ankles, shoulders, elbows, wrists.
-        pelvis: the frame that turns as the person's pelvis; x forward, z up.
-        torso: the frame that turns as the person's chest; None: the robot's trunk does not bend.
+        keypoints: place on the robot of each of a person's hips, knees, ankles, shoulders, elbows and wrists.
+        pelvis: the frame that follows the orientation of the person's pelvis; x forward, z up.
+        torso: the frame that follows the orientation of the person's chest; None: the robot's trunk is rigid.
         feet: the left and the right foot.
-        capsules: shapes that are kept from each other and above the floor.
-        scale: robot over person: what the person's path is multiplied with; None: the ratio of their legs, and stretch.
-        stretch: what the ratio of legs is multiplied with.
-        weights: of what the robot is asked for.
+        capsules: shapes that are kept apart and above the floor.
+        scale: factor on the person's path; None: the ratio of leg lengths times ``stretch``.
+        stretch: factor on the ratio of leg lengths.
+        weights: weights of the cost terms.
     """
 
     keypoints: Mapping[str, Place]
@@ -80,14 +80,14 @@ class Profile:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """All frames that it speaks of, each once."""
+        """Return all frames that the profile names, each once."""
         places = [*self.keypoints.values(), *self.corners, *((c.frame, c.start) for c in self.capsules)]
         trunk = [self.pelvis, *([] if self.torso is None else [self.torso])]
         return tuple(dict.fromkeys([*trunk, *(frame for frame, _ in places)]))
 
     @property
     def corners(self) -> tuple[Place, ...]:
-        """The soles' corners: of the left foot, two of the heel and two of the toe, then of the right."""
+        """Return the soles' corners: of the left foot two heel and two toe corners, then of the right foot."""
         return tuple(
             (self.feet[side].frame, point)
             for side in ("left", "right")

@@ -1,4 +1,4 @@
-"""Profiles as TOML files, and those that come with the package."""
+"""Profiles as TOML files, and the profiles bundled with the package."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BUNDLED = ("nao", "g1", "talos")
 
 
 def load_profile(path: str | os.PathLike[str]) -> Profile:
-    """Reads a profile from a TOML file, or one that comes with the package: ``"nao"``, ``"g1"``, ``"talos"``.
+    """Read a profile from a TOML file, or a bundled one: ``"nao"``, ``"g1"``, ``"talos"``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -38,12 +38,12 @@ def load_profile(path: str | os.PathLike[str]) -> Profile:
 
 
 def save_profile(profile: Profile, path: str | os.PathLike[str]) -> None:
-    """Writes a profile as a TOML file that ``load_profile`` reads."""
+    """Write a profile as a TOML file for ``load_profile``."""
     Path(path).write_text(profile_text(profile), encoding="utf-8")
 
 
 def find_profile(robot: Robot) -> Profile:
-    """The profile that comes with the package whose frames a robot all has, or a guess (``guess_profile``).
+    """Return the bundled profile whose frames a robot all has, else a guess (``guess_profile``).
 
     Raises:
         ValueError: as in ``guess_profile``.
@@ -56,13 +56,13 @@ def find_profile(robot: Robot) -> Profile:
 
 
 def check_profile(robot: Robot, profile: Profile) -> None:
-    """Raises KeyError where a profile speaks of a frame that the robot does not have."""
+    """Raise KeyError if a profile names a frame that the robot does not have."""
     for frame in profile.frames:
         robot.tree.frame(frame)
 
 
 def profile_text(profile: Profile) -> str:
-    """A profile in TOML."""
+    """Return a profile as TOML text."""
     lines = [f'pelvis = "{profile.pelvis}"']
     lines += [] if profile.torso is None else [f'torso = "{profile.torso}"']
     lines += [] if profile.scale is None else [f"scale = {profile.scale!r}"]

@@ -1,4 +1,4 @@
-"""How good a retargeted motion is, recomputed from its file's numbers by MuJoCo's own C code."""
+"""Quality report of a retargeted motion, recomputed by MuJoCo's C code from the numbers of its file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ._retargeted import Retargeted
 from ._roles import LIMBS, SIDES
 
 JUMP = 15.0
-"""A change of joint speed from one frame to the next that counts as a jump [rad/s]."""
+"""Change of a joint's speed between two frames that counts as a jump [rad/s]."""
 _CHAINS = {
     f"{side}_{limb}": tuple(f"{side}_{role}" for role in roles)
     for side in SIDES
@@ -28,17 +28,15 @@ _CHAINS = {
 
 
 def report(result: Retargeted) -> dict[str, Any]:
-    """Figures of a retargeted motion: lengths in mm, angles in rad but for ``segment_angle_deg``.
+    """Return the figures of a retargeted motion; lengths in mm, angles in rad except ``segment_angle_deg``.
 
-    ``joints``: how far joints are beyond their ranges, speed over its limit, accelerations and jerks (``rms``: root of
-    the mean square over joints and frames), and frames with a jump of more than 15 rad/s. ``feet``: how far points that
-    stand move from where they landed (``slip``), how high they are (``float``), and how deep soles are below the floor.
-    ``balance``: in frames in which both feet stand, how often the centre of mass is over the hull of what stands of
-    them, and how far inside its edge it is at least (outside: minus how far it is beyond an edge's line).
-    ``shapes``: how deep the profile's capsules are in each other.
-    ``tracking``: keypoints against the person's, limb by limb, with the scale that fits each limb best; and the angle
-    between the person's segments and the robot's.
-    ``notes``: sentences on bounds that gave way, and on feet that stand in less than 20 % of the frames.
+    ``joints``: largest excess beyond ranges and speed limits, accelerations and jerks (``rms``: root mean square over
+    joints and frames), and frames with a speed jump over 15 rad/s. ``feet``: distance of contact points from their
+    landing place (``slip``), their height (``float``), and depth of soles below the floor. ``balance``: in double
+    support, the share of frames with the centre of mass over the support polygon, and its least distance inside the
+    edge (negative outside). ``shapes``: depth of overlaps between the profile's capsules. ``tracking``: keypoint errors
+    per limb, at the scale that fits each limb best, and the angle between the person's segments and the robot's.
+    ``notes``: sentences on violated bounds and on clips whose feet stand in less than 20 % of the frames.
     """
     places = find_places(result.robot, result.profile, _in_model(result))
     figures = {
@@ -56,7 +54,7 @@ def report(result: Retargeted) -> dict[str, Any]:
 
 
 def _in_model(result: Retargeted) -> Float[np.ndarray, "F nq"]:
-    """Configurations of the robot's MuJoCo model."""
+    """Return the motion as configurations of the robot's MuJoCo model. (F, nq of the model)."""
     index, coefficient = result.robot.tree.qpos_source
     return result.q[:, index] * coefficient + np.asarray(result.robot.qpos_offset)
 
@@ -82,7 +80,7 @@ def _joints(result: Retargeted) -> dict[str, Any]:
 
 
 def _rms(values: np.ndarray) -> float:
-    """The root of the mean square; 0 of none."""
+    """Return the root mean square, or 0 for an empty array."""
     return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
@@ -121,7 +119,7 @@ def _balance(
 
 
 def _penetration(result: Retargeted, ends: Float[np.ndarray, "F k 2 3"]) -> float | None:
-    """The deepest overlap of two capsules that three joints or more are between and that are apart at home [mm]."""
+    """Return the deepest overlap [mm] of the capsule pairs with three or more joints between them and a gap at home."""
     profile = result.profile
     if not profile.capsules:
         return None
@@ -154,7 +152,7 @@ def _pairs(result: Retargeted, model: mujoco.MjModel, data: mujoco.MjData) -> li
 
 
 def _capsule_model(profile: Profile) -> mujoco.MjModel:
-    """Free-standing capsules, in the profile's order."""
+    """Return a MuJoCo model with the profile's capsules as free mocap bodies."""
     spec = mujoco.MjSpec()
     for c in profile.capsules:
         half = 0.5 * float(np.linalg.norm(np.subtract(c.end, c.start)))
@@ -164,7 +162,7 @@ def _capsule_model(profile: Profile) -> mujoco.MjModel:
 
 
 def _place(model: mujoco.MjModel, data: mujoco.MjData, ends: Float[np.ndarray, "k 2 3"]) -> None:
-    """Puts each capsule between its two ends."""
+    """Move each capsule between its two given ends."""
     data.mocap_pos[:] = ends.mean(1)
     for k, along in enumerate(ends[:, 1] - ends[:, 0]):
         mujoco.mju_quatZ2Vec(data.mocap_quat[k], along)
@@ -188,6 +186,6 @@ def _tracking(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) ->
 
 
 def _angle(a: Float[np.ndarray, "F 3"], b: Float[np.ndarray, "F 3"]) -> float:
-    """The mean angle between vectors [deg]."""
+    """Return the mean angle between two sequences of vectors [deg]."""
     across, along = np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, -1)
     return float(np.degrees(np.arctan2(across, along)).mean())

@@ -7,21 +7,21 @@ import numpy as np
 from ._motion import HumanMotion
 
 _LIKE = np.radians(30.0)
-"""How far joints are turned beside the root at most in what is taken for the rest pose: CMU's files have legs 21
-degrees from it in their first frame [rad]."""
+"""Largest rotation of a joint relative to the root in a frame taken for the rest pose [rad]; legs in CMU files have 21
+degrees in their first frame.
+"""
 _FASTEST = 5.0
-"""Speed of a joint beside the root above which the step out of the rest pose may be a jump [m/s]."""
+"""Speed of a joint relative to the root above which the step out of the rest pose counts as a jump [m/s]."""
 _ABOVE_ALL = 3.0
-"""By how much that step is longer than any other of the clip, at least."""
+"""Least ratio of that step to every other step of the clip."""
 
 
 def rest_frames(motion: HumanMotion) -> int:
-    """How many frames at the start of a clip are the rest pose, put before the motion: 0 but where that is sure.
+    """Return the number of rest-pose frames put before a clip's motion; 0 unless that is certain.
 
-    All joints are turned as the root there, within 30 degrees, and a jump comes after them: from the last of them to
-    the next frame a joint moves beside the root at more than 5 m/s, and three times as far as in any other step of the
-    clip. So a person who stands in the rest pose and goes on from there loses no frame. Where rotations or the rest
-    pose are not known it is 0.
+    In these frames all joints are rotated as the root within 30 degrees. The step to the next frame moves a joint
+    relative to the root at over 5 m/s, and three times farther than any other step of the clip. So a person who starts
+    from the rest pose loses no frame. 0 if rotations or the rest pose are unknown.
     """
     turns = motion.rotations
     if turns is None or motion.rest_positions is None or motion.frames < 3:

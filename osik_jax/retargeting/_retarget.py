@@ -1,4 +1,4 @@
-"""From a person's motion to a robot's."""
+"""Retargeting of recorded clips, one or many, to one robot."""
 
 from __future__ import annotations
 
@@ -45,17 +45,17 @@ _Checked = tuple[Source, Mapping[str, str]]
 
 
 class Retargeter(OnRobot):
-    """Retargets any number of clips to one robot; what does not depend on the clip is computed once.
+    """Retargeter for any number of clips to one robot; data that does not depend on the clip is computed once.
 
     Args:
-        robot: with a free base, two legs and two arms; x forward, y left, z up at home.
-        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
-        acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
-        smoothness: what is faster than about this time is smoothed out [s]: accelerations weigh, beside directions of
-            limbs, with its fourth power. 0: nothing but what the profile's weights say. Changing it compiles nothing.
-        balance: how far inside the edge of what stands the centre of mass is kept where both feet stand [m], and at
-            most a third of that polygon's width; a bound of the plan. None: it is where it falls.
-        max_iterations: of the plan.
+        robot: robot with a free base, two legs and two arms; x forward, y left, z up at home.
+        profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
+        acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+        smoothness: time below which motion is smoothed out [s]: its fourth power is added to the weight of
+            accelerations, relative to 1 for limb directions. 0: the profile's weights only. Changes do not recompile.
+        balance: margin of the centre of mass inside the support polygon in double support [m], at most a third of the
+            polygon's width; a bound of the plan. None: not bounded.
+        max_iterations: largest number of iterations of the plan.
 
     Raises:
         ValueError: no two legs and two arms are found, or a number is out of range.
@@ -81,7 +81,7 @@ class Retargeter(OnRobot):
     def retarget(
         self, motion: Source, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
     ) -> Retargeted:
-        """The robot does what a person did; see ``retarget``."""
+        """Retarget one clip; see the function ``retarget``."""
         clip = self._prepared(motion, mapping, fps)
         weights = self.profile.weights.smoother(self.smoothness, clip.dt)
         plan = make_plan(self._body, clip.goals, weights, clip.bounds, clip.start, self.max_iterations)
@@ -98,16 +98,16 @@ class Retargeter(OnRobot):
         out: str | os.PathLike[str] | None = None,
         progress: bool = True,
     ) -> list[Retargeted]:
-        """Many clips of any lengths, some at a time, in one program for all clips of about one length.
+        """Retarget clips of any lengths in batches; clips of similar length share one compiled program.
 
         Args:
             motions: the clips.
-            mapping: as of ``retarget``, the same for all.
+            mapping: as of ``retarget``, the same for all clips.
             fps: as of ``retarget``.
-            chunk: how many are worked on at once, and saved in ``out``; about 100 kB of memory a frame of each. On a
-                CPU without ``out`` as many are as there are cores.
-            out: a folder for what is finished, so that a job that was killed goes on where it was
-                (``osik_jax.scaling.run_in_chunks``). None: none.
+            chunk: clips per batch, and per file in ``out``; takes about 100 kB of memory per frame of each clip. On a
+                CPU without ``out``, one clip per core.
+            out: folder for finished batches, from which an interrupted job resumes
+                (``osik_jax.scaling.run_in_chunks``). None: nothing is saved.
             progress: whether to show a bar.
 
         Returns:
@@ -146,11 +146,11 @@ class Retargeter(OnRobot):
         return [found[i] for i in range(len(clips))]
 
     def _prepared(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
-        """What a clip asks for, in the form that is computed with."""
+        """Return a clip as arrays for planning, after checking it."""
         return self._read(*_checked(motion, mapping, fps))
 
     def _read(self, motion: Source, roles: Mapping[str, str]) -> Clip:
-        """The same of a clip that can be read, whose joints have these names."""
+        """Return a checked clip as arrays for planning; ``roles`` maps roles to the clip's joint names."""
         person = motion.person() if isinstance(motion, SourceMotion) else read_person(motion, roles)
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
@@ -158,9 +158,9 @@ class Retargeter(OnRobot):
         return Clip(person, motion.frames, goals, start, self._bounds(dt), dt)
 
     def _solved(self, clips: Sequence[Clip], length: int, lanes: int) -> list[Callable[[], Retargeted]]:
-        """Clips of at most so many frames (``shared_length`` or more).
+        """Retarget clips of at most ``length`` frames (``shared_length`` or more).
 
-        ``lanes`` is of how many clips the program is that works on all at once, where there is one: at least these.
+        ``lanes``: the batch size of the compiled program, at least the number of clips.
 
         Returns:
             for each clip a function that makes its record; it raises ValueError where the motion is not finite.
@@ -177,12 +177,12 @@ class Retargeter(OnRobot):
 
     @property
     def _shared(self) -> tuple[Any, ...]:
-        """What all lanes have in common, as ``solve_lanes`` takes it."""
+        """Return the arguments of ``solve_lane`` that all lanes share."""
         smoothness = np.asarray(self.smoothness, self._build.start.dtype)
         return self._body, self.profile.weights, self.limits, np.asarray(self.max_iterations), smoothness
 
     def _made_by_a_core(self, checked: _Checked) -> Retargeted:
-        """A clip from reading to its record: while one thread holds Python's lock for that, others compute."""
+        """Retarget one checked clip in one thread; other threads compute while this one holds the GIL."""
         clip = self._read(*checked)
         solved = solve_lane(as_lane(clip, shared_length(clip)), *self._shared)
         return self._finished(clip, jax.tree.map(np.asarray, solved))
@@ -195,7 +195,7 @@ class Retargeter(OnRobot):
 
 
 def _checked(motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
-    """A clip at the rate that is asked for, if it can be retargeted, and its joints by role."""
+    """Return a clip at the requested rate and its joints by role, or raise ValueError if it cannot be retargeted."""
     motion = motion if fps is None else motion.resampled(fps)
     if motion.frames < 3:
         raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
@@ -221,29 +221,29 @@ def retarget(
     balance: float | None = None,
     max_iterations: int = 100,
 ) -> Retargeted:
-    """The robot does what a person did: limbs in the same directions, feet that stay where they stand.
+    """Retarget a person's motion to a robot: limbs keep their directions, standing feet keep their place.
 
-    Two passes. The plan looks at all frames at once: directions of limbs, turns of pelvis, chest and feet, and the path
-    of the hips, scaled by the legs, are wishes with weights. That heels and toes that stand do not move and are at
-    height 0, that nothing is below the floor, that shapes are apart and joints inside their ranges, speeds and
-    accelerations, weighs a thousand times more and up. The last pass follows the plan inside limits of position, speed
-    and acceleration that hold exactly; ``Retargeted.off_plan`` says by how much they held it back.
+    The plan optimises all frames at once. Weighted goals are limb directions, orientations of pelvis, chest and feet,
+    and the hip path scaled by leg length. Contacts at height 0 that do not move, clearance above the floor and between
+    shapes, and limits of position, speed and acceleration weigh at least a thousand times more. The last pass follows
+    the plan inside limits of position, speed and acceleration that hold exactly; ``Retargeted.off_plan`` is the
+    remaining distance.
 
     Args:
-        robot: with a free base, two legs and two arms; x forward, y left, z up at home.
-        motion: the clip of a person, or of another robot (``SourceMotion``).
-        profile: how the robot is seen. None: the package's own for NAO, G1 and Talos, or a guess (``find_profile``).
-        mapping: role to the clip's name of it, see ``find_roles``. None: by the names that files use.
-        fps: frames a second of the result; None: the clip's.
-        acceleration: greatest acceleration of all joints, or by joint name or glob [rad/s^2 or m/s^2].
-        smoothness: what is faster than about this time is smoothed out [s]; 0: nothing (see ``Retargeter``).
-        balance: how far inside the edge of what stands the centre of mass is kept where both feet stand [m]; None: it
-            is where it falls (see ``Retargeter``).
-        max_iterations: of the plan.
+        robot: robot with a free base, two legs and two arms; x forward, y left, z up at home.
+        motion: clip of a person, or of another robot (``SourceMotion``).
+        profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
+        mapping: role to joint name of the clip, see ``find_roles``. None: by common names.
+        fps: frame rate of the result [1/s]; None: that of the clip.
+        acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
+        smoothness: time below which motion is smoothed out [s]; 0: none (see ``Retargeter``).
+        balance: margin of the centre of mass inside the support polygon in double support [m]; None: not bounded (see
+            ``Retargeter``).
+        max_iterations: largest number of iterations of the plan.
 
     Raises:
-        ValueError: the clip has no three frames, joints that are needed are missing from it, or the robot has no two
-            legs and two arms.
+        ValueError: the clip has fewer than three frames or lacks a needed joint, or the robot does not have two legs
+            and two arms.
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
     own = Retargeter(

@@ -1,4 +1,4 @@
-"""A robot's motion, and the person's that it was made from."""
+"""Record of a retargeted motion together with the person's motion."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from ._robot_motion import RobotMotion, in_mujoco_order
 
 @dataclasses.dataclass(frozen=True)
 class Retargeted:
-    """A robot's motion, and the person's that it was made from.
+    """Retargeted motion of a robot, with the person's motion it was made from.
 
     Attributes:
         robot: the robot.
-        profile: how it was seen.
-        motion: in MuJoCo's order: what files hold.
+        profile: its profile.
+        motion: the motion in MuJoCo's order, as written to files.
         q: configurations of ``robot``. (F, nq)
-        human: where the person's joints were, the floor at height 0 [m]. (F, J, 3)
-        human_names: of them: roles, and ``root``, the midpoint of the hips.
+        human: positions of the person's joints, floor at height 0 [m]. (F, J, 3)
+        human_names: roles of these joints, and ``root``, the midpoint of the hips.
         contact: whether left heel, left toe, right heel and right toe stand. (F, 4)
-        iterations: systems that the plan took; 0 where it was made frame by frame.
-        cost: what is left of the wishes, and of the bounds that have to hold; 0 where it was made frame by frame.
-        off_plan: how far the farthest joint is from the plan in each frame because a limit held it [rad or m]. (F,)
+        iterations: iterations of the plan; 0 for a live stream.
+        cost: final cost of the goals, and of the violated bounds; 0 for a live stream.
+        off_plan: largest distance of a joint from the plan in each frame because of a limit [rad or m]. (F,)
     """
 
     robot: Robot
@@ -44,7 +44,10 @@ class Retargeted:
     off_plan: Float[np.ndarray, " F"]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes an ``.npz`` with ``fps``, ``qpos``, ``joint_names``, ``human``, ``human_names`` and ``contact``."""
+        """Write an ``.npz`` file.
+
+        Arrays: ``fps``, ``qpos``, ``joint_names``, ``human``, ``human_names``, ``contact`` and ``ground`` (0).
+        """
         np.savez_compressed(
             Path(path),
             fps=self.motion.fps,
@@ -60,7 +63,7 @@ class Retargeted:
 def as_retargeted(
     robot: Robot, profile: Profile, person: Person, q: Float[np.ndarray, "F nq"], off_plan: Float[np.ndarray, " F"]
 ) -> Retargeted:
-    """The record of a motion that was made from a person's."""
+    """Return the record of a motion made from a person's motion."""
     return Retargeted(
         robot=robot,
         profile=profile,

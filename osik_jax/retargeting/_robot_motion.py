@@ -1,4 +1,4 @@
-"""Motions of robots in MuJoCo's order: what retargeting writes, and reads back."""
+"""Robot motions in MuJoCo's order, as written and read by retargeting."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from ._rotations import slerp
 
 @dataclasses.dataclass(frozen=True)
 class RobotMotion:
-    """A robot's motion.
+    """Motion of a robot in MuJoCo's joint order.
 
     Attributes:
-        fps: frames a second.
-        joint_names: in the order of the columns of ``qpos`` after the free joint's seven.
-        qpos: position of the base [m], its quaternion w x y z, then one number a joint [rad or m]. (F, 7 + joints)
-        contact: whether left heel, left toe, right heel and right toe stand; None: not known. (F, 4)
+        fps: frame rate [1/s].
+        joint_names: joints of the columns of ``qpos`` after the seven of the free joint.
+        qpos: position of the base [m], its quaternion w x y z, then one number per joint [rad or m]. (F, 7 + joints)
+        contact: whether left heel, left toe, right heel and right toe stand; None: unknown. (F, 4)
 
     Raises:
         ValueError: shapes that do not agree, numbers that are not finite, or quaternions that are not of unit length.
@@ -55,7 +55,7 @@ class RobotMotion:
             raise OsikValueError(f"contact has shape {np.shape(self.contact)}, expected {(len(self.qpos), 4)}")
 
     def resampled(self, fps: float) -> RobotMotion:
-        """The same motion at another rate: joints by straight lines, the base's turn by spherical interpolation.
+        """Return the motion at another rate: linear interpolation of joints, spherical interpolation of the base.
 
         Raises:
             ValueError: a rate that is not positive.
@@ -73,13 +73,13 @@ class RobotMotion:
 
 
 def joints_in_mujoco_order(robot: Robot) -> tuple[str, ...]:
-    """Return the joints of the columns of a ``RobotMotion`` with all joints of the robot's model."""
+    """Return the names of all joints of the robot's model but the free joint, in the order of ``RobotMotion``."""
     tree = robot.tree
     return tuple(name for name, kind in zip(tree.joint_names, tree.joint_types, strict=True) if kind != FREE)
 
 
 def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
-    """A motion with all joints of the robot's model, those that are locked and those that follow others too."""
+    """Return a motion with all joints of the robot's model, locked and coupled joints included."""
     tree = robot.tree
     index, coefficient = tree.qpos_source
     qpos = q[:, index] * coefficient + np.asarray(robot.qpos_offset)
@@ -94,12 +94,12 @@ def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> R
 def load_robot_motion(
     path: str | os.PathLike[str], *, joint_names: Sequence[str] | None = None, fps: float | None = None
 ) -> RobotMotion:
-    """Reads a robot's motion: ``motion.npz``, or a CSV without headings with the quaternion as x y z w.
+    """Read a robot's motion: ``motion.npz``, or a CSV without headings with the quaternion as x y z w.
 
     Args:
         path: the file, ``.npz`` or ``.csv``.
-        joint_names: of a CSV, the joints of its columns; a ``.npz`` has them.
-        fps: of a CSV; a ``.npz`` has it.
+        joint_names: joints of a CSV's columns; a ``.npz`` contains them.
+        fps: frame rate of a CSV [1/s]; a ``.npz`` contains it.
 
     Raises:
         FileNotFoundError: no such file.
@@ -129,7 +129,7 @@ def load_robot_motion(
 
 
 def write_csv(motion: RobotMotion, path: str | os.PathLike[str]) -> None:
-    """Writes the CSV that GMR's and mjlab's users load: position, quaternion x y z w, joints; no headings."""
+    """Write the CSV layout of GMR and mjlab: position, quaternion x y z w, joints; no headings."""
     columns = [0, 1, 2, 4, 5, 6, 3, *range(7, motion.qpos.shape[1])]
     np.savetxt(path, motion.qpos[:, columns], fmt="%.9g", delimiter=",")
 

@@ -1,4 +1,4 @@
-"""Names of a person's joints and limbs, as retargeting calls them."""
+"""Names of a person's joints and limbs in retargeting."""
 
 LIMBS = (
     ("left_hip", "left_knee"),
@@ -10,8 +10,8 @@ LIMBS = (
     ("right_shoulder", "right_elbow"),
     ("right_elbow", "right_wrist"),
 )
-"""The segments whose directions are followed: from the first role to the second."""
+"""Segments whose directions are tracked, from the first role to the second."""
 SIDES = ("left", "right")
 NEEDED = tuple(dict.fromkeys(role for limb in LIMBS for role in limb))
-"""Roles that every person has."""
+"""Roles that every clip must have."""
 OPTIONAL = ("pelvis", "chest", "neck", "head", "left_heel", "left_toe", "right_heel", "right_toe")

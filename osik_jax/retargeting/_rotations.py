@@ -1,4 +1,4 @@
-"""Rotations of recorded motion in NumPy: quaternions w x y z, any leading shape."""
+"""Rotations of recorded motion in NumPy: quaternions w x y z with any leading shape."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ _UNIT = {"x": 0, "y": 1, "z": 2}
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The Hamilton product: first the rotation b, then a. (..., 4)."""
+    """Return the Hamilton product a b: rotation b first, then a. (..., 4)."""
     w, v = a[..., :1], a[..., 1:]
     s, u = b[..., :1], b[..., 1:]
     return np.concatenate([w * s - np.sum(v * u, -1, keepdims=True), w * u + s * v + np.cross(v, u)], -1)
 
 
 def rotate(quaternion: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Points turned by quaternions of unit length. (..., 3)."""
+    """Return points rotated by unit quaternions. (..., 3)."""
     w, v = quaternion[..., :1], quaternion[..., 1:]
     t = 2.0 * np.cross(v, point)
     return point + w * t + np.cross(v, t)
 
 
 def about(axis: Axis, angle: np.ndarray) -> np.ndarray:
-    """The rotation about a coordinate axis, ``"x"``, ``"y"`` or ``"z"``, by angles [rad]. (..., 4)."""
+    """Return the quaternion of a rotation about a coordinate axis by an angle [rad]. (..., 4)."""
     half = 0.5 * np.asarray(angle, float)
     out = np.zeros((*half.shape, 4))
     out[..., 0], out[..., 1 + _UNIT[axis]] = np.cos(half), np.sin(half)
@@ -31,7 +31,7 @@ def about(axis: Axis, angle: np.ndarray) -> np.ndarray:
 
 
 def continuous(quaternion: np.ndarray) -> np.ndarray:
-    """The same rotations, each with the sign that is nearer to the frame before. (F, ..., 4)."""
+    """Return the same rotations with the quaternion sign nearest to the frame before. (F, ..., 4)."""
     if len(quaternion) < 2:
         return quaternion
     turned = np.sum(quaternion[1:] * quaternion[:-1], -1) < 0.0
@@ -40,7 +40,7 @@ def continuous(quaternion: np.ndarray) -> np.ndarray:
 
 
 def slerp(a: np.ndarray, b: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Spherical interpolation from a to b the short way round, at a part of the way in [0, 1]. (..., 4)."""
+    """Return the spherical interpolation from a to b along the shorter arc, at a fraction in [0, 1]. (..., 4)."""
     dot = np.sum(a * b, -1, keepdims=True)
     b, dot = np.where(dot < 0.0, -b, b), np.clip(np.abs(dot), 0.0, 1.0)
     angle, part = np.arccos(dot), np.asarray(part)[..., None]
@@ -51,5 +51,5 @@ def slerp(a: np.ndarray, b: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrices of quaternions of unit length. (..., 3, 3)."""
+    """Return the rotation matrices of unit quaternions. (..., 3, 3)."""
     return np.stack([rotate(quaternion, axis) for axis in np.eye(3)], -1)

@@ -1,4 +1,4 @@
-"""Which of a clip's joints are which of a person's: names that files use, and a mapping of one's own."""
+"""Assignment of a clip's joints to a person's roles, by common joint names or by a given mapping."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .._errors import OsikValueError, unknown_name
 from ._roles import NEEDED, OPTIONAL, SIDES
 
 ROLES = (*NEEDED, *OPTIONAL)
-"""A person's joints and points, as retargeting calls them."""
+"""All roles: a person's joints and points in retargeting."""
 _LIMB_WORDS = {
     "hip": "upleg upperleg thigh femur hip leg 足",
     "knee": "knee lowerleg lowleg calf shin tibia shank leg ひざ 膝",
@@ -22,39 +22,40 @@ _LIMB_WORDS = {
     "elbow": "elbow forearm lowerarm lowarm farm ulna radius ひじ 肘",
     "wrist": "wrist hand forearmend lowerarmend elbowend 手首",
 }
-"""Words for each joint of a limb, the most specific first. A joint of the clip has one role, so a word that conventions
-use differently is left to the joint further down where a more specific word names the first: Mixamo's ``leg`` is the
-shank (``upleg``, ``leg``), SOMA's the thigh (``leg``, ``shin``); SMPL's ``foot`` is the toe (``ankle``, ``foot``)."""
+"""Words for each joint of a limb, the most specific first. Each joint of the clip gets one role. A word with two
+meanings goes to the lower joint if a more specific word names the upper one: ``leg`` is Mixamo's shank (``upleg``,
+``leg``) but SOMA's thigh (``leg``, ``shin``), and ``foot`` is SMPL's toe (``ankle``, ``foot``).
+"""
 _TRUNK_WORDS = {
     "pelvis": "pelvis hips hip hipcenter midhip spinebase root 下半身",
     "chest": "spine001 spine03 spine2 spine chest spine01 spine1 spinemid t12 torso upperback thorax spine05 上半身",
     "neck": "neck neck01 neck1 lowerneck shouldercenter spineshoulder necknose 首",
     "head": "head 頭",
 }
-"""Words for each joint of the trunk, the preferred one first; ``_trunk`` has the exceptions."""
+"""Words for each joint of the trunk, the preferred one first; ``_trunk`` handles exceptions."""
 _SIDE_WORDS = {"left": ("left", "l", "左"), "right": ("right", "r", "右")}
 _MIDDLE_WORDS = ("", "c", "center")
 _SUFFIX = re.compile(r"(joint|jnt|bone)$")
 _FIRST = re.compile(r"0*1(?=(left|l|左|right|r|右)?$)")
-"""The number of the first of several bones in a row, as of MakeHuman's ``upperleg01.L``."""
+"""Number 1 of the first of several bones in a row, as in MakeHuman's ``upperleg01.L``."""
 _LONGEST_LIST = 400
 
 Part = tuple[str, str]
-"""A side, "" for the trunk, and a word of the tables."""
+"""Side ("" for the trunk) and word of the tables."""
 
 
 def find_roles(joint_names: tuple[str, ...], mapping: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Find which of a clip's joints is which of a person's.
+    """Return the clip's joint for each of a person's roles.
 
-    Names are compared without case and separators, with the word for the side (``left``, ``l``) before or after, and
-    without what all names that are used have in front (``mixamorig:``, ``Character1_``, ``Bip01``).
+    Names are compared without case and separators, with the word for the side (``left``, ``l``) before or after. A
+    prefix common to all used names (``mixamorig:``, ``Character1_``, ``Bip01``) is ignored.
 
     Args:
-        joint_names: the clip's.
-        mapping: role (``ROLES``) to a name of the clip's, where they are not to be guessed.
+        joint_names: joint names of the clip.
+        mapping: role (``ROLES``) to joint name of the clip; None: inferred from the names.
 
     Returns:
-        role to the clip's name of it.
+        role to joint name of the clip.
 
     Raises:
         KeyError: the mapping has a role or a joint that does not exist.
@@ -73,13 +74,13 @@ def find_roles(joint_names: tuple[str, ...], mapping: Mapping[str, str] | None =
 
 
 def _plain(name: str) -> str:
-    """Return a name in small letters, without separators and without a word for joint at its end."""
+    """Return a name in lower case, without separators and without a trailing word for joint."""
     return _SUFFIX.sub("", "".join(c for c in unicodedata.normalize("NFKC", name).lower() if c.isalnum()))
 
 
 @functools.cache
 def _spellings() -> dict[str, Part]:
-    """Return all ways to write a part of the tables: its word with the word for its side before or after."""
+    """Return all spellings of the tables' words: each word with its side before or after it."""
     out: dict[str, Part] = {}
     for side, word in ((side, word) for side in SIDES for word in _limb_words()):
         stem = word.removesuffix("end")
@@ -97,7 +98,7 @@ def _limb_words() -> frozenset[str]:
 
 
 def _readings(plain: str) -> Iterator[tuple[str, Part]]:
-    """Yield what a name may say: its prefix, and the part that the rest of it names."""
+    """Yield the possible readings of a name: a prefix, and the part named by the rest."""
     spellings, first = _spellings(), _FIRST.sub("", plain)
     for start in range(len(plain)):
         part = spellings.get(plain[start:])
@@ -113,7 +114,7 @@ def _readings(plain: str) -> Iterator[tuple[str, Part]]:
 
 
 def _assigned(parts: Mapping[Part, str]) -> dict[str, str]:
-    """Give each role the first of its words that there is and that no role before it has."""
+    """Assign to each role the first of its words that occurs and is not taken by an earlier role."""
     roles = {}
     for side in SIDES:
         taken: set[str] = set()
@@ -126,7 +127,7 @@ def _assigned(parts: Mapping[Part, str]) -> dict[str, str]:
 
 
 def _trunk(parts: Mapping[str, str]) -> dict[str, str]:
-    """Give the trunk's roles the first of their words that there is."""
+    """Assign to each trunk role the first of its words that occurs."""
     words = {role: words.split() for role, words in _TRUNK_WORDS.items()}
     if "spine001" in parts:  # Blender's Rigify: its spine is the pelvis
         words["pelvis"].insert(0, "spine")
@@ -159,7 +160,7 @@ def _check_complete(joint_names: tuple[str, ...], roles: Mapping[str, str]) -> N
 
 
 def _shortened(names: Iterable[str]) -> str:
-    """Return names with commas between them, as many as a message has room for."""
+    """Return names joined by commas, shortened to the length of a message."""
     out, names = "", list(names)
     for count, name in enumerate(names):
         if len(out) + len(name) > _LONGEST_LIST:

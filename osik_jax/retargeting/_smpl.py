@@ -1,4 +1,4 @@
-"""Body poses of SMPL and its relatives, as AMASS has them: rotations of joints, and where the root is."""
+"""Reader of SMPL, SMPL-H and SMPL-X poses in the layout of AMASS: joint rotations and the root's position."""
 
 from __future__ import annotations
 
@@ -37,25 +37,26 @@ _TREE = (
     ("left_wrist", 18, (0.25, 0.0, 0.0)),
     ("right_wrist", 19, (-0.25, 0.0, 0.0)),
 )
-"""Name, parent and offset [m] of the body's joints, y up and facing z, arms to the sides: the order is SMPL's, the
-lengths are round numbers of a person of 1.7 m and not those of SMPL's mesh. Joints of the hands follow, unused."""
+"""Name, parent and offset [m] of the body's joints; y up, facing z, arms to the sides. The order is SMPL's; the lengths
+are round numbers for a person of 1.7 m, not those of SMPL's mesh. Hand joints follow in files and are not used.
+"""
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 _REST = ("rest_joints", "J")
 
 
 def is_smpl(arrays: Mapping[str, np.ndarray]) -> bool:
-    """Whether a file holds poses of SMPL's joints."""
+    """Return whether a file holds poses of SMPL joints."""
     return "trans" in arrays and ("poses" in arrays or {"root_orient", "pose_body"} <= set(arrays))
 
 
 def read_smpl(path: Path, arrays: Mapping[str, np.ndarray]) -> HumanMotion:
     """Return the motion in a file of SMPL, SMPL-H or SMPL-X poses.
 
-    Lengths of bones are the file's (``rest_joints`` or ``J``: joints in the rest pose [m], the body's 22 first), or
-    those of one person of 1.7 m: ``betas`` needs the model's own data, which the file does not have.
+    Bone lengths come from the file (``rest_joints`` or ``J``: joints in the rest pose [m], 22 body joints first).
+    Without them they are those of a person of 1.7 m, because ``betas`` needs the model's own data.
 
     Args:
-        path: of the file.
+        path: path of the file, for error messages.
         arrays: ``poses`` (F, 3 k), rotation vectors of k joints, 22 at least, or ``root_orient`` (F, 3) and
             ``pose_body`` (F, 63); ``trans`` (F, 3) in metres; ``mocap_framerate``, ``mocap_frame_rate`` or ``fps``.
 
@@ -96,7 +97,7 @@ def read_smpl(path: Path, arrays: Mapping[str, np.ndarray]) -> HumanMotion:
 def _forward(
     parents: list[int], offsets: Float[np.ndarray, "J 3"], root: Float[np.ndarray, "F 3"], local: np.ndarray
 ) -> tuple[Float[np.ndarray, "F J 3"], Float[np.ndarray, "F J 4"]]:
-    """Return positions and rotations in the world, of rotations relative to the parents."""
+    """Return positions (F, J, 3) and rotations (F, J, 4) in the world from rotations relative to the parents."""
     positions, rotations = np.zeros((*local.shape[:2], 3)), local.copy()
     positions[:, 0] = root
     for joint, parent in enumerate(parents[1:], 1):

@@ -1,4 +1,4 @@
-"""A robot in place of the person: its motion as retargeting sees it."""
+"""Robot motion used in place of a person's."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from ._roles import LIMBS, SIDES
 
 @dataclasses.dataclass(frozen=True)
 class SourceMotion:
-    """A motion of one robot, for another to follow: ``retarget`` takes it in place of a ``HumanMotion``.
+    """Motion of one robot for another robot to follow; ``retarget`` accepts it in place of a ``HumanMotion``.
 
     Attributes:
         robot: the robot that moves; joints that the motion does not name stay at home.
-        motion: its motion. Where that does not say which heels and toes stand, it is found as of a person.
-        profile: how the robot is seen; None: the package's own or a guess (``find_profile``).
-        name: of the clip, for people.
+        motion: its motion; missing contacts are detected as for a person.
+        profile: its profile; None: a bundled one or a guess (``find_profile``).
+        name: name of the clip, for display.
 
     Raises:
         ValueError: the base does not float, or no profile is found.
@@ -55,20 +55,20 @@ class SourceMotion:
 
     @property
     def fps(self) -> float:
-        """Frames a second."""
+        """Return the frame rate [1/s]."""
         return self.motion.fps
 
     @property
     def frames(self) -> int:
-        """How many frames there are."""
+        """Return the number of frames."""
         return len(self.motion.qpos)
 
     def resampled(self, fps: float) -> SourceMotion:
-        """The same motion at another rate; see ``HumanMotion.resampled``."""
+        """Return the motion at another rate; see ``HumanMotion.resampled``."""
         return dataclasses.replace(self, motion=self.motion.resampled(fps))
 
     def person(self) -> Person:
-        """The robot as a person: directions of its limbs, turns of its trunk, its feet and where they stand."""
+        """Return the robot's motion as that of a person: limb directions, trunk and foot orientations, contacts."""
         profile, fps = self.profile, self.motion.fps
         assert profile is not None
         hips = (profile.keypoints[f"{side}_hip"][0] for side in SIDES)
@@ -120,7 +120,7 @@ def load_source(
         path: the file; a CSV has the robot's joints in MuJoCo's order.
         robot: the robot that moves.
         profile: as of ``SourceMotion``.
-        fps: of a CSV, which does not say it.
+        fps: frame rate of a CSV [1/s].
 
     Raises:
         FileNotFoundError, ValueError, KeyError: as of ``load_robot_motion`` and ``SourceMotion``.

@@ -1,4 +1,4 @@
-"""The exact pass for feet in a stream: what stands stays where it landed, and soles stay above the floor."""
+"""Contact correction of a stream: standing points stay at their landing place, and soles stay above the floor."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from jaxtyping import Array, Bool, Float, Int
 from ..kinematics import forward_kinematics, integrate
 from ._terms import Body, soles
 
+# Bounds the time of a frame; Newton's method converges quadratically.
 _MOST_ITERATIONS = 6
 _SMALL = 1e-6
 """Error at which the iterations end [m]."""
 _DAMPING = 1e-9
-"""Of the rows of rigid feet, some of which are combinations of others, and of rows that are 0 [m^2/rad^2]."""
+"""Damping of the normal equations [m^2/rad^2]: rows of a rigid foot are linearly dependent, and inactive rows are 0."""
 
 
 class Stance(NamedTuple):
-    """Where feet stand.
+    """Contact points and their landing places.
 
     Attributes:
-        landed: x and y of left heel and toe and of right heel and toe where they landed [m]. (4, 2)
-        stands: whether each stands since. (4,)
+        landed: x and y of the landing place of left heel, left toe, right heel and right toe [m]. (4, 2)
+        stands: whether each is in contact since then. (4,)
     """
 
     landed: Float[Array, "4 2"]
@@ -31,14 +32,13 @@ class Stance(NamedTuple):
 
 
 class Held(NamedTuple):
-    """A step that holds the feet.
+    """Step of a robot that holds its contacts.
 
     Attributes:
-        q: the configuration after it. (nq,)
+        q: the configuration after the step. (nq,)
         step: the step [rad or m]. (nv,)
-        stance: where feet stand after it.
-        off: how far a point that stands is from where it landed or from the floor, or a sole below the floor, at most
-            [m].
+        stance: contacts after the step.
+        off: largest distance of a contact point from its landing place or the floor, or of a sole below the floor [m].
     """
 
     q: Float[Array, " nq"]
@@ -63,20 +63,20 @@ def hold_feet(
     contact: Bool[Array, "4"],
     stance: Stance,
 ) -> Held:
-    """Change a step as little as it takes for feet to hold, inside bounds that hold exactly.
+    """Change a step as little as possible so that contacts hold, inside bounds that hold exactly.
 
-    Newton's method on heights of the soles' corners and on the places of what stands; each iteration takes the least
-    change of the step, with the dofs that reached a bound held there. Where the bounds do not allow it, ``off`` says
-    what is left.
+    Newton's method on the heights of the soles' corners and on the places of contact points. Each iteration takes the
+    minimum-norm change of the step; dofs that reach a bound stay there. If the bounds do not allow a solution, ``off``
+    is the remaining error.
 
     Args:
         body: the robot.
         q: configuration before the step.
         step: the step as planned, inside its bounds [rad or m].
-        lower: bounds of the step [rad or m].
-        upper: the other bounds [rad or m].
-        contact: whether left heel, left toe, right heel and right toe stand after it.
-        stance: where feet stood before it.
+        lower: lower bounds of the step [rad or m]. (nv,)
+        upper: upper bounds of the step [rad or m]. (nv,)
+        contact: whether left heel, left toe, right heel and right toe stand after the step. (4,)
+        stance: contacts before the step.
     """
     held = contact & stance.stands
 
@@ -106,7 +106,7 @@ def hold_feet(
 def _rows(
     body: Body, q: Float[Array, " nq"], contact: Bool[Array, "4"], held: Bool[Array, "4"], landed: Float[Array, "4 2"]
 ) -> tuple[Float[Array, "16"], Float[Array, "16 nv"]]:
-    """Return what is off, and its derivative: places of what is held, heights of what stands or is below the floor."""
+    """Return residuals and Jacobian: places of held points, and heights of corners in contact or below the floor."""
     points, rates = soles(body, forward_kinematics(body.robot, q))
     middles, moves = points.reshape(4, 2, 3).mean(1), rates.reshape(4, 2, 3, -1).mean(1)
     counts = jnp.repeat(contact, 2) | (points[:, 2] < 0.0)

@@ -1,4 +1,4 @@
-"""What one configuration has to do with one frame's goals: residuals, their Jacobians and weights."""
+"""Cost terms of one frame: residuals, Jacobians and weights of its goals at a configuration."""
 
 from __future__ import annotations
 
@@ -24,27 +24,28 @@ from ._goals import Goals, Weights
 from ._profile import Place, Profile
 from ._roles import LIMBS
 
+# Guard of a limb's direction: a shorter limb [m] has none.
 SHORTEST = 1e-6
+# Pairs of capsules that get rows; the nearest ones are chosen in each iteration.
 PAIRS = 12
 CLEARANCE, SWINGING = 3e-3, 2e-3
-"""How far soles that do not stand are kept above the floor [m], and what that weighs beside standing."""
+"""Height that swinging soles keep above the floor [m], and the weight of this relative to contacts."""
 
 
 class Body(eqx.Module):
-    """A robot with its profile, in the form that is computed with.
+    """Robot with its profile as arrays for the cost terms.
 
     Attributes:
         robot: the robot.
-        offsets: of each place in its frame [m]. (places, 3)
-        radii: of the capsules [m]. (capsules,)
-        home: how pelvis, chest and feet are turned at home, where the person's axes are the world's. (4, 3, 3)
-        inside: how far inside the edge of the feet the centre of mass is kept [m]; None: it is not.
-        frames: of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static).
+        offsets: position of each place in its frame [m]. (places, 3)
+        radii: radii of the capsules [m]. (capsules,)
+        home: rotation matrices of pelvis, chest and feet at home, where the person's axes equal the world's. (4, 3, 3)
+        inside: margin of the centre of mass inside the support polygon [m]; None: not bounded.
+        frames: frame of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static).
         keys: the role of each keypoint (static).
         bends: whether the trunk bends (static).
-        above: the capsules that are kept above the floor: not the feet's, which have their corners, nor those inside
-            others (static).
-        pairs: the capsules that are kept apart (static).
+        above: capsules kept above the floor: not the feet's, which have corners, nor capsules inside others (static).
+        pairs: pairs of capsules that are kept apart (static).
     """
 
     robot: Robot
@@ -60,7 +61,10 @@ class Body(eqx.Module):
 
     @classmethod
     def of(cls, robot: Robot, profile: Profile, pairs: Sequence[tuple[int, int]], inside: float | None = None) -> Body:
-        """The robot with this profile, whose capsules are kept apart in these pairs."""
+        """Return the arrays for a robot and a profile.
+
+        ``pairs``: the capsules that are kept apart. ``inside``: margin of balance [m], None for no balance.
+        """
         origin = (0.0, 0.0, 0.0)
         places: list[Place] = list(profile.keypoints.values())
         places += [(profile.pelvis, origin), (profile.torso or profile.pelvis, origin)]
@@ -90,7 +94,7 @@ class Body(eqx.Module):
 
 
 class Joints(NamedTuple):
-    """What hinges and slides cost by themselves: residuals and weights, of wishes and of bounds. (nv,) each."""
+    """Residuals and weights of single hinges and slides: of goals (soft) and of bounds (stiff). (nv,) each."""
 
     soft: Float[Array, " nv"]
     soft_weight: Float[Array, " nv"]
@@ -99,16 +103,16 @@ class Joints(NamedTuple):
 
 
 class FrameRows(NamedTuple):
-    """What one frame asks for; what is minimised is half the weighted sum of squared residuals.
+    """Cost terms of one frame; the cost is half the weighted sum of squared residuals.
 
     Attributes:
-        residual: of wishes and of bounds that have to hold. (m,)
-        jacobian: its derivative. (m, nv)
-        soft: weights of wishes, 0 in the rows of bounds. (m,)
-        stiff: weights of bounds, 0 in the rows of wishes. (m,)
-        joints: what each joint costs by itself.
-        stance: x and y of left heel and toe and of right heel and toe. (8,)
-        stance_jacobian: its derivative. (8, nv)
+        residual: residuals of goals and bounds. (m,)
+        jacobian: derivative of ``residual``. (m, nv)
+        soft: weights of goals, 0 in the rows of bounds. (m,)
+        stiff: weights of bounds, 0 in the rows of goals. (m,)
+        joints: terms of single joints.
+        stance: x and y of left heel, left toe, right heel and right toe [m]. (8,)
+        stance_jacobian: derivative of ``stance``. (8, nv)
     """
 
     residual: Float[Array, " m"]
@@ -121,13 +125,13 @@ class FrameRows(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What joints may do. (nv,) each.
+    """Joint bounds of a plan. (nv,) each.
 
     Attributes:
-        lower: end of the range [rad or m], -inf where there is none.
-        upper: the other end.
-        step: greatest change from one frame to the next [rad or m].
-        change: greatest change of that from frame to frame [rad or m].
+        lower: lower end of the range [rad or m], -inf without one.
+        upper: upper end of the range [rad or m], inf without one.
+        step: largest change per frame [rad or m].
+        change: largest change of that step between two frames [rad or m].
     """
 
     lower: Float[Array, " nv"]
@@ -137,9 +141,10 @@ class Bounds(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """How dofs move what is fixed to their bodies: velocities at a point that all share, and angular ones.
+    """Velocity of the bodies per unit rate of each dof, taken at a common origin.
 
-    A direction n at a point p of a body has the rate ``n . (linear + angular x (p - origin))``, where a dof moves it.
+    A direction n at a point p of a body has the rate ``n . (linear + angular x (p - origin))`` for a dof that moves the
+    body.
     """
 
     origin: Float[Array, "3"]
@@ -152,11 +157,11 @@ class _Motion(NamedTuple):
         return cls(origin, jnp.concatenate([linear, kinematics.dof_angular], -1))
 
     def rates(self, moves: Array | np.ndarray, direction: Float[Array, "m 3"], point: Float[Array, "m 3"]) -> Array:
-        """Of points along directions; ``moves`` says which dofs move them. (m, nvfull)."""
+        """Return the rates of points along directions; ``moves`` marks the dofs that move each point. (m, nvfull)."""
         return self._times(moves, jnp.concatenate([direction, cross(point - self.origin, direction)], -1))
 
     def turns(self, moves: Array | np.ndarray, axis: Float[Array, "m 3"]) -> Array:
-        """Angular velocities about axes. (m, nvfull)."""
+        """Return the angular rates about axes. (m, nvfull)."""
         return self._times(moves, jnp.concatenate([jnp.zeros_like(axis), axis], -1))
 
     def _times(self, moves, wrench: Float[Array, "m 6"]) -> Array:
@@ -164,7 +169,7 @@ class _Motion(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Some rows of a frame, their derivatives by all the model's dofs, and a weight of each."""
+    """Rows of a frame: residuals, derivatives by all dofs of the model, and weights."""
 
     residual: Float[Array, " m"]
     rates: Float[Array, "m nvfull"]
@@ -172,7 +177,7 @@ class _Rows(NamedTuple):
 
 
 def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weights, bounds: Bounds) -> FrameRows:
-    """All rows of one frame, and its standing points."""
+    """Return all cost terms of one frame, and its contact points."""
     robot = body.robot
     kinematics = forward_kinematics(robot, q)
     names = tuple(dict.fromkeys(body.frames))
@@ -214,7 +219,7 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
 
 
 def soles(body: Body, kinematics: Kinematics) -> tuple[Float[Array, "8 3"], Float[Array, "8 3 nv"]]:
-    """Return the soles' corners in the world [m], and their derivatives."""
+    """Return the soles' corners in the world [m] and their derivatives. (8, 3), (8, 3, nv)."""
     robot, first = body.robot, len(body.keys) + 4
     frames, offsets = body.frames[first : first + 8], body.offsets[first : first + 8]
     names = tuple(dict.fromkeys(frames))
@@ -228,7 +233,7 @@ def soles(body: Body, kinematics: Kinematics) -> tuple[Float[Array, "8 3"], Floa
 
 
 class _Places(NamedTuple):
-    """Points, how trunk and feet are turned, and which dofs move the bodies that the points are fixed to."""
+    """World points, orientations of trunk and feet, and the dofs that move each point's body."""
 
     points: Float[Array, "k 3"]
     rotations: Float[Array, "4 3 3"]
@@ -237,7 +242,7 @@ class _Places(NamedTuple):
 
 
 def _limbs(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights) -> _Rows:
-    """Direction of each limb less the person's: ``d - u``, with ``d' = (I - d d^T) / length (J_b - J_a)``."""
+    """Return the rows of limb directions: ``d - u``, with derivative ``d' = (I - d d^T) / length (J_b - J_a)``."""
     first, second = (np.array([keys.index(limb[i]) for limb in LIMBS]) for i in range(2))
     across = place.points[second] - place.points[first]
     length = jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), SHORTEST)
@@ -253,7 +258,7 @@ def _limbs(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights
 
 
 def _turn(place: _Places, first: int, i: int, wanted: Float[Array, "3 3"], weight: Float[Array, ""]) -> _Rows:
-    """The rotation vector from the wanted axes to a frame's."""
+    """Return the rows of an orientation: the rotation vector from the wanted axes to the frame's axes [rad]."""
     axes = jnp.eye(3, dtype=wanted.dtype)
     rates = place.motion.turns(place.moves[np.full(3, first + i)], axes)
     return _Rows(rotation_log(dot(place.rotations[i], wanted.T)), rates, jnp.full(3, weight))
@@ -269,16 +274,16 @@ def _root(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights)
 
 
 def _heights(place: _Places, some: slice | np.ndarray) -> tuple[Array, Array]:
-    """Heights of points, and their rates."""
+    """Return the heights of points [m] and their rates."""
     points = place.points[some]
     up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], points.dtype), points.shape)
     return points[:, 2], place.motion.rates(place.moves[some], up, points)
 
 
 def _soles(place: _Places, corners: slice, contact: Float[Array, "4"], weight: Float[Array, ""]) -> _Rows:
-    """Corners that stand are at height 0, the others not below a clearance.
+    """Return the rows of sole corners: height 0 in contact, at least the clearance otherwise.
 
-    Those weigh less, for they come and go from one iteration to the next: the clearance is there to be dipped into.
+    Corners without contact weigh less, because their rows switch between iterations; the clearance may be entered.
     """
     height, rates = _heights(place, corners)
     stands = jnp.repeat(contact, 2) > 0.5
@@ -287,7 +292,7 @@ def _soles(place: _Places, corners: slice, contact: Float[Array, "4"], weight: F
 
 
 def _stance(place: _Places, corners: slice) -> tuple[Array, Array]:
-    """Where the middles of heels and toes are in the plane of the floor, x and y in turn, and their rates."""
+    """Return x and y of the midpoints of heels and toes [m], and their rates. (8,), (8, nvfull)."""
     points = place.points[corners].reshape(4, 2, 3).mean(1)
     axes = jnp.tile(jnp.eye(3, dtype=points.dtype)[:2], (4, 1))
     moves = np.repeat(place.moves[corners][::2], 2, 0)
@@ -295,7 +300,7 @@ def _stance(place: _Places, corners: slice) -> tuple[Array, Array]:
 
 
 def _floor(place: _Places, first: int, body: Body, weight: Float[Array, ""]) -> _Rows:
-    """Ends of capsules not below the floor."""
+    """Return the rows that keep the ends of capsules above the floor."""
     above = np.array(body.above)
     height, rates = _heights(place, first + np.stack([2 * above, 2 * above + 1], 1).ravel())
     gap = height - jnp.repeat(body.radii[above], 2) - CLEARANCE
@@ -311,14 +316,15 @@ def _balanced(
     inside: Float[Array, ""],
     weight: Float[Array, ""],
 ) -> _Rows:
-    """Where both feet stand, the centre of mass inside what stands of them; none elsewhere.
+    """Return the row that keeps the centre of mass inside the support polygon; its weight is 0 in single support.
 
-    The direction changes too, but the distance does not by that: along any other it is less.
+    The derivative leaves out the change of the direction: the distance is a maximum over directions, so that to first
+    order it does not depend on it.
     """
     fractions = mass_fractions(robot)[:, None]
     centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
     at, both = jnp.sum(fractions * centers, 0), jnp.max(contact[:2]) * jnp.max(contact[2:]) > 0.5
-    # beside a row that does not count, a polygon that is one: its numbers are finite
+    # in single support all corners count, which keeps the numbers of the unused row finite
     stands = jnp.where(both, jnp.repeat(contact > 0.5, 2), 1.0)
     found = overhang(at[:2], place.points[corners][:, :2], stands)
     direction = jnp.append(found.direction, 0.0)
@@ -331,7 +337,7 @@ def _balanced(
 
 
 def _joints(robot: Robot, q: Float[Array, " nq"], weights: Weights, bounds: Bounds) -> Joints:
-    """Joints near home, and inside their ranges."""
+    """Return the terms of joint positions: near home (soft) and inside ranges (stiff)."""
     scalar, index = scalar_layout(robot)
     position = jnp.where(scalar, q[index], 0.0)
     outside = jnp.where(scalar, position - jnp.clip(position, bounds.lower, bounds.upper), 0.0)
@@ -344,7 +350,7 @@ def _joints(robot: Robot, q: Float[Array, " nq"], weights: Weights, bounds: Boun
 
 
 def _apart(place: _Places, first: int, body: Body, weights: Weights) -> _Rows:
-    """The pairs of capsules that are nearest, where they are nearer than the margin."""
+    """Return rows for the nearest pairs of capsules; only pairs closer than the margin have weight."""
     pairs = np.array(body.pairs)
     axes = place.points[first:].reshape(-1, 2, 3)
     start, along = axes[:, 0], axes[:, 1] - axes[:, 0]
@@ -364,9 +370,9 @@ def _apart(place: _Places, first: int, body: Body, weights: Weights) -> _Rows:
 def _ways(
     start: Float[Array, "k 3"], along: Float[Array, "k 3"], radii: Float[Array, " k"], pairs: np.ndarray
 ) -> Float[Array, " pairs"]:
-    """How far capsules are from each other, in single precision: enough to choose, and several times as fast.
+    """Return distances between capsules in single precision [m]: sufficient for a selection, and several times as fast.
 
-    Out of the products of all vectors with all, for which a batch of frames takes one product of matrices.
+    Computed from the products of all vectors with all, which for a batch of frames is one matrix product.
     """
     vectors = jnp.concatenate([along, start]).astype(jnp.float32)
     products, (a, b), k = dot(vectors, vectors.T), pairs.T, len(along)
@@ -379,6 +385,9 @@ def _ways(
 
 
 def _nearest(found: Float[Array, "17"]) -> Nearest:
-    """Two capsules, by the nearest points of their axes, the axes, the way between their middles, and the radii."""
+    """Return the nearest points of two capsules.
+
+    ``found``: nearest points of their axes, the axes, the offset of their middles, and the radii.
+    """
     on_a, on_b, along_a, along_b, outward, radii = jnp.split(found, (3, 6, 9, 12, 15))
     return _rounded(on_a, on_b, radii[0], radii[1], _across(along_a, along_b, outward))

@@ -1,4 +1,4 @@
-"""Which axis of a clip points up: what its motion shows, beside what is expected."""
+"""Detection of the up axis of a clip, from its motion and from the expected axis of its format."""
 
 from __future__ import annotations
 
@@ -25,23 +25,24 @@ _TO_Z_UP = {
     "-y": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
     "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
-"""Rotations that turn an axis up: facing z with y up becomes facing x with z up."""
+"""Rotations that turn each axis up; facing z with y up becomes facing x with z up."""
 _NEAR_FLOOR, _LOW_SHARE, _FLOOR_WEIGHT = 0.05, 10.0, 1.5
-"""Height of the lowest point above the floor in a frame that stands on it [m]; the percentile of lowest points that is
-the floor; what the share of such frames counts beside how upright the person is."""
+"""Largest height of the lowest point in a frame that stands on the floor [m], percentile of lowest points that defines
+the floor, and weight of the share of such frames relative to how upright the person is.
+"""
 _STANDS, _LEANS, _ON_FLOOR = 0.7, 0.1, 0.5
 _CLEARLY, _PERHAPS = 0.5, 0.1
-"""By how much an axis has to score more than the expected one to be taken, and to leave doubts."""
+"""Score above the expected axis' at which another axis is taken, and at which a warning is given."""
 
 
 class Evidence(NamedTuple):
-    """What speaks for each of ``UPS``. (6,) each.
+    """Evidence for each axis of ``UPS``. (6,) each.
 
     Attributes:
-        upright: component along the axis of the vector from the ankles to the shoulders, mean over frames, as a share
-            of its length.
-        grounded: share of frames in which the lowest point is within 5 cm of the floor.
-        floor: height of the floor along the axis [m].
+        upright: component along the axis of the vector from ankles to shoulders relative to its length, mean over
+            frames. (6,)
+        grounded: share of frames in which the lowest point is within 5 cm of the floor. (6,)
+        floor: height of the floor along the axis [m]. (6,)
     """
 
     upright: Float[np.ndarray, "6"]
@@ -50,21 +51,21 @@ class Evidence(NamedTuple):
 
     @property
     def score(self) -> Float[np.ndarray, "6"]:
-        """How well each axis explains the motion."""
+        """Return a score per axis; the highest explains the motion best. (6,)."""
         return self.upright + _FLOOR_WEIGHT * self.grounded
 
 
 def find_up(motion: HumanMotion, expected: Up, roles: Mapping[str, str] | None = None) -> tuple[Up, Up | None]:
-    """Return the axis that points up in a motion, and another that may do so; None: that is not in doubt.
+    """Return the up axis of a motion, and a second candidate, or None if there is no doubt.
 
-    The person stands along it, and the lowest point is near one height in most frames. The expected axis is kept where
-    the person stands along it, or lies on a floor at height 0 along it and stands on none along the other axis, and
-    where no other axis is clearly better.
+    The person stands along the up axis, and the lowest point is near one height in most frames. The expected axis is
+    kept if the person stands along it, if the person lies on a floor at height 0 along it (and on none along the other
+    axis), or if no other axis is clearly better.
 
     Args:
-        motion: with any axis up, in metres.
-        expected: the axis that is kept where the motion does not say more.
-        roles: of each of a person's joints, what the clip calls it; None: by their names.
+        motion: a clip with any axis up, in metres.
+        expected: the axis that is kept in doubt.
+        roles: joint name of the clip for each role; None: inferred from the names.
     """
     found = find_evidence(motion, roles)
     if found is None:
@@ -83,7 +84,7 @@ def find_up(motion: HumanMotion, expected: Up, roles: Mapping[str, str] | None =
 
 
 def find_rest_up(motion: HumanMotion) -> Up | None:
-    """Return the axis along which the person stands in the rest pose; None where that is not known."""
+    """Return the axis along which the person stands in the rest pose; None if unknown."""
     if motion.rest_positions is None:
         return None
     rest = dataclasses.replace(motion, positions=motion.rest_positions[None], rotations=None, contact=None)
@@ -93,7 +94,7 @@ def find_rest_up(motion: HumanMotion) -> Up | None:
 
 
 def find_evidence(motion: HumanMotion, roles: Mapping[str, str] | None) -> Evidence | None:
-    """Return what a motion shows of its up axis; None where no joint is known as a shoulder or a foot."""
+    """Return a motion's evidence for its up axis; None if no joint is known as a shoulder or a foot."""
     points = _tracks(motion, roles)
     if points is None:
         return None
@@ -109,7 +110,7 @@ def find_evidence(motion: HumanMotion, roles: Mapping[str, str] | None) -> Evide
 
 
 def _tracks(motion: HumanMotion, roles: Mapping[str, str] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return the tops and the bottoms of a person (F, 3), and all points that may touch the floor (F, k, 3)."""
+    """Return the tops and bottoms of a person (F, 3), and all points that may touch the floor (F, k, 3)."""
     try:
         roles = find_roles(motion.joint_names) if roles is None else roles
     except OsikValueError:
@@ -123,17 +124,17 @@ def _tracks(motion: HumanMotion, roles: Mapping[str, str] | None) -> tuple[np.nd
 
 
 def named(joint_names: tuple[str, ...], *words: str) -> list[int]:
-    """Return the joints with one of some words in their names."""
+    """Return the indices of joints whose names contain one of some words."""
     return [i for i, name in enumerate(joint_names) if any(word in name.lower() for word in words)]
 
 
 def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMotion:
-    """Return a motion with an axis turned up.
+    """Return a motion rotated so that ``up`` becomes z.
 
-    Rotations are counted from the rest pose, which is turned upright by itself where it stands along another axis.
+    Rotations are relative to the rest pose, which is rotated separately if it stands along another axis.
 
     Args:
-        motion: with the axis ``up`` up.
+        motion: a clip in which the axis ``up`` points up.
         up: the axis.
         rest_up: the axis that points up in the rest pose; None: the same.
     """
@@ -155,7 +156,7 @@ def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMo
 
 
 def checked_up(up: str | None) -> Up | None:
-    """Return an axis that was given.
+    """Return a given axis, or raise ValueError if there is no such axis.
 
     Raises:
         ValueError: no such axis.
@@ -166,13 +167,13 @@ def checked_up(up: str | None) -> Up | None:
 
 
 def standing_up(source: str, motion: HumanMotion, up: Up | None, expected: Up, rest_up: Up | None) -> HumanMotion:
-    """Return a clip with z up, by the axis that was given or by what its motion shows, and warn where that is another.
+    """Return a clip with z up, by the given axis or else by its motion; warn if that is not the expected axis.
 
     Args:
         source: the file, for the warning.
-        motion: as the file has it.
-        up: the axis that was given; None: none.
-        expected: the axis that the file is expected to have up.
+        motion: the clip in the file's axes.
+        up: the given axis; None: found from the motion.
+        expected: the axis that this kind of file has up.
         rest_up: the axis that points up in the rest pose; None: the same as in the motion.
     """
     own = find_up(motion, expected)[0] if up is None else up
