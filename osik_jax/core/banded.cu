@@ -9,7 +9,7 @@
 //     y[t] = V[t] (right[t] - near[t] y[t-1] - s V[t-2]^T y[t-2])
 //
 // and backwards x[t] = V[t]^T (y[t] - near[t+1]^T x[t+1] - V[t] (second[t+2] x[t+2])). Thread (a, b) of 4 x 8 has the
-// entries (a + 4 r, b + 8 c) of each block in registers. Constants from _banded_kernel.py: N dofs, M rows.
+// entries (a + 4 r, b + 8 c) of each block in registers. Constants from retargeting/_banded.py: N dofs, M rows.
 extern "C" __global__ void __launch_bounds__(32) osik_kernel(
     const float* square, const float* alone, const float* rows, const float* weight, const float* first,
     const float* second, const float* right, const int* frame_count, float* solution, float* near, float* inverse,

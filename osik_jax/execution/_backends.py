@@ -33,10 +33,11 @@ from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import jax
-import numpy as np
 
 from .._errors import OsikValueError
 from ..core import _library
+from ._platform import cuda_is_default, is_symbolic
+from ._rules import KERNEL_IN_EXPORT, not_exported
 
 Backend = Literal["auto", "jax", "core"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
@@ -59,23 +60,6 @@ def check_backend(backend: Any) -> Backend:
     if backend == "core" and not _library.installed():
         raise ModuleNotFoundError(f"backend='core': {_library.core().reason}", name="osik_jax.core")
     return backend
-
-
-def cuda_is_default() -> bool:
-    """Return whether the device that JAX computes on where it is not told otherwise is a GPU.
-
-    Beside one, under ``jax.default_device`` of a CPU, there is nothing to compile a kernel for.
-    """
-    device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
-    return getattr(device, "platform", device) in ("gpu", "cuda")
-
-
-def cpu_is_default() -> bool:
-    """Return whether JAX computes on a CPU where it is not told otherwise.
-
-    There, a program may be laid out for what costs time on a core: each operation by itself, and what its cache holds.
-    """
-    return jax.default_backend() == "cpu"
 
 
 def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
@@ -110,8 +94,6 @@ def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., A
     Raises:
         ValueError: a symbolic batch of ``jax.export``, which no kernel takes; a kernel in a program that is exported.
     """
-    from ._rules import KERNEL_IN_EXPORT, not_exported  # which needs this module
-
     if not kernels:
         return search(*args)
     if any(is_symbolic(size) for leaf in jax.tree.leaves(args) for size in jax.numpy.shape(leaf)):
@@ -123,8 +105,3 @@ def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., A
     return jax.lax.platform_dependent(
         *args, default=search, **{_PLATFORM[name]: kept_here(kernel) for name, kernel in kernels.items()}
     )
-
-
-def is_symbolic(count: Any) -> bool:
-    """Return whether a size is a symbol of ``jax.export``, which compares with no number."""
-    return not isinstance(count, int | np.integer)

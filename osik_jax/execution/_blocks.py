@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ._backends import cpu_is_default, is_symbolic
 from ._lapack import lanes_in_one
+from ._platform import cpu_is_default, is_symbolic
 from ._workers import too_few_workers, warn_of_few_workers
 
 BLOCK = 16

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ._backends import CPU_KERNELS, cpu_is_default, on_platforms
+from ._backends import CPU_KERNELS, on_platforms
+from ._platform import cpu_is_default
 
 
 class Candidates(NamedTuple):

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Int
 
-from ._backends import cpu_is_default, is_symbolic
 from ._blocks import BLOCK, first_axes_as_one, in_blocks
 from ._lapack import lanes_in_one
+from ._platform import cpu_is_default, is_symbolic
 from ._workers import too_few_workers
 
 FEW_ON_CPU, FEW = 4, 256

@@ -14,7 +14,7 @@ from functools import cache
 from importlib.metadata import version
 
 from .._errors import warn
-from ._backends import cpu_is_default
+from ._platform import cpu_is_default
 
 ENOUGH = 8
 """Workers: one more than batched factorisations are likely to run at once."""

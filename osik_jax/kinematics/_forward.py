@@ -13,8 +13,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from ..execution._backends import Backend, cuda_is_default, takes
+from ..execution._backends import Backend, takes
 from ..execution._computed import by_kernel
+from ..execution._platform import cuda_is_default
 from ..robot import Robot
 from ..robot._made_for import check_robot
 from ..robot._tree import BALL, FREE, HINGE, SLIDE, KinematicTree

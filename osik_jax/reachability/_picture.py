@@ -1,47 +1,61 @@
-"""A map as slices."""
+"""A map as slices: the picture that ``ReachabilityMap.figure`` returns."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
-from ._map import ReachabilityMap
 from ._slices import NOTHING, cell_edges, fullest, nearest, share_colors
 
 _INK, _GREY = "#2b2f36", "#5b636d"
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
 
-def draw_slices(found: ReachabilityMap, at: tuple[float, float, float] | None = None) -> Figure:
-    """Draw three slices of the map, as ``ReachabilityMap.figure`` does."""
-    axes = found.x, found.y, found.z
-    share = found.share
+class Field(NamedTuple):
+    """What is drawn of a map; arrays as in ``ReachabilityMap``."""
+
+    axes: tuple[np.ndarray, np.ndarray, np.ndarray]  # x, y and z of the positions [m]
+    share: Float[np.ndarray, "nx ny nz"]
+    beyond_reach: Float[np.ndarray, "nx ny nz"]
+    links: Float[np.ndarray, "l 3"]
+
+
+def draw_slices(found: Field, frame: str, orientations: int, at: tuple[float, float, float] | None = None) -> Figure:
+    """Return three slices of a map, one across each axis.
+
+    Args:
+        found: the map.
+        frame: name of the frame that reaches.
+        orientations: how many were tried at each position.
+        at: a point that the slices go through [m]; default: of each axis, where most is reached.
+    """
+    axes, share = found.axes, found.share
     spot = fullest(share) if at is None else nearest(axes, at)
     planes = [plane for plane in _PLANES if all(len(axes[i]) > 1 for i in plane)] or [_PLANES[0]]
     figure = Figure(figsize=(4.4 * len(planes) + 0.9, 5.0), dpi=130, facecolor="white")
     figure.set_layout_engine("constrained", rect=(0.005, 0.01, 0.99, 0.87))
     FigureCanvasAgg(figure)
     for place, plane in zip(figure.subplots(1, len(planes), squeeze=False)[0], planes, strict=True):
-        _draw_slice(place, found, share, spot, plane)
+        _draw_slice(place, found, spot, plane)
     colors = ScalarMappable(Normalize(0.0, 100.0), share_colors())
     bar = figure.colorbar(colors, ax=figure.axes, shrink=0.8, pad=0.015)
-    bar.set_label(f"of {len(found.rotations)} orientations reached [%]", color=_INK)
+    bar.set_label(f"of {orientations} orientations reached [%]", color=_INK)
     note = "grey: none found; white: proven out of reach; line: the joints at home"
-    figure.text(0.012, 0.945, f"Reach of {found.frame}", fontsize=13, weight="bold", color=_INK)
+    figure.text(0.012, 0.945, f"Reach of {frame}", fontsize=13, weight="bold", color=_INK)
     figure.text(0.012, 0.905, note, fontsize=8.5, color=_GREY)
     return figure
 
 
-def _draw_slice(
-    place: Axes, found: ReachabilityMap, share: np.ndarray, spot: tuple[int, int, int], plane: tuple[int, int]
-) -> None:
-    across = 3 - sum(plane)
-    axes = found.x, found.y, found.z
-    values, beyond = (np.take(field, spot[across], across).T for field in (share, found.beyond_reach > 0.0))
+def _draw_slice(place: Axes, found: Field, spot: tuple[int, int, int], plane: tuple[int, int]) -> None:
+    across, axes = 3 - sum(plane), found.axes
+    values, beyond = (np.take(field, spot[across], across).T for field in (found.share, found.beyond_reach > 0.0))
     edges = [cell_edges(axes)[i] for i in plane]
     nothing = np.ma.masked_where(beyond | (values > 0.0), np.zeros_like(values))
     place.pcolormesh(*edges, nothing, cmap=ListedColormap([NOTHING]))

@@ -1,4 +1,7 @@
-"""Symmetric block-banded linear systems of a whole clip: each frame is coupled to the two frames before it."""
+"""Symmetric block-banded linear systems of a whole clip: each frame is coupled to the two frames before it.
+
+A GPU solves them in single precision by ``core/banded.cu``, one warp of 32 threads for each system.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..core import _build, _cuda
 from ..execution._backends import on_platforms, takes
 from ..execution._lanes import in_lanes
 from ..numerics._dense import apply, product
-from . import _banded_kernel
+
+_SHARED_BYTES = 48 * 1024
+"""Shared memory [bytes] that every CUDA device offers a block by default."""
 
 
 class BandedSystem(NamedTuple):
@@ -48,14 +54,41 @@ def solve_banded(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Arra
     """
     weight, first = (a.at[0].set(0.0) for a in (system.weight, system.first))
     system = system._replace(weight=weight, first=first, second=system.second.at[:2].set(0.0))
-    if takes("auto", "core-cuda", fits=_banded_kernel.fits(system)):
+    if takes("auto", "core-cuda", fits=has_kernel(system)):
         return _anywhere()(system, right)
     return solve_banded_plain(system, right)
 
 
 @cache
 def _anywhere() -> Callable[[BandedSystem, Array], Array]:
-    return in_lanes(partial(on_platforms, {"core-cuda": _banded_kernel.solve}, jax.vmap(solve_banded_plain)))
+    return in_lanes(partial(on_platforms, {"core-cuda": _solve_on_gpu}, jax.vmap(solve_banded_plain)))
+
+
+def has_kernel(system: BandedSystem) -> bool:
+    """Return whether there is a GPU kernel for systems of this shape and precision."""
+    m, n = system.rows.shape[-2:]
+    is_small = 4 * (4 * n * (n | 1) + 2 * m * n + 6 * n) <= _SHARED_BYTES
+    return system.rows.dtype == jnp.float32 and is_small and _cuda.installed()
+
+
+def _solve_on_gpu(system: BandedSystem, right: Float[Array, "B F n"]) -> Float[Array, "B F n"]:
+    """Return the solutions of a batch, on the GPU that the program runs on."""
+    lanes, frames, n = right.shape
+    single, blocks = jnp.float32, (lanes, frames, n, n)
+    x, *_ = _cuda.call(
+        kernel_source(n, system.rows.shape[-2]),
+        [(right.shape, single), (blocks, single), (blocks, single)],
+        *(*system, right, jnp.full(1, frames, jnp.int32)),
+        problems=lanes,
+        shared=0,
+    )
+    return x
+
+
+@cache
+def kernel_source(n: int, m: int) -> str:
+    """Return the CUDA text for blocks of n x n that m rows couple."""
+    return _cuda.constants(N=n, M=m) + (_build.FOLDER / "banded.cu").read_text()
 
 
 def solve_banded_plain(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Array, "F n"]:

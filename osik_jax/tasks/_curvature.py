@@ -28,7 +28,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..execution._backends import cuda_is_default
+from ..execution._platform import cuda_is_default
 from ..numerics._constants import FARTHEST_ERROR, LEVER_ROUNDOFF, NEAR_ERROR, UNHELD_PART
 from ..numerics._dense import short_sum
 from ..numerics._guarded import largest, quotient, safe_norm

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from ..execution._backends import cuda_is_default
+from ..execution._platform import cuda_is_default
 from ..kinematics._rigid import compose, rotate
 from ..numerics._constants import SMALL_ANGLE_SQUARED, SMALL_SINE_SQUARED
 

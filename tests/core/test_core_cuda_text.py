@@ -7,7 +7,7 @@ import pytest
 from core_checks import needs_core
 
 from osik_jax.core import _cuda
-from osik_jax.retargeting import _banded_kernel as banded
+from osik_jax.retargeting import _banded as banded
 from osik_jax.solvers.hqp import _cuda as hierarchy
 from osik_jax.solvers.hqp._padding import Layout
 from osik_jax.solvers.null_space import _cuda as null_space
@@ -34,7 +34,7 @@ TEXTS = {
     "more rows than variables": lambda: weighted_qp._source(40, 33, 3, False, 100, 1),
     "weighted QP without rows, single": lambda: single_qp._source(single_qp.Shape(7, 5), 100),
     "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
-    "banded": lambda: banded._source(13, 2),
+    "banded": lambda: banded.kernel_source(13, 2),
 }
 
 

@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...execution._backends import Backend, cpu_is_default, is_symbolic, on_platforms, takes
+from ...execution._backends import Backend, on_platforms, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
+from ...execution._platform import cpu_is_default, is_symbolic
 from ...numerics._constants import (
     AT_LOWER,
     AT_UPPER,

@@ -12,7 +12,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..._errors import OsikValueError
 from ...execution import _rules
-from ...execution._backends import Backend, check_backend, cpu_is_default
+from ...execution._backends import Backend, check_backend
+from ...execution._platform import cpu_is_default
 from ...numerics._constants import FEASIBILITY, INACTIVE
 from ...numerics._dense import apply
 from .._box import clip_roundoff, ordered_bounds

@@ -188,7 +188,7 @@ def slice_picture(found: ReachabilityMap, across: int, index: int) -> Slice:
     edges = cell_edges(axes)
     length = {i: float(edges[i][-1] - edges[i][0]) for i in (first, second)}
     cells = [_cell_of_pixels(edges[i], _PIXELS * length[i] / max(length.values())) for i in (second, first)]
-    colors = np.moveaxis(slice_colors(found, across, index), 0, 1)
+    colors = np.moveaxis(slice_colors(found.share, found.beyond_reach, across, index), 0, 1)
     some = np.take(found.reached.any(-1), index, across).T
     colors[..., 3] = np.where(colors[..., 3] > 0, np.where(some, _SOLID, _FAINT), 0)
     center = np.array([0.5 * (edges[i][0] + edges[i][-1]) for i in range(3)])
