@@ -37,14 +37,14 @@ def progress_bar(total: int, done: int = 0, *, unit: str) -> Iterator[Callable[[
 
 
 class Pace:
-    """How long the rest will take, from how long it took since the first were done: they had to be compiled for."""
+    """Estimate of the remaining time from the pace since the first item, which includes compilation."""
 
     def __init__(self, done: int, now: float) -> None:
         """Takes how many are done already, and the time [s]."""
         self._done, self._then, self._first = done, now, True
 
     def seconds_left(self, done: int, total: int, now: float) -> float:
-        """For the rest, at a time when so many are done [s]."""
+        """Return the estimated time for the remaining items [s], when ``done`` items are finished at time ``now``."""
         seconds = (now - self._then) / max(done - self._done, 1) * (total - done)
         if self._first:
             self._done, self._then, self._first = done, now, False

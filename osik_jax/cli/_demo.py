@@ -30,12 +30,11 @@ class Demo:
     robot: str | None = None
     """A URDF or MJCF file to move instead, or a robot by name: nao, ur5, g1 and others, or of robot_descriptions."""
     base: Literal["auto", "floating", "fixed"] = "auto"
-    """With --robot: whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has
-    feet (or --support)."""
+    """Base of --robot. auto: as in the file; a URDF without a statement floats if it has feet (or --support)."""
     frame: str | None = None
-    """With --robot: the frame that moves. Default: the floating base, or the tip of a robot that is bolted down."""
+    """Frame of --robot that moves. Default: the floating base, or the tip of a robot with a fixed base."""
     support: tuple[str, ...] = ()
-    """With --robot: frames that stand on the ground. Default: those that look like feet."""
+    """Frames of --robot that stand on the ground. Default: frames named or shaped like feet."""
     duration: float = 8.0
     """Length of the motion [s]."""
     frequency: float = 200.0

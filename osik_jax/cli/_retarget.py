@@ -36,12 +36,12 @@ _MOST_ROWS, _MOST_NOTES = 50, 10
 
 @dataclasses.dataclass(frozen=True)
 class Retarget:
-    """Makes a robot do what a person did: from a motion file, or a folder of them, to a folder.
+    """Retargets a person's motion to a robot: reads a motion file or a folder of them, and writes a folder.
 
     Writes motion.npz (MuJoCo's order, with the person's joints), motion.csv (position, quaternion x y z w, joints; no
-    headings), report.json (figures recomputed by MuJoCo), profile.toml (how the robot was seen) and motion.gif.
-    Of a folder, each clip gets a folder of its own in --out, and report.json has the figures of all. The same command
-    goes on where one that was interrupted has come to.
+    headings), report.json (figures recomputed by MuJoCo), profile.toml (the robot's profile) and motion.gif.
+    For a folder, each clip gets its own folder in --out, and report.json has the figures of all clips. The same
+    command resumes an interrupted job.
     """
 
     clip: Annotated[str, tyro.conf.Positional]
@@ -57,9 +57,9 @@ class Retarget:
     out: Path = Path("osik-retarget")
     """Folder to write to."""
     profile: str | None = None
-    """A TOML file that says how the robot is seen. Default: the package's own for NAO, G1 and Talos, else a guess."""
+    """Profile of the robot (TOML). Default: a bundled one for NAO, G1 and Talos, else a guess."""
     mapping: tuple[str, ...] = ()
-    """Which of the clip's joints is which, as ROLE=NAME, where names are not to be guessed; all of them then."""
+    """Joints of the clip as ROLE=NAME pairs, for all needed roles. Default: inferred from the names."""
     fps: float | None = None
     """Frames a second of the result. Default: the clip's."""
     acceleration: float = 240.0
@@ -67,7 +67,7 @@ class Retarget:
     smooth: float = 0.0
     """Smooth out motion that is faster than about this time [s]; 0: none."""
     balance: float | None = None
-    """Where both feet stand, keep the centre of mass this far inside their edge [m]. Default: it is where it falls."""
+    """Margin of the centre of mass inside the support polygon while both feet stand [m]. Default: not bounded."""
     unit: str | None = None
     """Unit of a BVH: m, cm, mm, inch, cmu, or metres a unit as a number. Default: found from the skeleton's size."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
@@ -78,17 +78,17 @@ class Retarget:
     animation: bool = True
     """Write the film (motion.gif); of a folder none is written."""
     fit: Path | None = None
-    """Of a folder: no motions, but a profile whose weights, scale and keypoints suit its clips, written to this TOML
-    file. One clip in four is held out, and says which step is taken."""
+    """Fit a profile (weights, scale, keypoints) to the clips of a folder and write it to this TOML file, instead of
+    motions. Every fourth clip is held out and selects the step that is kept."""
     live: bool = False
-    """Frame by frame: CLIP is replayed at its own rate, as it would come from a person; - reads JSON lines from stdin
-    and writes JSON lines to stdout, and nothing to a folder."""
+    """Retarget frame by frame: replay CLIP at its own rate, or with - read JSON lines from stdin and write JSON lines
+    to stdout (nothing to a folder)."""
     look_ahead: float = 0.27
-    """With --live: time that the robot is behind the person [s]."""
+    """Delay of the robot behind the person with --live [s]."""
     iterations: int = 20
-    """With --live: iterations of the plan at each frame, at most."""
+    """Largest number of iterations per frame with --live."""
     budget: float | None = None
-    """With --live: time that computing a frame may take [s]. Default: 0.6 of the time from one frame to the next."""
+    """Computing time per frame with --live [s]. Default: 60 % of the time between frames."""
 
     def run(self) -> int:
         """Runs the command; returns the exit code."""

@@ -40,7 +40,7 @@ class View:
     browser: bool = True
     """Open the page in a browser."""
     html: Path | None = None
-    """With a motion.npz: write a page that plays it without a server, instead of serving one."""
+    """Write a page that plays a motion.npz without a server, instead of serving one."""
 
     def run(self) -> int:
         """Serves a page until Ctrl-C, which is how a view ends."""

@@ -154,9 +154,10 @@ def _rounded(
 def _segment_parameters(
     a: Float[Array, "3"], b: Float[Array, "3"], offset: Float[Array, "3"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Where along two segments, from 0 to 1, they are nearest; offset: from the start of b to that of a.
+    """Return the parameters in [0, 1] of the nearest points of two segments.
 
-    Where segments are parallel and lie side by side: the middle of what they have side by side.
+    ``a`` and ``b``: the segments' vectors [m]. ``offset``: vector from the start of b to the start of a [m]. Of
+    parallel segments that overlap, the middle of the overlap is taken.
     """
     return _parameters(_dot(a, a), _dot(b, b), _dot(a, b), _dot(a, offset), _dot(b, offset))
 

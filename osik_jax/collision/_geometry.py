@@ -32,7 +32,8 @@ MOST_VERTICES = 256
 
 _FIRST_VERTICES = 32
 _VERTICES_A_ROUND = 16
-"""How a large hull is thinned out: it begins with so many vertices, and each round adds those furthest outside."""
+"""Number of vertices with which a large hull starts, and that each round adds: those farthest outside the hull so far.
+"""
 
 _FLAT = 1e-12
 """Heights above a face are roundoff below this, relative to the size of the points."""
@@ -42,7 +43,7 @@ _MERGED = 1e-6
 
 
 class Kind(enum.Enum):
-    """What a shape's distances are computed from."""
+    """Core shape from which a geom's distances are computed."""
 
     SEGMENT = enum.auto()
     BOX = enum.auto()
@@ -61,7 +62,7 @@ KINDS = {
     int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): Kind.ELLIPSOID,
     int(mujoco.mjtGeom.mjGEOM_MESH): Kind.HULL,
 }
-"""Of MuJoCo's geom types; those that are missing have no distance here."""
+"""Kind of each of MuJoCo's geom types; other types have no distance here."""
 
 
 class UnitCore(NamedTuple):
@@ -200,7 +201,7 @@ def padded(cores: Sequence[UnitCore]) -> UnitCore:
 
 
 def scaling(kinds: Sequence[Kind]) -> tuple[np.ndarray, np.ndarray]:
-    """How MuJoCo's sizes scale unit cores: of each the entry for x, y and z (k, 3), and whether entry 0 is a radius."""
+    """Return which of MuJoCo's sizes scale x, y, z of a unit core (k, 3), and whether size 0 is a radius (k,)."""
     entries = {Kind.SEGMENT: (1, 1, 1), Kind.CYLINDER: (0, 0, 1)}
     return np.array([entries.get(kind, (0, 1, 2)) for kind in kinds]), np.array([k is Kind.SEGMENT for k in kinds])
 

@@ -42,7 +42,7 @@ class Member(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What messages call it: its name, with its link where the name does not tell it."""
+        """Return the shape's name for messages, with its link if the name alone does not tell it."""
         return self.name if self.added or self.name in self.aliases else f"{self.name} (of {self.aliases[0]})"
 
     @property

@@ -120,7 +120,7 @@ def checked_start(robot: Robot, q0: Any) -> Array:
 
 
 def warn_of_degrees(robot: Robot, q: Array) -> None:
-    """As ``checked_start`` warns, for a function that is called at each step: small numbers are not looked at."""
+    """Warn of joint positions that look like degrees; cheaper than ``checked_start``, for use in each step."""
     seen = concrete(q)
     if seen is not None and np.abs(seen).max() > _DEGREES:
         warn_of_far_joints(robot, seen, "q")

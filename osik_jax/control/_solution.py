@@ -44,11 +44,11 @@ class Solution(eqx.Module):
 
 
 class Trajectory(eqx.Module):
-    """What a rollout went through.
+    """Trajectory of a rollout.
 
     Attributes:
-        time: at the start of each step [s]. (steps,)
-        q: configurations, the start first; ``q[k + 1]`` is where step k led. (steps + 1, nq)
+        time: time at the start of each step [s]. (steps,)
+        q: configurations; ``q[0]`` is the start, ``q[k + 1]`` the result of step k. (steps + 1, nq)
         solution: of each step; every leaf has a leading axis. (steps, ...)
     """
 

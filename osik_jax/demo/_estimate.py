@@ -1,4 +1,4 @@
-"""How long a demonstration will take, said before it starts."""
+"""Estimate of a demonstration's run time, printed before it starts."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..kinematics import forward_kinematics
 from ._motion import Motion
 
 _COMPILE = {"weighted": 8.0, "null-space": 5.0, "hierarchical": 12.0}
-"""How much longer a scheme's loop takes to compile than the rows of its tasks."""
+"""Compile time of a scheme's loop relative to that of its tasks' rows."""
 _STEP = 1e-3
-"""Running, simulating and measuring a step [s]."""
+"""Time to run, simulate and measure one step [s]."""
 _SIMULATED = 4.0
-"""So many times as long with physics."""
+"""Factor on the time of a step with physics."""
 _PICTURE, _MESH_PICTURE = 0.15, 0.5
-"""A picture of a film, of simple shapes and of meshes, on one core [s]."""
+"""Time to draw one film picture on one core [s], of simple shapes and of meshes."""
 _PICTURES_PER_SECOND = 12.5
 
 
@@ -31,7 +31,7 @@ def estimate_seconds(
     animation: bool = True,
     physics: bool = False,
 ) -> float:
-    """How long a demonstration will take here and now [s], judged by compiling a part of it.
+    """Return the estimated run time of a demonstration [s], from the compile time of a part of it.
 
     Args:
         motion: what to do.
@@ -49,9 +49,9 @@ def estimate_seconds(
 
 
 def _reference(motion: Motion) -> tuple[float, float]:
-    """How long it takes to compile the rows of the tasks [s], which all schemes do and more.
+    """Return the compile time of the tasks' rows [s], and the ratio of elapsed to processor time.
 
-    And how many times longer that takes than this process works, as other programs want the processor too.
+    The ratio shows how much other programs slow this process down.
     """
 
     def rows(q: Float[Array, " nq"]) -> list[Array]:

@@ -1,4 +1,4 @@
-"""A waist or hand motion for a robot that somebody brings along."""
+"""Waist or hand motion for a user's robot."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def file_motion(
     duration: float = 8.0,
     look: Look | None = None,
 ) -> Motion:
-    """A frame goes 5 cm to its left and back, while the supporting frames, if any, stay.
+    """Return a motion in which a frame goes 5 cm to its left and back while the supporting frames stay.
 
-    A robot smaller than 30 cm or larger than 10 m goes the same part of its size; a frame that its joints cannot move
-    left goes where they move it most. A floating robot is put on the floor, its lowest point at height 0.
+    A robot smaller than 30 cm or larger than 10 m moves by the same share of its size. A frame that its joints cannot
+    move left moves in its best direction. A floating robot is placed on the floor, with its lowest point at height 0.
 
     Args:
         robot: the robot.
@@ -89,7 +89,7 @@ def file_motion(
 
 
 def _remarks(look: Look | None) -> tuple[str, ...]:
-    """What could not be drawn as the file says."""
+    """Return a remark on the meshes of a URDF that could not be drawn; empty if there are none."""
     if look is None or not look.missing:
         return ()
     first, *others = look.missing
@@ -98,7 +98,7 @@ def _remarks(look: Look | None) -> tuple[str, ...]:
 
 
 def guess_moving_frame(robot: Robot) -> str:
-    """The free joint's body; without one, the deepest frame that sounds like a tool or hand, else the last tip."""
+    """Return the free joint's body; without one, the deepest frame named like a tool or hand, else the last tip."""
     tree = robot.tree
     if robot.floating_base:
         return tree.body_names[tree.root]
@@ -116,7 +116,7 @@ def guess_moving_frame(robot: Robot) -> str:
 
 
 def guess_feet(robot: Robot) -> tuple[str, ...]:
-    """Frames with contact corners; else those of different bodies, without children, that sound like feet."""
+    """Return the frames with contact corners, else childless frames of different bodies named like feet."""
     tree = robot.tree
     with_corners = tuple(
         name.removesuffix("_corner_0")
@@ -129,13 +129,13 @@ def guess_feet(robot: Robot) -> tuple[str, ...]:
 
 
 def _corners(robot: Robot, foot: str) -> Float[np.ndarray, "k 3"]:
-    """Contact corners in the frame [m]; a foot without any touches the ground at its origin."""
+    """Return a foot's contact corners in its frame [m]; its origin if it has none. (k, 3)."""
     known = contact_corners(robot, foot)
     return known if len(known) else np.zeros((1, 3))
 
 
 def _polygon(robot: Robot, q0: Array, standing: Sequence[str]) -> tuple[SupportPolygon | None, tuple[str, ...]]:
-    """The support polygon where the feet have corners, or are enough to span one; and a remark where not."""
+    """Return the support polygon if the feet's corners span one, and a remark if they do not."""
     if not standing:
         return None, ()
     corners = {foot: _corners(robot, foot) for foot in standing}
@@ -148,7 +148,7 @@ def _polygon(robot: Robot, q0: Array, standing: Sequence[str]) -> tuple[SupportP
 def _tasks(
     robot: Robot, q0: Array, goal: Goal, standing: Sequence[str], polygon: SupportPolygon | None
 ) -> tuple[dict[str, Task], FrameTask]:
-    """What stands still, and the task that moves."""
+    """Return the tasks of standing feet, balance and posture, and the task that moves."""
     kinematics = compiled_kinematics(robot, q0)
     still: dict[str, Task] = {
         foot: FrameTask(
@@ -163,5 +163,5 @@ def _tasks(
 
 
 def _foot_rows(standing: Sequence[str]) -> Rows:
-    """One or two feet stand on soles; more of them stand on points."""
+    """Return the rows of a foot task: pose for one or two feet, position for more feet, which stand on points."""
     return "pose" if len(standing) <= 2 else "position"

@@ -1,4 +1,4 @@
-"""The folder that a demonstration writes to, tried before the work."""
+"""Output folder of a demonstration, checked before the work starts."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from pathlib import Path
 from ._motion import Motion
 
 _PICTURES = 12_000_000
-"""More than film, figure, picture and report have taken of any robot [bytes]."""
+"""Upper bound of the size of film, figure, picture and report [bytes]."""
 
 
 def needed_bytes(motion: Motion, schemes: int, dt: float) -> int:
-    """Room for everything that is written, the motion before it is compressed [bytes]."""
+    """Return the disk space for all output files [bytes], with the motion uncompressed."""
     steps = round(motion.duration / dt) + 1
     return _PICTURES + 8 * steps * (1 + schemes * (motion.robot.nq + motion.robot.nv))
 
 
 def writable_folder(path: Path, room: int) -> Path:
-    """Makes the folder, and tries whether files can be written to it.
+    """Create the folder and check that files can be written to it.
 
     Args:
         path: the folder.

@@ -1,4 +1,4 @@
-"""What a motion achieved, recomputed by MuJoCo's C code from the configurations alone."""
+"""Quality of a motion, recomputed by MuJoCo's C code from the configurations alone."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ._motion import Motion
 from ._references import Path
 
 TOLERANCE = 1e-9
-"""[rad, m, and relative for speeds]: beyond a limit by more than this is a violation."""
+"""Excess over a limit that counts as a violation [rad or m; relative for speeds]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """How far a frame is from where it should be, at every configuration; nan where nothing is asked of it.
+    """Distance of a frame from its reference at every configuration; NaN where it has none.
 
     Attributes:
         position: [m]. (T,)
@@ -36,19 +36,19 @@ class Track:
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """A motion in numbers.
+    """Figures of a motion.
 
     Attributes:
         time: [s]. (T,)
-        stances: frame to how far it drifted from where it stood at first.
-        goals: label to how far it is from its path.
+        stances: drift of each standing frame from its first pose.
+        goals: distance of each goal's frame from its path.
         com: centre of mass [m]. (T, 3)
         com_margin: distance of its ground projection to the nearest edge of the support polygon [m], positive inside;
             empty without a polygon. (T,) or (0,)
         support: vertices of the support polygon [m], counter-clockwise; empty without one.
-        displacement: of each goal's frame from where it was at first [m]. (T, 3)
-        wanted: the same of its path. (T, 3)
-        position_margin: over all joints, the least distance to a limit, as a part of half the range: 1 in the middle,
+        displacement: displacement of each goal's frame from its first position [m]. (T, 3)
+        wanted: displacement of its path [m]. (T, 3)
+        position_margin: least distance of a joint to a limit relative to half its range: 1 in the middle,
             0 at the limit, negative beyond. (T,)
         velocity_margin: the same for speeds: 1 at rest, 0 at the limit. (T - 1,)
         position_violations: joints times steps beyond a limit.
@@ -70,7 +70,7 @@ class Measurement:
 
 
 def measure(motion: Motion, q: Float[np.ndarray, "T nq"], dt: float) -> Measurement:
-    """Judges configurations, ``dt`` [s] apart, against what the motion asks for."""
+    """Compare configurations ``dt`` [s] apart with the references of a motion."""
     robot, time = motion.robot, dt * np.arange(len(q))
     frames = list(dict.fromkeys([s.frame for s in motion.stances] + [g.frame for g in motion.goals.values()]))
     poses, com, qpos = _look(robot, q, frames)
@@ -103,7 +103,7 @@ _Poses = tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3 3"]]
 
 
 def _look(robot: Robot, q: np.ndarray, frames: list[str]) -> tuple[dict[str, _Poses], np.ndarray, np.ndarray]:
-    """Poses of the frames, centre of mass and MuJoCo's qpos at every configuration."""
+    """Return the frames' poses, the centre of mass and MuJoCo's qpos at every configuration."""
     seen, com, qpos = [], [], []
     for data in mujoco_poses(robot, q):
         seen.append([mujoco_frame_pose(robot, data, name) for name in frames])
@@ -122,7 +122,7 @@ def _path(path: Path, time: np.ndarray) -> _Poses:
 
 
 def _angle(a: Float[np.ndarray, "T 3 3"], b: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, " T"]:
-    """Angle of the rotation between, exact for small ones."""
+    """Return the angle of the rotation between two rotation matrices [rad], accurate for small angles."""
     between = np.einsum("tij,tkj->tik", a, b)
     axis = np.stack(
         [between[:, 2, 1] - between[:, 1, 2], between[:, 0, 2] - between[:, 2, 0], between[:, 1, 0] - between[:, 0, 1]],
@@ -139,7 +139,7 @@ def _track(poses: _Poses, wanted: _Poses, settled: np.ndarray, *, turns: bool) -
 
 
 def _drift(poses: _Poses, standing: np.ndarray, *, flat: bool) -> Track:
-    """Against the first pose, nan in the air."""
+    """Return a standing frame's distance from its first pose; NaN while it is in the air."""
     first = np.broadcast_to(poses[0][:1], poses[0].shape), np.broadcast_to(poses[1][:1], poses[1].shape)
     track = _track(poses, first, standing, turns=flat)
     position, orientation = (np.where(standing, x, np.nan) for x in (track.position, track.orientation))
@@ -147,7 +147,7 @@ def _drift(poses: _Poses, standing: np.ndarray, *, flat: bool) -> Track:
 
 
 def _support(motion: Motion, poses: dict[str, _Poses], time: np.ndarray) -> list[np.ndarray]:
-    """Vertices of the hull of the corners on the ground, where the feet stood at first."""
+    """Return the vertices of the hull of the corners on the ground, at the feet's first poses [m]."""
     if not motion.balanced:
         return []
     corners = {s.frame: poses[s.frame][0][0] + s.corners @ poses[s.frame][1][0].T for s in motion.stances}
@@ -160,7 +160,7 @@ def _support(motion: Motion, poses: dict[str, _Poses], time: np.ndarray) -> list
 
 
 def margins(com: np.ndarray, support: list[np.ndarray]) -> np.ndarray:
-    """Least distance to the lines through the edges, positive inside."""
+    """Return the least signed distance of points to the polygon's edge lines [m], positive inside."""
     out = []
     for point, vertices in zip(com[:, :2], support, strict=False):
         edges = np.roll(vertices, -1, 0) - vertices
@@ -170,7 +170,7 @@ def margins(com: np.ndarray, support: list[np.ndarray]) -> np.ndarray:
 
 
 def _position_limits(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, int]:
-    """Every limited hinge and slide of the model, followers of mimic joints too."""
+    """Return the range of every limited hinge and slide of the model, coupled joints included."""
     joints = [
         j
         for j in range(model.njnt)
@@ -186,7 +186,7 @@ def _position_limits(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarra
 
 
 def _velocity_limits(robot: Robot, qpos: np.ndarray, dt: float) -> tuple[np.ndarray, int]:
-    """Speeds between configurations by MuJoCo; a follower's limit is already in its leader's."""
+    """Return speeds between configurations by MuJoCo, and their limits; a coupled joint's limit is in its leader's."""
     model = robot.mj_model
     speed = np.zeros((len(qpos) - 1, model.nv))
     for row, a, b in zip(speed, qpos[:-1], qpos[1:], strict=True):

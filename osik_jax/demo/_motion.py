@@ -1,4 +1,4 @@
-"""What a demonstration asks of a robot."""
+"""Motion of a demonstration: tasks over time, and the references to judge it by."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ..viewer import Look
 from ._references import Path
 
 GAIN = 20.0
-"""[1/s], of all tasks but the posture: at 200 Hz a tenth of an error goes in a step."""
+"""Gain of all tasks but the posture [1/s]: at 200 Hz a step removes a tenth of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """A frame that follows a path.
+    """Frame that follows a path.
 
     Attributes:
-        frame: its name.
-        path: where it should be.
-        rows: what of it counts: ``"pose"`` or ``"position"``.
+        frame: name of the frame.
+        path: reference of its pose.
+        rows: tracked part of the pose: ``"pose"`` or ``"position"``.
     """
 
     frame: str
@@ -37,13 +37,13 @@ class Goal:
 
 @dataclasses.dataclass(frozen=True)
 class Stance:
-    """A frame on the ground, and when it has to stay there.
+    """Frame that stands on the ground for a time.
 
     Attributes:
-        frame: its name.
-        corners: its contact corners in the frame [m]; none: it takes no part in the support polygon. (k, 3)
-        lifted: from when to when it is in the air [s]; ``None``: never.
-        flat: whether it may not turn either; a foot that is a point may.
+        frame: name of the frame.
+        corners: its contact corners in the frame [m]; empty: not part of the support polygon. (k, 3)
+        lifted: start and end of the time in the air [s]; ``None``: never.
+        flat: whether its orientation must stay too; a point foot may rotate.
     """
 
     frame: str
@@ -52,7 +52,7 @@ class Stance:
     flat: bool = True
 
     def on_ground(self, t: np.ndarray) -> np.ndarray:
-        """For each time [s], whether it stands."""
+        """Return whether the frame stands at each time [s]. (T,)."""
         if self.lifted is None:
             return np.ones(len(t), bool)
         return (t <= self.lifted[0]) | (t >= self.lifted[1])
@@ -60,22 +60,22 @@ class Stance:
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """Tasks over time, and what is needed to judge how well they were done.
+    """Tasks over time, and the references to judge them by.
 
     Attributes:
-        name: for files and reports.
-        title: for people.
+        name: name in files and reports.
+        title: title for display.
         robot: the robot.
-        q0: where it starts. (nq,)
-        tasks: from time [s] to the tasks; traced by JAX.
-        duration: [s].
+        q0: start configuration. (nq,)
+        tasks: function from time [s] to the tasks; traced by JAX.
+        duration: length of the motion [s].
         stances: frames that stand.
-        goals: label to what moves; the first is the one that pictures tell of.
-        limits: those that the schemes get.
+        goals: label to moving frame; pictures show the first one.
+        limits: limits given to the schemes.
         balanced: whether a task keeps the centre of mass over the support polygon.
         notes: remarks for the user.
-        look: what pictures show of it; ``None``: the model's own shapes.
-        scale: how large the motion is against one of 5 cm; the errors that are wanted grow with it.
+        look: visual shapes for pictures; ``None``: those of the model.
+        scale: size of the motion relative to 5 cm; required errors grow with it.
     """
 
     name: str
@@ -94,19 +94,19 @@ class Motion:
 
 
 def tracking(robot: Robot, goal: Goal, *, weight: float, priority: int, gain: float = GAIN) -> FrameTask:
-    """The task that follows a goal, standing at its start."""
+    """Return the task that follows a goal, with its target at the start of the path."""
     pose = (goal.path.position, goal.path.rotation)
     return FrameTask(robot, goal.frame, target=pose, rows=goal.rows, weight=weight, gain=gain, priority=priority)
 
 
 def along(task: FrameTask, goal: Goal, t: Any) -> FrameTask:
-    """The task at time t [s]."""
+    """Return the task with the target of the path at time t [s]."""
     pose, velocity = goal.path.at(t)
     return task.replace(target=pose, target_velocity=velocity)
 
 
 def circumscribed(normals: Float[Array, "m 2"], polygon: SupportPolygon) -> SupportPolygon:
-    """The smallest polygon with the given normals, in order around it, that contains another polygon."""
+    """Return the smallest polygon with the given normals that contains another polygon."""
     edges = np.asarray(normals)
     offsets = (np.asarray(polygon.vertices) @ edges.T).max(0)
     before = np.roll(edges, 1, 0)
@@ -116,6 +116,6 @@ def circumscribed(normals: Float[Array, "m 2"], polygon: SupportPolygon) -> Supp
 
 
 def blended(wide: SupportPolygon, tight: SupportPolygon, s: Any) -> SupportPolygon:
-    """Between two polygons with the same normals: ``wide`` at s = 0, ``tight`` at s = 1."""
+    """Return the polygon between two with the same normals: ``wide`` at s = 0, ``tight`` at s = 1."""
     offsets = (1.0 - s) * wide.offsets + s * tight.offsets
     return SupportPolygon(tight.normals, offsets, (1.0 - s) * wide.vertices + s * tight.vertices)

@@ -1,4 +1,4 @@
-"""NAO's two motions: the waist swings over both feet, and one foot is lifted (Ramos, Fig. 1)."""
+"""Two motions of NAO: the waist sways over both feet, and one foot is lifted (after Ramos, Fig. 1)."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ._references import Path, Stroke, minimum_jerk
 FEET = ("l_sole", "r_sole")
 WAIST, HANDS = "torso", ("l_gripper", "r_gripper")
 SWAY = 0.05
-"""How far the waist goes to its left [m]."""
+"""Distance of the waist's motion to its left [m]."""
 MARGIN = 0.01
-"""How far inside the edge of the support polygon the centre of mass is asked to stay [m]."""
+"""Margin of the centre of mass inside the support polygon [m]."""
 WEIGHTS = {"feet": 1e4, "com": 1e3, "foot": 1e3, "waist": 1e2, "hands": 1e1, "posture": 1e-2}
-"""For the weighted scheme; the hierarchical ones rank by priority and need none."""
+"""Weights of the weighted scheme; the hierarchical schemes use priorities instead."""
 
 
 def double_support(duration: float = 8.0) -> Motion:
-    """Both feet stay; the centre of mass stays over them; the waist goes 5 cm to its left and back."""
+    """Return the motion on both feet: the waist goes 5 cm to its left and back."""
     robot = load_robot("nao")
     paths = _home_paths(robot, (*FEET, WAIST))
     u = duration / 8.0
@@ -60,7 +60,7 @@ def double_support(duration: float = 8.0) -> Motion:
 
 
 def single_support(duration: float = 8.0) -> Motion:
-    """The weight goes onto the left foot, the right foot is lifted while the arms open, and all goes back."""
+    """Return the motion on one foot: weight on the left foot, right foot lifted, arms opened, and back."""
     robot = load_robot("nao")
     u = duration / 8.0
     paths = _home_paths(robot, (*FEET, WAIST, *HANDS))
@@ -108,7 +108,7 @@ def single_support(duration: float = 8.0) -> Motion:
 
 
 def _home_paths(robot: Robot, frames: tuple[str, ...]) -> dict[str, Path]:
-    """Of each frame, a path that stays where it is at ``q0``."""
+    """Return a constant path for each frame, at its pose at ``q0``."""
     kinematics = home_kinematics(robot)
     positions, rotations = kinematics.frame_poses(robot, frames)
     return {name: Path(np.asarray(p), np.asarray(R)) for name, p, R in zip(frames, positions, rotations, strict=True)}
@@ -121,16 +121,19 @@ def _with(path: Path, moves: list[tuple[float, float, tuple[float, float, float]
 def _there_and_back(
     u: float, start: float, there: float, leave: float, end: float, by: tuple[float, float, float]
 ) -> list[tuple[float, float, tuple[float, float, float]]]:
-    """Strokes by a vector and back; times in units of u [s]."""
+    """Return strokes by a vector and back; times are multiples of u [s]."""
     return [(start * u, there * u, by), (leave * u, end * u, (-by[0], -by[1], -by[2]))]
 
 
 def _swing(path: Path, u: float) -> Path:
-    """The right foot goes up, back and a little in, flat: one motor turns both hip yaw-pitch joints, so no tip."""
+    """Return the path of the right foot: up, back and slightly inwards, without tilting.
+
+    A tilt is not possible because one motor drives both hip yaw-pitch joints.
+    """
     return _with(path, _there_and_back(u, 2.25, 3.5, 4.25, 5.5, (-0.045, 0.01, 0.055)))
 
 
 def _reach(u: float, side: float) -> list[tuple[float, float, tuple[float, float, float]]]:
-    """A hand moves with the waist, then opens out and up to its side (+1 left, -1 right), and returns."""
+    """Return the path of a hand (side +1 left, -1 right): with the waist, then outwards and up, and back."""
     with_waist = _there_and_back(u, 0.25, 2.0, 5.75, 7.75, (0.0, SWAY, -0.01))
     return with_waist + _there_and_back(u, 1.5, 3.25, 4.5, 6.25, (-0.02, 0.055 * side, 0.08))

@@ -1,4 +1,4 @@
-"""NAO's motions with the full dynamics, and what MuJoCo's data say of them."""
+"""Motions of NAO with full dynamics, and their figures from MuJoCo's data."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ from ._run import Run, run_scheme
 from ._schemes import make_scheme
 
 LEGS = Servo(stiffness=150.0, damping=5.0)
-"""Position servos of NAO's legs, at the torque limits of its motors; the others are as in its model."""
+"""Position servos of NAO's legs at the torque limits of its motors; other servos are those of its model."""
 LEG_JOINTS = ("*Hip*", "*Knee*", "*Ankle*")
 FEEDBACK_GAIN = 5.0
-"""[1/s], of all tasks but the posture: what the servos follow without swinging, where the kinematic loop takes 20."""
+"""Gain of all tasks but the posture [1/s] that the servos follow without oscillation; the kinematic loop uses 20."""
 
 
 def nao_world(robot: Robot, *, timestep: float = 0.001) -> World:
-    """NAO on a floor, standing on its plastic soles, which reach 10 to 20 mm beyond its force sensors."""
+    """Return NAO on a floor, standing on its plastic soles, which extend 10 to 20 mm beyond its force sensors."""
     return build_world(robot, servos=dict.fromkeys(LEG_JOINTS, LEGS), timestep=timestep)
 
 
 def with_feedback_gain(tasks: Mapping[str, Task], gain: float = FEEDBACK_GAIN) -> dict[str, Task]:
-    """The same tasks with another gain [1/s], the posture aside."""
+    """Return the tasks with another gain [1/s], except the posture."""
     return {k: t if isinstance(t, PostureTask) else t.replace(gain=gain) for k, t in tasks.items()}
 
 
 @dataclasses.dataclass(frozen=True)
 class PhysicsMeasurement:
-    """What a simulated motion achieved, all of it from MuJoCo's data; T ends early where the robot fell.
+    """Figures of a simulated motion, from MuJoCo's data; T is shorter if the robot fell.
 
     Attributes:
-        height_error: of the base against the plan [m]. (T,)
-        tilt_error: angle between the base and the plan, all three axes together [rad]. (T,)
-        slip: foot to the greatest distance, over the floor, of its contact points from where they stood at first [m];
-            nan while the plan has it in the air. Each (T,)
-        contact_slip: foot to the greatest distance that a point moved over the floor while it touched it [m].
-        pressure_margin: of the centre of pressure inside the hull of the soles that touch the floor [m], 0 on its edge;
-            nan where none does. (T,)
-        com_margin: of the centre of mass inside the hull of the soles that the plan has on the floor [m]. (T,)
-        effort_used: the greatest part of its limit that any servo exerts. (T,)
-        busiest: the joint with the greatest part.
-        saturated: servos times steps at their limit.
-        beyond_limits: the greatest angle by which any sensed hinge has left its position limits [rad], 0 inside. (T,)
-        furthest: the hinge that leaves its limits most; ``None``: none does.
-        fell: when the robot fell [s], or ``None``.
+        height_error: height of the base minus that of the plan [m]. (T,)
+        tilt_error: angle of the rotation between the base and the plan [rad]. (T,)
+        slip: per foot, the largest horizontal distance of its contact points from their first places [m]; NaN while the
+            plan lifts it. (T,) each
+        contact_slip: per foot, the largest distance that a point moved over the floor during a contact [m].
+        pressure_margin: distance of the centre of pressure inside the hull of the soles in contact [m]; NaN without
+            contact. (T,)
+        com_margin: distance of the centre of mass inside the hull of the soles that stand in the plan [m]. (T,)
+        effort_used: largest effort of a servo relative to its limit. (T,)
+        busiest: name of the joint with that effort.
+        saturated: number of servos times steps at their limit.
+        beyond_limits: largest excess of a sensed hinge beyond its position limits [rad], 0 inside. (T,)
+        furthest: name of the hinge with that excess; ``None`` without any.
+        fell: time of the fall [s], or ``None``.
     """
 
     height_error: Float[np.ndarray, " T"]
@@ -77,14 +77,14 @@ class PhysicsMeasurement:
 
 @dataclasses.dataclass(frozen=True)
 class PhysicsRun:
-    """One scheme's motion with dynamics.
+    """Motion of one scheme with dynamics.
 
     Attributes:
-        world: what it ran in.
-        plan: the kinematic motion that it is compared with.
-        run: the sensed motion, judged as the kinematic one is.
-        recording: all that was recorded.
-        physics: what came of it.
+        world: the simulated world.
+        plan: the kinematic motion used as a reference.
+        run: the sensed motion, measured like the kinematic one.
+        recording: the recorded data.
+        physics: figures of the simulated motion.
     """
 
     world: World
@@ -95,7 +95,7 @@ class PhysicsRun:
 
 
 def run_physics(motion: Motion, scheme: str, *, dt: float, world: World | None = None) -> PhysicsRun:
-    """The kinematic motion as the plan, then the same tasks in closed loop with MuJoCo.
+    """Run the kinematic motion as a plan, then the same tasks in closed loop with MuJoCo.
 
     Args:
         motion: of NAO, or of another robot with ``world``.
@@ -132,14 +132,14 @@ def run_physics(motion: Motion, scheme: str, *, dt: float, world: World | None =
 
 
 def _slow(motion: Motion) -> Callable[[Any], dict[str, Task]]:
-    """The tasks of a motion with the gain that servos can follow."""
+    """Return the tasks of a motion with the gain that servos can follow."""
     return lambda t: with_feedback_gain(motion.tasks(t))
 
 
 def measure_physics(
     motion: Motion, world: World, recording: Recording, plan: Float[np.ndarray, "T nq"]
 ) -> PhysicsMeasurement:
-    """Judges a recording against the plan, for as long as it lasts."""
+    """Compare a recording with the plan over the time that it lasts."""
     base = next(world.robot.tree.qpos_address[j] for j in world.robot.tree.independent)
     is_, wanted = recording.q[:, base : base + 7], plan[: len(recording.q), base : base + 7]
     standing = {s.frame: s.on_ground(recording.time) for s in motion.stances}
@@ -163,7 +163,7 @@ def measure_physics(
 
 
 def _beyond_limits(robot: Robot, q: Float[np.ndarray, "T nq"]) -> tuple[list[str], Float[np.ndarray, "T n"]]:
-    """Names of the hinges that move on their own, and by how much each is outside its position limits [rad]."""
+    """Return the names of the independent hinges, and the excess of each beyond its limits [rad]. (T, k)."""
     tree = robot.tree
     hinges = [j for j in tree.dof_address if tree.joint_types[j] == HINGE]
     angle, dof = q[:, [tree.qpos_address[j] for j in hinges]], [tree.dof_address[j] for j in hinges]
@@ -172,7 +172,7 @@ def _beyond_limits(robot: Robot, q: Float[np.ndarray, "T nq"]) -> tuple[list[str
 
 
 def _turn(a: Float[np.ndarray, "T 4"], b: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, " T"]:
-    """Angle between unit quaternions."""
+    """Return the angle between unit quaternions [rad]."""
     out, difference = np.zeros(len(a)), np.zeros(3)
     for k, (x, y) in enumerate(zip(a, b, strict=True)):
         mujoco.mju_subQuat(difference, x, y)
@@ -181,7 +181,7 @@ def _turn(a: Float[np.ndarray, "T 4"], b: Float[np.ndarray, "T 4"]) -> Float[np.
 
 
 def _of_foot(world: World, recording: Recording, foot: str) -> tuple[np.ndarray, np.ndarray]:
-    """Contact points (T, k, 3) and forces (T, k, 3) of one foot."""
+    """Return the contact points (T, k, 3) and forces (T, k, 3) of one foot."""
     ends = np.cumsum([0, *(len(points) for points in world.feet.values())])
     first = list(world.feet).index(foot)
     part = slice(ends[first], ends[first + 1])
@@ -189,7 +189,7 @@ def _of_foot(world: World, recording: Recording, foot: str) -> tuple[np.ndarray,
 
 
 def _touches(forces: Float[np.ndarray, "T k 3"]) -> np.ndarray:
-    """Whether the floor bears on any of the points. (T,)."""
+    """Return whether the floor exerts a force on any of the points. (T,)."""
     return np.max(forces[..., 2], axis=-1) > 0.0
 
 
@@ -199,7 +199,7 @@ def _slip(world: World, recording: Recording, foot: str) -> Float[np.ndarray, " 
 
 
 def _contact_slip(points: Float[np.ndarray, "T k 3"], forces: Float[np.ndarray, "T k 3"]) -> float:
-    """Over all points, and all times in which one touches the floor without a break."""
+    """Return the largest distance [m] that a point moves over the floor during one uninterrupted contact."""
     worst = 0.0
     for place, touching in zip(np.moveaxis(points[..., :2], 1, 0), (forces[..., 2] > 0.0).T, strict=True):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], touching, [False]]).astype(int)))
@@ -209,7 +209,7 @@ def _contact_slip(points: Float[np.ndarray, "T k 3"], forces: Float[np.ndarray, 
 
 
 def _hulls(world: World, recording: Recording, down: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Vertices of the hull of the soles that are down, where they are at each time, counter-clockwise; none: (0, 2)."""
+    """Return, per time, the hull vertices of the soles that should stand, counter-clockwise; (0, 2) without any."""
     feet = {foot: _of_foot(world, recording, foot)[0][..., :2] for foot in down}
     out = []
     for k in range(len(recording.time)):
@@ -220,14 +220,14 @@ def _hulls(world: World, recording: Recording, down: Mapping[str, np.ndarray]) -
 
 
 def _pressure(recording: Recording) -> Float[np.ndarray, "T 2"]:
-    """Centre of pressure on the floor; nan where nothing touches."""
+    """Return the centre of pressure on the floor [m]; NaN without contact. (T, 2)."""
     weight = recording.contact_forces[..., 2:]
     total = weight.sum(1)
     return (weight * recording.contact_points[..., :2]).sum(1) / np.where(total > 0.0, total, np.nan)
 
 
 def _margins(points: Float[np.ndarray, "T 2"], hulls: list[np.ndarray]) -> Float[np.ndarray, " T"]:
-    """Least distance to the lines through the edges, positive inside; nan without a hull."""
+    """Return the least signed distance to the hull's edge lines [m], positive inside; NaN without a hull. (T,)."""
     out = np.full(len(points), np.nan)
     for k, vertices in enumerate(hulls):
         if len(vertices):

@@ -1,4 +1,4 @@
-"""Runs a motion of NAO with dynamics and writes what came of it."""
+"""Run of a NAO motion with dynamics, and its output files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def run_physics_demo(
     renderer: RendererName = "auto",
     announce: Announce | None = None,
 ) -> tuple[dict, list[PhysicsRun]]:
-    """As ``run_demo``, with MuJoCo between the servo targets and what is sensed. The film shows the simulated robot.
+    """Run the schemes as ``run_demo`` does, in closed loop with MuJoCo; film the simulated robot.
 
     Args:
         motion: of NAO.
@@ -79,7 +79,7 @@ def _save_figure(motion: Motion, runs: Sequence[PhysicsRun], folder: Path) -> st
 
 
 def _save_arrays(runs: Sequence[PhysicsRun], folder: Path) -> str:
-    """Of each SCHEME: time, q (sensed), plan, command, effort, com, contact_points, contact_forces."""
+    """Write time, q (sensed), plan, command, effort, com, contact_points and contact_forces of each scheme."""
     arrays: dict[str, np.ndarray] = {}
     for run in runs:
         key, r = run.run.scheme.replace("-", "_"), run.recording

@@ -1,4 +1,4 @@
-"""The figures of a demonstration with dynamics: as JSON for programs, as a table and plots for people."""
+"""Report of a demonstration with dynamics: JSON for programs, a table and plots for people."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ._report import inside, limit_count, number, report, solved, table_of_schem
 from ._schemes import TITLES
 
 HEIGHT, TILT, SLIP = 0.01, float(np.radians(3.0)), 0.005
-"""What has to be reached: base height off plan [m], base turned off plan [rad], a standing foot off its place [m]."""
+"""Largest accepted errors: base height [m], base orientation [rad], displacement of a standing foot [m]."""
 
 
 def physics_report(
     motion: Motion, runs: Sequence[PhysicsRun], world: World, *, dt: float, files: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """All figures of a demonstration with dynamics; lengths in mm, angles in degrees or mrad as the names say."""
+    """Return all figures of a demonstration with dynamics; lengths in mm, angles in degrees or mrad as named."""
     out = report(motion, {r.run.scheme: (r.run.outcome, r.run.measurement) for r in runs}, dt=dt, files=files)
     out["checked_with"] = "MuJoCo's data along the simulation; the plan is the kinematic motion of the same scheme"
     out["settings"] |= {
@@ -40,7 +40,7 @@ def physics_report(
 
 
 def physics_figures(physics: PhysicsMeasurement) -> dict[str, Any]:
-    """One scheme's part of the report; lengths in mm, angles in degrees."""
+    """Return one scheme's figures; lengths in mm, angles in degrees."""
     return {
         "fell_at_s": physics.fell,
         "base_height_error_mm": 1e3 * float(physics.height_error.max()),
@@ -59,18 +59,18 @@ def physics_figures(physics: PhysicsMeasurement) -> dict[str, Any]:
 
 
 def _worst(values: Float[np.ndarray, " T"]) -> float:
-    """The greatest that is no nan; 0 where there is none."""
+    """Return the largest value that is not NaN; 0 without any."""
     return float(np.nanmax(values, initial=0.0))
 
 
 def _least(margin: Float[np.ndarray, " T"]) -> float | None:
-    """The least that is no nan [mm]."""
+    """Return the least value that is not NaN [mm]."""
     known = margin[~np.isnan(margin)]
     return 1e3 * float(known.min()) if len(known) else None
 
 
 def reached(physics: PhysicsMeasurement) -> dict[str, bool]:
-    """What has to be reached, and whether it was."""
+    """Return, for each requirement, whether it was met."""
     slips = [_worst(slip) for slip in physics.slip.values()] + list(physics.contact_slip.values())
     return {
         "standing": physics.fell is None,
@@ -81,13 +81,13 @@ def reached(physics: PhysicsMeasurement) -> dict[str, bool]:
 
 
 def physics_table(summary: Mapping[str, Any]) -> Table:
-    """What each scheme reached with dynamics; red: not what it has to be."""
+    """Return a table of the schemes with dynamics; figures in red miss their requirement."""
     schemes = list(summary["schemes"].values())
     return table_of_schemes(f"{summary['title']}, with dynamics", schemes, _rows(schemes[0]))
 
 
 def _rows(example: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Labels, and functions from a scheme's figures to what its cell says."""
+    """Return row labels, each with a function from a scheme's figures to the cell's text."""
     return [
         ("stands to the end", lambda s: _stands(s["physics"]["fell_at_s"])),
         ("base height off plan [mm]", lambda s: number(s["physics"]["base_height_error_mm"], 1e3 * HEIGHT)),
@@ -121,7 +121,7 @@ def _margin(value: float | None) -> str:
 
 
 def physics_panels(runs: Sequence[PhysicsRun]) -> list[Panel]:
-    """What the comparison shows of each scheme."""
+    """Return the panels of the comparison plot."""
     measured = {TITLES[run.run.scheme]: run.physics for run in runs}
     slips = {name: 1e3 * _greatest(list(m.slip.values())) for name, m in measured.items()}
     return [
@@ -162,5 +162,5 @@ def physics_panels(runs: Sequence[PhysicsRun]) -> list[Panel]:
 
 
 def _greatest(values: Sequence[np.ndarray]) -> np.ndarray:
-    """Over the feet, at each time; one of them stands at all times."""
+    """Return the largest value over the feet at each time. (T,)."""
     return np.nanmax(np.stack(values), 0)

@@ -1,4 +1,4 @@
-"""Smooth references: sums of minimum-jerk strokes, with their velocities."""
+"""Smooth references: sums of minimum-jerk strokes and their velocities."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 
 
 def minimum_jerk(t: ArrayLike | Array, start: float, duration: float) -> tuple[Array, Array]:
-    """From 0 at ``start`` to 1 at ``start + duration`` [s], at rest at both ends; the value and its rate [1/s]."""
+    """Return value and rate [1/s] of a minimum-jerk curve from 0 at ``start`` to 1 at ``start + duration`` [s]."""
     s = jnp.clip((jnp.asarray(t) - start) / duration, 0.0, 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 30.0 * s**2 * (1.0 - s) ** 2 / duration
 
 
 @dataclasses.dataclass(frozen=True)
 class Stroke:
-    """A move by ``amount`` between two times.
+    """Minimum-jerk move by ``amount`` between two times.
 
     Attributes:
         start: when it starts [s].
@@ -33,7 +33,7 @@ class Stroke:
 
 
 def follow(strokes: Sequence[Stroke], t: ArrayLike | Array, size: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Sum of the strokes at time t [s], and its velocity. (size,) each."""
+    """Return the sum of the strokes at time t [s], and its velocity. (size,) each."""
     value = rate = jnp.zeros(size)
     for stroke in strokes:
         s, speed = minimum_jerk(t, stroke.start, stroke.end - stroke.start)
@@ -44,7 +44,7 @@ def follow(strokes: Sequence[Stroke], t: ArrayLike | Array, size: int) -> tuple[
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """Where a frame should be over time: strokes from a start, turned about one axis of the world.
+    """Reference of a frame over time: strokes of its position, and of its angle about one world axis.
 
     Attributes:
         position: at the start [m]. (3,)
@@ -61,7 +61,7 @@ class Path:
     axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
     def at(self, t: ArrayLike | Array) -> tuple[tuple[Float[Array, "3"], Float[Array, "3 3"]], Float[Array, "6"]]:
-        """Pose (p, R) and velocity [linear; angular], world axes, at time t [s]."""
+        """Return pose (p, R) and velocity [linear; angular] in world axes at time t [s]."""
         shift, velocity = follow(self.moves, t, 3)
         angle, speed = follow(self.turns, t, 1)
         axis = jnp.asarray(self.axis)
@@ -70,11 +70,11 @@ class Path:
 
     @property
     def strokes(self) -> tuple[Stroke, ...]:
-        """All strokes."""
+        """Return all strokes of position and angle."""
         return (*self.moves, *self.turns)
 
     def still(self, t: np.ndarray) -> np.ndarray:
-        """Whether the path has moved before, and stands at each time [s] of an array."""
+        """Return whether the path has moved before and is at rest, for each time [s]. (T,)."""
         begun = np.zeros(len(t), bool)
         moving = np.zeros(len(t), bool)
         for stroke in self.strokes:
@@ -84,7 +84,7 @@ class Path:
 
 
 def _rotation(axis: Float[Array, "3"], angle: Array) -> Float[Array, "3 3"]:
-    """Rodrigues' formula."""
+    """Return the rotation matrix about an axis by an angle [rad] (Rodrigues' formula)."""
     x, y, z = axis
     cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * cross @ cross

@@ -1,4 +1,4 @@
-"""The figures of a demonstration: as JSON for programs and as a table for people."""
+"""Report of a demonstration: JSON for programs and a table for people."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from ._motion import Motion
 from ._schemes import PROMISES_LIMITS, TITLES
 
 DRIFT_POSITION, DRIFT_ORIENTATION, PATH_ERROR = 1e-4, 1e-4, 1e-3
-"""What the hierarchical scheme has to reach: [m] and [rad] for the standing feet, [m] for the first goal.
+"""Requirements of the hierarchical scheme for a motion of 5 cm: drift of standing feet [m], [rad], error of the first
+goal [m].
 
 Lengths are those of a motion of 5 cm.
 """
@@ -31,7 +32,7 @@ Lengths are those of a motion of 5 cm.
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a solver said along a motion, and how long it took.
+    """Solver results along a motion, and run times.
 
     Attributes:
         compile_seconds: tracing and compiling the whole loop [s].
@@ -55,7 +56,7 @@ def report(
     dt: float,
     files: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """All figures of a demonstration; lengths in mm, angles in mrad."""
+    """Return all figures of a demonstration; lengths in mm, angles in mrad."""
     return {
         "motion": motion.name,
         "title": motion.title,
@@ -69,7 +70,7 @@ def report(
 
 
 def write_report(summary: Mapping[str, Any], path: Path) -> None:
-    """Writes strict JSON."""
+    """Write a report as strict JSON."""
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -135,13 +136,13 @@ def _drift(track: Track) -> dict[str, float]:
 
 
 def _turn(track: Track) -> dict[str, float]:
-    """The greatest angle, where one counts."""
+    """Return the largest orientation error [mrad]; None if no orientation is tracked."""
     angle = track.orientation[~np.isnan(track.orientation)]
     return {"orientation_mrad": 1e3 * float(angle.max())} if len(angle) else {}
 
 
 def _error(track: Track) -> dict[str, float | None]:
-    """Greatest errors over all times, and over those when the path stands again."""
+    """Return the largest errors over all times, and over the times when the path is at rest again."""
     out: dict[str, float | None] = {"position_mm": 1e3 * float(track.position.max())}
     out["settled_position_mm"] = 1e3 * float(track.position[track.settled].max()) if track.settled.any() else None
     return out | _turn(track)
@@ -165,7 +166,7 @@ def _finite(value: float) -> float | None:
 
 
 def _reached(motion: Motion, m: Measurement) -> dict[str, bool]:
-    """What the hierarchical scheme has to reach; told of every scheme."""
+    """Return, for each requirement of the hierarchical scheme, whether a motion met it."""
     first = next(iter(m.goals.values()))
     settled = first.position[first.settled]
     out = {"first_goal": bool(len(settled) and settled.max() <= PATH_ERROR * motion.scale)}
@@ -180,13 +181,16 @@ def _reached(motion: Motion, m: Measurement) -> dict[str, bool]:
 
 
 def table(summary: Mapping[str, Any]) -> Table:
-    """The same for people: what each scheme reached."""
+    """Return the figures as a table with one column per scheme."""
     schemes = list(summary["schemes"].values())
     return table_of_schemes(summary["title"], schemes, _rows(schemes[0], summary["settings"]["scale"]))
 
 
 def table_of_schemes(title: str, schemes: Sequence[Mapping[str, Any]], rows: Sequence[tuple[str, Any]]) -> Table:
-    """A column for each scheme; of each row the label, and a function from a scheme's figures to what its cell says."""
+    """Return a table with one column per scheme.
+
+    Each row has a label, and a function from a scheme's figures to the cell's text.
+    """
     out = Table(title=title, title_justify="left", title_style="bold")
     out.add_column("")
     for scheme in schemes:
@@ -197,7 +201,10 @@ def table_of_schemes(title: str, schemes: Sequence[Mapping[str, Any]], rows: Seq
 
 
 def _rows(example: Mapping[str, Any], scale: float) -> list[tuple[str, Any]]:
-    """Labels, and functions from a scheme's figures to what its cell says; wanted lengths grow with the scale."""
+    """Return row labels, each with a function from a scheme's figures to the cell's text.
+
+    Required lengths grow with the scale of the motion.
+    """
     rows: list[tuple[str, Any]] = []
     if example["standing"]:
         rows.append(("standing feet, drift [mm]", lambda s: number(_worst(s["standing"], "position_mm"), 0.1 * scale)))
@@ -230,7 +237,7 @@ def _worst(standing: Mapping[str, Mapping[str, float]], key: str) -> float:
 
 
 def number(value: float | None, limit: float | None) -> str:
-    """A figure for a cell, red above its limit."""
+    """Return a figure as a cell, in red above its limit."""
     if value is None:
         return "-"
     text = f"{value:.2g}" if value < 10 else f"{value:.1f}"
@@ -238,17 +245,17 @@ def number(value: float | None, limit: float | None) -> str:
 
 
 def inside(value: float) -> str:
-    """A margin for a cell, red where negative."""
+    """Return a margin as a cell, in red if negative."""
     return f"{value:.1f}" if value >= 0.0 else f"[red]{value:.1f}[/red]"
 
 
 def limit_count(value: int) -> str:
-    """A count of violations for a cell, red above 0."""
+    """Return a count of violations as a cell, in red above 0."""
     return "0" if value == 0 else f"[red]{value}[/red]"
 
 
 def solved(status: Mapping[str, int]) -> str:
-    """Steps solved out of all for a cell, red where some were not."""
+    """Return the number of solved steps out of all as a cell, in red if any is unsolved."""
     total = sum(status.values())
     done = status[Status.SOLVED.name]
     return f"{done}/{total}" if done == total else f"[red]{done}/{total}[/red]"

@@ -1,4 +1,4 @@
-"""Runs a motion with each scheme and writes what came of it."""
+"""Run of a motion with each scheme, and its output files."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from ._schemes import TITLES, make_scheme
 
 SCHEME_COLORS = {TITLES["weighted"]: "#f08c3a", TITLES["null-space"]: "#4d5561", TITLES["hierarchical"]: "#1565c0"}
 Announce = Callable[[str, float], None]
-"""Called with the stage that runs and the part of the whole that is done, 0 to 1."""
+"""Callback with the name of the current stage and the finished share, 0 to 1."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One scheme's motion.
+    """Motion of one scheme.
 
     Attributes:
-        scheme: its name.
-        q: configurations, the first one is the start. (steps + 1, nq)
-        v: velocities. (steps, nv)
-        outcome: what the solver said, and how long it took.
-        measurement: what came of it.
+        scheme: name of the scheme.
+        q: configurations, starting with the start. (steps + 1, nq)
+        v: velocities [rad/s or m/s]. (steps, nv)
+        outcome: solver results and run times.
+        measurement: figures of the motion.
     """
 
     scheme: str
@@ -45,7 +45,7 @@ class Run:
 
 
 def run_scheme(motion: Motion, scheme: str, *, dt: float) -> Run:
-    """Compiles the closed loop, runs it once, and measures the motion."""
+    """Compile the closed loop, run it once, and measure the motion."""
     steps = round(motion.duration / dt)
 
     def loop(q0):
@@ -80,7 +80,7 @@ def run_demo(
     renderer: RendererName = "auto",
     announce: Announce | None = None,
 ) -> tuple[dict, list[Run]]:
-    """Runs the schemes one after the other, and writes ``comparison.png``, ``motion.npz``, ``report.json`` and a film.
+    """Run the schemes in turn and write ``comparison.png``, ``motion.npz``, ``report.json`` and a film.
 
     Args:
         motion: what to do.
@@ -119,7 +119,7 @@ def run_demo(
 
 
 def _save_arrays(runs: Sequence[Run], folder: Path) -> str:
-    """time, q_SCHEME (steps + 1, nq) and v_SCHEME (steps, nv)."""
+    """Write time, q_SCHEME (steps + 1, nq) and v_SCHEME (steps, nv) of all schemes."""
     arrays = {"time": runs[0].measurement.time}
     for run in runs:
         key = run.scheme.replace("-", "_")
@@ -129,7 +129,7 @@ def _save_arrays(runs: Sequence[Run], folder: Path) -> str:
 
 
 def _save_figure(motion: Motion, runs: Sequence[Run], folder: Path) -> str:
-    """The comparison, panels that say nothing about this robot left out."""
+    """Write the comparison plot without panels that have no data for this robot."""
     figure = compare_figure(
         runs[0].measurement.time,
         comparison_panels(motion, {TITLES[run.scheme]: run.measurement for run in runs}),
@@ -142,7 +142,7 @@ def _save_figure(motion: Motion, runs: Sequence[Run], folder: Path) -> str:
 
 
 def comparison_panels(motion: Motion, measured: dict[str, Measurement]) -> list[Panel]:
-    """What the comparison shows of each scheme; lengths in millimetres."""
+    """Return the panels of the comparison plot; lengths in mm."""
     label, goal = next(iter(motion.goals.items()))
     panels = []
     if motion.stances:
@@ -174,19 +174,19 @@ def comparison_panels(motion: Motion, measured: dict[str, Measurement]) -> list[
 
 
 def _wanted(bound: float) -> dict[str, Any]:
-    """The line of an error that is wanted [mm]."""
+    """Return the options of the line at a required error [mm]."""
     return {"bound": bound, "bound_label": f"{bound:.2g} mm wanted"}
 
 
 def _worst_drift(m: Measurement) -> np.ndarray:
-    """Over the frames that stand at each time [m]."""
+    """Return the largest drift of the standing frames at each time [m]. (T,)."""
     return np.nanmax(np.stack([track.position for track in m.stances.values()]), 0)
 
 
 def film(
     motion: Motion, run: Run, folder: Path, dt: float, renderer: RendererName, progress: Callable[[float], None]
 ) -> list[str]:
-    """The last scheme's motion; what each goal moves most along is drawn beside it."""
+    """Write a film of a scheme's motion, with a curve of each goal's largest component."""
     names = ["motion.gif"] + (["motion.mp4"] if shutil.which("ffmpeg") else [])
     for name in names:
         animate(
@@ -206,7 +206,7 @@ def film(
 
 
 def draw_picture(motion: Motion, run: Run, path: str | Path, instants: Sequence[float] = (0.0, 0.26, 0.45)) -> Path:
-    """Three instants of a motion side by side, as a .png.
+    """Write a PNG with three instants of a motion side by side.
 
     Args:
         motion: the motion.
@@ -224,7 +224,7 @@ _DIRECTIONS = ("forward", "to the left", "up")
 
 
 def _film_curves(m: Measurement, scale: float) -> Curves:
-    """Of up to two goals, the coordinate that moves most [mm]."""
+    """Return the curves of the largest component of up to two goals [mm]."""
     values, wanted = {}, {}
     for label in list(m.goals)[:2]:
         axis = int(np.argmax(np.ptp(m.wanted[label], axis=0)))

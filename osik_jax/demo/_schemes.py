@@ -1,4 +1,4 @@
-"""The schemes that the demonstration compares, by the names that its command line knows."""
+"""Schemes of the demonstration by their names on the command line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PROMISES_LIMITS = ("weighted", "hierarchical")
 
 
 def make_scheme(name: str) -> Any:
-    """A scheme with its default settings.
+    """Return a scheme with its default settings.
 
     Raises:
         KeyError: no such scheme; the message lists those that exist.

@@ -1,4 +1,4 @@
-"""Where a robot that somebody brings along starts: on the floor, away from limits and from stretched limbs."""
+"""Start configuration for a user's robot: on the floor, away from limits and from stretched limbs."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from ..tasks import FrameTask
 from ..viewer import Outline
 
 _SINK = 0.05
-"""A standing robot first bends its legs: its waist goes down by this part of its height over the feet."""
+"""Share of the waist's height by which a standing robot first bends its legs."""
 _CLEAR = 0.04
-"""A robot that is bolted down keeps its links this far above its base, in parts of its size."""
+"""Height of the links of a fixed robot above its base, as a share of its size."""
 Rows = Literal["pose", "position"]
 
 
 def start(robot: Robot, outline: Outline, moving: str, standing: Sequence[str], rows: Rows) -> Float[Array, " nq"]:
-    """Home, unless the waist has to sink a little, or an arm has to bend or to rise from below its base.
+    """Return the home configuration, changed where the waist must sink or an arm must bend or rise above its base.
 
     Args:
         robot: the robot.
@@ -45,12 +45,12 @@ def start(robot: Robot, outline: Outline, moving: str, standing: Sequence[str], 
 
 
 def raised(robot: Robot, q: Array, height: float) -> Float[Array, " nq"]:
-    """The configuration with the floating base higher by so much [m]."""
+    """Return the configuration with the floating base raised by a height [m]."""
     return q.at[robot.tree.qpos_address[robot.tree.free_bases[0]] + 2].add(height)
 
 
 def _bent(robot: Robot) -> Float[Array, " nq"]:
-    """Home with every limited joint moved towards the middle of its range, by a twentieth of the range at most."""
+    """Return home with every limited joint moved towards the middle of its range, by at most 5 % of the range."""
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     q0, step = np.asarray(robot.q0), np.zeros(robot.nv)
     for joint, dof in robot.tree.dof_address.items():
@@ -61,7 +61,7 @@ def _bent(robot: Robot) -> Float[Array, " nq"]:
 
 
 def strides(robot: Robot, size: float) -> Float[np.ndarray, " nv"]:
-    """What is a long way for each dof: 1 rad, or a quarter of the robot's size where it slides [m]."""
+    """Return a large change of each dof: 1 rad, or a quarter of the robot's size for a slide [m]. (nv,)."""
     out = np.ones(robot.nv)
     for joint, dof in robot.tree.dof_address.items():
         if robot.tree.joint_types[joint] == SLIDE:
@@ -70,10 +70,10 @@ def strides(robot: Robot, size: float) -> Float[np.ndarray, " nv"]:
 
 
 def _dexterous(robot: Robot, outline: Outline, frame: str, count: int = 256, reach: float = 0.8) -> Float[Array, " nq"]:
-    """Home, unless a configuration near it moves the frame twice as well in its worst direction.
+    """Return home, or a nearby configuration that moves the frame twice as well in its worst direction.
 
-    Of all those, only such count as keep the links above the base, or as nearly as can be; a robot that hangs from its
-    base at home may hang.
+    Candidates must keep the links above the base, or as nearly as possible; a robot that hangs from its base at home
+    may hang.
     """
     steps = np.random.default_rng(0).uniform(-reach, reach, (count, robot.nv)) * (np.arange(count) > 0)[:, None]
     steps *= strides(robot, outline.size)
@@ -100,9 +100,10 @@ def _dexterous(robot: Robot, outline: Outline, frame: str, count: int = 256, rea
 def _settled(
     robot: Robot, q: Array, targets: dict[str, tuple[Array, Array]], rows: Rows, size: float
 ) -> Float[Array, " nq"]:
-    """Damped Gauss-Newton steps to the poses, the last of which counts least, from q and a few nudged starts.
+    """Return the configuration after damped Gauss-Newton steps to the poses, from q and a few perturbed starts.
 
-    A leg that is stretched at q, with no limit to tell which way its knee bends, only bends from a nudged one.
+    The last pose has the least weight. A stretched leg whose knee has no limit to tell its side bends from a perturbed
+    start only.
     """
     last = len(targets) - 1
     tasks = [
@@ -132,14 +133,14 @@ def _settled(
 
 
 def _leg_dofs(robot: Robot, q: Array, feet: Sequence[str]) -> np.ndarray:
-    """Which dofs move one of the feet. (nv,)."""
+    """Return which dofs move one of the feet. (nv,)."""
     kinematics = compiled_kinematics(robot, q)
     moved = [np.asarray(frame_jacobian(robot, kinematics, foot)) for foot in feet]
     return np.abs(np.concatenate(moved)).max(0) > 0.0
 
 
 def _inside(robot: Robot, q: Array, *, margin: float = 0.0) -> Array:
-    """Clips hinges and slides to their limits, drawn in by a part of their range."""
+    """Clip hinges and slides to their limits, narrowed by a share of their range."""
     single = [j for j in robot.tree.dof_address if robot.tree.joint_types[j] in (HINGE, SLIDE)]
     at = np.array([robot.tree.qpos_address[j] for j in single], int)
     dof = np.array([robot.tree.dof_address[j] for j in single], int)

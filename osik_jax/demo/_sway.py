@@ -1,4 +1,4 @@
-"""The path that a frame of any robot takes: to its left and back, or as its few joints let it."""
+"""Path of a frame of any robot to its left and back, within the motion that its joints allow."""
 
 from __future__ import annotations
 
@@ -18,27 +18,29 @@ from ._references import Path, Stroke, follow
 from ._start import strides
 
 SWAY = 0.05
-"""How far the frame goes [m], of a robot from ``_SMALL`` to ``_LARGE``; of others the same part of their size."""
+"""Distance of the frame's motion [m] for a robot sized between ``_SMALL`` and ``_LARGE``; the same share of the size
+otherwise.
+"""
 _SMALL, _LARGE = 0.3, 10.0
 _TURN = 0.3
-"""How far a joint turns that moves its frame nowhere [rad]."""
+"""Rotation of a joint that does not move its frame's origin [rad]."""
 
 
 def sway_of(size: float) -> float:
-    """How far a robot of some size goes [m]."""
+    """Return the distance of the motion for a robot of some size [m]."""
     return SWAY * size / float(np.clip(size, _SMALL, _LARGE))
 
 
 @dataclasses.dataclass(frozen=True)
 class JointPath(Path):
-    """Where a frame goes when the joints move together along a line.
+    """Path of a frame while the joints move together along a line in joint space.
 
     Attributes:
         robot: the robot.
-        q0: where it starts. (nq,)
-        frame: the frame.
-        line: how far each dof goes at 1. (nv,)
-        along: strokes of how far it is along the line, 0 to 1.
+        q0: start configuration. (nq,)
+        frame: name of the frame.
+        line: displacement of each dof at parameter 1 [rad or m]. (nv,)
+        along: strokes of the parameter along the line, 0 to 1.
     """
 
     robot: Robot | None = None
@@ -48,7 +50,7 @@ class JointPath(Path):
     along: tuple[Stroke, ...] = ()
 
     def at(self, t: ArrayLike | Array) -> tuple[tuple[Float[Array, "3"], Float[Array, "3 3"]], Float[Array, "6"]]:
-        """Pose (p, R) and velocity [linear; angular], world axes, at time t [s]."""
+        """Return pose (p, R) and velocity [linear; angular] in world axes at time t [s]."""
         assert self.robot is not None
         part, rate = follow(self.along, t, 1)
         q = integrate(self.robot, jnp.asarray(self.q0), jnp.asarray(self.line), part[0])
@@ -58,14 +60,14 @@ class JointPath(Path):
 
     @property
     def strokes(self) -> tuple[Stroke, ...]:
-        """All strokes."""
+        """Return all strokes along the line."""
         return self.along
 
 
 def sway(robot: Robot, q0: Array, frame: str, *, size: float, duration: float) -> Goal:
-    """A frame goes to its left and back, with its orientation kept where the robot has joints enough for that.
+    """Return a path to the frame's left and back, with its orientation kept if the robot has enough joints.
 
-    A frame that cannot go left goes where its joints move it most.
+    A frame that cannot move left moves in the direction in which its joints move it most.
     """
     kinematics = compiled_kinematics(robot, q0)
     position, rotation = (np.asarray(part) for part in kinematics.frame_pose(robot, frame))
@@ -83,7 +85,7 @@ def sway(robot: Robot, q0: Array, frame: str, *, size: float, duration: float) -
 
 
 def _can(J: Float[np.ndarray, "3 nv"], move: Float[np.ndarray, "3"], stride: Float[np.ndarray, " nv"]) -> bool:
-    """Whether the frame can move in any direction, and so far that way without long strides of its joints."""
+    """Return whether the frame can move in any direction, and by the distance without long strides of its joints."""
     scaled = J * stride
     if not _has_rank(scaled):
         return False
@@ -98,7 +100,7 @@ def _has_rank(J: Float[np.ndarray, "rows nv"]) -> bool:
 def _line(
     robot: Robot, q0: Array, J: Float[np.ndarray, "6 nv"], length: float, stride: Float[np.ndarray, " nv"]
 ) -> Float[np.ndarray, " nv"]:
-    """Along which the frame moves most: so far, or as far as limits and strides let it, towards the roomier side."""
+    """Return the line in joint space along which the frame moves most, within limits and strides."""
     _, values, rows = np.linalg.svd(J[:3] * stride)
     still = values[0] <= 1e-9 * length
     line = (np.eye(robot.nv)[int(np.argmax(np.linalg.norm(J[3:], axis=0)))] if still else rows[0]) * stride
@@ -108,7 +110,7 @@ def _line(
 
 
 def _room(robot: Robot, q0: Array, line: Float[np.ndarray, " nv"]) -> float:
-    """How often the line can be gone before a joint has used up nine tenths of its way to a limit."""
+    """Return the multiple of the line after which a joint has used 90 % of its way to a limit."""
     q, most = np.asarray(q0), np.inf
     for joint, dof in robot.tree.dof_address.items():
         limit = float((robot.position_upper if line[dof] > 0.0 else robot.position_lower)[dof])

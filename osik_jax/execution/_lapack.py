@@ -80,7 +80,7 @@ _OPERATIONS: dict[str, Callable[..., int]] = {
     "svd": _rotations,
     "eigh": _rotations,
 }
-"""For one matrix; at least what jaxlib counts, as far as it was measured (jaxlib 0.10.2).
+"""Operation counts for one matrix, at least those that jaxlib assumes (measured with jaxlib 0.10.2).
 
-Not among them are operations that the solvers do not use, such as eigenvalues of matrices without symmetry.
+Operations that the solvers do not use are missing, such as eigenvalues of unsymmetric matrices.
 """

@@ -23,6 +23,6 @@ class LimitRows(eqx.Module):
     upper: Float[Array, " m"]
 
     def violation(self, velocity: Float[Array, " nv"]) -> Float[Array, " m"]:
-        """How far each row is outside its bounds; 0 where it holds."""
+        """Return the distance of each row's value outside its bounds; 0 if the row holds. (m,)."""
         value = apply(self.jacobian, velocity)
         return jnp.maximum(jnp.maximum(self.lower - value, value - self.upper), 0.0)

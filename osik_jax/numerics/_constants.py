@@ -1,10 +1,9 @@
-"""The one table of tolerances and other numbers that solvers, schemes and tasks are tuned by, each with its reason.
+"""The table of tolerances and tuning numbers of solvers, schemes and tasks, each with its reason.
 
-Where data in single precision take another number, there is one for each precision. Most are relative: to machine
-epsilon, to roundoff (a tolerance times the scale of a constraint, ``constraint_scales``), or to what their line says.
-Kernels for CPUs have them compiled in, and texts for CUDA get them as constants (``_warp.py`` in ``solvers/qp``,
-``solvers/hqp`` and ``solvers/null_space``), so that methods in plain JAX and their kernels decide alike: neither
-imports the other.
+Numbers that depend on the precision of the data have one value for each precision. Most are relative: to machine
+epsilon, to roundoff (a tolerance times the scale of a constraint, ``constraint_scales``), or to the quantity named in
+their line. The compiled core has the same numbers in ``core/constants.hpp``, and GPU kernels get them as constants, so
+that plain JAX and the kernels decide alike.
 
 Not here, because they are no tolerances of a solver:
 
@@ -25,310 +24,356 @@ import numpy as np
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 """Labels of a constraint in an active set."""
 REDUNDANT = 3
-"""In a kernel's candidate: inactive, for it depends on the active ones, and holds up to roundoff where they do."""
+"""Label in a kernel's candidate: inactive, because the constraint depends on active ones and holds up to roundoff if
+they do.
+"""
 
 EPSILON = float(np.finfo(np.float64).eps)
-"""Machine epsilon of double precision, in which kernels for CPUs compute."""
+"""Machine epsilon of double precision, the precision of the CPU kernels."""
 
 # ---- damping of levels, shared with kernels
 
 DAMPING_ITERATIONS = 3
-"""Steps towards the fixed point of a level's damping; each shrinks an excess by the factor unmet / s^2."""
+"""Iterations towards the fixed point of a level's damping; each shrinks the error by the factor unmet / s^2."""
 DAMPING_RIDGE = 1e-13
-"""Relative to the trace of the Gram matrix of a level's rows: keeps its Cholesky factor from breaking."""
+"""Ridge relative to the trace of the Gram matrix of a level's rows; it keeps the Cholesky factor positive."""
 DAMPING_RIDGE_ROUNDOFF = 10.0
-"""In units of machine epsilon: the ridge is no smaller, which counts in single precision."""
+"""Least value of that ridge in units of machine epsilon; it applies in single precision."""
 NEGLIGIBLE_DAMPING = 1e-13
-"""Relative to the square of the level's longest row: gradients of a smaller damping are below roundoff."""
+"""Damping relative to the square of the level's longest row whose gradients are below roundoff."""
 TIE_ROUNDOFF = 100.0
-"""In units of machine epsilon of the terms of a row: one that is off its interval by less has no part in the damped
-step."""
+"""Tolerance in units of machine epsilon of a row's terms: a row that leaves its interval by less is not in the damped
+step.
+"""
 COST_FRACTION = 0.1
-"""Of a level's decrease of cost, the fraction that the levels below may cost it at second order."""
+"""Share of a level's cost decrease that lower levels may undo at second order."""
 MIN_RADIUS = 1e-6
-"""The smallest half-width of the trust region of the levels below: a box with a width is no equality."""
+"""Least half-width of the trust region of lower levels; a box of zero width would be an equality."""
 NEGLIGIBLE_CURVATURE = 1e-6
-"""Relative to the largest curvature cost of a variable: a smaller one may be roundoff and restricts nothing."""
+"""Curvature cost of a variable relative to the largest one, below which it may be roundoff and restricts nothing."""
 
 # ---- saturation, shared with kernels
 
 NEGLIGIBLE_STEP = 1e-11
-"""Relative to the norm of the point where it begins: a shorter step counts as none."""
+"""Step length relative to the norm of its starting point, below which it counts as zero."""
 FULL_STEP = 1.0 - 1e-9
-"""Step lengths from here on are a full step but for roundoff."""
+"""Step lengths above this are a full step up to roundoff."""
 STRAIGHT, PART, WHOLE = 1, 2, 3
-"""Where a level that is done ends: at the part of the straight way to the end of its path at which its damped cost is
-least; at the scale of least cost on the path; at the end. 0 is one that is not done."""
+"""Endings of a finished level; 0 is an unfinished one. STRAIGHT: the fraction of the straight line to the end of its
+path at which its damped cost is least. PART: the scale of least cost on the path. WHOLE: the end of the path.
+"""
 PATH_SEARCHES = 6
-"""Searches at most for the scale at which a level's damped cost is least; two or three are the rule."""
+"""Largest number of searches for the scale of least damped cost; two or three are usual."""
 PATH_STEP = 1e-9
-"""Relative to that scale: a smaller correction is the last."""
+"""Correction relative to that scale, below which the search ends."""
 PATH_END = 1e-6
-"""Relative to the largest scale: from here on the joints that are saturated are those with which the path ends."""
+"""Tolerance relative to the largest scale: within it, the saturated joints are those of the end of the path."""
 BLOCKING_RANK = 1e-6
-"""The part of a blocking joint's unit vector in the null space outside the span of others; with less it depends on
-them."""
+"""A blocking joint is dependent if the part of its unit vector in the null space and outside the span of the other
+joints is below this.
+"""
 BOUND_DISTANCE = 1e-9
-"""Relative to the bound: a joint at a larger distance is not at its bound."""
+"""Distance relative to the bound, above which a joint is not at its bound."""
 SATURATION_RESIDUAL = 2e-9
-"""Relative to the terms that x is made of: the largest residual of the active bounds with which an answer is taken."""
+"""Largest residual of the active bounds of an accepted answer, relative to the terms that add up to x."""
 SATURATION_LOSS = 1e-8
-"""In kernels: how much larger the scale may be than the answer's, by what the null space changes of the combination of
-joints that stops the motion; relative to the terms that x is made of, how far a joint may leave its bound by its
-multiplier. An answer with more is not taken."""
+"""Two limits of an accepted answer in kernels. The scale may be larger by at most this much, according to the change by
+the null space of the combination of joints that stops the motion. A joint may leave its bound according to its
+multiplier by at most this much, relative to the terms that add up to x.
+"""
 SATURATION_RANK = 1e-9
-"""In kernels: the part of a joint's unit vector in the null space and outside the span of saturated ones, with less of
-which it depends on them; of the largest in a combination, with less of which a joint does not stop the motion."""
+"""A joint is dependent in kernels if the part of its unit vector in the null space and outside the span of the
+saturated joints is below this. A joint whose entry in a combination is below this share of the largest does not stop
+the motion.
+"""
 SATURATION_COMPLIANCE, STIFFER_SATURATION_COMPLIANCE = 1e-12, 1e-13
-"""In kernels, of the missing part of the motion, in the second and the third attempt, where the answer before does not
-hold: joints nearly depended on each other. The squared length of x that it outweighs; the more is missing, the more
-certain is the first that no larger scale is possible."""
+"""Compliance (in kernels) of the missing part of the motion in the second and third attempt, which follow if nearly
+dependent joints spoil the first answer. It is the squared length of x that the missing part outweighs. A larger
+compliance makes it more certain that no larger scale is possible.
+"""
 SOFT_SATURATION_RANK = 1e-11
-"""``SATURATION_RANK`` in these attempts: what is missing is a coordinate there, so few joints depend on others."""
+"""``SATURATION_RANK`` in these attempts: the missing part is a coordinate there, so few joints depend on others."""
 SIGN_CHECKS = 3
-"""In kernels: how often a search that would end with a multiplier of the wrong sign, by rounding, goes on."""
+"""Number of times (in kernels) that a search resumes because rounding gave a multiplier of the wrong sign at its end.
+"""
 MAX_SATURATION_CHANGES = 5
-"""In kernels, for each variable: the first attempt ends with more changes of the active set, for it goes round by
-rounding; the others may have all that are left."""
+"""Changes (in kernels) of the active set per variable after which the first attempt ends, because rounding makes it
+cycle. Later attempts may use all remaining iterations.
+"""
 LARGEST_RATE = 10.0
-"""In kernels, in units of what the entering joint has in a combination: a joint with more is what the others say most
-about, and takes the entering one's place."""
+"""Factor (in kernels) by which a joint's coefficient in a dependent combination must exceed the entering joint's to
+take its place.
+"""
 
 # ---- answers and certificates
 
 KKT_TOLERANCE = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
-"""The largest ``kkt_residual`` of an answer that is SOLVED, by the precision of the data."""
+"""Largest ``kkt_residual`` of a SOLVED answer, by the precision of the data."""
 FEASIBILITY = 1e-12
-"""Relative to the scale of a constraint: a smaller violation, or multiplier of the wrong sign, counts as none."""
+"""Violation, or multiplier of the wrong sign, relative to the scale of a constraint, below which it counts as zero."""
 FARKAS_RADIUS = 1e3
-"""Relative to the numbers at hand: how large an x is considered along variables without a bound."""
+"""Magnitude of x, relative to the numbers of the problem, up to which unbounded variables are considered in a Farkas
+certificate.
+"""
 FARKAS_ROUNDOFF = 1e-14
-"""Relative to the absolute terms of a sum: a smaller sum is 0."""
+"""Sum relative to its absolute terms, below which it counts as 0."""
 SINGLE_TOL = 1e-7
-"""Smallest tolerance of a kernel in single precision, and of its certificate; the search has the one asked for."""
+"""Least tolerance of a kernel in single precision and of its certificate; the search uses the requested one."""
 VALUE_TOL, SIGN_TOL = 30.0, 2.0
-"""In units of the tolerance: how far a certified value may be off its bound, or a gradient from 0; and how large a
-multiplier of the wrong sign may be.
+"""Certificate limits in units of the tolerance: distance of a value from its bound or of a gradient from 0, and size of
+a multiplier of the wrong sign.
 
-The latter is smaller: such a multiplier says that the active set is not right, and what that costs is more the weaker
-the curvature is that the rows leave."""
+The second is smaller: a multiplier of the wrong sign means a wrong active set, whose cost grows as the curvature left
+by the rows weakens.
+"""
 GRADIENT_TOL = 4.0
-"""In units of machine epsilon times the gradient's terms: how large a certified gradient of a free variable may be."""
+"""Largest certified gradient of a free variable, in units of machine epsilon times the gradient's terms."""
 BOX_TOLERANCE = 10.0
-"""In units of the rank tolerance: how far a candidate may be outside its box, into which it is clipped before it is
-certified. A bound that a step approaches by less than the rank tolerance of the step does not stop it."""
+"""Largest distance of a candidate outside its box before it is clipped and certified, in units of the rank tolerance. A
+bound that a step approaches by less than the rank tolerance of the step does not stop it.
+"""
 MAX_RESIDUAL = 10.0
-"""In units of the rank tolerance: the largest ``kkt_residual`` of a hierarchy that is SOLVED. With the default rank
-tolerances this is ``KKT_TOLERANCE``."""
+"""Largest ``kkt_residual`` of a SOLVED hierarchy in units of the rank tolerance; with the default rank tolerance this
+is ``KKT_TOLERANCE``.
+"""
 MAX_DETOUR = 100.0
-"""In units of the answer: how large x may be on the way from a warm start. Tolerances are relative to x, and
-``HARD_ROW_TOL`` of an x that is larger by this factor is still the residual of an answer that is SOLVED."""
+"""Largest intermediate x of a warm start, in units of the answer. Tolerances are relative to x, and ``HARD_ROW_TOL`` of
+an x larger by this factor is still the residual of a SOLVED answer.
+"""
 
 # ---- the dual active-set method
 
 DEPENDENCE_TOL = 100.0
-"""In units of machine epsilon: a constraint of whose diagonal the active ones leave less depends on them."""
+"""Part of a constraint's diagonal left by the active constraints, in units of machine epsilon, below which it is
+dependent.
+"""
 KERNEL_DEPENDENCE = 1e-14
-"""The same in the core, which has orthogonal factors: relative to the square of the constraint's normal."""
+"""The same in the core, whose factors are orthogonal: relative to the square of the constraint's normal."""
 REDUNDANCY_TOL = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
-"""In units of roundoff: a dependent constraint that is violated by less is redundant, by more infeasible."""
+"""Violation in units of roundoff, below which a dependent constraint is redundant and above which the problem is
+infeasible.
+"""
 
 # ---- weighted QPs
 
 ZERO_TOL = 100.0
-"""In units of machine epsilon times the Newton step at x: an x that is no larger counts as 0."""
+"""Size of x in units of machine epsilon times the Newton step at x, below which x counts as 0."""
 MAX_ROUNDS = 12
-"""Rounds of factor, check and search; where that many end without an answer, projected Newton takes over."""
+"""Rounds of factor, check and search; after that many without an answer projected Newton takes over."""
 RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
-"""In units of roundoff; an answer that the dual method does not change is accepted with violations up to this."""
+"""Violations in units of roundoff up to which an answer is accepted that the dual method does not change."""
 MAX_INFEASIBLE = 2
-"""Dual methods that end as infeasible before projected Newton takes over; one that changes nothing is enough."""
+"""Number of dual methods that may end as infeasible before projected Newton takes over; one without any change is
+enough.
+"""
 ROW_MULTIPLIER = 1e-3
-"""Relative to what all rows add to a variable's gradient: a multiplier of a row that is smaller has no sign."""
+"""Multiplier of a row relative to the sum of all rows in a variable's gradient, below which its sign is not
+significant.
+"""
 INFEASIBLE_COMPLIANCE = 1e-12
-"""Compliance of infeasible hard rows relative to C diag(H)^-1 C': with it the least violation has a derivative."""
+"""Compliance of infeasible hard rows relative to C diag(H)^-1 C'; it makes the least violation differentiable."""
 KKT_RIDGE = {jnp.dtype("float64"): 10.0, jnp.dtype("float32"): 1.0}
-"""In units of machine epsilon times the diagonal: keeps the factor of a semidefinite Hessian from breaking."""
+"""Ridge in units of machine epsilon times the diagonal; it keeps the factor of a semidefinite Hessian positive."""
 QUADRATIC_RIDGE = 10.0
-"""The same for the square root of a Hessian that was given as a matrix, relative to its largest diagonal element."""
+"""The same for the square root of a Hessian given as a matrix, relative to its largest diagonal element."""
 SCHUR_RIDGE = 10.0
 """The same for the system of the active rows."""
 LAST_CORRECTION = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}
-"""Relative to the answer: a smaller correction is the last; the next would be its square, or roundoff."""
+"""Correction relative to the answer, below which it is the last; the next would be its square, or roundoff."""
 MAX_REFINEMENTS = 5
-"""Steps of iterative refinement at most; two are the rule."""
+"""Largest number of iterative refinements; two are usual."""
 MAX_ROW_RATIO = 0.9
-"""Rows per variable, beyond which the factor of the Hessian is as quick."""
+"""Rows per variable above which the factor of the Hessian is as fast."""
 ROW_SPACE_PIVOT = 1e4
-"""In units of machine epsilon times the diagonal element: a smaller pivot says that rows depend on each other."""
+"""Pivot in units of machine epsilon times the diagonal element, below which rows are dependent."""
 MAX_CONTRACTION = 1e-4
-"""The largest ratio of two corrections with which refinement is trusted to converge."""
+"""Largest ratio of two corrections for which refinement is trusted to converge."""
 ROW_SPACE_CORRECTION, ROW_SPACE_ACCURACY = 1e-6, 1e-13
-"""The last correction is smaller than the first relative to x, and the next one would be smaller than the second."""
+"""Limits relative to x: of the last correction, and of the predicted next one."""
 GRADIENT_STEPS = 100
-"""Steps of the projected gradient behind an answer that is MAX_ITERATIONS."""
+"""Steps of the projected gradient method that follow a MAX_ITERATIONS answer."""
 
 # ---- weighted QPs in kernels: double precision is the core's, single precision CUDA's
 
 KERNEL_REFINEMENTS = {jnp.dtype("float64"): 10, jnp.dtype("float32"): 6}
-"""Corrections at most."""
+"""Largest number of corrections."""
 KERNEL_CORRECTION = 1e-10
-"""Relative to the answer, in double precision: a smaller correction is the last. In single precision
-``LAST_CORRECTION``, for the one that would come next."""
+"""Correction relative to the answer, in double precision, below which it is the last. In single precision
+``LAST_CORRECTION`` applies to the predicted next one.
+"""
 MIN_DECREASE = 0.25
-"""A correction that shrinks to more than this part of the one before was roundoff."""
+"""Ratio of two corrections above which the second one was roundoff."""
 KERNEL_PIVOT = 1e2
-"""In units of machine epsilon times the diagonal element: a smaller pivot says that rows depend on each other."""
+"""Pivot in units of machine epsilon times the diagonal element, below which rows are dependent."""
 BOUND_MULTIPLIER = 1.0
-"""In units of machine epsilon times the terms of a gradient: a variable on a bound with a larger multiplier of the
-wrong sign is let go. Tolerances of the cost's curvature would not do: a weak task, such as a posture, pulls with less
-than those."""
+"""Multiplier of the wrong sign in units of machine epsilon times the gradient's terms, above which a variable leaves
+its bound. A tolerance relative to the cost's curvature would be too large: a weak task such as a posture pulls with
+less.
+"""
 VIOLATION_TOL = 10.0
-"""In units of roundoff, in single precision: a bound that is violated by less holds."""
+"""Violation in units of roundoff, in single precision, below which a bound holds."""
 MAX_EXCHANGES = 2
-"""Exchanges that leave no fewer wrong labels, before the dual active-set method."""
+"""Exchanges without fewer wrong labels, before the dual active-set method starts."""
 MAX_DUAL_STARTS = 8
-"""Times that the dual active-set method begins or goes on: its end, solved anew, may be a little off another bound."""
+"""Starts and restarts of the dual active-set method: its answer, solved anew, may violate another bound slightly."""
 MAX_FACTORIZATIONS = 100
-"""Systems that the kernel in single precision factors at most; the rest is searched."""
+"""Largest number of systems that the kernel in single precision factors; other problems are searched."""
 
 # ---- projected Newton
 
 PENALTY = 1e5
-"""Curvature of a hard row relative to the largest of the cost: an update reduces its violation to about 1e-5 of it."""
+"""Curvature of a hard row relative to the largest curvature of the cost; an update reduces its violation to about
+1e-5.
+"""
 SHORTEST_STEP, STEP_LENGTHS = 1e-9, 31
-"""The shortest step of the line search, and how many lengths from 1 down to it are tried."""
+"""Shortest step of the line search, and number of lengths tried from 1 down to it."""
 NEWTON_ROUNDOFF = 4e-15
-"""Relative to the terms of the gradient; a variable with a smaller gradient is stationary."""
+"""Gradient of a variable relative to its terms, below which the variable is stationary."""
 SMALL_STEP = 1e-13
-"""Relative to x; a Newton step that is shorter is the last on its face."""
+"""Newton step relative to x, below which it is the last on its face."""
 FULL_STEP_ROUNDOFF = 4.0
-"""In units of the roundoff of the cost: a full step is taken where a shorter one is not better by more."""
+"""Improvement of a shorter step in units of the roundoff of the cost, below which the full step is taken."""
 FEASIBLE_AT_ONCE, FEASIBLE_DECREASE = 1e-3, 0.1
-"""In units of the feasibility tolerance: with less violation the updates of the multipliers end. With at most 1 they
-end where an update leaves more than the second of what was violated."""
+"""End of the multiplier updates, in units of the feasibility tolerance: a violation below the first, or below 1 if an
+update leaves more than the second times the violation before.
+"""
 MAX_JOINT_RELEASES = 10
-"""Iterations in which all bounds that the gradient points away from are released at once; then one at a time."""
+"""Iterations in which all bounds are released together that the gradient points away from; afterwards one at a time."""
 MAX_UPDATES = 40
-"""Updates of the multipliers of hard rows at most."""
+"""Largest number of updates of the multipliers of hard rows."""
 COMPLIANCE_DECREASE = 0.1
-"""Factor of the compliance of infeasible hard rows, where a bound keeps x from the least violation."""
+"""Factor on the compliance of infeasible hard rows, applied while a bound keeps x from the least violation."""
 ZERO_GRADIENT = 1e-9
-"""Cosine of the angle between the violation and a column of C; a smaller one is 0."""
+"""Cosine of the angle between the violation and a column of C, below which it counts as 0."""
 UNCHANGED = 1e-9
-"""Relative to x; the least violation has been found where an update moves x by less."""
+"""Change of x by an update relative to x, below which the least violation has been found."""
 
 # ---- hierarchies
 
 HIERARCHY_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-6}
-"""The part of a row outside the span of others with less than which it depends on them; data in single precision have
-more roundoff, which makes dependent rows independent."""
+"""Part of a row outside the span of other rows, below which it is dependent. In single precision roundoff makes
+dependent rows look independent, so the value is larger.
+"""
 STEP_TOL = 1e-13
-"""Relative to the scale of a level's rows: a step that changes them by less is none."""
+"""Step relative to the scale of a level's rows, below which it counts as zero."""
 MULTIPLIER_TOL = 1e-10
-"""Relative to the level's gradient: a smaller multiplier is 0."""
+"""Multiplier relative to the level's gradient, below which it counts as 0."""
 HARD_ROW_TOL = 1e-11
-"""Relative to the scale of a row: a smaller violation is none."""
+"""Violation relative to the scale of a row, below which it counts as zero."""
 STATIONARITY_TOL = 10.0
-"""In units of the multiplier's tolerance and of roundoff: a gradient along free directions that is smaller is 0, in
-kernels."""
+"""Gradient (in kernels) along free directions that counts as 0, in units of the multiplier's tolerance and of
+roundoff.
+"""
 SINGULAR_TOL = 100.0
-"""In units of machine epsilon of the data: singular values that are smaller are not inverted in derivatives."""
+"""Singular values in units of machine epsilon of the data, below which they are not inverted in derivatives."""
 ZERO_PIVOT = 1e-2
-"""In units of the rank tolerance: a pivot up to this is 0, whatever rank another factorisation has found."""
+"""Pivot in units of the rank tolerance that counts as 0, whatever rank another factorisation found."""
 DAMPED_RANK = 1e-14
-"""Pivots of a damped level's rows that count in its step, relative to its longest row: all above roundoff."""
+"""Least pivot of a damped level's rows that counts in its step, relative to its longest row; all above roundoff count.
+"""
 EXTRA_DAMPING = 1e-9
-"""In units of the level's longest row, squared; whatever the level's own damping: the Hessian has to be regular. A
-kernel takes one step so damped along directions that the rank tolerance left out."""
+"""Damping in units of the square of the level's longest row, added to the level's own so that the Hessian is regular. A
+kernel takes one step with it along directions that the rank tolerance left out.
+"""
 GUESS_ROUNDOFF = 1e-10
-"""The roundoff tolerance of a row's value, in units of the terms that add up to it."""
+"""Roundoff of a row's value, in units of the terms that add up to it."""
 WORKING_SET_SOLVES = 2
-"""Solves with one factorisation, each against exact residuals: the first one, and one step of refinement."""
+"""Solves per factorisation, each against exact residuals: the first, and one refinement."""
 MAX_STALLED = 20
-"""Steps of zero length in a row after which the least index decides; shared with kernels, and so are the next two."""
+"""Consecutive steps of zero length after which the least index decides; shared with kernels, as are the next two."""
 MAX_ATTEMPTS = 4
-"""A kernel's solves on a guessed working set and its corrections, before the primal active-set method."""
+"""Solves and corrections of a kernel on a guessed working set, before the primal active-set method."""
 FACTOR_RIDGE = 1e-14
-"""Relative to the square of the longest row: keeps a kernel's factor of a damped level positive."""
+"""Ridge relative to the square of the longest row; it keeps a kernel's factor of a damped level positive."""
 
 # ---- null spaces
 
 INDEPENDENT_ROWS = 1e-7
-"""In a kernel, relative to the trace of a Gram matrix: its least eigenvalue, from which on its factors are accurate
-enough."""
+"""Least eigenvalue (in kernels) of a Gram matrix relative to its trace, above which its factors are accurate enough."""
 NULL_SPACE_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
-"""Of a level's Frobenius norm: a row with less outside the span of others depends on them; data in single precision
-have more roundoff, which makes dependent rows independent."""
+"""Part of a row outside the span of other rows relative to the level's Frobenius norm, below which it is dependent. In
+single precision roundoff makes dependent rows look independent, so the value is larger.
+"""
 MISSING_COMPLIANCE = 1e-7
-"""Of the missing part of the motion: the squared length of x that it outweighs."""
+"""Compliance of the missing part of the motion: the squared length of x that it outweighs."""
 STIFFER_COMPLIANCE = 0.1
-"""Factor of that compliance in every other attempt: a stiffer penalty on the missing part."""
+"""Factor on that compliance in every second attempt, which penalises the missing part more."""
 SATURATION_ROUNDOFF = 1e-11
-"""Relative to the terms that x is made of: a smaller violation of a bound counts as none."""
+"""Violation of a bound relative to the terms that add up to x, below which it counts as zero."""
 INDEPENDENCE_TOL = 1e-5
-"""Relative to a combination of joints: where the null space changes it by less, it does not change it."""
+"""Change of a combination of joints by the null space, relative to the combination, below which it counts as
+unchanged.
+"""
 PROJECTOR_ROUNDOFF = 0.1
-"""Diagonals of projectors are 1 at most; a smaller one has the dependence tolerance of one as large as this."""
+"""Least diagonal of a projector (at most 1) that scales its dependence tolerance; smaller diagonals use this value."""
 NEGLIGIBLE_ENTRY = 1e-7
-"""Joints with a smaller entry in the combination do not block the motion."""
+"""Entry in the combination of joints, below which a joint does not block the motion."""
 ENTRY_ROUNDOFF = 2.0
-"""In units of machine epsilon times the largest entry of a row: a smaller entry is what rounding left of 0."""
+"""Entry in units of machine epsilon times the row's largest entry, below which it is the rounding of 0."""
 SATURATION_ATTEMPTS = 6
-"""Where an answer is not accepted, the next attempt has a lower compliance, and only the part of the motion near the
-scale that was found: motions that are too large for their box by orders of magnitude lose digits."""
+"""Largest number of attempts. After a rejected answer the next attempt has a lower compliance and only the part of the
+motion near the found scale: motions too large for their box by orders of magnitude lose digits.
+"""
 ATTEMPT_GROWTH = 8.0
-"""Factor of the part of the motion that is considered, after an attempt that was accepted with less than all of it."""
+"""Factor on the part of the motion that is considered, after an accepted attempt with less than the whole motion."""
 ATTEMPT_SCALE = 1e-3, 0.25
-"""Least and largest scale that a failed attempt may have found; the next considers twice as much of its motion."""
+"""Least and largest scale found by a rejected attempt that is used; the next attempt considers twice as much motion."""
 SATURATION_ACCURACY = 1e-15
-"""Relative to the terms that x is made of: an answer with a smaller residual is not refined."""
+"""Residual relative to the terms that add up to x, below which an answer is not refined."""
 MAX_SATURATION_REFINEMENTS = 5
-"""Refinements of the answer at most; one is the rule."""
+"""Largest number of refinements of an answer; one is usual."""
 DERIVATIVE_RANK = 1e-7
-"""A saturated joint with less of its column of the projector outside the span of the others has no derivative of its
-own."""
+"""Part of a saturated joint's column of the projector outside the span of the others, below which the joint has no
+derivative of its own.
+"""
 
 # ---- schemes
 
 CONSTRAINT_TOL = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-4}
-"""Relative to what its numbers amount to: a hard row that is missed by less holds."""
+"""Violation of a hard row relative to the magnitude of its terms, below which the row holds."""
 STANDING_SPEED = 1e-4
-"""Speed [rad/s or m/s] that counts at least: of a robot at rest, roundoff is all that there is."""
+"""Least speed [rad/s or m/s] in that magnitude: a robot at rest has only roundoff."""
 DIAGONAL_RATIO = 30.0
-"""Little of the curvature damping is added where it is below this many times a dof's other diagonal terms."""
+"""Curvature damping is reduced where it is below this many times a dof's other diagonal terms."""
 BELOW_OTHERS = 2.0
-"""Factor of a priority's curvature damping, where others are above it: their rows, which bend too, balance what it
-cannot meet."""
+"""Factor on a priority's curvature damping if other priorities are above it: their rows bend too, and balance the part
+that it cannot meet.
+"""
 SINGLE_DAMPING = 4.0
-"""In units of epsilon times the largest weight times row norm squared: a kernel in single precision gets no weaker
-damping, which would be lost in the Hessian's roundoff."""
+"""Least damping of a kernel in single precision, in units of epsilon times the largest weight times squared row norm; a
+weaker damping would be lost in the Hessian's roundoff.
+"""
 
 # ---- tasks, shared with kernels
 
 SMALL_SINE_SQUARED = 1e-6
-"""Squared sine of half an angle below which a series for the logarithm of a rotation is exact to roundoff."""
+"""Squared sine of half an angle, below which a series for the logarithm of a rotation is exact to roundoff."""
 SMALL_ANGLE_SQUARED = 1e-2
 """Squared angle [rad^2] below which a series for the derivative of that logarithm is exact to roundoff."""
 SMALL_TURN_SQUARED = 1e-6
-"""Squared angle [rad^2] below which a kernel moves along a rotation by a series."""
+"""Squared angle [rad^2] below which a kernel integrates a rotation by a series."""
 PARALLEL = 1e-6
-"""Squared sine of the angle under which segments count as parallel."""
+"""Squared sine of the angle between segments, below which they count as parallel."""
 
 # ---- tasks
 
 POINTING_SINE_SQUARED = 1e-3
-"""Squared sine of the angle from an axis to a direction, below which a series for angle over sine is exact."""
+"""Squared sine of the angle from an axis to a direction, below which a series for angle over sine is exact to
+roundoff.
+"""
 LEVER_ROUNDOFF = 1e-6
-"""Relative to the longest lever: a shorter one may be roundoff of none."""
+"""Lever arm relative to the longest one, below which it may be the roundoff of 0."""
 UNHELD_PART = 0.04
-"""Of the bound on a task's curvature: the part for what bends where the frame does not move across its pull."""
+"""Share of the bound on a task's curvature that is used for joints that bend without moving the frame across its pull.
+"""
 NEAR_ERROR = 0.06
-"""In lever arms: an error below which the whole bound is damped, so that a stretched arm leaves its boundary and comes
-back to it calmly."""
+"""Error in lever arms, below which the whole bound is used, so that a stretched arm leaves and reaches its boundary
+without oscillation.
+"""
 FARTHEST_ERROR = 1e6
-"""In units of ``NEAR_ERROR``: farther makes no difference."""
+"""Largest error that is considered, in units of ``NEAR_ERROR``; a larger one makes no difference."""
 ROW_ROUNDOFF = 10.0
-"""In units of machine epsilon for each dof: a row of a Jacobian of which those before it leave less depends on them."""
+"""Part of a Jacobian row left by the rows before it, in units of machine epsilon per dof, below which it is dependent.
+"""
 INERTIA_ROUNDOFF = 4.0
-"""In units of machine epsilon for each dof: what a motion without inertia counts as, of the inertia of its dofs."""
+"""Inertia given to a motion without any, in units of machine epsilon per dof, relative to the inertia of its dofs."""

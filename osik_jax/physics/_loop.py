@@ -57,10 +57,11 @@ class Integrated(Command):
 
 
 class Lookahead(Command):
-    """Where the velocity leads from the sensed configuration in a given time: no memory, proportional action.
+    """Servo target: the configuration to which the velocity leads from the sensed one within a given time.
 
-    A steady error stays, that of a servo whose stiffness is multiplied by gain times time: with a gain of 20 / s and
-    0.05 s a servo holds its load as it would with the plan as its target. A time of one step makes a robot fall limp.
+    This is proportional control without memory. A steady error remains, as of a servo whose stiffness is multiplied by
+    gain times time. With a gain of 20 / s and 0.05 s, a servo holds its load as it would with the plan as its target.
+    With one step as the time the robot goes limp.
 
     Attributes:
         time: [s].
@@ -78,7 +79,7 @@ class Lookahead(Command):
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """What MuJoCo's data held at the start and after every step: T is the number of steps run and one.
+    """MuJoCo data at the start and after every step; T is the number of steps plus one.
 
     Attributes:
         time: [s]. (T,)

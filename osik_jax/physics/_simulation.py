@@ -155,5 +155,5 @@ class Simulation:
 
 
 def _entries(joints: tuple[int, ...], address: np.ndarray, kinds: tuple[int, ...]) -> np.ndarray:
-    """Where the entries of q are in MuJoCo's qpos."""
+    """Return the indices of q's entries in MuJoCo's qpos."""
     return np.concatenate([address[j] + np.arange(QPOS_WIDTH[kinds[j]]) for j in joints]).astype(int)

@@ -28,7 +28,7 @@ _FORMAT = "osik-jax controller 1"
 
 
 class Controller(NamedTuple):
-    """What ``load_controller`` returns: the arguments of ``solve`` and ``rollout``.
+    """Result of ``load_controller``: the arguments of ``solve`` and ``rollout``.
 
     Attributes:
         robot: the robot.

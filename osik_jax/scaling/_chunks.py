@@ -152,7 +152,7 @@ class _Job:
             return None
 
     def manifest(self, label: str) -> dict[str, Any]:
-        """What has to be the same for the job to go on, and an identifier of it, which each chunk carries."""
+        """Return the inputs that must be the same for a job to resume, with an identifier that each chunk carries."""
         first, last = (fingerprint(self.lanes(k)) for k in (0, self.chunks - 1)) if callable(self.batch) else ({}, {})
         inputs = {"first chunk": first, "last chunk": last} if callable(self.batch) else fingerprint(self.batch)
         said = {

@@ -83,7 +83,7 @@ class Saved:
 
     @property
     def chunks(self) -> int:
-        """How many there are when all is done."""
+        """Return the number of chunks of the finished job."""
         return -(-len(self) // self.manifest["chunk"])
 
     @property

@@ -63,7 +63,7 @@ def sharded(
 
 
 class ShardedFunction:
-    """What ``sharded`` returns.
+    """Function of a batch whose lanes are split over several devices.
 
     Attributes:
         function: of one lane.
@@ -228,7 +228,7 @@ def moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:
 
 
 def _filled(a: Any, axis: int, missing: int) -> Any:
-    """With the last lane repeated."""
+    """Return an array with its last lane repeated ``missing`` times."""
     if axis == _SHARED:
         return a
     xp = np if isinstance(a, np.ndarray) else jnp

@@ -1,4 +1,4 @@
-"""What a scheme is given and what it answers."""
+"""Interface of schemes: their inputs and their answer."""
 
 from __future__ import annotations
 
@@ -212,7 +212,7 @@ def status_with(
 
 
 class SchemeAnswer(eqx.Module):
-    """What a scheme says of one step; see ``Solution`` for the fields."""
+    """Answer of a scheme for one step; ``Solution`` describes the fields."""
 
     velocity: Float[Array, " nv"]
     status: Int[Array, ""]

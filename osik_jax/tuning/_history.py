@@ -52,7 +52,7 @@ class History:
         return len(self.loss)
 
     def and_then(self, **row: Any) -> History:
-        """With one more iteration."""
+        """Return the history with one more iteration."""
         return History(**{name: np.append(old, np.asarray(row[name])[None], 0) for name, old in vars(self).items()})
 
     @property

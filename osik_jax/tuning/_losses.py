@@ -29,7 +29,7 @@ class Loss(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
-        """What one trajectory costs."""
+        """Return the loss of one trajectory."""
 
     def __add__(self, other: LossFunction) -> Loss:
         return WeightedSum((self, other), jnp.ones(2))
@@ -162,7 +162,7 @@ class JointLimitDistance(Loss):
 
 
 class ComMargin(Loss):
-    """How far the centre of mass is into a margin inside a support polygon, or outside: squares, mean over time [m^2].
+    """Loss of balance: squared depth of the centre of mass in a margin of the support polygon, mean over time [m^2].
 
     Attributes:
         polygon: see ``osik_jax.support_polygon``.

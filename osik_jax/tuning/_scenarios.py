@@ -1,4 +1,4 @@
-"""What a loop is tried on: starts, targets, robots, as one batch."""
+"""Scenarios of a tuning run: starts, targets and robots as one batch."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Scenarios(eqx.Module):
 
 
 def _starts(q0: Array, loop: Loop) -> Float[Array, "n nq"]:
-    """In the precision of the loop; configurations of its robot."""
+    """Return start configurations in the precision of the loop. (n, nq)."""
     if q0.shape[1:] != (loop.robot.nq,):
         raise OsikValueError(f"q0 has shape {q0.shape}, expected (n, {loop.robot.nq})")
     return q0.astype(loop.robot.q0.dtype)
