@@ -1,4 +1,7 @@
-"""Pictures, films and live views of robots. Needs no display and no GL library; loads matplotlib: import it by name."""
+"""Pictures, films and live views of robots, without a display or GL library.
+
+Not imported with the package, because it loads matplotlib.
+"""
 
 from ._animate import Curves as Curves
 from ._animate import animate as animate

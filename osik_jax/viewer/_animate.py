@@ -1,4 +1,4 @@
-"""A motion as a GIF or MP4."""
+"""Motions as GIF or MP4 films."""
 
 from __future__ import annotations
 
@@ -67,7 +67,9 @@ def animate(
     elevation: float = 13.0,
     progress: Callable[[float], None] | None = None,
 ) -> Path:
-    """Films a motion. Needs no display; MuJoCo's renderer is used where OpenGL works, else rays are cast on the CPU.
+    """Write a film of a motion as GIF or MP4, without a display.
+
+    MuJoCo's renderer is used where OpenGL works, else ray casting on the CPU.
 
     Args:
         path: a ``.gif``, or an ``.mp4`` if the program ffmpeg is installed.
@@ -131,7 +133,7 @@ def _check_path(path: Path) -> None:
 
 
 def _each(support: Polygons | Float[np.ndarray, "m 2"] | None, frames: np.ndarray) -> Polygons | None:
-    """One polygon a picture."""
+    """Return one polygon per picture, from one polygon or a sequence."""
     if support is None:
         return None
     if isinstance(support, np.ndarray) and support.ndim == 2:
@@ -140,7 +142,7 @@ def _each(support: Polygons | Float[np.ndarray, "m 2"] | None, frames: np.ndarra
 
 
 class _Film:
-    """Everything about an animation that does not change between pictures."""
+    """Data of an animation that is the same in all pictures."""
 
     def __init__(
         self,
@@ -186,7 +188,7 @@ class _Film:
         return seen, np.array(com), list(np.swapaxes(np.array(paths), 0, 1)) if trails else []
 
     def _on_floor(self) -> Float[np.ndarray, "points 3"]:
-        """Corners of the support polygons."""
+        """Return the corners of the support polygons on the floor [m]."""
         corners = np.concatenate([np.zeros((0, 2)), *(self._support or ())])
         return np.column_stack([corners, np.full(len(corners), self._floor)])
 
@@ -219,7 +221,7 @@ class _Film:
             )
 
     def pictures(self, progress: Callable[[float], None]) -> Iterator[np.ndarray]:
-        """The pictures, (height, width, 3) uint8. The stage is drawn ahead, one picture a core."""
+        """Yield the pictures, (height, width, 3) uint8; the stage is drawn ahead, one picture per core."""
         stages = (self._stage.pose([source]) for source in mujoco_poses(self._robot, self._q))
         layers = (self._floor_layer(frame) for frame in range(len(self._q)))
         for frame, base in enumerate(self._draw(zip(stages, layers, strict=True))):
@@ -228,7 +230,10 @@ class _Film:
             progress((frame + 1) / len(self._q))
 
     def _draw(self, jobs: Iterable[tuple[mujoco.MjData, np.ndarray | None]]) -> Iterator[np.ndarray]:
-        """Pictures of the stage in order; only rays may be cast by several threads, a GL context belongs to one."""
+        """Yield pictures of the stage in order.
+
+        Ray casting may use several threads; a GL context belongs to one.
+        """
         if not isinstance(self._renderer, RayCaster):
             yield from (self._renderer.image(*job) for job in jobs)
             return
@@ -243,7 +248,7 @@ class _Film:
                 yield ahead.popleft().result()
 
     def _floor_layer(self, frame: int) -> np.ndarray | None:
-        """The support polygon on the floor, drawn again only where it changed."""
+        """Return the support polygon painted on the floor, redrawn only when it changes."""
         if self._support is None:
             return None
         vertices = self._support[frame]
@@ -262,13 +267,13 @@ class _Film:
 
 
 def paint_over(base: Float[np.ndarray, "height width 3"], layer: np.ndarray) -> np.ndarray:
-    """Puts a uint8 picture with alpha over one whose colours run from 0 to 1; uint8."""
+    """Return an RGBA uint8 picture painted over an RGB picture with values 0 to 1, as uint8."""
     below = Image.fromarray((255.0 * base + 0.5).astype(np.uint8)).convert("RGBA")
     return np.asarray(Image.alpha_composite(below, Image.fromarray(layer)).convert("RGB"))
 
 
 def write_gif(path: Path, pictures: Iterable[np.ndarray], period: float) -> None:
-    """Writes pictures, ``period`` [s] apart, with one palette for all."""
+    """Write pictures that are ``period`` [s] apart as a GIF with one palette."""
     images = [Image.fromarray(picture) for picture in pictures]
     picks = [np.asarray(images[i]) for i in np.linspace(0, len(images) - 1, min(4, len(images))).astype(int)]
     palette = Image.fromarray(np.concatenate(picks)).quantize(256, method=Image.Quantize.MEDIANCUT)

@@ -1,4 +1,4 @@
-"""Still pictures: schemes compared over time, and robots side by side."""
+"""Still figures: schemes compared over time, and robots side by side."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ._stage import Camera, Stage, frame_camera
 SCHEME_COLORS = ("#f08c3a", "#8a8f98", "#1565c0", "#2a9d62", "#7b3fa0")
 _BAD = "#d7263d"
 _LONG_LENS = 10.0
-"""Robots in a row look alike from afar."""
+"""Camera distance in picture heights for a row of robots: large, so that they look alike."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ def compare_figure(
     note: str = "",
     colors: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Compares schemes over time, a plot a panel, with one legend for all.
+    """Save a figure that compares schemes over time, with one plot per panel and a common legend.
 
     Args:
         time: [s]. (T,)
@@ -108,14 +108,14 @@ def _draw_panel(axes: Axes, time: np.ndarray, panel: Panel, palette: Mapping[str
 
 
 def _widen(axes: Axes, span: float) -> None:
-    """Makes the axis show so much at least, about the middle of what it shows."""
+    """Widen an axis about its middle to a least range."""
     low, high = axes.get_ylim()
     more = max(span - (high - low), 0.0)
     axes.set_ylim(low - 0.5 * more, high + 0.5 * more)
 
 
 def _draw_bound(axes: Axes, panel: Panel) -> None:
-    """The line not to cross, its bad side tinted."""
+    """Draw the line of a bound, with its forbidden side tinted."""
     assert panel.bound is not None
     low, high = axes.get_ylim()
     if panel.floor is None:
@@ -192,7 +192,7 @@ def hero_picture(
     elevation: float = 14.0,
     renderer: RendererName = "raycast",
 ) -> Path:
-    """Draws one robot at several instants, side by side on one floor, and saves it.
+    """Save a picture of one robot at several instants, side by side on one floor.
 
     Args:
         path: of the picture (.png).
@@ -247,7 +247,7 @@ def hero_picture(
 def _side_by_side(
     instants: Sequence[Float[np.ndarray, "n 3"]], azimuth: float, spacing: float | None
 ) -> Float[np.ndarray, "k 3"]:
-    """Moves on the floor that put robots in a row across the camera's view, their middles evenly spaced."""
+    """Return floor offsets [m] that put robots in a row across the camera's view, evenly spaced."""
     right = Camera((0.0, 0.0, 0.0), 1.0, azimuth, 0.0, 1.0).axes[0]
     low = np.array([(points @ right).min() for points in instants])
     high = np.array([(points @ right).max() for points in instants])

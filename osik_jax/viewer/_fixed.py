@@ -1,4 +1,4 @@
-"""Shapes that stand in the world beside a robot: posts, tables, balls."""
+"""Shapes fixed in the world beside a robot: posts, tables, balls."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class Look:
 
 
 def read_look(urdf: str | os.PathLike[str], *, package_dirs: Iterable[str | os.PathLike[str]] = ()) -> Look:
-    """The visual shapes of a URDF, with their meshes (DAE, STL, OBJ, MSH).
+    """Return the visual shapes of a URDF with their meshes (DAE, STL, OBJ, MSH).
 
     Some programs turn COLLADA files whose ``up_axis`` is y, others (RViz) do not, and URDFs are made for either. Of
     both ways that one is taken that puts the meshes nearer to the joints of their links.
@@ -85,7 +85,7 @@ def read_look(urdf: str | os.PathLike[str], *, package_dirs: Iterable[str | os.P
 
 
 class _Reader:
-    """Reads each file once."""
+    """Reader that reads each mesh file once."""
 
     def __init__(self, urdf: Urdf, packages: Packages, beside: Path | None) -> None:
         self._urdf, self._packages, self._beside = urdf, packages, beside
@@ -120,7 +120,7 @@ class _Reader:
         return total
 
     def _link(self, link: Link, *, visual: bool) -> list[LinkShape]:
-        """Its visual shapes; its collision shapes where one of those cannot be read."""
+        """Return a link's visual shapes, or its collision shapes if a visual shape cannot be read."""
         wanted = [shape for shape in link.shapes if shape.visual == visual and not _is_transparent(shape)]
         readable = all(shape.kind != "mesh" or self._triangles(shape) for shape in wanted)
         if readable or not visual:

@@ -1,4 +1,4 @@
-"""Poses and the centre of mass from MuJoCo's C code: pictures and reports do not use this package's kinematics."""
+"""Poses and centre of mass from MuJoCo's C code, independent of this package's kinematics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..robot._own_masses import own_masses
 
 
 def mujoco_poses(robot: Robot, q: ArrayLike | Array) -> Iterator[mujoco.MjData]:
-    """MuJoCo's body, site, geom and CoM positions at one configuration (nq,) or along a trajectory (T, nq).
+    """Return MuJoCo's body, site, geom and CoM positions [m] at a configuration (nq,) or along a trajectory (T, nq).
 
     Yields the same ``MjData`` each time, with new content: copy what has to last.
     """
@@ -28,13 +28,13 @@ def mujoco_poses(robot: Robot, q: ArrayLike | Array) -> Iterator[mujoco.MjData]:
 
 
 def robot_com(robot: Robot, data: mujoco.MjData) -> Float[np.ndarray, "3"]:
-    """Centre of mass [m] of the robot's bodies that move, from MuJoCo; neither the scene nor a fixed base counts."""
+    """Return the centre of mass [m] of the robot's moving bodies from MuJoCo, without scene and fixed base."""
     mass = own_masses(robot)
     return mass @ data.xipos / mass.sum()
 
 
 def model_bodies(robot: Robot) -> list[int]:
-    """MuJoCo's index of each body of ``robot.tree``."""
+    """Return MuJoCo's index of each body of ``robot.tree``."""
     model = robot.mj_model
     names = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, b) or f"body{b}": b for b in range(model.nbody)}
     return [names[name] for name in robot.tree.body_names]
@@ -43,7 +43,7 @@ def model_bodies(robot: Robot) -> list[int]:
 def mujoco_frame_pose(
     robot: Robot, data: mujoco.MjData, name: str
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Position [m] and rotation of a frame: the model's own site or body of that name, else its place in a body.
+    """Return position [m] and rotation of a frame: MuJoCo's site or body of that name, else from its body's pose.
 
     Raises:
         KeyError: no such frame.

@@ -1,4 +1,4 @@
-"""Pictures by MuJoCo's own renderer, where OpenGL works, and the choice between it and the ray caster."""
+"""MuJoCo's OpenGL renderer, and the choice between it and ray casting."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from ._stage import Camera, Stage
 
 RendererName = Literal["auto", "mujoco", "raycast"]
 _MANY = 1000
-"""Triangles of meshes from which on they are drawn one by one, and no rays are cast."""
+"""Number of mesh triangles above which triangles are rasterised instead of cast by rays."""
 
 _GL_ERRORS = (mujoco.FatalError, ImportError, AttributeError, OSError, RuntimeError)
 """Exceptions of MuJoCo's renderer without a GL library, without a screen, or with a broken driver."""
 
 
 _failures: list[str] = []
-"""Why OpenGL does not work here, once that is known: MuJoCo 4.0 aborts the process at its second failure."""
+"""Reason why OpenGL does not work here, kept because MuJoCo 4.0 aborts the process at a second failure."""
 
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Draws a stage."""
+    """Interface of renderers of a stage."""
 
     def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
-        """A picture; ``under`` is painted on the floor."""
+        """Return a picture of the stage; ``under`` is painted on the floor."""
         ...
 
 
 class GlRenderer:
-    """MuJoCo's renderer with the camera and the picture size of the ray caster."""
+    """MuJoCo's renderer with the camera and picture size of the ray caster."""
 
     def __init__(self, stage: Stage, camera: Camera, size: tuple[int, int]) -> None:
-        """Opens a GL context.
+        """Open a GL context.
 
         Raises:
             RuntimeError: OpenGL does not work here.
@@ -57,7 +57,7 @@ class GlRenderer:
         self._options.geomgroup[:] = 1
 
     def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
-        """A picture of the stage; ``under`` is painted over the floor and the sky, behind the robots."""
+        """Return a picture of the stage; ``under`` is painted over floor and sky, behind the robots."""
         picture = self._render(data) / 255.0
         if under is not None:
             self._renderer.enable_segmentation_rendering()
@@ -74,7 +74,7 @@ class GlRenderer:
 
 
 def make_renderer(name: RendererName, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float) -> Renderer:
-    """MuJoCo's renderer (``"mujoco"``), one on the CPU (``"raycast"``), or the first of them that works (``"auto"``).
+    """Return MuJoCo's renderer (``"mujoco"``), a CPU renderer (``"raycast"``), or the first that works (``"auto"``).
 
     On the CPU rays are cast, unless there are meshes of so many triangles that drawing those is faster.
 
@@ -92,7 +92,7 @@ def make_renderer(name: RendererName, stage: Stage, camera: Camera, size: tuple[
 
 
 def check_opengl() -> None:
-    """Tries MuJoCo's renderer on an empty scene.
+    """Raise an error unless MuJoCo's renderer can draw an empty scene.
 
     Raises:
         RuntimeError: OpenGL does not work here.

@@ -1,4 +1,4 @@
-"""Size of a robot, its lowest point, and the height of its floor."""
+"""Size of a robot, its lowest point, and its floor height."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ._shapes import lowest_points
 
 
 class Outline(NamedTuple):
-    """The measures of a robot at one configuration.
+    """Dimensions of a robot at one configuration.
 
     Attributes:
         size: diagonal of a box about all that is drawn of it [m].
@@ -32,7 +32,7 @@ class Outline(NamedTuple):
 
 
 def robot_outline(robot: Robot, q: ArrayLike, look: Look | None = None) -> Outline:
-    """The measures of a robot.
+    """Return the dimensions of a robot at one configuration.
 
     Args:
         robot: the robot.
@@ -52,7 +52,7 @@ def _base_height(shape: RobotParts, heights: Float[np.ndarray, " parts"]) -> flo
 
 
 def floor_height(robot: Robot, shape: RobotParts, poses: Iterable[mujoco.MjData]) -> float:
-    """Return the height of the floor [m]: a floating robot's lowest point at first, else the base's height.
+    """Return the floor's height [m]: a floating robot's lowest point in the first frame, or its base's height.
 
     Where a robot that is bolted down reaches below its base, the floor is under the lowest point of all poses.
     """

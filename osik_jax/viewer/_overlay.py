@@ -1,4 +1,4 @@
-"""Flat drawings over a picture of the stage: marks in the world, and panels with curves."""
+"""Flat drawings over a picture of the stage: marks in the world and panels with curves."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _CARD = (1.0, 1.0, 1.0, 0.82)
 
 
 class Canvas:
-    """A transparent picture that matplotlib draws on: a still part, and artists that move."""
+    """Transparent matplotlib picture with a static part and moving artists."""
 
     def __init__(self, size: tuple[int, int], scale: float = 1.0) -> None:
-        """Takes width and height [pixels]; ``scale`` enlarges lines and text."""
+        """Take width and height [pixels]; ``scale`` enlarges lines and text."""
         dpi = DPI * scale
         self.size = size
         self.figure = Figure(figsize=(size[0] / dpi, size[1] / dpi), dpi=dpi)
@@ -43,18 +43,18 @@ class Canvas:
         return axes
 
     def title(self, x: float, y: float, words: str, fontsize: float) -> None:
-        """A bold line from (x, y) on, smaller where it would not end in the picture."""
+        """Write a bold line starting at (x, y), shrunk if it would leave the picture."""
         text = self.page.text(x, y, words, fontsize=fontsize, color=INK, weight="bold")
         width = text.get_window_extent(self._canvas.get_renderer()).width
         text.set_fontsize(fontsize * min(1.0, (self.size[0] - 2.0 * x) / max(width, 1.0)))
 
     def moving(self, artist: Artist) -> None:
-        """Marks an artist as one that changes between pictures."""
+        """Mark an artist as one that changes between pictures."""
         artist.set_animated(True)
         self._moving.append(artist)
 
     def picture(self) -> np.ndarray:
-        """Red, green, blue, alpha; alpha not multiplied in. (height, width, 4), uint8."""
+        """Return the picture as RGBA with straight alpha. (height, width, 4), uint8."""
         if self._still is None:
             self._canvas.draw()
             self._still = self._canvas.copy_from_bbox(self.figure.bbox)
@@ -68,7 +68,7 @@ class Canvas:
 def polygon_layer(
     vertices: Sequence[Float[np.ndarray, "m 2"]], camera: Camera, size: tuple[int, int], *, floor: float
 ) -> Float[np.ndarray, "height width 4"]:
-    """Support polygons on the floor, to be painted under the robots."""
+    """Return a layer of support polygons on the floor, to be painted under the robots."""
     canvas = Canvas(size)
     for corners in vertices:
         points = camera.project(np.column_stack([corners, np.full(len(corners), floor)]), size)
@@ -78,10 +78,10 @@ def polygon_layer(
 
 
 class ComMark:
-    """The centre of mass, its plumb line, and where that meets the floor."""
+    """Mark of the centre of mass: dot, plumb line, and its point on the floor."""
 
     def __init__(self, canvas: Canvas, camera: Camera, *, floor: float, moving: bool = True) -> None:
-        """Adds the artists to the page of a canvas."""
+        """Add the artists to a canvas."""
         self._camera, self._size, self._floor = camera, canvas.size, floor
         (self._line,) = canvas.page.plot([], [], color=ORANGE, lw=1.4, ls=(0, (4, 2.5)))
         (self._foot,) = canvas.page.plot([], [], "o", ms=6.5, mfc="white", mec=ORANGE, mew=2.0)
@@ -91,7 +91,7 @@ class ComMark:
                 canvas.moving(artist)
 
     def place(self, com: Float[np.ndarray, "3"]) -> None:
-        """Moves it to a centre of mass [m]."""
+        """Move the mark to a centre of mass [m]."""
         (x0, y0), (x1, y1) = self._camera.project(np.array([com, [com[0], com[1], self._floor]]), self._size)
         self._line.set_data([x0, x1], [y0, y1])
         self._ball.set_data([x0], [y0])
@@ -99,7 +99,10 @@ class ComMark:
 
 
 def card(canvas: Canvas, rectangle: tuple[float, float, float, float], title: str) -> Axes:
-    """Axes for a panel on a light card; the rectangle is left, bottom, width, height in parts of the picture."""
+    """Return axes for a panel on a light card.
+
+    ``rectangle``: left, bottom, width and height as shares of the picture.
+    """
     axes = canvas.figure.add_axes(rectangle)
     axes.set_facecolor(_CARD)
     axes.set_title(title, loc="left", fontsize=8.5, color=INK, pad=4)
@@ -113,7 +116,7 @@ def card(canvas: Canvas, rectangle: tuple[float, float, float, float], title: st
 
 
 class PlanPanel:
-    """The ground from above, x up and y to the left: support polygon, path of the centre of mass, where it is now."""
+    """Top view of the ground, x up and y left: support polygon, path of the centre of mass, and its current place."""
 
     def __init__(
         self,
@@ -122,7 +125,7 @@ class PlanPanel:
         support: Sequence[Float[np.ndarray, "m 2"]],
         com: Float[np.ndarray, "frames 3"],
     ) -> None:
-        """Draws the still part; millimetres."""
+        """Draw the static part; lengths in mm."""
         self._com, self._support = 1e3 * com, [1e3 * vertices for vertices in support]
         axes = card(canvas, rectangle, "support and centre of mass from above [mm]")
         points = np.concatenate([self._com[:, :2], *self._support])
@@ -144,14 +147,14 @@ class PlanPanel:
         return vertices[:, ::-1]
 
     def place(self, frame: int) -> None:
-        """Moves the dot to a frame."""
+        """Move the dot to a frame."""
         self._patch.set_xy(self._flip(self._support[min(frame, len(self._support) - 1)]))
         self._path.set_data(self._com[: frame + 1, 1], self._com[: frame + 1, 0])
         self._dot.set_data([self._com[frame, 1]], [self._com[frame, 0]])
 
 
 class CurvePanel:
-    """Curves over time that are drawn as the motion goes; wanted ones, dashed, are there from the start."""
+    """Curves over time, drawn up to the current frame; dashed references are drawn from the start."""
 
     def __init__(
         self,
@@ -164,7 +167,7 @@ class CurvePanel:
         *,
         span: float,
     ) -> None:
-        """Draws the still part; every curve has one value a frame, and the axis shows so much at least."""
+        """Draw the static part; each curve has one value per frame, and the axis has a least range."""
         self._time, self._curves, self._lines = time, list(curves.values()), []
         axes = card(canvas, rectangle, title)
         values = np.concatenate([*curves.values(), *wanted.values()])
@@ -186,7 +189,7 @@ class CurvePanel:
         )
 
     def place(self, frame: int) -> None:
-        """Draws the curves up to a frame."""
+        """Draw the curves up to a frame."""
         for (line, dot), values in zip(self._lines, self._curves, strict=True):
             line.set_data(self._time[: frame + 1], values[: frame + 1])
             dot.set_data([self._time[frame]], [values[frame]])

@@ -1,4 +1,4 @@
-"""Parts of a robot's picture: its URDF's visual shapes, its geoms, or else sticks, posed by MuJoCo's kinematics."""
+"""Shapes of a robot for pictures (visual shapes of its URDF, its geoms, or sticks), posed by MuJoCo's kinematics."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _STICK = np.array([0.42, 0.49, 0.60, 1.0])
 _JOINT = np.array([0.93, 0.50, 0.13, 1.0])
 _MUJOCO_DEFAULT = np.array([0.5, 0.5, 0.5, 1.0])
 _HIDDEN_GROUP = 3
-"""Groups from here on hold collision shapes by MuJoCo's convention; its own viewer hides them."""
+"""First geom group of collision shapes by MuJoCo's convention; its viewer hides these groups."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class RobotParts:
-    """The shapes of a robot.
+    """Shapes of a robot for pictures.
 
     Attributes:
         model: the MuJoCo model.
@@ -121,13 +121,13 @@ class RobotParts:
                 return ends[index]
 
     def corners(self, data: mujoco.MjData) -> Float[np.ndarray, "points 3"]:
-        """Corners of boxes about the parts, in the world [m]: what a camera has to see."""
+        """Return the corners of the parts' bounding boxes in the world [m], which a camera must show."""
         position, rotation = self.poses(data)
         own = np.array([part.corners for part in self.parts])
         return (np.einsum("pij,pkj->pki", rotation, own) + position[:, None]).reshape(-1, 3)
 
     def poses(self, data: mujoco.MjData) -> tuple[Float[np.ndarray, "parts 3"], Float[np.ndarray, "parts 3 3"]]:
-        """Positions [m] and rotations of the parts in the world, as ``mj_kinematics`` left them in ``data``."""
+        """Return positions [m] and rotations of the parts in the world, from ``data`` after ``mj_kinematics``."""
         if self.style == "look":
             bodies, shift, turn = self.anchors
             frames = data.xmat.reshape(-1, 3, 3)[bodies]
@@ -143,7 +143,7 @@ class RobotParts:
 
 
 def robot_parts(robot: Robot, *, style: Style = "auto", look: Look | None = None) -> RobotParts:
-    """The shapes of a robot.
+    """Return the shapes of a robot for pictures.
 
     Args:
         robot: the robot.
@@ -168,7 +168,7 @@ def robot_parts(robot: Robot, *, style: Style = "auto", look: Look | None = None
 
 
 def _link_bodies(model: mujoco.MjModel, look: Look) -> list[int]:
-    """The body of each shape."""
+    """Return MuJoCo's body index of each shape."""
     bodies = {name: mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in {s.link for s in look.shapes}}
     strange = sorted(name for name, body in bodies.items() if body < 0)
     if strange:
@@ -188,7 +188,7 @@ def _look_parts(
 
 
 def _cover(model: mujoco.MjModel, bodies: Sequence[int]) -> bool:
-    """Whether two thirds of the bodies that move are among these, or have one of these fixed to them.
+    """Return whether two thirds of the moving bodies carry a shape, themselves or through a fixed body.
 
     A body that only joins another to its own place, such as one of three that make a ball joint, does not count.
     """
@@ -200,7 +200,7 @@ def _cover(model: mujoco.MjModel, bodies: Sequence[int]) -> bool:
 
 
 def _visible_geoms(model: mujoco.MjModel) -> list[int]:
-    """Geoms of the groups that MuJoCo's viewer shows, of any group where those hold none."""
+    """Return the geoms of the groups that MuJoCo's viewer shows, or all geoms if these groups are empty."""
     solid = [g for g in range(model.ngeom) if model.geom_type[g] in _DRAWN and _geom_color(model, g)[3] > 0.0]
     return [g for g in solid if model.geom_group[g] < _HIDDEN_GROUP] or solid
 
@@ -224,7 +224,7 @@ def _geom_color(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _sticks(robot: Robot, tips: tuple[np.ndarray, np.ndarray]) -> tuple[Part, ...]:
-    """Dots on the bodies with joints; links, as long as at ``q0``, from each body to its parent and from tips on."""
+    """Return dots on bodies with joints, and sticks from each body to its parent and to its tip."""
     model, data = robot.mj_model, next(mujoco_poses(robot, np.asarray(robot.q0)))
     start, end = _stick_ends(data, model.body_parentid, tips)
     length = np.linalg.norm(end - start, axis=-1)
@@ -242,7 +242,7 @@ def _sticks(robot: Robot, tips: tuple[np.ndarray, np.ndarray]) -> tuple[Part, ..
 
 
 def _tips(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Bodies without children, by MuJoCo's index, and of each the farthest named point, in the body's frame [m]."""
+    """Return the bodies without children by MuJoCo's index, and the farthest named point of each in its frame [m]."""
     tree, bodies_of = robot.tree, model_bodies(robot)
     frame_bodies, points = np.asarray(tree.frame_bodies), np.asarray(robot.frame_position)
     bodies, tips = [], []
@@ -263,7 +263,7 @@ def _stick_ends(
 
 
 def _link_frames(along: Float[np.ndarray, "links 3"]) -> Float[np.ndarray, "links 3 3"]:
-    """Rotations whose z runs along each link."""
+    """Return rotations whose z axis points along each link. (k, 3, 3)."""
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     z = np.where(length > 0.0, along / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
     x = np.cross(np.where(np.abs(z[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), z)

@@ -1,4 +1,4 @@
-"""Pictures of meshes by drawing their triangles into a depth buffer: rays take long where there are many triangles."""
+"""Rasteriser of triangle meshes with a depth buffer; faster than rays for many triangles."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ._shapes import part_surface
 from ._stage import TO_LAMP, Camera, Stage
 
 _FINE = 2
-"""Each pixel is the mean of so many by so many."""
+"""Samples per pixel along each axis; a pixel is their mean."""
 _SHADOW_SIZE = 0.6
-"""Width of the lamp's depth buffer, in widths of the picture."""
+"""Width of the lamp's depth buffer relative to that of the picture."""
 _SLACK = 0.012
-"""Distance behind the nearest lit surface from which a point is in shadow, in heights of the picture."""
+"""Distance behind the nearest lit surface, in picture heights, above which a point is in shadow."""
 _DETAIL = 10
 """Number of rings of a round shape; a sphere has four times as many meridians."""
 _AT_ONCE = 4_000_000
-"""Pixels of triangles' rectangles that are drawn at once: they take about 100 bytes each."""
+"""Number of pixels in triangles' bounding rectangles drawn at once, at about 100 bytes each."""
 
 
 class _Buffer(NamedTuple):
@@ -33,7 +33,7 @@ class _Buffer(NamedTuple):
 
 
 class _Surface(NamedTuple):
-    """Triangles of one part in its own frame; ``closed``: those that look away from a camera cannot be seen."""
+    """Triangles of one part in its own frame; of a ``closed`` surface, triangles that face away are not drawn."""
 
     vertices: Float[np.ndarray, "k 3"]
     faces: Int[np.ndarray, "m 3"]
@@ -41,7 +41,7 @@ class _Surface(NamedTuple):
 
 
 class _Lamp(NamedTuple):
-    """Depth buffer of the lamp, which looks at the robots."""
+    """Depth buffer of the lamp that lights the robots."""
 
     axes: Float[np.ndarray, "3 3"]
     low: Float[np.ndarray, "2"]
@@ -50,10 +50,10 @@ class _Lamp(NamedTuple):
 
 
 class Rasterizer(RayCaster):
-    """A ``RayCaster`` whose robots and shadows are drawn triangle by triangle."""
+    """Variant of ``RayCaster`` that rasterises robots and shadows triangle by triangle."""
 
     def __init__(self, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float) -> None:
-        """Collects the triangles of the stage."""
+        """Collect the triangles of the stage."""
         super().__init__(stage, camera, size, floor=floor)
         self._shadow_size = round(_SHADOW_SIZE * max(size))
         self._surfaces = [_surface(part) for part in stage.parts]
@@ -64,7 +64,7 @@ class Rasterizer(RayCaster):
         self._faces = np.concatenate([s.faces + start for s, start in zip(self._surfaces, starts, strict=False)])
 
     def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
-        """A picture of the stage; ``under`` is painted on the floor, shadows included, but not on the robots."""
+        """Return a picture of the stage; ``under`` is painted on the floor with shadows, behind the robots."""
         corners = self._corners(data)
         lamp = self._look_from_lamp(corners)
         picture = self._background * self._shadow(data, lambda points: self._unshaded(lamp, points))[..., None]
@@ -80,7 +80,7 @@ class Rasterizer(RayCaster):
         return np.concatenate(placed)[self._faces]
 
     def _triangles(self, corners: np.ndarray, lamp: _Lamp) -> tuple[Image, Float[np.ndarray, "height width"]]:
-        """Colour (times cover) and cover of the robots."""
+        """Return the robots' colours times coverage, and their coverage."""
         width, height = (_FINE * n for n in self.size)
         eye, axes = self.camera.eye, self.camera.axes
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -102,7 +102,7 @@ class Rasterizer(RayCaster):
         return color.reshape(*blocks, 3).mean((1, 3)), cover.reshape(blocks).mean((1, 3))
 
     def _look_from_lamp(self, corners: np.ndarray) -> _Lamp:
-        """The depth buffer of the lamp."""
+        """Return the depth buffer of the lamp."""
         axes = Camera((0.0, 0.0, 0.0), 1.0, *_angles(TO_LAMP), 1.0).axes
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         away = np.sum(normals * (corners[:, 0] - self._lamp), -1) > 0.0
@@ -130,12 +130,12 @@ class Rasterizer(RayCaster):
 
 
 def _angles(way: Float[np.ndarray, "3"]) -> tuple[float, float]:
-    """Azimuth and elevation of a unit vector [deg]."""
+    """Return azimuth and elevation of a unit vector [deg]."""
     return float(np.rad2deg(np.arctan2(way[1], way[0]))), float(np.rad2deg(np.arcsin(way[2])))
 
 
 def _surface(part: Part) -> _Surface:
-    """A part's triangles, turned outwards where they close."""
+    """Return the triangles of one part; normals point outwards if the mesh is closed."""
     if part.mesh is None:
         quads = part_surface(part, _DETAIL)
         vertices = quads.reshape(-1, 3)
@@ -153,7 +153,7 @@ def _surface(part: Part) -> _Surface:
 def draw_triangles(
     places: Float[np.ndarray, "triangles 3 2"], nearness: Float[np.ndarray, "triangles 3"], size: tuple[int, int]
 ) -> _Buffer:
-    """Draws triangles into an empty depth buffer.
+    """Draw triangles into an empty depth buffer.
 
     Args:
         places: their corners in a picture, x to the right and y down [pixels]; a pixel is drawn where its middle is
@@ -181,7 +181,7 @@ def _cuts(counts: Int[np.ndarray, " n"]) -> np.ndarray:
 
 
 class _Rows(NamedTuple):
-    """Stretches of pixels in a row that a triangle covers: first and last x, y, and the nearness, linear in x."""
+    """Horizontal runs of pixels covered by triangles: first and last x, y, and the inverse depth, linear in x."""
 
     triangle: np.ndarray
     first: np.ndarray

@@ -1,4 +1,4 @@
-"""Pictures by MuJoCo's ray casting: exact surfaces and shadows on the CPU, without GL."""
+"""Pictures by MuJoCo's ray casting on the CPU: exact surfaces and shadows without GL."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy import ndimage
 from ._stage import TO_LAMP, Camera, Stage
 
 Image = Float[np.ndarray, "height width 3"]
-"""Red, green and blue from 0 to 1."""
+"""Picture with red, green and blue from 0 to 1. (height, width, 3)."""
 
 _WHITE = 1.0
 _TILES = np.array([[0.925, 0.937, 0.952], [0.968, 0.975, 0.985]])
@@ -30,7 +30,7 @@ class _Hits(NamedTuple):
 
 
 class RayCaster:
-    """Draws a stage with a fixed camera.
+    """Ray-casting renderer of a stage with a fixed camera.
 
     Attributes:
         camera: the camera.
@@ -38,13 +38,13 @@ class RayCaster:
     """
 
     def __init__(self, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float) -> None:
-        """Draws the empty floor at height ``floor`` [m], once for all pictures."""
+        """Draw the empty floor at height ``floor`` [m], once for all pictures."""
         self.stage, self.camera, self.size, self._floor = stage, camera, size, floor
         self._lamp = np.asarray(camera.center) + 6.0 * camera.height * TO_LAMP
         self._background, self._ground = self._empty_floor()
 
     def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
-        """A picture of the stage; ``under`` is painted on the floor, shadows included, but not on the robots.
+        """Return a picture of the stage; ``under`` is painted on the floor with shadows, behind the robots.
 
         Args:
             data: from ``Stage.pose``.
@@ -59,7 +59,10 @@ class RayCaster:
         return picture
 
     def _robots(self, data: mujoco.MjData, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colour (times cover) and cover of the robots in some pixels; edges are seen through four rays a pixel."""
+        """Return the robots' colours times coverage, and their coverage, in some pixels.
+
+        Pixels at edges get four rays.
+        """
         corners = np.stack([columns, rows], -1).astype(float)
         rays = self.camera.rays(corners + 0.5, self.size)
         hits = self._cast(data, self.camera.eye, rays)
@@ -83,7 +86,7 @@ class RayCaster:
         return _edges(geom, normal)[y, x]
 
     def _near_robots(self, data: mujoco.MjData) -> np.ndarray:
-        """Pixels, in blocks, that the geoms' bounding balls may cover. (height, width)."""
+        """Return the pixels, in blocks, that the geoms' bounding spheres may cover. (height, width)."""
         center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:]  # the floor is geom 0
         middle = self.camera.project(center, self.size)
         depth = (center - self.camera.eye) @ self.camera.axes[2]
@@ -105,7 +108,7 @@ class RayCaster:
         return _Hits(geom, distance, normal.reshape(n, 3))
 
     def _shade(self, data: mujoco.MjData, rays: Float[np.ndarray, "n 3"], hits: _Hits) -> Float[np.ndarray, "n 3"]:
-        """Colours under a bright sky and one lamp that throws shadows; 0 where a ray hits nothing."""
+        """Return the colours of hit points under a sky and a lamp with shadows; 0 for rays that hit nothing."""
         color = np.zeros((len(rays), 3))
         seen = np.flatnonzero(hits.geom >= 0)
         if not len(seen):
@@ -120,7 +123,7 @@ class RayCaster:
         return color
 
     def _lit(self, data: mujoco.MjData, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
-        """Whether the lamp sees each point."""
+        """Return whether the lamp lights each point."""
         way = points - self._lamp
         length = np.linalg.norm(way, axis=-1)
         hits = self._cast(data, self._lamp, way / length[:, None])
@@ -151,7 +154,7 @@ class RayCaster:
         return keep
 
     def _empty_floor(self) -> tuple[Image, Float[np.ndarray, "height width 2"]]:
-        """The chequered floor, fading into white, and where each pixel meets it [m] (far away for the sky)."""
+        """Return a chequered floor that fades into white, and each pixel's floor point [m] (far away for the sky)."""
         y, x = np.mgrid[: self.size[1], : self.size[0]]
         pixels = np.stack([x, y], -1).reshape(-1, 2).astype(float)
         samples = [self._floor_color(self._floor_point(pixels + shift)) for shift in _SUBPIXELS]
@@ -179,7 +182,7 @@ def light(
     rays: Float[np.ndarray, "n 3"],
     lit: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Colours of points under a bright sky and one lamp.
+    """Return the colours of points under a bright sky and one lamp.
 
     Args:
         colors: of their surfaces. (n, 3)
@@ -197,13 +200,13 @@ def light(
 
 
 def _round_length(value: float) -> float:
-    """The nearest of ..., 0.1, 0.2, 0.5, 1, ... from below, so that a tile is a length that one can name."""
+    """Return the largest of ..., 0.1, 0.2, 0.5, 1, ... that does not exceed a length, as the size of a floor tile."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(m for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-9)))
 
 
 def _edges(geom: np.ndarray, normal: Float[np.ndarray, "h w 3"]) -> np.ndarray:
-    """Pixels next to another geom, or to a face turned elsewhere."""
+    """Return the pixels beside another geom or beside a face with another normal."""
     edge = np.zeros(geom.shape, bool)
     halves = (np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])
     for first, second in halves:

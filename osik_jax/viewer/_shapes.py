@@ -17,7 +17,7 @@ _MESH_FACES = 600
 
 
 def revolve(profile: Float[np.ndarray, "k 2"], segments: int) -> Quads:
-    """The surface that a profile of (radius, z), z rising, sweeps about the z axis."""
+    """Return the surface swept about the z axis by a profile of (radius, z) with rising z."""
     angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
     radius, height = profile[:, 0], profile[:, 1]
@@ -29,25 +29,25 @@ def revolve(profile: Float[np.ndarray, "k 2"], segments: int) -> Quads:
 
 
 def _arc(radius: float, start: float, stop: float, steps: int, shift: float = 0.0) -> np.ndarray:
-    """Points (radius, z) of an arc between two latitudes, moved along z."""
+    """Return points (radius, z) of an arc between two latitudes, shifted along z."""
     latitude = np.linspace(start, stop, steps + 1)
     return np.stack([radius * np.cos(latitude), radius * np.sin(latitude) + shift], -1)
 
 
 def sphere(radius: float, detail: int) -> Quads:
-    """A sphere of 4 * detail meridians."""
+    """Return a sphere of ``4 * detail`` meridians."""
     return revolve(_arc(radius, -np.pi / 2, np.pi / 2, 2 * detail), 4 * detail)
 
 
 def capsule(radius: float, half_length: float, detail: int) -> Quads:
-    """A cylinder along z with half spheres on its ends, ``half_length`` from the middle to each sphere's centre."""
+    """Return a capsule along z; ``half_length`` is the distance from its middle to each half sphere's centre."""
     bottom = _arc(radius, -np.pi / 2, 0.0, detail, -half_length)
     top = _arc(radius, 0.0, np.pi / 2, detail, half_length)
     return revolve(np.concatenate([bottom, _inner_rings(radius, half_length, detail), top]), 4 * detail)
 
 
 def cylinder(radius: float, half_length: float, detail: int) -> Quads:
-    """A closed cylinder along z."""
+    """Return a closed cylinder along z."""
     ends = np.array([[0.0, half_length]])
     side = _inner_rings(radius, half_length, detail)
     rim = np.array([[radius, half_length]])
@@ -77,7 +77,7 @@ def box(half_sizes: Float[np.ndarray, "3"], detail: int) -> Quads:
 
 
 def mesh(vertices: Float[np.ndarray, "k 3"], faces: np.ndarray) -> Quads:
-    """A triangle mesh; its convex hull where it has too many faces to draw one by one."""
+    """Return a triangle mesh, or its convex hull if it has too many faces."""
     if len(faces) > _MESH_FACES:
         hull = ConvexHull(vertices[:: max(1, len(vertices) // 2000)])
         corners = hull.points[hull.simplices]
@@ -90,7 +90,7 @@ def mesh(vertices: Float[np.ndarray, "k 3"], faces: np.ndarray) -> Quads:
 
 
 def part_surface(part: Part, detail: int) -> Quads:
-    """Surface of one part in its own frame."""
+    """Return the surface of one part in its own frame."""
     size = part.size
     match part.kind:
         case _GEOM.mjGEOM_SPHERE:
@@ -108,7 +108,7 @@ def part_surface(part: Part, detail: int) -> Quads:
 
 
 def robot_surface(shape: RobotParts, data: mujoco.MjData, detail: int) -> tuple[Quads, Float[np.ndarray, "faces 4"]]:
-    """Faces of a robot in the world [m], and their colours."""
+    """Return the faces of a robot in the world [m], and their colours."""
     surfaces = [part_surface(part, detail) for part in shape.parts]
     placed = [
         quads @ rotation.T + position for quads, position, rotation in zip(surfaces, *shape.poses(data), strict=True)

@@ -1,4 +1,4 @@
-"""A camera, and the MuJoCo model of what it sees: copies of robots' shapes that can be put anywhere."""
+"""Camera, and a MuJoCo model of the scene: movable copies of robots' shapes."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ._fixed import FixedParts
 from ._parts import Part, RobotParts
 
 FLOOR_GROUP = 5
-"""The floor's geom group: MuJoCo's renderer shows it, the ray caster draws its own."""
+"""Geom group of the floor: MuJoCo's renderer shows it, the ray caster draws its own floor."""
 
 LENS = 3.6
-"""Distance of the camera, in heights of the picture."""
+"""Distance of the camera in picture heights."""
 
 TO_LAMP = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
 
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that looks at a point.
+    """Pinhole camera that looks at a point.
 
     Attributes:
         center: what it looks at [m]. (3,)
@@ -41,12 +41,12 @@ class Camera:
 
     @property
     def view_angle(self) -> float:
-        """Vertical field of view [deg]."""
+        """Return the vertical field of view [deg]."""
         return float(2.0 * np.rad2deg(np.arctan2(0.5 * self.height, self.distance)))
 
     @property
     def axes(self) -> Float[np.ndarray, "3 3"]:
-        """Rows: right, up and forward in the world."""
+        """Return the camera's right, up and forward axes in the world as rows. (3, 3)."""
         azimuth, elevation = np.deg2rad([self.azimuth, self.elevation])
         forward = -np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -60,7 +60,7 @@ class Camera:
         return np.asarray(self.center) - self.distance * self.axes[2]
 
     def rays(self, pixels: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> Float[np.ndarray, "n 3"]:
-        """Unit directions through points of a picture of (width, height); x to the right, y down, in pixels."""
+        """Return unit directions through pixel positions of a picture (width, height); x right, y down."""
         width, height = size
         scale = self.height / height
         right = (pixels[:, 0] - 0.5 * width) * scale
@@ -76,7 +76,7 @@ class Camera:
         return np.stack([0.5 * width + right * scale, 0.5 * height - up * scale], -1)
 
     def for_mujoco(self) -> mujoco.MjvCamera:
-        """The same camera for MuJoCo's renderer (the model's ``vis.global_.fovy`` has to be ``view_angle``)."""
+        """Return the same camera for MuJoCo's renderer; the model's ``vis.global_.fovy`` must equal ``view_angle``."""
         camera = mujoco.MjvCamera()
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] = self.center
@@ -92,7 +92,7 @@ def frame_camera(
     window: tuple[float, float, float, float] = (0.04, 0.96, 0.06, 0.94),
     lens: float = LENS,
 ) -> Camera:
-    """The nearest camera that sees all points [m] within a window of its picture.
+    """Return the nearest camera that sees all points [m] within a window of its picture.
 
     Args:
         points: what has to be seen [m]. (n, 3)
@@ -126,7 +126,7 @@ def frame_camera(
 
 
 class Stage:
-    """Copies of robots' shapes on mocap bodies, a floor and a lamp.
+    """Scene of robots' shapes on mocap bodies, a floor and a lamp.
 
     Attributes:
         model: the MuJoCo model.
@@ -135,7 +135,7 @@ class Stage:
     """
 
     def __init__(self, robots: Sequence[RobotParts | FixedParts], camera: Camera, *, floor: float) -> None:
-        """Builds the model; ``floor`` is the height of the floor [m]."""
+        """Build the model; ``floor`` is the height of the floor [m]."""
         spec = mujoco.MjSpec()
         for robot in robots:
             for part in robot.parts:
@@ -150,7 +150,7 @@ class Stage:
     def pose(
         self, poses: Sequence[mujoco.MjData], offsets: Float[np.ndarray, "robots 3"] | None = None
     ) -> mujoco.MjData:
-        """Places every robot as its own ``mj_kinematics`` says, moved by its offset [m]."""
+        """Move each robot's shapes to the poses of its own ``mj_kinematics``, shifted by its offset [m]."""
         data = mujoco.MjData(self.model)
         shift = np.zeros((len(self._robots), 3)) if offsets is None else offsets
         start = 0
@@ -178,7 +178,7 @@ def _add_part(spec: mujoco.MjSpec, part: Part) -> None:
 
 
 def _add_surroundings(spec: mujoco.MjSpec, camera: Camera, floor: float) -> None:
-    """Floor, lamp and sky for MuJoCo's renderer; it needs room for pictures of any sensible size."""
+    """Add floor, lamp and sky for MuJoCo's renderer, with an off-screen buffer for large pictures."""
     spec.add_texture(
         name="tiles",
         type=mujoco.mjtTexture.mjTEXTURE_2D,

@@ -1,4 +1,4 @@
-"""A robot in the browser: a control loop of its own, and pages that show it. The pages need the extra ``viewer``."""
+"""Live view of a robot in the browser: a control loop in a thread, and pages that show it (extra ``viewer``)."""
 
 from ._batch import BatchView as BatchView
 from ._batch import serve_batch as serve_batch

@@ -1,4 +1,4 @@
-"""A page with several robots side by side: one controller whose numbers differ, one vmapped step."""
+"""Page with several robots side by side: controllers with different numbers, run by one vmapped step."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 _FRAME = 1.0 / 30.0
 """Time between pictures [s]."""
 _APART = 0.6
-"""Robots stand so many of their sizes apart at least: they move."""
+"""Least distance between robots, in sizes of a robot, so that they can move."""
 _WORDS = 6
-"""The panel's figures change with every so many pictures."""
+"""Number of pictures between updates of the panel's text."""
 
 
 class BatchView(Served):
-    """A page that runs a batch of robots; ``serve_batch`` makes one.
+    """Page that runs a batch of robots; made by ``serve_batch``.
 
     Attributes:
         url: address of the page.
@@ -63,7 +63,7 @@ class BatchView(Served):
         port: int,
         title: str,
     ) -> None:
-        """Starts the server and the loop."""
+        """Start the server and the loop."""
         self.names, self._robot = tuple(controllers), robot
         self.loop = ControlLoop(robot, stacked(tuple(controllers.values())), dt=dt, q0=jnp.asarray(q0))
         super().__init__(host, port, title)
@@ -87,7 +87,7 @@ class BatchView(Served):
         self._thread.start()
 
     def aim(self, robot: str, task: str, target: Any) -> None:
-        """Gives a task of one of the robots another target.
+        """Set the target of a task of one robot.
 
         Raises:
             KeyError: no such robot or task.
@@ -154,7 +154,7 @@ class BatchView(Served):
                 handle.content = text
 
     def _table(self) -> str:
-        """The errors of all tasks of all robots."""
+        """Return a table of all tasks' errors for all robots."""
         errors = self.loop.snapshot.errors
         rows = [
             f"| {name} | "
@@ -180,7 +180,7 @@ class BatchView(Served):
         return drag
 
     def _retarget(self, name: str, lane: int, target: Any, *, together: bool, owner: int | None) -> None:
-        """Another target of one robot; the others', with it, by the same displacement and turn."""
+        """Set one robot's target; move the other robots' targets by the same displacement and rotation."""
         own: Any = self._tasks[lane][name]
         new = jax.tree.map(np.asarray, own.replace(target=target).target)
         others: list[Any] = [tasks[name] for tasks in self._tasks]
@@ -189,7 +189,7 @@ class BatchView(Served):
         self.loop.aim(name, jax.tree.map(lambda *rows: np.stack(rows), *each), owner=owner)
 
     def _gone(self, client: ClientHandle) -> None:
-        """A visitor has closed the page: all robots stop whose handles he led."""
+        """Stop the robots whose handles were held by a visitor who closed the page."""
         for gizmos in self._gizmos:
             gizmos.drop(client.client_id)
         self.loop.release(client.client_id)
@@ -199,7 +199,7 @@ class BatchView(Served):
 
 
 def _displaced(task: Any, led: Any, new: Any) -> Any:
-    """The target of a task, moved and turned as the led one's was."""
+    """Return a task's target, moved and rotated as the dragged one was."""
     if not isinstance(task, FrameTask):
         return np.asarray(task.target) + new - np.asarray(led.target)
     (position, rotation), (old, turned) = task.target, led.target

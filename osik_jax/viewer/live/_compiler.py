@@ -1,4 +1,4 @@
-"""Compiles control steps in the background, each structure once."""
+"""Background compiler of control steps; compiles each structure once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _KEPT = 16
 
 
 class Compiler:
-    """A thread that compiles the controller asked for last, and tells when it has."""
+    """Thread that compiles the most recently requested controller, and calls back when done."""
 
     def __init__(
         self,
@@ -24,7 +24,7 @@ class Compiler:
         done: Callable[[Controller, Program], None],
         failed: Callable[[Controller, Exception], None],
     ) -> None:
-        """Takes how many robots there are (None: one, without an axis), and what to call from the thread."""
+        """Take the number of robots (None: one, without a batch axis) and the callback, which the thread calls."""
         self._batch = batch
         self._robot, self._dt, self._done, self._failed = robot, dt, done, failed
         self._programs: dict[tuple[Any, ...], Program] = {}
@@ -33,12 +33,12 @@ class Compiler:
         self.thread = threading.Thread(target=self._work, name="osik-compile", daemon=True)
 
     def ask(self, controller: Controller) -> None:
-        """Compiles this one next, instead of any that was asked for and not begun."""
+        """Request the compilation of a controller; it replaces earlier requests that have not started."""
         self._asked = controller
         self._news.set()
 
     def stop(self) -> None:
-        """Ends the thread after what it is compiling."""
+        """End the thread after the current compilation."""
         self._end = True
         self._news.set()
         if self.thread.is_alive():

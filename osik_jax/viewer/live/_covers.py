@@ -1,4 +1,4 @@
-"""Collision shapes of links in a live view: a capsule or a box around what is drawn of each link."""
+"""Collision shapes of links in a live view: a capsule or a box around the visual shape of each link."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ._surfaces import part_triangles
 
 SUFFIX = "_shape"
 _SMALL = 0.015
-"""Links that are smaller than this part of the robot, such as fingers, are left out."""
+"""Share of the robot's size below which links, such as fingers, get no shape."""
 _BOX = 0.7
-"""A box is taken where its volume is less than this part of the capsule's: capsules are quicker."""
+"""Volume ratio of box to capsule below which the box is used; capsules are faster."""
 
 
 def link_covers(robot: Robot, shapes: RobotParts) -> dict[str, CollisionShape]:
-    """A shape around each link that moves by itself, fixed to it, called like the link with ``SUFFIX`` after it.
+    """Return a shape around each moving link, fixed to it and named like it plus ``SUFFIX``.
 
     Args:
         robot: the robot.
@@ -34,7 +34,7 @@ def link_covers(robot: Robot, shapes: RobotParts) -> dict[str, CollisionShape]:
 
 
 def _clouds(robot: Robot, shapes: RobotParts) -> tuple[dict[str, Float[np.ndarray, "k 3"]], float]:
-    """The points of what is drawn of each moving body, in its frame, and the size of the robot [m]."""
+    """Return the visual shape's points of each moving body in its frame [m], and the size of the robot [m]."""
     data = next(mujoco_poses(robot, np.asarray(robot.q0)))
     weld, own = shapes.model.body_weldid, model_bodies(robot)
     names = {int(weld[body]): name for name, body in zip(robot.tree.body_names, own, strict=True) if weld[body] == body}
@@ -51,7 +51,7 @@ def _clouds(robot: Robot, shapes: RobotParts) -> tuple[dict[str, Float[np.ndarra
 
 
 def _cover(points: Float[np.ndarray, "k 3"], frame: str) -> CollisionShape:
-    """The smaller of a capsule along a principal axis and a box along all of them."""
+    """Return the smaller of a capsule along a principal axis and a box along all principal axes."""
     middle = points.mean(0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
     axes[2] = np.cross(axes[0], axes[1])
@@ -69,7 +69,7 @@ def _cover(points: Float[np.ndarray, "k 3"], frame: str) -> CollisionShape:
 
 
 def _capsule(points: Float[np.ndarray, "k 3"], along: int) -> tuple[float, float, float]:
-    """Radius and half the length [m] of a capsule around points along an axis through their middle, and its volume."""
+    """Return radius [m], half length [m] and volume of a capsule around points, along an axis through their middle."""
     off = np.linalg.norm(np.delete(points, along, axis=1), axis=1)
     radius = max(float(off.max()), 1e-3)
     reach = max(float(np.max(np.abs(points[:, along]) - np.sqrt(np.maximum(radius**2 - off**2, 0.0)))), 0.0)

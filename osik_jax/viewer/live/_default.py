@@ -32,7 +32,7 @@ def default_session(
     source: RobotSource | None = None,
     dt: float = 0.005,
 ) -> Session:
-    """A session for a robot, whose waist and centre of mass are switched off until somebody wants to lead them.
+    """Return the default session of a robot; waist and centre of mass are offered but switched off.
 
     Args:
         robot: the robot.
@@ -81,7 +81,7 @@ def _led_later(robot: Robot, q: Float[Array, " nq"]) -> dict[str, Task]:
 
 
 def find_hands(robot: Robot) -> tuple[str, ...]:
-    """A frame for the left hand and one for the right; of a robot without sides, what is called a hand, or the tip.
+    """Return a frame of the left and of the right hand; without sides, a frame named like a hand, or the tip.
 
     Of several frames of one kind, the one that most joints move.
     """
@@ -100,7 +100,7 @@ def find_hands(robot: Robot) -> tuple[str, ...]:
 
 
 def _named(frames: Sequence[tuple[str, int]]) -> str | None:
-    """The deepest of the frames that are called like a hand."""
+    """Return the deepest of the frames that are named like a hand."""
     for pattern in _HANDS:
         found = [frame for frame in frames if re.search(pattern, frame[0], re.IGNORECASE)]
         if found:

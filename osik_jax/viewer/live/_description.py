@@ -1,4 +1,4 @@
-"""Tasks, limits and schemes as plain data, which JSON can hold, and as the line of Python that makes them."""
+"""Tasks, limits and schemes as plain data for JSON, and as Python expressions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ...tasks._pose import PoseTask
 from ._shape_description import describe_pairs, describe_shapes, rebuild_shape, shape_python
 
 Description = dict[str, Any]
-"""``{"kind": name of the class, argument: plain value, ...}``; arguments that change nothing are left out."""
+"""Plain data ``{"kind": class name, argument: value, ...}``; arguments at their defaults are left out."""
 
 _PARTS = {"AdaptiveGain": AdaptiveGain, "SupportPolygon": SupportPolygon}
 _NO_LIMITS = "no_limits"
@@ -26,7 +26,7 @@ _ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) *
 
 
 def describe(part: Any, robot: Robot) -> Description:
-    """A task, limit or scheme of this package as plain data.
+    """Return a task, limit or scheme of this package as plain data.
 
     Raises:
         ValueError: a class of somebody's own, or an object that its constructor's arguments do not tell all of.
@@ -49,7 +49,7 @@ def describe(part: Any, robot: Robot) -> Description:
 
 
 def _describe_collisions(limit: CollisionAvoidanceLimit, robot: Robot) -> Description:
-    """Pairs by globs where these say the same, and by their names elsewhere."""
+    """Return a collision limit's pairs as globs if these select the same pairs, else by name."""
     numbers = {name: _plain(getattr(limit, name)) for name in (*limit.replaceable, "max_pairs")}
     shapes, any_distance = describe_shapes(limit, robot), {"q0_distance": -np.inf}
     for short in (True, False):
@@ -62,7 +62,7 @@ def _describe_collisions(limit: CollisionAvoidanceLimit, robot: Robot) -> Descri
 
 
 def _makes(described: Description, robot: Robot, part: Any) -> bool:
-    """Whether that is a description of the object: the same structure and the same numbers."""
+    """Return whether a description rebuilds the object with the same structure and numbers."""
     try:
         first, second = jax.tree.flatten(rebuild(described, robot)), jax.tree.flatten(part)
     except ValueError:
@@ -71,7 +71,7 @@ def _makes(described: Description, robot: Robot, part: Any) -> bool:
 
 
 def rebuild(described: Mapping[str, Any], robot: Robot) -> Any:
-    """The object of a description.
+    """Return the object of a description.
 
     Raises:
         ValueError: a description of nothing that is known, or arguments that do not fit.
@@ -96,7 +96,7 @@ def rebuild(described: Mapping[str, Any], robot: Robot) -> Any:
 
 
 def python(described: Mapping[str, Any]) -> str:
-    """The expression that makes it, in a program that has ``import osik_jax as osik`` and a ``robot``."""
+    """Return the expression that makes an object, for a program with ``import osik_jax as osik`` and a ``robot``."""
     kind = described["kind"]
     if kind == _NO_LIMITS:
         return f"osik.{_NO_LIMITS}"
@@ -126,7 +126,7 @@ def _argument(part: Any, robot: Robot, name: str) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers as floats and lists of floats."""
+    """Return numbers as floats and lists of floats."""
     for kind, cls in _PARTS.items():
         if isinstance(value, cls):
             names = ("maximum", "minimum", "decay") if cls is AdaptiveGain else ("normals", "offsets", "vertices")
@@ -149,7 +149,7 @@ def _live(value: Any) -> Any:
 
 
 def _text(value: Any) -> str:
-    """Plain data as Python."""
+    """Return plain data as Python source."""
     if isinstance(value, Mapping):
         given = ", ".join(f"{name}=np.array({_text(one)})" for name, one in value.items() if name != "kind")
         return f"osik.{value['kind']}({given})"

@@ -1,4 +1,4 @@
-"""A session that is being edited, and the loop that runs it."""
+"""Editable session, and the loop that runs it."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ SCHEMES: dict[str, Callable[[], Scheme]] = {
     "Hierarchical QP": lambda: HierarchicalQP(damping=_DAMPING),
     "Null space": lambda: NullSpace(method="saturated"),
 }
-"""The schemes to choose from, all of which keep the limits."""
+"""Schemes to choose from; all of them keep the limits."""
 
 
 class Desk:
-    """Edits of a session, each of which the loop takes up.
+    """Edits of a session, each passed on to the control loop.
 
     Attributes:
         loop: runs the session's controller.
     """
 
     def __init__(self, session: Session, shapes: RobotParts) -> None:
-        """Takes the session to start with and what is drawn of its robot; the loop does not run yet."""
+        """Take the initial session and the visual shapes of its robot; the loop does not run yet."""
         self._session, self._lock, self._shapes = session, threading.RLock(), shapes
         self._seen: tuple[Any, dict[str, Obstacle]] = ((), {})
         controller = session.controller()
@@ -54,7 +54,7 @@ class Desk:
 
     @property
     def session(self) -> Session:
-        """The session with the targets of now; the same object until something changes."""
+        """Return the session with the current targets; the same object until something changes."""
         with self._lock:
             now = self.loop.controller
             if self._told[0] is now and self._told[1] is self._session:
@@ -65,14 +65,14 @@ class Desk:
             return self._told[2]
 
     def edit(self, **changes: Any) -> None:
-        """Replaces fields of the session."""
+        """Replace fields of the session."""
         with self._lock:
             new = dataclasses.replace(self.session, **changes)
             self.loop.change(lambda _: new.controller())
             self._session = new
 
     def switch(self, name: str, on: bool) -> None:
-        """Switches a task on or off; one that comes on starts where the robot is."""
+        """Switch a task on or off; its target starts at the robot's current pose."""
         with self._lock:
             session = self.session
             if on == (name not in session.off):
@@ -85,12 +85,12 @@ class Desk:
                 self.edit(off=session.off | {name})
 
     def renumber(self, name: str, **numbers: Any) -> None:
-        """Another weight or gain of a task."""
+        """Set the weight or gain of a task."""
         with self._lock:
             self._put(name, self.task(name).replace(**numbers))
 
     def rank(self, name: str, priority: int) -> None:
-        """Another priority of a task.
+        """Set the priority of a task.
 
         Raises:
             ValueError: a task of a class of somebody's own.
@@ -101,7 +101,7 @@ class Desk:
                 self._put(name, rebuild({**describe(task, robot), "priority": priority}, robot))
 
     def add_frame(self, frame: str) -> str:
-        """A new task for a frame, which starts where the robot is; returns its name."""
+        """Add a task for a frame with its target at the current pose; return the task's name."""
         with self._lock:
             session, name = self.session, frame
             while name in session.tasks:
@@ -111,24 +111,24 @@ class Desk:
             return name
 
     def remove(self, name: str) -> None:
-        """Takes a task away; the last one stays."""
+        """Remove a task; the last task cannot be removed."""
         with self._lock:
             left = {key: task for key, task in self.session.tasks.items() if key != name}
             if left:
                 self.edit(tasks=left, off=self._session.off - {name})
 
     def take_scheme(self, title: str) -> None:
-        """Another scheme, by its title."""
+        """Set the scheme by its title."""
         self.edit(scheme=SCHEMES[title]())
 
     def switch_limit(self, number: int, on: bool) -> None:
-        """Switches one of the session's limits on or off."""
+        """Switch one of the session's limits on or off."""
         with self._lock:
             off = self._session.limits_off
             self.edit(limits_off=off - {number} if on else off | {number})
 
     def slow_down(self, share: float) -> None:
-        """Speed limits at a share of the robot's own."""
+        """Set speed limits to a share of the robot's own."""
         with self._lock:
             own = np.asarray(self._session.robot.velocity_limit)
             limits = [
@@ -146,7 +146,7 @@ class Desk:
             return self._seen[1]
 
     def add_obstacle(self, kind: str, position: Float[np.ndarray, "3"], size: float) -> str:
-        """Puts a ball or a box there [m]; returns its name. The limit for obstacles is added with the first of them.
+        """Add a ball or box at a position [m] and return its name; the first one adds the limit for obstacles.
 
         Raises:
             ValueError: there are as many as there may be, or the robot has no links that move.
@@ -162,17 +162,17 @@ class Desk:
             return name
 
     def move_obstacle(self, name: str, **changes: Float[np.ndarray, "..."]) -> None:
-        """Another position, rotation or size of an obstacle; compiles nothing."""
+        """Set position, rotation or size of an obstacle without compiling."""
         with self._lock:
             self._session = dataclasses.replace(self._session, limits=moved(self._session.limits, name, **changes))
             self.loop.place(name, **changes)
 
     def remove_obstacle(self, name: str) -> None:
-        """Takes an obstacle out of the way."""
+        """Move an obstacle out of use."""
         self.move_obstacle(name, position=PARKED)
 
     def avoid_itself(self) -> None:
-        """Adds the limit that keeps the robot off itself.
+        """Add the limit that avoids self-collision.
 
         Raises:
             ValueError: no two links of it are apart.
@@ -190,7 +190,7 @@ class Desk:
         self.edit(limits=(*self._session.limits, limit))
 
     def load(self, session: Session) -> None:
-        """Takes over another session of the same robot, at the configuration reached.
+        """Replace the session by another one of the same robot, at the current configuration.
 
         Raises:
             ValueError: a session of another robot.
@@ -200,7 +200,7 @@ class Desk:
         self.edit(**{f.name: getattr(session, f.name) for f in dataclasses.fields(session) if f.name != "robot"})
 
     def task(self, name: str) -> Task:
-        """A task by name.
+        """Return a task by name.
 
         Raises:
             KeyError: no such task.

@@ -1,4 +1,4 @@
-"""A motion as one page that plays without a server and without a network."""
+"""Export of a motion as one HTML page that plays without a server or network."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ._playback import Cast, Motion
 from ._server import close_server, open_server
 
 _PICTURES = 30.0
-"""A second, of those that are kept."""
+"""Number of pictures kept per second."""
 
 
 def export_html(
@@ -30,7 +30,7 @@ def export_html(
     look: Look | None = None,
     title: str = "osik-jax",
 ) -> Path:
-    """Writes a motion as one self-contained page: time slider, speeds, and a camera to turn with the mouse.
+    """Write a motion as one self-contained page with time slider, speeds and a mouse-controlled camera.
 
     Everything is in the file, which any browser with WebGL plays offline; it is about 1 MB and what the robot's meshes
     take.
@@ -54,7 +54,7 @@ def export_html(
 
 
 def write_page(robot: Robot, motion: Motion, out: Path, *, look: Look | None, title: str) -> Path:
-    """Writes a motion that has been read already.
+    """Write the page of an already loaded motion.
 
     Raises:
         ImportError: viser is not installed.
@@ -75,7 +75,7 @@ def write_page(robot: Robot, motion: Motion, out: Path, *, look: Look | None, ti
 
 
 def _motion(robot: Robot, trajectory: Any, dt: float | None) -> Motion:
-    """The runs with their times, checked."""
+    """Return the checked runs with their times."""
     if isinstance(trajectory, Trajectory):
         period = float(trajectory.time[1] - trajectory.time[0]) if len(trajectory.time) > 1 else 0.005
         trajectory, dt = trajectory.q, period if dt is None else dt

@@ -1,4 +1,4 @@
-"""Handles to drag: one for each task that has a target in space."""
+"""Draggable handles: one for each task with a target in space."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Pose = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]
 """Position [m] and quaternion w x y z."""
 Dragged = Callable[[str, Pose, int, str], None]
-"""Task, where it was dragged to, by which visitor, and the phase of the drag: start, update or end."""
+"""Arguments of a drag callback: task, pose, visitor, and phase (start, update or end)."""
 _MOVED = 1e-9
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -37,7 +37,7 @@ def gizmo_pose(task: Task) -> Pose | None:
 
 
 def gizmo_target(task: Task, pose: Pose) -> Any:
-    """The target of a task whose handle is there."""
+    """Return the target of a task whose handle is at a pose."""
     if isinstance(task, ComTask):
         return pose[0]
     if isinstance(task, FrameTask) and not turns(task):
@@ -46,10 +46,10 @@ def gizmo_target(task: Task, pose: Pose) -> Any:
 
 
 class Gizmos:
-    """The handles of a page."""
+    """Handles of a page."""
 
     def __init__(self, scene: SceneApi, size: float, dragged: Dragged, *, below: str = "") -> None:
-        """Takes the size of the robot [m], what to call when somebody drags, and the node to be below of."""
+        """Take the size of the robot [m], the drag callback, and the parent node."""
         self._scene, self._scale, self._dragged, self._below = scene, 0.13 * size, dragged, below
         self._handles: dict[str, TransformControlsHandle] = {}
         self._held: dict[str, int] = {}
@@ -61,7 +61,7 @@ class Gizmos:
         return dict(self._held)
 
     def show(self, tasks: Mapping[str, Task]) -> None:
-        """Has a handle for each of these tasks that has a target in space, at its target; others go."""
+        """Show a handle at the target of each given task that has one in space; remove other handles."""
         wanted = {name: (task, pose) for name, task in tasks.items() if (pose := gizmo_pose(task)) is not None}
         for name in [name for name in self._handles if name not in wanted or self._turns[name] != turns(tasks[name])]:
             self._handles.pop(name).remove()
@@ -73,7 +73,7 @@ class Gizmos:
                 self._move(self._handles[name], pose)
 
     def drop(self, visitor: int) -> None:
-        """The visitor has gone, with all that he was dragging."""
+        """Release everything that a visitor who left was dragging."""
         for name in [name for name, holder in self._held.items() if holder == visitor]:
             self._held.pop(name, None)
 
@@ -108,5 +108,5 @@ class Gizmos:
 
 
 def turns(task: Task) -> bool:
-    """Whether a task asks for an orientation."""
+    """Return whether a task tracks an orientation."""
     return isinstance(task, FrameTask) and any(task.kept[3:])

@@ -1,4 +1,4 @@
-"""Targets that are where the robot is, from MuJoCo's kinematics: quick enough for the control thread."""
+"""Targets at the robot's current pose by MuJoCo's kinematics, fast enough for the control thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The control loop in a thread of its own: what others ask for is taken up between steps and never waited for."""
+"""Control loop in its own thread; requests take effect between steps and never block it."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from ._step import Controller, Program, State, with_targets
 from ._timing import Stopwatch, Timing
 
 _LATE = 5
-"""A loop that is so many periods late starts counting anew instead of catching up."""
+"""Number of periods of delay after which a loop restarts its schedule instead of catching up."""
 _SWITCH_INTERVAL = 5e-5
-"""[s]"""
+"""GIL switch interval while a loop runs [s]."""
 _HALF_A_MICROSECOND = 5e-7
-"""Python keeps that interval in whole microseconds, and cuts off."""
+"""Offset [s] added to the switch interval, which Python truncates to whole microseconds."""
 _loops: set[int] = set()
 """Identities of the running loops. The last one to stop unfreezes the objects of Python's garbage collector."""
 
@@ -55,7 +55,7 @@ class _Lease(NamedTuple):
 
 
 class ControlLoop:
-    """Runs a controller at a fixed rate, in a thread of its own.
+    """Controller running at a fixed rate in its own thread.
 
     All methods may be called from any thread. Numbers (targets, weights, gains, limits) count from the next step on.
     Another structure (another task, scheme, priority or limit) is compiled in the background while the step before
@@ -75,7 +75,7 @@ class ControlLoop:
     def __init__(
         self, robot: Robot, controller: Controller, *, dt: float = 0.005, q0: Float[Array, " nq"] | None = None
     ) -> None:
-        """Takes the robot, the controller to start with, the period [s] and where to start, ``robot.q0`` by default.
+        """Take the robot, the first controller, the period [s] and the start configuration (default ``robot.q0``).
 
         Raises:
             ValueError: q0 does not fit, or dt is not positive.
@@ -107,7 +107,7 @@ class ControlLoop:
         self._thread = threading.Thread(target=self._run, name="osik-control", daemon=True)
 
     def start(self) -> Self:
-        """Starts the threads; the first step is compiled in the background.
+        """Start the threads; the first step is compiled in the background.
 
         While it runs, Python's threads change places every 0.05 ms, not every 5: the control thread would wait that
         long for each of the others that computes. What was there when a program was compiled is left out of
@@ -123,7 +123,7 @@ class ControlLoop:
         return self
 
     def stop(self) -> None:
-        """Ends the threads; what is being compiled is waited for, as no thread may be left in XLA when Python ends."""
+        """End the threads, after the current compilation: no thread may be inside XLA when Python ends."""
         atexit.unregister(self.stop)
         self._stop.set()
         if self._thread.is_alive():
@@ -147,7 +147,7 @@ class ControlLoop:
 
     @property
     def controller(self) -> Controller:
-        """The controller that is asked for; it runs as soon as it is compiled. The same object until it changes."""
+        """Return the requested controller, which runs as soon as it is compiled; the same object until it changes."""
         with self._lock:
             if self._told[0] is not self._wanted or self._told[1] is not self._targets:
                 self._told = self._wanted, self._targets, with_targets(self._wanted, self._targets)
@@ -155,11 +155,11 @@ class ControlLoop:
 
     @property
     def timing(self) -> Timing:
-        """Periods and step times of the last steps since the start or the last pause."""
+        """Return periods and step times of the last steps since the start or the last pause."""
         return self._stopwatch.timing()
 
     def wait_until_ready(self, timeout: float = 60.0) -> bool:
-        """Waits until the controller asked for is the one that runs; False: it does not after the timeout [s]."""
+        """Wait until the requested controller runs; return False if it does not within the timeout [s]."""
         end = time.monotonic() + timeout
         while time.monotonic() < end:
             if self._job is not None and not self._is_behind:
@@ -168,7 +168,7 @@ class ControlLoop:
         return False
 
     def change(self, edit: Callable[[Controller], Controller]) -> None:
-        """Replaces the controller by what ``edit`` makes of the one asked for; changes wait for each other.
+        """Replace the requested controller by ``edit`` of it; concurrent changes are serialised.
 
         Raises:
             Whatever ``edit`` raises; the controller then stays.
@@ -189,7 +189,7 @@ class ControlLoop:
                 self._compiler.ask(wanted)
 
     def aim(self, name: str, target: Any, *, owner: Hashable = None, timeout: float | None = None) -> None:
-        """Gives a task another target, also while another structure is being compiled.
+        """Set the target of a task, also while another structure is being compiled.
 
         Args:
             name: of the task.
@@ -213,7 +213,7 @@ class ControlLoop:
             self._retarget({name: aimed.target})
 
     def place(self, obstacle: str, **changes: Float[np.ndarray, "..."]) -> None:
-        """Another position, rotation or size of an obstacle (``CollisionAvoidanceLimit.moved``), for all that runs."""
+        """Set position, rotation or size of an obstacle (``CollisionAvoidanceLimit.moved``) in all controllers."""
         with self._editing, self._lock:
             both = self._wanted is self._running
             self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, **changes))
@@ -222,53 +222,53 @@ class ControlLoop:
             self._refresh()
 
     def let_go(self, owner: Hashable) -> None:
-        """The owner has put its targets where it wants them: they stay."""
+        """Keep the targets where their owner left them, without a timeout."""
         with self._lock:
             self._leases = {name: lease for name, lease in self._leases.items() if lease.owner != owner}
 
     def release(self, owner: Hashable) -> None:
-        """The owner has gone while it led targets: they become where the robot is."""
+        """Set the targets of an owner who left to the robot's current pose."""
         with self._lock:
             left = [name for name, lease in self._leases.items() if lease.owner == owner]
         if left:
             self._orders.append(lambda: self._hold(left))
 
     def push(self, velocity: Float[np.ndarray, " nv"]) -> None:
-        """Adds a velocity [m/s, rad/s] that fades within a second: a shove, which the controller has to make up for."""
+        """Add a velocity disturbance [m/s, rad/s] that fades within a second; the controller corrects it."""
         self._orders.append(lambda: self._push.start(velocity))
 
     def pause(self) -> None:
-        """Stands still from the next step on."""
+        """Stop the robot from the next step on."""
         self._orders.append(lambda: self._show(paused=True))
 
     def resume(self) -> None:
-        """Goes on."""
+        """Resume after a pause."""
         self._orders.append(lambda: self._show(paused=False))
 
     def reset(self) -> None:
-        """Puts the robot back to where it started, at once; targets stay where they are."""
+        """Move the robot to its start configuration at once; targets stay."""
         self._orders.append(self._reset)
 
     def record(self) -> None:
-        """Starts a recording, of ten minutes at most; one that runs is thrown away."""
+        """Start a recording of at most ten minutes; a running one is discarded."""
         self._orders.append(lambda: self._recorder.start(self._snapshot.q))
 
     def recorded(self) -> Recording:
-        """Ends the recording and returns it; empty where there was none."""
+        """End the recording and return it; empty if none ran."""
         return self._recorder.stop()
 
     def _refresh(self) -> None:
-        """Takes the numbers over that are asked for; the lock is held."""
+        """Take over the requested numbers; the caller holds the lock."""
         if self._job is not None:
             self._job = self._job._replace(numbers=with_targets(self._running, self._targets).numbers())
 
     def _retarget(self, targets: dict[str, Any]) -> None:
-        """New targets for what runs and for what is being compiled; the lock is held."""
+        """Set targets in the running and the pending controller; the caller holds the lock."""
         self._targets = self._targets | targets
         self._refresh()
 
     def _compiled(self, controller: Controller, program: Program) -> None:
-        """The compiler has the program of a controller; it may no longer be the one that is asked for."""
+        """Run a compiled program unless another controller has been requested since."""
         if not self._stop.is_set():
             gc.freeze()
         with self._lock:
@@ -277,14 +277,14 @@ class ControlLoop:
                 self._job = _Job(program, with_targets(self._running, self._targets).numbers())
 
     def _not_compiled(self, controller: Controller, error: Exception) -> None:
-        """Goes back to what runs, and says why."""
+        """Return to the running controller and report the error."""
         with self._lock:
             if controller.structure() == self._wanted.structure():
                 self._wanted, self._is_behind = self._running, False
                 self._problem = " ".join(str(error).split())
 
     def _run(self) -> None:
-        """The control thread."""
+        """Run the control thread."""
         run_before_others()
         deadline = time.perf_counter()
         while not self._stop.is_set():
@@ -310,7 +310,7 @@ class ControlLoop:
         self._stopwatch.add(begin, time.perf_counter() - begin)
 
     def _step(self, job: _Job) -> None:
-        """One step; where its answer cannot be used, the robot stands still and the solver starts anew."""
+        """Run one step; if its answer is unusable, stop the robot and cold-start the solver."""
         if job.program is not self._program:
             self._program, self._state = job.program, (*self._state[:2], job.program.cold)
         state, status, errors = job.program.run(job.numbers, self._state, self._push.now())
@@ -336,7 +336,7 @@ class ControlLoop:
         self._snapshot = replace(self._snapshot, **changes)
 
     def _reset(self) -> None:
-        """Back to the start, at rest."""
+        """Move the robot to the start, at rest."""
         still = np.zeros_like(self._snapshot.velocity)
         cold = None if self._program is None else self._program.cold
         self._state = (jnp.asarray(self._start), jnp.asarray(still), cold)
@@ -344,12 +344,12 @@ class ControlLoop:
         self._show(time=0.0, q=self._start, velocity=still, failures=0)
 
     def _abandoned(self) -> list[str]:
-        """Tasks whose target is older than it may be."""
+        """Return the tasks whose target is older than allowed."""
         now = time.monotonic()
         return [name for name, lease in list(self._leases.items()) if lease.until < now]
 
     def _hold(self, names: list[str]) -> None:
-        """Targets of these tasks become where the robot is."""
+        """Set the targets of these tasks to the robot's current pose."""
         if not names:
             return
         q, tasks = self._snapshot.q, self._running.tasks
@@ -361,5 +361,5 @@ class ControlLoop:
 
 
 def _aim(task: Any, target: Any) -> Any:
-    """The task with another target."""
+    """Return the task with another target."""
     return task.replace(target=target)

@@ -1,4 +1,4 @@
-"""Marks on the scene: the support polygon, the centre of mass and its shadow on the ground."""
+"""Marks of balance: support polygon, centre of mass and its projection on the ground."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ if TYPE_CHECKING:
 
 _IN, _OUT, _EDGE = (42, 157, 98), (215, 38, 61), (28, 111, 184)
 _LIFT = 0.002
-"""Flat marks are so far above the floor [m]."""
+"""Height of flat marks above the floor [m]."""
 _TOUCHING = 1e-3
 """Distance beyond a polygon's edge up to which a point counts as inside [m]."""
 
 
 class BalanceMarks:
-    """The polygon, and the centre of mass as a ball with a disc below it: green inside the polygon, red outside."""
+    """Support polygon, and the centre of mass as a ball with a disc on the floor; green inside, red outside."""
 
     def __init__(self, scene: SceneApi, floor: float, size: float) -> None:
-        """Takes the height of the floor and the size of the robot [m]."""
+        """Take the height of the floor and the size of the robot [m]."""
         self._scene, self._floor, self._size = scene, floor, size
         self._polygon: SupportPolygon | None = None
         self._color: tuple[int, int, int] | None = None
         self._at = np.full(3, np.inf)
 
     def show_polygon(self, polygon: SupportPolygon | None) -> None:
-        """Draws the polygon; None draws none."""
+        """Draw the polygon; None removes it."""
         self._polygon, self._color = polygon, None
         self._scene.remove_by_name("/balance/area")
         self._scene.remove_by_name("/balance/edge")
@@ -45,7 +45,7 @@ class BalanceMarks:
         self._scene.add_line_segments("/balance/edge", ring, _EDGE, thickness=2.5, thickness_units="screen")
 
     def place(self, com: Float[np.ndarray, "3"]) -> None:
-        """Moves the centre of mass [m]."""
+        """Move the centre of mass [m]."""
         inside = self._polygon is None or float(self._polygon.distance(com[:2])) > -_TOUCHING
         color = _IN if inside else _OUT
         if color != self._color:

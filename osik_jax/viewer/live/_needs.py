@@ -1,4 +1,4 @@
-"""The extra that a live view needs."""
+"""Check for the extra of live views."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from types import ModuleType
 
 
 def import_viser() -> ModuleType:
-    """viser.
+    """Return the module viser, or raise ImportError that names the extra.
 
     Raises:
         ImportError: it is not installed; the message says which extra to install.

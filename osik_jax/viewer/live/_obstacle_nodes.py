@@ -1,4 +1,4 @@
-"""Obstacles in a page, each with a handle to drag."""
+"""Obstacles in a page, each with a draggable handle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from viser import SceneApi, TransformControlsEvent, TransformControlsHandle
 
 Dragged = Callable[[str, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], None]
-"""Obstacle, and the position [m] and rotation it was dragged to."""
+"""Arguments of a drag callback: obstacle, position [m] and rotation."""
 _COLOR = (231, 126, 34)
 _MOVED = 1e-9
 
@@ -29,17 +29,17 @@ class _Shown(NamedTuple):
 
 
 class ObstacleNodes:
-    """The obstacles of a page."""
+    """Obstacles of a page."""
 
     def __init__(self, scene: SceneApi, size: float, dragged: Dragged) -> None:
-        """Takes the size of the robot [m], and what to call when somebody drags."""
+        """Take the size of the robot [m] and the drag callback."""
         self._scene, self._scale, self._dragged = scene, 0.1 * size, dragged
         self._shown: dict[str, _Shown] = {}
         self._held: dict[str, int] = {}
         self._last: Mapping[str, Obstacle] | None = None
 
     def show(self, obstacles: Mapping[str, Obstacle]) -> None:
-        """Has these obstacles and no others."""
+        """Show these obstacles and remove others."""
         if obstacles is self._last and not self._held:
             return
         self._last = obstacles
@@ -57,7 +57,7 @@ class ObstacleNodes:
                 self._shown[name] = shown._replace(size=one.size)
 
     def drop(self, visitor: int) -> None:
-        """The visitor has gone, with all that he was dragging."""
+        """Release everything that a visitor who left was dragging."""
         for name in [name for name, holder in self._held.items() if holder == visitor]:
             self._held.pop(name, None)
 
@@ -85,7 +85,7 @@ class ObstacleNodes:
         return handle
 
     def _draw(self, one: Obstacle) -> None:
-        """The shape below its handle."""
+        """Draw the shape as a child of its handle."""
         name = f"/obstacles/{one.name}/shape"
         if one.kind == "ball":
             self._scene.add_icosphere(name, radius=float(one.size[0]), color=_COLOR, opacity=0.8)

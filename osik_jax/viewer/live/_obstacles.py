@@ -1,4 +1,4 @@
-"""Obstacles of a page, and the limits that keep a robot off them and off itself.
+"""Obstacles of a page, and the limits that avoid them and self-collision.
 
 Obstacles are the world's shapes of the session's ``CollisionAvoidanceLimit``s. The limit that the page adds has room
 for so many of each kind: those that are not in use are far below the floor, so that adding, moving and removing one
@@ -26,14 +26,14 @@ from .._mujoco import mujoco_frame_pose, mujoco_poses
 SLOTS = {"ball": 3, "box": 3}
 """Number of obstacles of each kind that a page may have."""
 MARGIN = 0.01
-"""Least distance; of a robot with itself, of pairs that are farther apart where the robot starts [m]."""
+"""Least distance to obstacles, and of links that are farther apart at the start [m]."""
 PARKED = np.array([0.0, 0.0, -1e3])
-"""Position of obstacles that are not in use [m]."""
+"""Position of obstacles out of use [m]."""
 _ROWS = {"itself": 12, "world": 12}
 
 
 class Obstacle(NamedTuple):
-    """A shape of the world that can be dragged.
+    """Draggable shape of the world.
 
     Attributes:
         name: in its limit.
@@ -51,18 +51,18 @@ class Obstacle(NamedTuple):
 
 
 def obstacles_in(limits: Sequence[Limit]) -> dict[str, Obstacle]:
-    """The obstacles in use, by name."""
+    """Return the obstacles in use by name."""
     return {one.name: one for limit in limits for one in _slots(limit) if not _is_parked(one)}
 
 
 def free_slot(limits: Sequence[Limit], kind: str) -> str | None:
-    """The name of an obstacle of that kind that is not in use; None where there is none."""
+    """Return the name of an unused obstacle of a kind, or None."""
     parked = (one.name for limit in limits for one in _slots(limit) if one.kind == kind and _is_parked(one))
     return next(parked, None)
 
 
 def keeps_off_world(limit: Limit) -> bool:
-    """Whether it has obstacles, in use or not."""
+    """Return whether a limit has obstacles, used or not."""
     return any(True for _ in _slots(limit))
 
 
@@ -71,7 +71,7 @@ def _is_parked(one: Obstacle) -> bool:
 
 
 def _slots(limit: Limit) -> Iterator[Obstacle]:
-    """Balls and boxes of the world."""
+    """Return the world's balls and boxes, all out of use."""
     if not isinstance(limit, CollisionAvoidanceLimit):
         return
     scene, own = limit.scene, len(limit.scene.geoms)
@@ -86,7 +86,7 @@ def _slots(limit: Limit) -> Iterator[Obstacle]:
 
 
 def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."]) -> tuple[Limit, ...]:
-    """The limits with an obstacle somewhere else, or of another size; as they are where none has it."""
+    """Return the limits with an obstacle moved or resized."""
     return tuple(
         limit.moved(name, **changes)
         if isinstance(limit, CollisionAvoidanceLimit) and name in limit.scene.names[len(limit.scene.geoms) :]
@@ -96,7 +96,7 @@ def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."
 
 
 def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float) -> CollisionAvoidanceLimit:
-    """Keeps links off obstacles, none of which is in use yet.
+    """Return the limit between links and obstacles, with all obstacles out of use.
 
     Args:
         robot: the robot.
@@ -118,7 +118,7 @@ def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float)
 def own_limit(
     robot: Robot, covers: Mapping[str, CollisionShape], q: Float[np.ndarray, " nq"]
 ) -> CollisionAvoidanceLimit:
-    """Keeps links off each other, but for those that are too near at q: neighbours of neighbours, by construction.
+    """Return the limit of self-collision, without pairs that are too near at q, such as links two joints apart.
 
     Raises:
         ValueError: no two links can meet.
@@ -140,7 +140,7 @@ def own_limit(
 def _as_model(
     robot: Robot, covers: Mapping[str, CollisionShape], q: Float[np.ndarray, " nq"]
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The shapes as geoms of a model of MuJoCo's, in their order, where they are at q."""
+    """Return a MuJoCo model of the shapes at q, as geoms in their order."""
     spec, posed = mujoco.MjSpec(), next(mujoco_poses(robot, q))
     for shape in covers.values():
         position, rotation = mujoco_frame_pose(robot, posed, str(shape.frame))

@@ -26,7 +26,7 @@ from ._stance import sole_polygon, standing
 
 
 def check(host: str, port: int) -> None:
-    """Finds out before the work what would fail after it.
+    """Raise an error early if address, port or extra would fail later.
 
     Raises:
         ImportError: viser is not installed.
@@ -37,7 +37,7 @@ def check(host: str, port: int) -> None:
 
 
 def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: str, port: int) -> LiveView:
-    """A robot to drag.
+    """Open a page with a robot to drag.
 
     Args:
         robot: the robot.
@@ -63,7 +63,7 @@ def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: 
 
 
 def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> Player:
-    """A motion to play.
+    """Open a page that plays a motion.
 
     Raises:
         FileNotFoundError, ValueError: as in ``read_motion``.
@@ -74,7 +74,7 @@ def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, por
 
 
 def is_map(path: Path) -> bool:
-    """Whether a file is what ``osik reach`` writes, rather than a motion."""
+    """Return whether a file is a map of ``osik reach`` rather than a motion."""
     try:
         with open_npz(path) as file:
             return "reached" in file.files
@@ -83,7 +83,7 @@ def is_map(path: Path) -> bool:
 
 
 def open_map(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> ReachView:
-    """A map of what a frame reaches.
+    """Open a page with a reachability map.
 
     Raises:
         ValueError: a map of another version, or of another robot.
@@ -98,7 +98,7 @@ def open_map(path: Path, robot: Robot, source: RobotSource, *, host: str, port: 
 
 
 def write_motion(path: Path, robot: Robot, source: RobotSource, page: Path) -> None:
-    """Writes a page that plays a motion without a server.
+    """Write a page that plays a motion without a server.
 
     Raises:
         FileNotFoundError, ValueError: as in ``read_motion``.
@@ -108,7 +108,7 @@ def write_motion(path: Path, robot: Robot, source: RobotSource, page: Path) -> N
 
 
 def open_session(path: Path, *, host: str, port: int) -> LiveView:
-    """A session to go on with.
+    """Open a page that resumes a saved session.
 
     Raises:
         FileNotFoundError, ValueError: as in ``load_session``.

@@ -1,4 +1,4 @@
-"""A page: the scene and the panel of a session, kept up to date by a thread that only reads."""
+"""Page of a session: scene and panel, updated by a thread that only reads."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ if TYPE_CHECKING:
 _FRAME = 1.0 / 30.0
 """Time between pictures [s]."""
 _WORDS = 6
-"""The panel's figures change with every so many pictures."""
+"""Number of pictures between updates of the panel's text."""
 
 
 class LiveView(Served):
-    """A page that runs a session; ``serve`` makes one.
+    """Page that runs a session; made by ``serve``.
 
     Attributes:
         url: address of the page.
     """
 
     def __init__(self, session: Session, *, look: Look | None, host: str, port: int, title: str) -> None:
-        """Starts the server and the loop."""
+        """Start the server and the loop."""
         super().__init__(host, port, title)
         robot = session.robot
         shapes, self._data = robot_parts(robot, look=look), mujoco.MjData(robot.mj_model)
@@ -77,11 +77,11 @@ class LiveView(Served):
 
     @property
     def session(self) -> Session:
-        """The session as it is now; ``session.save(path)`` writes it."""
+        """Return the current session; ``session.save(path)`` writes it."""
         return self._desk.session
 
     def aim(self, task: str, target: Any, *, timeout: float | None = None) -> None:
-        """Gives a task another target; the robot is held where it is if none follows within the timeout [s].
+        """Set the target of a task; the robot stops if no further call follows within the timeout [s].
 
         Raises:
             KeyError: no such task.
@@ -93,7 +93,7 @@ class LiveView(Served):
         self.loop.stop()
 
     def _run(self) -> None:
-        """The thread that draws."""
+        """Run the drawing thread."""
         count = 0
         while not self._end.is_set():
             begin = time.perf_counter()
@@ -104,7 +104,7 @@ class LiveView(Served):
             self._end.wait(max(_FRAME - (time.perf_counter() - begin), 0.2 * _FRAME))
 
     def _draw(self) -> None:
-        """The robot as it is now."""
+        """Draw the current state of the robot."""
         session = self._desk.session
         self._kinematics(self.loop.snapshot.q)
         with self._server.atomic():
@@ -132,7 +132,7 @@ class LiveView(Served):
         mujoco.mj_comPos(robot.mj_model, self._data)
 
     def _drag(self, name: str, pose: Pose, visitor: int, phase: str) -> None:
-        """A visitor drags a handle; one who has gone lets the robot stop where it is."""
+        """Apply a visitor's drag of a handle; a visitor who left stops the robot."""
         if phase != "end":
             self.loop.aim(name, gizmo_target(self._desk.session.tasks[name], pose), owner=visitor)
         elif visitor in self._server.get_clients():
@@ -141,11 +141,11 @@ class LiveView(Served):
             self.loop.release(visitor)
 
     def _place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
-        """A visitor drags an obstacle."""
+        """Apply a visitor's drag of an obstacle."""
         self._desk.move_obstacle(obstacle, position=position, rotation=rotation)
 
     def _gone(self, client: ClientHandle) -> None:
-        """A visitor has closed the page."""
+        """Release everything of a visitor who closed the page."""
         self._gizmos.drop(client.client_id)
         self._obstacles.drop(client.client_id)
         self.loop.release(client.client_id)
@@ -213,7 +213,9 @@ def serve_session(
     port: int = 8080,
     open_browser: bool = False,
 ) -> LiveView:
-    """Run and show a session; arguments that are not named here, and exceptions, are those of ``serve``.
+    """Run and show a session.
+
+    Arguments that are not named here, and exceptions, are those of ``serve``.
 
     Args:
         session: from a view or from ``load_session``.

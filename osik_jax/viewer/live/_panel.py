@@ -1,4 +1,4 @@
-"""The panel of a page: what can be switched, slid and read."""
+"""Panel of a page: switches, sliders and readouts."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _PLURALS = {"ball": "balls", "box": "boxes"}
 _NONE: str = "none"
 _WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
 _PUSH = 0.6
-"""Speed of a push, in sizes of the robot a second."""
+"""Speed of a push, in sizes of the robot per second."""
 
 
 class Panel:
-    """Everything that is no scene."""
+    """Controls and readouts of a page."""
 
     def __init__(self, server: ViserServer, desk: Desk, seen: Float[np.ndarray, "n 3"]) -> None:
-        """Adds the panel to the page of a robot that is where these points are [m]."""
+        """Add the panel to the page of a robot that occupies these points [m]."""
         self._server, self._desk, self._seen = server, desk, seen
         self._size = float(np.linalg.norm(np.ptp(seen, axis=0)))
         gui = server.gui
@@ -57,7 +57,7 @@ class Panel:
         self._fill_obstacles(None)
 
     def tell(self) -> None:
-        """Shows what the loop says now."""
+        """Show the current state of the loop."""
         snapshot, session = self._desk.loop.snapshot, self._desk.session
         texts = (
             (self._state, state_text(snapshot)),
@@ -70,7 +70,7 @@ class Panel:
                 handle.content = text
 
     def refill(self) -> None:
-        """Shows the session: after tasks were added or taken away, or another session was loaded."""
+        """Show the session after tasks changed or another session was loaded."""
         session = self._desk.session
         for box in self._boxes.values():
             box.remove()
@@ -141,7 +141,7 @@ class Panel:
         self._joints = gui.add_markdown("")
 
     def _fill_limits(self) -> None:
-        """A switch for each limit, and one for collisions of the robot with itself where there is none yet."""
+        """Add a switch for each limit, and one for self-collision if the session has no such limit."""
         session = self._desk.session
         for box in self._limit_boxes:
             box.remove()
@@ -155,7 +155,7 @@ class Panel:
                 self._switch_limit(_ITSELF, False, None)
 
     def _switch_limit(self, words: str, on: bool, number: int | None) -> None:
-        """A switch for a limit; for None, for one that is added when it is switched on."""
+        """Add a switch for a limit; None stands for a limit that switching on creates."""
 
         def switch(event: GuiEvent[Any]) -> None:
             if number is not None:
@@ -204,14 +204,14 @@ class Panel:
             self._fill_obstacles(None)
 
     def _fill_obstacles(self, chosen: str | None) -> None:
-        """The names to choose from."""
+        """Update the names of obstacles to choose from."""
         names = tuple(self._desk.obstacles) or (_NONE,)
         self._obstacle.options = names
         self._obstacle.value = chosen if chosen is not None and chosen in names else names[-1]
         self._show_obstacle()
 
     def _show_obstacle(self) -> None:
-        """The sliders stand where the chosen obstacle has its sizes: of a ball, its diameter."""
+        """Set the sliders to the sizes of the chosen obstacle; for a ball, its diameter."""
         one = self._desk.obstacles.get(self._obstacle.value)
         for axis, edge in enumerate(self._edges):
             edge.visible = one is not None and (one.kind == "box" or axis == 0)
@@ -274,14 +274,14 @@ class Panel:
         self._boxes[name] = box
 
     def _weigh(self, exponent: float) -> None:
-        """Scales a task's weights so that the largest is that power of ten."""
+        """Scale a task's weights so that the largest is the given power of ten."""
         old = np.asarray(self._desk.task(self._name).weight)
         top = float(old.max())
         new = old * (10.0**exponent / top) if top > 0.0 else np.full(old.shape, 10.0**exponent)
         self._desk.renumber(self._name, weight=new)
 
     def _show_chosen(self) -> None:
-        """The sliders stand where the chosen task has its numbers."""
+        """Set the sliders to the numbers of the chosen task."""
         task = self._desk.task(self._name)
         top, gain = float(np.max(np.asarray(task.weight))), task.gain
         rate = float(np.max(np.asarray(gain.maximum if isinstance(gain, AdaptiveGain) else gain)))
@@ -290,7 +290,7 @@ class Panel:
         self._priority.value = int(np.clip(task.priority, *_PRIORITIES))
 
     def _guarded(self, act: Callable[[Any], Any]) -> Callable[[Any], None]:
-        """An answer to what a visitor does: mistakes are told to him. What the panel sets itself has no client."""
+        """Return a callback that shows errors to the visitor; changes by the panel itself have no client."""
 
         def answer(event: Any) -> None:
             if event.client is None:

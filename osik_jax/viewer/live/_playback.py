@@ -1,4 +1,4 @@
-"""Plays motions: a slider for the time, a speed, and one robot for each run side by side."""
+"""Player of motions: time slider, speed, and one robot per run side by side."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _RATE = 200.0
 
 
 class Motion:
-    """Runs of one motion.
+    """Motion of one or more runs, with their times.
 
     Attributes:
         runs: name to configurations. {name: (T, nq)}
@@ -37,7 +37,7 @@ class Motion:
     """
 
     def __init__(self, runs: Mapping[str, Float[np.ndarray, "T nq"]], times: Mapping[str, np.ndarray]) -> None:
-        """Takes runs with their times."""
+        """Take runs with their times [s]."""
         self.runs, self.times = dict(runs), dict(times)
 
     @property
@@ -46,12 +46,12 @@ class Motion:
         return max(float(time[-1]) for time in self.times.values())
 
     def at(self, name: str, now: float) -> Float[np.ndarray, " nq"]:
-        """The configuration of a run at a time, or its last one [s]."""
+        """Return the configuration of a run at a time [s]; its last one after the end."""
         return self.runs[name][max(int(np.searchsorted(self.times[name], now, side="right")) - 1, 0)]
 
 
 def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
-    """Reads what ``osik demo``, ``osik retarget``, a view or ``numpy.savez(path, q=rollout.q, time=...)`` wrote.
+    """Read a motion from ``osik demo``, ``osik retarget``, a view, or ``numpy.savez(path, q=rollout.q, time=...)``.
 
     Runs are arrays (T, nq) called ``q`` or ``q_NAME``; times are ``time_NAME`` or ``time``, one fewer where they are
     those of the steps; without any, there are 200 configurations a second. What ``osik retarget`` writes is ``qpos``
@@ -83,7 +83,7 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
 
 
 def _retargeted(arrays: Mapping[str, np.ndarray], robot: Robot, path: Any) -> dict[str, np.ndarray]:
-    """The arrays q and time of a motion whose joints are called by their names."""
+    """Return the arrays q and time of a motion whose joints are given by name."""
     qpos, names = np.asarray(arrays["qpos"], float), [str(name) for name in arrays["joint_names"]]
     tree = robot.tree
     unknown = sorted(set(names) - set(tree.joint_names))
@@ -101,7 +101,7 @@ def _retargeted(arrays: Mapping[str, np.ndarray], robot: Robot, path: Any) -> di
 
 
 def _times(name: str, count: int, arrays: Mapping[str, np.ndarray]) -> Float[np.ndarray, " T"]:
-    """Return the time of each configuration of a run, from 0 [s]."""
+    """Return the time of each configuration of a run, starting at 0 [s]."""
     time = arrays.get(f"time_{name}", arrays.get("time"))
     if time is None or time.ndim != 1 or len(time) not in (count, count - 1) or len(time) < 2:
         return np.arange(count) / _RATE
@@ -112,10 +112,10 @@ def _times(name: str, count: int, arrays: Mapping[str, np.ndarray]) -> Float[np.
 
 
 class Cast:
-    """The robots of a motion, side by side in one scene."""
+    """Robots of a motion, side by side in one scene."""
 
     def __init__(self, server: Any, robot: Robot, motion: Motion, look: Look | None, *, panel: bool) -> None:
-        """Adds a robot for each run, with the floor and a camera that leaves room for a panel or not."""
+        """Add a robot per run, the floor and a camera, optionally with room for a panel."""
         shapes, self._robot, self._motion = robot_parts(robot, look=look), robot, motion
         spans = np.concatenate([_span(robot, shapes, q) for q in motion.runs.values()])
         offsets = side_by_side(spans, len(motion.runs))
@@ -129,26 +129,26 @@ class Cast:
                 add_label(server.scene, name, spans + offset)
 
     def show(self, now: float) -> None:
-        """Moves all robots to a time [s]."""
+        """Move all robots to a time [s]."""
         for name, nodes in self._nodes.items():
             nodes.place(next(mujoco_poses(self._robot, self._motion.at(name, now))))
 
 
 def _span(robot: Robot, shapes: Any, q: Float[np.ndarray, "T nq"]) -> Float[np.ndarray, "points 3"]:
-    """Corners of boxes about the robot at a few instants."""
+    """Return corners of the robot's bounding boxes at a few instants [m]."""
     chosen = q[np.unique(np.linspace(0, len(q) - 1, 9).astype(int))]
     return np.concatenate([shapes.corners(data) for data in mujoco_poses(robot, chosen)])
 
 
 class Player(Served):
-    """A page that plays a motion, over and over.
+    """Page that plays a motion in a loop.
 
     Attributes:
         url: address of the page.
     """
 
     def __init__(self, robot: Robot, motion: Motion, *, look: Look | None, host: str, port: int, title: str) -> None:
-        """Starts the server and plays."""
+        """Start the server and the playback."""
         super().__init__(host, port, title)
         self._cast, self._motion = Cast(self._server, robot, motion, look, panel=True), motion
         gui, length = self._server.gui, motion.duration

@@ -7,16 +7,16 @@ import sys
 import threading
 
 _CONTROL, _DRAWING = -10, 5
-"""Niceness; 0 is what other threads have."""
+"""Niceness of the control and drawing threads; other threads have 0."""
 
 
 def run_before_others() -> None:
-    """Prefers the thread that calls; only with the right to do so, as root has it, and on Linux."""
+    """Raise the priority of the calling thread, on Linux and with the permission (root)."""
     _be_nice(_CONTROL)
 
 
 def run_after_others() -> None:
-    """Lets other threads go before the one that calls; on Linux, where niceness is a thread's own."""
+    """Lower the priority of the calling thread, on Linux, where niceness is per thread."""
     _be_nice(_DRAWING)
 
 

@@ -1,4 +1,4 @@
-"""A page with a robot and a slice of what one of its frames reaches."""
+"""Page with a robot and a slice of a frame's reachability map."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 Axis = Literal["x", "y", "z"]
 _FRAME = 1.0 / 30.0
-"""Time between looks at the panel [s]."""
+"""Time between checks of the panel [s]."""
 _AXES = ("x", "y", "z")
 _PIXELS = 768
-"""Along the longer side of a slice: cells are sharp where each is many of them."""
+"""Pixels along the longer side of a slice; many pixels per cell keep cells sharp."""
 _SOLID, _FAINT = 210, 90
-"""Alpha where something is reached, and where nothing was found: the robot is seen behind it."""
+"""Alpha of reached cells, and of cells without a solution, through which the robot is visible."""
 
 
 class Slice(NamedTuple):
-    """A slice as a picture in space, whose rows go along its second axis and whose columns along its first.
+    """Slice as a picture in space; rows go along its second axis, columns along its first.
 
     Attributes:
         image: red, green, blue, alpha. (h, w, 4)
@@ -51,7 +51,7 @@ class Slice(NamedTuple):
 
 
 class ReachView(Served):
-    """A page that shows a slice of a map; ``serve_reach`` makes one.
+    """Page that shows a slice of a map; made by ``serve_reach``.
 
     Attributes:
         url: address of the page.
@@ -61,7 +61,7 @@ class ReachView(Served):
     def __init__(
         self, robot: Robot, found: ReachabilityMap, *, look: Look | None, host: str, port: int, title: str
     ) -> None:
-        """Starts the server."""
+        """Start the server."""
         super().__init__(host, port, title)
         self.map, self._robot = found, robot
         self._axes = found.x, found.y, found.z
@@ -78,7 +78,7 @@ class ReachView(Served):
         self._thread.start()
 
     def show(self, across: Axis, at: float) -> None:
-        """Shows the slice across an axis whose coordinate is nearest [m].
+        """Show the slice across an axis at the nearest coordinate [m].
 
         Raises:
             KeyError: no such axis.
@@ -94,7 +94,7 @@ class ReachView(Served):
         self._across.value = across
 
     def stand(self, position: Sequence[float] | None) -> bool:
-        """Puts the robot into the most manipulable configuration of the grid's nearest position; None: home.
+        """Show the most manipulable configuration at the nearest grid position [m]; None: home.
 
         Returns:
             Whether the map has one; else the robot stays where it is.
@@ -129,7 +129,7 @@ class ReachView(Served):
             self.stand(None)
 
     def _run(self) -> None:
-        """The thread that draws."""
+        """Run the drawing thread."""
         while not self._end.wait(_FRAME):
             self._draw()
 
@@ -167,7 +167,7 @@ class ReachView(Served):
         self._told.content = "The robot is at home." if cell is None else _cell_words(self.map, cell)
 
     def _clicked(self, event: SceneClickEvent) -> None:
-        """A visitor clicks into the scene: on the slice, or past it."""
+        """Handle a visitor's click into the scene, on the slice or beside it."""
         if self._drawn is None:
             return
         across, index = self._drawn
@@ -182,7 +182,7 @@ class ReachView(Served):
 
 
 def slice_picture(found: ReachabilityMap, across: int, index: int) -> Slice:
-    """The slice across an axis at one of its coordinates, as a page draws it."""
+    """Return the slice across an axis at one coordinate, as a page draws it."""
     axes = found.x, found.y, found.z
     first, second = (i for i in range(3) if i != across)
     edges = cell_edges(axes)
@@ -276,7 +276,7 @@ def serve_reach(
 
 
 def check_map(robot: Robot, found: ReachabilityMap) -> None:
-    """Raises TypeError for what is no map, ValueError for one of another robot."""
+    """Raise TypeError unless the argument is a map, ValueError if it is of another robot."""
     if not isinstance(found, ReachabilityMap):
         raise OsikTypeError(f"found is {found!r}; it is a ReachabilityMap, of reachability_map or load_map")
     if found.q.shape[-1] != robot.nq or found.frame not in robot.frame_names:

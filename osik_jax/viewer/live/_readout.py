@@ -24,7 +24,7 @@ _NEAREST = 5
 
 
 def state_text(snapshot: Snapshot) -> str:
-    """Whether it runs, and how well, in one line."""
+    """Return one line on whether the loop runs, and how well."""
     if snapshot.problem:
         return f"**refused:** {snapshot.problem}"
     if not snapshot.ready:
@@ -38,7 +38,7 @@ def state_text(snapshot: Snapshot) -> str:
 
 
 def timing_text(snapshot: Snapshot, timing: Timing) -> str:
-    """Status of the last step, its time, and the rate of the loop."""
+    """Return status and time of the last step, and the rate of the loop, as text."""
     status = _WORDS.get(Status(snapshot.status), str(snapshot.status))
     if not timing.steps:
         return f"{status}"
@@ -47,13 +47,13 @@ def timing_text(snapshot: Snapshot, timing: Timing) -> str:
 
 
 def error_table(tasks: Mapping[str, Task], off: frozenset[str], errors: Mapping[str, np.ndarray]) -> str:
-    """The errors of the tasks that are switched on."""
+    """Return a table of the errors of the active tasks."""
     rows = [f"| {name} | {error_text(task, errors.get(name))} |" for name, task in tasks.items() if name not in off]
     return "\n".join(["| task | error |", "|:--|--:|", *rows])
 
 
 def error_text(task: Task, error: Float[np.ndarray, " m"] | None) -> str:
-    """An error with its unit; of an inequality, by how much it is violated."""
+    """Return an error with its unit; for an inequality, its violation."""
     if error is None:
         return "…"
     if isinstance(task, FrameTask) and not task.bounded:
@@ -70,7 +70,7 @@ def error_text(task: Task, error: Float[np.ndarray, " m"] | None) -> str:
 
 
 def joint_table(robot: Robot, q: Float[np.ndarray, " nq"], velocity: Float[np.ndarray, " nv"]) -> str:
-    """The joints nearest to an end of their range, with the share of the range that is left and their speed."""
+    """Return a table of the joints nearest to their limits: remaining share of the range, and speed."""
     scalar, index = (np.asarray(part) for part in scalar_layout(robot))
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     limited = scalar & np.isfinite(upper - lower) & (upper > lower)

@@ -1,4 +1,4 @@
-"""Keeps what the robot does, while it is asked to."""
+"""Recorder of a robot's motion."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from jaxtyping import Float
 from ._snapshot import Recording
 
 _LONGEST = 600.0
-"""[s]"""
+"""Longest recording [s]."""
 
 
 class Recorder:
-    """Configurations at a fixed rate, of ten minutes at most."""
+    """Recorder of configurations at a fixed rate, for at most ten minutes."""
 
     def __init__(self, dt: float) -> None:
-        """Takes the time between configurations [s]."""
+        """Take the time between configurations [s]."""
         self._dt, self._lock = dt, threading.Lock()
         self._rows: list[np.ndarray] | None = None
 
     def start(self, q: Float[np.ndarray, "*batch nq"]) -> None:
-        """Starts with a configuration, and forgets what was kept."""
+        """Start with a configuration and discard earlier ones."""
         with self._lock:
             self._rows = [q.copy()]
 
     def add(self, q: Float[np.ndarray, "*batch nq"]) -> float | None:
-        """Keeps another one; returns how long the recording is [s], None where nothing is recorded."""
+        """Append a configuration and return the length of the recording [s]; None if none runs."""
         with self._lock:
             if self._rows is None:
                 return None
@@ -36,7 +36,7 @@ class Recorder:
             return (len(self._rows) - 1) * self._dt
 
     def stop(self) -> Recording:
-        """Ends the recording and returns it."""
+        """End the recording and return it."""
         with self._lock:
             rows, self._rows = self._rows or [], None
         return Recording(np.arange(len(rows)) * self._dt, np.array(rows) if rows else np.zeros((0, 0)))

@@ -1,4 +1,4 @@
-"""A robot in a page: a node for each body, with what is fixed to it below."""
+"""Robot in a page: a scene node per body, with its shapes as children."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from viser import FrameHandle, SceneApi
 
 _APART = 1.1
-"""Robots stand so many of their widths apart."""
+"""Distance between robots, in widths of a robot."""
 _MOVED = 1e-7
-"""Nodes that move less are left alone [m, or of a quaternion]."""
+"""Least change of a position [m] or quaternion that is sent to the page."""
 
 
 class RobotNodes:
-    """The nodes of one robot."""
+    """Scene nodes of one robot."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class RobotNodes:
         offset: Float[np.ndarray, "3"] | None = None,
         opacity: float | None = None,
     ) -> None:
-        """Adds the robot, at ``robot.q0``.
+        """Add the robot at ``robot.q0``.
 
         Args:
             scene: of viser.
@@ -67,7 +67,7 @@ class RobotNodes:
         self._position, self._quaternion = data.xpos[self._bodies], data.xquat[self._bodies]
 
     def place(self, data: mujoco.MjData) -> None:
-        """Moves the bodies to where MuJoCo's kinematics has them."""
+        """Move the bodies to their poses by MuJoCo's kinematics."""
         position, quaternion, frames = data.xpos[self._bodies], data.xquat[self._bodies], tuple(self._frames.values())
         for k in np.flatnonzero(np.abs(position - self._position).max(1) > _MOVED):
             frames[k].position = self._position[k] = position[k]
@@ -85,7 +85,7 @@ def side_by_side(span: Float[np.ndarray, "points 3"], count: int, least: float =
 
 
 def add_label(scene: SceneApi, name: str, span: Float[np.ndarray, "points 3"]) -> None:
-    """A robot's name above its points [m]."""
+    """Add a robot's name above its points [m]."""
     at, height = span[:, :2].mean(0), span[:, 2].max() + 0.05 * float(np.ptp(span[:, 1]))
     scene.add_label(f"/label {name}", name.replace("_", " "), position=(at[0], at[1], height))
 

@@ -1,4 +1,4 @@
-"""A page's server, on the port that was asked for and on no other."""
+"""Web server of a page, on exactly the requested port."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ _BLUE = (28, 111, 184)
 
 
 class Served(ABC):
-    """A page with a thread that keeps it up to date: ``_run``, until ``_end``.
+    """Base class of a page with a thread that runs ``_run`` until ``_end`` is set.
 
     Attributes:
         url: address of the page.
     """
 
     def __init__(self, host: str, port: int, title: str) -> None:
-        """Starts the server."""
+        """Start the server."""
         self._server = open_server(host, port, title)
         self.url = f"http://{host}:{self._server.get_port()}"
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._draw_all, name="osik-page", daemon=True)
 
     def wait(self) -> None:
-        """Blocks until ``stop`` is called from elsewhere, or Ctrl-C."""
+        """Block until ``stop`` is called elsewhere, or Ctrl-C."""
         while not self._end.wait(0.5):
             pass
 
     def stop(self) -> None:
-        """Ends all that runs, and the server."""
+        """End all threads and the server."""
         self._end.set()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)
@@ -57,14 +57,14 @@ class Served(ABC):
 
     @abstractmethod
     def _run(self) -> None:
-        """Draws, in a thread of its own, until ``_end``."""
+        """Draw in a thread of its own until ``_end`` is set."""
 
     def _close(self) -> None:  # noqa: B027 (a page that plays a file runs nothing)
-        """Ends what runs beside the page."""
+        """End everything that runs beside the page."""
 
 
 def open_server(host: str, port: int, title: str) -> ViserServer:
-    """Starts a server.
+    """Start a server.
 
     Args:
         host: address to listen at.
@@ -87,13 +87,13 @@ def open_server(host: str, port: int, title: str) -> ViserServer:
 
 
 def close_server(server: ViserServer) -> None:
-    """Ends a server without a word."""
+    """Stop a server without printing."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def check_port(host: str, port: int) -> int:
-    """The port, or one that is free for 0.
+    """Return the port, or a free one for 0; raise an error if it is in use.
 
     Raises:
         OSError: it is in use, or the address is none of this machine's.

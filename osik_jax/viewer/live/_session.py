@@ -1,4 +1,4 @@
-"""A session: a robot with its controller and what is switched off, as one file and as lines of Python."""
+"""Session: a robot, its controller and its switched-off parts, as a file and as Python."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _FORMAT = "osik-jax session 1"
 
 @dataclasses.dataclass(frozen=True)
 class Session:
-    """A controller as it is in a live view.
+    """Controller of a live view with its switches.
 
     ``osik_jax.solve(session.robot, q, session.active_tasks, scheme=session.scheme, limits=session.active_limits,
     dt=session.dt)`` is a step of it.
@@ -63,17 +63,17 @@ class Session:
 
     @property
     def active_tasks(self) -> dict[str, Task]:
-        """The tasks that are switched on."""
+        """Return the tasks that are switched on."""
         return {name: task for name, task in self.tasks.items() if name not in self.off}
 
     @property
     def active_limits(self) -> tuple[Limit, ...]:
-        """The limits that are switched on, as ``solve`` takes them."""
+        """Return the limits that are switched on, in the form that ``solve`` takes."""
         on = tuple(limit for number, limit in enumerate(self.limits) if number not in self.limits_off)
         return (no_limits, *on) if self.limits_off else on
 
     def controller(self) -> Controller:
-        """The same controller with weights of 0 and infinite limits in the place of what is off.
+        """Return the controller with weight 0 and infinite limits for everything switched off.
 
         So that switching compiles nothing; limits of other kinds are left out.
         """
@@ -82,7 +82,7 @@ class Session:
         return Controller(tasks, self.scheme, [no_limits, *(limit for limit in limits if limit is not None)])
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the session to a file, for ``load_session``.
+        """Write the session to a file for ``load_session``.
 
         Raises:
             ValueError: it holds what a file cannot, such as a task of a class of one's own.
@@ -113,7 +113,7 @@ class Session:
         return json.dumps(content, indent=1) + "\n"
 
     def to_python(self) -> str:
-        """A program that makes the same controller and takes one step; what is switched off is left out.
+        """Return a program that makes the same controller and takes one step, without switched-off parts.
 
         Raises:
             ValueError: as in ``save``.
@@ -142,7 +142,7 @@ class Session:
 
 
 def load_session(path: str | os.PathLike[str]) -> Session:
-    """Reads a session that a live view or ``Session.save`` wrote.
+    """Read a session written by a live view or ``Session.save``.
 
     Args:
         path: of the file.
@@ -155,7 +155,7 @@ def load_session(path: str | os.PathLike[str]) -> Session:
 
 
 def session_from_json(text: str, where: str = "this") -> Session:
-    """The session of what ``Session.to_json`` gave; ``where`` is what messages call it.
+    """Return the session of a ``Session.to_json`` text; ``where`` names its source in messages.
 
     Raises:
         ValueError: as in ``load_session``.
@@ -192,7 +192,7 @@ def _session(content: Mapping[str, Any]) -> Session:
 
 
 def _loose(limit: Limit) -> Limit | None:
-    """The limit with numbers that bound nothing; None where it has no such."""
+    """Return the limit with numbers that bound nothing, or None if it has no such numbers."""
     if type(limit) is ConfigurationLimit:
         free = np.full(limit.lower.shape, np.inf)
         return limit.replace(lower=-free, upper=free)

@@ -1,4 +1,4 @@
-"""Shapes and pairs of a ``CollisionAvoidanceLimit`` as plain data, and as lines of Python."""
+"""Shapes and pairs of a ``CollisionAvoidanceLimit`` as plain data and as Python."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _KINDS = {"capsule": Kind.SEGMENT, "box": Kind.BOX, "cylinder": Kind.CYLINDER, "
 
 
 def describe_shapes(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, dict[str, Any]]:
-    """The shapes that were added to the robot's own, by name.
+    """Return the shapes added to the robot's own, by name.
 
     Raises:
         ValueError: a convex hull, whose points are not kept.
@@ -40,7 +40,7 @@ def describe_shapes(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, d
 
 
 def rebuild_shape(described: Mapping[str, Any]) -> CollisionShape:
-    """The shape of a description, to the last bit.
+    """Return the shape of a description, equal to the last bit.
 
     Raises:
         ValueError: a kind that is not known.
@@ -54,7 +54,7 @@ def rebuild_shape(described: Mapping[str, Any]) -> CollisionShape:
 
 
 def shape_python(described: Mapping[str, Any]) -> str:
-    """The expression that makes it, to rounding."""
+    """Return the expression that makes a shape, up to rounding."""
     position, turn, size = (np.asarray(described[k]) for k in ("position", "rotation", "size"))
     kind, frame = described["shape"], f"frame={described['frame']!r}"
     if kind == "box":

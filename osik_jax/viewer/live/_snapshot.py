@@ -1,4 +1,4 @@
-"""State of a control loop, as other threads read it."""
+"""State of a control loop for other threads."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Snapshot:
 
 
 class Recording(NamedTuple):
-    """A motion.
+    """Recorded motion.
 
     Attributes:
         time: of each configuration [s]. (T,)

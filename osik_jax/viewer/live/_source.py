@@ -15,7 +15,7 @@ _SUFFIX = "_description"
 
 @dataclasses.dataclass(frozen=True)
 class RobotSource:
-    """A robot by name or file.
+    """Robot given by name or file.
 
     Attributes:
         robot: a name that ``load_robot`` takes, or the path of a URDF or MJCF file.
@@ -27,16 +27,16 @@ class RobotSource:
 
     @property
     def is_file(self) -> bool:
-        """Whether it is a file, rather than a name."""
+        """Return whether the source is a file rather than a name."""
         return Path(self.robot).is_file() or (self.robot not in NAMES and not self.robot.endswith(_SUFFIX))
 
     @property
     def is_mjcf(self) -> bool:
-        """Whether it is a file in MuJoCo's format."""
+        """Return whether the source is an MJCF file."""
         return self.is_file and is_mjcf(self.robot)
 
     def python(self) -> str:
-        """The expression that loads it, in a program with ``import osik_jax as osik``."""
+        """Return the expression that loads it, in a program with ``import osik_jax as osik``."""
         base = "" if self.floating_base is None else f", floating_base={self.floating_base}"
         if not self.is_file:
             return f"osik.load_robot({self.robot!r}{base})"
@@ -44,7 +44,7 @@ class RobotSource:
 
 
 def load_source(source: RobotSource) -> Robot:
-    """The robot.
+    """Return the robot of a source.
 
     Raises:
         FileNotFoundError: no such file.

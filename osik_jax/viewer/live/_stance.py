@@ -20,9 +20,9 @@ from .._shapes import lowest_points
 from ._surfaces import part_triangles
 
 _SINK = 0.05
-"""The waist goes down by this part of its height over the feet."""
+"""Share of the waist's height by which it is lowered over the feet."""
 _BEND = 0.05
-"""Joints first go towards the middle of their range by this part of it, so that knees bend the way they can."""
+"""Share of the range by which joints first move towards its middle, so that knees bend to their possible side."""
 _STEPS = 60
 _SOLE = 0.006
 """Height above a foot's lowest point up to which its points count as sole [m]."""
@@ -34,7 +34,7 @@ soles.
 
 
 def standing(robot: Robot, shapes: RobotParts, feet: Sequence[str]) -> Float[np.ndarray, " nq"]:
-    """Home, with the waist a little lower over the feet and the robot on the ground.
+    """Return home with the waist slightly lowered over the feet and the robot on the ground. (nq,).
 
     A robot that has a keyframe is where that says.
 
@@ -53,7 +53,7 @@ def standing(robot: Robot, shapes: RobotParts, feet: Sequence[str]) -> Float[np.
 
 
 def _crouched(robot: Robot, feet: Sequence[str]) -> Float[np.ndarray, " nq"]:
-    """Damped Gauss-Newton steps to the feet of home and a waist that is lower, from legs that are bent already."""
+    """Return the configuration with the feet of home and a lower waist, by damped Gauss-Newton steps from bent legs."""
     home = home_kinematics(robot)
     waist = robot.tree.body_names[robot.tree.root]
     p, R = home.frame_pose(robot, waist)
@@ -80,7 +80,7 @@ def _crouched(robot: Robot, feet: Sequence[str]) -> Float[np.ndarray, " nq"]:
 
 
 def _bent(robot: Robot) -> Float[Array, " nq"]:
-    """Home with the joints that have a range moved a little towards its middle."""
+    """Return home with limited joints moved slightly towards the middle of their range."""
     scalar, index = (np.asarray(part) for part in scalar_layout(robot))
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     limited = scalar & np.isfinite(lower) & np.isfinite(upper)
@@ -94,7 +94,7 @@ def _bent(robot: Robot) -> Float[Array, " nq"]:
 def sole_polygon(
     robot: Robot, shapes: RobotParts, q: Float[np.ndarray, " nq"], feet: Sequence[str]
 ) -> SupportPolygon | None:
-    """The support polygon of feet, whose soles are what is lowest of them where the model names no corners.
+    """Return the support polygon of feet; without named corners, soles are the feet's lowest points.
 
     None where they span no area.
     """
@@ -108,7 +108,7 @@ def sole_polygon(
 
 
 def _sole(robot: Robot, shapes: RobotParts, data: object, foot: str) -> Float[np.ndarray, "k 3"]:
-    """The lowest points of what moves with a foot, in its frame [m]."""
+    """Return the lowest points of a foot, in its frame [m]."""
     body = model_bodies(robot)[robot.tree.frame_bodies[robot.tree.frame(foot)]]
     weld = shapes.model.body_weldid
     position, rotation = mujoco_frame_pose(robot, data, foot)

@@ -1,4 +1,4 @@
-"""One step of a controller as one compiled program, whose every number may change while it runs."""
+"""Control step as one compiled program with replaceable numbers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Controller:
     limits: Sequence[Limit]
 
     def parts(self) -> tuple[dict[str, Task], Scheme, tuple[Limit, ...]]:
-        """The same as a pytree."""
+        """Return tasks, scheme and limits as a pytree."""
         return dict(self.tasks), self.scheme, tuple(self.limits)
 
     def numbers(self) -> list[Array]:
@@ -55,13 +55,13 @@ class Controller:
 
 
 def with_targets(controller: Controller, targets: Mapping[str, Any]) -> Controller:
-    """The controller with other targets of some of its tasks; those that it has not, or not such, are passed over."""
+    """Return the controller with some targets replaced; unknown or unsuitable targets are ignored."""
     aimed = {name: _aimed(task, targets[name]) for name, task in controller.tasks.items() if name in targets}
     return dataclasses.replace(controller, tasks={**controller.tasks, **aimed}) if aimed else controller
 
 
 def _aimed(task: Any, target: Any) -> Task:
-    """The task with a target of the same shape, in its precision; no other checks."""
+    """Return the task with a target of the same shape, in its precision and without further checks."""
     old = getattr(task, "target", None)
     if old is None or jax.tree.map(np.shape, old) != jax.tree.map(np.shape, target):
         return task
@@ -71,7 +71,7 @@ def _aimed(task: Any, target: Any) -> Task:
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """A compiled step.
+    """Compiled control step.
 
     Attributes:
         run: from the controller's numbers, the state and a push (nv,) to the next state, status and task errors.
@@ -83,7 +83,7 @@ class Program:
 
 
 def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | None = None) -> Program:
-    """Compiles one step of a controller; takes seconds, in whichever thread calls it.
+    """Compile one step of a controller in the calling thread; takes seconds.
 
     The push is a velocity (nv,) that the robot has on top of what the controller asks for. Of a batch, all numbers,
     states and pushes have a leading axis.
@@ -107,7 +107,7 @@ def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | N
 
 
 def stacked(controllers: Sequence[Controller]) -> Controller:
-    """One controller for a batch: each of its numbers has a leading axis.
+    """Return one controller for a batch; each number has a leading axis.
 
     Raises:
         ValueError: they differ in more than numbers.

@@ -1,4 +1,4 @@
-"""A robot's shapes as triangles that a page draws well: round where they are round, sharp at edges, not too many."""
+"""Robot shapes as triangles for a page: smooth where round, sharp at edges, limited in number."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from .._parts import Part
 from .._shapes import Quads, part_surface
 
 _CREASE = np.cos(np.deg2rad(35.0))
-"""Faces that meet at less than this angle look like one round surface."""
+"""Angle between faces below which they are shaded as one smooth surface."""
 _DETAIL = 8
 """Number of rings of a round shape; a sphere has four times as many meridians."""
 _MOST_FACES = 4000
 """Maximum number of faces of a mesh; larger meshes are simplified by merging close vertices."""
 _CELLS = (160, 120, 96, 80, 64, 48, 40, 32, 24, 16, 12, 8)
-"""Cells along a mesh's longest side, from fine to coarse."""
+"""Number of cells along a mesh's longest side, from fine to coarse."""
 
 
 class Surface(NamedTuple):
-    """Triangles.
+    """Triangle surface.
 
     Attributes:
         vertices: [m]. (k, 3)
@@ -34,7 +34,7 @@ class Surface(NamedTuple):
 
 
 def part_triangles(part: Part) -> Surface:
-    """A part's surface in its own frame."""
+    """Return a part's surface in its own frame."""
     if part.mesh is None:
         return _split_at_creases(_triangulated(part_surface(part, _DETAIL)))
     vertices, faces = part.mesh
@@ -42,13 +42,13 @@ def part_triangles(part: Part) -> Surface:
 
 
 def _triangulated(quads: Quads) -> Surface:
-    """Two triangles for each quad; those without area are left out."""
+    """Return two triangles per quad, without those of zero area."""
     corners = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3, 3)
     return _merged(Surface(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)), decimals=9)
 
 
 def _merged(surface: Surface, *, decimals: int) -> Surface:
-    """Vertices at the same place become one."""
+    """Return the surface with vertices at the same place merged."""
     _, first, index = np.unique(np.round(surface.vertices, decimals), axis=0, return_index=True, return_inverse=True)
     return _proper(surface.vertices[first], index.reshape(-1)[surface.faces])
 
@@ -71,7 +71,7 @@ def _fewer(surface: Surface) -> Surface:
 
 
 def _clustered(surface: Surface, cell: float) -> Surface:
-    """The vertices of a cell become their mean."""
+    """Return the surface with the vertices of each grid cell replaced by their mean."""
     _, index = np.unique(np.floor(surface.vertices / cell), axis=0, return_inverse=True)
     index = index.reshape(-1)
     sums = np.zeros((index.max() + 1, 3))
@@ -82,7 +82,7 @@ def _clustered(surface: Surface, cell: float) -> Surface:
 
 
 def _split_at_creases(surface: Surface) -> Surface:
-    """Vertices where faces meet at an edge are doubled: a page shades what shares a vertex as one round surface."""
+    """Return the surface with vertices duplicated at creases, because a page shades shared vertices smoothly."""
     vertices, faces = surface
     if not len(faces):
         return surface
@@ -100,7 +100,7 @@ def _split_at_creases(surface: Surface) -> Surface:
 
 
 def _alike(corners: Int[np.ndarray, " k"], normals: Float[np.ndarray, "m 3"]) -> Iterator[Int[np.ndarray, " j"]]:
-    """The corners of faces around a vertex, in groups whose faces look the same way; corner c is of face c // 3."""
+    """Return groups of corners around a vertex by similar face normals; corner c belongs to face floor(c / 3)."""
     while len(corners):
         own = normals[corners // 3] @ normals[corners[0] // 3] > _CREASE
         own[0] = True

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 _AZIMUTH, _ELEVATION, _VIEW_ANGLE = 32.0, 16.0, 32.0
-"""Angles of the first camera [deg]."""
+"""Angles of the initial camera [deg]."""
 _FLOOR, _LINE, _SECTION = (232, 236, 242), (217, 223, 231), (201, 209, 219)
 
 
 def add_surroundings(server: ViserServer, seen: Float[np.ndarray, "n 3"], floor: float, *, panel: bool = True) -> None:
-    """Floor at a height [m], lights, and a camera that sees the points [m], beside the panel where there is one."""
+    """Add floor at a height [m], lights, and a camera that sees the points [m] beside the panel."""
     scene, size = server.scene, float(np.linalg.norm(np.ptp(seen, axis=0)))
     middle = 0.5 * (seen.min(0) + seen.max(0))
     scene.set_up_direction("+z")
@@ -52,7 +52,7 @@ def add_surroundings(server: ViserServer, seen: Float[np.ndarray, "n 3"], floor:
 
 
 def _place_camera(server: ViserServer, seen: Float[np.ndarray, "n 3"], right: float) -> None:
-    """The first camera of each visitor, a little from the front and above; what it sees ends at ``right`` (0 to 1)."""
+    """Place a visitor's initial camera in front and above; ``right`` is the right end of the visible part (0 to 1)."""
     angle = np.deg2rad(_VIEW_ANGLE)
     lens = 0.5 / np.tan(0.5 * angle)
     camera = frame_camera(seen, (3, 2), _AZIMUTH, _ELEVATION, window=(0.06, right, 0.1, 0.9), lens=float(lens))

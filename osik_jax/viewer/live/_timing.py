@@ -1,4 +1,4 @@
-"""Regularity of a loop: periods and computing times of its last steps."""
+"""Timing of a loop: periods and computing times of its last steps."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ class Timing:
 
 
 class Stopwatch:
-    """Keeps the starts and durations of the last steps, in memory that does not grow."""
+    """Ring buffer of the start times and durations of the last steps."""
 
     def __init__(self, length: int = 2000) -> None:
-        """Keeps so many steps."""
+        """Take the number of steps to keep."""
         self._starts, self._durations, self._count = np.zeros(length), np.zeros(length), 0
 
     def add(self, start: float, duration: float) -> None:
-        """Notes a step [s]."""
+        """Record a step [s]."""
         place = self._count % len(self._starts)
         self._starts[place], self._durations[place] = start, duration
         self._count += 1
 
     def clear(self) -> None:
-        """Forgets all steps, as after a pause."""
+        """Discard all steps, as after a pause."""
         self._count = 0
 
     def timing(self) -> Timing:
-        """Percentiles of what is kept."""
+        """Return percentiles of the recorded steps."""
         count = min(self._count, len(self._starts))
         first = self._count % len(self._starts) if self._count > len(self._starts) else 0
         starts = np.roll(self._starts, -first)[:count]
