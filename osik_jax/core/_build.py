@@ -1,4 +1,4 @@
-"""Compile the C++ core. Run by the installation (``hatch_build.py``) and by ``python -m osik_jax.core._build``.
+"""Build of the C++ core, run by the installation (``hatch_build.py``) and by ``python -m osik_jax.core._build``.
 
 Only the standard library is imported, for nothing else is there while a package is installed.
 """
@@ -20,22 +20,22 @@ _IS_X86 = platform.machine() in ("x86_64", "AMD64")
 
 
 def levels() -> dict[str, list[str]]:
-    """Return the instruction sets that are built here and their compiler flags, the most capable one first."""
+    """Return the instruction sets of this platform with their compiler flags, the most capable one first."""
     return {"x86_64_v3": _V3, "x86_64": []} if _IS_X86 else {platform.machine() or "unknown": []}
 
 
 def library_path(level: str) -> Path:
-    """Return where the library for an instruction set is."""
+    """Return the path of the library for an instruction set."""
     return FOLDER / f"_core_{level}.so"
 
 
 def sources() -> list[Path]:
-    """Return the C++ files that make the library."""
+    """Return the C++ files of the library."""
     return sorted([*FOLDER.glob("*.hpp"), *FOLDER.glob("*.cpp")])
 
 
 def fingerprint() -> str:
-    """Return a hash of the C++ files and the compiler flags."""
+    """Return a hash of the C++ files and compiler flags, which tells whether a library is current."""
     digest = hashlib.sha256(repr((_FLAGS, levels())).encode())
     for path in sources():
         digest.update(path.name.encode() + path.read_bytes())
@@ -43,7 +43,7 @@ def fingerprint() -> str:
 
 
 def build(flags: tuple[str, ...] = ()) -> list[Path]:
-    """Compile the library for each instruction set, side by side.
+    """Compile the library for all instruction sets in parallel.
 
     Args:
         flags: more flags for the compiler, for example ``-fsanitize=address``.
@@ -77,7 +77,7 @@ def build(flags: tuple[str, ...] = ()) -> list[Path]:
 
 
 def part(out: Path) -> Path:
-    """Return where a library is written before it is whole."""
+    """Return the temporary path of a library that is being written."""
     return out.with_suffix(f".{os.getpid()}.part")
 
 

@@ -1,4 +1,4 @@
-"""Calls of the core's methods on a GPU: CUDA text for the sizes at hand, compiled by NVRTC at the first call."""
+"""GPU calls of the core's methods: CUDA text specialised for the problem sizes, compiled by NVRTC at the first call."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from jaxtyping import Array
 from . import _build, _library
 
 SHARED_BYTES = 227 * 1024
-"""Shared memory of one block at most, on devices of compute capability 9.0; less on others, which take the search."""
+"""Largest shared memory of a block [bytes], on compute capability 9.0. Devices with less use the search in plain JAX.
+"""
 _MOST_SPACES = 1 << 14
 _LOCAL_INCLUDE = re.compile(r'^#include "(.*)"\n', re.MULTILINE)
 # a loop stays a loop unless the line before it asks to unroll it: unrolled, the text exceeds the instruction cache
@@ -29,13 +30,13 @@ _SYSTEM_INCLUDE = re.compile(r"^#include <.*>\n", re.MULTILINE)
 
 
 def installed() -> bool:
-    """Return whether the core and NVRTC are there."""
+    """Return whether the core and NVRTC are installed."""
     return _library.core().library is not None and nvrtc() is not None
 
 
 @cache
 def nvrtc() -> str | None:
-    """Return the path of the NVRTC library: of the wheels that JAX for CUDA brings, else of a CUDA toolkit."""
+    """Return the path of the NVRTC library: from the wheels of JAX's CUDA extra, else from a CUDA toolkit."""
     folders = [*sys.path, "/usr/local/cuda"]
     patterns = ("nvidia/**/lib/libnvrtc.so.*", "lib64/libnvrtc.so*")
     found = [path for folder in folders for pattern in patterns for path in glob(f"{folder}/{pattern}", recursive=True)]
@@ -45,7 +46,7 @@ def nvrtc() -> str | None:
 
 @cache
 def text_of(header: str) -> str:
-    """Return a header of the core with the headers that it includes, as one text for NVRTC."""
+    """Return a header of the core with all headers it includes, as one text for NVRTC."""
     seen: set[str] = set()
 
     def inlined(name: str) -> str:
@@ -59,7 +60,7 @@ def text_of(header: str) -> str:
 
 
 def rolled(text: str) -> str:
-    """Return CUDA text whose loops stay loops, except for those that ask to be unrolled."""
+    """Return CUDA text with loop unrolling disabled, except for loops marked for unrolling."""
     return _LOOP.sub(r"#pragma unroll 1\n\g<0>", text)
 
 
@@ -72,7 +73,7 @@ def call(
     per_block: int = 1,
     warps: int = 1,
 ) -> list[Array]:
-    """Launch a kernel named ``osik_kernel``.
+    """Launch a compiled kernel named ``osik_kernel`` through XLA.
 
     Args:
         source: CUDA text.
@@ -96,7 +97,7 @@ def call(
 
 
 def problems_of_a_block(problems: int) -> int:
-    """Return how many problems a block solves whose kernel has space in global memory: so that few blocks have some."""
+    """Return the number of problems per block for a kernel with workspace in global memory, which keeps blocks few."""
     return -(-problems // _MOST_SPACES)
 
 
@@ -110,7 +111,7 @@ def _register() -> None:
 
 
 def cache_folder() -> str:
-    """Return the folder of compiled kernels, made if need be; "" where it cannot be written."""
+    """Return the folder of compiled kernels, created if necessary; "" if it cannot be written."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "osik_jax"
     try:
@@ -121,7 +122,7 @@ def cache_folder() -> str:
 
 
 def constants(**values: Any) -> str:
-    """Return C++ constants: numbers, and lists of integers (which have one entry at least)."""
+    """Return C++ constant definitions of numbers and non-empty lists of integers."""
     lines = []
     for name, value in values.items():
         if isinstance(value, Sequence):
@@ -133,6 +134,6 @@ def constants(**values: Any) -> str:
 
 
 def as_double(a: Any) -> Array:
-    """Return numbers in double precision, whatever JAX's default is."""
+    """Return numbers in double precision, regardless of JAX's default."""
     with jax.enable_x64(True):
         return jnp.asarray(a).astype(jnp.float64)

@@ -1,4 +1,4 @@
-"""The compiled core: which library is loaded and why, and calls of its methods from JAX."""
+"""The compiled core: choice of the library, and calls of its methods from JAX."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _lock = threading.Lock()
 
 
 class Core(NamedTuple):
-    """The compiled core of this process.
+    """Compiled core of this process: its library, or the reason for its absence.
 
     Attributes:
         library: the library, None where there is none.
@@ -38,7 +38,10 @@ class Core(NamedTuple):
 
 @cache
 def core() -> Core:
-    """Return the library for this processor. ``OSIK_CORE_LIBRARY`` names another file, or is "none"."""
+    """Return the core for this processor.
+
+    ``OSIK_CORE_LIBRARY`` selects another library file, or "none".
+    """
     named = os.environ.get("OSIK_CORE_LIBRARY")
     if named == "none":
         return Core(None, None, "the core is switched off by OSIK_CORE_LIBRARY=none")
@@ -65,7 +68,7 @@ def core() -> Core:
 
 
 def installed() -> bool:
-    """Return whether the compiled core is there. The first time that it is not, a warning says what to do."""
+    """Return whether the compiled core is installed; warn once, with the remedy, if it is not."""
     if core().library is None:
         _warn_once()
         return False
@@ -79,7 +82,7 @@ def _warn_once() -> None:
 
 
 def call(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any) -> list[Array]:
-    """Call a method of the core on a batch of problems.
+    """Call a method of the core on a batch of problems through XLA's FFI.
 
     There is no rule for ``vmap``: call it in a function under ``in_lanes``, which hands over a whole batch at once.
 
@@ -101,7 +104,7 @@ def call(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: A
 
 
 def register(method: str) -> str:
-    """Make a method's handler known to XLA for CPUs; return its name there."""
+    """Register a method's handler with XLA for CPUs; return its name there."""
     name = f"osik_{method}"
     with _lock:
         if name not in _registered:

@@ -1,4 +1,4 @@
-"""Array-level solvers, no robot inside: quadratic programs, hierarchies, null-space projection."""
+"""Solvers on arrays, without robots: quadratic programs, hierarchies, null-space projection."""
 
 from ..execution._backends import Backend as Backend
 from ._damping import Damping as Damping

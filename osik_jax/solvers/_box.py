@@ -1,4 +1,4 @@
-"""The box of a solver: bounds with lower > upper at its start, and at its end an answer inside to the last bit."""
+"""Box constraints of a solver: contradictory bounds at its start, and clipping of its answer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..numerics._guarded import clipped
 def ordered_bounds(
     lower: Float[Array, " n"], upper: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, ""]]:
-    """Return bounds in which lower > upper is an equality halfway between the two, and whether there were any."""
+    """Return bounds with each lower > upper replaced by their mean as an equality, and whether there were any."""
     unordered = lower > upper
     # 0 where bounds are in order: lower + upper may be inf - inf there, and its derivative NaN
     middle = 0.5 * jnp.where(unordered, lower + upper, 0.0)
@@ -21,7 +21,7 @@ def ordered_bounds(
 
 @custom_jvp
 def clip_roundoff(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return x clipped into its box, with the derivative of x itself.
+    """Return x clipped into its box, with the derivative of the unclipped x.
 
     What is clipped here is roundoff. The derivative of a clip would be half that of x and half that of the bound where
     x touches it, and the bound's alone where roundoff has carried x over: neither is the derivative on a side of a
@@ -36,7 +36,7 @@ def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, A
 
 
 def clip_to_box(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return x in [lower, upper]; a bound that is none (NaN, an infinity of the wrong sign) is ignored."""
+    """Return x clipped to [lower, upper]; invalid bounds (NaN, or infinite with the wrong sign) are ignored."""
     return clipped(x, jnp.where(lower < jnp.inf, lower, -jnp.inf), jnp.where(upper > -jnp.inf, upper, jnp.inf))
 
 

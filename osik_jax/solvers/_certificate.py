@@ -1,4 +1,4 @@
-"""Certificates behind a status: the relative KKT residual of an answer, and Farkas certificates of infeasible rows."""
+"""Certificates of a status: relative KKT residual of an answer, and Farkas certificates of infeasible rows."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def relative_kkt_residual(
     violation: Float[Array, " p"],
     violation_scale: Float[Array, " p"],
 ) -> Float[Array, ""]:
-    """Return how far a point is from optimal, without units: comparable between problems, whatever their weights.
+    """Return the KKT residual of a point without units, comparable between problems of any weights.
 
     Args:
         stationarity: the gradient of the Lagrangian at variables without an active bound, and multipliers of the wrong

@@ -1,4 +1,4 @@
-"""The damping of a level: a constant part, and one in proportion to what the level's linear model cannot meet.
+"""Damping of a level: a constant, plus a part in proportion to the error that the level's linear model cannot meet.
 
 A linear model is wrong by ``1/2 dt^2 (grad^2 e)[v, v]``, and what that costs is its product with the residual that the
 model leaves. Where a step meets the level's demand there is no residual, so nothing has to be damped; where the demand
@@ -35,11 +35,11 @@ from ._level import positive_root
 
 @runtime_checkable
 class Rows(Protocol):
-    """The rows of a level, weights multiplied in."""
+    """Rows of a level with weights multiplied in."""
 
     @property
     def matrix(self) -> Float[Array, "m n"]:
-        """A."""
+        """Return the matrix A."""
         ...
 
     @property
@@ -53,7 +53,7 @@ class Rows(Protocol):
 
 
 class Damping(NamedTuple):
-    """The damping of one level: it minimises ``1/2 |w|^2 + 1/2 (constant + unmet ratio) |x|^2``.
+    """Damping of one level, which minimises ``1/2 |w|^2 + 1/2 (constant + unmet ratio) |x|^2``.
 
     ``ratio`` is the size of the residual w that the level's own step, clipped into the box, leaves, relative to
     ``demand``; it is 1 at most.
@@ -70,7 +70,7 @@ class Damping(NamedTuple):
 
 
 def per_level(damping: Any, count: int, n: int, dtype: jnp.dtype) -> Damping:
-    """Return the dampings of ``count`` levels of n variables as one, whose fields have a leading axis of levels.
+    """Return the dampings of ``count`` levels of n variables as one object with a leading axis of levels.
 
     Args:
         damping: a number or a ``Damping``: one for all levels, or a sequence with one for each.
@@ -105,7 +105,7 @@ def level_damping(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
 ) -> Float[Array, ""]:
-    """Return the damping of one level, ``constant + unmet ratio``, 0 where its gradient would be roundoff.
+    """Return the damping of one level, ``constant + unmet ratio``; 0 if its gradient would be roundoff.
 
     The ratio is the fixed point of ``ratio = min(|w(x)| / demand, 1)``, with x the damped step of this very damping,
     found from 1 downwards.
@@ -151,7 +151,7 @@ def narrow_box(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
-    """Return the trust region of the levels below one that ended at x: what they may spend of its progress.
+    """Return the trust region of the levels below one that ended at x: motion that costs a share of its progress.
 
     A residual that a level cannot meet acts, through the rows of the levels above, on everything that supports it. A
     motion d of the levels below, which none of those rows sees, costs it at second order up to

@@ -1,4 +1,4 @@
-"""The active set of a strictly convex QP, by the dual active-set method of Goldfarb and Idnani on a tableau.
+"""Active set of a strictly convex QP by the dual active-set method of Goldfarb and Idnani on a tableau.
 
 The iterate is the minimiser for some active set whose multipliers have the right signs (wrong ones are dropped first).
 The method takes the violated constraint whose activation raises the dual objective most, and moves along the dual until
@@ -32,14 +32,14 @@ from ..numerics._constants import AT_LOWER, AT_UPPER, DEPENDENCE_TOL, EQUALITY, 
 
 
 class Roundoff(NamedTuple):
-    """Tolerances: a smaller violation, or a smaller multiplier of the wrong sign, is roundoff."""
+    """Tolerances below which a violation, or a multiplier of the wrong sign, is roundoff."""
 
     value: Float[Array, " m"]
     multiplier: Float[Array, " m"]
 
 
 class Constraints(NamedTuple):
-    """The constraints in the units of the tableau: each is scaled so that its diagonal element is 1."""
+    """Constraints in the units of the tableau: each is scaled to a diagonal element of 1."""
 
     lower: Float[Array, " m"]
     upper: Float[Array, " m"]
@@ -49,7 +49,7 @@ class Constraints(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A step that has been decided: z += length column, then the pivot, T -= left right'."""
+    """Decided step: z += length column, then the pivot T -= left right'."""
 
     index: Int[Array, ""]  # the constraint whose prescribed quantity changes by ``length``
     length: Float[Array, ""]
@@ -61,7 +61,7 @@ class Step(NamedTuple):
 
 
 class DualState(NamedTuple):
-    """An iterate of the dual method, of one problem."""
+    """Iterate of the dual method for one problem."""
 
     tableau: Float[Array, "m m"]
     value: Float[Array, " m"]
@@ -126,7 +126,7 @@ def dual_active_set(
 
 
 def _apply_step(constraints: Constraints, s: DualState) -> DualState:
-    """Take the step that has been decided."""
+    """Apply the decided step."""
     step, order = s.step, jnp.arange(len(s.value))
     is_active = s.active != INACTIVE
     # the prescribed quantity (y of an inactive, s of an active constraint) changes by the length, the others follow
@@ -147,7 +147,7 @@ def _apply_step(constraints: Constraints, s: DualState) -> DualState:
 
 
 def _drop_wrong_sign(constraints: Constraints, s: DualState) -> DualState:
-    """Make the constraint inactive whose multiplier has the wrong sign, the worst if there are several."""
+    """Deactivate the constraint with the most wrongly signed multiplier, if there is one."""
     signed = jnp.where(s.active == AT_LOWER, s.multiplier, jnp.where(s.active == AT_UPPER, -s.multiplier, 0.0))
     wrong = jnp.where(signed < -constraints.roundoff.multiplier, signed, 0.0)
     j = first_smallest(wrong)
@@ -168,7 +168,7 @@ def _drop_wrong_sign(constraints: Constraints, s: DualState) -> DualState:
 
 
 class _Entering(NamedTuple):
-    """The violated constraint that a dual step goes towards."""
+    """Violated constraint that a dual step makes active."""
 
     index: Int[Array, ""]
     exists: Bool[Array, ""]
@@ -177,7 +177,7 @@ class _Entering(NamedTuple):
 
 
 def _add_violated(constraints: Constraints, s: DualState) -> DualState:
-    """Decide on one dual step towards a violated constraint, which stays until it holds (GI, step 1).
+    """Decide on one dual step towards a violated constraint, which is kept until it holds (GI, step 1).
 
     Equalities come first.
     """
@@ -236,7 +236,7 @@ def _entering_constraint(constraints: Constraints, s: DualState) -> _Entering:
 
 
 def _full_step(constraints: Constraints, row: Float[Array, " m"], entering: _Entering) -> Float[Array, ""]:
-    """Return the full (primal) step length t2 of GI, infinite where the active constraints determine constraint k."""
+    """Return the full (primal) step length t2 of GI; infinite if constraint k depends on the active constraints."""
     k, eps = entering.index, jnp.finfo(row.dtype).eps
     independent = row[k] > DEPENDENCE_TOL * eps * constraints.scale[k]
     return jnp.where(independent, jnp.maximum(entering.gap, 0.0) / jnp.where(independent, row[k], 1.0), jnp.inf)
@@ -245,7 +245,7 @@ def _full_step(constraints: Constraints, row: Float[Array, " m"], entering: _Ent
 def _partial_step(
     s: DualState, sign: Float[Array, ""], column: Float[Array, " m"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Return the partial (dual) step length t1 of GI, and the active inequality whose multiplier is 0 there first.
+    """Return the partial (dual) step length t1 of GI, and the active inequality whose multiplier reaches 0 first.
 
     Args:
         s: the iterate.

@@ -1,4 +1,4 @@
-"""Pseudo-inverses and damped inverses of projected rows, by orthogonal factorisations, with derivatives in both modes.
+"""Pseudo-inverses and damped inverses of projected rows by orthogonal factorisations, with both derivative modes.
 
 Derivatives of the Moore-Penrose inverse are those at constant rank: G. H. Golub, V. Pereyra, "The differentiation of
 pseudo-inverses and nonlinear least squares problems whose variables separate", SIAM Journal on Numerical Analysis 10,
@@ -90,7 +90,7 @@ def _row_space_and_motion_jvp(
 def row_space_and_motion_of_rank(
     matrix: Float[Array, "m n"], target: Float[Array, " m"], rank: Int[Array, ""], cutoff: Float[Array, ""]
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Return the same without damping for a given rank; pivots up to the cutoff are 0 whatever the rank says."""
+    """Return the undamped result for a given rank; pivots up to the cutoff count as 0 regardless of the rank."""
     space, inverse = _by_pivots(matrix, rank, cutoff)
     return space, apply(inverse, target)
 
@@ -129,14 +129,14 @@ def _row_space_and_motion_of_rank_jvp(primals: tuple[Any, ...], tangents: tuple[
 
 
 def _space_rate(space: Float[Array, "n n"], X: Float[Array, "n m"], da: Float[Array, "m n"]) -> Float[Array, "n n"]:
-    """Return the derivative of the projector P = X A onto the row space: X dA (I - P) and its transpose (GP)."""
+    """Return the derivative of the projector P = X A onto the row space, X dA (I - P) plus its transpose."""
     half = product(X, da)
     half = half - product(half, space)
     return half + half.T
 
 
 def _columns(rate: Callable[[Float[Array, " m"]], Float[Array, " n"]], a: Float[Array, "m n"]) -> Float[Array, "n m"]:
-    """Return the matrix of a linear map, for second derivatives; first ones need its value alone."""
+    """Return the matrix of a linear map; needed for second derivatives only."""
     return jax.vmap(rate, out_axes=1)(jnp.eye(len(a), dtype=a.dtype))
 
 
@@ -149,7 +149,7 @@ def _damped_rate(
     d_damping: Array,
     w: Float[Array, " m"],
 ) -> Float[Array, " n"]:
-    """Return the derivative of D w, from that of (I + damping X X') D = X; where damping is strong, of D alone."""
+    """Return the derivative of D w from (I + damping X X') D = X; for strong damping from D alone."""
     # rows are at most of size 1: with more damping than that, D is small, and differences of X would be roundoff
     is_strong = damping > 1.0
     strong = _strongly_damped_rate(a, D, jnp.where(is_strong, damping, 1.0), da, d_damping, w)
@@ -181,7 +181,7 @@ def _strongly_damped_rate(
 def _inverse_rate(
     a: Float[Array, "m n"], X: Float[Array, "n m"], da: Float[Array, "m n"], w: Float[Array, " m"]
 ) -> Float[Array, " n"]:
-    """Return the derivative of X w, X being the Moore-Penrose inverse of A (GP).
+    """Return the derivative of X w with X the Moore-Penrose inverse of A (Golub and Pereyra).
 
     dX = -X dA X + X X' dA' (I - A X) + (I - X A) dA' X' X.
     """
@@ -194,7 +194,7 @@ def _inverse_rate(
 def _transposed_rate(
     a: Float[Array, "m n"], X: Float[Array, "n m"], da: Float[Array, "m n"], v: Float[Array, " n"]
 ) -> Float[Array, " m"]:
-    """Return the derivative of X' v: the transpose of the same formula."""
+    """Return the derivative of X' v by the transpose of the same formula."""
     y = apply(X.T, v)
     wide = apply(da, apply(X, y))
     tall = apply(X.T, apply(X, apply(da, v - apply(X, apply(a, v)))))
@@ -204,14 +204,14 @@ def _transposed_rate(
 def regularised_inverse(
     matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
 ) -> Float[Array, "n m"]:
-    """Return (A'A + damping I)^-1 A'; for a damping of 0 the Moore-Penrose inverse, the only one with a cutoff."""
+    """Return (A'A + damping I)^-1 A'; for damping 0 the Moore-Penrose inverse, which alone uses the cutoff."""
     return _by_singular_values(matrix, cutoff, damping)[0]
 
 
 def regularised_space(
     matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
 ) -> Float[Array, "n n"]:
-    """Return the regularised inverse times the matrix, which is the projector onto its row space where undamped.
+    """Return the regularised inverse times the matrix: the projector onto its row space for damping 0.
 
     Their product has roundoff in proportion to the ratio of the singular values; this has not.
     """

@@ -1,4 +1,4 @@
-"""One priority level of a hierarchy."""
+"""Priority level of a hierarchy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ._box import ordered_bounds
 
 
 class Level(eqx.Module):
-    """One priority: rows that should lie in an interval, as nearly as the levels above allow.
+    """Rows of one priority that should lie in an interval, as nearly as higher levels allow.
 
     Attributes:
         matrix: A. (m, n); m may be 0.
@@ -59,24 +59,24 @@ class Level(eqx.Module):
 
     @property
     def equality(self) -> bool:
-        """Whether all rows are known to be equalities (static)."""
+        """Return whether all rows are known to be equalities (static)."""
         return all(self.equalities)
 
     @property
     def equal(self) -> Bool[Array, " m"]:
-        """Return which rows are equalities: those known to be, and those with lower >= upper, (m,)."""
+        """Return which rows are equalities: the known ones, and those with lower >= upper, (m,)."""
         # a row of weight 0 has no bounds, so it is no equality
         has_weight = True if self.weight is None else self.weight > 0.0
         return jnp.array(self.equalities, bool) | ((self.lower >= self.upper) & has_weight)
 
     @property
     def length(self) -> Float[Array, " m"]:
-        """Euclidean norm of each row, (m,)."""
+        """Return the Euclidean norm of each row, (m,)."""
         return jnp.sqrt(jnp.sum(self.matrix**2, -1))
 
     @property
     def size(self) -> Float[Array, ""]:
-        """Euclidean norm of the longest row."""
+        """Return the Euclidean norm of the longest row."""
         return jnp.max(self.length, initial=0.0)
 
     def scaled(self) -> Level:
@@ -95,7 +95,7 @@ class Level(eqx.Module):
         return Level(matrix, lower, upper, equalities=self.equalities)
 
     def ordered(self) -> tuple[Level, Bool[Array, ""]]:
-        """Return the level with lower > upper replaced by equalities halfway, and whether there were any."""
+        """Return the level with each lower > upper replaced by an equality at the mean, and whether there were any."""
         known = np.array(self.equalities, bool)
         lower, upper, unordered = ordered_bounds(self.lower, jnp.where(known, self.lower, self.upper))
         return Level(self.matrix, lower, upper, self.weight, self.equalities), unordered
@@ -107,12 +107,12 @@ class Level(eqx.Module):
 
 
 def positive_root(a: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the square root where ``a`` is positive; elsewhere (NaN too) 0, with a derivative of 0."""
+    """Return the square root of positive entries; 0 with derivative 0 for others, NaN included."""
     positive = a > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, a, 1.0)), 0.0)
 
 
 def _scaled_bound(bound: Float[Array, " m"], root: Float[Array, " m"], none: float) -> Float[Array, " m"]:
-    """Return root times bound, ``none`` where root is 0; an infinite bound has no derivative by its weight."""
+    """Return root times bound, or ``none`` if root is 0; an infinite bound has derivative 0 by its weight."""
     finite = jnp.where(jnp.isinf(bound), 0.0, bound)
     return jnp.where(root > 0.0, jnp.where(jnp.isinf(bound), bound, root * finite), none)

@@ -1,4 +1,4 @@
-"""Rank-revealing factors of a matrix: an orthonormal basis of its row space, and QR factors of its rows on the basis.
+"""Rank-revealing factors of a matrix: orthonormal basis of its row space, and QR factors of its rows on that basis.
 
 Modified Gram-Schmidt with the longest row that is left as the pivot (A. Bjorck, "Numerics of Gram-Schmidt
 orthogonalization", Linear Algebra and its Applications 197, 1994); each new direction is orthogonalised twice, after
@@ -48,7 +48,7 @@ class _State(NamedTuple):
 def row_factors(
     matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""], backend: Backend = "jax"
 ) -> RowFactors:
-    """Factor the rows and their damping; a residual row no longer than the cutoff is 0, and ends the basis.
+    """Factor rows and damping; the basis ends when the longest residual row is below the cutoff.
 
     Not differentiable. ``backend`` as ``here`` returns it (``execution/_backends.py``).
     """
@@ -57,7 +57,7 @@ def row_factors(
 
 @cache
 def _factored(backend: Backend) -> Callable[[Array, Array, Array], RowFactors]:
-    """Return the function of one problem."""
+    """Return the function that factors one problem."""
     return in_lanes(partial(_factors_anywhere, backend))
 
 
@@ -89,7 +89,7 @@ def _factors(matrix: Float[Array, "B m n"], cutoff: Float[Array, " B"], damping:
 
 
 def _next_direction(cutoff: Float[Array, ""], root: Float[Array, ""], s: _State) -> _State:
-    """Add one direction to the basis, and one column to the QR factors; ``root`` is that of the damping."""
+    """Add one direction to the basis and one column to the QR factors; ``root`` is the root of the damping."""
     at_rank = jnp.arange(len(s.basis)) == s.rank
     # the longest residual row is the pivot, orthogonalised against the basis a second time
     row = s.residual[first_smallest(-jnp.sum(s.residual**2, -1))]

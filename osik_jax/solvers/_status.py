@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Status(enum.IntEnum):
-    """Verdict of a solver, one per problem. Under ``vmap`` it is an integer array."""
+    """Status of a solver's answer, one per problem; an integer array under ``vmap``."""
 
     SOLVED = 0
     MAX_ITERATIONS = 1

@@ -19,7 +19,7 @@ from ._task import Task, TaskRows, check_priority
 
 
 class AngularMomentumTask(Task):
-    """Gives the robot an angular momentum about its centre of mass, or keeps that within bounds.
+    """Task on the robot's angular momentum about its centre of mass: at a value or within bounds.
 
     With A the angular rows of ``centroidal_momentum_matrix`` along the chosen axes of the world:
 
@@ -72,7 +72,7 @@ class AngularMomentumTask(Task):
         self.target = self._along_axes(0.0 if target is None else target) if self.lower is None else None
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row for each axis."""
+        """Return one row per axis [kg m^2/s]."""
         del q
         kept = np.array([3 + "xyz".index(axis) for axis in self.axes])
         jacobian = centroidal_momentum_matrix(robot, kinematics)[kept]
@@ -85,7 +85,7 @@ class AngularMomentumTask(Task):
 
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Names that ``replace`` takes."""
+        """Return the names that ``replace`` accepts."""
         return tuple(name for name in super().replaceable if name != "gain")
 
     @property
@@ -93,7 +93,7 @@ class AngularMomentumTask(Task):
         return len(self.axes)
 
     def _along_axes(self, value: Any) -> Float[Array, " m"]:
-        """One entry for each axis, from that, from a scalar, or from a vector x, y, z."""
+        """Return one entry per axis from a scalar, from a vector x, y, z, or from one entry per axis."""
         value = jnp.asarray(value, self.weight.dtype)
         if value.shape == (3,) and len(self.axes) < 3:
             value = value[np.array(["xyz".index(axis) for axis in self.axes])]

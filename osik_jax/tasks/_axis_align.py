@@ -18,7 +18,7 @@ from ._task import DEFAULT_GAIN, TaskRows
 
 
 class AxisAlignTask(PointingTask):
-    """Aligns an axis of a frame with a direction, or keeps it in a cone around one.
+    """Task that aligns an axis of a frame with a direction, or keeps it in a cone around one.
 
     With R the frame's rotation and x* the direction (world), ``d = R' x*``: a ``LookAtTask`` at a point infinitely far
     away. Two rows [rad], of which the norm is the angle t between the two; with ``half_angle`` one inequality row,
@@ -83,7 +83,7 @@ class AxisAlignTask(PointingTask):
         jacobians: Float[Array, "k 6 nv"],
         backend: Backend = "jax",
     ) -> TaskRows:
-        """Two rows along the axes across ``axis``, or one for a cone."""
+        """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
         del positions, backend
         turn, spin = rotations[0].T, jacobians[0, 3:]
         direction, velocity = unit(self.target), self.target_velocity

@@ -1,4 +1,4 @@
-"""Weight of what goes on in the background: postures and dampings of the whole robot."""
+"""Default weights of background tasks: postures and dampings of the whole robot."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from ..robot import Robot
 from ..robot._size import robot_size
 
 _BACKGROUND = 1e-3
-"""Other tasks of the same priority win against this weight."""
+"""Default weight of a background task, small against other tasks of the same priority."""
 _FULL_SIZE = 0.5
-"""Size [m] from which on rows of joint angles weigh as they are."""
+"""Robot size [m] from which joint angles have their full weight."""
 _LEAST_SIZE = 0.005
-"""Size [m] below which their weight falls no further, so that it stays above the schemes' own damping."""
+"""Robot size [m] below which the weight stays constant, so that it stays above the schemes' damping."""
 
 
 def background_weight(robot: Robot) -> Float[Array, ""] | float:
-    """Return the default weight of rows of joint angles in the background, 1e-3 for robots of half a metre and more.
+    """Return the default weight of background rows of joint angles: 1e-3 for robots of half a metre or more.
 
     A joint moves a frame by its angle times a lever arm, so squared angles outweigh squared distances on a small robot.
     Below half a metre the weight falls with the square of the robot's size (``robot_size``).
@@ -26,7 +26,7 @@ def background_weight(robot: Robot) -> Float[Array, ""] | float:
 
 
 def angle_scale(robot: Robot) -> Float[Array, ""] | float:
-    """Return the factor of weights of joint angles against those of distances in metres: 1 from half a metre on."""
+    """Return the factor on weights of joint angles relative to distances: 1 for robots of half a metre or more."""
     size = robot_size(robot)
     if isinstance(size, float):
         return min(max(size / _FULL_SIZE, _LEAST_SIZE / _FULL_SIZE), 1.0) ** 2

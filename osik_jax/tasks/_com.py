@@ -29,7 +29,7 @@ from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
 
 class ComTask(Task):
-    """Brings the centre of mass to a point, or keeps it within bounds or over a support polygon.
+    """Task that brings the centre of mass to a point, or keeps it within bounds or over a support polygon.
 
     With c (3,) the centre of mass in the world [m] and A the chosen axes:
 
@@ -100,7 +100,7 @@ class ComTask(Task):
                 self.target = self._along_axes(point, "target")
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row for each axis, or for each edge of the polygon."""
+        """Return one row per axis, or one per edge of the polygon [m]."""
         del q
         if kinematics.backend != "jax" and self.target is not None and not isinstance(self.gain, AdaptiveGain):
             mass = body_masses(robot, self.subtree)
@@ -151,7 +151,7 @@ class ComTask(Task):
         return dict(target=center_of_mass(robot, kinematics, self.subtree))
 
     def _along_axes(self, value: Any, what: str) -> Float[Array, " m"]:
-        """One entry for each axis, from that, from a scalar, or from a vector x, y, z."""
+        """Return one entry per axis from a scalar, from a vector x, y, z, or from one entry per axis."""
         value = as_array(value, what, self.weight.dtype)
         check_finite(value, what)
         if value.shape == (3,) and len(self.axes) < 3:
@@ -178,7 +178,7 @@ def _fields(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array,
 
 
 def _fields_by_kernel(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
-    """The same of many lanes."""
+    """Return the same fields for a batch, from a kernel."""
     assert task.target is not None and task.target_velocity is not None and not isinstance(task.gain, AdaptiveGain)
     given, integers, lanes = center_arguments(robot, kinematics)
     m, nv = len(task.axes), robot.tree.nv
@@ -207,7 +207,7 @@ def axis_numbers(axes: str) -> np.ndarray:
 
 
 def check_axes(axes: str) -> str:
-    """The names of axes, if they are x, y or z, each at most once.
+    """Return the names of axes, or raise ValueError unless they are x, y or z, each at most once.
 
     Raises:
         ValueError: they are not.

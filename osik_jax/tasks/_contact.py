@@ -26,7 +26,7 @@ from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
 
 
 class ContactTask(PlaneTask):
-    """Keeps a frame in contact with a plane of the world: a foot on the ground, a hand on a wall.
+    """Task that keeps a frame in contact with a plane of the world: a foot on the ground, a hand on a wall.
 
     The plane is all x with ``normal x = offset``, t_1 and t_2 two unit vectors along it; p (3,) is the contact point of
     the frame, R (3, 3) the frame's axes, and p*, R* those of the anchor. The rows are those of e that the kind of
@@ -122,7 +122,7 @@ class ContactTask(PlaneTask):
         jacobians: Float[Array, "1 6 nv"],
         backend: Backend = "jax",
     ) -> TaskRows:
-        """Positions along the plane's axes, then tilts and the turn: those that the kind of contact has."""
+        """Return the rows of the contact: position in the plane, height, tilts and spin, as its kind needs them."""
         del backend
         turn, axes = rotations[0], plane_axes(self.normal)
         arm = dot(turn, self.point)
@@ -143,7 +143,7 @@ class ContactTask(PlaneTask):
         return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
 
     def _place(self, point: Float[Array, "3"], axes: Float[Array, "3 3"]) -> Float[Array, "3"]:
-        """Along the plane from the anchor, and above the plane."""
+        """Return the position along the plane relative to the anchor, and the height above the plane [m]."""
         if self.anchor is None:
             return dot(axes, point) - self.offset * jnp.array([0.0, 0.0, 1.0], point.dtype)
         held = self.anchor[0] + dot(self.anchor[1], self.point)
@@ -153,7 +153,7 @@ class ContactTask(PlaneTask):
     def _tilt(
         self, axis: Float[Array, "3"], turn: Float[Array, "3 3"], axes: Float[Array, "3 3"]
     ) -> tuple[Float[Array, " m"], Float[Array, "m 3"]]:
-        """Sines of the tilts, and of the turn where it is held, with their derivatives over the angular velocity."""
+        """Return the sines of the tilts (and of the spin if held), and their derivatives by the angular velocity."""
         standing = dot(turn, axis)
         error, derivative = dot(axes[:2], standing), cross(standing, axes[:2])
         if self.anchor is None:
@@ -165,11 +165,11 @@ class ContactTask(PlaneTask):
 
     @staticmethod
     def _along(direction: Float[Array, "3"], normal: Float[Array, "3"]) -> Float[Array, "3"]:
-        """The part of a direction that is along the plane."""
+        """Return the component of a direction along the plane."""
         return direction - dot(normal, direction) * normal
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
-        """The anchor there, and the plane through the contact point."""
+        """Return the anchor and the plane through the current contact point."""
         del q
         position, rotation = kinematics.frame_pose(robot, self.frame)
         held: dict[str, Any] = dict(offset=dot(self.normal, position + dot(rotation, self.point)))

@@ -1,4 +1,4 @@
-"""Bounds on the second derivative of a task's error along its own pull, the feedback ``gain e``.
+"""Upper bounds on the curvature of a task's error along the feedback ``gain e``.
 
 A step of dt changes the error by ``dt J v + dt^2/2 (grad^2 e)[v, v] + ...``, and a solver minimises
 ``1/2 w |J v + gain e|^2`` as if the second term were not there. What it leaves out of the cost is, to first order,
@@ -38,7 +38,7 @@ from ._rotation import dot
 def pose_curvature(
     pull: Float[Array, "3"], torque: Float[Array, "3"], jacobian: Float[Array, "6 nv"]
 ) -> Float[Array, ""]:
-    """Return the bound for a frame that is pulled at its origin and turned, in the axes of its Jacobian.
+    """Return the bound for a frame with a force and torque at its origin, in the axes of its Jacobian.
 
     Rows of the Jacobian are [linear; angular]. A position bends by ``w_i x J_j``, an orientation by ``1/2 w_i x w_j``.
     Columns that turn nothing are left out: a base or a carriage that only translates bends no path.
@@ -50,7 +50,7 @@ def pose_curvature(
 
 
 def _gram(rows: Float[Array, "3 n"]) -> Float[Array, "3 3"]:
-    """Return the products of the rows with each other; on a GPU as sums, as its library is slow with these."""
+    """Return the Gram matrix of rows; as sums on a GPU, where the library is slow for small sizes."""
     return short_sum(rows[:, None] * rows[None]) if cuda_is_default() else dot(rows, rows.T)
 
 
@@ -87,7 +87,7 @@ def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"])
 def fraction_to_damp(
     bound: Float[Array, " k"], distance: Float[Array, " k"], stiffness: Float[Array, " k"]
 ) -> Float[Array, " k"]:
-    """Return which fraction of the bound on each task's curvature has to be damped; its own rows resist the rest.
+    """Return the fraction of each task's curvature bound to damp; the task's own rows resist the rest.
 
     Rows resist a motion v with ``1/2 v'J'W J v`` and leave out ``1/2 dt p . (grad^2 e)[v, v]``, which is large where
     the frame moves across p. There it is up to b, the resistance up to g, and b / (b + 2 g) of the bound is enough.
@@ -111,14 +111,14 @@ def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:
 
 
 def levers(weight: Float[Array, " m"], jacobian: Float[Array, "m nv"]) -> Float[Array, " nv"]:
-    """Return how far each dof moves the rows: the length of its weighted column; the gradient at 0 is 0."""
+    """Return the length of each dof's weighted column: how much the dof moves the rows; gradient 0 at 0. (nv,)."""
     squared = jnp.sum(weight[:, None] * jacobian**2, axis=0)
     positive = squared > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
 def row_sums(levers: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Return a bound on the sum of the absolute entries of each dof's row in the second derivative along a unit pull.
+    """Return a bound on the absolute row sums of the second derivative along a unit pull, per dof. (nv,).
 
     The entry of dofs i and j is at most the lever of the one that is farther from the root, and dofs stand in the order
     of the tree. So a motion d costs at most ``1/2 sum_j row_sums_j d_j^2`` at second order.

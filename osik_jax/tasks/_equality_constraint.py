@@ -36,7 +36,7 @@ _Rows = tuple[Float[Array, " m"], Float[Array, "m nv"]]
 
 
 class Constraint(NamedTuple):
-    """The structure of one constraint."""
+    """Static structure of one constraint."""
 
     name: str
     kind: str  # "connect", "weld" or "joint"
@@ -44,7 +44,7 @@ class Constraint(NamedTuple):
 
 
 class EqualityConstraintTask(Task):
-    """Keeps equality constraints of the robot's MJCF model: ``connect``, ``weld`` and ``joint``.
+    """Task that keeps equality constraints of the robot's MJCF model: ``connect``, ``weld`` and ``joint``.
 
     A kinematic tree cannot have loops: linkages that close are cut somewhere, and a constraint holds the ends together.
     The error is MuJoCo's residual (``efc_pos``), asked to follow ``e' = -gain e``; use ``hard=True`` or the first
@@ -76,13 +76,13 @@ class EqualityConstraintTask(Task):
 
     constraints: tuple[Constraint, ...] = eqx.field(static=True)
     anchors: Float[Array, "k 2 3"]
-    """Points that meet, in the two frames of each connect and weld [m]."""
+    """Points that must coincide, in both frames of each connect and weld [m]."""
     relative: Float[Array, "w 3 3"]
-    """Rotation from the axes in which the second end of each weld should be to the first end's."""
+    """Rotation between the wanted axes of each weld's second end and its first end."""
     torque_scale: Float[Array, " w"]
-    """Factor of each weld's rotation rows."""
+    """Factor on each weld's rotation rows [m]."""
     coefficients: Float[Array, "j 5"]
-    """Polynomial coefficients of each joint constraint, the constant first."""
+    """Polynomial coefficients of each joint constraint, constant term first."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class EqualityConstraintTask(Task):
         self.coefficients = jnp.asarray(np.reshape([model.eq_data[e, :5] for e in joints], (-1, 5)), dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """3, 6 or 1 rows for each constraint."""
+        """Return 3, 6 or 1 rows per connect, weld or joint constraint."""
         by_kind = {"joint": iter(self._joint_rows(robot, q)), **self._spatial_rows(robot, kinematics)}
         parts = [next(by_kind[constraint.kind]) for constraint in self.constraints]
         error, jacobian = (jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -146,7 +146,7 @@ class EqualityConstraintTask(Task):
         return {"connect": iter(connects), "weld": iter(welds)}
 
     def _turned(self, weld: int, turns: Float[Array, "2 3 3"], angular: Float[Array, "2 3 nv"]) -> _Rows:
-        """The rotation rows of a weld."""
+        """Return the rotation rows of a weld."""
         first, second = turns
         wxyz = jaxlie.SO3.from_matrix(compose(second.T, compose(first, self.relative[weld]))).wxyz
         wxyz = jnp.where(wxyz[0] < 0.0, -wxyz, wxyz)
@@ -178,12 +178,12 @@ def _qpos(tree: KinematicTree, joint: str) -> int:
 
 
 def _column(tree: KinematicTree, joint: str, dtype: Any) -> Float[Array, " nvfull"]:
-    """1 at the joint's own dof."""
+    """Return a row with 1 at the joint's own dof and 0 elsewhere. (nv,)."""
     return jnp.asarray(np.arange(len(tree.dof_joint)) == tree.full_dof_address[tree.joint(joint)], dtype)
 
 
 def _selected(robot: Robot, names: Iterable[str] | None) -> list[int]:
-    """Constraints of the model by number, in its order."""
+    """Return the indices of the selected constraints of the model, in its order."""
     model = robot.mj_model
     available = element_names(model, mujoco.mjtObj.mjOBJ_EQUALITY, "equality", model.neq)
     if names is None:
@@ -217,7 +217,7 @@ def _check_kind(robot: Robot, e: int, name: str) -> None:
 
 
 def _is_kept(model: mujoco.MjModel, e: int) -> bool:
-    """Whether the robot was made with it: an active joint constraint that is linear or constant."""
+    """Return whether the robot's coupled joints contain the constraint: active, on joints, of degree at most 1."""
     if int(model.eq_type[e]) != mujoco.mjtEq.mjEQ_JOINT or not model.eq_active0[e]:
         return False
     return int(model.eq_obj2id[e]) < 0 or not model.eq_data[e, 2:5].any()
@@ -242,7 +242,7 @@ def _site_frame(robot: Robot, site: int) -> str:
 
 
 def _anchors(model: mujoco.MjModel, e: int) -> np.ndarray:
-    """The point in the first end and in the second."""
+    """Return the anchor point in the first and in the second end [m]."""
     if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
         return np.zeros((2, 3))
     first, second = model.eq_data[e, :3], model.eq_data[e, 3:6]

@@ -19,7 +19,7 @@ from ._task import DEFAULT_GAIN, TaskRows
 
 
 class FrameTask(PoseTask):
-    """Brings a frame to a pose, or keeps it within bounds around one.
+    """Task that brings a frame to a pose, or keeps it within bounds around one.
 
     With p (3,), R (3, 3) the frame's pose, p*, R* the target's, and v*, w* the target's velocity (world axes):
 
@@ -109,7 +109,7 @@ class FrameTask(PoseTask):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frame."""
+        """Return the name of the frame."""
         return (self.frame,)
 
     def rows_at(
@@ -119,7 +119,7 @@ class FrameTask(PoseTask):
         jacobians: Float[Array, "1 6 nv"],
         backend: Backend = "jax",
     ) -> TaskRows:
-        """Rows in the order x, y, z, rotation x, y, z, those left out skipped (m <= 6)."""
+        """Return the chosen rows in the order x, y, z, rotation x, y, z. (m <= 6)."""
         return self.pose_rows(positions[0], rotations[0], jacobians[0], backend)
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Tasks whose rows follow from where a few frames are and how they move."""
+"""Base of tasks whose rows follow from the poses and Jacobians of a few frames."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from ._task import Task, TaskRows
 
 
 class FramedTask(Task):
-    """Base of tasks on frames; a step works on many of them in one go (``rows_of``)."""
+    """Base of tasks on frames; tasks of the same structure are evaluated in one batch (``rows_of``)."""
 
     @property
     @abc.abstractmethod
     def frames(self) -> tuple[str, ...]:
-        """Names of the frames."""
+        """Return the names of the frames."""
 
     @property
     @abc.abstractmethod
     def bounded(self) -> bool:
-        """Whether the rows are inequalities."""
+        """Return whether the rows are inequalities."""
 
     @abc.abstractmethod
     def rows_at(
@@ -34,9 +34,9 @@ class FramedTask(Task):
         jacobians: Float[Array, "k 6 nv"],
         backend: Backend = "jax",
     ) -> TaskRows:
-        """The rows, from the poses and Jacobians of the frames in the world; by a kernel where there is one for it."""
+        """Return the rows from the world poses and Jacobians of the frames, by a kernel if the task has one."""
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
+        """Return error, Jacobian and wanted velocities at configuration q with given kinematics."""
         del q
         return self.rows_at(*moving_frames(robot, kinematics, self.frames), kinematics.backend)

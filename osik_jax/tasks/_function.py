@@ -28,7 +28,7 @@ Function = Callable[[Robot, Kinematics, Float[Array, " nq"]], Float[Array, " m"]
 
 
 class FunctionTask(Task):
-    """Brings a function of the configuration to a value, or keeps it within bounds; the Jacobian comes by itself.
+    """Task that brings a function of the configuration to a value or within bounds; JAX derives the Jacobian.
 
     With x = ``function(robot, kinematics, q)``, a scalar or (m,), the Jacobian is that of x along the tangent,
     ``d x(integrate(q, v)) / dv`` at v = 0, by forward differentiation of the function alone: how the kinematics change
@@ -101,11 +101,11 @@ class FunctionTask(Task):
 
     @property
     def function(self) -> Function:
-        """The function, with the numbers that it has now."""
+        """Return the function with its current numbers."""
         return put_together(self.numbers, self.structure)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row for each entry of x."""
+        """Return one row per entry of x."""
         still = jnp.zeros(robot.nv, q.dtype)
         kinematics = replace(kinematics, backend="jax")  # of which there are rates
         rates = kinematics_rates(robot, kinematics), jax.jacfwd(lambda v: integrate(robot, q, v))(still)
@@ -138,7 +138,7 @@ class FunctionTask(Task):
         return dict(target=jnp.atleast_1d(self.function(robot, kinematics, q)))
 
     def replace(self, **changes: Any) -> Self:
-        """The same task with other numbers; ``function`` takes one of the same structure. See ``Task.replace``.
+        """Return the task with other numbers; ``function`` takes one of the same structure (see ``Task.replace``).
 
         Raises:
             TypeError: a name that is not one of this task's numbers, or a function of another structure.
@@ -151,7 +151,7 @@ class FunctionTask(Task):
 
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Names that ``replace`` takes; ``function`` is among them if it has numbers."""
+        """Return the names that ``replace`` accepts; ``function`` is among them if it has numbers."""
         names = super().replaceable
         own = ("function",) if jax.tree.leaves(self.numbers) else ()
         return tuple(name for name in names if name != "numbers") + own
@@ -175,7 +175,7 @@ class FunctionTask(Task):
 
 
 def _check_signature(function: Function) -> None:
-    """Raises TypeError where it can be told that the function does not take three arguments."""
+    """Raise TypeError if the function certainly does not take three arguments."""
     try:
         signature = inspect.signature(function)
     except ValueError:  # some built-in functions have none

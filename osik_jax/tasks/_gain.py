@@ -1,4 +1,4 @@
-"""Gains: the rate at which a task's error decays."""
+"""Gains: decay rates of task errors [1/s]."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ._leaves import as_scalar, concrete
 
 
 class AdaptiveGain(eqx.Module):
-    """A gain that grows as the error shrinks (Ramos, eq. 3).
+    """Gain that grows as the error shrinks (Ramos, eq. 3).
 
     ``gain(e) = (maximum - minimum) exp(-decay ||e||) + minimum`` [1/s]: gentle far from the target, so that the first
     velocities stay small, and firm near it. The speed ``gain(s) s`` grows with the error s everywhere only if
@@ -46,12 +46,12 @@ class AdaptiveGain(eqx.Module):
             raise OsikValueError(f"an AdaptiveGain needs maximum >= minimum, got maximum {high} and minimum {low}")
 
     def __call__(self, error: Float[Array, " m"]) -> Float[Array, ""]:
-        """Gain [1/s] at this error."""
+        """Return the gain [1/s] at an error."""
         return (self.maximum - self.minimum) * jnp.exp(-self.decay * safe_norm(error)) + self.minimum
 
 
 class _CappedGain(AdaptiveGain):
-    """An adaptive gain that is at most ``1 / dt`` [1/s]."""
+    """Adaptive gain of at most ``1 / dt`` [1/s]."""
 
     dt: Float[Array, ""]
 
@@ -63,11 +63,11 @@ class _CappedGain(AdaptiveGain):
 
 
 Gain = Float[Array, ""] | AdaptiveGain
-"""A task's gain as it is stored: a constant [1/s], or an AdaptiveGain."""
+"""Stored form of a task's gain: a constant [1/s] or an AdaptiveGain."""
 
 
 def as_gain(value: Any, dtype: Any = None) -> Gain:
-    """A constant or an AdaptiveGain in the given precision; ``None``: in its own."""
+    """Return a gain as a constant [1/s] or an AdaptiveGain, in the given precision or, for ``None``, its own."""
     if isinstance(value, AdaptiveGain):
         if dtype is None:
             return value
@@ -76,12 +76,12 @@ def as_gain(value: Any, dtype: Any = None) -> Gain:
 
 
 def capped_gain(gain: Gain, dt: Float[Array, ""] | float) -> Gain:
-    """Return the gain, at most 1 / dt [1/s]: with this gain, one step of dt [s] takes all of an error."""
+    """Return the gain, limited to 1 / dt [1/s]: that gain removes all of an error in one step of dt [s]."""
     if isinstance(gain, AdaptiveGain):
         return _CappedGain(gain, jnp.asarray(dt, gain.maximum.dtype))
     return at_most_inverse(gain, dt)
 
 
 def evaluate_gain(gain: Gain, error: Float[Array, " m"]) -> Float[Array, ""]:
-    """The gain [1/s] at this error."""
+    """Return the gain [1/s] at an error."""
     return gain(error) if isinstance(gain, AdaptiveGain) else gain

@@ -24,7 +24,7 @@ from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
 
 class JointCouplingTask(Task):
-    """Couples joints like gears: ``sum_i ratio_i q_i`` at a value, or within bounds.
+    """Task that couples joints like gears: ``sum_i ratio_i q_i`` at a value or within bounds.
 
     One row. A target: ``e = ratios q - target``, ``e' = ratios v - target'``, asked to be ``-gain(e) e``; bounds:
     ``gain (lower - ratios q) <= ratios v <= gain (upper - ratios q)``. ``{"a": 1.0, "b": -1.0}`` keeps two joints
@@ -87,7 +87,7 @@ class JointCouplingTask(Task):
             self.target = as_vector(0.0 if target is None else target, (1,), "target", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row."""
+        """Return one row."""
         del kinematics
         dofs = np.array([robot.tree.dof_address[joint] for joint in self.joints])
         value = self._value(robot, q)
@@ -108,7 +108,7 @@ class JointCouplingTask(Task):
         return dict(target=self._value(robot, q))
 
     def _value(self, robot: Robot, q: Float[Array, " nq"]) -> Float[Array, "1"]:
-        """The weighted sum."""
+        """Return the weighted sum of joint positions [rad or m]."""
         return dot(self.ratios, q[np.array([robot.tree.qpos_address[joint] for joint in self.joints])])[None]
 
     def _check(self) -> None:
@@ -116,7 +116,7 @@ class JointCouplingTask(Task):
 
 
 def _by_joint(robot: Robot, ratios: Mapping[str, float]) -> dict[int, float]:
-    """Ratios by joint, in the order of v."""
+    """Return the ratios of the joints in the order of v."""
     if not isinstance(ratios, Mapping):
         raise OsikTypeError(f"ratios is a {type(ratios).__name__}; it is a mapping from joint names to factors")
     found = {joint: value for name, value in ratios.items() for joint in select_joints(robot, name)}

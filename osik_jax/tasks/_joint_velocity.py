@@ -1,4 +1,4 @@
-"""Tasks on the velocities of joints, whatever the configuration."""
+"""Tasks on joint velocities, independent of the configuration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ._task import Task, TaskRows, check_priority
 
 
 class VelocityTask(Task):
-    """Base of tasks that want dofs at a velocity: rows of the identity, ``v_i = wanted_i``.
+    """Base of tasks on the velocity of dofs: rows of the identity, ``v_i = wanted_i``.
 
     There is no error that could decay: it is 0, and there is no gain.
     """
@@ -40,10 +40,10 @@ class VelocityTask(Task):
 
     @abc.abstractmethod
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """Return the velocities of these dofs that are asked for [rad/s or m/s]."""
+        """Return the wanted velocities of the chosen dofs [rad/s or m/s]."""
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row for each dof of the chosen joints, in the order of v."""
+        """Return one row per dof of the chosen joints, in the order of v."""
         del kinematics, q
         dofs = dofs_of(robot, self.joints)
         wanted = self.wanted(dofs)
@@ -59,7 +59,7 @@ class VelocityTask(Task):
 
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Names that ``replace`` takes."""
+        """Return the names that ``replace`` accepts."""
         return tuple(name for name in super().replaceable if name != "gain")
 
     @property
@@ -68,7 +68,7 @@ class VelocityTask(Task):
 
 
 class DampingTask(VelocityTask):
-    """Wants joints to stand still, at a low weight: of the motions that serve the other tasks, a slow one.
+    """Task for small joint velocities at a low weight: among motions that serve other tasks, it prefers slow ones.
 
     ``v_i = 0``. It calms near singularities and settles what the other tasks leave open. Each scheme has a damping of
     all dofs of its own; this one has a weight and a priority, and can choose joints.
@@ -105,7 +105,7 @@ class DampingTask(VelocityTask):
 
 
 class FreezeTask(VelocityTask):
-    """Makes joints stand still while the rest of the robot works: ``v_i = 0``.
+    """Task that keeps joints at rest while the rest of the robot moves: ``v_i = 0``.
 
     Meant as a constraint (``hard=True``) or at priority 1; to leave joints out of the problem altogether, load the
     robot with ``locked_joints``.
@@ -142,7 +142,7 @@ class FreezeTask(VelocityTask):
 
 
 class JointVelocityTask(VelocityTask):
-    """Wants joints to move at given velocities: ``v_i = target_i``.
+    """Task that moves joints at given velocities: ``v_i = target_i``.
 
     Args:
         robot: the robot.
@@ -177,13 +177,13 @@ class JointVelocityTask(VelocityTask):
         self.target = as_vector(target, (self.row_count,), "target", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """The target."""
+        """Return the target velocities [rad/s or m/s]."""
         del dofs
         return self.target
 
 
 class LowAccelerationTask(VelocityTask):
-    """Wants joints to keep the velocity that they had: ``v_i = velocity_i``, that of the step before.
+    """Task that keeps the joint velocities of the step before: ``v_i = velocity_i``.
 
     At a low weight it makes motions smooth. It takes no energy out of a motion, so have something beside it that does,
     such as a ``PostureTask`` or a ``DampingTask``. ``rollout`` hands the velocity from step to step; with ``solve``,
@@ -225,5 +225,5 @@ class LowAccelerationTask(VelocityTask):
         return self.velocity[np.array(dofs, int)]
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The task for the next step, once this one's answer is ``velocity`` [rad/s or m/s]."""
+        """Return the task for the next step, given this step's ``velocity`` [rad/s or m/s]."""
         return self.replace(velocity=velocity)

@@ -1,4 +1,4 @@
-"""A task that keeps the kinetic energy low."""
+"""Task that minimises the kinetic energy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ._task import Task, TaskRows, check_priority
 
 
 class KineticEnergyTask(Task):
-    """Keeps the kinetic energy low: of all motions that serve the other tasks, the one that moves the least mass.
+    """Task for low kinetic energy: among motions that serve other tasks, it prefers those that move little mass.
 
     With M = L L' the ``mass_matrix``, asks for ``L' v = 0``. In a weighted problem that adds ``weight v' M v / 2``,
     the weight times the kinetic energy [J]: damping in which a heavy dof counts more than a light one. It has as many
@@ -49,12 +49,12 @@ class KineticEnergyTask(Task):
 
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Names that ``replace`` takes."""
+        """Return the names that ``replace`` accepts."""
         return tuple(name for name in super().replaceable if name != "gain")
 
 
 def _root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """U with U' U = matrix, which is symmetric and not negative; of each dof in units of its own inertia."""
+    """Return U with U' U = matrix (symmetric, positive semidefinite), with each dof in units of its own inertia."""
     inertia = jnp.diagonal(matrix)
     moves = inertia > 0.0
     scale = jnp.where(moves, jnp.sqrt(jnp.where(moves, inertia, 1.0)), 0.0)

@@ -25,11 +25,11 @@ from ..robot import Robot
 from ..robot._joint_selection import dof_values
 
 WeightLike = ArrayLike | Array | Mapping[str, float]
-"""One weight, one for each row, or weights by the names of joints."""
+"""One weight, one per row, or weights by joint name."""
 
 
 def as_own_weight(value: Any) -> Float[Array, "..."]:
-    """A weight in its own precision, for a field: what a class of one's own is given, or what a task has converted.
+    """Return a weight in its own precision, as the field of a user's task class or of a task that converted it.
 
     Raises:
         ValueError: it is neither a scalar nor a vector, or negative or not finite.
@@ -42,7 +42,9 @@ def as_own_weight(value: Any) -> Float[Array, "..."]:
 
 
 def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...] = ()) -> Float[Array, "..."]:
-    """A weight for all rows, or one for each; a scalar takes the shape ``like``. ``rows=None``: a scalar alone.
+    """Return a weight for all rows, or one per row; a scalar takes the shape ``like``.
+
+    ``rows=None`` accepts a scalar only.
 
     Raises:
         ValueError: any other shape, or a weight that is negative or not finite.
@@ -56,7 +58,9 @@ def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...]
 
 
 def as_joint_weight(robot: Robot, value: Any, dofs: list[int]) -> Float[Array, "..."]:
-    """A weight for all rows of some dofs, or one for each, given in the order of these rows, of v, or by joint names.
+    """Return one weight per row of some dofs.
+
+    It is given as a scalar, in the order of these rows, in the order of v, or by joint names.
 
     Raises:
         KeyError: a name that is none of the joints'.

@@ -1,4 +1,4 @@
-"""Limits that may give way."""
+"""Limit used as a task, which gives way to higher priorities."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ._task import Task, TaskRows, check_priority
 
 
 class LimitTask(Task):
-    """A limit as an inequality task: it holds at its priority, and gives way to what is above it.
+    """Inequality task made of a limit: it holds at its priority and gives way to higher ones.
 
     ``lower <= v <= upper``, one row for each dof, and then the limit's own rows, if it has any, at their bounds. There
     is no error that could decay: it is 0, and there is no gain.
@@ -60,7 +60,7 @@ class LimitTask(Task):
         self.dt = as_scalar(1.0, "dt", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row for each dof, then those of the limit, for the step that ``during`` says (1 s where it was not)."""
+        """Return one row per dof, then the limit's rows, for the step of ``during`` (1 s by default)."""
         lower, upper = limit_box(robot, q, (self.limit,), self.dt)
         jacobian, own = jnp.eye(robot.nv, dtype=lower.dtype), limit_rows(robot, kinematics, q, (self.limit,), self.dt)
         if own is not None:
@@ -77,16 +77,16 @@ class LimitTask(Task):
         )
 
     def during(self, dt: Float[Array, ""] | float) -> Self:
-        """The task for a step of dt [s]."""
+        """Return the task for a step of dt [s]."""
         return eqx.tree_at(lambda task: task.dt, self, jnp.asarray(dt, self.dt.dtype))
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The task for the next step, once this one's answer is ``velocity``."""
+        """Return the task for the next step, given this step's ``velocity`` [rad/s or m/s]."""
         return eqx.tree_at(lambda task: task.limit, self, self.limit.after(velocity))
 
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Names that ``replace`` takes."""
+        """Return the names that ``replace`` accepts."""
         return tuple(name for name in super().replaceable if name not in ("gain", "dt"))
 
     def _convert(self, name: str, value: Any) -> Any:

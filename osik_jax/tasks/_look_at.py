@@ -22,7 +22,7 @@ NEAREST = 1e-3
 
 
 class LookAtTask(PointingTask):
-    """Points an axis of a frame at a point, or keeps the point in the frame's visual field.
+    """Task that points an axis of a frame at a point, or keeps the point in the frame's field of view.
 
     With p, R the frame's pose and x* the point (world), the direction is ``d = R' (x* - p) / |x* - p|``; frame and
     point may both move. Two rows [rad], of which the norm is the angle t between axis and line of sight; with
@@ -88,7 +88,7 @@ class LookAtTask(PointingTask):
         jacobians: Float[Array, "k 6 nv"],
         backend: Backend = "jax",
     ) -> TaskRows:
-        """Two rows along the axes across ``axis``, or one for a cone."""
+        """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
         del backend
         position, rotation, jacobian = positions[0], rotations[0], jacobians[0]
         point, velocity, moves = self.target, self.target_velocity, jnp.zeros_like(jacobian[:3])
@@ -107,7 +107,7 @@ class LookAtTask(PointingTask):
         return self.pointing_rows(dot(rotation.T, sight), dot(turn, rate), dot(turn, dot(narrowing, velocity)))
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
-        """A point 1 m ahead, in the frame that carries it."""
+        """Return a target point 1 m ahead, in the frame that carries it."""
         del q
         point = _ahead(robot, kinematics, self.frame, self.axis)
         if self.target_frame is not None:
@@ -117,6 +117,6 @@ class LookAtTask(PointingTask):
 
 
 def _ahead(robot: Robot, kinematics: Kinematics, frame: str, axis: ArrayLike | Array) -> Float[Array, "3"]:
-    """The point 1 m along the axis."""
+    """Return the point 1 m along the axis [m]."""
     position, rotation = kinematics.frame_pose(robot, frame)
     return position + dot(rotation, unit(as_direction(axis, "axis", position.dtype)))

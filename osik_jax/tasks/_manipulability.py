@@ -1,4 +1,4 @@
-"""A task that keeps a frame able to move in all directions."""
+"""Task on the manipulability of a frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
 
 class ManipulabilityTask(Task):
-    """Raises a frame's manipulability, brings it to a value, or keeps it within bounds.
+    """Task that raises a frame's manipulability, brings it to a value, or keeps it within bounds.
 
     Yoshikawa's index ``m = sqrt(det(J J'))`` is that of the chosen rows and joints of ``frame_jacobian``: the volume of
     what the frame's velocity can be at joint speeds of norm 1, 0 where it is singular (T. Yoshikawa, "Manipulability of
@@ -118,7 +118,7 @@ class ManipulabilityTask(Task):
         self.target_velocity = None if climbs else as_vector(velocity, (), "target_velocity", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row, or where it climbs one for each dof that moves the frame."""
+        """Return one row; when ascending the gradient, one row per dof that moves the frame."""
         del kinematics
         standing = jnp.zeros(robot.nv, q.dtype)
         value, gradient = jax.value_and_grad(lambda step: self.value(robot, integrate(robot, q, step)))(standing)
@@ -135,11 +135,14 @@ class ManipulabilityTask(Task):
         )
 
     def during(self, dt: Float[Array, ""] | float) -> Self:
-        """Return the task for a step of dt [s]; where it climbs, its gain is no rate of an error and stays."""
+        """Return the task for a step of dt [s].
+
+        When ascending the gradient, the gain is kept, because it is not the decay rate of an error.
+        """
         return self if self.target_velocity is None else super().during(dt)
 
     def value(self, robot: Robot, q: Float[Array, " nq"]) -> Float[Array, ""]:
-        """Yoshikawa's index, or its logarithm, at configuration q."""
+        """Return Yoshikawa's index or its logarithm at configuration q."""
         kinematics = forward_kinematics(robot, q)
         jacobian = frame_jacobian(robot, kinematics, self.frame)[:, np.array(self.dofs)]
         if self.axes == "frame":
@@ -172,7 +175,7 @@ def _moving_dofs(tree: KinematicTree, body: int, joints: Sequence[int]) -> tuple
 
 
 def volume(rows: Float[Array, "m n"], *, log: bool) -> Float[Array, ""]:
-    """sqrt(det(rows rows')) or its logarithm, m <= n: the product of what each row adds to those before it.
+    """Return sqrt(det(rows rows')) or its logarithm, for m <= n rows, by successive orthogonalisation.
 
     By Gram and Schmidt's method, so that small values keep their digits, which determinants of products lose.
     """

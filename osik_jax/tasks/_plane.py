@@ -1,4 +1,4 @@
-"""Planes that frames touch, and what tasks on them share."""
+"""Planes in contact with frames, and common parts of tasks on them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ._pointing import across, as_direction, unit
 
 
 class PlaneTask(FramedTask):
-    """Base of tasks that keep one frame on a plane of the world, by equalities: all x with ``normal x = offset``."""
+    """Base of equality tasks that keep one frame on a plane of the world: all x with ``normal x = offset``."""
 
     frame: str = eqx.field(static=True)
     normal: Float[Array, "3"]
@@ -22,12 +22,12 @@ class PlaneTask(FramedTask):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frame."""
+        """Return the name of the frame."""
         return (self.frame,)
 
     @property
     def bounded(self) -> bool:
-        """No."""
+        """Return False: the rows are equalities."""
         return False
 
     def _convert(self, name: str, value: Any) -> Any:
@@ -35,7 +35,7 @@ class PlaneTask(FramedTask):
 
 
 def as_normal(value: Any, dtype: Any) -> Float[Array, "3"]:
-    """A unit normal from a vector of any length but 0.
+    """Return a unit normal from a vector of any non-zero length.
 
     Raises:
         ValueError: it is not such a vector.
@@ -44,7 +44,7 @@ def as_normal(value: Any, dtype: Any) -> Float[Array, "3"]:
 
 
 def as_offset(value: Any, dtype: Any) -> Float[Array, ""]:
-    """Offset of a plane along its normal from the world's origin [m].
+    """Return the offset of a plane along its normal from the world's origin [m].
 
     Raises:
         ValueError: not a scalar.
@@ -53,5 +53,5 @@ def as_offset(value: Any, dtype: Any) -> Float[Array, ""]:
 
 
 def plane_axes(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Rows: two unit vectors in the plane, and the unit normal; right-handed."""
+    """Return right-handed axes as rows: two unit vectors in the plane, and the unit normal."""
     return jnp.concatenate([across(normal), normal[None]])

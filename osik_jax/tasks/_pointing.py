@@ -1,4 +1,4 @@
-"""Shared parts of tasks that point a frame's axis: the angle to a direction, as two rows or as a cone."""
+"""Common parts of tasks that point a frame's axis: the angle to a direction, as two rows or as a cone."""
 
 from __future__ import annotations
 
@@ -24,15 +24,17 @@ from ._rotation import dot
 from ._task import TaskRows, check_priority, task_rows
 
 _BEHIND = -0.5
-"""Cosine below which a direction counts as behind: there the formulas divide by it, in front by one plus it."""
+"""Cosine below which a direction counts as behind. The formulas for behind divide by the cosine, those for ahead by one
+plus the cosine.
+"""
 _LEAST_SINE = 0.1
 """Lower bound on the divisor of rows across the error, near the opposite direction."""
 _TIP = 0.01
-"""Angle [rad] below which that of a cone is rounded off, so that its gradient passes through 0."""
+"""Angle [rad] below which a cone's angle is rounded off, so that its gradient is 0 at 0."""
 
 
 class PointingTask(FramedTask):
-    """Base of tasks that bring an axis a of a frame to a direction d, or keep it in a cone around one.
+    """Base of tasks that bring an axis a of a frame to a direction d, or keep it in a cone around d.
 
     All in the frame's own axes, with t the angle from a to d, u the unit vector from a towards d across a, and B (3, 2)
     two unit vectors across a:
@@ -80,18 +82,18 @@ class PointingTask(FramedTask):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frame, and that of the target if there is one."""
+        """Return the name of the frame, then that of the target if it has one."""
         return (self.frame,) if self.target_frame is None else (self.frame, self.target_frame)
 
     @property
     def bounded(self) -> bool:
-        """Whether the task is a cone."""
+        """Return whether the task is a cone."""
         return self.half_angle is not None
 
     def pointing_rows(
         self, direction: Float[Array, "3"], jacobian: Float[Array, "3 nv"], drift: Float[Array, "3"]
     ) -> TaskRows:
-        """The rows from d, a unit vector in the frame's axes, whose rate there is ``jacobian v + drift``."""
+        """Return the rows for a unit vector d in the frame's axes, whose rate there is ``jacobian v + drift``."""
         error, derivative = deviation(unit(self.axis), direction)
         upper = None
         if self.half_angle is not None:
@@ -117,7 +119,7 @@ class PointingTask(FramedTask):
 
 
 def check_frames(robot: Robot, frame: str, target_frame: str | None) -> None:
-    """Raises KeyError where one does not exist, ValueError where they are the same."""
+    """Raise KeyError if a frame does not exist, ValueError if both are the same."""
     robot.tree.frame(frame)
     if target_frame is not None:
         robot.tree.frame(target_frame)
@@ -126,7 +128,7 @@ def check_frames(robot: Robot, frame: str, target_frame: str | None) -> None:
 
 
 def as_direction(value: Any, what: str, dtype: Any) -> Float[Array, "3"]:
-    """A vector (3,) of any length but 0.
+    """Return a vector (3,), or raise ValueError if its length is 0.
 
     Raises:
         ValueError: it is not.
@@ -139,13 +141,13 @@ def as_direction(value: Any, what: str, dtype: Any) -> Float[Array, "3"]:
 
 
 def unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The vector at length 1; 0 stays 0."""
+    """Return the vector scaled to length 1; 0 stays 0."""
     length = safe_norm(vector)
     return vector / jnp.where(length > 0.0, length, 1.0)
 
 
 def deviation(axis: Float[Array, "3"], direction: Float[Array, "3"]) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
-    """The error e of ``PointingTask`` from two unit vectors, and D with ``e' = D d'`` for a rate d' across d."""
+    """Return the error e of ``PointingTask`` for two unit vectors, and D with ``e' = D d'`` for a rate d' across d."""
     basis = across(axis)
     cosine, beside = dot(axis, direction), dot(basis, direction)
     behind = cosine < _BEHIND
@@ -157,7 +159,7 @@ def deviation(axis: Float[Array, "3"], direction: Float[Array, "3"]) -> tuple[Fl
 def _in_front(
     axis: Array, basis: Array, cosine: Float[Array, ""], beside: Float[Array, "2"]
 ) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
-    """Return e and D at most 120 degrees apart: a rate is carried from d to a, then stretched.
+    """Return e and D for vectors at most 120 degrees apart: a rate is carried from d to a, then scaled.
 
     With s the sine, ``k = t / s`` and ``g = (1 - k) / s^2``, which is -1/6 at 0: ``e = -k y``, ``y = B' d``, and
     ``D = -(k I + g y y') (B' - y a' / (1 + cos t))``.
@@ -176,7 +178,7 @@ def _in_front(
 def _behind(
     basis: Array, cosine: Float[Array, ""], beside: Float[Array, "2"]
 ) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:
-    """Return e and D behind: ``e = -t u`` and ``D = -(k I + (1 / cos t - k) u u') B'``."""
+    """Return e and D for vectors over 120 degrees apart: ``e = -t u``, ``D = -(k I + (1 / cos t - k) u u') B'``."""
     squared = jnp.sum(beside**2)
     clear = squared > jnp.finfo(squared.dtype).eps ** 2
     sine = jnp.sqrt(jnp.where(clear, squared, 1.0))
@@ -188,7 +190,7 @@ def _behind(
 
 
 def across(axis: Float[Array, "3"]) -> Float[Array, "2 3"]:
-    """Two unit vectors that make a right-handed basis with a unit vector (Duff et al., JCGT 6(1), 2017)."""
+    """Return two unit vectors that complete a unit vector to a right-handed basis (Duff et al., JCGT 6(1), 2017)."""
     x, y, z = axis
     sign = jnp.where(z < 0.0, -1.0, 1.0).astype(axis.dtype)
     a = -1.0 / (sign + z)
@@ -197,7 +199,7 @@ def across(axis: Float[Array, "3"]) -> Float[Array, "2 3"]:
 
 
 def _rounded(squared: Float[Array, ""]) -> Float[Array, ""]:
-    """An angle from its square, rounded off below the tip."""
+    """Return an angle from its square, rounded off near 0 [rad]."""
     tip = squared < _TIP**2
     return jnp.where(tip, squared / (2.0 * _TIP) + 0.5 * _TIP, jnp.sqrt(jnp.where(tip, 1.0, squared)))
 

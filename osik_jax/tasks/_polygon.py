@@ -1,4 +1,4 @@
-"""The polygon over which a standing robot balances."""
+"""Support polygon of a standing robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COLLINEAR = 1e-6
 
 
 class SupportPolygon(eqx.Module):
-    """A convex polygon on the ground: ``normals @ xy <= offsets`` inside. Edge i ends at vertex i + 1.
+    """Convex polygon on the ground: ``normals @ xy <= offsets`` inside. Edge i ends at vertex i + 1.
 
     Attributes:
         normals: unit vectors across the edges, outward. (m, 2)
@@ -32,11 +32,14 @@ class SupportPolygon(eqx.Module):
     vertices: Float[Array, "m 2"]
 
     def distance(self, xy: Float[Array, "... 2"] | ArrayLike) -> Float[Array, "..."]:
-        """Distance [m] to the nearest edge, positive inside; outside, minus the largest violation of an edge's line."""
+        """Return the distance [m] to the nearest edge, positive inside.
+
+        Outside it is minus the largest violation of an edge's line.
+        """
         return jnp.min(self.offsets - jnp.sum(self.normals * jnp.asarray(xy)[..., None, :], -1), -1)
 
     def contains(self, xy: Float[Array, "... 2"] | ArrayLike) -> Bool[Array, "..."]:
-        """Whether points lie inside or on the edge."""
+        """Return whether points lie inside or on the edge."""
         return self.distance(xy) >= 0.0
 
 
@@ -48,7 +51,7 @@ def support_polygon(
     margin: float = 0.0,
     corners: Mapping[str, ArrayLike] | None = None,
 ) -> SupportPolygon:
-    """Convex hull, on the ground, of the contact corners of the supporting frames, drawn in by a margin.
+    """Return the convex hull of the supporting frames' contact corners on the ground, reduced by a margin.
 
     Runs on the host (SciPy), outside jit. Vertices within a micrometre of the line through their neighbours are
     dropped, so that the polygon of two aligned feet has no edge twice.
@@ -89,7 +92,7 @@ _Polygon = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _ground_points(robot: Robot, q: Array, frame: str, corners: ArrayLike | None) -> np.ndarray:
-    """Corners of one frame on the ground. (k, 2)."""
+    """Return the corners of one frame, projected to the ground [m]. (k, 2)."""
     robot.tree.frame(frame)
     robot.check_configuration(q)
     kinematics = compiled_kinematics(robot, q)
@@ -119,7 +122,7 @@ def _corner_names(robot: Robot, frame: str) -> list[str]:
 
 
 def hull(points: np.ndarray) -> _Polygon | None:
-    """Normals, offsets and vertices of the convex hull; None where it has no area."""
+    """Return normals, offsets and vertices of the convex hull; None if its area is 0."""
     if len(points) < 3:
         return None
     try:
@@ -135,7 +138,7 @@ def hull(points: np.ndarray) -> _Polygon | None:
 
 
 def _merge_collinear(vertices: np.ndarray) -> np.ndarray:
-    """Drops, one after the other, the vertex nearest to the line through its neighbours, while any is too near."""
+    """Remove, one by one, the vertex nearest to the line through its neighbours while one is too near."""
     while len(vertices) >= 3:
         before, after = np.roll(vertices, 1, 0), np.roll(vertices, -1, 0)
         chord, arm = after - before, vertices - before
@@ -147,7 +150,7 @@ def _merge_collinear(vertices: np.ndarray) -> np.ndarray:
 
 
 def _draw_in(polygon: _Polygon, margin: float) -> _Polygon | None:
-    """The polygon of the same edges, each moved inward; edges that no longer matter drop out."""
+    """Return the polygon with each edge moved inwards; edges that become redundant are dropped."""
     normals, offsets = polygon[0], polygon[1] - margin
     i, j = np.triu_indices(len(offsets), 1)
     pairs = np.stack([normals[i], normals[j]], 1)

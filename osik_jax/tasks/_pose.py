@@ -33,13 +33,13 @@ _ROWS = {
 }
 _Parts = tuple[Float[Array, "3"], Float[Array, "3 nv"], Float[Array, "3"]]
 _Blocks = list[tuple[Sequence[bool], tuple[Array, Array, Array, Array]]]
-"""Blocks of rows: which rows are kept, then error, Jacobian, feed-forward and weight."""
+"""Blocks of a pose task's rows: mask of the chosen rows, error, Jacobian, feedforward and weight."""
 _Wrench = Float[Array, "6 6"] | None
-"""Matrix from a pull on all six rows to force and torque on the frame, in the outer axes; None for the identity."""
+"""Matrix from a pull on all six rows to force and torque on the frame, in the outer axes; None is the identity."""
 
 
 class PoseTask(FramedTask):
-    """Base of tasks on a pose: of a frame in the world, or in another frame. ``FrameTask`` has the formulas."""
+    """Base of tasks on a pose, in the world or in another frame; ``FrameTask`` states the formulas."""
 
     frame: str = eqx.field(static=True)
     kept: tuple[bool, ...] = eqx.field(static=True)
@@ -98,12 +98,12 @@ class PoseTask(FramedTask):
 
     @property
     def bounded(self) -> bool:
-        """Whether the task keeps the pose within bounds."""
+        """Return whether the task keeps the pose within bounds."""
         return self.lower is not None
 
     @property
     def coupled(self) -> bool:
-        """Whether the error is the logarithm on SE(3)."""
+        """Return whether the error is the logarithm on SE(3)."""
         return self.error == "se3"
 
     def pose_rows(
@@ -113,7 +113,7 @@ class PoseTask(FramedTask):
         jacobian: Float[Array, "6 nv"],
         backend: Backend = "jax",
     ) -> TaskRows:
-        """Rows in the order x, y, z, rotation x, y, z, those left out skipped (m <= 6), from a pose and its Jacobian.
+        """Return the chosen rows (m <= 6) of a pose and its Jacobian, in the order x, y, z, rotation x, y, z.
 
         Pose, target and Jacobian are in the outer axes: the world's, or those of the frame that the pose is in.
         """
@@ -152,7 +152,7 @@ class PoseTask(FramedTask):
         return [(self.kept, (error, dot(factor, twist), feedforward, weight))], dot(_twice(rotation), factor.T)
 
     def _decoupled_parts(self, position: Array, rotation: Array, jacobian: Array) -> tuple[_Blocks, _Wrench]:
-        """Return the rows of position and of orientation that are kept."""
+        """Return the chosen rows of position and of orientation."""
         parts = []
         if any(self.kept[:3]):
             linear = self._position_in_frame if self.axes == "frame" else self._position_outside
@@ -163,7 +163,7 @@ class PoseTask(FramedTask):
         return parts, _twice(rotation) if self.axes == "frame" else None
 
     def _curvature(self, pull: Float[Array, " m"], wrench: _Wrench, jacobian: Float[Array, "6 nv"]) -> Float[Array, ""]:
-        """Return the curvature of the task for the weighted pull of the rows that are kept."""
+        """Return the curvature bound for the weighted pull of the chosen rows."""
         whole = jnp.zeros(6, pull.dtype).at[np.flatnonzero(self.kept)].set(pull)
         whole = whole if wrench is None else dot(wrench, whole)
         return pose_curvature(whole[:3], whole[3:], jacobian)
@@ -190,7 +190,7 @@ class PoseTask(FramedTask):
         return error, dot(factor, jacobian), dot(factor, self.target_velocity[3:])
 
     def _factor(self, error: Float[Array, "3"]) -> Float[Array, "3 3"]:
-        """The inverse left Jacobian (its transpose is the right one), or the identity for the geometric Jacobian."""
+        """Return the inverse left Jacobian (transposed: the right one), or the identity for a geometric Jacobian."""
         if self.orientation_jacobian == "geometric":
             return jnp.eye(3, dtype=error.dtype)
         return inverse_left_jacobian(error)
@@ -203,7 +203,7 @@ class PoseTask(FramedTask):
         return super()._convert(name, value)
 
     def _rest(self, pose: Pose) -> tuple[Any, Any]:
-        """The parts of a pose that the rows do not depend on, which a target may leave out."""
+        """Return the parts of a pose on which the rows do not depend, for targets that leave them out."""
         position, rotation = pose
         if self.coupled:
             return None, None
@@ -220,7 +220,7 @@ def _fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -
 
 
 def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
-    """The same of many lanes."""
+    """Return the same fields for a batch, from a kernel."""
     assert not isinstance(task.gain, AdaptiveGain)
     kept = np.flatnonzero(task.kept)
     both = jnp.concatenate([task.position_weight, task.orientation_weight], 1) * task.weight[:, None]
@@ -240,7 +240,7 @@ _by_kernel = by_kernel(_fields, _fields_by_kernel)
 
 
 def _axes(axes: str | None, outer_axes: str, error: str) -> str:
-    """Along which the rows are: by default the outer ones, and for a twist the frame's, which it always has."""
+    """Return the axes of the rows: the outer ones by default, the frame's own for a twist."""
     if error == "se3":
         if axes not in (None, "frame"):
             raise OsikValueError(f"axes is {axes!r}; the rows of error='se3' are along the frame's own axes, 'frame'")
@@ -249,13 +249,13 @@ def _axes(axes: str | None, outer_axes: str, error: str) -> str:
 
 
 def _twice(rotation: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
-    """Turns a wrench or a twist: the rotation for each half."""
+    """Return the (6, 6) matrix that rotates both halves of a wrench or twist."""
     zero = jnp.zeros_like(rotation)
     return jnp.block([[rotation, zero], [zero, rotation]])
 
 
 def _chosen(kept: Sequence[bool], arrays: Sequence[Array]) -> list[Array]:
-    """The rows that are kept, of each array."""
+    """Return the chosen rows of each array."""
     return list(arrays) if all(kept) else [array[np.flatnonzero(kept)] for array in arrays]
 
 
@@ -266,7 +266,7 @@ def _row_weight(value: Any, name: str, dtype: Any) -> Float[Array, "3"]:
 
 
 def option(name: str, value: str, available: tuple[str, ...]) -> str:
-    """The value, if it is one of those available.
+    """Return a value, or raise ValueError that lists the options.
 
     Raises:
         ValueError: it is not; the message lists them.
@@ -277,7 +277,7 @@ def option(name: str, value: str, available: tuple[str, ...]) -> str:
 
 
 def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
-    """Six booleans from the name of a set of rows or from themselves.
+    """Return six booleans from the name of a set of rows, or from six booleans.
 
     Raises:
         ValueError: no such name, not six, or none of them is true.

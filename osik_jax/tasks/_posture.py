@@ -1,4 +1,4 @@
-"""A task on the joints themselves."""
+"""Task on joint positions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
 
 class PostureTask(Task):
-    """Brings joints to a configuration, or keeps them within bounds.
+    """Task that brings joints to a configuration, or keeps them within bounds.
 
     - A target q*: ``e = difference(q*, q)`` on the chosen joints' dofs (hinges and slides: ``q - q*``; ball and free
       joints: the rotation vector ``log(R*' R)``, and the base's position in the world), asked to follow
@@ -95,7 +95,7 @@ class PostureTask(Task):
             _check_bounded(robot, self.joints, target)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """One row for each dof of the chosen joints, in the order of v."""
+        """Return one row per dof of the chosen joints, in the order of v."""
         del kinematics
         dofs = dofs_of(robot, self.joints)
         jacobian = jnp.asarray(np.eye(robot.nv)[dofs], self.weight.dtype)
@@ -125,7 +125,7 @@ class PostureTask(Task):
         return super()._held(robot, kinematics, q) if self.target is None else dict(target=q)
 
     def _adds(self, robot: Robot) -> bool:
-        """Whether all joints are hinges and slides, whose values simply add up."""
+        """Return whether all joints are hinges and slides, whose positions are plain numbers."""
         return all(is_scalar(robot, joint) for joint in self.joints)
 
     def _difference(self, robot: Robot, target: Array, q: Array, dofs: list[int]) -> Float[Array, " m"]:
@@ -136,7 +136,7 @@ class PostureTask(Task):
         return difference(robot, target, q)[np.array(dofs)]
 
     def _turn(self, robot: Robot, error: Array, jacobian: Array) -> tuple[Float[Array, "m nv"], Float[Array, " m"]]:
-        """Jacobian and feed-forward with the rotations' blocks put in."""
+        """Return Jacobian and feedforward with the blocks of rotations filled in."""
         feedforward, row = self.target_velocity, 0
         for joint in self.joints:
             kind = robot.tree.joint_types[joint]
@@ -164,7 +164,7 @@ class PostureTask(Task):
 
 
 def _check_bounded(robot: Robot, joints: tuple[int, ...], target: Any) -> None:
-    """Raises where bounds make no sense."""
+    """Raise ValueError if bounds are not possible for these joints."""
     if target is not None:
         raise OsikTypeError("a PostureTask has a target or bounds (lower, upper), not both")
     turning = [robot.tree.joint_names[j] for j in joints if not is_scalar(robot, j)]

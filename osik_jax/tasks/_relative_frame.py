@@ -1,4 +1,4 @@
-"""A task on the pose of a frame in another."""
+"""Task on the pose of a frame relative to another frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ._task import DEFAULT_GAIN, TaskRows
 
 
 class RelativeFrameTask(PoseTask):
-    """Brings a frame to a pose in another frame, its root, or keeps it within bounds around one.
+    """Task that brings a frame to a pose in another frame, its root, or keeps it within bounds around one.
 
     A ``FrameTask`` whose world is the root: p and R are the frame's pose in the root, ``p = R_r' (p_f - p_r)`` and
     ``R = R_r' R_f``, with the Jacobians ``R_r' (J_f,lin - J_r,lin + [p_f - p_r] J_r,ang)`` and
@@ -108,7 +108,7 @@ class RelativeFrameTask(PoseTask):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frame, then its root."""
+        """Return the name of the frame, then of its root."""
         return self.frame, self.root
 
     def rows_at(
@@ -118,7 +118,7 @@ class RelativeFrameTask(PoseTask):
         jacobians: Float[Array, "2 6 nv"],
         backend: Backend = "jax",
     ) -> TaskRows:
-        """Rows in the order x, y, z, rotation x, y, z, those left out skipped (m <= 6)."""
+        """Return the chosen rows in the order x, y, z, rotation x, y, z. (m <= 6)."""
         turn, (frame, root) = rotations[1].T, jacobians
         apart = positions[0] - positions[1]
         linear = frame[:3] - root[:3] + dot(cross_matrix(apart), root[3:])
@@ -131,7 +131,7 @@ class RelativeFrameTask(PoseTask):
 
 
 def _pose_in(robot: Robot, kinematics: Kinematics, frame: str, root: str) -> Pose:
-    """The frame's pose in the root."""
+    """Return the frame's pose in the root."""
     positions, rotations = kinematics.frame_poses(robot, (frame, root))
     turn = rotations[1].T
     return dot(turn, positions[0] - positions[1]), dot(turn, rotations[0])

@@ -1,4 +1,4 @@
-"""Tasks in one line."""
+"""One-line representation of tasks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def short_repr(task: Any) -> str:
-    """The names and options of a task, its weight and its gain; arrays are left out.
+    """Return names, options, weight and gain of a task in one line, without arrays.
 
     ``FrameTask(frame='l_gripper', rows='position', axes='world', weight=2, gain=10, priority=3)``
     """
@@ -23,11 +23,11 @@ def short_repr(task: Any) -> str:
 
 _ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
 _SILENT = ("row_count", "orientation_jacobian", "made_for")
-"""Fields that follow from others or that few change."""
+"""Fields that are left out, because they follow from others or rarely change."""
 
 
 def _options(task: Any) -> dict[str, str]:
-    """Static fields that say something in a few words, by name."""
+    """Return the static fields with a short value, by name."""
     found = {}
     for field in dataclasses.fields(task):
         value, name = getattr(task, field.name), field.name
@@ -47,7 +47,7 @@ def _is_short(value: Any) -> bool:
 
 
 def _number(value: Any) -> str:
-    """A number in full, an array by its shape."""
+    """Return a number in full, an array by its shape."""
     if isinstance(value, eqx.Module):
         numbers = (_number(getattr(value, field.name)) for field in dataclasses.fields(value))
         return f"{type(value).__name__}({', '.join(numbers)})"

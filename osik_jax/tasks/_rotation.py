@@ -1,4 +1,4 @@
-"""The logarithm of a rotation and the matrix that turns angular velocity into its rate; products in full precision."""
+"""Logarithm of a rotation and the matrix from angular velocity to its rate, with matrix products in full precision."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..numerics._constants import SMALL_ANGLE_SQUARED, SMALL_SINE_SQUARED
 
 
 def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Rotation vector (axis times angle, angle in [0, pi]) [rad]. Exact derivatives at angle 0 and at pi.
+    """Return the rotation vector [rad], axis times angle in [0, pi]; derivatives are exact at 0 and pi.
 
     ``jaxlie.SO3.log`` holds the angle constant very near pi, which makes its derivative there wrong; the quaternion is
     taken from jaxlie, the angle from an arctangent that is smooth over the whole range. Beyond pi the vector flips to
@@ -31,7 +31,7 @@ def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def inverse_left_jacobian(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Inverse left Jacobian of SO(3) at a rotation vector: the paper's matrix E.
+    """Return the inverse left Jacobian of SO(3) at a rotation vector (matrix E of the paper).
 
     With ``Q = exp(vector)`` and angular velocity w in the axes on the left (``Q' = [w] Q``), ``vector' = E w``. Its
     transpose is the inverse right Jacobian (``Q' = Q [w]``). E = I - [e]/2 + c(angle) [e]^2 with
@@ -49,14 +49,14 @@ def inverse_left_jacobian(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def cross_matrix(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """[a], the matrix with [a] b = a x b."""
+    """Return [a], the matrix with [a] b = a x b."""
     x, y, z = vector
     zero = jnp.zeros_like(x)
     return jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
 
 
 def dot(a: Array, b: Array) -> Array:
-    """The matrix product, in full precision on every device.
+    """Return the matrix product, in full precision on every device.
 
     Sums of three are written out where JAX's default is a GPU, whose library is slow with batches of them. On a CPU
     gradients would be slower for it.

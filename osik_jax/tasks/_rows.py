@@ -1,4 +1,4 @@
-"""The rows of all tasks of a step."""
+"""Rows of all tasks of a step."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from ._task import Task, TaskRows
 from ._wheel import WheelTask
 
 _TOGETHER = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask, ContactTask, WheelTask)
-"""Kinds that are worked on in one go; a subclass may have rows of its own."""
+"""Task classes that are evaluated in batches; a subclass may define rows of its own."""
 _APART = {"frame", "root", "target_frame", "priority", "hard"}
-"""Static fields that such tasks may differ in: they do not reach ``rows_at``."""
+"""Static fields in which batched tasks may differ, because ``rows_at`` does not use them."""
 
 
 def rows_of(
     robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], tasks: Mapping[str, Task]
 ) -> dict[str, TaskRows]:
-    """``task.rows`` of each; frames that are asked for in the same way are worked on in one go, which is faster."""
+    """Return ``task.rows`` of each task; frame tasks of the same structure are evaluated in one batch."""
     groups: dict[Hashable, dict[str, FramedTask]] = {}
     for name, task in tasks.items():
         if isinstance(task, FramedTask) and type(task) in _TOGETHER:
@@ -44,7 +44,7 @@ def rows_of(
 
 
 def _manner(task: FramedTask) -> Hashable:
-    """Equal for tasks that differ in their numbers, frames and priority alone."""
+    """Return a key that is equal for tasks that differ only in numbers, frames and priority."""
     fields = [(f.name, getattr(task, f.name), bool(f.metadata.get("static"))) for f in dataclasses.fields(task)]
     options = tuple(value for name, value, static in fields if static and name not in _APART)
     structure = tuple(jax.tree.structure(value) for _, value, static in fields if not static)
@@ -72,5 +72,5 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
 
 
 def _of_task(i: np.integer, a: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Task i's part of an array of all. Rows are slices of all rows, since XLA joins those again without a copy."""
+    """Return task i's part of batched arrays, as slices, which XLA joins again without a copy."""
     return a[i] if a.ndim == 1 else a.reshape(-1, *a.shape[2:])[i * a.shape[1] : (i + 1) * a.shape[1]]

@@ -1,4 +1,4 @@
-"""Conversion of the many forms of a pose to a position and a rotation matrix."""
+"""Conversion of all accepted forms of a pose to position and rotation matrix."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._leaves import check_finite, concrete
 
 Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
-"""Position [m] and rotation (frame axes to world axes)."""
+"""Position [m] and rotation matrix (frame axes to world axes)."""
 PoseLike = tuple[ArrayLike | Array, ArrayLike | Array] | ArrayLike | Array | jaxlie.SE3 | Any
-"""``(p (3,), R (3, 3))``, ``(p (3,), quaternion w x y z (4,))``, a (4, 4) matrix, a ``jaxlie.SE3`` or another object
-with ``as_matrix()`` (mink's) or ``homogeneous`` (Pinocchio's); p or R alone where the other does not matter."""
+"""Accepted forms of a pose: ``(p (3,), R (3, 3))``, ``(p (3,), quaternion w x y z (4,))``, a (4, 4) matrix, a
+``jaxlie.SE3`` or another object with ``as_matrix()`` (mink) or ``homogeneous`` (Pinocchio). p or R alone is accepted
+if the other is not used.
+"""
 
 _LAST_ROW = 1e-4
 
 
 def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> Pose:
-    """A pose from any of the ways to write one, see ``PoseLike``.
+    """Return position and rotation matrix from any form of a pose (``PoseLike``).
 
     Quaternions and matrices that are rounded, up to 2 %, become the nearest rotation. Traced values that are farther
     from a rotation become NaN, which a solve answers with its status.
@@ -58,7 +60,7 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> 
 
 
 def _parts(value: Any, dtype: Any) -> tuple[Array, Array] | None:
-    """Position and rotation, of what has two parts."""
+    """Return position and rotation of a pair."""
     if isinstance(value, jaxlie.SE3):  # its quaternion, so that no other normalisation comes in between
         return jnp.asarray(value.translation(), dtype), jnp.asarray(value.rotation().wxyz, dtype)
     if isinstance(value, (tuple, list)) and len(value) == 2:
@@ -67,7 +69,7 @@ def _parts(value: Any, dtype: Any) -> tuple[Array, Array] | None:
 
 
 def pose_array(value: Any, dtype: Any, accepted: str | None = None) -> Array:
-    """The numbers of an array, or of an object that has a matrix.
+    """Return the numbers of an array, or of an object that has a matrix.
 
     Raises:
         TypeError: they are none; the message tells what is accepted, by default of one pose.
@@ -95,7 +97,7 @@ def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
 
 
 def _rotation(given: Float[Array, "3 3"] | Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """The rotation matrix of itself or of a quaternion, either rounded to a few digits."""
+    """Return the normalised rotation matrix of a matrix or quaternion rounded to a few digits."""
     if given.shape == (4,):
         return jaxlie.SO3(exact_quaternion(given, "the target's quaternion")).as_matrix()
     return exact_rotation(given, "the target's rotation")

@@ -1,4 +1,4 @@
-"""Base class of tasks, and the rows that a task gives to a solver."""
+"""Base class of tasks, and the rows that tasks give to schemes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ from ._leaves import as_own_weight, as_weight
 from ._repr import short_repr
 
 DEFAULT_GAIN = 10.0
-"""[1/s]. The error falls by 1/e in 0.1 s; Euler steps are monotone up to dt = 0.1 s and stable up to 0.2 s."""
+"""Default gain [1/s]. The error falls to 1/e in 0.1 s; Euler steps are monotone up to dt = 0.1 s and stable up to 0.2
+s.
+"""
 
 
 class TaskRows(eqx.Module):
@@ -68,10 +70,9 @@ class TaskRows(eqx.Module):
 
 
 class Task(MadeForRobot, Replaceable):
-    """Base of all tasks: an immutable pytree. Make your own: subclass it, add fields, write ``rows`` (``task_rows``).
+    """Base of all tasks: an immutable pytree.
 
-    ``task.replace(name=value, ...)`` is the same task with other numbers, of those that ``task.replaceable`` lists,
-    checked as on construction; it works inside ``jit`` and compiles nothing again.
+    To make your own, subclass it, add fields and write ``rows`` (``task_rows``).
 
     Attributes:
         priority: 1 is the most important; static.
@@ -95,22 +96,22 @@ class Task(MadeForRobot, Replaceable):
 
     @abc.abstractmethod
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """Error, Jacobian and wanted velocities at configuration q, whose kinematics are given."""
+        """Return error, Jacobian and wanted velocities at configuration q with given kinematics."""
 
     def during(self, dt: Float[Array, ""] | float) -> Self:
-        """Return the task for a step of dt [s], as ``solve`` uses it: with a gain of at most 1 / dt.
+        """Return the task for a step of dt [s] as ``solve`` uses it, with a gain of at most 1 / dt.
 
         With 1 / dt a step takes all of the error. With more it overshoots, and from 2 / dt on errors grow.
         """
         return eqx.tree_at(lambda task: task.gain, self, capped_gain(self.gain, dt))
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The task for the next step, once this one's answer is ``velocity``; itself where it remembers nothing."""
+        """Return the task for the next step, given this step's ``velocity``; the task itself if it has no memory."""
         del velocity
         return self
 
     def at(self, robot: Robot, q: Float[Array, " nq"]) -> Self:
-        """The same task with the target that holds at configuration q, so that its error there is 0.
+        """Return the task with its target at configuration q, so that its error there is 0.
 
         What mink and pink call ``set_target_from_configuration``, as a new task. Works inside ``jit`` and under
         ``vmap``, and compiles nothing again.
@@ -127,16 +128,16 @@ class Task(MadeForRobot, Replaceable):
         return self.replace(**self._held(robot, compiled_kinematics(robot, jnp.asarray(q)), jnp.asarray(q)))
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
-        """The numbers with which the error at q is 0, by name."""
+        """Return, by name, the numbers for which the error at q is 0."""
         raise OsikTypeError(f"this {type(self).__name__} has no target that a configuration could set")
 
     @property
     def _weight_rows(self) -> int | None:
-        """Return the number of weights that ``weight`` may have; None for one alone."""
+        """Return the number of entries that ``weight`` may have; None for a scalar only."""
         return None
 
     def _convert(self, name: str, value: Any) -> Any:
-        """A new value for a field, in the task's precision."""
+        """Return a new value of a field in the task's precision."""
         if name == "weight":
             return as_weight(value, self._weight_rows, self.weight.dtype, like=self.weight.shape)
         return as_gain(value, self.weight.dtype) if name == "gain" else super()._convert(name, value)
@@ -146,7 +147,7 @@ class Task(MadeForRobot, Replaceable):
 
 
 def check_priority(priority: int) -> int:
-    """The priority as an int, if it is an integer from 1 up, Python's or NumPy's."""
+    """Return the priority as an int, or raise an error unless it is an integer from 1 up."""
     if isinstance(priority, bool) or not isinstance(priority, int | np.integer) or priority < 1:
         raise OsikValueError(
             f"a priority is an integer, 1 for the most important task, 2 for the next; got {priority!r}"
@@ -166,7 +167,7 @@ def task_rows(
     dofs: tuple[int, ...] | None = None,
     curvature: Callable[[Float[Array, " m"]], Float[Array, ""]] | None = None,
 ) -> TaskRows:
-    """Return the rows of an equality task, or with bounds of an inequality task on ``error``, as ``Task.rows`` does.
+    """Return the rows of an equality task on ``error``, or of an inequality task if bounds are given.
 
     Equality: ``jacobian v = -gain(error) error + feedforward``. Inequality: ``gain (lower - error) + feedforward <=
     jacobian v <= gain (upper - error) + feedforward``; infinite bounds stay infinite, and an adaptive gain is evaluated
@@ -205,7 +206,7 @@ def task_rows(
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
-    """``rate (bound - value)``; an infinite bound stays so at rate 0, and its gradients are 0."""
+    """Return ``rate (bound - value)``; an infinite bound stays infinite at rate 0, with gradients of 0."""
     free = jnp.isinf(bound)
     gap = jnp.where(free, 0.0, bound) - value
     return jnp.where(free, bound, rate * gap)

@@ -1,4 +1,4 @@
-"""The logarithm of a pose and the matrix that turns the twist of a moving frame into its rate."""
+"""Logarithm of a pose, and the matrix from a frame's twist to its rate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 def pose_log(
     position: Float[Array, "3"], rotation: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
-    """The logarithm (6,) of a pose T, [linear; angular], and L (6, 6) with ``log(T)' = L twist``.
+    """Return the logarithm (6,) of a pose T, [linear; angular], and L (6, 6) with ``log(T)' = L twist``.
 
     The twist is the frame's own, [linear; angular] in its own axes: ``T' = T [twist]``. With phi = log(R) and E the
     inverse left Jacobian of SO(3) at phi, the logarithm is (E p, phi). Its rate is
@@ -32,6 +32,6 @@ def pose_log(
 
 
 def seen_from(position: Float[Array, "3"], rotation: Float[Array, "3 3"], twist: Float[Array, "6 ..."]) -> Array:
-    """Twists (6, ...) of a frame in its own axes, as those of a second frame whose pose in the first is given."""
+    """Return twists (6, ...) of a frame in its own axes as twists of a second frame, whose relative pose is given."""
     linear, angular = twist[:3], twist[3:]
     return jnp.concatenate([dot(rotation.T, linear - dot(cross_matrix(position), angular)), dot(rotation.T, angular)])

@@ -1,4 +1,4 @@
-"""A task that makes a wheel roll."""
+"""Task of a rolling wheel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
 
 
 class WheelTask(PlaneTask):
-    """Makes a wheel roll on a plane of the world without slipping.
+    """Task that makes a wheel roll on a plane of the world without slipping.
 
     With a the wheel's axis and n the plane's normal in world axes, the wheel rolls along ``x = a x n / |a x n|``, its
     side is ``y = n x x``, and it touches the plane at ``p + radius (a x x)``, its lowest point, also when it leans.
@@ -95,7 +95,7 @@ class WheelTask(PlaneTask):
         jacobians: Float[Array, "1 6 nv"],
         backend: Backend = "jax",
     ) -> TaskRows:
-        """No slip ahead and to the side, or along the rollers; then the height."""
+        """Return the no-slip rows (ahead and sideways, or along the rollers), then the height row."""
         del backend
         axle = dot(rotations[0], self.axis)
         ahead = unit(cross(axle, self.normal))
@@ -117,7 +117,7 @@ class WheelTask(PlaneTask):
         return 3 if self.roller_angle is None else 2
 
     def _rolling(self, ahead: Float[Array, "3"]) -> Float[Array, "m 3"]:
-        """Directions along the plane in which the wheel does not slip."""
+        """Return the directions along the plane in which the wheel must not slip."""
         aside = cross(self.normal, ahead)
         if self.roller_angle is None:
             return jnp.stack([ahead, aside])

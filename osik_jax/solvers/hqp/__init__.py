@@ -1,4 +1,4 @@
-"""Hierarchical quadratic programs at the array level: no robot inside."""
+"""Hierarchical quadratic programs on arrays, without robots."""
 
 from .._level import Level as Level
 from ._problem import HQPSolution as HQPSolution

@@ -1,4 +1,4 @@
-"""Orthonormal factors of the active hard rows, inside the null space of the rows that are frozen."""
+"""Orthonormal factors of the active hard rows within the null space of the frozen rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ._padding import LevelProblem
 
 
 class ActiveRows(NamedTuple):
-    """The factorisation N' = basis triangle of the active rows N, each of unit length, by pivoted QR."""
+    """Factors N' = basis triangle of the active rows N, scaled to unit length, by pivoted QR."""
 
     index: Int[Array, " n"]  # of each pivot, its index among the hard rows
     valid: Bool[Array, " n"]  # active, and independent of the frozen rows and of the pivots before
@@ -64,7 +64,7 @@ def restoring_step(
 
 
 def multipliers(problem: LevelProblem, rows: ActiveRows, downhill: Float[Array, " n"]) -> Float[Array, " h"]:
-    """Return the multipliers with which the active rows add up to ``downhill`` in the least-squares sense.
+    """Return the multipliers whose combination of active rows is nearest to ``downhill`` in least squares.
 
     Args:
         problem: the level.
@@ -77,5 +77,5 @@ def multipliers(problem: LevelProblem, rows: ActiveRows, downhill: Float[Array, 
 
 
 def drop_dependent(active: Int[Array, " h"], rows: ActiveRows) -> Int[Array, " h"]:
-    """Return ``active`` without the rows that depend on frozen rows or on other active ones."""
+    """Return ``active`` without rows that depend on frozen rows or on other active rows."""
     return jnp.zeros_like(active).at[rows.index].set(jnp.where(rows.valid, active[rows.index], 0))

@@ -1,4 +1,4 @@
-"""The search for hierarchies in plain JAX: level after level, each over the minimisers of those above (eq. 9).
+"""Search for hierarchies in plain JAX: level after level, each over the minimisers of the levels above (eq. 9).
 
 Each level solves on guessed working sets (``_working_set_solve.py``), goes on by the primal active-set method where no
 guess is right (``_primal_active_set.py``), and freezes what it determines (``_freeze.py``).
@@ -29,7 +29,7 @@ from ._working_set_solve import WorkingSetSolution, placeholder, solve_on_workin
 
 
 class CascadeResult(NamedTuple):
-    """The answer of a hierarchy, of the search or of a kernel, and what is known of each level."""
+    """Answer of a hierarchy by the search or by a kernel, with the results of each level."""
 
     x: Float[Array, " n"]
     active_bounds: Int[Array, " n"]
@@ -44,7 +44,7 @@ class CascadeResult(NamedTuple):
 
 
 def first_working_sets(hierarchy: PaddedHierarchy, warm_start: WorkingSet | None) -> WorkingSet:
-    """Return the working sets of a batch that a kernel tries first: the warm starts, or zeros for none."""
+    """Return the working sets of a batch that a kernel tries first: warm starts, or zeros without any."""
     batch, count, m, _ = hierarchy.levels.matrix.shape
     h = hierarchy.hard.shape[1]
     zeros = WorkingSet(jnp.zeros((batch, count, h), int), jnp.zeros((batch, count, m), int))
@@ -69,7 +69,7 @@ class KernelAnswers(NamedTuple):
 
 
 def result_of_kernel(answers: KernelAnswers) -> CascadeResult:
-    """Return a kernel's answers as those of a search, not yet certified."""
+    """Return a kernel's uncertified answers in the form of the search's."""
     is_damped = answers.dampings[:, :, None] > 0.0
     # the derivative keeps rows that a damped level has at their bounds, frozen or not
     kept = jnp.where(is_damped, answers.active, answers.frozen)
@@ -96,7 +96,7 @@ def solve_cascade(
     *,
     by_guesses: bool = True,
 ) -> CascadeResult:
-    """Solve all levels of a batch of hierarchies; every array has a leading axis of problems, then perhaps of levels.
+    """Solve all levels of a batch of hierarchies; arrays have a leading axis of problems, then of levels if any.
 
     Args:
         layout: sizes and row indices (static).
@@ -157,7 +157,7 @@ def solve_cascade(
 
 
 class _Passes(NamedTuple):
-    """Passes through all levels: the first with the guesses of warm starts, the second without them."""
+    """Results of two passes through all levels: with the warm start's guesses, and without."""
 
     count: Int[Array, ""]
     wanted: Bool[Array, " B"]
@@ -170,7 +170,7 @@ def _solve_again_without_guesses(
     everywhere: Bool[Array, " B"],
     known: Bool[Array, " B"],
 ) -> tuple[CascadeState, LevelOutcome]:
-    """Solve all levels, and once more without the warm start where it led nowhere, or far beyond the answer.
+    """Solve all levels; repeat without the warm start if it failed or led far beyond the answer.
 
     Tolerances and roundoff of a level are relative to the largest x on its way. So a guess with variables at 1e10
     leaves 1e-6 of roundoff in rows that should hold exactly.
@@ -202,7 +202,7 @@ def _solve_again_without_guesses(
 
 
 def _bounds_of_the_box(hierarchy: PaddedHierarchy, state: CascadeState) -> Int[Array, "B n"]:
-    """Return which bounds of the box are active: one that levels narrowed for those below them is none of it."""
+    """Return which bounds of the box are active, without bounds that a level narrowed for lower ones."""
     n = state.x.shape[1]
     narrowed = jnp.where(
         state.active_bounds < 0,
@@ -213,7 +213,7 @@ def _bounds_of_the_box(hierarchy: PaddedHierarchy, state: CascadeState) -> Int[A
 
 
 def _start(hierarchy: PaddedHierarchy) -> CascadeState:
-    """Return the point of the box nearest to 0, with the pinned variables frozen."""
+    """Return the point of the box nearest to 0, with variables of equal bounds frozen."""
     h, n = hierarchy.hard.shape
     dtype = hierarchy.hard.dtype
     lower, upper = hierarchy.hard_lower[:n], hierarchy.hard_upper[:n]
@@ -239,7 +239,7 @@ def _start(hierarchy: PaddedHierarchy) -> CascadeState:
 def _level_problem(
     layout: Layout, k: Int[Array, ""], hierarchy: PaddedHierarchy, level: Level, state: CascadeState
 ) -> LevelProblem:
-    """Return level k with the hard rows and the frozen rows that it has to keep."""
+    """Return level k with the hard rows and the frozen rows that it must keep."""
     level_of_hard = jnp.asarray(layout.level_of_hard)
     bounded = jnp.isfinite(state.lower) | jnp.isfinite(state.upper)
     n = len(state.x)
@@ -268,7 +268,7 @@ def _solve_level(
     tolerances: Tolerances,
     max_iterations: int,
 ) -> tuple[CascadeState, LevelOutcome]:
-    """Solve one more level, where no attempt (``_solve_on_guesses``) is its optimum, and freeze what it determines."""
+    """Solve one level by the primal method if no guess is optimal, and freeze the rows that it determines."""
     best, changes, factorizations = attempts
 
     def search() -> tuple[PrimalState, Array]:
@@ -290,7 +290,7 @@ def _solve_level(
 
 
 class _Attempts(NamedTuple):
-    """Solves on the working set of the warm start, then on the one that the dual method guesses."""
+    """Solutions on the warm start's working sets, then on those guessed by the dual method."""
 
     count: Int[Array, ""]
     best: WorkingSetSolution
@@ -306,7 +306,7 @@ def _solve_on_guesses(
     known: Bool[Array, " B"] | None,
     max_iterations: int,
 ) -> tuple[WorkingSetSolution, Int[Array, " B"], Int[Array, " B"]]:
-    """Solve on the warm start's working sets and, where these are not optimal, on those of the dual method.
+    """Solve on the warm start's working sets; where these are not optimal, on those of the dual method.
 
     Args:
         problem: the levels.
@@ -349,7 +349,7 @@ def _solve_on_guesses(
 
 
 def _usable_guess(problem: LevelProblem, warm_start: WorkingSet) -> WorkingSet:
-    """Return the warm start without the rows whose bound is infinite or that cannot block."""
+    """Return the warm start without rows of infinite bounds and rows that cannot block."""
     level = problem.level
     # an inequality may have become an equality since, or the other way round
     own = jnp.sign(warm_start.own)
@@ -362,7 +362,7 @@ def _usable_guess(problem: LevelProblem, warm_start: WorkingSet) -> WorkingSet:
 
 
 def _as_primal_state(solution: WorkingSetSolution) -> PrimalState:
-    """Return the state of a level that ended with the solution on a working set."""
+    """Return a solution on a working set as the final state of the primal method."""
     zero = jnp.asarray(0, jnp.int32)
     return PrimalState(*solution[:-2], zero, zero, solution.optimal)
 
@@ -370,7 +370,7 @@ def _as_primal_state(solution: WorkingSetSolution) -> PrimalState:
 def _primal_start(
     problem: LevelProblem, active: Int[Array, " h"], solution: WorkingSetSolution, tolerances: Tolerances
 ) -> PrimalState:
-    """Return the solution on the guessed working set where it is feasible, else the end of the level above."""
+    """Return the solution on the guessed working set if it is feasible, else the end of the level above."""
     # the end of the level above is feasible; what it had active may depend on rows that were frozen since
     independent = drop_dependent(active, factor_active_rows(problem, active, tolerances.rank))
     above = _as_primal_state(placeholder(problem))._replace(active=independent)
@@ -378,7 +378,7 @@ def _primal_start(
 
 
 def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances) -> CascadeResult:
-    """Check the residual: each level's own one, and by how much the levels below have changed the norm that it reached.
+    """Check each level's residual, and the change of its reached norm by the levels below.
 
     The norm of a level at its optimum is one number on all of its minimisers. So a smaller norm at the answer says,
     like a larger one, that one of the two points is no optimum.

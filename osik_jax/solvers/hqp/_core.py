@@ -18,7 +18,7 @@ def solve(
     warm_start: WorkingSet | None,
     max_iterations: int,
 ) -> CascadeResult:
-    """Return candidates for a batch of hierarchies; all levels, the last one too.
+    """Return candidates for a batch of hierarchies, for all levels including the last.
 
     Args:
         layout: sizes and row indices (static).

@@ -1,4 +1,4 @@
-"""Candidates for hierarchies on a GPU: ``core/hierarchy.hpp``, one warp of 32 threads for each problem."""
+"""Candidates for hierarchies on a GPU (``core/hierarchy.hpp``), one warp of 32 threads per problem."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def solve(
     warm_start: WorkingSet | None,
     max_iterations: int,
 ) -> CascadeResult:
-    """Return candidates for a batch of hierarchies, on the GPU that the program runs on.
+    """Return candidates for a batch of hierarchies, computed on the default GPU.
 
     Args:
         layout: sizes and row indices (static).

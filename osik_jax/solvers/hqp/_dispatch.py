@@ -1,4 +1,4 @@
-"""Choice of backend for a hierarchy: a kernel's candidates, certified in plain JAX, and the search for the others.
+"""Choice of backend for a hierarchy: candidates of a kernel, certified in plain JAX, else the search.
 
 A kernel judges each level as ``solve_on_working_set`` does, by feasibility and multipliers. What is certified here is
 what needs no factorisation: numbers are finite, x is in its box, and no level lost its optimum to those below. Problems
@@ -25,7 +25,7 @@ from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
 _BLOCK = 256
-"""Problems that the search takes at a time: on a GPU its many small operations cost as much for one as for these."""
+"""Number of problems that the search solves together; on a GPU its many small operations cost the same for one."""
 
 
 Solve = Callable[[Layout, PaddedHierarchy, Tolerances, WorkingSet | None, int], CascadeResult]
@@ -64,7 +64,7 @@ def _solve_on_platform(
 
 
 def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve) -> Candidates:
-    """Return how a kernel is used: its certified candidates, and the search for the rest, a block at a time.
+    """Return the function that uses a kernel: certified candidates, and the search in blocks for other problems.
 
     Args:
         layout: sizes and row indices.

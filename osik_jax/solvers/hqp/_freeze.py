@@ -23,7 +23,7 @@ from ._working_set_solve import gradient_roundoff
 
 
 class CascadeState(NamedTuple):
-    """State between levels: x, bounds of the hard rows, and what the levels so far have frozen."""
+    """State between levels: x, bounds of the hard rows, and the rows frozen so far."""
 
     x: Float[Array, " n"]
     lower: Float[Array, " h"]  # of the hard rows; those of solved levels are widened to the values reached
@@ -60,7 +60,7 @@ class _Determined(NamedTuple):
 def freeze(
     state: CascadeState, problem: LevelProblem, end: PrimalState, tolerances: Tolerances
 ) -> tuple[CascadeState, LevelOutcome]:
-    """Freeze what a level determines, and report the level.
+    """Freeze the rows that a level determines, and report the level.
 
     Args:
         state: what the levels above have fixed.
@@ -92,7 +92,7 @@ def freeze(
 
 
 def _determined(problem: LevelProblem, end: PrimalState, tolerances: Tolerances) -> _Determined:
-    """Return which rows have the same value at all minimisers: those with a slack, and those with a multiplier."""
+    """Return the rows with the same value at all minimisers: rows with a slack and rows with a multiplier."""
     level = problem.level
     value = apply(level.matrix, end.x)
     slack = value - jnp.clip(value, level.lower, level.upper)
@@ -109,7 +109,7 @@ def _determined(problem: LevelProblem, end: PrimalState, tolerances: Tolerances)
 
 
 def _rows_to_freeze(problem: LevelProblem, found: _Determined) -> Float[Array, "k n"]:
-    """Return them with unit length, and own rows in units of the longest, so that one rank tolerance fits all."""
+    """Return these rows at unit length (own rows relative to the longest), so that one rank tolerance fits all."""
     level, n = problem.level, len(problem.x)
     rows = jnp.argsort(~found.frozen, stable=True)[:n]
     length = jnp.where(found.frozen, problem.length, 1.0)[rows]
@@ -124,7 +124,7 @@ def _rows_to_freeze(problem: LevelProblem, found: _Determined) -> Float[Array, "
 def _state_below(
     state: CascadeState, problem: LevelProblem, end: PrimalState, found: _Determined, basis: Float[Array, "n k"]
 ) -> CascadeState:
-    """Return what the level below starts with; ``basis`` is one of the space that is frozen here."""
+    """Return the initial state of the next level; ``basis`` spans the newly frozen space."""
     n, reached = len(problem.x), apply(problem.hard, end.x)
     low, high, curvature = narrow_box(
         problem.damping_terms, problem.level, state.curvature, end.x, problem.lower[:n], problem.upper[:n]
@@ -148,7 +148,7 @@ def _state_below(
 
 
 def skip(state: CascadeState, problem: LevelProblem) -> tuple[CascadeState, LevelOutcome]:
-    """Report a level that finds no freedom left: it freezes nothing."""
+    """Report a level without remaining freedom, which freezes nothing."""
     inactive, own = jnp.zeros_like(state.active), jnp.zeros(problem.level.lower.shape, jnp.int32)
     active_sets = ActiveSets(inactive, inactive, own, jnp.zeros_like(state.iterations))
     slack_norm = jnp.full_like(state.residual, jnp.inf)  # x does not move any more, so no level below can make it worse

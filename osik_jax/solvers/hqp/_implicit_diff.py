@@ -24,7 +24,7 @@ from ._padding import PaddedHierarchy
 
 
 class ActiveSets(NamedTuple):
-    """The active sets at the optimum of one level: -1 at the lower bound, 1 at the upper, 0 inactive."""
+    """Active sets at the optimum of one level: -1 at the lower bound, 1 at the upper, 0 inactive."""
 
     active: Int[Array, " h"]  # hard rows that stop the level
     frozen: Int[Array, " h"]  # those of them that are frozen for the levels below
@@ -63,7 +63,7 @@ def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def _solve_at_active_sets(
     active_sets: ActiveSets, singular_tol: Float[Array, ""], hierarchy: PaddedHierarchy
 ) -> Float[Array, " n"]:
-    """Return the answer of the cascade of equality-constrained least squares that the active sets define."""
+    """Return the answer of the equality-constrained least-squares cascade defined by the active sets."""
     n = hierarchy.hard.shape[1]
     pinned = hierarchy.hard_is_equality[:n]
 
@@ -91,7 +91,7 @@ def _solve_at_active_sets(
 
 
 def _active_first(matrix: Array, lower: Array, upper: Array, active: Array) -> tuple[Array, Array, Array, Array]:
-    """Return as many hard rows as there are variables, active ones first: these are independent, so all are kept."""
+    """Return as many hard rows as variables, active ones first; independent active rows are never more than that."""
     rows = jnp.argsort(active == 0, stable=True)[: matrix.shape[1]]
     return matrix[rows], lower[rows], upper[rows], active[rows]
 
@@ -107,7 +107,7 @@ def _fit_rows(
     singular_tol: Float[Array, ""],
     damping: Float[Array, ""] | None = None,
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Move x in the projector's range so that the active rows come nearest to their bounds.
+    """Move x within the projector's range to bring the active rows nearest to their bounds.
 
     With C the active rows times the projector P and g what they miss, the motion is ``C^+ g``, with a pseudo-inverse of
     the given rank at most. With damping it minimises ``|C d - g|^2 + damping |x + d|^2``.
@@ -133,5 +133,5 @@ def _fit_rows(
 
 
 def _masked(bound: Array, used: Array) -> Array:
-    """Return the bounds that are used and 0 for the others, which may be infinite."""
+    """Return the active bounds, and 0 for unused bounds, which may be infinite."""
     return jnp.where(used, bound, 0.0)

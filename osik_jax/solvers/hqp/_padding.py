@@ -1,4 +1,4 @@
-"""The levels of a hierarchy padded to one shape, so that one program serves them all."""
+"""Levels of a hierarchy padded to one shape, so that one program serves all levels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .._level import Level
 
 
 class Layout(NamedTuple):
-    """The sizes of a hierarchy and the index of each row; all static.
+    """Static sizes of a hierarchy and the index of each row.
 
     Hard rows are those that a level may have to leave as they are: the box, then the rows of every level that may have
     inequalities.
@@ -30,14 +30,14 @@ class Layout(NamedTuple):
 
     @property
     def row_of_hard(self) -> list[int]:
-        """The index of each hard row beside the box among the rows of its level."""
+        """Return the index of each hard row (box excluded) among the rows of its level."""
         first = self.variables
         levels = self.level_of_hard[first:]
         return [self.hard_of_row[level].index(q) for q, level in enumerate(levels, first)]
 
 
 class PaddedHierarchy(NamedTuple):
-    """The numbers of a hierarchy.
+    """Numbers of a hierarchy, padded.
 
     Which rows are equalities is decided once and never read off the bounds again: XLA may compute one bound twice, and
     round it in two ways.
@@ -53,7 +53,7 @@ class PaddedHierarchy(NamedTuple):
 
 
 class LevelProblem(NamedTuple):
-    """One level, to be minimised over the minimisers of the levels above it."""
+    """Problem of one level, to be minimised over the minimisers of the levels above."""
 
     level: Level
     damping: Float[Array, ""]  # delta_k of the cost 1/2 |slack|^2 + 1/2 delta_k |x|^2
@@ -71,12 +71,12 @@ class LevelProblem(NamedTuple):
 
     @property
     def length(self) -> Float[Array, " h"]:
-        """The Euclidean norm of each hard row."""
+        """Return the Euclidean norm of each hard row."""
         return jnp.sqrt(jnp.sum(self.hard**2, -1))
 
     @property
     def size(self) -> Float[Array, ""]:
-        """The norm of the longest row of the level's cost, the rows sqrt(damping) I included."""
+        """Return the norm of the longest row of the level's cost, rows sqrt(damping) I included."""
         return jnp.maximum(self.level.size, jnp.sqrt(self.damping))
 
     def gradient(self, x: Float[Array, " n"], slack: Float[Array, " m"]) -> Float[Array, " n"]:

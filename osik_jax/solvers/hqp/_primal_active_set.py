@@ -1,4 +1,4 @@
-"""A primal active-set method for one level, for working sets that no guess has found.
+"""Primal active-set method for one level, for working sets that no guess found.
 
     min 1/2 |dist(A x, [l, u])|^2 + 1/2 damping |x|^2   over   {x: frozen rows keep their values},  hard rows hold
 
@@ -27,7 +27,7 @@ from ._working_set_solve import factor_least_squares, slack_roundoff, wrong_sign
 
 
 class PrimalState(NamedTuple):
-    """An iterate of the primal active-set method."""
+    """Iterate of the primal active-set method."""
 
     x: Float[Array, " n"]
     active: Int[Array, " h"]  # of each hard row: -1 active at its lower bound, 1 at its upper, 0 inactive
@@ -87,7 +87,7 @@ def _release(
     rows: ActiveRows,
     tolerances: Tolerances,
 ) -> PrimalState:
-    """Release the active row with the most wrongly signed multiplier, or declare the optimum where there is none."""
+    """Release the active row with the most wrongly signed multiplier, or declare the optimum if none is wrong."""
     multiplier = multipliers(problem, rows, -apply(problem.projector, gradient))
     wrong = wrong_signs(problem, s.active, multiplier, gradient, roundoff, tolerances)
     force = multiplier * s.active * problem.length

@@ -1,4 +1,4 @@
-"""Tolerances, working sets and the answer of a hierarchy, as pytrees."""
+"""Pytrees of a hierarchy: tolerances, working sets and the answer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...numerics._constants import HARD_ROW_TOL, HIERARCHY_RANK, MULTIPLIER_TOL,
 
 
 class Tolerances(NamedTuple):
-    """The tolerances below which a number counts as zero, relative to the scale of the quantity at hand."""
+    """Relative tolerances below which a number counts as zero."""
 
     # part of a row outside the span of others, relative to the row
     rank: Float[Array, ""] | float = HIERARCHY_RANK[jnp.dtype("float64")]
@@ -22,14 +22,14 @@ class Tolerances(NamedTuple):
 
 
 class WorkingSet(NamedTuple):
-    """The rows taken as active in a level: 0 for no, -1 at the lower bound, 1 at the upper (2: an equality)."""
+    """Rows taken as active in a level: 0 inactive, -1 at the lower bound, 1 at the upper, 2 equality."""
 
     hard: Int[Array, " h"]  # hard rows, active at a bound
     own: Int[Array, " m"]  # the level's own rows that are outside their interval on that side, and so in its cost
 
 
 class HQPSolution(eqx.Module):
-    """The answer of a hierarchy.
+    """Answer of a hierarchy.
 
     The hard rows are those of the box and then those of every level that may hold inequalities (not
     ``Level.equality``), h of them.

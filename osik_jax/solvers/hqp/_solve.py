@@ -1,4 +1,4 @@
-"""The entry point of hierarchies: check and pad the data, solve, attach the derivative, set the status."""
+"""Entry point of hierarchies: check and pad the data, solve, attach the derivative, set the status."""
 
 from __future__ import annotations
 

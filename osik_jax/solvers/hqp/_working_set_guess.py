@@ -1,4 +1,4 @@
-"""A guess for the working set of a level: the dual method on the level made strictly convex by a little damping.
+"""Guess of a level's working set: the dual method on the level, made strictly convex by a small damping.
 
     min 1/2 |A_e d + r|^2 + 1/2 damping |x + d|^2 + 1/2 extra |d|^2 + 1/2 |t|^2
 
@@ -41,7 +41,7 @@ def guess_working_set(
 
 
 def _tableau(problem: LevelProblem) -> tuple[Constraints, Float[Array, " h"], DualState]:
-    """Return bounds and start of the dual method with no row active, and the scale of each row."""
+    """Return bounds and start of the dual method without active rows, and the scale of each row."""
     level, x, dtype = problem.level, problem.x, problem.x.dtype
     scale = 1.0 / jnp.where(problem.size > 0.0, problem.size, 1.0)
     damping = problem.damping * scale**2
@@ -86,7 +86,10 @@ def _tableau(problem: LevelProblem) -> tuple[Constraints, Float[Array, " h"], Du
 
 
 def _minimiser(problem: LevelProblem, root: Float[Array, " h"], end: DualState) -> Float[Array, " n"]:
-    """Return the damped minimiser: the first n rows are the box, so their values are x; frozen rows keep theirs."""
+    """Return the damped minimiser.
+
+    The first n rows are the box, so their values are x; frozen rows keep their values.
+    """
     n = len(problem.x)
     return problem.x + apply(problem.projector, (end.value / root)[:n] - problem.x)
 

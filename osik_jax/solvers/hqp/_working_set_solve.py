@@ -1,4 +1,4 @@
-"""The minimiser of a level on a given working set, and the optimality conditions at it."""
+"""Minimiser of a level on a given working set, and its optimality conditions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ._problem import Tolerances, WorkingSet
 
 
 class WorkingSetSolution(NamedTuple):
-    """The minimiser of the level's cost on a working set, and whether it is the optimum of the level."""
+    """Minimiser of a level's cost on a working set, and whether it is the level's optimum."""
 
     x: Float[Array, " n"]
     active: Int[Array, " h"]  # the active hard rows without those that depend on others
@@ -74,7 +74,7 @@ def solve_on_working_set(
 
 
 def placeholder(problem: LevelProblem) -> WorkingSetSolution:
-    """Return the point where the level starts, as a solution that is neither feasible nor optimal."""
+    """Return the start of a level as a solution that is neither feasible nor optimal."""
     inactive = jnp.zeros(problem.lower.shape, jnp.int32)
     return WorkingSetSolution(
         x=problem.x,
@@ -137,7 +137,7 @@ def wrong_signs(
     roundoff: Float[Array, ""],
     tolerances: Tolerances,
 ) -> Bool[Array, " h"]:
-    """Return which active rows pull x away from their bound instead of stopping it there.
+    """Return which active rows have a multiplier of the wrong sign (they pull x away from their bound).
 
     Forces multiplier * row length are compared with the multiplier tolerance of the gradient's norm, plus ``roundoff``.
 
@@ -157,14 +157,14 @@ def wrong_signs(
 def gradient_roundoff(
     problem: LevelProblem, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances
 ) -> Float[Array, ""]:
-    """Return the roundoff tolerance of the gradient A' slack: that of a slack, times the longest row."""
+    """Return the roundoff of the gradient A' slack: the roundoff of a slack times the longest row."""
     return problem.size * slack_roundoff(problem, x, slack, tolerances)
 
 
 def slack_roundoff(
     problem: LevelProblem, x: Float[Array, " n"], slack: Float[Array, " m"], tolerances: Tolerances
 ) -> Float[Array, ""]:
-    """Return the roundoff tolerance of the level's rows: the step tolerance times the terms that cancel in A x - a."""
+    """Return the roundoff of the level's rows: the step tolerance times the terms that cancel in A x - a."""
     return tolerances.step * (problem.size * jnp.max(jnp.abs(x)) + problem.root_cost(x, slack))
 
 
@@ -182,7 +182,7 @@ def _is_feasible(
 def _is_consistent(
     level: Level, own: Int[Array, " m"], x: Float[Array, " n"], tolerances: Tolerances
 ) -> Bool[Array, ""]:
-    """Check that the rows in the cost are those outside their interval, on the side that was assumed."""
+    """Check that the rows in the cost are exactly those outside their interval, on the assumed side."""
     value = apply(level.matrix, x)
     tolerance = tolerances.feasible * (level.length * jnp.max(jnp.abs(x)) + jnp.abs(value))
     # a row in the cost is outside on its side; one that is not is inside; an equality is always in it

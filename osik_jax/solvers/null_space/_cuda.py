@@ -1,4 +1,4 @@
-"""Saturation in the null space on a GPU: the CUDA text in ``core/saturation_cuda``, one warp of 32 threads a problem.
+"""GPU kernel of saturation in the null space (``core/saturation_cuda``), one warp of 32 threads per problem.
 
 It is the method of ``core/saturation.hpp`` in half of its shared memory. Compiled for a GPU, that header takes more
 than twice the time, for half as many warps have room.
@@ -20,9 +20,9 @@ PARTS = (
     *("workspace", "reductions", "calls", "problem", "level", "row_space", "cholesky", "damping", "motion"),
     *("saturated", "stop", "choices", "search", "attempt", "after", "levels"),
 )
-"""The files of the kernel, in their order: each uses what those before it define."""
+"""Files of the kernel in order; each uses the definitions of earlier ones."""
 _SHARED_BYTES = 48 * 1024
-"""Shared memory that any CUDA device gives a block without being asked for more."""
+"""Shared memory [bytes] that every CUDA device offers a block by default."""
 _MAX_ROWS, _MAX_WARPS = 64, 2
 _WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "SIGN_CHECKS", "STRAIGHT", "WHOLE")
 _NUMBERS = (
@@ -31,7 +31,7 @@ _NUMBERS = (
     *("PATH_STEP", "SATURATION_LOSS", "SATURATION_RANK", "SATURATION_RESIDUAL", "SATURATION_ROUNDOFF"),
     *("SATURATION_COMPLIANCE", "SOFT_SATURATION_RANK", "STIFFER_SATURATION_COMPLIANCE"),
 )
-"""Names of the constants that the text takes from ``numerics/_constants.py``."""
+"""Names of the constants from ``numerics/_constants.py`` in the kernel's text."""
 _KERNEL = """
 #define INFINITY __longlong_as_double(0x7ff0000000000000ll)
 extern "C" __global__ void __launch_bounds__(32 * WARPS) osik_kernel(
@@ -46,7 +46,7 @@ if (pid >= problems) return;
 
 
 class Shape(NamedTuple):
-    """The numbers that a kernel is compiled for."""
+    """Sizes for which a kernel is compiled."""
 
     variables: int
     levels: int
@@ -60,7 +60,7 @@ class Shape(NamedTuple):
 
     @property
     def warps(self) -> int:
-        """The number of warps of a block; 0 for a problem that is too large for this kernel."""
+        """Return the number of warps per block; 0 if a problem is too large for this kernel."""
         n, m = self.variables, self.rows
         if m > _MAX_ROWS:
             return 0
@@ -89,7 +89,7 @@ def _source(shape: Shape, max_iterations: int) -> str:
 
 
 def solve(problem: Problem, max_iterations: int) -> SaturatedResult:
-    """Return answers for a batch of problems, on the GPU that the program runs on; ``done`` where it has one.
+    """Return answers for a batch on the default GPU, and in ``done`` whether each problem has one.
 
     Args:
         problem: the numbers, with a leading axis of problems; in double precision.
@@ -116,7 +116,7 @@ def solve(problem: Problem, max_iterations: int) -> SaturatedResult:
 
 
 def of_core(results: list[Any]) -> SaturatedResult:
-    """Return what a kernel answers, in the order of ``SaturationAnswer`` in ``core/saturation.hpp``."""
+    """Return a kernel's outputs in the order of ``SaturationAnswer`` in ``core/saturation.hpp``."""
     x, projector, scales, done, at_bound, blocking, blocker, active, report = results
     joints = ActiveJoints(done != 0, at_bound, blocking, blocker, done)
     return SaturatedResult(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)

@@ -1,4 +1,4 @@
-"""Choice of backend for the classical projection: on a CPU, the core for all levels of one problem after another.
+"""Choice of backend for the classical projection: on a CPU, the core solves all levels of one problem after another.
 
 ``core/null_space.hpp`` computes what ``_projection.py`` defines, in double precision; nothing is searched, so nothing
 is certified. That file is the definition, what runs elsewhere, and the derivative.
@@ -23,13 +23,13 @@ from ..hqp import Level
 from ._projection import solve_forward
 
 Answer = tuple[Float[Array, " n"], Float[Array, "n n"]]
-"""x, and the projector onto the null space of all levels."""
+"""Answer x, and the projector onto the null space of all levels."""
 
 
 def project(
     levels: Sequence[Level], secondary: Float[Array, " n"], damping: Damping, rank_tol: Array | float, backend: Backend
 ) -> Answer:
-    """Return what ``solve_forward`` does, by the kernel where there is one; the damping has an axis of levels."""
+    """Return the result of ``solve_forward``, by the kernel if available; the damping has an axis of levels."""
     rank_tol = jnp.asarray(rank_tol, secondary.dtype)
     if takes(backend, "core", fits=True):
         return _by_kernel(list(levels), secondary, damping, rank_tol, backend=backend)
@@ -53,7 +53,7 @@ def _by_kernel_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backe
 
 @cache
 def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Array], Answer]:
-    """Return the function of one problem."""
+    """Return the function that solves one problem on the current platform."""
     plain = jax.vmap(partial(_plain, backend=backend))
     return in_lanes(partial(on_platforms, dict(core=_by_core), plain))
 

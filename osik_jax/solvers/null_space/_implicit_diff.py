@@ -27,7 +27,7 @@ from ._scaled_motion import ScaledMotion, blocked_scale
 
 
 class ActiveJoints(NamedTuple):
-    """The active set of one level."""
+    """Active set of one level."""
 
     done: Bool[Array, ""]
     active: Int[Array, " n"]  # -1 saturated at the lower bound, 1 at the upper, 0 free
@@ -37,7 +37,7 @@ class ActiveJoints(NamedTuple):
 
 
 class SaturatedResult(NamedTuple):
-    """The answer of all levels, and the active set of each."""
+    """Answer of all levels, with the active set of each."""
 
     x: Float[Array, " n"]
     projector: Float[Array, "n n"]
@@ -49,11 +49,11 @@ class SaturatedResult(NamedTuple):
 
 
 Answer = tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, " L"]]
-"""x, the projector, and the scales."""
+"""Answer x, projector and scales."""
 
 
 def with_derivative(answer: Answer, sets: ActiveJoints, problem: Problem, backend: Backend = "jax") -> Answer:
-    """Return the answer unchanged, with the derivatives of the linear equations at these active sets.
+    """Return the answer unchanged, with the derivatives of the linear equations at its active sets.
 
     Args:
         answer: x, the projector and the scales.
@@ -78,7 +78,7 @@ def _attach_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend:
 
 
 def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend) -> Answer:
-    """Return the answer that the active sets of all levels determine."""
+    """Return the answer determined by the active sets of all levels."""
 
     def solve_level(state: tuple[Array, ...], each: tuple[Any, ...]) -> tuple[tuple[Array, ...], Array]:
         joints, level, damping, target = each
@@ -101,7 +101,7 @@ def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend
 def _level(
     joints: ActiveJoints, problem: ScaledMotion, best: Callable[[Float[Array, "n n"]], Float[Array, ""]]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
-    """Return the step, the projector and the scale of one level; ``best`` is its scale where the cost is least."""
+    """Return step, projector and scale of one level; ``best`` is its scale at the least cost."""
     scale, projector = _scale_and_projector(problem, joints)
     # one factorisation after another: see docs/installation.md
     scale, active = jax.lax.optimization_barrier((scale, joints.active))
@@ -133,7 +133,7 @@ def _scale_and_projector(problem: ScaledMotion, joints: ActiveJoints) -> tuple[F
 
 
 def _purified(projector: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Return 3 P^2 - 2 P^3 (McWeeny's purification): eigenvalues at a distance e from 0 or 1 come as near as 3 e^2."""
+    """Return 3 P^2 - 2 P^3 (McWeeny's purification), which reduces an error e of eigenvalues 0 and 1 to 3 e^2."""
     projector = 0.5 * (projector + projector.T)
     square = product(projector, projector)
     return 3.0 * square - 2.0 * product(square, projector)

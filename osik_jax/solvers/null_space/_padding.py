@@ -1,4 +1,4 @@
-"""The levels of a projection padded to one shape, so that one ``scan`` goes through them all."""
+"""Levels of a projection padded to one shape, so that one ``scan`` runs over all of them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..hqp import Level
 
 
 class PaddedLevel(NamedTuple):
-    """A level padded with rows of zeros without bounds; it answers what a ``Level`` does.
+    """Level padded with zero rows without bounds, with the interface of ``Level``.
 
     Which rows are equalities is decided once, and not by comparing bounds again: XLA may compute those twice, with
     different roundoff.
@@ -34,7 +34,7 @@ class PaddedLevel(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """The levels, weights multiplied in, and the box."""
+    """Levels with weights multiplied in, and the box."""
 
     levels: PaddedLevel  # with a leading axis; the last has no rows where there is a secondary motion
     damping: Damping  # with a leading axis too
@@ -93,7 +93,7 @@ def _pad(level: Level, count: int) -> PaddedLevel:
 
 
 def without_roundoff(problem: Problem) -> Problem:
-    """Return the problem without entries of rows that are roundoff beside the row's largest.
+    """Return the problem with row entries set to 0 that are roundoff of the row's largest entry.
 
     The largest scale of a motion takes what every joint can add, however little: one that does not move the task but
     for rounding would go at its top speed.
@@ -105,7 +105,7 @@ def without_roundoff(problem: Problem) -> Problem:
 
 
 def initial_point(problem: Problem) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Return the point of the box nearest to 0, and the projector onto the joints that are not pinned."""
+    """Return the point of the box nearest to 0, and the projector onto joints whose bounds differ."""
     lower, upper = problem.lower, problem.upper
     pinned = lower == upper
     x = jnp.where(lower > 0.0, lower, jnp.where(upper < 0.0, upper, jnp.where(pinned, lower, 0.0)))

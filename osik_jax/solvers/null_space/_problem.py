@@ -1,4 +1,4 @@
-"""Common parts of the methods: the answer, the residual of a level at a point, and the check of the data."""
+"""Common parts of the methods: answer, residual of a level, and data checks."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class NullSpaceSolution(eqx.Module):
 
 
 class ActiveTask(NamedTuple):
-    """The rows of a level that are active at a point (the others are 0), and the task error that they should remove.
+    """Rows of a level that are active at a point (0 for others), and the error they should remove.
 
     ``cutoff`` is the smallest pivot of these rows, projected, that is not 0: rows that have less outside the span of
     the longer ones count as dependent.
@@ -52,7 +52,7 @@ class ActiveTask(NamedTuple):
 
     @classmethod
     def at(cls, level: Level | PaddedLevel, x: Float[Array, " n"], rank_tol: Array | float) -> ActiveTask:
-        """Return the active rows at x: equalities always, inequalities where x violates them."""
+        """Return the rows active at x: equalities always, inequalities if x violates them."""
         value, equal = apply(level.matrix, x), level.equal
         # a clip halves its derivative between equal bounds
         error = jnp.where(equal, level.lower, jnp.clip(value, level.lower, level.upper)) - value

@@ -1,4 +1,4 @@
-"""The classical projection (eqs. 6 and 7): from the highest level down, each in the null space of those before it.
+"""Classical projection (eqs. 6 and 7): from the highest level down, each in the null space of the higher ones.
 
     v_k = v_{k-1} + (J_k P_{k-1})^+ (b_k - J_k v_{k-1}),    P_k = P_{k-1} - (J_k P_{k-1})^+ (J_k P_{k-1})
 
@@ -63,7 +63,7 @@ def solve_forward(
 def _step_length(
     x: Float[Array, " n"], motion: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]
 ) -> Float[Array, ""]:
-    """Return the largest step length, 1 at most, in the box that levels out of reach leave to those below."""
+    """Return the largest step length up to 1 within the box that levels beyond reach leave to lower ones."""
     gap = jnp.where(motion > 0.0, upper - x, x - lower)
     stops = gap < jnp.abs(motion)
     # the double where keeps quotients by tiny numbers, whose derivatives are infinite, out of the derivative

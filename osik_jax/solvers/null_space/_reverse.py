@@ -1,4 +1,4 @@
-"""The reverse order: from the lowest level to the highest, each disturbing those before it as little as it can.
+"""Reverse order: from the lowest level to the highest, each changing lower levels as little as possible.
 
 F. Flacco, A. De Luca, "A reverse priority approach to multi-task control of redundant robots", IROS 2014:
 
@@ -44,7 +44,7 @@ def solve_reverse(
     rank_tol: Array | float,
     backend: Backend = "jax",
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Return the answer, and the projector onto the null space of all levels; the secondary motion comes first of all.
+    """Return the answer, and the projector onto the null space of all levels; the secondary motion is applied first.
 
     Arguments as in ``solve_forward``.
     """
@@ -75,7 +75,7 @@ def _least_change(
     below: Sequence[tuple[Array, Damping]],
     rank_tol: Array | float,
 ) -> Float[Array, " n"]:
-    """Return the change of a level that changes the rows of the levels below least, the highest of them first.
+    """Return the motion of a level that changes the rows of lower levels least, in their order of priority.
 
     Args:
         change: the smallest one.

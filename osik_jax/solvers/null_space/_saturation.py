@@ -1,4 +1,4 @@
-"""Saturation in the null space: hard bounds for the projection.
+"""Saturation in the null space: projection with hard bounds.
 
 F. Flacco, A. De Luca, O. Khatib, "Motion control of redundant robots under joint constraints: saturation in the null
 space", ICRA 2012, and "Control of redundant robots under hard joint constraints: saturation in the null space", IEEE
@@ -53,7 +53,7 @@ from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
 
 
 class BoundedAnswer(NamedTuple):
-    """The answer of all levels inside the box."""
+    """Answer of all levels inside the box."""
 
     x: Float[Array, " n"]
     projector: Float[Array, "n n"]
@@ -73,7 +73,7 @@ def solve_saturated(
     max_iterations: int,
     backend: Backend = "jax",
 ) -> BoundedAnswer:
-    """Solve level after level; then come as near to the secondary motion as they leave room.
+    """Solve level after level, then approach the secondary motion within the remaining freedom.
 
     The levels are solved in double precision whatever the data are, for a joint is at its bound or is not. At the
     active sets that were found, the derivative is in the precision of the data.
@@ -96,7 +96,7 @@ def solve_saturated(
 
 
 class _State(NamedTuple):
-    """State between levels: x, its bounds, and the projector on the freedom that is left."""
+    """State between levels: x, its bounds, and the projector onto the remaining freedom."""
 
     x: Float[Array, " n"]
     lower: Float[Array, " n"]  # of the levels to come
@@ -125,7 +125,7 @@ def _kernel_candidates(
     solve: Callable[[Problem, int], SaturatedResult],
     block: int | None,
 ) -> Candidates:
-    """Return how a kernel is used, which judges its own answers; the rest is searched, so many lanes at a time."""
+    """Return the function that uses a kernel, which checks its own answers, and the search in blocks for the rest."""
 
     def certified(problem: Problem) -> tuple[SaturatedResult, Array]:
         result = solve(problem, max_iterations)
@@ -139,7 +139,7 @@ def _kernel_candidates(
 
 
 def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> SaturatedResult:
-    """Solve all levels of a batch in plain JAX; every array has a leading axis of problems, then perhaps of levels."""
+    """Solve all levels of a batch in plain JAX; arrays have a leading axis of problems, then of levels if any."""
     x, projector = jax.vmap(initial_point)(problem)
     fixed = jnp.where(problem.lower == problem.upper, 2, 0).astype(jnp.int32)
     zeros = jnp.zeros(x.shape[0], jnp.int32)
@@ -167,7 +167,7 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> Sa
 
 
 def _by_core(problem: Problem, max_iterations: int) -> SaturatedResult:
-    """Return the core's answers, ``done`` where it has one."""
+    """Return the core's answers, and in ``done`` whether each problem has one."""
     batch, count, _, n = problem.levels.matrix.shape
     floats = (batch, n), (batch, n, n), (batch, count)
     ints = (batch, count), (batch, count, n), (batch, count, n), (batch, count), (batch, n), (batch, 2)
@@ -183,7 +183,7 @@ def _by_core(problem: Problem, max_iterations: int) -> SaturatedResult:
 def _level_problem(
     backend: Backend, problem: Problem, state: _State, level: PaddedLevel, damping: Damping, target: Array
 ) -> tuple[ScaledMotion, Array]:
-    """Return the motion that a level asks for and where x may be, and the damping of the level."""
+    """Return the motion that a level demands, the box of x, and the damping of the level."""
     motion, projector, total = level_motion(level, state.x, state.projector, damping, problem.rank_tol, backend)
     # the trace is the number of directions that are left; where none is, the numbers are roundoff
     space = jnp.where(jnp.trace(projector) < 0.5, 0.0, projector)
@@ -200,7 +200,7 @@ def _after_level(
     level: PaddedLevel,
     damping: Damping,
 ) -> tuple[_State, ActiveJoints]:
-    """Return the state for the next level; where the search failed, x stays."""
+    """Return the state for the next level; x stays if the search failed."""
     active, blocking = (jnp.where(result.done, joints, 0) for joints in (result.active, result.blocking))
     # the blocking joints can move no more: their columns are removed from the projector
     columns = jnp.where((blocking != 0)[:, None], motion.projector, 0.0)

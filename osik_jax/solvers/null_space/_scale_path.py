@@ -1,4 +1,4 @@
-"""The scale of a damped level's motion at which its damped cost is least, where bounds make the whole of it too dear.
+"""Scale of a damped level's motion with the least damped cost, if the full motion within bounds costs more.
 
 Of all x whose rows move by s times the motion of a level, the search finds the smallest, x(s), and the largest s. On
 a set of saturated joints x(s) is linear in s. Bounds may ask far larger motions of the other joints for the same motion
@@ -42,7 +42,7 @@ def least_cost(
     rank_tol: Float[Array, " B"],
     max_iterations: int,
 ) -> tuple[SaturationResult, Int[Array, " B"], Float[Array, " B"]]:
-    """Return where damped levels end, how (``STRAIGHT``, ``PART``, ``WHOLE``), and which part of the way there they go.
+    """Return the ends of damped levels, their kind (``STRAIGHT``, ``PART``, ``WHOLE``), and the fraction of the way.
 
     Where the searches fail, that is a part of the straight way to the end of the path; else it is 1.
 
@@ -96,7 +96,7 @@ def best_scale(
     active: Int[Array, " n"],
     dual: Float[Array, "n n"] | None = None,
 ) -> Float[Array, ""]:
-    """Return the scale at which the damped cost is least, with these joints at their bounds; 1 where nothing moves.
+    """Return the scale with the least damped cost for these joints at their bounds; 1 without any motion.
 
     Args:
         problem: the motion of the level.
@@ -124,7 +124,7 @@ def best_scale(
 def step_to_bounds(
     problem: ScaledMotion, scale: Array, active: Int[Array, " n"], dual: Float[Array, "n n"]
 ) -> Float[Array, " n"]:
-    """Return the step from start to x(scale), which brings the active joints to their bounds; refined once."""
+    """Return the step from start to x(scale) that brings the active joints to their bounds, refined once."""
     goal = problem.bound(active) - problem.start
     step = problem.unbounded_step(scale)
     for _ in range(2):
@@ -135,7 +135,7 @@ def step_to_bounds(
 
 @custom_jvp
 def dual_basis(projector: Float[Array, "n n"], active: Int[Array, " n"]) -> Float[Array, "n n"]:
-    """Return C, the pseudo-inverse of the projector's columns of the active joints, with rows of 0 for the others.
+    """Return C, the pseudo-inverse of the projector's columns of the active joints; other rows are 0.
 
     C' (bound - x) brings the active joints to their bounds, by the smallest step in the projector's range.
     """
@@ -154,7 +154,7 @@ def dual_basis(projector: Float[Array, "n n"], active: Int[Array, " n"]) -> Floa
 
 @dual_basis.defjvp
 def _dual_basis_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
-    """Differentiate as Golub and Pereyra (``solvers/_inverses.py``), a matrix of full column rank."""
+    """Differentiate by Golub and Pereyra's formula (``solvers/_inverses.py``) for a matrix of full column rank."""
     projector, active = primals
     dual = dual_basis(projector, active)
     columns, moved = (jnp.where(active != 0, matrix, 0.0) for matrix in (projector, tangents[0]))

@@ -1,4 +1,4 @@
-"""The largest scale of a level's motion in the box, and the joints that are saturated there.
+"""Largest scale of a level's motion in the box, and the joints that saturate there.
 
     min 1/2 |x - target|^2   over   x = start + scale motion + P u,   lower <= x <= upper
 
@@ -61,7 +61,7 @@ from .._goldfarb_idnani import Constraints, DualState, Roundoff, dual_active_set
 
 
 class ScaledMotion(NamedTuple):
-    """The problem above. The start is in the box, the motion is outside the range of the projector."""
+    """Problem data; the start is in the box, the motion outside the range of the projector."""
 
     start: Float[Array, " n"]
     motion: Float[Array, " n"]
@@ -79,16 +79,16 @@ class ScaledMotion(NamedTuple):
         return scale * self.motion + apply(self.projector, self.target - self.start)
 
     def size(self, scale: Array) -> Float[Array, ""]:
-        """Return the size of the terms that x is made of."""
+        """Return the magnitude of the terms that add up to x."""
         return jnp.max(jnp.abs(self.start) + scale * jnp.abs(self.motion) + jnp.abs(self.target))
 
     def bound(self, active: Int[Array, " n"]) -> Float[Array, " n"]:
-        """Return the bound of each saturated joint, 0 for the others."""
+        """Return the bound of each saturated joint, 0 for other joints."""
         return jnp.where(active > 0, self.upper, jnp.where(active < 0, self.lower, 0.0))
 
 
 class SaturationResult(NamedTuple):
-    """The answer, and the joints that determine it."""
+    """Answer, and the joints that determine it."""
 
     x: Float[Array, " n"]  # inside its box
     scale: Float[Array, ""]
@@ -100,7 +100,7 @@ class SaturationResult(NamedTuple):
 
 
 def solve_scaled_motion(problem: ScaledMotion, max_iterations: int) -> SaturationResult:
-    """Return the saturated joints, the scale and the answer of a batch; not ``done`` where the limit was met.
+    """Return saturated joints, scale and answer of a batch; not ``done`` at the iteration limit.
 
     Args:
         problem: every array has a leading axis of problems.
@@ -145,7 +145,7 @@ def _attempt(
 
 
 def _tableau(problem: ScaledMotion, compliance: Float[Array, ""]) -> tuple[Constraints, Float[Array, " n"], DualState]:
-    """Return bounds and start of the dual method with no joint active, and the scale of each joint."""
+    """Return bounds and start of the dual method without active joints, and the scale of each joint."""
     # T = P + compliance m m', in units in which its diagonal is 1
     unit = _motion_direction(problem)
     tableau = problem.projector + compliance * unit[:, None] * unit[None, :]
@@ -168,13 +168,13 @@ def _tableau(problem: ScaledMotion, compliance: Float[Array, ""]) -> tuple[Const
 
 
 def _motion_direction(problem: ScaledMotion) -> Float[Array, " n"]:
-    """Return the motion with unit length."""
+    """Return the motion scaled to unit length."""
     length = jnp.sqrt(jnp.sum(problem.motion**2))
     return problem.motion / jnp.where(length > 0.0, length, 1.0)
 
 
 class _ActiveSet(NamedTuple):
-    """An active set, and what it takes to solve it without the penalty."""
+    """Active set, with the quantities for solving it without the penalty."""
 
     active: Int[Array, " n"]
     y: Float[Array, " n"]  # multipliers
@@ -185,7 +185,7 @@ class _ActiveSet(NamedTuple):
 
 
 def _active_set(problem: ScaledMotion, root: Float[Array, " n"], end: DualState) -> _ActiveSet:
-    """Return the saturated joints; where they depend on each other, all but one.
+    """Return the saturated joints; of a dependent set, all but one.
 
     That is the one which the others determine best, if they block the motion; if the whole motion ends where they are,
     the one without which all multipliers have their signs.
@@ -224,7 +224,7 @@ def _active_set(problem: ScaledMotion, root: Float[Array, " n"], end: DualState)
 
 
 class _Iterate(NamedTuple):
-    """An iterate of the refinement, with its residuals."""
+    """Iterate of the refinement with its residuals."""
 
     normal: Float[Array, " n"]
     y: Float[Array, " n"]
@@ -288,7 +288,7 @@ def _result(problem: ScaledMotion, active_set: _ActiveSet, at: _Iterate, iterati
 
 
 def blocked_scale(problem: ScaledMotion, active: Int[Array, " n"], normal: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return the scale with the active joints at their bounds, whose combination the null space cannot change.
+    """Return the scale for active joints at their bounds, if their combination is not changed by the null space.
 
     ``normal . bound = normal . start + scale normal . motion``.
     """

@@ -1,4 +1,4 @@
-"""The entry point of null-space projection: check the data, choose the method, set the status."""
+"""Entry point of null-space projection: check the data, choose the method, set the status."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def solve_nullspace(
 
 
 def _or_zeros(is_valid: Array, tree: Any) -> Any:
-    """Return the numbers as they are, or zeros."""
+    """Return the given numbers, or zeros for None."""
     return jax.tree.map(lambda leaf: jnp.where(is_valid, leaf, 0.0), tree)
 
 
@@ -139,7 +139,7 @@ def _unbounded(x: Float[Array, " n"], projector: Float[Array, "n n"], *, count: 
 def _solution(
     levels: Sequence[Level], answer: BoundedAnswer, is_valid: Array, bounds_are_ordered: Array, fallback: Array
 ) -> NullSpaceSolution:
-    """Return the answer with its status, all numbers finite; ``fallback`` where the data are not valid."""
+    """Return the answer with its status and finite numbers; ``fallback`` if the data are not valid."""
     is_valid &= jnp.isfinite(answer.x).all()
     x = jnp.where(is_valid, answer.x, fallback)
     status = jnp.where(answer.done, Status.SOLVED, Status.MAX_ITERATIONS)

@@ -1,4 +1,4 @@
-"""Array-level quadratic programs: no robot inside."""
+"""Quadratic programs on arrays, without robots."""
 
 from ._problem import QPSolution as QPSolution
 from ._solve import solve_least_squares_qp as solve_least_squares_qp

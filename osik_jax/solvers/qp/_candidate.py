@@ -1,4 +1,4 @@
-"""Output of a kernel for a batch of QPs."""
+"""Candidates: outputs of a kernel for a batch of QPs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ...numerics._constants import INACTIVE, REDUNDANT
 
 
 class Candidate(NamedTuple):
-    """A kernel's answers for a batch, which are yet to be certified."""
+    """Uncertified answers of a kernel for a batch."""
 
     x: Float[Array, "B n"]
     row_multipliers: Float[Array, "B p"]
@@ -25,7 +25,7 @@ class Candidate(NamedTuple):
 def of_core(
     x: Float[Array, "B n"], row_multipliers: Float[Array, "B p"], active: Int[Array, "B n+p"], report: Int[Array, "B 3"]
 ) -> Candidate:
-    """Return the candidates that the core answers, in which labels may be REDUNDANT."""
+    """Return the core's candidates, whose labels may be REDUNDANT."""
     redundant = active == REDUNDANT
     active = jnp.where(redundant, INACTIVE, active)
     return Candidate(x, row_multipliers, active, *(report[:, i] for i in range(3)), redundant=redundant)

@@ -13,7 +13,7 @@ from ._problem import QP, arrays
 
 
 def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
-    """Return candidates for a batch; each problem takes as long as it needs.
+    """Return candidates for a batch of QPs.
 
     Args:
         qp: the problems, with a leading axis.

@@ -1,4 +1,4 @@
-"""Convex quadratic costs, by a Hessian or by a least-squares problem."""
+"""Convex quadratic costs, given by a Hessian or as least squares."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...numerics._dense import apply, product
 
 
 class Quadratic(eqx.Module):
-    """1/2 x'Hx + g'x."""
+    """Cost 1/2 x'Hx + g'x."""
 
     matrix: Float[Array, "n n"]
     linear: Float[Array, " n"]
@@ -35,11 +35,11 @@ class Quadratic(eqx.Module):
         return apply(self.matrix, x)
 
     def gradient_scale(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the sums of the absolute terms of the gradient, in proportion to which roundoff is, (n,)."""
+        """Return the sums of the gradient's absolute terms, which scale its roundoff, (n,)."""
         return apply(jnp.abs(self.matrix), jnp.abs(x)) + jnp.abs(self.linear)
 
     def square_root(self, free: Bool[Array, " n"]) -> Float[Array, "n n"]:
-        """Return R with R'R = H over the free variables, ones for the others (Cholesky, with a ridge of roundoff)."""
+        """Return R with R'R = H over the free variables, identity rows for others (Cholesky with a small ridge)."""
         eps = QUADRATIC_RIDGE * float(jnp.finfo(self.matrix.dtype).eps)
         square = jnp.where(free[:, None] & free[None, :], self.matrix, 0.0)
         # relative to the largest diagonal element, so that a semidefinite H has a factor too
@@ -56,12 +56,12 @@ class Quadratic(eqx.Module):
         return [np.where(np.eye(n, dtype=bool), 0.0, number), np.full(n, number)]
 
     def placeholder(self) -> Quadratic:
-        """Return a cost of the same shape that has a minimiser."""
+        """Return a cost of the same shape that certainly has a minimiser."""
         return Quadratic(jnp.eye(len(self.linear), dtype=self.matrix.dtype), jnp.zeros_like(self.linear))
 
 
 class LeastSquares(eqx.Module):
-    """1/2 sum_i weight_i (A x - b)_i^2 + 1/2 sum_j damping_j (x_j - center_j)^2.
+    """Cost 1/2 sum_i weight_i (A x - b)_i^2 + 1/2 sum_j damping_j (x_j - center_j)^2.
 
     Products go through A: what is lost to roundoff in H = A'WA (small weights beside large ones) is kept.
     """
@@ -90,14 +90,14 @@ class LeastSquares(eqx.Module):
         return apply(self.matrix.T, self.weight * apply(self.matrix, x)) + self.damping * x
 
     def gradient_scale(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the sums of the absolute terms of the gradient, in proportion to which roundoff is, (n,)."""
+        """Return the sums of the gradient's absolute terms, which scale its roundoff, (n,)."""
         size = jnp.abs(self.matrix)
         # the terms that cancel in A x - b count one by one, and so do those of the damping
         residual_scale = self.weight * (apply(size, jnp.abs(x)) + jnp.abs(self.target))
         return apply(size.T, residual_scale) + self.damping * (jnp.abs(x) + jnp.abs(self.center))
 
     def square_root(self, free: Bool[Array, " n"]) -> Float[Array, "m_and_n n"]:
-        """Return R with R'R = H over the free variables, ones for the others: [sqrt(W) A; sqrt(D)], nothing squared."""
+        """Return R with R'R = H over the free variables, identity rows for others: [sqrt(W) A; sqrt(D)]."""
         diagonal = jnp.where(free, jnp.sqrt(self.damping), 1.0)
         return jnp.concatenate([jnp.sqrt(self.weight)[:, None] * self.matrix * free, jnp.diag(diagonal)])
 
@@ -113,7 +113,7 @@ class LeastSquares(eqx.Module):
         return [np.full((m, n), number), np.full(m, number), np.zeros(m), np.zeros(n), np.full(n, number)]
 
     def placeholder(self) -> LeastSquares:
-        """Return a cost of the same shape that has a minimiser."""
+        """Return a cost of the same shape that certainly has a minimiser."""
         return LeastSquares(
             matrix=jnp.zeros_like(self.matrix),
             target=jnp.zeros_like(self.target),

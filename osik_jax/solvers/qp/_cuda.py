@@ -1,4 +1,4 @@
-"""Candidates for weighted QPs on a GPU: ``core/weighted_qp.hpp``, one warp of 32 threads for each problem."""
+"""Candidates for weighted QPs on a GPU (``core/weighted_qp.hpp``), one warp of 32 threads per problem."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ extern "C" __global__ void __launch_bounds__(32) osik_kernel(
 
 
 def fits(qp: QP) -> bool:
-    """Return whether a GPU has room for a problem: least squares, of a size that fits."""
+    """Return whether the GPU kernel supports a problem: least squares that fit its shared memory."""
     if not isinstance(qp.cost, LeastSquares) or not _cuda.installed():
         return False
     m, n = qp.cost.matrix.shape[-2:]

@@ -1,4 +1,4 @@
-"""Choice of backend for a QP: a kernel's candidates, certified in plain JAX, and the search for the others.
+"""Choice of backend for a QP: candidates of a kernel, certified in plain JAX, else the search.
 
 The certificate is that of the search itself (``violated_conditions``, ``kkt_residual``), on the data as they were
 given, so that answers do not rest on the kernel. It costs two products with the rows. Problems whose candidate fails
@@ -72,7 +72,7 @@ def _solve_on_platform(max_iterations: int, backend: Backend, qp: QP, guess: Arr
 
 
 def cuda_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
-    """Return how the core is used on a GPU: in the precision of the data; the rest is searched, a block at a time.
+    """Return the function that uses the core on a GPU in the data's precision, and the search for the rest.
 
     Args:
         kkt_tol: the largest residual that is certified.
@@ -98,7 +98,7 @@ def cuda_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
 
 
 def core_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
-    """Return how the core is used on a CPU: in double precision; arguments as for ``cuda_candidates``."""
+    """Return the function that uses the core on a CPU in double precision; arguments as for ``cuda_candidates``."""
 
     def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
         start = jax.vmap(usable_guess)(qp, guess)
@@ -123,7 +123,7 @@ def core_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
 def _certified(
     qp: QP, start: Array, tolerance: Float[Array, " B"], candidate: Candidate, kkt_tol: float, max_iterations: int
 ) -> SearchResult:
-    """Return candidates, ``done`` where they are certified; ``start`` has the labels that they began with."""
+    """Return candidates with ``done`` set if certified; ``start`` has their initial labels."""
     result, within_limit = _as_result(qp, candidate), candidate.iterations <= max_iterations
     is_certified = (candidate.converged != 0) & within_limit & (result.residual <= kkt_tol)
     conditions = [jax.vmap(_is_certified)(qp, result, tolerance)]
@@ -140,7 +140,7 @@ def _block(batch: int) -> int:
 
 
 def _as_result(qp: QP, candidate: Candidate) -> SearchResult:
-    """Return a candidate as the end of a search, not yet certified."""
+    """Return a candidate as an uncertified search result."""
     zeros, redundant = jnp.zeros_like(candidate.iterations), candidate.redundant
     return SearchResult(
         x=candidate.x,
@@ -183,7 +183,7 @@ def _is_certified(qp: QP, result: SearchResult, tolerance: Float[Array, ""]) -> 
 
 
 def _is_stationary(qp: QP, result: SearchResult) -> Bool[Array, " n"]:
-    """Check that the gradient at each variable is roundoff, or points out of the active bound."""
+    """Check that each variable's gradient is roundoff or points out of its active bound."""
     downhill = apply(qp.rows.T, result.row_multipliers) - qp.cost.gradient(result.x)
     active = result.active[: len(downhill)]
     # a variable at its lower bound may be pulled down but not up, and the other way round
@@ -194,7 +194,7 @@ def _is_stationary(qp: QP, result: SearchResult) -> Bool[Array, " n"]:
 
 
 def kkt_solver(qp: QP, active: Int[Array, " m"], backend: Backend) -> Callable[[Array], Array]:
-    """Return ``kkt_inverse`` at an active set; on a GPU, in single precision, the core computes it."""
+    """Return ``kkt_inverse`` at an active set, computed by the core in single precision on a GPU."""
     if not takes(backend, "core-cuda", fits=qp.lower.dtype == jnp.float32 and _cuda.fits(qp)):
         return kkt_inverse(qp, active)
     return lambda right: _solve_kkt_on_platform()(qp, active, right)
@@ -209,7 +209,7 @@ def _solve_kkt_on_platform() -> Callable[[QP, Array, Array], Array]:
 
 
 def _solve_kkt(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
-    """Solve the KKT system as a QP on one active set: its constraints are equalities, the others have no bounds."""
+    """Solve the KKT system as a QP whose active constraints are equalities and whose others have no bounds."""
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
     n = cost.damping.shape[1]

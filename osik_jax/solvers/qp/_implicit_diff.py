@@ -1,4 +1,4 @@
-"""The derivative of the solution map, forward and reverse, to any order.
+"""Derivative of the solution map, in forward and reverse mode, to any order.
 
 Where no constraint is about to enter or leave the active set, the answer solves the KKT system at that set, which is
 smooth in all data. By the implicit function theorem its derivative is one more solution of the same system
@@ -44,7 +44,7 @@ def with_derivative(backend: Backend) -> Callable[[Array, Array, Array, QP], tup
 
 
 def _solution_rates(x: Array, y: Array, active: Array, qp: QP, rates: QP, backend: Backend) -> tuple[Array, Array]:
-    """Return the rates of x and y, from those of the problem."""
+    """Return the rates of x and y from the rates of the problem's data."""
     n = x.shape[0]
     free, active_rows = active[:n] == INACTIVE, active[n:] != INACTIVE
 

@@ -1,4 +1,4 @@
-"""The minimiser for a given active set: one Cholesky factorisation, and iterative refinement of the KKT system.
+"""Minimiser for a given active set: one Cholesky factorisation, and iterative refinement of the KKT system.
 
 With the active bounds substituted, F the free variables and C the active rows of compliances E, the conditions are
 
@@ -63,7 +63,7 @@ def factorize(qp: QP, hessian: Float[Array, "n n"], active: Int[Array, " n_and_p
 def solve_on_active_set(
     qp: QP, factor: KKTFactor, active: Int[Array, "B n_and_p"]
 ) -> tuple[Float[Array, "B n"], Float[Array, "B p"]]:
-    """Return minimisers and row multipliers with the active constraints as equalities and the others left out.
+    """Return minimisers and row multipliers with active constraints as equalities and inactive ones ignored.
 
     Every argument has a leading axis of problems; all are refined until the last correction is small in each.
     """
@@ -89,7 +89,7 @@ def refine(
     root: Float[Array, "B n"],
     limit: Float[Array, "..."],
 ) -> tuple[Float[Array, "B n"], Float[Array, "B p"], Bool[Array, " B"]]:
-    """Refine x and y until the last correction is small in each problem; return them, and whether it is.
+    """Refine x and y until the last correction of each problem is small; return them, and whether it is.
 
     Args:
         correction: from x and y of all problems to their corrections, by exact residuals.
@@ -121,7 +121,7 @@ def _relative_size(dx: Float[Array, " n"], x: Float[Array, " n"]) -> Float[Array
 def _correction(
     qp: QP, factor: KKTFactor, target: Float[Array, " n_and_p"], x: Float[Array, " n"], y: Float[Array, " p"]
 ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
-    """Return the corrections of x and y, from the residuals of the KKT conditions themselves."""
+    """Return corrections of x and y from the residuals of the KKT conditions."""
     downhill = apply(qp.rows.T, y) - qp.cost.gradient(x)
     gap = target[len(x) :] - apply(qp.rows, x) - qp.compliance * y
     return solve_kkt(factor, downhill, gap)
@@ -144,7 +144,7 @@ def solve_kkt(
 def kkt_inverse(
     qp: QP, active: Int[Array, " n_and_p"]
 ) -> Callable[[Float[Array, " n_and_p"]], Float[Array, " n_and_p"]]:
-    """Return the map from r and -g to dx and dy of ``solve_kkt``; 0 for variables that are not free and inactive rows.
+    """Return the map from r and -g to dx and dy of ``solve_kkt``; 0 for fixed variables and inactive rows.
 
     One refinement: products with A keep what the factor of A'WA has lost.
     """
@@ -170,7 +170,7 @@ def inverse_root(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Return L, lower triangular, with L L' the matrix, of which the lower triangle is read."""
+    """Return the lower triangular L with L L' = matrix; only the lower triangle is read."""
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 

@@ -1,4 +1,4 @@
-"""The quadratic program and its answer as pytrees, and its optimality (KKT) conditions."""
+"""Pytrees of a quadratic program and its answer, and its optimality (KKT) conditions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ._cost import LeastSquares, Quadratic
 
 
 class QP(eqx.Module):
-    """min cost(x) + 1/2 sum_i t_i^2 / compliance_i  over  lower <= [x; C x + t] <= upper.
+    """Problem min cost(x) + 1/2 sum_i t_i^2 / compliance_i subject to lower <= [x; C x + t] <= upper.
 
     Attributes:
         cost: of x, strictly convex.
@@ -41,25 +41,25 @@ class QP(eqx.Module):
 
     @property
     def equality(self) -> Bool[Array, " n_and_p"]:
-        """Return which constraints are equalities: those known to be, and those with equal bounds, (n + p,)."""
+        """Return which constraints are equalities: the known ones, and those with equal bounds, (n + p,)."""
         equal = self.lower == self.upper
         return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
 
 
 def arrays(qp: QP) -> tuple[list[Any], Any]:
-    """Return the cost's matrix, then all other arrays in the order in which ``packed`` has them; and their tree."""
+    """Return the cost's matrix, then all other arrays in the order of ``pack``, and their tree structure."""
     # not by replace: the constructor's annotations are of one problem, and a kernel gets a batch
     return jax.tree.flatten(eqx.tree_at(lambda p: p.packed, qp, None, is_leaf=lambda leaf: leaf is None))
 
 
 def pack(qp: QP) -> tuple[Array | np.ndarray, Array]:
-    """Return the cost's matrix and all other arrays as one, as ``unpack`` takes them; they may be NumPy's."""
+    """Return the cost's matrix, and all other arrays concatenated for ``unpack``; NumPy arrays are accepted."""
     (matrix, *others), _ = arrays(qp)
     return matrix, jnp.concatenate([jnp.ravel(a) for a in others])
 
 
 def unpack(like: QP, matrix: Float[Array, "..."], packed: Float[Array, " k"]) -> QP:
-    """Return a problem of the shapes of another, from its matrix and all its other arrays, one after another."""
+    """Return a problem with the shapes of another one, from its matrix and its other arrays concatenated."""
     (first, *rest), tree = arrays(like)
     parts = jnp.split(packed, np.cumsum([a.size for a in rest])[:-1])
     others = [part.reshape(a.shape).astype(a.dtype) for part, a in zip(parts, rest, strict=True)]
@@ -101,13 +101,13 @@ class QPSolution(eqx.Module):
 
 
 def active_bounds(qp: QP, active: Int[Array, " n_and_p"]) -> Float[Array, " n_and_p"]:
-    """Return the bound of each active constraint, 0 for the others (never infinite)."""
+    """Return the bound of each active constraint, 0 for inactive ones (never infinite)."""
     at_lower = (active != INACTIVE) & (active != AT_UPPER)
     return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)
 
 
 def softened_compliance(qp: QP, penalty_ratio: float) -> Float[Array, " p"]:
-    """Return compliances in which hard rows are soft: by ``penalty_ratio`` times the largest curvature of the cost."""
+    """Return compliances with hard rows made soft: curvature ``penalty_ratio`` times the largest one of the cost."""
     is_soft = qp.compliance > 0.0
     penalty = jnp.where(is_soft, 1.0 / jnp.where(is_soft, qp.compliance, 1.0), 0.0)
     largest_curvature = jnp.max(qp.cost.diagonal() + apply(qp.rows.T**2, penalty))
@@ -118,19 +118,19 @@ def softened_compliance(qp: QP, penalty_ratio: float) -> Float[Array, " p"]:
 
 
 def gradient_scale(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n"]:
-    """Return the sums of the absolute terms of the Lagrangian's gradient, in proportion to which its roundoff is."""
+    """Return the sums of the absolute terms of the Lagrangian's gradient, which scale its roundoff."""
     return qp.cost.gradient_scale(x) + apply(jnp.abs(qp.rows).T, jnp.abs(y))
 
 
 class Scales(NamedTuple):
-    """The sizes of the terms in values and multipliers of the constraints; times a tolerance they are roundoff."""
+    """Magnitudes of the terms in values and multipliers of the constraints; times a tolerance they are roundoff."""
 
     value: Float[Array, " m"]
     multiplier: Float[Array, " m"]
 
 
 def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"], y: Float[Array, " p"]) -> Scales:
-    """Return scales that do not depend on the units of the variables: each is measured by the root of its curvature.
+    """Return scales independent of the variables' units: each variable is measured by the root of its curvature.
 
     Where the constraints hold all of x at 0, the Newton step of each variable alone takes the place of x.
 
@@ -161,7 +161,7 @@ def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"
 
 
 def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: Int[Array, " n+p"]) -> Float[Array, ""]:
-    """Return the largest violation of the optimality conditions, without units: see ``QPSolution.kkt_residual``.
+    """Return the largest violation of the optimality conditions, without units (``QPSolution.kkt_residual``).
 
     The conditions are stationarity, ``grad cost(x) - C'y = multipliers of the box``; signs of the multipliers;
     feasibility, and complementarity of the rows with a multiplier.

@@ -1,4 +1,4 @@
-"""Fallback where no answer was found: a bounded step in the box that is no worse than none."""
+"""Fallback without an answer: a bounded point of the box that is no worse than zero."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ._problem import QP, softened_compliance
 
 
 def projected_gradient(qp: QP) -> Float[Array, " n"]:
-    """Return a point of the box, of one problem: a hundred projected gradient steps from the zero vector.
+    """Return a point of the box for one problem: a hundred projected gradient steps from the zero vector.
 
     Each step divides the gradient by a diagonal bound on the Hessian, variable by variable (majorisation), so the cost
     never rises and no unit matters. Directions of a curvature under about a hundredth of the bound are hardly moved

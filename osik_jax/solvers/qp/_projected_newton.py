@@ -1,4 +1,4 @@
-"""The minimiser by a projected Newton method, for problems in which the dual method's tableau loses its accuracy.
+"""Minimiser by a projected Newton method, for problems in which the dual method's tableau loses accuracy.
 
 The tableau is an inverse. Where a weak damping stands beside heavy rows, what bounds and rows leave of it is smaller
 than its roundoff, and feasible constraints seem infeasible. Here nothing is inverted and nothing is updated. A soft row
@@ -49,7 +49,7 @@ from ._problem import QP, constraint_scales, gradient_scale, softened_compliance
 
 
 class NewtonState(NamedTuple):
-    """An iterate, of one problem."""
+    """Iterate of one problem."""
 
     x: Float[Array, " n"]
     multiplier: Float[Array, " p"]  # of the hard rows, as estimated so far
@@ -78,7 +78,7 @@ class Linearisation(NamedTuple):
 
 
 class NewtonResult(NamedTuple):
-    """End point of the method."""
+    """Final iterate of the method."""
 
     x: Float[Array, " n"]
     row_multipliers: Float[Array, " p"]
@@ -158,7 +158,7 @@ def _linearise(qp: QP, s: NewtonState) -> Linearisation:
 
 
 def _iterate(feasibility_tol: float, qp: QP, s: NewtonState) -> NewtonState:
-    """Take a projected Newton step; at a minimiser, update the multipliers of the hard rows or end."""
+    """Take a projected Newton step; at a minimiser update the multipliers of the hard rows, or end."""
     at = _linearise(qp, s)
     updated, stepped = _update_multipliers(feasibility_tol, qp, s, at), _newton_iteration(qp, s, at)
     return jax.tree.map(partial(jnp.where, s.at_minimiser), updated, stepped)
@@ -187,7 +187,7 @@ def _newton_iteration(qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
 
 
 def _add_step(qp: QP, x: Float[Array, " n"], step: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return x + step clipped into the box; at the bound ahead where only roundoff is in between."""
+    """Return x + step clipped into the box; a bound within roundoff ahead is reached exactly."""
     lower, upper = _box(qp)
     new = jnp.clip(x + step, lower, upper)
     bound = jnp.where(step > 0.0, upper, lower)
@@ -201,7 +201,7 @@ def _box(qp: QP) -> tuple[Array, Array]:
 
 
 def _newton_step(qp: QP, s: NewtonState, at: Linearisation) -> Float[Array, " n"]:
-    """Return the step to the minimiser over the free variables, if no row changed sides: -(R'R)^-1 gradient."""
+    """Return the Newton step over the free variables, assuming that no row changes sides: -(R'R)^-1 gradient."""
     # R of [rows in the penalty / sqrt(compliance); R of the cost], over the free variables
     root = jnp.where(at.multipliers != 0.0, 1.0 / jnp.sqrt(s.compliance), 0.0)
     rows = jnp.concatenate([(root[:, None] * qp.rows) * at.free, qp.cost.square_root(at.free)])
@@ -220,7 +220,7 @@ def _longest_first(rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
 def _line_search(
     qp: QP, s: NewtonState, at: Linearisation, newton: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
-    """Return the step along Newton's direction that lowers the cost most, by a projected line search.
+    """Return the step along Newton's direction with the lowest cost, by a projected line search.
 
     The direction is clipped into the box at many lengths, or followed to the first bound.
 
@@ -251,7 +251,7 @@ def _line_search(
 
 
 def _cost_change(qp: QP, s: NewtonState, at: Linearisation, step: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return the change of the augmented Lagrangian by gradient and curvature terms: nothing large cancels."""
+    """Return the change of the augmented Lagrangian by gradient and curvature terms, without cancellation."""
     lower, upper = qp.lower[len(step) :], qp.upper[len(step) :]
     along, old = apply(qp.rows, step), violation(at.values, lower, upper)
     new = violation(at.values + along, lower, upper)
@@ -262,7 +262,7 @@ def _cost_change(qp: QP, s: NewtonState, at: Linearisation, step: Float[Array, "
 
 
 def _update_multipliers(feasibility_tol: float, qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
-    """End at a minimiser of the augmented Lagrangian whose hard rows hold; elsewhere take their multipliers over."""
+    """Update the multipliers of hard rows at a minimiser of the augmented Lagrangian, or end if they hold."""
     n = len(s.x)
     hard = qp.compliance == 0.0
     # how far hard rows are off, and off the points that their multipliers stand for
@@ -302,7 +302,7 @@ def _update_multipliers(feasibility_tol: float, qp: QP, s: NewtonState, at: Line
 
 
 def _is_least_violation(qp: QP, x: Float[Array, " n"], gap: Float[Array, " p"]) -> Bool[Array, ""]:
-    """Check that no direction in the box makes the gaps smaller in the Euclidean norm (projected gradient).
+    """Check that no direction in the box reduces the Euclidean norm of the violations (projected gradient).
 
     The gradient is 0 where the gaps are orthogonal to a variable's column of C. That is measured against the lengths of
     both: gaps of roundoff alone may be all that a column meets.

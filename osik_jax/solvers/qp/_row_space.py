@@ -1,4 +1,4 @@
-"""The minimiser for a given active set, by a linear system of the size of the rows of the cost, not of the variables.
+"""Minimiser for a given active set by a linear system of the size of the cost's rows instead of the variables.
 
 Whole-body tasks have fewer rows than the robot has dofs: 18 for two feet, the centre of mass and a hand, 35 dofs of a
 G1. With B the rows of A times the roots of their weights, and the active rows of C, each column over the root of its
@@ -39,7 +39,7 @@ from ._search import SearchResult, is_optimal
 
 
 class RowFactor(NamedTuple):
-    """Factors of the KKT system at an active set, in the space of the rows."""
+    """Factors of the KKT system at an active set, in row space."""
 
     free: Bool[Array, " n"]
     active_rows: Bool[Array, " p"]
@@ -51,7 +51,7 @@ class RowFactor(NamedTuple):
 
 
 def has_few_rows(qp: QP) -> bool:
-    """Return whether the system of the rows is the smaller one (static); ``qp`` has a leading axis of problems."""
+    """Return whether the row system is the smaller one (static); ``qp`` has a leading axis of problems."""
     if not isinstance(qp.cost, LeastSquares):
         return False
     _, m, n = qp.cost.matrix.shape
@@ -59,7 +59,7 @@ def has_few_rows(qp: QP) -> bool:
 
 
 def try_row_space(qp: QP, start: SearchResult, tolerance: Float[Array, " B"]) -> SearchResult:
-    """Return the answers where the guess is right, for less than a round of the search; else ``start``.
+    """Return the answers for correct guesses at less than the cost of a search round, else ``start``.
 
     Args:
         qp: problems of which ``has_few_rows`` holds, with a leading axis, as on all arguments.
@@ -77,7 +77,7 @@ def try_row_space(qp: QP, start: SearchResult, tolerance: Float[Array, " B"]) ->
 def solve_in_row_space(
     qp: QP, active: Int[Array, "B n_and_p"]
 ) -> tuple[Float[Array, "B n"], Float[Array, "B p"], Bool[Array, " B"]]:
-    """Return what ``solve_on_active_set`` does, and whether it is accurate; all arguments have a leading axis."""
+    """Return the result of ``solve_on_active_set`` and whether it is accurate; arguments have a leading axis."""
     factor = jax.vmap(_factorize)(qp, active)
     target = jax.vmap(active_bounds)(qp, active)
     x, y = jax.vmap(_first_solve)(qp, factor, target)
@@ -122,7 +122,7 @@ def _solve(
 def _first_solve(
     qp: QP, factor: RowFactor, target: Float[Array, " n_and_p"]
 ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
-    """Return x and y, solved for the step from the damping's center, where nothing large has to cancel."""
+    """Return x and y, solved for the step from the damping's center, which avoids cancellation."""
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
     n, m = len(factor.free), len(cost.weight)
@@ -137,7 +137,7 @@ def _first_solve(
 def _correction(
     qp: QP, factor: RowFactor, target: Float[Array, " n_and_p"], x: Float[Array, " n"], y: Float[Array, " p"]
 ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
-    """Return the corrections of x and y, from the residuals of the KKT conditions themselves."""
+    """Return corrections of x and y from the residuals of the KKT conditions."""
     n, m = len(x), len(factor.cholesky) - len(y)
     downhill = apply(qp.rows.T, y) - qp.cost.gradient(x)
     gap = jnp.where(factor.active_rows, target[n:] - apply(qp.rows, x) - qp.compliance * y, 0.0)

@@ -1,4 +1,4 @@
-"""The search for the active set in plain JAX: guess, factor, check; where the check fails, the dual method goes on.
+"""Search for the active set in plain JAX: guess, factor, check; if the check fails, the dual method continues.
 
 The guess is the warm start, or no active bound at all; where it is right, one factorisation is all there is. The answer
 always comes from a fresh factorisation at the final active set, never from the tableau that found it.
@@ -38,7 +38,7 @@ from ._tableau import find_active_set
 
 
 class SearchResult(NamedTuple):
-    """The end of a search. As an iterate it has a leading axis of problems."""
+    """Result of a search; as an iterate it has a leading axis of problems."""
 
     x: Float[Array, " n"]
     row_multipliers: Float[Array, " p"]
@@ -56,11 +56,11 @@ class SearchResult(NamedTuple):
 
 
 FirstTry = Callable[[QP, SearchResult, Array], SearchResult]
-"""Function from problems, starts and tolerances to results; ``done`` where the first guess was right."""
+"""Function from problems, starts and tolerances to results; ``done`` if the first guess was right."""
 
 
 def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
-    """Return where a search begins: nothing solved, the usable part of the guess active."""
+    """Return the initial iterate of a search: nothing solved, the usable part of the guess active."""
     batch, n, dtype = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1], qp.lower.dtype
     zeros, no = jnp.zeros(batch, jnp.int32), jnp.zeros(batch, bool)
     return SearchResult(
@@ -118,7 +118,7 @@ def _solve_batch(
     first_try: FirstTry | None,
     kkt_tol: float,
 ) -> SearchResult:
-    """Return the answers, and projected gradient steps where there is none."""
+    """Return the answers, or the end of projected gradient steps for problems without one."""
     start = initial_result(qp, guess, tolerance)
     if first_try is None:
         result = rounds((qp, tolerance), start)
@@ -141,7 +141,7 @@ def _fall_back(qp: QP, result: SearchResult) -> SearchResult:
 def _search_rounds(
     given: tuple[QP, Float[Array, " B"]], start: SearchResult, *, max_iterations: int, kkt_tol: float, by_pivots: bool
 ) -> SearchResult:
-    """Factor, check and search in rounds until every problem is done; where that fails, projected Newton takes over.
+    """Factor, check and search in rounds until all problems are done; projected Newton takes over on failure.
 
     After projected Newton there is one more round, so that its answer is the exact minimiser on its active set, if
     there are digits enough for that.
@@ -188,7 +188,7 @@ def _by_newton(qp: QP, result: SearchResult, *, kkt_tol: float, max_iterations: 
 
 
 class _Minimizers(NamedTuple):
-    """The minimisers of a batch on its active sets, and what the optimality conditions say of them."""
+    """Minimisers of a batch on its active sets, and their optimality checks."""
 
     factor: KKTFactor
     x: Float[Array, "B n"]
@@ -206,7 +206,7 @@ def _round(
     max_iterations: int,
     by_pivots: bool,
 ) -> SearchResult:
-    """Solve on the active set, check, and run the dual method where the check fails, or give up without it."""
+    """Solve on the active set, check, and run the dual method if the check fails, or end."""
     end = _minimize(qp, hessian, result, tolerance)
     exhausted = result.iterations >= max_iterations
     searching = ~(result.done | end.optimal | exhausted | result.used_newton)
@@ -256,7 +256,7 @@ def _by_dual_method(
     searching: Bool[Array, " B"],
     max_iterations: int,
 ) -> SearchResult:
-    """Go on from the minimisers by the dual method, which may confirm their active sets, change them or end."""
+    """Continue from the minimisers by the dual method, which confirms or changes their active sets, or ends."""
     end = find_active_set(
         *(qp, hessian, at.factor, result.active, at.roundoff, at.x, at.row_multipliers),
         searching=searching,
@@ -289,7 +289,7 @@ def usable_guess(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
 def is_optimal(
     qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
 ) -> Bool[Array, ""]:
-    """Check that the minimiser on the active set is the minimiser: constraints hold, multipliers have their signs.
+    """Check that the minimiser on the active set is optimal: constraints hold, and multipliers have their signs.
 
     The arguments are those of ``violated_conditions``.
     """
@@ -299,7 +299,7 @@ def is_optimal(
 def violated_conditions(
     qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
 ) -> Bool[Array, " m"]:
-    """Return which constraints are violated, inactive equalities, or have a multiplier of the wrong sign.
+    """Return which constraints are violated, are inactive equalities, or have a multiplier of the wrong sign.
 
     Args:
         qp: the problem.
@@ -320,6 +320,6 @@ def violated_conditions(
 
 
 def _gaps(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " m"]:
-    """Return how far each constraint is outside its interval; negative inside."""
+    """Return the distance of each constraint outside its interval; negative inside."""
     values = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * y])
     return jnp.maximum(qp.lower - values, values - qp.upper)

@@ -1,4 +1,4 @@
-"""Weighted QPs without rows in single precision on a GPU: the CUDA text in ``core/weighted_qp_cuda``.
+"""Weighted QPs without rows in single precision on a GPU (``core/weighted_qp_cuda``).
 
 It has the factor of a warp's problem in registers. The text of the core (``core/weighted_qp.hpp``), which ``_cuda.py``
 takes for all other problems, makes 0.7 times as many steps of a whole-body loop a second.
@@ -27,10 +27,10 @@ from ._cost import LeastSquares
 from ._problem import QP
 
 PARTS = ("workspace", "vectors", "problem", "factor", "refine", "labels", "dual_step", "active_set")
-"""The files of the kernel, in their order: each uses what those before it define."""
+"""Files of the kernel in order; each uses the definitions of earlier ones."""
 _MAX_VARIABLES = 64
 _SHARED_BYTES = 48 * 1024
-"""Shared memory that any CUDA device gives a block without being asked for more."""
+"""Shared memory [bytes] that every CUDA device offers a block by default."""
 _MAX_WARPS = 4
 _KERNEL = """
 #define INFINITY __int_as_float(0x7f800000)
@@ -44,14 +44,14 @@ if (pid >= problems) return;
 
 
 class Shape(NamedTuple):
-    """The numbers that a kernel is compiled for."""
+    """Sizes for which a kernel is compiled."""
 
     variables: int
     rows: int
 
     @property
     def warps(self) -> int:
-        """The number of warps of a block; 0 for a problem that is too large for this kernel."""
+        """Return the number of warps per block; 0 if a problem is too large for this kernel."""
         n, m = self
         if n > _MAX_VARIABLES:
             return 0
@@ -61,7 +61,7 @@ class Shape(NamedTuple):
 
 
 def fits(qp: QP) -> bool:
-    """Return whether a problem has no rows, is in single precision, and there is room for it."""
+    """Return whether the kernel supports a problem: no rows, single precision, and enough shared memory."""
     if not isinstance(qp.cost, LeastSquares) or qp.lower.dtype != jnp.float32 or qp.rows.shape[-2]:
         return False
     m, n = qp.cost.matrix.shape[-2:]
@@ -83,7 +83,7 @@ def _source(shape: Shape, max_iterations: int) -> str:
 
 
 def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
-    """Return candidates for a batch on the GPU that the program runs on; arguments as ``_cuda.solve``."""
+    """Return candidates for a batch on the default GPU; arguments as for ``_cuda.solve``."""
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
     batch, m, n = cost.matrix.shape

@@ -1,4 +1,4 @@
-"""The entry points of QPs: check the data, solve, attach the derivative, set the status."""
+"""Entry points of QPs: check the data, solve, attach the derivative, set the status."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _problem(
     compliance: ArrayLike | None,
     equalities: tuple[bool, ...] | None = None,
 ) -> QP:
-    """Return the problem with the bounds of box and rows one after the other; shapes are checked here."""
+    """Return the problem with the bounds of box and rows concatenated, after checking shapes."""
     dtype = cost.matrix.dtype
     if rows is None:
         rows, rows_lower, rows_upper = jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
@@ -171,7 +171,7 @@ def _solve(
     tolerance: ArrayLike | None,
     backend: Backend,
 ) -> QPSolution:
-    """Solve, certify, and differentiate nothing but the answer.
+    """Solve and certify without derivatives.
 
     Args:
         qp: the problem as it was given.
@@ -216,7 +216,7 @@ def _solve(
 def _differentiable(
     safe: QP, result: SearchResult, is_valid: Bool[Array, ""], backend: Backend
 ) -> tuple[Float[Array, " n"], Float[Array, " p"], Bool[Array, ""]]:
-    """Return x and the row multipliers with their derivatives where there is an answer; 0 where they are not finite.
+    """Return x and the row multipliers with their derivatives (0 if not finite), and whether they are finite.
 
     The derivative is that of the problem which x solves: with infeasible hard rows, the softened one.
 
@@ -237,7 +237,7 @@ def _differentiable(
 
 
 def _upper(qp: QP) -> Float[Array, " n_and_p"]:
-    """Return the upper bounds; those of known equalities are exactly the lower ones."""
+    """Return the upper bounds; for known equalities they equal the lower bounds."""
     if qp.known_equalities is None:
         return qp.upper
     return jnp.where(np.array(qp.known_equalities), qp.lower, qp.upper)
@@ -250,7 +250,7 @@ def _status(is_finite: Bool[Array, ""], unordered: Bool[Array, ""], result: Sear
 
 
 def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
-    """Return the problem, or a placeholder where its numbers are not valid, and whether they are.
+    """Return the problem, or a placeholder if its numbers are not valid, and whether they are.
 
     Valid are numbers without NaN, infinities only as bounds that do not exist, and weights that are not negative. The
     placeholder keeps derivatives finite too.

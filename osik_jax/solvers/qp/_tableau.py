@@ -1,4 +1,4 @@
-"""The dual active-set method of a QP: its tableau, from the KKT factors at the active set where the search begins."""
+"""Dual active-set method of a QP: its tableau, from the KKT factors at the initial active set."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def find_active_set(
 
 
 def _tableau(qp: QP, hessian: Float[Array, "B n n"], factor: KKTFactor) -> Float[Array, "B m m"]:
-    """Return the tableau at the active bounds of the box, with no row active."""
+    """Return the tableau at the active bounds of the box, without active rows."""
     # pivoting on all free variables at once is what their inverse block is for
     inverse = jax.vmap(_inverse)(factor)
     if qp.rows.shape[1]:
@@ -102,7 +102,7 @@ def _scaled_start(
     x: Float[Array, " n"],
     y: Float[Array, " p"],
 ) -> tuple[DualState, Constraints]:
-    """Return the start of the search and the constraints, scaled so that the diagonal of the tableau is 1."""
+    """Return the start of the search and the constraints, scaled to a tableau diagonal of 1."""
     n = len(x)
     diagonal = jnp.abs(jnp.diagonal(tableau))
     # a row's diagonal element by the diagonal of the Hessian alone, which active bounds do not reduce
@@ -131,7 +131,7 @@ def _scaled_start(
 def _activate_rows(
     qp: QP, constraints: Constraints, s: DualState, active: Int[Array, " m"]
 ) -> tuple[DualState, Bool[Array, ""]]:
-    """Pivot the active rows in; dependent ones become inactive, and the state is then not consistent."""
+    """Pivot the active rows in; dependent rows become inactive, which makes the state inconsistent."""
     m, p = len(active), qp.rows.shape[0]
     order = jnp.arange(m)
 
