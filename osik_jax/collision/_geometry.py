@@ -248,6 +248,7 @@ def _ball() -> np.ndarray:
     points = np.array([np.roll(corner, k) for corner in corners for k in range(3)])
     points /= np.linalg.norm(points[0])
     first, second = np.triu_indices(len(points), 1)
+    # edges of the unit icosahedron are 1.05 long; all other distances of its corners are at least 1.7
     near = np.linalg.norm(points[first] - points[second], axis=1) < 1.2
     halves = (points[first] + points[second])[near]
     points = np.concatenate([points, halves / np.linalg.norm(halves, axis=1, keepdims=True)])

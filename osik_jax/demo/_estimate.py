@@ -20,6 +20,7 @@ _SIMULATED = 4.0
 """Factor on the time of a step with physics."""
 _PICTURE, _MESH_PICTURE = 0.15, 0.5
 """Time to draw one film picture on one core [s], of simple shapes and of meshes."""
+# rate of the film's pictures [1/s]
 _PICTURES_PER_SECOND = 12.5
 
 
@@ -62,4 +63,5 @@ def _reference(motion: Motion) -> tuple[float, float]:
     start, worked = time.perf_counter(), time.process_time()
     jax.jit(rows).lower(motion.q0).compile()
     seconds = time.perf_counter() - start
+    # compilation uses several threads, so processor time may exceed elapsed time: the ratio is at least 1
     return seconds, max(1.0, seconds / max(time.process_time() - worked, 1e-3))

@@ -19,6 +19,7 @@ from ._motion import GAIN, Goal, Motion, Stance, along, contact_corners, trackin
 from ._start import Rows, raised, start
 from ._sway import SWAY, sway, sway_of
 
+# margin of the centre of mass inside the support polygon [m], as in NAO's motions
 _MARGIN = 0.01
 _HANDS = (r"tcp|tool|gripper|end_?effector|\bee\b", r"hand", r"flange|wrist")
 
@@ -158,6 +159,7 @@ def _tasks(
     }
     if polygon is not None:
         still["com"] = ComTask(robot, polygon=polygon, weight=1e3, gain=GAIN, priority=2)
+    # weak and slow: the posture only decides between motions that serve the other tasks
     still["posture"] = PostureTask(robot, target=q0, weight=1e-2, gain=1.0, priority=4)
     return still, tracking(robot, goal, weight=1e2, priority=3)
 

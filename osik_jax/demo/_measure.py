@@ -182,6 +182,7 @@ def _position_limits(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarra
     value = qpos[:, model.jnt_qposadr[joints]]
     lower, upper = model.jnt_range[joints].T
     room = np.minimum(value - lower, upper - value)
+    # the guard keeps a joint with an empty range finite
     return np.min(2.0 * room / np.maximum(upper - lower, 1e-12), -1), int((room < -TOLERANCE).sum())
 
 

@@ -108,6 +108,7 @@ def run_physics(motion: Motion, scheme: str, *, dt: float, world: World | None =
         ValueError: ``dt`` is no whole number of the timesteps of ``world``.
     """
     plan = run_scheme(motion, scheme, dt=dt)
+    # the timestep is the largest divisor of dt up to 1 ms; 1e-9 keeps an exact divisor from being rounded up
     simulation = Simulation(world or nao_world(motion.robot, timestep=dt / math.ceil(dt / 0.001 - 1e-9)), motion.q0)
     # sensed errors of the feet are those of servos and contacts: no step of the kinematics leaves them out
     own = make_scheme(scheme).replace(curvature_damping=0.0)
@@ -155,6 +156,7 @@ def measure_physics(
         com_margin=_margins(recording.com[:, :2], _hulls(world, recording, standing)),
         effort_used=used.max(-1),
         busiest=list(world.servos)[int(used.max(0).argmax())],
+        # MuJoCo clips efforts to the limit, so a saturated servo has a ratio of 1 up to rounding
         saturated=int((used >= 1.0 - 1e-9).sum()),
         beyond_limits=beyond.max(-1, initial=0.0),
         furthest=hinges[int(beyond.max(0).argmax())] if beyond.any() else None,

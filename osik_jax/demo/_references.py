@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 def minimum_jerk(t: ArrayLike | Array, start: float, duration: float) -> tuple[Array, Array]:
     """Return value and rate [1/s] of a minimum-jerk curve from 0 at ``start`` to 1 at ``start + duration`` [s]."""
     s = jnp.clip((jnp.asarray(t) - start) / duration, 0.0, 1.0)
+    # the quintic with zero velocity and acceleration at both ends, and its derivative
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 30.0 * s**2 * (1.0 - s) ** 2 / duration
 
 

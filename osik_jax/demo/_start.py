@@ -81,6 +81,7 @@ def _dexterous(robot: Robot, outline: Outline, frame: str, count: int = 256, rea
     moving = [name for name, body in zip(robot.frame_names, robot.tree.frame_bodies, strict=True) if body]
 
     def judged(step: Array) -> tuple[Array, Array, Array]:
+        # candidates stay off the limits, so that the motion has room
         q = _inside(robot, integrate(robot, robot.q0, step, 1.0), margin=0.1)
         kinematics = forward_kinematics(robot, q)
         J = frame_jacobian(robot, kinematics, frame)[:rows]
@@ -88,9 +89,11 @@ def _dexterous(robot: Robot, outline: Outline, frame: str, count: int = 256, rea
         return q, jnp.linalg.svd(J, compute_uv=False)[-1], heights
 
     configurations, worst, heights = jax.jit(jax.vmap(judged))(jnp.asarray(steps, robot.q0.dtype))
+    # how far links reach below the height that keeps them off the base
     below = np.maximum(_CLEAR * outline.size - np.asarray(heights), 0.0).sum(-1)
     if np.mean(heights[0]) < 0.0:
         below[:] = 0.0
+    # candidates that are equally high up to 0.1 % of the size count as equal
     allowed = below <= below.min() + 1e-3 * outline.size
     judged_worst = np.where(allowed, np.asarray(worst), -1.0)
     best = int(np.argmax(judged_worst))
@@ -107,6 +110,7 @@ def _settled(
     """
     last = len(targets) - 1
     tasks = [
+        # the last pose (the waist) only picks one of the solutions that keep the feet
         FrameTask(robot, frame, target=pose, rows="pose" if k == last else rows, weight=1e-4 if k == last else 1.0)
         for k, (frame, pose) in enumerate(targets.items())
     ]
@@ -117,6 +121,7 @@ def _settled(
         scale = jnp.sqrt(jnp.concatenate([part.weight for part in parts]))
         e = scale * jnp.concatenate([part.error for part in parts])
         J = scale[:, None] * jnp.concatenate([part.jacobian for part in parts])
+        # the damping keeps steps finite where legs are stretched and J loses rank
         v = -J.T @ jnp.linalg.solve(J @ J.T + 1e-7 * jnp.eye(len(e)), e)
         return _inside(robot, integrate(robot, q, v, 1.0)), jnp.sum(e**2)
 
@@ -125,6 +130,7 @@ def _settled(
         ends, errors = jax.lax.scan(lambda x, _: step(x), start, length=100)
         return ends, errors[-1]
 
+    # a fixed seed, so that the same robot always starts in the same configuration
     nudges = np.random.default_rng(0).uniform(-0.4, 0.4, (8, robot.nv)) * strides(robot, size)
     nudges *= _leg_dofs(robot, q, tuple(targets)[:last])
     nudges[0], nudges[:, :6] = 0.0, 0.0  # the base stays

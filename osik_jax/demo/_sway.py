@@ -94,6 +94,7 @@ def _can(J: Float[np.ndarray, "3 nv"], move: Float[np.ndarray, "3"], stride: Flo
 
 def _has_rank(J: Float[np.ndarray, "rows nv"]) -> bool:
     values = np.linalg.svd(J, compute_uv=False)
+    # below this ratio a direction needs joint motions a thousand times as large as the best one
     return J.shape[0] <= J.shape[1] and bool(values[-1] > 1e-3 * values[0])
 
 
@@ -102,6 +103,7 @@ def _line(
 ) -> Float[np.ndarray, " nv"]:
     """Return the line in joint space along which the frame moves most, within limits and strides."""
     _, values, rows = np.linalg.svd(J[:3] * stride)
+    # no joint moves the frame's origin: the frame turns in place instead
     still = values[0] <= 1e-9 * length
     line = (np.eye(robot.nv)[int(np.argmax(np.linalg.norm(J[3:], axis=0)))] if still else rows[0]) * stride
     line *= _TURN if still else min(length / values[0], 0.5)
@@ -115,5 +117,6 @@ def _room(robot: Robot, q0: Array, line: Float[np.ndarray, " nv"]) -> float:
     for joint, dof in robot.tree.dof_address.items():
         limit = float((robot.position_upper if line[dof] > 0.0 else robot.position_lower)[dof])
         if line[dof] != 0.0 and np.isfinite(limit):
+            # the last tenth is kept, because near a limit the schemes slow the joint down
             most = min(most, 0.9 * (limit - float(q[robot.tree.qpos_address[joint]])) / float(line[dof]))
     return max(most, 0.0)

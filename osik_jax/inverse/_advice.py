@@ -61,6 +61,7 @@ def _rows_to_keep(robot: Robot, frame: str, asked: tuple[bool, ...], joints: int
     def worth(choice: tuple[tuple[int, ...], str]) -> tuple[bool, float]:
         rows, axes = choice
         least = float(np.median(np.linalg.svd(matrices[axes][:, list(rows)], compute_uv=False)[:, -1]))
+        # sets that keep the whole position come first, then those that the joints move best
         return least > _SINGULAR and set(rows) >= set(range(min(3, joints))), least
 
     rows, axes = max(((rows, axes) for axes in matrices for rows in sets), key=worth)
@@ -76,6 +77,7 @@ def _jacobians(robot: Robot, frame: str) -> tuple[Float[Array, "samples 6 n"], F
     x = _RANGE * (2.0 * points - 1.0)
     kinematics = chain_kinematics(chain, x.T)
     matrix = jnp.moveaxis(jacobian(chain, kinematics)[0], -1, 0)
+    # lengths in units of the longest lever make rows of position and orientation comparable
     size = jnp.maximum(jnp.max(jnp.abs(matrix[:, :3])), jnp.finfo(x.dtype).tiny)
     world = jnp.concatenate([matrix[:, :3] / size, matrix[:, 3:]], 1)
     turn = jnp.moveaxis(kinematics.rotation[0], -1, 0)

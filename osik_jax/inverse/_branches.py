@@ -47,6 +47,7 @@ def with_all(
     solutions = np.full((*score.shape, q.shape[1]), np.nan, q.dtype)
     counts, branches = np.zeros(len(q), np.int32), np.zeros(len(q), np.int32)
     for target in np.flatnonzero(np.asarray(found.converged)):
+        # a score is the error over its tolerance, so up to 1 it is a solution
         good = score[target] <= 1.0
         solved = np.concatenate([q[target, own.entries][None], x[target][good]])
         alone = np.append(separation[target, found.seed[target]], separation[target][good])

@@ -129,6 +129,7 @@ def allowed(tolerance: Float[Array, "2"], length: Float[Array, ""]) -> Float[Arr
     """Tolerances less what rounding may hide, so that what is called converged is so in exact numbers too."""
     size = jnp.stack([jnp.where(jnp.isfinite(length), length, 1.0), jnp.ones_like(length)])
     hidden = _ROUNDOFF * float(jnp.finfo(tolerance.dtype).eps) * size
+    # a tolerance near roundoff keeps a quarter of itself, or no search could end
     return jnp.maximum(tolerance - hidden, 0.25 * tolerance)
 
 
@@ -154,6 +155,7 @@ def _starts(layout: Layout, turns: tuple[bool, ...], lower: Array, upper: Array,
     low = jnp.where(free, jnp.maximum(first - width, lower), lower)
     high = jnp.where(free, jnp.minimum(first + width, upper), upper)
     once, again = one_turn(lower, upper, first)
+    # beyond a whole turn, starts would repeat the same poses
     wide = np.array(turns) & (upper - lower > 2.0 * np.pi)
     return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, again, high).astype(first.dtype)
 
@@ -223,6 +225,7 @@ def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
     """Return a lower bound on the distance from each target to the workspace, 0 where it may be inside."""
     length, root = reaches(search.chain, search.first, *starting_box(search.lower, search.upper))
     asked = np.array(search.rows)[:, :3].all(-1)
+    # rounded up, so that a target on the boundary is never called out of reach
     longest = length * (1.0 + _ROUNDOFF * float(jnp.finfo(length.dtype).eps))
     away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - longest
     away = jnp.where(jnp.isfinite(away) & asked, away, 0.0)

@@ -121,6 +121,7 @@ class ChainSearch(eqx.Module):
         error, matrix, errors = self.linearised(x, goal)
         gradient = _transposed_times(matrix, error)
         lower, upper = self.lower[:, None], self.upper[:, None]
+        # a joint at a limit that the descent direction points beyond would be clipped there anyway
         free = ~(((x <= lower) & (gradient > 0.0)) | ((x >= upper) & (gradient < 0.0)))
         matrix = jnp.where(free, matrix, 0.0)
         damping = _DAMPING * errors.cost + _LEAST_DAMPING * self.length**2
@@ -139,6 +140,7 @@ class ChainSearch(eqx.Module):
         forced = jnp.where(low, self.lower, jnp.where(high, self.upper, x)) - x
         error = error + _times(matrix, forced[:, None])
         matrix = jnp.where((low | high)[:, None], 0.0, matrix)
+        # just above roundoff: at a regular solution it does not change the derivative, at a singular one it is finite
         ridge = 100.0 * jnp.finfo(x.dtype).eps * jnp.maximum(jnp.sum(matrix**2, (0, 1)), self.length**2)
         step = _transposed_times(matrix, solve_positive(_gram(matrix, ridge), error))
         return forced - step[:, 0]
@@ -163,6 +165,7 @@ class ChainSearch(eqx.Module):
         """Whether a solution is the only one around: every motion of the joints takes a frame off its target."""
         matrix = self.linearised(x.T, lanes_last(goal))[1]
         if len(matrix) < x.shape[1]:
+            # with fewer rows than joints there is always a motion that keeps the frames
             return jnp.zeros(len(x), bool)
         squares = jnp.sum(matrix[:, :, None] * matrix[:, None], 0)
         _, pivot = solve_with_pivots(squares, jnp.zeros_like(x.T))

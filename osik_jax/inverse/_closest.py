@@ -53,6 +53,7 @@ def closest(
     lanes = jax.tree.map(lambda a: jnp.repeat(a, groups, 0), goals)
     end, error, steps = search.local_optima(start, lanes, jnp.repeat(open_, groups))
     ends, errors = end.reshape(targets, groups, n), error.reshape(targets, groups)
+    # argmin would choose NaN
     errors = jnp.where(jnp.isnan(errors), jnp.inf, errors)
     equal = errors <= jnp.min(errors, 1, keepdims=True) + _EQUAL * search.tolerance[0]
     away = jax.vmap(jax.vmap(search.distance))(search.unwound(ends)) if near else jnp.arange(groups, dtype=x.dtype)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+# below this, angle over sine of half the angle is 2 up to 1e-12
 _SMALL_SINE_SQUARED = 1e-12
 
 
@@ -14,6 +15,7 @@ def rotation_error(
     """Axis times angle, in world axes, of the turn from the target to the rotation; angles up to pi [rad]."""
     first, second, third = (rotation[:, :, None, i] * target[:, None, :, i] for i in range(3))
     wxyz = _quaternion(first + second + third)
+    # q and -q are the same rotation; with w >= 0 the angle is at most pi
     wxyz = jnp.where(wxyz[:, :1] < 0.0, -wxyz, wxyz)
     cosine, vector = wxyz[:, :1], wxyz[:, 1:]
     squared = jnp.sum(vector**2, 1, keepdims=True)

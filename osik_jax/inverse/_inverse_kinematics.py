@@ -196,6 +196,7 @@ def checked_tolerance(value: Any, dtype: Any) -> Any:
     seen = concrete(out)
     if out.shape != () or (seen is not None and not (np.isfinite(seen) and seen > 0.0)):
         raise OsikValueError(f"a tolerance is {value!r}; it is one positive number, in metres or radians")
+    # smaller tolerances are below the rounding of kinematics of a robot of about a metre
     least = 1e-4 if out.dtype == jnp.float32 else 1e-11
     if seen is not None and seen < least:
         raise OsikValueError(f"a tolerance is {value!r}; {out.dtype} can tell errors of {least:g} and more")

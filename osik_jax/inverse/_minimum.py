@@ -21,6 +21,7 @@ _LONGEST = 1.0
 """Longest step of a coordinate [rad or m]."""
 _DAMPING = 1e-3
 """Damping of the first step, relative to the largest entry of the Hessian's diagonal. Steps with more prove nothing."""
+# keeps the Hessian regular where the errors leave a joint free
 _LEAST_DAMPING = 1e-9
 _LESS, _MORE = 0.1, 6.0
 """Factors of the damping after a step that lowers the cost, and after one that does not."""
@@ -90,6 +91,7 @@ def minimum(
     lanes = x.shape[1]
     nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(model, x))
     unknown = jnp.full(lanes, jnp.inf, x.dtype)
+    # the first trial is the start itself, which counts as a success and lowers the damping
     damping = jnp.full(lanes, _DAMPING / _LESS, x.dtype)
     end = jax.lax.while_loop(
         goes_on, body, _State(x, unknown, nothing, x, unknown, damping, open_, jnp.zeros(lanes, jnp.int32))
@@ -105,6 +107,7 @@ def _step(model: Model, lower: Array, upper: Array, gain: Array, state: _State) 
     x, lowest, (error, matrix, curvature) = jax.tree.map(
         lambda a, b: jnp.where(better, a, b), (state.trial, cost, new), (state.x, state.cost, state.model)
     )
+    # a small step counts as the end only if damping did not make it small
     settled = (state.promised <= gain * jnp.sqrt(2.0 * lowest)) & (state.damping <= _DAMPING)
     damping = jnp.maximum(state.damping * jnp.where(better, _LESS, _MORE), _LEAST_DAMPING)
     gradient = jnp.sum(matrix * error[:, None], 0)

@@ -176,6 +176,7 @@ def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
     none = jnp.full(found.seed.shape, len(number), jnp.int32)
     winner = none.at[lanes.target].min(jnp.where(wins, number, len(number)))
     wins &= winner[lanes.target] == number
+    # each target is written by one lane only, because the order of colliding writes is undefined on a GPU
     row = jnp.where(wins, lanes.target, len(found.seed))  # out of range: dropped
 
     def put(old: Array, new: Array) -> Array:
@@ -192,6 +193,7 @@ def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
 def _culled(lanes: _Lanes, x: Array, errors: Errors, found: Found, longest: Array, enough: Array) -> _Lanes:
     """Searches end when their target is found, when they are too long, and when they no longer make progress."""
     age = lanes.age + CHECK
+    # the negated comparison also ends a search whose cost is NaN
     stuck = (age > _TRIAL) & ~(errors.cost < _PROGRESS * lanes.cost)
     ends = stuck | (age >= longest) | (found.errors.score[lanes.target] <= enough)
     idle = len(found.seed) - 1

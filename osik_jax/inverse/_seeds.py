@@ -20,6 +20,7 @@ def shift_of(key: int | Array, dimensions: int) -> UInt[Array, " n"]:
 
 def starting_box(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Limits as searches start within them: infinite beyond 100 rad or 100 m, which spread starts over nothing."""
+    # starts spread over such a range would practically never be inside the robot's real one
     return jnp.where(lower < -_UNLIMITED, -jnp.inf, lower), jnp.where(upper > _UNLIMITED, jnp.inf, upper)
 
 
@@ -40,6 +41,7 @@ def unit_points(shift: UInt[Array, " n"], number: Int[Array, "..."], dtype: jnp.
 
 
 def _increments(dimensions: int) -> np.ndarray:
+    # any start above 1 converges to the fixed point
     phi = 1.5
     for _ in range(64):  # a contraction: phi = (1 + phi)^(1 / (n + 1))
         phi = (1.0 + phi) ** (1.0 / (dimensions + 1))

@@ -31,9 +31,11 @@ from ._turns import TURN, one_turn
 _KEPT = (ConfigurationLimit, CollisionAvoidanceLimit, PositionBarrier)
 _ON_PLACES = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask, ComTask, ContactTask)
 """Tasks that see where bodies are and not by which joints."""
+# score at which a search ends; the next step would be roundoff
 _ENOUGH = 0.01
 _RADIUS = 1.0
 """Length by which the rounding of positions is judged [m]."""
+# least gradient, relative to its largest value for the error, at which a limit counts as stopping a joint
 _STOPPED = 1e-3
 _AT = 1e-6
 """A joint that is nearer to its limit is at it [rad or m]."""
@@ -173,6 +175,7 @@ def turning(robot: Robot, tasks: Mapping[str, Task]) -> tuple[bool, ...]:
         turns[at] = robot.tree.joint_types[joint] == HINGE
     index, factor = robot.tree.qpos_source
     for entry, share in zip(index.tolist(), factor.tolist(), strict=True):
+        # a coupled joint with a fractional ratio is elsewhere after a whole turn of its leader
         if share and share % 1.0:
             turns[entry] = False
     return tuple(turns.tolist())

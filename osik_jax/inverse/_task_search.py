@@ -141,6 +141,7 @@ class TaskSearch(eqx.Module):
     def step(self, q: Float[Array, " nq"], goal: Aims) -> tuple[Float[Array, " nq"], Errors]:
         """Return the next configuration, and the errors at the present one. A finished search does not move."""
         errors = self.errors(q, goal)[1]
+        # preferences fade with the error, so that they vanish at a solution
         gain = jnp.minimum(_PREFERENCES * errors.score, self.preferred)
         faded = {
             name: task if is_goal(task) else task.replace(gain=gain.astype(q.dtype))
@@ -152,6 +153,7 @@ class TaskSearch(eqx.Module):
             problem, lower=jnp.clip(problem.lower, -step, step), upper=jnp.clip(problem.upper, -step, step)
         )
         velocity = self.scheme.solve(problem).velocity
+        # a step that failed leaves the lane where it is, and the pool replaces it
         velocity = jnp.where(jnp.isfinite(velocity), jnp.clip(velocity, problem.lower, problem.upper), 0.0)
         return jnp.where(errors.score <= self.enough, q, self._moved(q, velocity)), errors
 

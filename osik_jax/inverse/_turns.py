@@ -27,6 +27,7 @@ def unwound(
         upper: likewise.
         turns: of each coordinate, whether a whole turn changes no pose.
     """
+    # the numbers of turns that stay inside the limits; infinite limits allow any number
     fewest, most = jnp.ceil((lower - x) / TURN), jnp.floor((upper - x) / TURN)
     number = jnp.clip(jnp.round((about - x) / TURN), fewest, most)
     moved = jnp.clip(x + TURN * number, lower, upper)

@@ -121,6 +121,7 @@ class _Reachable(Limit):
 
     def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
         del robot, q
+        # infinite minus infinite would be NaN, also in derivatives
         free = jnp.isinf(self.acceleration)
         change = _rounded(jnp.where(free, 0.0, self.acceleration) * dt)
         lower, upper = self.velocity - change, self.velocity + change
@@ -142,6 +143,7 @@ class _Stopping(Limit):
         position = jnp.asarray(q)[index]
         above = stopping_speed(_way(jnp.where(scalar, self.upper, jnp.inf), position), self.acceleration, dt)
         below = stopping_speed(_way(-jnp.where(scalar, self.lower, -jnp.inf), -position), self.acceleration, dt)
+        # a joint beyond its range has a negative stopping speed: it returns, at most at the return speed
         lower, upper = -jnp.maximum(below, -self.return_speed), jnp.maximum(above, -self.return_speed)
         outside = upper < 0.0  # above the range; below it, the lower bound is the one to give way
         least, most = jnp.minimum(lower, upper), jnp.maximum(lower, upper)
@@ -173,8 +175,11 @@ def stopping_speed(
     way_left = jnp.where(free, 0.0, way)
     change = jnp.where(instant, 1.0, acceleration) * dt
     least = jnp.finfo(way_left.dtype).tiny
+    # the number of braking steps is piecewise constant: it has no derivative
     triangle = jax.lax.stop_gradient(jnp.maximum(way_left, 0.0) / jnp.maximum(change * dt, least))
+    # least n with n (n + 1) / 2 >= triangle, by the quadratic formula
     steps = jnp.ceil(0.5 * (jnp.sqrt(1.0 + 8.0 * triangle) - 1.0))
+    # the upper end keeps the quotient finite for accelerations near 0
     steps = jnp.where(instant, 1.0, jnp.clip(steps, 1.0, _MOST_STEPS))
     speed = way_left / (steps * dt) + 0.5 * (steps - 1.0) * change
     return jnp.where(free, way, speed)

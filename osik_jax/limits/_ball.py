@@ -79,6 +79,7 @@ def ball_rates(
     free, share = upper[first] >= jnp.pi, gain[first]  # no rotation is greater than pi
     span = jnp.where(free, jnp.pi, upper[first])
     way, least = span - angle, (shortest if np.isfinite(shortest) else 1.0) * span
+    # a box of this half-width has no vector longer than the allowed step
     longest = jnp.maximum(share * way, least) / jnp.sqrt(3.0)
     speed = return_speed[first]
     unlimited = jnp.isinf(speed)  # inf dt has no derivative

@@ -75,6 +75,7 @@ class PositionBarrier(Limit):
     ) -> LimitRows:
         """One row for each normal."""
         del q
+        # with a gain of 1 / dt one step reaches the plane; more would cross it
         rate = at_most_inverse(self.gain, dt)
         position, _ = kinematics.frame_pose(robot, self.frame)
         value = jnp.matmul(self.normals, position, precision="highest")
@@ -92,5 +93,6 @@ class PositionBarrier(Limit):
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
     """``rate (bound - value)``; an infinite bound stays so, with gradients 0."""
+    # rate times infinity has a NaN gradient by the rate
     free = jnp.isinf(bound)
     return jnp.where(free, bound, rate * (jnp.where(free, 0.0, bound) - value))

@@ -19,6 +19,7 @@ from ._rows import LimitRows
 
 Kind = Literal["acceleration", "velocity", "braking", "position"]
 _COMPUTED: tuple[Kind, ...] = ("acceleration", "braking")
+# machine epsilons by which two evaluations of the same bound may differ
 _ROUNDOFF = 4.0
 _ORDER: tuple[Kind, ...] = ("acceleration", "velocity", "braking", "position")
 
@@ -94,6 +95,7 @@ def limit_box(
     dtype = jnp.result_type(jnp.asarray(q), robot.q0)
     lower, upper = jnp.full(robot.nv, -jnp.inf, dtype), jnp.full(robot.nv, jnp.inf, dtype)
     parts = [part for limit in limits for part in limit.parts()]
+    # the first of two contradicting bounds holds, so physical limits (acceleration, speed) come before positions
     for limit in sorted(parts, key=lambda part: _ORDER.index(part.kind)):
         low, high = limit.box(robot, q, dt)
         lower, upper = clipped(low, lower, upper), clipped(high, lower, upper)

@@ -142,6 +142,7 @@ class CollisionAvoidanceLimit(Limit):
         jacobian = separation_jacobian(robot.tree, kinematics, near, self.scene.pair_bodies)
         gap = near.distance - self.minimum_distance
         soonest = jax.lax.top_k(-_time_to_meet(gap, jacobian), self.max_pairs)[1]
+        # with a gain of 1 / dt one step closes the gap; a negative gap asks to part at no more than the recovery speed
         lower = jnp.minimum(-at_most_inverse(self.gain, dt) * gap, self.recovery_speed)
         lower = jnp.where(near.distance < self.detection_distance, lower, -jnp.inf)[soonest]
         return LimitRows(jacobian[soonest], lower, jnp.full_like(lower, jnp.inf))
@@ -200,6 +201,7 @@ class CollisionAvoidanceLimit(Limit):
 
 def _time_to_meet(gap: Float[Array, " pairs"], jacobian: Float[Array, "pairs nv"]) -> Float[Array, " pairs"]:
     """Time until pairs are too near [s], with each dof at 1 rad/s or m/s in the worst direction; constant."""
+    # the choice of pairs is discrete and has no derivative
     gap, jacobian = jax.lax.stop_gradient((gap, jacobian))
     return gap / (jnp.sum(jnp.abs(jacobian), -1) + _SLOWEST)
 

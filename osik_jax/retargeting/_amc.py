@@ -12,6 +12,7 @@ from .._errors import OsikValueError
 from ._motion import HumanMotion
 from ._rotations import continuous
 
+# an inch [m]; an ASF unit is an inch over the file's ``length``
 _INCH = 0.0254
 _FPS = 120.0
 """Frame rate of the CMU database [1/s]; the AMC format does not store a rate."""
@@ -49,6 +50,7 @@ def read_amc(path: Path, skeleton: Path | None = None, fps: float = _FPS) -> Hum
     for name, bone in bones.items():
         own = dict(zip(bone.dofs, values[name].T, strict=True)) if bone.dofs else {}
         angles = np.stack([own.get(f"r{axis}", np.zeros(count)) for axis in "xyz"], 1)
+        # angles are about the bone's own axes: conjugation turns them into the world's
         local = bone.axes * Rotation.from_euler("xyz", angles, degrees=degrees) * bone.axes.inv()
         if not bone.parent:
             moves = np.stack([own.get(f"t{axis}", np.zeros(count)) for axis in "xyz"], 1)

@@ -64,6 +64,7 @@ def overhang(center: Float[Array, "2"], corners: Float[Array, "8 2"], stands: Fl
     best = jnp.argmax(distances)
     # along a normal the hull is as wide as its support there and in the opposite direction together
     lines = len(edge)
+    # lines between corners that do not stand have no width
     width = jnp.where(exists[:lines], support[:lines] + support[lines : 2 * lines], jnp.inf).min()
     coefficients = jnp.zeros(8).at[first[best]].add(1.0 - ratio[best]).at[second[best]].add(ratio[best])
     return Overhang(distances[best], directions[best], coefficients, width)

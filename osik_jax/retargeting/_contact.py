@@ -111,6 +111,7 @@ def find_contact(
     steps = min(noise_steps(noise, fps, speed), max(len(points) - 1, 1))
     low = mean_over(points[..., 2], steps) - ground < height
     stands = low & _still(points, fps, noise, speed, steps)
+    # a contact lasts two frames at least, also at low rates
     least = max(2, round(_SHORTEST * fps))
     # two means over ``steps`` frames differ by noise with a standard deviation of noise * sqrt(2 / steps) per axis
     longest, back = max(least, steps) + 1, _STAYS + 2.0 * noise * np.sqrt(2.0 / steps) * (steps > 1)

@@ -39,6 +39,7 @@ def film(result: Retargeted, path: str | os.PathLike[str]) -> Path:
     stride = max(1, round(result.motion.fps / _RATE))
     person = _person_sticks(result)[::stride]
     robot = _robot_sticks(result)[::stride]
+    # the guard keeps a robot that lies flat in the first frame finite
     robot = robot * (np.ptp(person[0, ..., 2]) / max(np.ptp(robot[0, ..., 2]), 1e-6))
     views = [_projected(sticks) for sticks in (person, robot)]
     figure = Figure(figsize=(6.4, 3.6), dpi=100)

@@ -75,6 +75,7 @@ def velocity_inside(
     spare = _SPARE * _accelerations(robot, limits)
     lower, upper = limit_box(robot, q, remembering(tuple(limits), velocity, True), dt)
     behind = difference(robot, q, goal)
+    # at this speed the joint can still stop at the plan with the spare acceleration: no overshoot
     back = jnp.sign(behind) * stopping_speed(jnp.abs(behind), spare, dt)
     return jnp.clip(difference(robot, goal, following) / dt + back, lower, upper), lower, upper
 

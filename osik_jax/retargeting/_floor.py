@@ -74,6 +74,7 @@ def find_floor(points: Float[np.ndarray, "F k 3"], fps: float, noise: float) -> 
     for columns in ([0, 1], [2], [0, 1, 2]):
         floor = _fitted(places, height, time, columns)
         rest = height - floor.height - places @ np.array(floor.slope) - floor.drift * time
+        # each further column must halve the residual again, so that the simplest sufficient floor wins
         better = _deviation(rest) < _HALF * left and np.mean(rest > HEIGHT) < _HALF * off
         if better and np.hypot(*floor.slope) < _STEEPEST and abs(floor.drift) < _FASTEST:
             best, off, left = floor, np.mean(rest > HEIGHT), _deviation(rest)

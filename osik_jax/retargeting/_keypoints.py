@@ -178,6 +178,7 @@ def _rate(path: Path, time: np.ndarray, lines: list[int]) -> float:
     """Return the frame rate [1/s]; raise ValueError unless the times are evenly spaced to a tenth of a step."""
     steps = np.diff(time)
     step = np.median(steps)
+    # files round their times, so a tenth of a step is allowed; more is a gap
     uneven = np.flatnonzero((np.abs(steps - step) > 0.1 * abs(step)) | (steps <= 0.0))
     if uneven.size:
         where = lines[int(uneven[0]) + 1]

@@ -55,6 +55,7 @@ def as_lane(clip: Clip, length: int) -> _Lane:
 
 def shared_length(clip: Clip) -> int:
     """Return a padded length shared by clips of similar length: at most a quarter more, and few distinct values."""
+    # steps of an eighth of the next power of two: at most a quarter is padding, with four lengths per doubling
     step = max(LENGTHS, (1 << (clip.frames - 1).bit_length()) // 8)
     return -(-clip.frames // step) * step
 

@@ -223,6 +223,7 @@ class LiveRetargeter(OnRobot):
         with np.errstate(invalid="ignore"):
             seen = np.where((np.abs(seen) <= LARGEST).all(-1, keepdims=True), seen, np.nan)
         self._known = np.where(np.isnan(seen), self._known, seen)
+        # the first frame fills the history, as if the person had stood there before
         copies = 1 if self._seen else self._history + 1
         self._seen += [seen] * copies
         self._stands += [stands] * copies
@@ -277,6 +278,7 @@ class LiveRetargeter(OnRobot):
             before = velocity, stance, plan.damping
             plan = _advance(*known, plan.q, before, contact, self.limits, self._dt, more)
             plan = plan._replace(iterations=plan.iterations + self.iterations - more)
+        # the last pass counts as one iteration
         spent = (time.perf_counter() - start) / (int(plan.iterations) + 1)
         mean = self._iteration_seconds
         if not first:  # the first call may include compilation
@@ -302,7 +304,9 @@ def _advance(
     mended = mend_plan(body, goals, weights, bounds, q, 1.0 * (jnp.arange(len(q)) >= _PAST), iterations, damping)
     # if all steps were refused, the next frame starts with more damping
     taken = jnp.any(mended.q != q)
+    # the damping is carried from frame to frame, because a frame has too few iterations to find it anew
     damping = jnp.clip(damping * jnp.where(taken, _LESS, _MORE), _DAMPING, _MOST_DAMPING)
+    # a plan that is not finite is replaced by standing still
     still = jnp.concatenate([q[:_PAST], jnp.broadcast_to(q[_PAST - 1], q[_PAST:].shape)])
     plan = jnp.where(jnp.isfinite(mended.q).all(), mended.q, still)
     goal = plan[_PAST - 1]

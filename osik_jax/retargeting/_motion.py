@@ -132,6 +132,7 @@ def check_rate(fps: float) -> float:
 
 def instants(frames: int, fps: float, wanted: float) -> tuple[np.ndarray, np.ndarray]:
     """Return, for each instant of another rate, the frame before it and its fraction of the way to the next frame."""
+    # 1e-9 keeps the last frame where the rates divide evenly up to rounding
     at = np.arange(int(np.floor((frames - 1) / fps * wanted + 1e-9)) + 1) / wanted * fps
     before = np.minimum(at.astype(int), frames - 2)
     return before, np.clip(at - before, 0.0, 1.0)

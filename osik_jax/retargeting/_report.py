@@ -130,6 +130,7 @@ def _penetration(result: Retargeted, ends: Float[np.ndarray, "F k 2 3"]) -> floa
     for placed in ends:
         _place(model, data, placed)
         for pair in pairs:
+            # beyond 0.1 m MuJoCo stops computing; only overlaps count here
             deepest = max(deepest, -mujoco.mj_geomDistance(model, data, *pair, 0.1, None))
     return 1e3 * deepest
 

@@ -46,6 +46,7 @@ class RobotMotion:
         if not np.isfinite(self.qpos).all():
             raise OsikValueError(f"qpos is not finite in frame {int(np.argwhere(~np.isfinite(self.qpos))[0][0])}")
         off = np.abs(np.linalg.norm(self.qpos[:, 3:7], axis=1) - 1.0)
+        # tolerance for the rounding of numbers in files
         if off.max() > 1e-3:
             raise OsikValueError(
                 f"the base's quaternion (columns 3 to 6) is not of unit length in frame {off.argmax()}"

@@ -154,7 +154,9 @@ def _draw_in(polygon: _Polygon, margin: float) -> _Polygon | None:
     normals, offsets = polygon[0], polygon[1] - margin
     i, j = np.triu_indices(len(offsets), 1)
     pairs = np.stack([normals[i], normals[j]], 1)
+    # nearly parallel edges have no reliable intersection
     crossing = np.abs(np.linalg.det(pairs)) > 1e-9
     points = np.linalg.solve(pairs[crossing], np.stack([offsets[i], offsets[j]], 1)[crossing][..., None])[..., 0]
+    # vertices lie on their own two edges only up to rounding
     inside = (points @ normals.T <= offsets + 1e-9).all(1)
     return hull(points[inside])

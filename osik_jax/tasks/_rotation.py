@@ -26,6 +26,7 @@ def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     sine = jnp.sqrt(jnp.where(small, 1.0, sine_squared))
     safe_cosine = jnp.where(small, cosine, 1.0)
     tangent_squared = sine_squared / safe_cosine**2
+    # 2 atan(t) / t / cos, by the Taylor series of atan to t^4
     series = (2.0 - tangent_squared * (2.0 / 3.0 - tangent_squared * (2.0 / 5.0))) / safe_cosine
     return jnp.where(small, series, 2.0 * jnp.arctan2(sine, cosine) / sine) * vector
 

@@ -119,6 +119,7 @@ def _draw_bound(axes: Axes, panel: Panel) -> None:
     assert panel.bound is not None
     low, high = axes.get_ylim()
     if panel.floor is None:
+        # space beyond the bound, so that its line and tint are visible
         room = 0.08 * (max(high, panel.bound) - min(low, panel.bound))
         low, high = min(low, panel.bound - room), max(high, panel.bound) + room
     else:
@@ -251,6 +252,7 @@ def _side_by_side(
     right = Camera((0.0, 0.0, 0.0), 1.0, azimuth, 0.0, 1.0).axes[0]
     low = np.array([(points @ right).min() for points in instants])
     high = np.array([(points @ right).max() for points in instants])
+    # 8 % more than the widest robot, so that neighbours do not touch
     gap = 1.08 * float((high - low).max()) if spacing is None else spacing
     if gap == 0.0:
         return np.zeros((len(instants), 3))

@@ -129,6 +129,7 @@ class PlanPanel:
         self._com, self._support = 1e3 * com, [1e3 * vertices for vertices in support]
         axes = card(canvas, rectangle, "support and centre of mass from above [mm]")
         points = np.concatenate([self._com[:, :2], *self._support])
+        # space around polygon and path inside the panel
         room = 0.06 * np.ptp(points, axis=0).max()
         low, high = points.min(0) - room, points.max(0) + room
         axes.set_aspect("equal", adjustable="box", anchor="W")

@@ -230,6 +230,7 @@ def _sticks(robot: Robot, tips: tuple[np.ndarray, np.ndarray]) -> tuple[Part, ..
     length = np.linalg.norm(end - start, axis=-1)
     length[: model.nbody][model.body_parentid == 0] = 0.0
     extent = float(np.linalg.norm(np.ptp(np.concatenate([start, end]), axis=0)))
+    # thin beside typical links and beside the whole robot, also if one of both sizes is unusual
     radius = min(0.13 * float(np.median(length[length > 1e-6])), 0.02 * extent) if np.any(length > 1e-6) else 0.02
     dots = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
     return (
@@ -266,6 +267,7 @@ def _link_frames(along: Float[np.ndarray, "links 3"]) -> Float[np.ndarray, "link
     """Return rotations whose z axis points along each link. (k, 3, 3)."""
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     z = np.where(length > 0.0, along / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    # any axis that is not nearly parallel to z makes a well-conditioned cross product
     x = np.cross(np.where(np.abs(z[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), z)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], -1)

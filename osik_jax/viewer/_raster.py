@@ -95,6 +95,7 @@ class Rasterizer(RayCaster):
         n = normals[seen] / np.maximum(np.linalg.norm(normals[seen], axis=-1, keepdims=True), 1e-300)
         n *= np.where(away[seen], -1.0, 1.0)[:, None]
         points = eye + depth[:, None] * rays
+        # lifted off the surface, or rounding would put points in their own shadow
         lit = self._unshaded(lamp, points + 1e-3 * self.camera.height * n)
         color, cover = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
         color[rows, columns], cover[rows, columns] = light(self._colors[seen], n, rays, lit), 1.0
@@ -120,6 +121,7 @@ class Rasterizer(RayCaster):
         place = (np.stack([right, up], -1) / depth[:, None] - lamp.low) / lamp.step - 0.5
         corner, hidden = np.floor(place).astype(int), np.zeros(len(points))
         part = place - corner
+        # bilinear mean of four shadow tests, which softens the steps of the depth buffer
         for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
             column, row = np.clip(corner + shift, 0, self._shadow_size - 1).T
             near = lamp.nearness[row, column]
@@ -145,7 +147,9 @@ def _surface(part: Part) -> _Surface:
         vertices, faces = part.mesh
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(0), 1, 0)
     areas = np.cross(b - a, c - a)
+    # the area vectors of a closed surface add up to 0 (divergence theorem)
     closed = np.linalg.norm(areas.sum(0)) < 1e-3 * np.linalg.norm(areas, axis=-1).sum()
+    # six times the enclosed volume, which is negative if the faces are turned inwards
     inside_out = np.sum(a * areas) < 0.0
     return _Surface(vertices, faces[:, ::-1] if closed and inside_out else faces, bool(closed))
 
@@ -214,6 +218,7 @@ def _rows(places: np.ndarray, nearness: np.ndarray, first: np.ndarray, last: np.
         low = np.where(slope > 0.0, np.maximum(low, root), low)
         high = np.where(slope < 0.0, np.minimum(high, root), high)
         high = np.where((slope == 0.0) & (value < 0.0), -1.0, high)
+    # pixels whose centre lies on an edge up to rounding belong to both triangles: no gaps
     start = np.ceil(low - 1e-9).astype(int)
     count = np.maximum(np.floor(high + 1e-9).astype(int) - start + 1, 0)
     count[np.isinf(area)[place]] = 0

@@ -40,6 +40,7 @@ class RayCaster:
     def __init__(self, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float) -> None:
         """Draw the empty floor at height ``floor`` [m], once for all pictures."""
         self.stage, self.camera, self.size, self._floor = stage, camera, size, floor
+        # far enough for nearly parallel light
         self._lamp = np.asarray(camera.center) + 6.0 * camera.height * TO_LAMP
         self._background, self._ground = self._empty_floor()
 
@@ -90,6 +91,7 @@ class RayCaster:
         center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:]  # the floor is geom 0
         middle = self.camera.project(center, self.size)
         depth = (center - self.camera.eye) @ self.camera.axes[2]
+        # 10 % more for the perspective of spheres off the axis, and one block for the grid
         reach = 1.1 * radius * self.camera.distance / depth * self.size[1] / self.camera.height + _BLOCK
         shape = tuple(-(-n // _BLOCK) for n in (self.size[1], self.size[0]))
         row, column = (_BLOCK * (k + 0.5) for k in np.indices(shape))
@@ -118,6 +120,7 @@ class RayCaster:
         point = self.camera.eye + hits.distance[seen, None] * ray
         lit = np.zeros(len(seen))
         turned = np.flatnonzero(n @ TO_LAMP > 0.0)  # only these faces can be in another part's shadow
+        # lifted off the surface, or rounding would put points in their own shadow
         lit[turned] = self._lit(data, (point + 1e-3 * self.camera.height * n)[turned])
         color[seen] = light(self.stage.colors[hits.geom[seen] - 1], n, ray, lit)
         return color
@@ -141,11 +144,13 @@ class RayCaster:
         center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:, None]
         way = center - self._lamp
         foot = self._lamp + way * ((self._floor - self._lamp[2]) / way[:, 2:])
+        # a slanted lamp stretches the shadow of a sphere along the floor
         low, high = (foot[:, :2] - 2.5 * radius).min(0), (foot[:, :2] + 2.5 * radius).max(0)
         step = (high - low) / (_SHADOW_MAP - 1)
         i, j = np.mgrid[:_SHADOW_MAP, :_SHADOW_MAP]
         grid = np.stack([low[0] + i * step[0], low[1] + j * step[1], np.full(i.shape, self._floor)], -1)
         dark = 1.0 - lit(grid.reshape(-1, 3)).reshape(i.shape)
+        # blurred by the same length in the world along both axes of the map
         soft = ndimage.gaussian_filter(dark, 0.012 * self.camera.height / step)
         place = np.moveaxis((self._ground - low) / step, -1, 0)
         keep = np.ones(self._ground.shape[:2], np.float32)
@@ -164,6 +169,7 @@ class RayCaster:
 
     def _floor_point(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         rays = self.camera.rays(pixels, self.size)
+        # rays towards the sky never meet the floor: the guard keeps the quotient finite
         down = np.minimum(rays[:, 2:], -1e-6)
         far = 1e3 * self.camera.height
         reach = np.where(rays[:, 2:] < 0.0, (self._floor - self.camera.eye[2]) / down, far)
@@ -195,6 +201,7 @@ def light(
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     shine = np.clip(np.sum(normals * half, -1), 0.0, 1.0) ** 40 * (lamp > 0.0)
     facing = np.clip(-np.sum(normals * rays, -1), 0.0, 1.0)
+    # ambient light, light from the sky, the lamp, and a weak light from the camera
     shades = 0.40 + 0.13 * normals[:, 2] + 0.40 * lamp + 0.14 * facing
     return np.clip(colors * shades[:, None] + 0.16 * shine[:, None], 0.0, 1.0)
 
@@ -210,6 +217,7 @@ def _edges(geom: np.ndarray, normal: Float[np.ndarray, "h w 3"]) -> np.ndarray:
     edge = np.zeros(geom.shape, bool)
     halves = (np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])
     for first, second in halves:
+        # faces that meet at more than 60 degrees
         crease = np.einsum("ijk,ijk->ij", normal[first], normal[second]) < 0.5
         differs = (geom[first] != geom[second]) | (crease & (geom[first] >= 0))
         edge[first] |= differs

@@ -57,6 +57,7 @@ def cylinder(radius: float, half_length: float, detail: int) -> Quads:
 
 def _inner_rings(radius: float, half_length: float, detail: int) -> np.ndarray:
     """Return rings between the ends of a long cylinder, so that no quad is much longer than wide."""
+    # rings about as far apart as the surface is wide; the guard is for a radius of 0
     count = min(detail, int(half_length / max(radius, 1e-9)))
     height = np.linspace(-half_length, half_length, count + 2)[1:-1]
     return np.stack([np.full_like(height, radius), height], -1)

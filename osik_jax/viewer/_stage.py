@@ -116,6 +116,7 @@ def frame_camera(
         for x, (low, high) in zip((across, up), sides, strict=True)
     ]
     tall = max((most - least) / (high - low) for (most, least), (low, high) in zip(spans, sides, strict=True))
+    # the camera stays in front of the nearest point, with half as much again
     height = float(max(tall, -1.5 * behind.min(), 1e-9))
     x, y = (
         0.5 * (most - high * height + least - low * height)

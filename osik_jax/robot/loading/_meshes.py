@@ -66,6 +66,7 @@ def _has_area(part: Triangles) -> bool:
     if len(part.vertices) < 4 or not np.isfinite(part.vertices).all():
         return False
     a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
+    # twice the area relative to the squared size: below it all triangles are slivers, which MuJoCo refuses
     return bool(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() > 1e-12 * np.ptp(part.vertices, 0).max() ** 2)
 
 

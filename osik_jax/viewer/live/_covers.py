@@ -58,10 +58,12 @@ def _cover(points: Float[np.ndarray, "k 3"], frame: str) -> CollisionShape:
     own = (points - middle) @ axes.T
     low, high = own.min(0), own.max(0)
     own, center = own - 0.5 * (low + high), middle + 0.5 * (low + high) @ axes
+    # flat links get a half thickness of 1 mm
     half = np.maximum(0.5 * (high - low), 1e-3)
     fits = [_capsule(own, along) for along in range(3)]
     along = int(np.argmin([volume for *_, volume in fits]))
     radius, reach, volume = fits[along]
+    # 8 a b c is the volume of a box with these half lengths
     if 8.0 * np.prod(half) < _BOX * volume:
         return CollisionShape.box(half, center, axes.T, frame=frame)
     end = max(reach, 1e-3) * axes[along]

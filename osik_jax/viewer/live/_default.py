@@ -18,6 +18,7 @@ from ._source import RobotSource
 
 _HANDS = (r"gripper|tcp|tool|end_?effector|\bee\b", r"rubber_hand|palm|hand(?!.*(index|middle|thumb|finger))", r"wrist")
 _SIDES = {"left": r"(^|_)(l|left)(_|$)|left|^L(?=[A-Z])", "right": r"(^|_)(r|right)(_|$)|right|^R(?=[A-Z])"}
+# gain of the default tasks [1/s]
 _GAIN = 15.0
 WEIGHTS = {"foot": 1e4, "balance": 1e3, "waist": 1e2, "com": 1e2, "hand": 1e2, "posture": 1e-2}
 """Weights of the default tasks in the weighted scheme; the other schemes use priorities."""

@@ -18,6 +18,7 @@ Pose = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]
 """Position [m] and quaternion w x y z."""
 Dragged = Callable[[str, Pose, int, str], None]
 """Arguments of a drag callback: task, pose, visitor, and phase (start, update or end)."""
+# a smaller change of a handle [m, or of a quaternion] is rounding and is not sent to the page
 _MOVED = 1e-9
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -116,7 +116,9 @@ class ControlLoop:
         self._switch_interval = sys.getswitchinterval()
         sys.setswitchinterval(min(_SWITCH_INTERVAL, self._switch_interval))
         _loops.add(id(self))
+        # a thread that is inside XLA when Python ends may crash the process
         atexit.register(self.stop)
+        # the compiler starts first: the control thread needs its program
         self._compiler.thread.start()
         self._compiler.ask(self._wanted)
         self._thread.start()
@@ -178,6 +180,7 @@ class ControlLoop:
                 known = dict(self._targets)
             wanted = edit(with_targets(self._wanted, known))
             with self._lock:
+                # targets set while the edit ran are kept; older ones are part of the edited controller
                 self._targets = {k: new for k, new in self._targets.items() if new is not known.get(k)}
                 self._wanted, self._problem = wanted, ""
                 self._is_behind = wanted.structure() != self._running.structure()
@@ -270,9 +273,11 @@ class ControlLoop:
     def _compiled(self, controller: Controller, program: Program) -> None:
         """Run a compiled program unless another controller has been requested since."""
         if not self._stop.is_set():
+            # a collection over all of JAX's objects takes up to 0.1 s, several periods of the loop
             gc.freeze()
         with self._lock:
             if controller.structure() == self._wanted.structure():
+                # numbers may have changed during compilation, so the wanted controller runs, not the compiled one
                 self._running, self._is_behind = self._wanted, False
                 self._job = _Job(program, with_targets(self._running, self._targets).numbers())
 
@@ -289,6 +294,7 @@ class ControlLoop:
         deadline = time.perf_counter()
         while not self._stop.is_set():
             self._run_once()
+            # counted from the schedule and not from now, so that delays do not add up
             deadline += self.dt
             wait = deadline - time.perf_counter()
             if wait > 0.0:
@@ -304,6 +310,7 @@ class ControlLoop:
         job = self._job
         self._show(ready=job is not None, preparing=job is None or self._is_behind, problem=self._problem)
         if job is None or self._snapshot.paused:
+            # periods across a pause would count as late
             self._stopwatch.clear()
             return
         self._step(job)
@@ -320,6 +327,7 @@ class ControlLoop:
         if usable.all():
             self._state = state
         else:
+            # in a batch, robots with usable answers go on
             q, velocity = np.where(usable, q, before.q), np.where(usable, velocity, 0.0)
             self._state = (jnp.asarray(q), jnp.asarray(velocity), job.program.cold)
         self._show(

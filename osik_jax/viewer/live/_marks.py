@@ -51,6 +51,7 @@ class BalanceMarks:
         if color != self._color:
             self._color = color
             self._draw(com, color)
+        # smaller motions are invisible and need no message to the page
         elif np.abs(com - self._at).max() > 1e-5:
             self._ball.position = com
             self._disc.position = (com[0], com[1], self._floor + 2.0 * _LIFT)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 Dragged = Callable[[str, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], None]
 """Arguments of a drag callback: obstacle, position [m] and rotation."""
 _COLOR = (231, 126, 34)
+# a smaller change of an obstacle [m] is rounding and is not sent to the page
 _MOVED = 1e-9
 
 

@@ -128,6 +128,7 @@ def own_limit(
     kept = [
         (found[i].name, found[j].name)
         for i, j in candidate_pairs(robot, found, None, ())
+        # MuJoCo computes distances up to its cutoff, which only has to exceed the margin
         if mujoco.mj_geomDistance(model, data, i, j, 10.0 * MARGIN, None) > MARGIN
     ]
     if not kept:

@@ -101,6 +101,7 @@ class LiveView(Served):
             if count % _WORDS == 0:
                 self._panel.tell()
             count += 1
+            # a pause even when drawing is late, so that the control loop gets the GIL
             self._end.wait(max(_FRAME - (time.perf_counter() - begin), 0.2 * _FRAME))
 
     def _draw(self) -> None:

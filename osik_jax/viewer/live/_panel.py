@@ -285,6 +285,7 @@ class Panel:
         task = self._desk.task(self._name)
         top, gain = float(np.max(np.asarray(task.weight))), task.gain
         rate = float(np.max(np.asarray(gain.maximum if isinstance(gain, AdaptiveGain) else gain)))
+        # the guard shows a weight of 0 at the lower end of the slider
         self._weight.value = float(np.clip(np.log10(max(top, 1e-12)), *_WEIGHTS))
         self._gain.value = float(np.clip(rate, *_GAINS))
         self._priority.value = int(np.clip(task.priority, *_PRIORITIES))

@@ -63,6 +63,7 @@ def error_text(task: Task, error: Float[np.ndarray, " m"] | None) -> str:
         return ", ".join(parts + ([f"{np.rad2deg(np.linalg.norm(turned)):.1f}°"] if len(turned) else []))
     if isinstance(task, ComTask) and task.polygon is not None:
         outside = float(np.max(error - np.asarray(task.polygon.offsets)))
+        # half a millimetre, below which the rounded text would read 0 mm outside
         return f"{1e3 * outside:.1f} mm outside" if outside > 5e-4 else f"{-1e3 * outside:.0f} mm inside"
     if isinstance(task, ComTask) and task.target is not None:
         return f"{1e3 * np.linalg.norm(error):.1f} mm"

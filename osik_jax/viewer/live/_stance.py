@@ -26,6 +26,7 @@ _BEND = 0.05
 _STEPS = 60
 _SOLE = 0.006
 """Height above a foot's lowest point up to which its points count as sole [m]."""
+# margin of the support polygon inside the soles' edge [m]
 _MARGIN = 0.01
 _CORNERS = 8
 """Number of polygon corners for each sole; corners are points of the sole, so the polygon is never larger than the
@@ -67,10 +68,12 @@ def _crouched(robot: Robot, feet: Sequence[str]) -> Float[np.ndarray, " nq"]:
         kinematics = forward_kinematics(robot, q)
         parts = [task.rows(robot, kinematics, q) for task in tasks]
         e, J = (jnp.concatenate([getattr(part, name) for part in parts]) for name in ("error", "jacobian"))
+        # the damping keeps steps finite where legs are stretched and J loses rank
         v = -J.T @ jnp.linalg.solve(J @ J.T + 1e-6 * jnp.eye(len(e)), e)
         at = q[index]
         low = jnp.where(scalar, robot.position_lower - at, -jnp.inf)
         high = jnp.where(scalar, robot.position_upper - at, jnp.inf)
+        # clipped to the limits; a joint that starts outside its range may stay but not go farther
         return integrate(robot, q, jnp.clip(v, jnp.minimum(low, 0.0), jnp.maximum(high, 0.0)), 1.0)
 
     q = _bent(robot)

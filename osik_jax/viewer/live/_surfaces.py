@@ -77,6 +77,7 @@ def _clustered(surface: Surface, cell: float) -> Surface:
     sums = np.zeros((index.max() + 1, 3))
     np.add.at(sums, index, surface.vertices)
     means = sums / np.bincount(index)[:, None]
+    # clustering folds several faces onto the same three vertices: one of each is kept
     faces = np.unique(np.sort(index[surface.faces], axis=1), axis=0, return_index=True)[1]
     return _proper(means, index[surface.faces[faces]])
 
@@ -88,6 +89,7 @@ def _split_at_creases(surface: Surface) -> Surface:
         return surface
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     normals = np.cross(b - a, c - a)
+    # a sliver may have an area of 0 in floating point
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
     corners = np.argsort(faces.ravel(), kind="stable")
     ends = np.searchsorted(faces.ravel()[corners], np.arange(len(vertices) + 1))
@@ -102,6 +104,7 @@ def _split_at_creases(surface: Surface) -> Surface:
 def _alike(corners: Int[np.ndarray, " k"], normals: Float[np.ndarray, "m 3"]) -> Iterator[Int[np.ndarray, " j"]]:
     """Return groups of corners around a vertex by similar face normals; corner c belongs to face floor(c / 3)."""
     while len(corners):
+        # compared by cosine with the first face of the group
         own = normals[corners // 3] @ normals[corners[0] // 3] > _CREASE
         own[0] = True
         yield corners[own]
