@@ -57,3 +57,8 @@ def unknown_name(kind: str, name: object, available: tuple[str, ...]) -> KeyErro
     hint = f"; did you mean {close[0]!r}?" if close else "."
     kinds = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
     return OsikKeyError(f"no {kind} {name!r}{hint} {kinds}: {', '.join(available) or '(none)'}")
+
+
+def missing_extra(what: str, needs: str, extra: str) -> ModuleNotFoundError:
+    """The exception for a package that an extra of this one installs."""
+    return ModuleNotFoundError(f'{what} needs {needs}: pip install ".[{extra}]" in the folder of osik-jax')

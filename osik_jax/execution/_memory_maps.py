@@ -12,6 +12,9 @@ _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _SHARE = 0.75
 """Fraction of the system's maximum at which a warning is given, about 25 programs before the process would end."""
 _seen: dict[str, int] = {}
+"""By name of a function, its number of programs at the last call."""
+_warned: list[int] = []
+"""The number of maps of which the process has been warned; empty before."""
 
 
 def watch_memory_maps(name: str, compiled: Any) -> None:
@@ -22,12 +25,13 @@ def watch_memory_maps(name: str, compiled: Any) -> None:
         compiled: what ``jax.jit`` made of it. Maps are counted only where it has more programs than at the last call.
     """
     programs = compiled._cache_size()
-    if programs <= _seen.get(name, 0):
+    if programs == _seen.get(name, 0):
         return
-    _seen[name] = programs
+    _seen[name] = programs  # fewer than before where jax.clear_caches() was called
     maps, most = counted_maps(), _most_maps()
-    if maps is not None and most is not None and maps > _SHARE * most:
-        _warn_once(maps, most)
+    if maps is not None and most is not None and maps > _SHARE * most and not _warned:
+        _warned.append(maps)
+        _warn(maps, most)
 
 
 def counted_maps() -> int | None:
@@ -46,8 +50,7 @@ def _most_maps() -> int | None:
         return None
 
 
-@cache
-def _warn_once(maps: int, most: int) -> None:
+def _warn(maps: int, most: int) -> None:
     warn(
         f"this process has {maps} of the {most} memory maps that the system allows. Each compiled structure of tasks "
         "takes several hundred, and at the limit the process is aborted. Change numbers by replace, which compiles "

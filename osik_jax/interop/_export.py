@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._errors import OsikTypeError, OsikValueError
+from .._errors import OsikTypeError, OsikValueError, missing_extra
 from ..batching._names import find_leaves, leaf_names, replace_named
 from ..control._checks import check_setting, check_tasks, checked_limits
 from ..control._rollout import move, remembering
@@ -71,7 +71,7 @@ def export_controller(
 
     Raises:
         KeyError: ``inputs`` names a number that does not exist.
-        ModuleNotFoundError: ``flatbuffers`` is not installed: ``pip install 'osik-jax[export]'``.
+        ModuleNotFoundError: ``flatbuffers`` is not installed: ``pip install ".[export]"``.
         TypeError, ValueError: as in ``solve``; ``batch`` or ``platforms`` is none of those above.
     """
     check_setting("export_controller(robot, tasks)", robot, scheme, dt)
@@ -206,4 +206,4 @@ def _serialized(exported: jax.export.Exported) -> bytes:
     try:
         return bytes(exported.serialize())
     except ImportError as error:
-        raise ModuleNotFoundError("an export needs flatbuffers: pip install 'osik-jax[export]'") from error
+        raise missing_extra("an export", "flatbuffers", "export") from error

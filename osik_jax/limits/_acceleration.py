@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
 from ..numerics._arguments import check_bounds, concrete, entries
+from ..numerics._guarded import rate_of_way
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values, scalar_layout
 from ._box import Kind, Limit, limit_box
@@ -181,5 +182,5 @@ def stopping_speed(
     steps = jnp.ceil(0.5 * (jnp.sqrt(1.0 + 8.0 * triangle) - 1.0))
     # the upper end keeps the quotient finite for accelerations near 0
     steps = jnp.where(instant, 1.0, jnp.clip(steps, 1.0, _MOST_STEPS))
-    speed = way_left / (steps * dt) + 0.5 * (steps - 1.0) * change
+    speed = rate_of_way(way_left, steps * dt) + 0.5 * (steps - 1.0) * change
     return jnp.where(free, way, speed)

@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from ..numerics._guarded import rate_of_way
 from ..robot import Robot
 from ..robot._balls import ball_rotation, independent_balls
 from ..robot._joint_selection import dofs_of
@@ -49,7 +50,7 @@ def ball_rates(
     upper: Float[Array, " nv"],
     gain: Float[Array, " nv"],
     return_speed: Float[Array, " nv"],
-    dt: ArrayLike,
+    dt: Float[Array, ""] | float,
     *,
     margin: float,
     shortest: float,
@@ -90,6 +91,6 @@ def ball_rates(
     return BallRates(
         dofs,
         jnp.where(binds[:, None], axis, 0.0),
-        jnp.where(binds, outward / dt, jnp.inf),
-        jnp.where(free | jnp.isinf(shortest), jnp.inf, longest / dt),
+        jnp.where(binds, rate_of_way(outward, dt), jnp.inf),
+        jnp.where(free | jnp.isinf(shortest), jnp.inf, rate_of_way(longest, dt)),
     )

@@ -44,7 +44,7 @@ def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, ""] | float) -> Float[
     dt = jnp.asarray(dt, way.dtype)
     is_far = jnp.abs(way) > _FASTEST * dt
     far = jax.lax.stop_gradient(way / dt)
-    return jnp.where(is_far, far, jnp.where(is_far, 0.0, way) / jnp.where(is_far, 1.0, dt))
+    return jnp.where(is_far, far, quotient(jnp.where(is_far, 0.0, way), jnp.where(is_far, 1.0, dt)))
 
 
 def safe_norm(vector: Float[Array, " m"]) -> Float[Array, ""]:

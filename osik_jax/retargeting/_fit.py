@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._errors import OsikValueError
+from .._errors import OsikValueError, missing_extra
 from ..kinematics import difference, forward_kinematics
 from ..kinematics._rigid import rotate
 from ..robot import Robot
@@ -144,7 +144,7 @@ def fit(
     try:
         import optax
     except ImportError as missing:
-        raise ImportError("osik_jax.retargeting.fit needs optax: pip install 'osik-jax[tuning]'") from missing
+        raise missing_extra("osik_jax.retargeting.fit", "optax", "tuning") from missing
     if not motions:
         raise OsikValueError("there are no clips to learn from")
     if not steps > 0:

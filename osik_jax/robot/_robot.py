@@ -298,10 +298,11 @@ class Robot(RobotModel):
         Locked joints are gone, their bodies posed at the locked values. Links that are fixed to others are one body
         with them and stay as frames. Mimic joints are joint equality constraints, velocity limits custom numerics
         ``velocity_limit/JOINT``, and ``q0`` is the keyframe ``home``. Frames that are no bodies are sites, or geoms
-        where they were: simple shapes are kept, meshes are not, so the file needs no other. Actuators, sensors,
-        tendons, other constraints and the masses of what is fixed to the world are left out; bodies that locked joints
-        leave fixed to the world count as such when the file is read. ``Robot.from_mjcf`` of the text is the same robot
-        in all else.
+        where they were: simple shapes are kept, meshes are not, so the file needs no other. Equality constraints of an
+        ``EqualityConstraintTask`` are kept, between sites ``equality_end/...`` that are no frames; those of locked
+        joints are not. Actuators, sensors, tendons, other constraints and keyframes, contact pairs and exclusions, and
+        the masses of what is fixed to the world are left out; bodies that locked joints leave fixed to the world count
+        as such when the file is read. ``Robot.from_mjcf`` of the text is the same robot in all else.
 
         Args:
             path: file to write the text to, if any.

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,9 +15,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .._errors import OsikValueError
+from .._errors import OsikValueError, OsikWarning
 from ..control._checks import check_setting, check_tasks, checked_limits
-from ..limits import Limit, Limits
+from ..limits import CollisionAvoidanceLimit, Limit, Limits
 from ..robot import Robot, load_robot
 from ..robot.loading import is_mjcf
 from ..schemes import Scheme
@@ -57,7 +58,8 @@ def save_controller(
 ) -> None:
     """Write a controller to a JSON file, for ``load_controller``.
 
-    All numbers of the robot are in the file, so a robot that was scaled or moved home comes back as it is.
+    All numbers of the robot are in the file, so a robot that was scaled or moved home comes back as it is. Joints,
+    frames and bodies are in it by name.
 
     Args:
         path: of the file.
@@ -67,23 +69,25 @@ def save_controller(
         limits: as in ``solve``.
         dt: time of a step [s].
         source: where the robot comes from: a name that ``load_robot`` takes, or the path of a URDF or MJCF file, which
-            has to be there when the controller is loaded. Default: the robot's model is written into the file as
-            MJCF, without its meshes' files.
+            has to be there when the controller is loaded; the robot's numbers then are in the file to the last bit.
+            Default: the file has the robot as ``Robot.to_mjcf`` writes it, without meshes and locked joints.
 
     Raises:
-        TypeError, ValueError: as in ``solve``; a task, limit or scheme of a class that is not in osik_jax.
+        TypeError, ValueError: as in ``solve``; a task, limit or scheme of a class that is not in osik_jax; a robot that
+            its source does not make again, or without one a limit on the distances of its meshes.
         OSError: the file cannot be written.
     """
     check_setting("save_controller(path, robot, tasks)", robot, scheme, dt)
     check_tasks(tasks, robot)
     given = checked_limits(robot, limits) or ()
+    used, tree = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme, robot.tree
     content = {
         "format": _FORMAT,
-        "robot": _source(robot, source),
+        "robot": _source(robot, source, given),
         "dt": float(dt),
-        "scheme": encode(scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme, "scheme"),
-        "limits": [encode(limit, f"limits[{place}]") for place, limit in enumerate(given)],
-        "tasks": [[name, encode(task, f"tasks[{name!r}]")] for name, task in tasks.items()],
+        "scheme": encode(used, "scheme", tree),
+        "limits": [encode(limit, f"limits[{place}]", tree) for place, limit in enumerate(given)],
+        "tasks": [[name, encode(task, f"tasks[{name!r}]", tree)] for name, task in tasks.items()],
     }
     Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -102,17 +106,18 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
         known = False
     if not known:
         raise OsikValueError(f"{path} is no controller that save_controller wrote ({_FORMAT})")
+    robot = _robot(content["robot"])
     return Controller(
-        robot=_robot(content["robot"]),
-        tasks={name: decode(task) for name, task in content["tasks"]},
-        scheme=decode(content["scheme"]),
-        limits=tuple(map(decode, content["limits"])),
+        robot=robot,
+        tasks={name: decode(task, robot.tree) for name, task in content["tasks"]},
+        scheme=decode(content["scheme"], robot.tree),
+        limits=tuple(decode(limit, robot.tree) for limit in content["limits"]),
         dt=content["dt"],
     )
 
 
-def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, Any]:
-    """Return how to make the robot again: a name, a file with its hash, or the model; and all of its numbers."""
+def _source(robot: Robot, source: str | os.PathLike[str] | None, limits: Sequence[Limit]) -> dict[str, Any]:
+    """Return how to make the robot again: its model; or a name or a file with its hash, and all of its numbers."""
     if source is None:
         found: dict[str, Any] = {"mjcf": robot.to_mjcf()}
     elif Path(source).is_file():
@@ -120,17 +125,35 @@ def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, An
     else:
         found = {"name": str(source)}
     found |= {"floating_base": robot.floating_base, "locked_joints": list(robot.locked_joints)}
-    if _structure(_loaded(found)) != _structure(robot):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OsikWarning)  # what the robot does not keep was said when it was loaded
+        again = _loaded(found)
+    if source is None:
+        _check_written(robot, again, limits)
+        return found
+    if _structure(again) != _structure(robot):
         raise OsikValueError(
             "the robot cannot be made again from its source: its joints, frames or shapes differ. Give source= as the "
             "name or file that it was loaded from, without options other than floating_base and locked_joints"
         )
-    return found | {"numbers": {name: encode(getattr(robot, name), name) for name in _numbers(robot)}}
+    return found | {"numbers": {name: encode(getattr(robot, name), name, robot.tree) for name in _numbers(robot)}}
+
+
+def _check_written(robot: Robot, again: Robot, limits: Sequence[Limit]) -> None:
+    """Raise where tasks or limits need a part of the robot that its MJCF does not have."""
+    if again.tree.dof_owners != robot.tree.dof_owners or set(again.frame_names) != set(robot.frame_names):
+        raise OsikValueError("the robot's MJCF does not have all of its joints and frames: give source=")
+    own = any(isinstance(limit, CollisionAvoidanceLimit) and limit.scene.geoms for limit in limits)
+    if own and again.tree.geom_names != robot.tree.geom_names:
+        raise OsikValueError(
+            "a CollisionAvoidanceLimit needs meshes, which the robot's MJCF does not have: give source= as the name or "
+            "file that the robot was loaded from"
+        )
 
 
 def _robot(described: Mapping[str, Any]) -> Robot:
     robot = _loaded(described)
-    numbers = {name: decode(one) for name, one in described["numbers"].items()}
+    numbers = {name: decode(one, robot.tree) for name, one in described.get("numbers", {}).items()}
     return eqx.tree_at(lambda own: [getattr(own, name) for name in numbers], robot, list(numbers.values()))
 
 

@@ -15,16 +15,21 @@ import numpy as np
 
 from .._errors import OsikValueError
 from ..limits import NoLimits, no_limits
+from ..robot._tree import KinematicTree
 
 _PACKAGE = "osik_jax."
+_NUMBERED = {"joint": "joint_names", "joints": "joint_names", "bodies": "body_names", "frames": "frame_names"}
+"""Fields that number parts of a robot, and where its tree has their names. A file has the names: the robot that is
+read from it may number its parts in another order."""
 
 
-def encode(value: Any, where: str) -> Any:
+def encode(value: Any, where: str, tree: KinematicTree) -> Any:
     """Return the value as data for JSON.
 
     Args:
         value: a task, limit, scheme or what their fields hold.
         where: name of the value, for messages.
+        tree: of the robot that the value was made for.
 
     Raises:
         ValueError: an object of a class that is not in osik_jax, such as a function or a task of your own.
@@ -37,44 +42,62 @@ def encode(value: Any, where: str) -> Any:
         array = np.asarray(value)
         return {
             "array": array.tolist(),
+            "shape": array.shape,  # which the list does not tell of an array without entries
             "dtype": str(array.dtype),
             "of": "jax" if isinstance(value, jax.Array) else "numpy",
         }
     if isinstance(value, Mapping):
-        return {"mapping": [[encode(key, where), encode(one, f"{where}[{key!r}]")] for key, one in value.items()]}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: encode(getattr(value, f.name), f"{where}.{f.name}") for f in dataclasses.fields(value)}
-        return {"class": _name(type(value), where), "fields": fields}
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        fields = {name: encode(getattr(value, name), f"{where}.{name}") for name in value._fields}  # pyright: ignore
+        pairs = [[encode(key, where, tree), encode(one, f"{where}[{key!r}]", tree)] for key, one in value.items()]
+        return {"mapping": pairs}
+    if (names := _field_names(value)) is not None:
+        fields = {name: _field(name, getattr(value, name), f"{where}.{name}", tree) for name in names}
         return {"class": _name(type(value), where), "fields": fields}
     if isinstance(value, tuple | list | frozenset):
         kind = type(value).__name__
-        return {"sequence": kind, "items": [encode(one, f"{where}[{k}]") for k, one in enumerate(value)]}
+        return {"sequence": kind, "items": [encode(one, f"{where}[{k}]", tree) for k, one in enumerate(value)]}
     raise OsikValueError(
         f"{where} is a {type(value).__name__}, which a file cannot hold: it holds classes of osik_jax and numbers"
     )
 
 
-def decode(data: Any) -> Any:
-    """Return the value of what ``encode`` returned.
+def _field_names(value: Any) -> list[str] | None:
+    """Return the names of the fields of a dataclass or named tuple, None for anything else."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return [field.name for field in dataclasses.fields(value)]
+    return list(value._fields) if isinstance(value, tuple) and hasattr(value, "_fields") else None  # pyright: ignore
+
+
+def _field(name: str, value: Any, where: str, tree: KinematicTree) -> Any:
+    numbers = value if isinstance(value, tuple) else (value,)
+    if name not in _NUMBERED or not all(type(number) is int for number in numbers):
+        return encode(value, where, tree)
+    names = [getattr(tree, _NUMBERED[name])[number] for number in numbers]
+    return {"names": _NUMBERED[name], "of": names if isinstance(value, tuple) else names[0]}
+
+
+def decode(data: Any, tree: KinematicTree) -> Any:
+    """Return the value of what ``encode`` returned, for the robot with this tree.
 
     Raises:
-        ValueError: no such data, or a class or field that this version does not have.
+        ValueError: no such data, a class or field that this version does not have, or a name that the robot has not.
     """
     if not isinstance(data, Mapping):
         return data
     if "array" in data:
-        array = np.asarray(data["array"], data["dtype"])
+        array = np.asarray(data["array"], data["dtype"]).reshape(data["shape"])
         return jnp.asarray(array) if data["of"] == "jax" else array
     if "mapping" in data:
-        return {decode(key): decode(one) for key, one in data["mapping"]}
+        return {decode(key, tree): decode(one, tree) for key, one in data["mapping"]}
     if "sequence" in data:
-        return {"tuple": tuple, "list": list, "frozenset": frozenset}[data["sequence"]](map(decode, data["items"]))
+        items = [decode(one, tree) for one in data["items"]]
+        return {"tuple": tuple, "list": list, "frozenset": frozenset}[data["sequence"]](items)
+    if "names" in data:
+        names, of = getattr(tree, data["names"]), data["of"]
+        return names.index(of) if isinstance(of, str) else tuple(map(names.index, of))
     cls = _class(data["class"])
     if "value" in data:
         return cls(data["value"])
-    return _made(cls, {name: decode(one) for name, one in data["fields"].items()})
+    return _made(cls, {name: decode(one, tree) for name, one in data["fields"].items()})
 
 
 def _made(cls: Any, fields: dict[str, Any]) -> Any:

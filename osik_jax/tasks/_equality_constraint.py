@@ -20,18 +20,13 @@ from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
 from ..robot import Robot
 from ..robot._tree import KinematicTree
-from ..robot.loading._mjmodel import element_names
+from ..robot.loading._equalities import KINDS, constraint_ends, constraint_names, is_in_tree
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_weight
 from ._rotation import cross_matrix
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
 
-_TYPES = {
-    int(mujoco.mjtEq.mjEQ_CONNECT): "connect",
-    int(mujoco.mjtEq.mjEQ_WELD): "weld",
-    int(mujoco.mjtEq.mjEQ_JOINT): "joint",
-}
 _Rows = tuple[Float[Array, " m"], Float[Array, "m nv"]]
 
 
@@ -105,8 +100,9 @@ class EqualityConstraintTask(Task):
         spatial = [e for e, kind in zip(chosen, kinds, strict=True) if kind != "joint"]
         welds = [e for e, kind in zip(chosen, kinds, strict=True) if kind == "weld"]
         joints = [e for e, kind in zip(chosen, kinds, strict=True) if kind == "joint"]
-        self.anchors = jnp.asarray(np.reshape([_anchors(model, e) for e in spatial], (-1, 2, 3)), dtype)
-        self.relative = jnp.asarray(np.reshape([_relative(model, e) for e in welds], (-1, 3, 3)), dtype)
+        ends = {e: constraint_ends(model, robot.frame_names, e) for e in spatial}
+        self.anchors = jnp.asarray(np.reshape([own.anchors for own in ends.values()], (-1, 2, 3)), dtype)
+        self.relative = jnp.asarray(np.reshape([ends[e].relative for e in welds], (-1, 3, 3)), dtype)
         self.torque_scale = jnp.asarray([model.eq_data[e, 10] for e in welds], dtype)
         self.coefficients = jnp.asarray(np.reshape([model.eq_data[e, :5] for e in joints], (-1, 5)), dtype)
 
@@ -185,10 +181,10 @@ def _column(tree: KinematicTree, joint: str, dtype: Any) -> Float[Array, " nvful
 def _selected(robot: Robot, names: Iterable[str] | None) -> list[int]:
     """Return the indices of the selected constraints of the model, in its order."""
     model = robot.mj_model
-    available = element_names(model, mujoco.mjtObj.mjOBJ_EQUALITY, "equality", model.neq)
+    available = constraint_names(model)
     if names is None:
         active = np.flatnonzero(model.eq_active0)
-        found = [int(e) for e in active if int(model.eq_type[e]) in _TYPES and not _is_kept(model, int(e))]
+        found = [int(e) for e in active if int(model.eq_type[e]) in KINDS and not is_in_tree(model, int(e))]
         if not found:
             raise OsikValueError(
                 "the model has no active connect, weld or joint constraint that is not a mimic or locked joint; "
@@ -209,50 +205,17 @@ def _selected(robot: Robot, names: Iterable[str] | None) -> list[int]:
 
 
 def _check_kind(robot: Robot, e: int, name: str) -> None:
-    if int(robot.mj_model.eq_type[e]) not in _TYPES:
+    if int(robot.mj_model.eq_type[e]) not in KINDS:
         kind = mujoco.mjtEq(int(robot.mj_model.eq_type[e])).name
         raise OsikValueError(f"constraint {name!r} is of kind {kind}; it can be connect, weld or joint")
-    if _is_kept(robot.mj_model, e):
+    if is_in_tree(robot.mj_model, e):
         raise OsikValueError(f"constraint {name!r} holds already: its joint is a mimic joint of the robot, or locked")
-
-
-def _is_kept(model: mujoco.MjModel, e: int) -> bool:
-    """Return whether the robot's coupled joints contain the constraint: active, on joints, of degree at most 1."""
-    if int(model.eq_type[e]) != mujoco.mjtEq.mjEQ_JOINT or not model.eq_active0[e]:
-        return False
-    return int(model.eq_obj2id[e]) < 0 or not model.eq_data[e, 2:5].any()
 
 
 def _structure(robot: Robot, e: int) -> Constraint:
     model = robot.mj_model
-    name = element_names(model, mujoco.mjtObj.mjOBJ_EQUALITY, "equality", model.neq)[e]
-    kind = _TYPES[int(model.eq_type[e])]
-    ids = [int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e])]
-    if kind == "joint":
-        return Constraint(name, kind, tuple(robot.tree.joint_names[i] for i in ids if i >= 0))
-    if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
-        return Constraint(name, kind, tuple(_site_frame(robot, i) for i in ids))
-    bodies = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
-    return Constraint(name, kind, tuple(bodies[i] for i in ids))
-
-
-def _site_frame(robot: Robot, site: int) -> str:
-    name = robot.mj_model.site(site).name
-    return f"site:{name}" if f"site:{name}" in robot.frame_names else name
-
-
-def _anchors(model: mujoco.MjModel, e: int) -> np.ndarray:
-    """Return the anchor point in the first and in the second end [m]."""
-    if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
-        return np.zeros((2, 3))
-    first, second = model.eq_data[e, :3], model.eq_data[e, 3:6]
-    weld = int(model.eq_type[e]) == mujoco.mjtEq.mjEQ_WELD  # whose numbers are in the other order
-    return np.array([second, first] if weld else [first, second])
-
-
-def _relative(model: mujoco.MjModel, e: int) -> np.ndarray:
-    if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
-        return np.eye(3)
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, model.eq_data[e, 6:10])
-    return out.reshape(3, 3)
+    name, kind = constraint_names(model)[e], KINDS[int(model.eq_type[e])]
+    if kind != "joint":
+        return Constraint(name, kind, constraint_ends(model, robot.frame_names, e).frames)
+    joints = [int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e])]
+    return Constraint(name, kind, tuple(robot.tree.joint_names[i] for i in joints if i >= 0))

@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from .._errors import OsikTypeError, OsikValueError
+from .._errors import OsikTypeError, OsikValueError, missing_extra
 from ..batching._structure import Static, put_together, taken_apart
 from ._evaluate import Evaluation, Problem, check_loss, check_mesh, chunk_size, replicas, replicated, shares
 from ._history import History, State, load_state, save_state
@@ -28,7 +28,7 @@ from ._scenarios import Scenarios
 try:
     import optax
 except ImportError as missing:
-    raise ImportError("osik_jax.tuning needs optax: pip install 'osik-jax[tuning]'") from missing
+    raise missing_extra("osik_jax.tuning", "optax", "tuning") from missing
 
 LEARNING_RATE = 0.1
 """Learning rate of the default optimiser: weights and gains change by up to 10 % an iteration."""

@@ -185,7 +185,7 @@ def test_times_are_told_no_more_exactly_than_they_are_known():
 def test_a_name_without_its_extra_is_one_line(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "robot_descriptions", None)
     line = refused(capsys, "info", "panda_mj_description")
-    assert "pip install 'osik-jax[descriptions]'" in line
+    assert 'pip install ".[descriptions]"' in line
     assert "names of robot_descriptions end in _description" in refused(capsys, "info", "atlas")
 
 

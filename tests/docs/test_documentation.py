@@ -266,6 +266,17 @@ def test_one_repository_everywhere() -> None:
     assert f"\nrepo_url: {REPOSITORY}\n" in (ROOT / "mkdocs.yml").read_text()
 
 
+def test_extras_are_installed_from_a_checkout_and_exist() -> None:
+    """The package is on no index: ``pip install ".[extra]"`` is the one form, in pages, messages and docstrings."""
+    code = [path for part in ("osik_jax", "examples", "notebooks") for path in (ROOT / part).rglob("*.py")]
+    texts = {path: path.read_text() for path in (*TEXTS, *code)}
+    assert [path.name for path, text in texts.items() if re.search(r"osik[-_]jax\[\w", text)] == []
+    asked = [names for text in texts.values() for names in re.findall(r'"\.\[([\w, ]+)\]"', text)]
+    asked += [name for text in texts.values() for name in re.findall(r'missing_extra\(.*, "(\w+)"\)', text)]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert len(asked) > 15 and {name.strip() for names in asked for name in names.split(",")} <= set(extras)
+
+
 def test_import_is_light() -> None:
     code = f"import osik_jax, sys; print(*(m for m in {OPTIONAL!r} if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)

@@ -90,6 +90,43 @@ def test_the_box_has_the_slopes_of_differences(name, rng):
     assert (slopes >= sides.min(0) - slack)[finite].all() and (slopes <= sides.max(0) + slack)[finite].all()
 
 
+ROD = """<mujoco><worldbody><body><joint name="ball" type="ball" range="0 60"/><geom size=".05" pos=".2 0 0"/>
+  <body pos=".4 0 0"><joint name="slide" type="slide" axis="1 0 0" range="-1 1"/><geom size=".05"/></body></body>
+  </worldbody></mujoco>"""
+TIMES = np.array([1e-3, 1e-8, 1e-14, 1e-20, 1e-26, 1e-36])
+
+
+def _rates_of_limits_by_dt(precision, angle):
+    """Return the rates by dt of the bounds of a ball and a slide, boxes and rows, in both modes."""
+    with jax.enable_x64(precision == "float64"):
+        robot = osik.Robot.from_mjcf(ROD)
+        q = jnp.array([np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0, 0.7])
+        ranges, braking = osik.ConfigurationLimit(robot), osik.AccelerationLimit(robot, {"*": 5.0})
+        kinematics = osik.forward_kinematics(robot, q)
+
+        def bounds(dt):
+            rows = ranges.rows(robot, kinematics, q, dt)
+            boxes = [jnp.stack(osik.limit_box(robot, q, (limit,), dt)) for limit in (ranges, braking)]
+            return jnp.concatenate([*(jnp.ravel(box) for box in boxes), rows.upper])
+
+        def rates(dt):
+            value, rate = jax.jvp(bounds, (dt,), (jnp.ones_like(dt),))
+            finite = jnp.isfinite(value)
+            total = jax.grad(lambda dt: jnp.sum(jnp.where(finite, bounds(dt), 0.0)))(dt)
+            return jnp.where(finite, rate, 0.0), total
+
+        return [np.asarray(a, float) for a in jax.jit(jax.vmap(rates))(jnp.asarray(TIMES, precision))]
+
+
+@pytest.mark.parametrize("angle", [0.1, 1.04, 1.2])
+def test_rates_of_limits_by_tiny_times_in_single_precision(angle):
+    """Of a ball far from the end of its range, near to it and beyond it: 1 / dt^2 overflows from 1e-19 down."""
+    (single, total), (double, _) = (_rates_of_limits_by_dt(p, angle) for p in ("float32", "float64"))
+    assert np.abs(double[0]).max() > 1e3
+    np.testing.assert_allclose(single, double, rtol=2e-4, atol=1e-3)
+    np.testing.assert_allclose(total, double.sum(1), rtol=2e-3, atol=1e-2)
+
+
 def _rates_of_saturated(precision, distances, directions, shifts):
     """Return the rate of the velocity as hand and posture move from their targets, by the scale of both."""
     with jax.enable_x64(precision == "float64"):

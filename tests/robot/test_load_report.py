@@ -271,6 +271,23 @@ LINE = "v 0 0 0\nv .1 0 0\nv .2 0 0\nv .3 0 0\nf 1 2 3\nf 2 3 4\n"
 TETRA = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 
 
+TEXT_STL = "solid x\nfacet normal 0 0 1\nouter loop\n{}endloop\nendfacet\nendsolid\n"
+
+
+@pytest.mark.parametrize(
+    "text", [TEXT_STL.format("vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"), TEXT_STL.format(""), "solid facet 1 a"]
+)
+def test_text_files_without_a_body_do_not_stop_the_robot(tmp_path: Path, text: str):
+    """A single triangle, and nothing at all; MuJoCo does not read such files, so this package does."""
+    (tmp_path / "flat.stl").write_text(text)
+    shape = '<collision><geometry><mesh filename="flat.stl"/></geometry></collision>'
+    path = tmp_path / "robot.urdf"
+    path.write_text(urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{shape}'))
+    robot, told = loaded(Robot.from_urdf, path, floating_base=False, collision_meshes=True)
+    assert robot.tree.geom_types == () and notes(robot) == {("collision mesh", "l1")}
+    assert "flat.stl is left out: nothing in it has a surface" in told[0]
+
+
 @pytest.mark.parametrize(
     ("mesh", "scale", "count", "message"),
     [

@@ -120,6 +120,27 @@ class TestAgainstMuJoCo:
         assert np.linalg.norm(rows.error[3:]) == pytest.approx(np.sin((2 * np.pi - 3.5) / 2.0), abs=1e-12)
 
 
+@pytest.mark.parametrize("locked", [{}, {"b1": 0.4, "b3": -0.7}])
+def test_written_and_read_again_they_are_the_same(locked):
+    """Ends on fused bodies, on the world and on sites; rows of welds may be in other axes, which have the same norm."""
+    robot = osik.Robot.from_mjcf(MODEL, locked_joints=locked)
+    again = osik.Robot.from_mjcf(robot.to_mjcf())
+    model = again.mj_model
+    kept = [e for e in range(model.neq) if model.equality(e).name in (*NAMES, "off")]
+    assert len(kept) == 7 - bool(locked)  # the cam of a locked joint is gone
+    names = tuple(model.equality(e).name for e in kept)
+    assert set(again.frame_names) == set(robot.frame_names) and model.neq == len(kept) + (robot.mimic_joints != {})
+    tasks = [{"task": osik.EqualityConstraintTask(one, constraints=names)} for one in (robot, again)]
+    for step in np.random.default_rng(3).uniform(-0.7, 0.7, (LANES, robot.nv)):
+        q = osik.integrate(robot, robot.q0, step, 1.0)
+        before, after = (rows_of_each(one, task, q)["task"] for one, task in zip((robot, again), tasks, strict=True))
+        residual, jacobian = _oracle(again, q, kept)
+        np.testing.assert_allclose(after.error, residual, atol=1e-12)
+        np.testing.assert_allclose(after.jacobian, jacobian, atol=1e-12)
+        np.testing.assert_allclose(before.error @ before.jacobian, residual @ jacobian, atol=1e-12)
+        np.testing.assert_allclose(before.jacobian.T @ before.jacobian, jacobian.T @ jacobian, atol=1e-12)
+
+
 class TestMistakes:
     def test_names(self, robot):
         with pytest.raises(KeyError, match="did you mean 'glue'"):

@@ -457,4 +457,4 @@ def test_progress_shows_the_loss(loop, scenarios, capsys):
 def test_without_optax_it_says_what_to_install():
     code = "import sys; sys.modules['optax'] = None; import osik_jax; import osik_jax.tuning"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert "pip install 'osik-jax[tuning]'" in done.stderr
+    assert 'pip install ".[tuning]"' in done.stderr

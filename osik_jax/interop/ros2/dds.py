@@ -1,5 +1,7 @@
 """Nodes over DDS, their messages, and bags. Needs the extra ``ros2``."""
 
+from ..._errors import missing_extra
+
 try:
     from . import _messages as messages
     from ._bag import BagWriter as BagWriter
@@ -8,6 +10,6 @@ try:
     from ._node import Endpoints as Endpoints
     from ._node import Node as Node
 except ImportError as missing:
-    raise ImportError("ROS 2 topics need cyclonedds and mcap: pip install 'osik-jax[ros2]'") from missing
+    raise missing_extra("a ROS 2 topic", "cyclonedds and mcap", "ros2") from missing
 
 __all__ = ["BagWriter", "Endpoints", "Node", "Replay", "messages", "replay"]

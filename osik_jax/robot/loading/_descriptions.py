@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterable
 from types import ModuleType
 
-from ..._errors import OsikKeyError, OsikValueError, unknown_name
+from ..._errors import OsikKeyError, OsikValueError, missing_extra, unknown_name
 from .._model import RobotModel
 from ._embedded import NAMES
 from ._mjcf import from_mjcf
@@ -55,9 +55,7 @@ def _known(name: str) -> tuple[str, ...]:
         package = importlib.import_module("robot_descriptions")
     except ImportError as missing:
         if name.endswith(SUFFIX):
-            raise ImportError(
-                f"robot {name!r} needs robot_descriptions: pip install 'osik-jax[descriptions]'"
-            ) from missing
+            raise missing_extra(f"robot {name!r}", "robot_descriptions", "descriptions") from missing
         raise unknown_name("robot", name, NAMES) from None
     return tuple(package.DESCRIPTIONS)
 

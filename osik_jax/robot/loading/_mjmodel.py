@@ -35,6 +35,9 @@ VELOCITY_LIMIT_PREFIX = "velocity_limit/"
 ACCELERATION_LIMIT_PREFIX = "acceleration_limit/"
 """A custom numeric of this name and a joint's holds the joint's greatest acceleration [rad/s^2 or m/s^2]."""
 
+EQUALITY_END_PREFIX = "equality_end/"
+"""Sites of such names are ends of the constraints that ``to_mjcf`` writes, and no frames of the robot."""
+
 LEAST_INERTIA = 2e-15
 """Mass [kg] and moments [kg m^2] of moving bodies that have none: MuJoCo asks for more than 1e-15."""
 
@@ -229,7 +232,8 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
 
     for s in range(model.nsite):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
-        add("site", name, model.site_bodyid[s], model.site_pos[s], model.site_quat[s])
+        if not (name or "").startswith(EQUALITY_END_PREFIX):
+            add("site", name, model.site_bodyid[s], model.site_pos[s], model.site_quat[s])
     for g in range(model.ngeom):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g)
         add("geom", name, model.geom_bodyid[g], model.geom_pos[g], model.geom_quat[g])

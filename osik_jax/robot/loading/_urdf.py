@@ -218,11 +218,9 @@ def _compiled(urdf: Urdf, packages: Packages, beside: Path | None, *, checked: b
 
 
 def _compiled_with_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> _Compiled:
-    """Compile the model with its meshes as they are; if MuJoCo refuses, try each mesh alone."""
+    """Compile the model with its meshes as they are; if one of them cannot be taken, try each mesh alone."""
     try:
         return _compiled(urdf, packages, beside, checked=False)
-    except OsikValueError:
-        raise
     except ValueError:
         return _compiled(urdf, packages, beside, checked=True)
 

@@ -47,8 +47,8 @@ def meshes_of(
             _check_mesh(path, link.name)
             key = path, shape.size
             if key not in known:
-                form = dict(name=f"{path.stem}_{len(known)}", scale=shape.size, **_source(path))
-                known[key] = _repaired(form) if checked else (form, "")
+                made = dict(name=f"{path.stem}_{len(known)}", scale=shape.size)
+                known[key] = _repaired(path, made) if checked else (made | _source(path), "")
             form, done = known[key]
             if form is not None:
                 found.append((link.name, shape, form))
@@ -72,14 +72,18 @@ def _source(path: Path) -> dict[str, Any]:
     return dict(uservert=vertices.ravel(), userface=faces.ravel())
 
 
-def _repaired(form: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
-    """Return the geom to add in place of a mesh (None for nothing), and what was done (empty if unchanged)."""
+def _repaired(path: Path, made: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
+    """Return the mesh to add in place of a file (None for nothing), and what was done (empty if unchanged)."""
+    form: dict[str, Any] | None = None
     try:
+        form = made | _source(path)
         _compiled(form)
     except ValueError as error:
-        reason = " ".join(str(error).partition("\n")[0].removeprefix("Error: ").split())
+        reason = " ".join(str(error).partition("\n")[0].removeprefix("Error: ").removeprefix(f"{path}: ").split())
     else:
         return form, ""
+    if form is None:
+        return None, f"is left out: {reason}"
     try:
         unit = {**form, "scale": (1.0, 1.0, 1.0), "inertia": mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL}
         shell = _compiled(unit, with_hull=False)

@@ -13,7 +13,15 @@ from numpy.typing import ArrayLike
 from ..._errors import OsikValueError
 from .._model import RobotModel
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree
-from ._mjmodel import ACCELERATION_LIMIT_PREFIX, LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, quaternion, rotation_matrix
+from ._equalities import KINDS, Ends, constraint_ends, constraint_names, is_in_tree
+from ._mjmodel import (
+    ACCELERATION_LIMIT_PREFIX,
+    EQUALITY_END_PREFIX,
+    LEAST_INERTIA,
+    VELOCITY_LIMIT_PREFIX,
+    quaternion,
+    rotation_matrix,
+)
 from ._robots import ROBOT_ROOTS
 from ._urdf_elements import IDENTITY, Pose
 
@@ -53,7 +61,9 @@ def to_mjcf(robot: RobotModel) -> str:
     custom = ElementTree.SubElement(root, "custom")
     _add_rates(robot, custom)
     _add_roots(robot.tree, custom)
-    _add_followers(robot, ElementTree.SubElement(root, "equality"))
+    equality = ElementTree.SubElement(root, "equality")
+    _add_followers(robot, equality)
+    _add_constraints(robot, bodies, equality)
     _add_home(robot, ElementTree.SubElement(root, "keyframe"))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -301,6 +311,40 @@ def _add_followers(robot: RobotModel, element: ElementTree.Element) -> None:
         constant = offset - _reference(robot, follower) + multiplier * _reference(robot, leader)
         names = dict(joint1=tree.joint_names[follower], joint2=tree.joint_names[leader])
         _put(element, "joint", **names, polycoef=(constant, multiplier, 0.0, 0.0, 0.0))
+
+
+def _add_constraints(robot: RobotModel, bodies: list[ElementTree.Element], element: ElementTree.Element) -> None:
+    """Constraints that are not in the tree: closed loops, and joints coupled by polynomials."""
+    model, tree = robot.mj_model, robot.tree
+    names = constraint_names(model)
+    for e in (e for e in range(model.neq) if int(model.eq_type[e]) in KINDS and not is_in_tree(model, e)):
+        kind = KINDS[int(model.eq_type[e])]
+        places: dict[str, str | ArrayLike] = {}
+        if kind == "joint":
+            joints = [int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e]) if i >= 0]
+            if set(tree.locked) & set(joints):
+                continue  # with a constant in the place of one joint, the file would lock the other
+            places |= {f"joint{k + 1}": tree.joint_names[joint] for k, joint in enumerate(joints)}
+            places["polycoef"] = model.eq_data[e, :5]
+        else:
+            ends = constraint_ends(model, tree.frame_names, e)
+            places |= dict(zip(("site1", "site2"), _end_sites(robot, bodies, ends, names[e]), strict=True))
+        if kind == "weld":
+            places["torquescale"] = model.eq_data[e, 10]
+        _put(element, kind, name=names[e], active=str(bool(model.eq_active0[e])).lower(), **places)
+
+
+def _end_sites(robot: RobotModel, bodies: list[ElementTree.Element], ends: Ends, name: str) -> list[str]:
+    """Add sites at the ends of a constraint; return their names."""
+    numbers = [robot.tree.frame(frame) for frame in ends.frames]
+    first, second = (_pose(robot.frame_position[k], robot.frame_rotation[k]) for k in numbers)
+    turns = first.rotation @ ends.relative @ second.rotation.T, np.eye(3)  # of a weld the two are to agree
+    made = []
+    for k, pose, anchor, turn in zip(numbers, (first, second), ends.anchors, turns, strict=True):
+        made.append(f"{EQUALITY_END_PREFIX}{name}/{len(made) + 1}")
+        position = pose.position + pose.rotation @ anchor
+        _put(bodies[robot.tree.frame_bodies[k]], "site", name=made[-1], pos=position, quat=quaternion(turn))
+    return made
 
 
 def _add_home(robot: RobotModel, element: ElementTree.Element) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from types import ModuleType
 
+from ..._errors import missing_extra
+
 
 def import_viser() -> ModuleType:
     """Return the module viser, or raise ImportError that names the extra.
@@ -15,4 +17,4 @@ def import_viser() -> ModuleType:
     try:
         return import_module("viser")
     except ImportError as missing:
-        raise ImportError("a live view needs viser: pip install 'osik-jax[viewer]'") from missing
+        raise missing_extra("a live view", "viser", "viewer") from missing
