@@ -1,5 +1,7 @@
 """Inverse kinematics out of reach: the least error, beside SciPy's bounded minimiser on MuJoCo's kinematics."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -31,38 +33,44 @@ def arm():
     return osik.load_robot("arm7")
 
 
-def least_distance(robot, site, target, rng, starts=30):
-    """By many bounded searches, each with MuJoCo's position and Jacobian."""
+RADIAN = 0.1
+"""What a radian counts as [m], with the default tolerances."""
+
+
+def error_and_slope(robot, site, position, rotation=None):
+    """The error of a configuration, half its square in metres, and its gradient, by MuJoCo."""
     model = robot.mj_model
-    data, jacobian = mujoco.MjData(model), np.zeros((3, model.nv))
+    data, jacobian = mujoco.MjData(model), np.zeros((6, model.nv))
 
     def cost(q):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        mujoco.mj_jacSite(model, data, jacobian, None, data.site(site).id)
-        error = data.site(site).xpos - target
-        return 0.5 * error @ error, jacobian.T @ error
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], data.site(site).id)
+        error = data.site(site).xpos - position
+        half, slope = 0.5 * error @ error, jacobian[:3].T @ error
+        if rotation is not None:
+            quaternion, turn = np.zeros(4), np.zeros(3)
+            mujoco.mju_mat2Quat(quaternion, (data.site(site).xmat.reshape(3, 3) @ rotation.T).ravel())
+            mujoco.mju_quat2Vel(turn, quaternion, 1.0)
+            half, slope = half + 0.5 * RADIAN**2 * turn @ turn, slope + RADIAN**2 * jacobian[3:].T @ turn
+        return half, slope
 
+    return cost
+
+
+def least_distance(robot, cost, rng, starts=30):
+    """The least error by many bounded searches [m]."""
     low, high = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
-    found = [
-        minimize(
-            cost,
-            rng.uniform(low, high),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=list(zip(low, high, strict=True)),
-            tol=1e-14,
-        ).fun
-        for _ in range(starts)
-    ]
-    return np.sqrt(2.0 * min(found))
+    bounds = list(zip(low, high, strict=True))
+    options: dict[str, Any] = dict(jac=True, method="L-BFGS-B", bounds=bounds, tol=1e-14)
+    return np.sqrt(2.0 * min(minimize(cost, rng.uniform(low, high), **options).fun for _ in range(starts)))
 
 
 def test_least_error_beside_scipy(arm, rng):
     """Positions beyond the links, one proven so, and one inside the arm's base, by numbers and while tracing."""
     targets = np.array([[1.4, 0.1, 0.3], [0.0, 0.0, -1.5], [-0.4, 0.3, 1.2], [0.02, 0.01, -0.55]])
-    least = [least_distance(arm, "hand", target, rng) for target in targets]
+    least = [least_distance(arm, error_and_slope(arm, "hand", target), rng) for target in targets]
     found = osik.inverse_kinematics(arm, {"hand": targets})
     assert not np.asarray(found.converged).any() and np.asarray(found.beyond_reach)[0] > 0.0
     np.testing.assert_allclose(found.position_error, least, atol=1e-5)
@@ -72,6 +80,19 @@ def test_least_error_beside_scipy(arm, rng):
     assert (np.asarray(quick.position_error) >= np.array(least) - 1e-5).all()
     q = np.asarray(found.q)
     assert (q >= np.asarray(arm.position_lower)).all() and (q <= np.asarray(arm.position_upper)).all()
+
+
+@pytest.mark.slow
+def test_least_error_of_poses_beside_scipy(arm, rng):
+    """Positions beyond the links, and orientations that the ranges exclude."""
+    positions = np.array([[1.1, 0.1, 0.3], [-0.2, -0.9, 0.4], [0.05, 0.0, -0.4]])
+    rotations = np.linalg.qr(rng.normal(size=(3, 3, 3)))[0]
+    rotations *= np.linalg.det(rotations)[:, None, None]
+    found = osik.inverse_kinematics(arm, {"hand": (positions, rotations)})
+    assert not np.asarray(found.converged).any()
+    for q, *pose in zip(np.asarray(found.q), positions, rotations, strict=True):
+        cost = error_and_slope(arm, "hand", *pose)
+        assert np.sqrt(2.0 * cost(q)[0]) < least_distance(arm, cost, rng, starts=60) + 1e-4
 
 
 def test_limbs_that_share_no_joint_stay_on_their_targets():

@@ -157,6 +157,56 @@ def test_derivatives_of_the_saturated_null_space_near_a_target_in_single_precisi
     np.testing.assert_allclose(single, double, atol=2e-5 * np.abs(double).max())
 
 
+SMALL = np.array([1e-4, 1e-10, 1e-16, 1e-20, 1e-25, 1e-30])
+SCHEMES = {
+    "weighted": osik.WeightedQP,
+    "hierarchy": osik.HierarchicalQP,
+    "classical": osik.NullSpace,
+    "reverse": lambda: osik.NullSpace(method="reverse"),
+    "saturated": lambda: osik.NullSpace(method="saturated"),
+}
+LEAST_WEIGHT = {"weighted": 0.0, "hierarchy": 1e-26, "classical": 1e-11, "reverse": 0.0, "saturated": 1e-26}
+"""Weights below this are among the limitations: derivatives by them may be wrong there."""
+
+
+def _rates_by_weight_and_dt(precision, name):
+    """Return the rates of the velocity by a task's weight and by dt, in forward and in reverse mode; by sizes."""
+    with jax.enable_x64(precision == "float64"):
+        arm = osik.load_robot("arm7")
+        hand, posture = osik.FrameTask(arm, "hand", priority=1), osik.PostureTask(arm, priority=2)
+        p, R = hand.target
+        tasks = {"hand": hand.replace(target=(p + np.array([0.05, -0.03, 0.02]), R)), "posture": posture}
+        scheme = SCHEMES[name]()
+
+        def velocity(weight, dt):
+            own = tasks | {"hand": tasks["hand"].replace(weight=weight)}
+            return osik.solve(arm, arm.q0, own, scheme=scheme, dt=dt).velocity
+
+        def rates(weight, dt, by):
+            def moved(s):
+                return velocity(weight + s * by, dt + s * (1.0 - by))
+
+            value, rate = jax.linearize(moved, jnp.zeros_like(dt))
+            return rate(jnp.ones_like(dt)), jax.linear_transpose(rate, dt)(jnp.ones_like(value))[0]
+
+        ones = np.ones_like(SMALL)
+        lanes = np.r_[SMALL, ones], np.r_[0.01 * ones, SMALL], np.r_[ones, 0.0 * ones]
+        # what rounding of the velocity by one part in 1 makes of the rate
+        size = np.abs(jax.vmap(velocity)(*(jnp.asarray(a, precision) for a in lanes[:2]))).max(1) / np.r_[SMALL, SMALL]
+        found = jax.jit(jax.vmap(rates))(*(jnp.asarray(a, precision) for a in lanes))
+        return [np.asarray(a, float) for a in (*found, size)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCHEMES)
+def test_derivatives_by_tiny_weights_and_times_in_single_precision(name):
+    (single, reverse, _), (double, _, size) = (_rates_by_weight_and_dt(p, name) for p in ("float32", "float64"))
+    tolerance = 1e-5 * np.maximum(np.abs(double).max(1), size)
+    kept = np.r_[LEAST_WEIGHT[name] < SMALL, SMALL > 0.0]
+    assert (np.abs(single - double).max(1) <= tolerance)[kept].all()
+    assert (np.abs(reverse - double.sum(1)) < 10.0 * tolerance)[kept].all()
+
+
 def test_no_module_gives_a_name_to_two_values():
     """The second value of a constant stands silently against the text and the tables of the first."""
     twice = []
