@@ -42,7 +42,7 @@ class OsikWarning(UserWarning):
 
 
 def warn(message: str) -> None:
-    """Gives an ``OsikWarning`` that points at the line outside this package that led here."""
+    """Give an ``OsikWarning`` that points at the line outside this package that led here."""
     loaded = [sys.modules[name] for name in _WRAPPERS if name in sys.modules]
     wrappers = [str(Path(module.__file__).parent) for module in loaded if module.__file__]
     inside, level, frame = (_PACKAGE, *wrappers), 2, sys._getframe(1)
@@ -52,7 +52,7 @@ def warn(message: str) -> None:
 
 
 def unknown_name(kind: str, name: object, available: tuple[str, ...]) -> KeyError:
-    """The exception for a name that does not exist: the nearest one that does, and all of them."""
+    """Return the exception for a name that does not exist: the nearest one that does, and all of them."""
     close = difflib.get_close_matches(str(name), available, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else "."
     kinds = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"

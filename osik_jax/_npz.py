@@ -16,7 +16,7 @@ from ._errors import OsikValueError
 
 @contextlib.contextmanager
 def open_npz(path: str | os.PathLike[str]) -> Iterator[NpzFile]:
-    """The arrays of a file, to be read inside the block.
+    """Open a .npz file for reading inside the block; yield its arrays.
 
     The file is closed whatever happens: ``numpy.load`` leaves one open that is no archive after all.
 

@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterator
 
 @contextlib.contextmanager
 def progress_bar(total: int, done: int = 0, *, unit: str) -> Iterator[Callable[[int, str], None]]:
-    """A bar on the error stream, and a function to tell how many are done and how it goes; "compiling" until then.
+    """Draw a bar on the error stream; yield a function that takes the number done and a text.
+
+    The bar says "compiling" until the first call.
 
     Args:
         total: of how many.
@@ -40,7 +42,7 @@ class Pace:
     """Estimate of the remaining time from the pace since the first item, which includes compilation."""
 
     def __init__(self, done: int, now: float) -> None:
-        """Takes how many are done already, and the time [s]."""
+        """Take how many are done already, and the time [s]."""
         self._done, self._then, self._first = done, now, True
 
     def seconds_left(self, done: int, total: int, now: float) -> float:
@@ -52,7 +54,7 @@ class Pace:
 
 
 def spoken(seconds: float) -> str:
-    """A time as one says it: no more exact than it is known."""
+    """Return a time as one says it: no more exact than it is known."""
     if seconds < 90.0:
         return f"{max(5 * round(seconds / 5.0), 5)} s"
     if seconds < 5400.0:

@@ -51,7 +51,7 @@ class Demo:
     """mujoco needs OpenGL; raycast runs anywhere; auto takes the first that works."""
 
     def run(self) -> int:
-        """Runs the command; returns the exit code."""
+        """Run the command; return the exit code."""
         from rich.console import Console
         from rich.markup import escape
 
@@ -88,7 +88,7 @@ class Demo:
 
 
 def _motion(command: Demo) -> Motion:
-    """The motion that the options ask for."""
+    """Return the motion that the options ask for."""
     from ..demo import double_support, single_support
     from ..demo._file import file_motion
     from ..viewer.live._source import RobotSource, source_look
@@ -110,7 +110,7 @@ def _motion(command: Demo) -> Motion:
 
 
 def _check(command: Demo) -> None:
-    """Options that exclude each other, and values out of range."""
+    """Raise an error for options that exclude each other, and for values out of range."""
     if command.robot is None and (command.frame is not None or command.support):
         raise CommandError("--frame and --support go with --robot FILE; NAO's motions choose their own")
     if command.robot is not None and command.motion is not None:
@@ -136,7 +136,7 @@ def _check(command: Demo) -> None:
 
 
 def read_demo_robot(command: Demo, source: str) -> Robot:
-    """The robot to move; a URDF that does not say whether its base moves floats if --support names what stands."""
+    """Return the robot to move; if a URDF does not say whether its base moves, it does if --support names feet."""
     from ..robot.loading import is_mjcf
 
     stands = command.base == "auto" and command.support and Path(source).is_file() and not is_mjcf(source)

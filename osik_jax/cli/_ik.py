@@ -48,7 +48,7 @@ class Ik:
     """Largest angle to the orientation [rad]."""
 
     def run(self) -> int:
-        """Runs the command; returns the exit code."""
+        """Run the command; return the exit code."""
         from rich.console import Console
 
         from ..inverse import inverse_kinematics

@@ -29,7 +29,7 @@ class Info:
     """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
     def run(self) -> int:
-        """Runs the command; returns the exit code."""
+        """Run the command; return the exit code."""
         from rich.console import Console
 
         console = Console()

@@ -23,7 +23,7 @@ _Command = Demo | Ik | Reach | Retarget | Ros2 | View | Info
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code.
+    """Run the command line; return the exit code.
 
     0, or 1 where ``osik ik`` finds nothing or a clip of a folder failed, or 2 after what the user can set right (told
     on stderr in one line), or 130 where it was interrupted.
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(command: _Command) -> int:
-    """Runs a command in double precision; returns the exit code."""
+    """Run a command in double precision; return the exit code."""
     import jax
 
     from ..runtime import configure_cpu
@@ -61,7 +61,7 @@ def _run(command: _Command) -> int:
 
 
 def _left_behind(command: _Command) -> str:
-    """A remark where an interrupted command has written something."""
+    """Return a remark where an interrupted command has written something."""
     if isinstance(command, Reach) and command.unfinished.is_dir():
         return f"; with --resume it goes on where it was ({command.unfinished})"
     if isinstance(command, Retarget) and os.path.isdir(command.clip) and command.out.is_dir():

@@ -22,7 +22,7 @@ class CommandError(Exception):
 
 @contextmanager
 def notes() -> Iterator[None]:
-    """Tells this package's warnings in one line each, in the words of the command line."""
+    """Tell this package's warnings in one line each, in the words of the command line."""
     from .._errors import OsikWarning
 
     told = warnings.showwarning
@@ -42,7 +42,7 @@ def notes() -> Iterator[None]:
 
 @contextmanager
 def told() -> Iterator[None]:
-    """Turns the exceptions of wrong input into a one-line message."""
+    """Turn the exceptions of wrong input into a one-line message."""
     try:
         yield
     except USER_ERRORS as error:
@@ -52,7 +52,7 @@ def told() -> Iterator[None]:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Tells in one line that a file could not be written, as on a full disk."""
+    """Tell in one line that a file could not be written, as on a full disk."""
     try:
         yield
     except OSError as error:
@@ -61,7 +61,7 @@ def writing(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def progress(console: Console) -> Iterator[Callable[[str, float], None]]:
-    """A progress bar over the stages; yields what to tell it."""
+    """Draw a progress bar over the stages; yield the function that takes the stage and the finished share."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (BarColumn(bar_width=30), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())

@@ -45,11 +45,11 @@ class Reach:
 
     @property
     def unfinished(self) -> Path:
-        """Folder of what is finished."""
+        """Return the folder of what is finished."""
         return self.out.with_name(f"{self.out.name}.chunks")
 
     def run(self) -> int:
-        """Runs the command; returns the exit code."""
+        """Run the command; return the exit code."""
         import shutil
 
         from rich.console import Console

@@ -91,7 +91,7 @@ class Retarget:
     """Computing time per frame with --live [s]. Default: 60 % of the time between frames."""
 
     def run(self) -> int:
-        """Runs the command; returns the exit code."""
+        """Run the command; return the exit code."""
         if self.fit is not None:
             _fit(self, self.fit)
             return 0
@@ -132,7 +132,7 @@ def _reader(command: Retarget) -> Reader:
 
 
 def _fit(command: Retarget, file: Path) -> None:
-    """Writes a profile found by a folder's clips."""
+    """Write a profile found by a folder's clips."""
     from rich.console import Console
 
     from .. import retargeting
@@ -176,7 +176,7 @@ def _retargeter(command: Retarget) -> Retargeter:
 
 
 def _retarget_folder(command: Retarget) -> int:
-    """All clips of a folder; returns the exit code."""
+    """Return all clips of a folder; returns the exit code."""
     from rich.console import Console
 
     from ..retargeting._folder import retarget_folder
@@ -214,7 +214,7 @@ def _retarget_folder(command: Retarget) -> int:
 
 
 def _table(summary: dict[str, Any]) -> Table:
-    """A line for each clip, if they are not too many, and the worst of all."""
+    """Return a line for each clip, if they are not too many, and the worst of all."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -230,7 +230,7 @@ def _table(summary: dict[str, Any]) -> Table:
 
 
 def _retarget_live(command: Retarget) -> None:
-    """A clip at its own rate, or a stream on stdin."""
+    """Retarget a clip at its own rate, or a stream from stdin."""
     import numpy as np
     from rich.console import Console
     from rich.markup import escape
@@ -302,7 +302,7 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
 
 
 def _robot_to_retarget(source: str) -> Robot:
-    """A robot by name or file, its base floating."""
+    """Return a robot by name or file, its base floating."""
     from ..robot.loading import ROBOTS
 
     return read_robot(source, "auto" if source in ROBOTS else "floating")
@@ -316,7 +316,7 @@ def _number_or_name(text: str) -> str | float:
 
 
 def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:
-    """ROLE=NAME as a mapping; None where there are none."""
+    """Return a mapping from texts ROLE=NAME; None without any."""
     wrong = [pair for pair in pairs if "=" not in pair]
     if wrong:
         raise OsikValueError(f"--mapping takes ROLE=NAME; got {', '.join(wrong)}")

@@ -17,7 +17,7 @@ FLOATING = {"auto": None, "floating": True, "fixed": False}
 
 
 def read_robot(source: str, base: str = "auto") -> Robot:
-    """A robot by a name that ``load_robot`` takes, or a URDF or MJCF file, told apart by what is in it.
+    """Return a robot by a name that ``load_robot`` takes, or a URDF or MJCF file, told apart by what is in it.
 
     Args:
         source: name or path.
@@ -48,7 +48,7 @@ def read_robot(source: str, base: str = "auto") -> Robot:
 
 
 def _described(name: str, floating: bool | None) -> Robot:
-    """A robot of robot_descriptions, whose git may fail in ways of its own."""
+    """Return a robot of robot_descriptions, whose git may fail in ways of its own."""
     from ..robot import load_robot
 
     try:

@@ -46,7 +46,7 @@ class Ros2:
     """Largest difference of a joint from the recorded command for exit code 0, with --replay [rad or m]."""
 
     def run(self) -> int:
-        """Runs the command; returns the exit code: 1 where a replay does not reproduce its commands."""
+        """Run the command; return the exit code: 1 where a replay does not reproduce its commands."""
         with told():
             from ..interop.ros2 import Controller, Settings, dds, read_settings
 

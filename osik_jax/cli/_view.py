@@ -43,7 +43,7 @@ class View:
     """Write a page that plays a motion.npz without a server, instead of serving one."""
 
     def run(self) -> int:
-        """Serves a page until Ctrl-C, which is how a view ends."""
+        """Serve a page until Ctrl-C, which is how a view ends."""
         from ..viewer.live import _open
         from ..viewer.live._source import RobotSource
 
@@ -77,7 +77,7 @@ class View:
 
 
 def _feet(robot: Robot) -> tuple[str, ...]:
-    """Frames on the ground, of a robot that moves freely."""
+    """Return frames on the ground, of a robot that moves freely."""
     from ..demo._file import guess_feet
 
     return guess_feet(robot) if robot.floating_base else ()

@@ -60,7 +60,7 @@ class Core(NamedTuple):
 
 
 def between_segments(a: Core, b: Core) -> Nearest:
-    """Two spheres or capsules: segments, of length 0 for a sphere, with a radius.
+    """Return the separation of two spheres or capsules: segments, of length 0 for a sphere, with a radius.
 
     Axes that cross or centres that coincide leave the direction open: perpendicular to both axes is taken.
     """
@@ -73,7 +73,7 @@ def between_segments(a: Core, b: Core) -> Nearest:
 
 
 def from_plane(point: Float[Array, "3"], normal: Float[Array, "3"], b: Core) -> Nearest:
-    """A half-space, whose surface holds ``point`` and whose outside ``normal`` points to, and a core."""
+    """Return a half-space, whose surface holds ``point`` and whose outside ``normal`` points to, and a core."""
     height = _dot(b.vertices - point, normal)
     lowest = jnp.argmin(height)
     distance = height[lowest] - b.radius
@@ -82,7 +82,7 @@ def from_plane(point: Float[Array, "3"], normal: Float[Array, "3"], b: Core) -> 
 
 
 def between_polytopes(a: Core, b: Core, *, rounds: int = 1) -> Nearest:
-    """Two cores, at least one of which has faces.
+    """Return the separation of two cores, at least one of which has faces.
 
     Where they overlap, b is moved out along the best separating axis, by a little more than it takes, and the nearest
     points of the two are then looked for. Exact if ``normals`` and ``edges`` are all there are. With edges left out the
@@ -145,7 +145,7 @@ def _rounded(
     radius_b: Float[Array, ""],
     otherwise: Float[Array, "3"],
 ) -> Nearest:
-    """Two balls; ``otherwise`` is the normal where their centres coincide."""
+    """Return the separation of two balls; ``otherwise`` is the normal where their centres coincide."""
     way = on_b - on_a
     normal, apart = _unit(way, otherwise), _length(way)
     return Nearest(apart - radius_a - radius_b, on_a + radius_a * normal, on_b - radius_b * normal, normal)
@@ -163,7 +163,7 @@ def _segment_parameters(
 
 
 def _parameters(aa: Array, bb: Array, ab: Array, ao: Array, bo: Array) -> tuple[Array, Array]:
-    """The same of any number of pairs, from the products of the two and of each with the offset."""
+    """Return the same of any number of pairs, from the products of the two and of each with the offset."""
     square = aa * bb - ab * ab
     parallel = square <= PARALLEL * aa * bb
     crossing = jnp.clip(_over(ab * bo - ao * bb, jnp.where(parallel, 0.0, square)), 0.0, 1.0)
@@ -174,7 +174,10 @@ def _parameters(aa: Array, bb: Array, ab: Array, ao: Array, bo: Array) -> tuple[
 
 
 def _across(a: Float[Array, "3"], b: Float[Array, "3"], outward: Float[Array, "3"]) -> Float[Array, "3"]:
-    """A unit vector perpendicular to two directions, as far outward as may be; any, where there is none. Constant."""
+    """Return a unit vector perpendicular to two directions, as far outward as may be; any, where there is none.
+
+    Constant.
+    """
     a, b, outward = jax.lax.stop_gradient((a, b, outward))
     longer = jnp.where(_dot(a, a) >= _dot(b, b), a, b)
     steepest = jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(longer))]
@@ -184,7 +187,7 @@ def _across(a: Float[Array, "3"], b: Float[Array, "3"], outward: Float[Array, "3
 
 
 def _axes(a: Core, b: Core) -> Float[Array, "k 3"]:
-    """Directions, or their opposites, along which convex polytopes that do not overlap are apart; some may be 0."""
+    """Return directions, or opposites, along which convex polytopes that do not overlap are apart; some may be 0."""
     crossed = cross(a.edges[:, None], b.edges[None]).reshape(-1, 3)
     lengths = jax.vmap(_length)(a.edges)[:, None] * jax.vmap(_length)(b.edges)
     tiny = jax.vmap(_length)(crossed) <= PARALLEL * lengths.reshape(-1)
@@ -195,7 +198,7 @@ def _axes(a: Core, b: Core) -> Float[Array, "k 3"]:
 def _best_axis(
     a: Float[Array, "v 3"], b: Float[Array, "w 3"], axes: Float[Array, "k 3"]
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The axis along which b is furthest out, k more if against it; and how far b is out."""
+    """Return the axis along which b is furthest out, k more if against it; and how far b is out."""
     along_a, along_b = (_dot(points[:, None], axes) for points in (a, b))
     ahead = jnp.min(along_b, 0) - jnp.max(along_a, 0)
     behind = jnp.min(along_a, 0) - jnp.max(along_b, 0)
@@ -210,13 +213,13 @@ def _signed(axes: Float[Array, "k 3"], best: Int[Array, ""]) -> Float[Array, "3"
 
 
 def _margin(a: Float[Array, "v 3"], b: Float[Array, "w 3"]) -> Float[Array, ""]:
-    """A distance that is small against the shapes and large against rounding."""
+    """Return a distance that is small against the shapes and large against rounding."""
     size = jnp.max(jnp.abs(a - a[0])) + jnp.max(jnp.abs(b - b[0]))
     return jnp.finfo(a.dtype).eps ** 0.4 * size
 
 
 def _search(a: Float[Array, "v 3"], b: Float[Array, "w 3"]) -> tuple[Int[Array, "4"], Int[Array, "4"]]:
-    """Vertices of two polytopes apart from each other that their nearest points lie between (Gilbert's distance)."""
+    """Return vertices of two disjoint polytopes between which their nearest points lie (Gilbert's distance)."""
     tolerance = 8.0 * jnp.finfo(a.dtype).eps
 
     def support(way: Array) -> tuple[Array, Array]:
@@ -262,7 +265,7 @@ def _corners(
 
 
 def _weights(points: Float[Array, "4 3"]) -> Float[Array, "4"]:
-    """Barycentric weights of the point nearest to 0 of a tetrahedron that 0 is not inside of.
+    """Return barycentric weights of the point nearest to 0 of a tetrahedron that 0 is not inside of.
 
     Each edge and each face is tried. Points may coincide.
     """
@@ -283,7 +286,7 @@ def _edge_weights(ends: Float[Array, "2 3"]) -> Float[Array, "2"]:
 
 
 def _face_weights(corners: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """Weights of the point of a plane nearest to 0, and whether it is inside the triangle."""
+    """Return the weights of the point of a plane nearest to 0, and whether it is inside the triangle."""
     u, v = corners[1] - corners[0], corners[2] - corners[0]
     uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
     u0, v0 = -_dot(u, corners[0]), -_dot(v, corners[0])
@@ -300,20 +303,20 @@ def _dot(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "..
 
 
 def _over(a: Float[Array, "*B"], b: Float[Array, "*B"]) -> Float[Array, "*B"]:
-    """a / b; 0 where b is 0, with derivatives 0."""
+    """Return a / b; 0 where b is 0, with derivatives 0."""
     is_zero = b == 0.0
     return jnp.where(is_zero, 0.0, a / jnp.where(is_zero, 1.0, b))
 
 
 def _length(a: Float[Array, "3"]) -> Float[Array, ""]:
-    """The 2-norm, with derivatives 0 at 0."""
+    """Return the 2-norm, with derivatives 0 at 0."""
     square = _dot(a, a)
     is_zero = square == 0.0
     return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, square)))
 
 
 def _unit(a: Float[Array, "3"], otherwise: Float[Array, "3"]) -> Float[Array, "3"]:
-    """a / |a|; where a is nothing but rounding, ``otherwise``."""
+    """Return a / |a|; ``otherwise`` where a is only rounding."""
     square = _dot(a, a)
     is_zero = square <= jnp.finfo(a.dtype).tiny ** 0.5
     return jnp.where(is_zero, otherwise, a / jnp.sqrt(jnp.where(is_zero, 1.0, square)))

@@ -83,7 +83,7 @@ class UnitCore(NamedTuple):
 
 @cache
 def unit_core(kind: Kind) -> UnitCore:
-    """The core that shapes of a kind share; a hull has its own."""
+    """Return the core that shapes of a kind share; a hull has its own."""
     if kind is Kind.SEGMENT:
         ends = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
         return UnitCore(ends, np.zeros((0, 3)), ends[1:])
@@ -192,7 +192,7 @@ def _spread_normals() -> np.ndarray:
 
 
 def padded(cores: Sequence[UnitCore]) -> UnitCore:
-    """Cores of one size, with a leading axis: short ones repeat their last rows; all have edges, or none."""
+    """Return the cores of one size, with a leading axis: short ones repeat their last rows; all have edges, or none."""
     complete = all(len(core.edges) for core in cores)
     whole = [core if complete else core._replace(edges=np.zeros((0, 3))) for core in cores]
     array = jnp if any(isinstance(core.radius, jax.Array) for core in cores) else np
@@ -213,7 +213,7 @@ def world_cores(
     position: Float[Array, "k 3"],
     rotation: Float[Array, "k 3 3"],
 ) -> Core:
-    """Cores of shapes of MuJoCo's sizes, placed in the world; all with a leading axis."""
+    """Return the cores of shapes of MuJoCo's sizes, placed in the world; all with a leading axis."""
     entries, rounded = scaling(kinds)
     vertices, normals, edges, radius = (jnp.asarray(rows, size.dtype) for rows in unit)
     x, y, z = (size[np.arange(len(kinds)), entries[:, i], None] for i in range(3))
@@ -228,21 +228,21 @@ def world_cores(
 
 
 def unit_rows(rows: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Rows of length 1; those of length 0 stay so, with derivatives 0."""
+    """Return the rows of length 1; those of length 0 stay so, with derivatives 0."""
     square = jnp.sum(rows * rows, -1, keepdims=True)
     is_zero = square == 0.0
     return jnp.where(is_zero, 0.0, rows / jnp.sqrt(jnp.where(is_zero, 1.0, square)))
 
 
 def _prism() -> np.ndarray:
-    """A prism around the cylinder of radius 1 between z = -1 and 1."""
+    """Return a prism around the cylinder of radius 1 between z = -1 and 1."""
     angle = 2.0 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
     ring = np.stack([np.cos(angle), np.sin(angle)], -1) / np.cos(np.pi / CYLINDER_SIDES)
     return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-1.0, 1.0)])
 
 
 def _ball() -> np.ndarray:
-    """A polyhedron of 42 corners around the unit ball: an icosahedron with its edges halved."""
+    """Return a polyhedron of 42 corners around the unit ball: an icosahedron with its edges halved."""
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     points = np.array([np.roll(corner, k) for corner in corners for k in range(3)])
@@ -256,7 +256,7 @@ def _ball() -> np.ndarray:
 
 
 def _bent_edges(points: np.ndarray, ends: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Directions of the edges whose two triangles are not in one plane; each edge is given twice."""
+    """Return the directions of the edges whose two triangles are not in one plane; each edge is given twice."""
     order = np.lexsort(ends.T)
     ends, normals = ends[order].reshape(-1, 2, 2)[:, 0], normals[order].reshape(-1, 2, 3)
     bent = np.linalg.norm(normals[:, 0] - normals[:, 1], axis=1) > _MERGED
@@ -265,7 +265,7 @@ def _bent_edges(points: np.ndarray, ends: np.ndarray, normals: np.ndarray) -> np
 
 
 def _different(directions: np.ndarray) -> np.ndarray:
-    """Unit vectors without those that are, or are opposite to, one before them."""
+    """Return unit vectors without those that repeat an earlier one or its opposite."""
     apart = np.linalg.norm(directions[:, None] - directions, axis=-1)
     opposite = np.linalg.norm(directions[:, None] + directions, axis=-1)
     repeats = np.tril(np.minimum(apart, opposite) <= _MERGED, -1).any(1)

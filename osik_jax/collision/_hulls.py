@@ -13,7 +13,7 @@ from ._pairs import Member
 from ._shape import CollisionShape
 
 Hulls = dict[int, UnitCore]
-"""Hulls by the number of the member."""
+"""Convex hulls of shapes, by the number of the member."""
 
 
 def read_hulls(

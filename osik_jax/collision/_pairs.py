@@ -47,12 +47,12 @@ class Member(NamedTuple):
 
     @property
     def solid(self) -> bool:
-        """Whether it is there to be met, rather than to be seen."""
+        """Return whether the shape takes part in collisions, and is not only visual."""
         return self.masks is None or any(self.masks)
 
 
 def members(robot: Robot, shapes: Mapping[str, CollisionShape]) -> list[Member]:
-    """A robot's geoms in the model's order, then the added shapes.
+    """Return a robot's geoms in the model's order, then the added shapes.
 
     Raises:
         KeyError: a shape is fixed to a frame that does not exist.
@@ -134,7 +134,7 @@ def candidate_pairs(
 
 
 def _checked(pairs: Patterns) -> list[tuple[str, str]]:
-    """The pairs of names, if that is what they are."""
+    """Return pairs of names, or raise TypeError for anything else."""
     checked: list[Any] = [pairs] if isinstance(pairs, str) else list(pairs)
     for pair in checked:
         if not isinstance(pair, tuple | list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
@@ -178,7 +178,7 @@ def _excluded(scene: Sequence[Member], exclude: Iterable[str | tuple[str, str]])
 
 
 def _match(scene: Sequence[Member], pattern: str) -> list[int]:
-    """Members called ``pattern``, or on a body or link called so, or else that match it as a glob.
+    """Return members called ``pattern``, or on a body or link called so, or else that match it as a glob.
 
     Of a body or link, those that are there to be met.
     """
@@ -201,7 +201,7 @@ def _match(scene: Sequence[Member], pattern: str) -> list[int]:
 
 
 def _model_excludes(robot: Robot, scene: Sequence[Member]) -> set[tuple[int, int]]:
-    """The model's own ``<exclude>`` elements."""
+    """Return the model's own ``<exclude>`` elements."""
     pairs = {frozenset(divmod(int(signature), 1 << 16)) for signature in robot.mj_model.exclude_signature}
     return {
         (i, j)

@@ -59,22 +59,22 @@ class Scene:
 
     @cached_property
     def _hash(self) -> int:
-        """Computed once: every call of a jitted function asks for it."""
+        """Return the hash, computed once because every call of a jitted function asks for it."""
         return hash(tuple(getattr(self, field.name) for field in dataclasses.fields(self)))
 
     @cached_arrays
     def pairs(self) -> np.ndarray:
-        """Shapes of each pair, in the order of the distances. (pairs, 2), int."""
+        """Return the shapes of each pair, in the order of the distances. (pairs, 2), int."""
         return np.concatenate([np.array([group.first, group.second]).T for group in self.groups])
 
     @cached_arrays
     def pair_bodies(self) -> np.ndarray:
-        """Moving bodies of each pair. (pairs, 2), int."""
+        """Return moving bodies of each pair. (pairs, 2), int."""
         return np.asarray(self.bodies, int)[self.pairs]
 
     @cached_property
     def pair_names(self) -> tuple[tuple[str, str], ...]:
-        """Names of each pair's shapes."""
+        """Return the names of each pair's shapes."""
         return tuple((self.names[i], self.names[j]) for i, j in self.pairs)
 
 
@@ -83,7 +83,7 @@ _RANKS = {Kind.PLANE: 0, Kind.SEGMENT: 1, Kind.BOX: 2, Kind.CYLINDER: 2, Kind.EL
 
 
 def grouped(kinds: Sequence[Kind], pairs: Sequence[tuple[int, int]]) -> tuple[Group, ...]:
-    """Pairs by what computes them: few groups, for each is compiled by itself."""
+    """Return pairs by what computes them: few groups, because each is compiled separately."""
     found: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for pair in pairs:
         i, j = sorted(pair, key=lambda k: (_RANKS[kinds[k]], k))
@@ -108,7 +108,7 @@ class Placed(eqx.Module):
 
 
 def place(scene: Scene, robot: Robot, kinematics: Kinematics, added: Placed) -> Placed:
-    """The scene's shapes in the world; ``added`` are those that are not the robot's, each in its frame."""
+    """Return the scene's shapes in the world; ``added`` are those that are not the robot's, each in its frame."""
     own, frames = np.asarray(scene.geoms, int), np.asarray(scene.frames, int)
     robots = Placed(robot.geom_position[own], robot.geom_rotation[own], robot.geom_size[own])
     turn = robot.frame_rotation[frames]
@@ -124,7 +124,7 @@ def place(scene: Scene, robot: Robot, kinematics: Kinematics, added: Placed) -> 
 
 
 def nearest(scene: Scene, placed: Placed, hulls: UnitCore | None) -> Nearest:
-    """Distances, points and normals of all pairs, with a leading axis; the first shape of a pair is ``a``."""
+    """Return distances, points and normals of all pairs, with a leading axis; the first shape of a pair is ``a``."""
     parts = [_of_group(scene, group, placed, hulls) for group in scene.groups]
     return jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
 
@@ -142,7 +142,7 @@ def _of_group(scene: Scene, group: Group, placed: Placed, hulls: UnitCore | None
 
 
 def _cores(scene: Scene, ids: tuple[int, ...], placed: Placed, hulls: UnitCore | None) -> Core:
-    """The cores of some shapes, of one size, with a leading axis."""
+    """Return the cores of some shapes, of one size, with a leading axis."""
     index, kinds = np.asarray(ids, int), [scene.kinds[k] for k in ids]
     units = [unit_core(kind) for kind in dict.fromkeys(kinds) if kind is not Kind.HULL]
     start = {kind: k for k, kind in enumerate(kind for kind in dict.fromkeys(kinds) if kind is not Kind.HULL)}
@@ -157,7 +157,7 @@ def _cores(scene: Scene, ids: tuple[int, ...], placed: Placed, hulls: UnitCore |
 def separation_jacobian(
     tree: KinematicTree, kinematics: Kinematics, near: Nearest, bodies: Int[np.ndarray, "k 2"] | Int[Array, "k 2"]
 ) -> Float[Array, "k nv"]:
-    """``d distance / dt = J v`` of pairs whose shapes are fixed to these bodies: ``normal' (J_b - J_a)``.
+    """Return J with ``d distance / dt = J v`` for pairs whose shapes are fixed to bodies: ``normal' (J_b - J_a)``.
 
     A point's velocity along the normal is the dof's at the robot's root, and its turning times the arm from there.
     """

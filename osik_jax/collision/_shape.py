@@ -39,7 +39,7 @@ class CollisionShape(eqx.Module):
     def sphere(
         cls, radius: ArrayLike | Array, position: ArrayLike | Array = (0.0, 0.0, 0.0), *, frame: str | None = None
     ) -> Self:
-        """A ball.
+        """Return a ball.
 
         Args:
             radius: [m].
@@ -55,7 +55,7 @@ class CollisionShape(eqx.Module):
     def capsule(
         cls, radius: ArrayLike | Array, start: ArrayLike | Array, end: ArrayLike | Array, *, frame: str | None = None
     ) -> Self:
-        """All points within ``radius`` [m] of the segment between two points of the frame [m].
+        """Return all points within ``radius`` [m] of the segment between two points of the frame [m].
 
         Raises:
             ValueError: as in ``sphere``; start and end are one point.
@@ -75,7 +75,7 @@ class CollisionShape(eqx.Module):
         *,
         frame: str | None = None,
     ) -> Self:
-        """A box.
+        """Return a box.
 
         Args:
             half_sizes: half its edges [m]. (3,)
@@ -93,7 +93,9 @@ class CollisionShape(eqx.Module):
     def cylinder(
         cls, radius: ArrayLike | Array, start: ArrayLike | Array, end: ArrayLike | Array, *, frame: str | None = None
     ) -> Self:
-        """A cylinder of ``radius`` [m] between two points of the frame [m]; taken as the prism of 16 sides around it.
+        """Return a cylinder of ``radius`` [m] between two points of the frame [m].
+
+        It is taken as the prism of 16 sides around it.
 
         Raises:
             ValueError: as in ``capsule``.
@@ -130,7 +132,7 @@ class CollisionShape(eqx.Module):
         *,
         frame: str | None = None,
     ) -> Self:
-        """The convex hull of points, such as a mesh's vertices.
+        """Return the convex hull of points, such as a mesh's vertices.
 
         Args:
             points: [m]. (k, 3)
@@ -153,7 +155,7 @@ def _vector(value: Any, what: str) -> Float[Array, "3"]:
 
 
 def _sizes(*sizes: Any) -> Float[Array, "3"]:
-    """MuJoCo's sizes: those that are given, which have to be positive, and zeros."""
+    """Return MuJoCo's sizes: the given ones, which have to be positive, then zeros."""
     for size in sizes:
         _check_positive(size, "a size")
     return jnp.stack([jnp.asarray(size, float) for size in (*sizes, 0.0, 0.0)[:3]])
@@ -175,7 +177,7 @@ def _rotation(value: Any) -> Float[Array, "3 3"]:
 
 
 def _turned_to(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """A rotation that takes z to a unit vector."""
+    """Return a rotation that takes z to a unit vector."""
     steepest = jnp.eye(3, dtype=axis.dtype)[jnp.argmin(jnp.abs(axis))]
     side = jnp.cross(steepest, axis)
     side = side / jnp.linalg.norm(side)

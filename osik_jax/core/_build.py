@@ -1,6 +1,6 @@
 """Build of the C++ core, run by the installation (``hatch_build.py``) and by ``python -m osik_jax.core._build``.
 
-Only the standard library is imported, for nothing else is there while a package is installed.
+Only the standard library is imported, because nothing else is available during an installation.
 """
 
 from __future__ import annotations

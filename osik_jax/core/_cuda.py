@@ -78,9 +78,9 @@ def call(
     Args:
         source: CUDA text.
         outputs: shape and dtype of each result.
-        inputs: arrays, as the kernel wants them.
-        problems: how many there are.
-        shared: bytes of shared memory of one problem, which begin where shared memory does.
+        inputs: arrays with the dtypes and memory layout that the kernel expects.
+        problems: number of problems in the batch.
+        shared: bytes of shared memory that one problem takes.
         per_block: how many problems a block solves.
         warps: how many warps of 32 threads a block has.
 

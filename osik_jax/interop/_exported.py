@@ -97,7 +97,7 @@ class ExportedController:
         return value
 
     def __repr__(self) -> str:
-        """Inputs and outputs with their shapes."""
+        """Return inputs and outputs with their shapes."""
         parts = [f"{p.name} {p.shape} {p.dtype}" for p in (*self.inputs.values(), *self.outputs.values())]
         return f"ExportedController(dt={self.dt}, batch={self.batch!r}, {'; '.join(parts)})"
 

@@ -131,12 +131,12 @@ class TaskSpaceAction(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Number of entries of an action."""
+        """Return the number of entries of an action."""
         return self.scale.shape[-1]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the entries of an action: the task, then x, y, z of its position and rx, ry, rz of its rotation."""
+        """Return the names of an action's entries: the task, then x, y, z (position), rx, ry, rz (rotation)."""
         return tuple(
             f"{name}.{entry}"
             for name in self.commanded

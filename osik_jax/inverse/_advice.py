@@ -54,7 +54,7 @@ def _line(robot: Robot, frame: str, asked: tuple[bool, ...], joints: int) -> str
 
 
 def _rows_to_keep(robot: Robot, frame: str, asked: tuple[bool, ...], joints: int) -> tuple[tuple[bool, ...], str]:
-    """The rows that the joints move best, and their axes: with the whole position where it can be kept."""
+    """Return the rows that the joints move best, and their axes: with the whole position where it can be kept."""
     matrices = {axes: np.asarray(own) for axes, own in zip(("world", "frame"), _jacobians(robot, frame), strict=True)}
     sets = list(combinations(np.flatnonzero(asked).tolist(), joints))
 
@@ -70,7 +70,7 @@ def _rows_to_keep(robot: Robot, frame: str, asked: tuple[bool, ...], joints: int
 
 @partial(jax.jit, static_argnames="frame")
 def _jacobians(robot: Robot, frame: str) -> tuple[Float[Array, "samples 6 n"], Float[Array, "samples 6 n"]]:
-    """Jacobians at sample configurations, in world axes and in the frame's; lengths relative to the longest lever."""
+    """Return Jacobians at sample configurations, in world and frame axes; lengths relative to the longest lever."""
     layout = chain_layout(robot.tree, (frame,))
     chain = make_chain(robot, (frame,), layout)
     points = unit_points(shift_of(0, len(layout.dofs)), jnp.arange(_SAMPLES), robot.q0.dtype)

@@ -64,7 +64,7 @@ def with_all(
 def _distinct(
     x: Float[np.ndarray, "k n"], separation: Float[np.ndarray, " k"], turns: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, "m n"]:
-    """The first of each set of configurations that differ by less than their separation, whole turns left out."""
+    """Return the first of each set of configurations that differ by less than their separation, modulo whole turns."""
     kept: list[np.ndarray] = []
     while len(x):
         kept.append(x[0])
@@ -74,7 +74,7 @@ def _distinct(
 
 
 def _copies(branches: Float[np.ndarray, "k n"], own: Coordinates, most: int) -> Float[np.ndarray, "m n"]:
-    """Other configurations by whole turns of joints whose limits allow it, those near the first configuration first.
+    """Return other configurations by whole turns of joints within limits, those near the first configuration first.
 
     A joint without limits has no copies: there is no end to them.
     """

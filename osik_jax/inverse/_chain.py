@@ -73,13 +73,13 @@ class Chain(eqx.Module):
 
 
 def is_plain(tree: KinematicTree, frames: Sequence[str]) -> bool:
-    """Whether only hinges and slides carry the frames, so that a ``Chain`` can be made."""
+    """Return whether only hinges and slides carry the frames, so that a ``Chain`` can be made."""
     joints = {joint for name in frames for joint in _carrying(tree, name)}
     return bool(joints) and all(tree.joint_types[j] in (HINGE, SLIDE) for j in joints)
 
 
 def _carrying(tree: KinematicTree, frame: str) -> list[int]:
-    """The joints between the world and a frame, from the world on."""
+    """Return the joints between the world and a frame, from the world on."""
     body, path = tree.frame_bodies[tree.frame(frame)], []
     while body:
         path.append(body)
@@ -88,7 +88,7 @@ def _carrying(tree: KinematicTree, frame: str) -> list[int]:
 
 
 def chain_layout(tree: KinematicTree, frames: Sequence[str]) -> Layout:
-    """The structure of the chain to some frames, of which ``is_plain`` holds."""
+    """Return the structure of the chain to some frames, of which ``is_plain`` holds."""
     paths = [_carrying(tree, name) for name in frames]
     joints = sorted({joint for path in paths for joint in path})
     index_of = {joint: at for at, joint in enumerate(joints)}
@@ -109,7 +109,7 @@ def chain_layout(tree: KinematicTree, frames: Sequence[str]) -> Layout:
 
 
 def make_chain(robot: Robot, frames: Sequence[str], layout: Layout) -> Chain:
-    """The geometry of the chain to some frames; differentiable in the robot's numbers."""
+    """Return the geometry of the chain to some frames; differentiable in the robot's numbers."""
     tree, joints = robot.tree, np.array(layout.joints, int)
     bodies = np.asarray(tree.joint_bodies, int)[joints]
     first_of_body = np.array([tree.joint_bodies.index(int(body)) == j for j, body in zip(joints, bodies, strict=True)])
@@ -135,7 +135,7 @@ def make_chain(robot: Robot, frames: Sequence[str], layout: Layout) -> Chain:
 def _before_joints(
     robot: Robot, bodies: np.ndarray, first_of_body: np.ndarray
 ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
-    """Pose, in the frame before, in which each joint finds its body: that of the body before the first of its joints.
+    """Return, for each joint, the pose of its body before the body's first joint, in the frame before.
 
     Bodies that are fixed to others are one body with them, so that there is a joint on each body of a path.
     """
@@ -153,7 +153,7 @@ def _motions(
     anchor: Float[Array, "k 3"],
     hinges: np.ndarray,
 ) -> tuple[Array, Array, Array]:
-    """Rodrigues' formula as three matrices a joint: ``R = I + sin K + (1 - cos) K^2``, about the anchor."""
+    """Return Rodrigues' formula as three matrices per joint: ``R = I + sin K + (1 - cos) K^2``, about the anchor."""
     zero = jnp.zeros_like(axis[:, 0])
     x, y, z = axis.T
     skew = jnp.stack([jnp.stack([zero, -z, y], -1), jnp.stack([z, zero, -x], -1), jnp.stack([-y, x, zero], -1)], -2)
@@ -185,7 +185,7 @@ class ChainKinematics(NamedTuple):
 
 
 def chain_kinematics(chain: Chain, x: Float[Array, "n lanes"]) -> ChainKinematics:
-    """Forward kinematics of the chain.
+    """Return forward kinematics of the chain.
 
     Args:
         chain: the chain.
@@ -246,7 +246,7 @@ def _joined(pose: Float[Array, "3 4 lanes"], own: Float[Array, "3 4 lanes"]) -> 
 
 
 def _times(a: Float[Array, "*k m 3 lanes"], b: Float[Array, "*k 3 n lanes"]) -> Float[Array, "*k m n lanes"]:
-    """The matrix product of each lane, written out: three products of arrays."""
+    """Return the matrix product of each lane, written out: three products of arrays."""
     first, second, third = (a[..., :, i, None, :] * b[..., i, None, :, :] for i in range(3))
     return first + second + third
 
@@ -258,7 +258,7 @@ def jacobian(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames 
 
 
 def _joint_columns(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames k 6 lanes"]:
-    """The same over the chain's joints."""
+    """Return the same as ``_body_columns`` over the chain's joints."""
     layout = chain.layout
     hinge = np.array(layout.hinges)[:, None, None]
     columns = []

@@ -64,11 +64,11 @@ class ChainRoute(NamedTuple):
 
     @property
     def starts_anew(self) -> bool:
-        """Whether the way to the least error begins with new searches, and is part of traced programs."""
+        """Return whether the way to the least error begins with new searches, and is part of traced programs."""
         return True
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
-        """The search for these frames."""
+        """Return the search for these frames."""
         return chain_search(robot, self, settings, warm=warm, near=near)
 
     def beyond(self, search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
@@ -76,16 +76,16 @@ class ChainRoute(NamedTuple):
         return _beyond(search, goal)
 
     def entries(self, robot: Robot) -> np.ndarray:
-        """Entries of q that a search moves."""
+        """Return the entries of q that a search moves."""
         return np.array(chain_layout(robot.tree, self.frames).dofs, int)
 
     def asked(self, settings: Settings) -> dict[str, tuple[bool, ...]]:
-        """The rows of each frame that count."""
+        """Return the rows of each frame that count."""
         del settings
         return dict(zip(self.frames, self.rows, strict=True))
 
     def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
-        """Whether a whole turn of each of these entries changes no pose."""
+        """Return whether a whole turn of each of these entries changes no pose."""
         return np.array(turning(chain_layout(robot.tree, self.frames)))
 
     def answer(self, robot: Robot, search: ChainSearch, goal: Goal, x: Array, seed: Array, steps: Array) -> Any:
@@ -94,7 +94,7 @@ class ChainRoute(NamedTuple):
 
 
 def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
-    """The search for configurations of a robot whose frames hinges and slides carry."""
+    """Return the search for configurations of a robot whose frames hinges and slides carry."""
     frames, rows = route
     layout = chain_layout(robot.tree, frames)
     chain = make_chain(robot, frames, layout)
@@ -126,7 +126,7 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
 
 
 def allowed(tolerance: Float[Array, "2"], length: Float[Array, ""]) -> Float[Array, "2"]:
-    """Tolerances less what rounding may hide, so that what is called converged is so in exact numbers too."""
+    """Return the tolerances less the possible rounding, so that a converged answer holds in exact numbers too."""
     size = jnp.stack([jnp.where(jnp.isfinite(length), length, 1.0), jnp.ones_like(length)])
     hidden = _ROUNDOFF * float(jnp.finfo(tolerance.dtype).eps) * size
     # a tolerance near roundoff keeps a quarter of itself, or no search could end
@@ -134,7 +134,7 @@ def allowed(tolerance: Float[Array, "2"], length: Float[Array, ""]) -> Float[Arr
 
 
 def dof_of_entries(robot: Robot) -> np.ndarray:
-    """The entry of v of each entry of q, of hinges and slides. (nq,)."""
+    """Return the entry of v of each entry of q, of hinges and slides. (nq,)."""
     scalar, index = scalar_layout(robot)
     out = np.zeros(robot.nq, int)
     out[index[scalar]] = np.flatnonzero(scalar)
@@ -142,13 +142,13 @@ def dof_of_entries(robot: Robot) -> np.ndarray:
 
 
 def turning(layout: Layout) -> tuple[bool, ...]:
-    """Whether a whole turn of each coordinate brings every joint that it moves to the same place."""
+    """Return whether a whole turn of each coordinate brings every joint that it moves to the same place."""
     moved = [[j for j, entry in enumerate(layout.entries) if entry == dof] for dof in layout.dofs]
     return tuple(all(layout.hinges[j] and layout.factors[j] % 1.0 == 0.0 for j in own) for own in moved)
 
 
 def _starts(layout: Layout, turns: tuple[bool, ...], lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
-    """Finite ends of where searches start: the limits, one turn of them, or a metre around the first configuration."""
+    """Return finite ranges for the starts of searches: the limits, one turn, or 1 m around the first configuration."""
     hinge = np.array([layout.hinges[layout.entries.index(dof)] for dof in layout.dofs])
     width = np.where(hinge, np.pi, 1.0)
     free = jnp.isinf(lower) | jnp.isinf(upper)
@@ -161,7 +161,7 @@ def _starts(layout: Layout, turns: tuple[bool, ...], lower: Array, upper: Array,
 
 
 def reaches(chain: Chain, x: Array, lower: Array, upper: Array) -> tuple[Float[Array, " frames"], Array]:
-    """Length of the links to each frame [m], slides drawn out; and where the first joint of each is. (frames, 3)."""
+    """Return the length of the links to each frame [m], slides extended, and where the first joint is. (frames, 3)."""
     kinematics, layout = chain_kinematics(chain, x[:, None]), chain.layout
     travel = jnp.maximum(jnp.abs(upper - x), jnp.abs(lower - x))
     lengths, roots = [], []
@@ -209,7 +209,7 @@ def answer(
 
 
 def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
-    """Residual of each frame (frames, 6, lanes), at which limits it is stopped (n, lanes), and the errors."""
+    """Return the residual of each frame (frames, 6, lanes), the limits that stop it (n, lanes), and the errors."""
     error, matrix, errors = search.linearised(x, goal)
     rows = np.array(search.rows)
     scale = jnp.where(np.arange(6) < 3, 1.0, search.length)[None].repeat(len(rows), 0)[rows]

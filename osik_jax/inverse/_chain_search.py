@@ -43,7 +43,7 @@ class Goal(NamedTuple):
 
 
 def lanes_last(goal: Goal) -> Goal:
-    """Goals with the lanes behind, where they are in front."""
+    """Return goals with the axis of lanes moved from the front to the end."""
     return Goal(jnp.moveaxis(goal.position, 0, -1), jnp.moveaxis(goal.rotation, 0, -1))
 
 
@@ -103,7 +103,7 @@ class ChainSearch(eqx.Module):
         return jnp.clip(points, self.lower, self.upper)
 
     def advance(self, x: Float[Array, "lanes n"], goal: Goal, steps: int) -> tuple[Array, Array, Errors]:
-        """Some steps: where the last one set out, where it led, and the errors of where it set out."""
+        """Return the state after some steps: start and end of the last one, and the errors at its start."""
         turned = lanes_last(goal)
 
         def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
@@ -133,7 +133,7 @@ class ChainSearch(eqx.Module):
         return jnp.where(done, x, jnp.clip(x + move, lower, upper)), errors
 
     def newton_step(self, x: Float[Array, " n"], goal: Goal) -> Float[Array, " n"]:
-        """The shortest step to the goal by the linear model at x; what stands at a limit goes with the limit."""
+        """Return the shortest step to the goal by the linear model at x; what stands at a limit goes with the limit."""
         aim = Goal(goal.position[..., None], goal.rotation[..., None])
         error, matrix, _ = self.linearised(x[:, None], aim)
         low, high = x <= self.lower, x >= self.upper
@@ -146,7 +146,7 @@ class ChainSearch(eqx.Module):
         return forced - step[:, 0]
 
     def unwound(self, x: Float[Array, "*lanes n"]) -> Float[Array, "*lanes n"]:
-        """The same poses, each joint as near to the first configuration as whole turns within its limits bring it."""
+        """Return the same poses, each joint turned as near to the first configuration as its limits allow."""
         return unwound(x, self.first, self.lower, self.upper, self.turns)
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, ""]:
@@ -154,7 +154,7 @@ class ChainSearch(eqx.Module):
         return jnp.sqrt(jnp.sum((x - self.first) ** 2))
 
     def finishing(self, exact: bool) -> ChainSearch:
-        """The same search without the term that draws it to the first configuration, for the last steps.
+        """Return the same search without the term that draws it to the first configuration, for the last steps.
 
         ``exact``: it goes on beyond what the tolerances ask for.
         """
@@ -162,7 +162,7 @@ class ChainSearch(eqx.Module):
         return dataclasses.replace(self, near=False, enough=enough)
 
     def isolated(self, x: Float[Array, "lanes n"], goal: Goal) -> Bool[Array, " lanes"]:
-        """Whether a solution is the only one around: every motion of the joints takes a frame off its target."""
+        """Return whether a solution is the only one around: every motion of the joints takes a frame off its target."""
         matrix = self.linearised(x.T, lanes_last(goal))[1]
         if len(matrix) < x.shape[1]:
             # with fewer rows than joints there is always a motion that keeps the frames
@@ -178,31 +178,34 @@ class ChainSearch(eqx.Module):
     def local_optima(
         self, x: Float[Array, "lanes n"], goal: Goal, open_: Bool[Array, " lanes"]
     ) -> tuple[Float[Array, "lanes n"], Float[Array, " lanes"], Int[Array, " lanes"]]:
-        """Local optima from some starts, their errors [m], and the steps taken; lanes that are not open stay."""
+        """Return local optima from some starts, their errors [m], and the steps taken; lanes that are not open stay."""
         own, turned, gain = self._measuring(), lanes_last(goal), _GAIN * self.tolerance[0]
         found = minimum(lambda x: own.model(x, turned), x.T, self.lower, self.upper, open_, gain)
         return found.x.T, jnp.sqrt(2.0 * found.cost), found.steps
 
     def _measuring(self) -> ChainSearch:
-        """The same errors, with a radian for as many metres as the tolerances say."""
+        """Return the same errors, with a radian for as many metres as the tolerances say."""
         return dataclasses.replace(self, length=self.tolerance[0] / self.tolerance[1])
 
     def model(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Array]:
-        """Error of each row that counts [m], its derivative, and its second derivatives times it (n, n, lanes)."""
+        """Return the error of each row that counts [m], and its derivatives.
+
+        The second ones are multiplied by the error. (n, n, lanes).
+        """
         error, matrix, (kinematics, linear, angular) = self._rows(x, goal)
         kept = np.array(self.rows)[..., None]
         linear, angular = jnp.where(kept[:, :3], linear, 0.0), jnp.where(kept[:, 3:], angular, 0.0)
         return error, matrix, curvature(self.chain, kinematics, linear, angular, self.length)
 
     def linearised(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
-        """Error of each row that counts [m], its derivative (rows, n, lanes), and the errors of the frames."""
+        """Return the error of each row that counts [m], its derivative (rows, n, lanes), and the frames' errors."""
         error, matrix, (_, linear, angular) = self._rows(x, goal)
         return error, matrix, self._errors(linear, angular, jnp.sum(error**2, 0))
 
     def _rows(
         self, x: Float[Array, "n lanes"], goal: Goal
     ) -> tuple[Array, Array, tuple[ChainKinematics, Array, Array]]:
-        """Error of each row that counts, its derivative, and the kinematics and errors that they are taken from."""
+        """Return the error of each row that counts, its derivative, and the kinematics and errors behind them."""
         kinematics = chain_kinematics(self.chain, x)
         linear = kinematics.position - goal.position
         angular = rotation_error(kinematics.rotation, goal.rotation)
@@ -234,6 +237,6 @@ def _transposed_times(matrix: Float[Array, "m n lanes"], vector: Float[Array, "m
 
 
 def _gram(matrix: Float[Array, "m n lanes"], damping: Float[Array, " lanes"]) -> Float[Array, "m m lanes"]:
-    """matrix matrix' + damping I."""
+    """Return matrix matrix' + damping I."""
     parts = [matrix[:, None, k] * matrix[None, :, k] for k in range(matrix.shape[1])]
     return sum(parts[1:], parts[0]) + jnp.eye(len(matrix), dtype=matrix.dtype)[..., None] * damping

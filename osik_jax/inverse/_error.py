@@ -12,7 +12,7 @@ _SMALL_SINE_SQUARED = 1e-12
 def rotation_error(
     rotation: Float[Array, "frames 3 3 lanes"], target: Float[Array, "frames 3 3 lanes"]
 ) -> Float[Array, "frames 3 lanes"]:
-    """Axis times angle, in world axes, of the turn from the target to the rotation; angles up to pi [rad]."""
+    """Return axis times angle, in world axes, of the turn from the target to the rotation; angles up to pi [rad]."""
     first, second, third = (rotation[:, :, None, i] * target[:, None, :, i] for i in range(3))
     wxyz = _quaternion(first + second + third)
     # q and -q are the same rotation; with w >= 0 the angle is at most pi

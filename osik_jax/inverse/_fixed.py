@@ -49,7 +49,7 @@ def search_all(search: Search, goals: Any, *, seeds: int, steps: int, last: Sear
 
 
 def choose(outcomes: Outcomes, distance: Float[Array, "targets seeds"] | None) -> Int[Array, " targets"]:
-    """Number of the one to take: the nearest of those that have converged, or the first where there are no distances.
+    """Return the number of the best: the nearest of the converged ones, or the first where there are no distances.
 
     Not the most exact one, which could be any as the target moves. Where none has converged, the least wrong.
     """
@@ -63,5 +63,5 @@ def choose(outcomes: Outcomes, distance: Float[Array, "targets seeds"] | None) -
 
 
 def at_solution(search: Any, goal: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """x, found by a search that is not differentiated, with the derivative of a solution."""
+    """Return x, found by a search that is not differentiated, with the derivative of a solution."""
     return attached(jax.lax.stop_gradient(x), search, goal)

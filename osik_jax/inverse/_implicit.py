@@ -12,7 +12,7 @@ from ..execution._rules import custom_jvp
 
 @custom_jvp
 def attached(x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, " n"]:
-    """x as it is, moving with the problem that it solves.
+    """Return x as it is, with the derivative by the problem that it solves.
 
     Where ``error(x, problem) = 0``, the implicit function theorem gives ``J dx = -d error``: of all such dx the
     shortest, over the coordinates that stand at no limit; those that do move with their limit. That is the derivative

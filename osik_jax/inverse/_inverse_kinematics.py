@@ -55,7 +55,7 @@ def inverse_kinematics(
     restarts: int = _RESTARTS,
     closest: bool = True,
 ) -> InverseKinematicsSolution:
-    """Configurations that bring frames to poses, or meet tasks; or the best that was found, and what stops it.
+    """Return configurations that bring frames to poses, or meet tasks; or the best that was found, and what stops it.
 
     Searches start at quasi-random configurations within the limits. Those that make no progress are given up for
     others, and each target is searched for until it is found or has had ``seeds * (1 + restarts)`` of them. Poses of
@@ -147,12 +147,12 @@ def inverse_kinematics(
 
 
 def default_seeds(coordinates: int, every: bool) -> int:
-    """Number of searches for a target that moves so many coordinates: more where all solutions count."""
+    """Return the number of searches for a target that moves so many coordinates: more where all solutions count."""
     return int(np.clip(2 ** min(coordinates + 2, 30), _SEEDS, _MOST_SEEDS)) if every else _SEEDS
 
 
 def _coordinates(robot: Robot, route: Any, settings: Settings) -> Coordinates:
-    """The entries of q that a search moves, as numbers."""
+    """Return the entries of q that a search moves, as numbers."""
     entries = route.entries(robot)
     lower, upper = entry_limits(robot, *starting_box(settings.lower, settings.upper))
     whole = lower, upper, jnp.clip(settings.home, lower, upper)
@@ -172,7 +172,7 @@ def joint_box(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Array, Ar
 
 
 def _inward(bound: Array, sign: float) -> Array:
-    """A bound in single precision may be beyond the one that was meant, by its rounding: the next number is not."""
+    """Return a single-precision bound moved inside by one number, against rounding beyond the wanted one."""
     if bound.dtype != jnp.float32:
         return bound
     if not _is_traced(bound):
@@ -183,7 +183,7 @@ def _inward(bound: Array, sign: float) -> Array:
 
 
 def _together(values: Sequence[Any]) -> Any:
-    """One array, NumPy's where nothing is traced: operations of JAX's cost more than a search."""
+    """Return one array, NumPy's where nothing is traced, because operations of JAX cost more than a search."""
     return (jnp if _is_traced(values) else np).stack(values)
 
 

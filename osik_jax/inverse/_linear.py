@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 
 def solve_positive(matrix: Float[Array, "m m lanes"], vector: Float[Array, "m lanes"]) -> Float[Array, "m lanes"]:
-    """matrix^-1 vector by elimination without pivoting, which a positive definite matrix allows."""
+    """Return matrix^-1 vector by elimination without pivoting, which a positive definite matrix allows."""
     return solve_with_pivots(matrix, vector)[0]
 
 

@@ -132,7 +132,7 @@ def _move(
     curvature: Float[Array, "n n lanes"],
     damping: Float[Array, " lanes"],
 ) -> Float[Array, "n lanes"]:
-    """A damped Newton step, or one of Gauss and Newton where the damped Hessian is not positive definite."""
+    """Return a damped Newton step, or one of Gauss and Newton where the damped Hessian is not positive definite."""
     squares = jnp.sum(matrix[:, :, None] * matrix[:, None], 0)
     scale = jnp.maximum(jnp.max(jnp.sum(matrix**2, 0), 0), jnp.finfo(gradient.dtype).tiny)
     ridged = squares + damping * scale * jnp.eye(len(gradient), dtype=gradient.dtype)[..., None]

@@ -41,7 +41,7 @@ class Search(Protocol):
         ...
 
     def advance(self, x: Float[Array, "lanes n"], goal: Any, steps: int) -> tuple[Array, Array, Errors]:
-        """Some steps: where the last one set out, where it led, and the errors of where it set out."""
+        """Return the state after some steps: start and end of the last one, and the errors at its start."""
         ...
 
 
@@ -86,7 +86,7 @@ def run_pool(
     longest: Int[Array, ""],
     enough: Float[Array, ""],
 ) -> Found:
-    """Searches for all targets until each is found or has had all its seeds.
+    """Search for all targets until each is found or has had all its seeds.
 
     Deterministic: which search a lane takes up depends on nothing but the arguments.
 
@@ -117,12 +117,12 @@ def run_pool(
 
 
 def _of(goals: Any, target: Int[Array, " lanes"]) -> Any:
-    """Each lane's goal; idle lanes have the last one's."""
+    """Return each lane's goal; idle lanes have the last one's."""
     return jax.tree.map(lambda a: jnp.take(a, target, axis=0, mode="clip"), goals)
 
 
 def _first_state(size: Any, targets: int, lanes: int) -> _State:
-    """All lanes idle. Arrays over targets have one more row, for what idle lanes write."""
+    """Return all lanes idle. Arrays over targets have one more row, to which idle lanes write."""
     worst = jnp.full(targets + 1, jnp.inf, size.dtype)
     none = jnp.zeros(targets + 1, jnp.int32)
     idle = jnp.zeros(lanes, jnp.int32)
@@ -135,12 +135,12 @@ def _first_state(size: Any, targets: int, lanes: int) -> _State:
 
 
 def _wanting(state: _State, open_: Array, seeds: Array, enough: Array) -> Bool[Array, " targets"]:
-    """Targets that another search could help."""
+    """Return targets that another search could help."""
     return open_ & (state.started[:-1] < seeds) & (state.found.errors.score[:-1] > enough)
 
 
 def _refill(search: Search, goals: Any, open_: Array, seeds: Array, enough: Array, state: _State) -> _State:
-    """Idle lanes take up searches for the targets that want one, in turn."""
+    """Give idle lanes new searches for the targets that want one, in turn."""
     targets = len(open_)
     wanting = _wanting(state, open_, seeds, enough)
     rank = jnp.cumsum(wanting, dtype=jnp.int32)
@@ -191,7 +191,7 @@ def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
 
 
 def _culled(lanes: _Lanes, x: Array, errors: Errors, found: Found, longest: Array, enough: Array) -> _Lanes:
-    """Searches end when their target is found, when they are too long, and when they no longer make progress."""
+    """End searches whose target is found, that are too long, or that no longer make progress."""
     age = lanes.age + CHECK
     # the negated comparison also ends a search whose cost is NaN
     stuck = (age > _TRIAL) & ~(errors.cost < _PROGRESS * lanes.cost)

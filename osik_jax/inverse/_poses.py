@@ -28,7 +28,9 @@ _ACCEPTED = (
 
 
 def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tuple[bool, ...], ...], int | None]:
-    """Goals (targets, frames, ...), the rows of each frame that count, and the number of targets; None: one, no batch.
+    """Return goals (targets, frames, ...), the rows of each frame that count, and the number of targets.
+
+    The number is None for one target that is no batch.
 
     Raises:
         TypeError, ValueError: something that is no pose, or batches of different lengths.
@@ -58,7 +60,7 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
 
 
 def _one(value: Any, dtype: Any) -> tuple[Array, Array, tuple[bool, ...]]:
-    """Position (3,) or (n, 3), rotation likewise, and rows."""
+    """Return position, rotation and rows of one pose or of n. (3,) or (n, 3), likewise the rotation."""
     array = None if _has_parts(value) else pose_array(value, dtype, _ACCEPTED)
     if array is not None and array.shape[-1:] == (3,) and array.ndim <= 2:
         _check_finite(array)

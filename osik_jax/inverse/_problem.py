@@ -89,7 +89,7 @@ def _of_tasks(
 
 
 def _aims(targets: Any, tasks: Mapping[str, Task], count: int | None) -> tuple[dict[str, Any], int | None]:
-    """Targets of tasks as arrays with the targets in front, and how many they are."""
+    """Return the targets of tasks as arrays with the targets in front, and how many they are."""
     if targets is None:
         return {}, count
     if not isinstance(targets, Mapping):

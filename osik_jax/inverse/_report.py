@@ -29,7 +29,7 @@ def print_found(console: Console, robot: Robot, found: InverseKinematicsSolution
 
 
 def configuration_table(robot: Robot, q: Any) -> Table:
-    """A configuration, joint by joint."""
+    """Return a configuration, joint by joint."""
     table = Table("joint", *(Column(name, justify="right") for name in ("in q", "value", "lower", "upper")))
     for joint in robot.tree.free_bases:
         start = robot.tree.qpos_address[joint]

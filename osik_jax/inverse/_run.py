@@ -133,7 +133,7 @@ def explored(
     every: bool,
     go_on: bool,
 ) -> tuple[InverseKinematicsSolution, Outcomes, Bool[Array, "targets seeds"] | None]:
-    """All searches of each target, to their ends, and with ``every`` whether solutions are isolated.
+    """Return all searches of each target, to their ends, and with ``every`` whether solutions are isolated.
 
     It is a pure function of a limited amount of work.
     """
@@ -173,7 +173,7 @@ def explored(
 
 
 def _with_placeholders(goals: Any) -> tuple[Any, Bool[Array, " targets"]]:
-    """The targets with 0 in place of those that are not finite, which traced ones may be; and which are valid."""
+    """Return the targets with 0 in place of non-finite ones (traced ones may be), and which are valid."""
     numbers, rest = eqx.partition(goals, eqx.is_inexact_array)
     valid = jnp.ones(len(jax.tree.leaves(goals)[0]), bool)
     for leaf in jax.tree.leaves(numbers):

@@ -19,13 +19,13 @@ def shift_of(key: int | Array, dimensions: int) -> UInt[Array, " n"]:
 
 
 def starting_box(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Limits as searches start within them: infinite beyond 100 rad or 100 m, which spread starts over nothing."""
+    """Return the limits for starts: infinite beyond 100 rad or 100 m, where starts would be spread too thinly."""
     # starts spread over such a range would practically never be inside the robot's real one
     return jnp.where(lower < -_UNLIMITED, -jnp.inf, lower), jnp.where(upper > _UNLIMITED, jnp.inf, upper)
 
 
 def unit_points(shift: UInt[Array, " n"], number: Int[Array, "..."], dtype: jnp.dtype) -> Float[Array, "... n"]:
-    """Points of an additive recurrence in the unit cube (Kronecker's sequence).
+    """Return the points of an additive recurrence in the unit cube (Kronecker's sequence).
 
     Its increments are the powers of 1/phi, phi being the positive root of ``phi**(n + 1) = phi + 1``: the golden ratio
     for n = 1. In integers that wrap around, so that a late point is as exact as the first.

@@ -101,6 +101,6 @@ class InverseKinematicsSolution(eqx.Module):
 
 
 def _miss(residual: np.ndarray) -> str:
-    """A residual in words."""
+    """Return a residual in words."""
     numbers = " ".join(f"{value:+.3g}" for value in residual)
     return f"off by {numbers}" + (" (x y z [m], rotation about x y z [rad])" if len(residual) == 6 else "")

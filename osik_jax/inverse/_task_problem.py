@@ -61,11 +61,11 @@ class TaskRoute(NamedTuple):
 
     @property
     def starts_anew(self) -> bool:
-        """No: each copy of a scheme's step in a program takes long to compile."""
+        """Return False, because each copy of a scheme's step in a program takes long to compile."""
         return False
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> TaskSearch:
-        """The search for these tasks."""
+        """Return the search for these tasks."""
         del warm, near
         parts: TaskParts = settings.parts
         lower, upper = entry_limits(robot, settings.lower, settings.upper)
@@ -95,16 +95,16 @@ class TaskRoute(NamedTuple):
         return jnp.zeros(goal.number.shape, search.first.dtype)
 
     def entries(self, robot: Robot) -> np.ndarray:
-        """Entries of q that a search moves."""
+        """Return the entries of q that a search moves."""
         return np.arange(robot.nq)
 
     def asked(self, settings: Settings) -> dict[str, tuple[bool, ...]]:
-        """The rows of each frame that a task asks for."""
+        """Return the rows of each frame that a task asks for."""
         tasks = settings.parts.tasks.values()
         return {task.frame: task.kept for task in tasks if isinstance(task, FrameTask) and not task.bounded}
 
     def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
-        """Whether a whole turn of each of these entries changes no task."""
+        """Return whether a whole turn of each of these entries changes no task."""
         return np.array(turning(robot, settings.parts.tasks))
 
     def answer(self, robot: Robot, search: TaskSearch, goal: Any, x: Array, seed: Array, steps: Array) -> Any:
@@ -132,7 +132,7 @@ class TaskRoute(NamedTuple):
 
 
 def read_tasks(robot: Robot, given: Mapping[str, Any]) -> dict[str, Task]:
-    """Tasks as they are searched with: gains 1, targets at rest.
+    """Return tasks as they are searched with: gains 1, targets at rest.
 
     Raises:
         TypeError: something that is no task.
@@ -160,14 +160,14 @@ def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ..
 
 
 def _unhurried(robot: Robot, limit: Limit) -> Limit:
-    """The limit as a search takes it."""
+    """Return the limit as a search uses it."""
     if isinstance(limit, ConfigurationLimit):
         return _ProjectedRange(robot, lower=limit.lower, upper=limit.upper)  # pyright: ignore[reportCallIssue]
     return limit if "gain" not in limit.replaceable else limit.replace(gain=1.0)
 
 
 def turning(robot: Robot, tasks: Mapping[str, Task]) -> tuple[bool, ...]:
-    """Whether a whole turn of each entry of q brings the robot to the same place, and all tasks are on places alone."""
+    """Return whether a whole turn of each entry of q moves nothing, and all tasks depend on places alone."""
     turns = np.zeros(robot.nq, bool)
     if not all(isinstance(task, _ON_PLACES) for task in tasks.values()):
         return tuple(turns.tolist())
@@ -197,7 +197,7 @@ def _starts(robot: Robot, turns: tuple[bool, ...], lower: Array, upper: Array, f
 def _evaluated(
     search: TaskSearch, q: Float[Array, " nq"], goal: Aims
 ) -> tuple[dict[str, Array], Int[Array, " nv"], Errors]:
-    """Residual of each goal, which limits stop the robot, and the errors."""
+    """Return the residual of each goal, which limits stop the robot, and the errors."""
     rows, errors = search.errors(q, goal)
     gradients = [jnp.matmul(own.jacobian.T, own.weight * own.pull, precision="highest") for own in rows.values()]
     sizes = [jnp.sqrt(jnp.sum(own.weight * own.pull**2)) for own in rows.values()]
@@ -215,7 +215,7 @@ def _evaluated(
 
 
 def _with_balls(search: TaskSearch, q: Array, gradient: Array, most: Array, active: Array) -> Array:
-    """Marks the first entry of each ball joint that is at the end of its range and is driven further along its axis."""
+    """Mark the first entry of each ball joint that is at the end of its range and is driven further along its axis."""
     for joint in independent_balls(search.robot.tree):
         dofs = np.array(dofs_of(search.robot, [joint]))
         at = search.robot.tree.qpos_address[joint]

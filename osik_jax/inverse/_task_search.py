@@ -69,11 +69,11 @@ _SPREADS = 8
 
 
 class Aims(NamedTuple):
-    """One of many targets.
+    """Targets of the tasks of one search, where a batch has many.
 
     Attributes:
-        number: of the target.
-        targets: of tasks, by name; the others keep their own.
+        number: number of the target in the batch.
+        targets: targets by name of the task; other tasks keep their own.
     """
 
     number: Int[Array, "*n"]
@@ -129,7 +129,7 @@ class TaskSearch(eqx.Module):
         return jnp.clip(self.first + ratio * (points - self.first), self.lower, self.upper)
 
     def advance(self, x: Float[Array, "lanes nq"], goal: Aims, steps: int) -> tuple[Array, Array, Errors]:
-        """Some steps: where the last one set out, where it led, and the errors of where it set out."""
+        """Return the state after some steps: start and end of the last one, and the errors at its start."""
 
         def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
             after, errors = jax.vmap(self.step)(carry[1], goal)
@@ -158,12 +158,12 @@ class TaskSearch(eqx.Module):
         return jnp.where(errors.score <= self.enough, q, self._moved(q, velocity)), errors
 
     def newton_step(self, q: Float[Array, " nq"], goal: Aims) -> Float[Array, " nq"]:
-        """The scheme's step by the goals alone."""
+        """Return the scheme's step by the goals alone."""
         goals = {name: task for name, task in self.aimed(goal).items() if is_goal(task)}
         return self._moved(q, self.scheme.solve(self._problem(q, goals)).velocity) - q
 
     def errors(self, q: Float[Array, " nq"], goal: Aims) -> tuple[dict[str, TaskRows], Errors]:
-        """The goals' rows at q, and how far it is from meeting them."""
+        """Return the goals' rows at q, and how far it is from meeting them."""
         goals = {name: task for name, task in self.aimed(goal).items() if is_goal(task)}
         kinematics = forward_kinematics(self.robot, q)
         rows = rows_of(self.robot, kinematics, q, {name: task.during(1.0) for name, task in goals.items()})
@@ -198,7 +198,7 @@ class TaskSearch(eqx.Module):
         return jnp.max(bounds.violation(jnp.zeros(self.robot.nv, q.dtype)), initial=0.0)
 
     def aimed(self, goal: Aims) -> dict[str, Task]:
-        """The tasks with a goal's targets."""
+        """Return the tasks with a goal's targets."""
         return {
             **self.tasks,
             **{name: self.tasks[name].replace(target=target) for name, target in goal.targets.items()},
@@ -209,7 +209,7 @@ class TaskSearch(eqx.Module):
         return jnp.sqrt(jnp.sum(difference(self.robot, self.first, q) ** 2))
 
     def finishing(self, exact: bool) -> TaskSearch:
-        """The same search, for the last steps."""
+        """Return the same search, for the last steps."""
         return dataclasses.replace(self, enough=jnp.zeros_like(self.enough)) if exact else self
 
     def isolated(self, x: Float[Array, "lanes nq"], goal: Aims) -> Bool[Array, " lanes"]:
@@ -218,7 +218,7 @@ class TaskSearch(eqx.Module):
         return jnp.zeros(len(x), bool)
 
     def unwound(self, q: Float[Array, "*lanes nq"]) -> Float[Array, "*lanes nq"]:
-        """The same poses, each joint as near to the first configuration as whole turns within its limits bring it."""
+        """Return the same poses, each joint turned as near to the first configuration as its limits allow."""
         return unwound(q, self.first, self.lower, self.upper, self.turns)
 
     def costs(self, q: Float[Array, "lanes nq"], goal: Aims) -> Float[Array, " lanes"]:
@@ -261,19 +261,19 @@ class TaskSearch(eqx.Module):
 
 
 def damped(scheme: Scheme, factor: float) -> Scheme:
-    """The scheme with so many times its curvature damping."""
+    """Return the scheme with so many times its curvature damping."""
     if "curvature_damping" not in scheme.replaceable:
         return scheme
     return scheme.replace(curvature_damping=factor * scheme.curvature_damping)  # pyright: ignore
 
 
 def is_goal(task: Task) -> bool:
-    """Whether a task has to be met for a configuration to be a solution."""
+    """Return whether a task has to be met for a configuration to be a solution."""
     return task.hard or isinstance(task, GOALS)
 
 
 def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:
-    """Length of what a task is off in metres and in radians; what is in other units counts as metres."""
+    """Return how far a task is off in metres and in radians; other units count as metres."""
     position = position_rows(task, len(rows.error))
     residual = jnp.where(rows.weight > 0.0, rows.pull, 0.0)
     parts = (jnp.sum(jnp.where(mask, residual, 0.0) ** 2) for mask in (position, ~position))
@@ -292,7 +292,7 @@ def position_rows(task: Task, count: int) -> np.ndarray:
 
 
 def entry_limits(robot: Robot, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Limits of each entry of q, from those of each entry of v."""
+    """Return the limits of each entry of q, from those of each entry of v."""
     scalar, index = scalar_layout(robot)
     low, high = jnp.full(robot.nq, -jnp.inf, lower.dtype), jnp.full(robot.nq, jnp.inf, upper.dtype)
     return low.at[index[scalar]].set(lower[scalar]), high.at[index[scalar]].set(upper[scalar])

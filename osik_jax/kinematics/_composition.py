@@ -18,7 +18,7 @@ Poses = tuple[Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]
 
 
 def world_poses(tree: KinematicTree, position: Float[Array, "nbody 3"], rotation: Float[Array, "nbody 3 3"]) -> Poses:
-    """Poses of all bodies in the world from their poses in their parents. Rotations have to be rotations.
+    """Return the poses of all bodies in the world from their poses in their parents. Rotations have to be rotations.
 
     Row 0 is the world's: 0 and the identity.
 
@@ -31,7 +31,7 @@ def world_poses(tree: KinematicTree, position: Float[Array, "nbody 3"], rotation
 
 @lru_cache(maxsize=64)
 def _composer(tree: KinematicTree) -> Callable[..., Poses]:
-    """The function for one tree, with its rule."""
+    """Return the function for one tree, with its rule."""
 
     @custom_jvp
     def poses(position: Array, rotation: Array) -> Poses:
@@ -56,7 +56,7 @@ def _composer(tree: KinematicTree) -> Callable[..., Poses]:
 
 
 def _in_a_loop(position: Array, rotation: Array, rounds: Array) -> Poses:
-    """XLA's CPU backend makes one operation of a small loop; its rounds, written out, would be a dozen."""
+    """Return the composed poses by a small loop, which XLA's CPU backend makes one operation instead of a dozen."""
     if not len(rounds):
         return position, rotation
     start = position, rotation
@@ -72,13 +72,13 @@ def _one_by_one(position: Array, rotation: Array, rounds: Array) -> Poses:
 
 
 def _doubled(poses: Poses, above: Array) -> Poses:
-    """Poses that reached as far as ``above``, as far again."""
+    """Return poses that reach twice as many bodies up the tree."""
     position, rotation = poses
     turn = rotation[above]
     return position[above] + rotate(turn, position), compose(turn, rotation)
 
 
 def _axis(skew: Float[Array, "... 3 3"]) -> Float[Array, "... 3"]:
-    """The vector of a skew-symmetric matrix."""
+    """Return the vector of a skew-symmetric matrix."""
     rows = [skew[..., i, j] - skew[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
     return 0.5 * jnp.stack(rows, -1)

@@ -47,7 +47,7 @@ class Kinematics(eqx.Module):
     backend: Backend = eqx.field(default="jax", static=True)
 
     def frame_pose(self, robot: Robot, name: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        """Position [m] and rotation (frame axes to world axes) of a body, link, site or geom.
+        """Return the position [m] and rotation (frame axes to world axes) of a body, link, site or geom.
 
         Raises:
             KeyError: no such frame.
@@ -56,7 +56,7 @@ class Kinematics(eqx.Module):
         return positions[0], rotations[0]
 
     def frame_poses(self, robot: Robot, names: Sequence[str]) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
-        """Positions and rotations of several frames.
+        """Return positions and rotations of several frames.
 
         Raises:
             KeyError: no such frame.
@@ -86,7 +86,9 @@ def frame_pose(robot: Robot, kinematics: Kinematics, frame: str) -> tuple[Float[
 
 
 def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
-    """Poses of all bodies and motion axes of all dofs at configuration q. Quaternions are normalised first.
+    """Return the poses of all bodies and motion axes of all dofs at configuration q.
+
+    Quaternions are normalised first.
 
     Raises:
         TypeError: robot is no Robot.
@@ -120,7 +122,7 @@ def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kin
 
 
 def frame_jacobians(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> Float[Array, "k 6 nv"]:
-    """Jacobians of several frames: rows [linear; angular] in world axes, linear at each frame's origin.
+    """Return the jacobians of several frames: rows [linear; angular] in world axes, linear at each frame's origin.
 
     Raises:
         KeyError: no such frame.
@@ -136,7 +138,7 @@ def frame_jacobians(robot: Robot, kinematics: Kinematics, names: Sequence[str]) 
 
 
 def moving_frames(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> Moving:
-    """Positions (k, 3), rotations (k, 3, 3) and Jacobians (k, 6, nv) of several frames.
+    """Return positions (k, 3), rotations (k, 3, 3) and Jacobians (k, 6, nv) of several frames.
 
     Raises:
         KeyError: no such frame.
@@ -149,7 +151,7 @@ def moving_frames(robot: Robot, kinematics: Kinematics, names: Sequence[str]) ->
 
 
 def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Array, "6 nv"]:
-    """Jacobian of one frame: [linear; angular] velocity = J v, world axes, at the frame's origin.
+    """Return the jacobian of one frame: [linear; angular] velocity = J v, world axes, at the frame's origin.
 
     Raises:
         KeyError: no such frame.
@@ -158,7 +160,7 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Arr
 
 
 def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3"]:
-    """Centre of mass [m], in the world, of the whole robot or of the body ``subtree`` and all that hangs from it.
+    """Return the centre of mass [m], in the world, of the robot or of the body ``subtree`` with its descendants.
 
     What is fixed to the world (an arm's base) does not count, as in Pinocchio and unlike MuJoCo, nor do loose bodies of
     a scene. A frame that is not a body stands for the moving body that carries it.
@@ -172,7 +174,7 @@ def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = N
 
 
 def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3 nv"]:
-    """Jacobian of ``center_of_mass``: its velocity in world axes = J v.
+    """Return the jacobian of ``center_of_mass``: its velocity in world axes = J v.
 
     Raises:
         KeyError, ValueError: as in ``center_of_mass``.
@@ -183,7 +185,7 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
 def moving_center(
     robot: Robot, kinematics: Kinematics, subtree: str | None = None
 ) -> tuple[Float[Array, "3"], Float[Array, "3 nv"]]:
-    """``center_of_mass`` and ``com_jacobian``.
+    """Return ``center_of_mass`` and ``com_jacobian``.
 
     Raises:
         KeyError, ValueError: as in ``center_of_mass``.
@@ -223,7 +225,7 @@ def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"
 def _motion_axes(
     tree: KinematicTree, axis: Float[Array, "njoint 3"], rotation: Float[Array, "nbody 3 3"]
 ) -> tuple[Float[Array, "nvfull 3"], Float[Array, "nvfull 3"]]:
-    """Linear and angular direction of each dof, in the world: the tangent convention of MuJoCo."""
+    """Return the linear and angular direction of each dof, in the world: MuJoCo's tangent convention."""
     kinds, number = dof_kinds(tree)
     hinge, slide = kinds == HINGE, kinds == SLIDE
     translates = (kinds == FREE) & (number < 3)

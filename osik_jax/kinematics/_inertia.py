@@ -30,7 +30,7 @@ class Momenta(NamedTuple):
 
 
 def mass_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "nv nv"]:
-    """The inertia matrix M of the robot over v: its kinetic energy is ``v' M v / 2`` [J].
+    """Return the inertia matrix M of the robot over v: its kinetic energy is ``v' M v / 2`` [J].
 
     With the inertia of drives (``robot.dof_armature``), as in MuJoCo. Followers carry theirs to their leaders, locked
     joints move with what carries them. Symmetric; positive definite where every motion moves some mass.
@@ -47,11 +47,9 @@ def mass_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "nv nv"]:
 
 
 def centroidal_momentum_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "6 nv"]:
-    """A with A v = [linear; angular] momentum [kg m/s; kg m^2/s], angular about the centre of mass, in world axes.
+    """Return A with A v = [linear; angular] momentum [kg m/s; kg m^2/s].
 
-    The linear rows are the robot's mass times ``com_jacobian``. Drives (``robot.dof_armature``) do not count, as in
-    MuJoCo and Pinocchio (D. Orin, A. Goswami, S.-H. Lee, "Centroidal dynamics of a humanoid robot", Autonomous Robots
-    35, 2013). Loose bodies of a scene have no part in it.
+    World axes; the angular momentum is about the centre of mass.
 
     Raises:
         ValueError: the scene has several trees that may be the robot.
@@ -79,7 +77,7 @@ def _momenta(robot: Robot, kinematics: Kinematics) -> Momenta:
 
 
 def _composites(robot: Robot, kinematics: Kinematics) -> Composite:
-    """Summed about their own centres: about one point for all, what is light and far away would lose its digits."""
+    """Return inertias summed about their own centres, because far from a common point light bodies lose digits."""
     turn, mass = kinematics.body_rotation, robot.body_mass
     centers = kinematics.body_position + rotate(turn, robot.body_com)
     below = jnp.asarray(robot.tree.descendants, mass.dtype)

@@ -24,7 +24,7 @@ with contextlib.redirect_stdout(None):  # it prints which of its optional back e
 
 
 def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
-    """MJX data in which ``xpos, xquat, xanchor, xaxis`` are in the frame of each body's parent.
+    """Return MJX data in which ``xpos, xquat, xanchor, xaxis`` are in the frame of each body's parent.
 
     The quaternions are as long as the model's and the joints' axes are: 1, unless somebody changed those numbers. The
     world is where it is, whatever its row says.
@@ -47,7 +47,7 @@ def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
 def _forest(
     joint_types: tuple[int, ...], joint_bodies: tuple[int, ...], bodies: int, precision: str
 ) -> tuple[mjx.Model, mjx.Data]:
-    """An MJX model with these joints and no tree, and its data; the numbers in it are replaced before use."""
+    """Return an MJX model with these joints and no tree, and its data; the numbers in it are replaced before use."""
     del precision  # part of the cache key: the arrays take the precision in force when they are made
     spec = mujoco.MjSpec()
     for body in range(1, bodies):

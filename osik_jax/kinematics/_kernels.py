@@ -21,7 +21,7 @@ from ..robot._tree import KinematicTree
 
 
 def bodies(robot: Robot, q: Float[Array, "lanes nq"]) -> tuple[Array, ...]:
-    """The fields of ``Kinematics``."""
+    """Return the fields of ``Kinematics``."""
     tree = robot.tree
     index, coefficient = tree.qpos_source
     integers = np.concatenate([[len(index)], tree.body_parents, tree.joint_types, tree.joint_bodies, index])
@@ -36,7 +36,7 @@ def bodies(robot: Robot, q: Float[Array, "lanes nq"]) -> tuple[Array, ...]:
 
 
 def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Array, Array, Array]:
-    """Positions, rotations and Jacobians of frames."""
+    """Return positions, rotations and Jacobians of frames."""
     tree, chosen = robot.tree, np.asarray(ids, int)
     carriers = np.asarray(tree.frame_bodies, int)[chosen]
     columns, factors = dof_columns(tree)
@@ -53,7 +53,7 @@ def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Ar
 
 
 def center_of_mass(robot: Robot, kinematics: Any) -> tuple[Array, Array]:
-    """The centre of the masses of the bodies, and its Jacobian."""
+    """Return the centre of the masses of the bodies, and its Jacobian."""
     given, integers, lanes = center_arguments(robot, kinematics)
     outputs = [((lanes, 3), float), ((lanes, 3, robot.tree.nv), float)]
     center, jacobian = _library.call("center_of_mass", outputs, *given, integers)
@@ -70,14 +70,14 @@ def center_arguments(robot: Robot, kinematics: Any) -> tuple[tuple[Array, ...], 
 
 
 def _arrays(kinematics: Any) -> tuple[Array, ...]:
-    """Its fields, as the kernels take them: all of as many lanes."""
+    """Return the fields as the kernels take them: all with the same number of lanes."""
     fields = jax.tree.leaves(kinematics)
     lanes = max(len(a) for a in fields)
     return tuple(jnp.broadcast_to(a, (lanes, *a.shape[1:])) for a in fields)
 
 
 def dof_columns(tree: KinematicTree) -> tuple[np.ndarray, np.ndarray]:
-    """The column of v that each full dof adds to, -1 for none, and the factor with which it does."""
+    """Return the column of v that each full dof adds to, -1 for none, and the factor with which it does."""
     full = len(tree.dof_joint)
     columns, factors = np.full(full, -1), np.zeros(full)
     for index, coefficient in tree.dof_columns:

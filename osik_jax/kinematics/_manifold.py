@@ -51,7 +51,7 @@ def integrate(
 
 
 def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"]) -> Float[Array, " nv"]:
-    """The velocity that goes from qa to qb in unit time, so that integrating it from qa arrives at qb. (nv,).
+    """Return the velocity that goes from qa to qb in unit time, so that integrating it from qa arrives at qb. (nv,).
 
     Rotations go the short way round: no angle is greater than pi.
 
@@ -72,7 +72,7 @@ def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"
 
 
 def layout(robot: Robot) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
-    """Entries of q and v that simply add, and (start in q, start in v) of each quaternion."""
+    """Return the entries of q and v that simply add, and (start in q, start in v) of each quaternion."""
     tree = robot.tree
     scalar_q, scalar_v, quaternions = [], [], []
     for joint, at in tree.qpos_address.items():

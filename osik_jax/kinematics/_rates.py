@@ -17,7 +17,7 @@ from ._rigid import cross
 
 
 def kinematics_rates(robot: Robot, kinematics: Kinematics) -> Kinematics:
-    """The derivative of ``forward_kinematics`` along the tangent: every field with a last axis more, of length nv.
+    """Return the derivative of ``forward_kinematics`` along v: each field with a last axis of length nv.
 
     What autodiff through the kinematics gives, from the motion axes that are known already: a body turns and moves with
     every dof above it, an axis and its anchor with every dof of the joints before them.

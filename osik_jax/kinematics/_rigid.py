@@ -16,7 +16,7 @@ _GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)).mT
 
 
 def rotation_matrix(quaternion: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
-    """The rotation of a quaternion w, x, y, z of any length but 0.
+    """Return the rotation of a quaternion w, x, y, z of any length but 0.
 
     Made of whole arrays, for XLA makes one operation of that, and one for each entry of stacked entries.
     """
@@ -29,19 +29,19 @@ def rotation_matrix(quaternion: Float[Array, "... 4"]) -> Float[Array, "... 3 3"
 
 
 def rotate(rotation: Float[Array, "... 3 3"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """R x."""
+    """Return R x."""
     x, y, z = (rotation[..., i] * vector[..., i, None] for i in range(3))
     return x + y + z
 
 
 def compose(a: Float[Array, "... 3 3"], b: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
-    """A B."""
+    """Return A B."""
     x, y, z = (a[..., i, None] * b[..., i, None, :] for i in range(3))
     return x + y + z
 
 
 def cross(a: Float[Array, "..."], b: Float[Array, "..."], *, along: int = -1) -> Float[Array, "..."]:
-    """a x b, along an axis of length 3."""
+    """Return a x b, along an axis of length 3."""
     ax, ay, az = (jax.lax.index_in_dim(a, i, along, keepdims=False) for i in range(3))
     bx, by, bz = (jax.lax.index_in_dim(b, i, along, keepdims=False) for i in range(3))
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], along)

@@ -93,12 +93,12 @@ class AccelerationLimit(Limit):
         self._check(dof_names(robot))
 
     def parts(self) -> Sequence[Limit]:
-        """The accelerations themselves, and the braking; a velocity limit comes in between."""
+        """Return the accelerations and the braking as separate limits; a velocity limit comes in between."""
         stopping = _Stopping(self.acceleration, self.lower, self.upper, self.return_speed)
         return _Reachable(self.acceleration, self.velocity), stopping
 
     def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
-        """Both parts together."""
+        """Return the bounds of both parts together."""
         return limit_box(robot, q, self.parts(), dt)
 
     def _check(self, names: Sequence[str] | None = None) -> None:
@@ -109,7 +109,7 @@ class AccelerationLimit(Limit):
             raise OsikValueError(f"accelerations have to be positive: {entries(seen, ~(seen > 0.0), names)}")
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The limit for the next step, once this one's answer is ``velocity``."""
+        """Return the limit for the next step, given this step's ``velocity``."""
         return eqx.tree_at(lambda limit: limit.velocity, self, jnp.asarray(velocity, self.velocity.dtype))
 
 
@@ -139,7 +139,10 @@ class _Stopping(Limit):
     return_speed: Float[Array, " nv"]
 
     def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
-        """Outside a range: back at the return speed, but not faster than what can stop at the other end."""
+        """Return the bounds by braking.
+
+        A joint outside its range returns at the return speed, or slower to stop at the other end.
+        """
         scalar, index = scalar_layout(robot)
         position = jnp.asarray(q)[index]
         above = stopping_speed(_way(jnp.where(scalar, self.upper, jnp.inf), position), self.acceleration, dt)
@@ -167,7 +170,7 @@ def _way(bound: Float[Array, " nv"], position: Float[Array, " nv"]) -> Float[Arr
 def stopping_speed(
     way: Float[Array, " nv"], acceleration: Float[Array, " nv"], dt: Float[Array, ""] | float
 ) -> Float[Array, " nv"]:
-    """The greatest velocity from which braking stops within the way left, of which some is used in every step.
+    """Return the greatest velocity from which braking stops within the way left, of which some is used in every step.
 
     See ``AccelerationLimit``. Piecewise linear in ``way`` [rad or m], continuous, with n steps of braking in a piece;
     ``way / dt`` for a way that is negative, or an acceleration that is infinite.

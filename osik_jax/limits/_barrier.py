@@ -73,7 +73,7 @@ class PositionBarrier(Limit):
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows:
-        """One row for each normal."""
+        """Return one row for each normal."""
         del q
         # with a gain of 1 / dt one step reaches the plane; more would cross it
         rate = at_most_inverse(self.gain, dt)
@@ -92,7 +92,7 @@ class PositionBarrier(Limit):
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
-    """``rate (bound - value)``; an infinite bound stays so, with gradients 0."""
+    """Return ``rate (bound - value)``; an infinite bound stays infinite, with gradients 0."""
     # rate times infinity has a NaN gradient by the rate
     free = jnp.isinf(bound)
     return jnp.where(free, bound, rate * (jnp.where(free, 0.0, bound) - value))

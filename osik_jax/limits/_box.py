@@ -40,13 +40,13 @@ class Limit(MadeForRobot, Replaceable):
     kind: ClassVar[Kind] = "velocity"
 
     def parts(self) -> Sequence[Limit]:
-        """The limits that take its place in the box, for one that is of several kinds."""
+        """Return the limits that take this one's place in the box, if it is of several kinds."""
         return (self,)
 
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-        """Lower and upper bounds on v [rad/s or m/s], lower <= upper, +-inf where free. Default: all free."""
+        """Return lower and upper bounds on v [rad/s or m/s], lower <= upper, +-inf where free. Default: all free."""
         del dt
         free = jnp.full(robot.nv, jnp.inf, jnp.result_type(jnp.asarray(q), robot.q0))
         return -free, free
@@ -54,12 +54,12 @@ class Limit(MadeForRobot, Replaceable):
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows | None:
-        """Bounds on linear functions of v, at configuration q whose kinematics are given. Default: none."""
+        """Return bounds on linear functions of v, at configuration q whose kinematics are given. Default: none."""
         del robot, kinematics, q, dt
         return None
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
-        """The limit for the next step, once this one's answer is ``velocity``; itself where it remembers nothing.
+        """Return the limit for the next step, given this step's ``velocity``; itself if it has no memory.
 
         What remembers has it as a leaf. ``rollout`` calls this at every step; around ``solve`` it is for you to do.
         """
@@ -70,7 +70,7 @@ class Limit(MadeForRobot, Replaceable):
 def limit_box(
     robot: Robot, q: Float[Array, " nq"], limits: Sequence[Limit], dt: Float[Array, ""] | float
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-    """The box on v that all limits ask for over a step of dt [s]; lower <= upper always.
+    """Return the box on v that all limits ask for over a step of dt [s]; lower <= upper always.
 
     Acceleration and velocity limits first; then each position limit is clipped into the box so far:
     ``lower = clip((q_lower - q) / dt, v_lower, v_upper)``, ``upper = clip((q_upper - q) / dt, v_lower, v_upper)``.
@@ -117,7 +117,7 @@ def limit_rows(
     limits: Sequence[Limit],
     dt: Float[Array, ""] | float,
 ) -> LimitRows | None:
-    """The rows of all limits that have any, in the order of the limits; None where there are none.
+    """Return the rows of all limits that have any, in the order of the limits; None where there are none.
 
     Args:
         robot: the robot.

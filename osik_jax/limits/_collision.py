@@ -126,17 +126,17 @@ class CollisionAvoidanceLimit(Limit):
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of the shapes that are kept apart, pair by pair, in the order of ``distances``."""
+        """Return the names of the shapes that are kept apart, pair by pair, in the order of ``distances``."""
         return self.scene.pair_names
 
     def distances(self, robot: Robot, kinematics: Kinematics) -> Float[Array, " pairs"]:
-        """Signed distances [m] of all ``pairs``, negative where they overlap."""
+        """Return signed distances [m] of all ``pairs``, negative where they overlap."""
         return self._nearest(robot, kinematics).distance
 
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows:
-        """Lower bounds [m/s] on the rates of those distances that could be gone soonest; -inf where a pair is free."""
+        """Return lower bounds [m/s] on the rates of distances that could vanish soonest; -inf where free."""
         del q
         near = self._nearest(robot, kinematics)
         jacobian = separation_jacobian(robot.tree, kinematics, near, self.scene.pair_bodies)
@@ -149,7 +149,7 @@ class CollisionAvoidanceLimit(Limit):
 
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Names that ``replace`` takes; ``moved`` changes shapes."""
+        """Return names that ``replace`` takes; for shapes use ``moved``."""
         return _NUMBERS
 
     def _convert(self, name: str, value: Any) -> Any:
@@ -163,7 +163,7 @@ class CollisionAvoidanceLimit(Limit):
         rotation: ArrayLike | Array | None = None,
         size: ArrayLike | Array | None = None,
     ) -> Self:
-        """The same limit with one of the added shapes somewhere else, or of another size.
+        """Return the same limit with one of the added shapes somewhere else, or of another size.
 
         Works inside ``jit``; nothing is compiled again. The rows take obstacles as standing still.
 
@@ -213,7 +213,7 @@ _NUMBERS = ("minimum_distance", "detection_distance", "gain", "recovery_speed")
 
 
 def _number(value: ArrayLike | Array, name: str, dtype: Any) -> Float[Array, ""]:
-    """A scalar leaf; distances may be negative."""
+    """Return a scalar leaf; distances may be negative."""
     if not name.endswith("distance"):
         return as_scalar(value, name, dtype)
     out = as_vector(value, (), name, dtype)
@@ -262,7 +262,7 @@ def _warn_of_left_out(shown: str, least: Float[Array, ""]) -> None:
 
 
 def _shown(found: Sequence[Member], near: Mapping[tuple[int, int], float]) -> str:
-    """Pairs with their distances."""
+    """Return pairs with their distances."""
     return ", ".join(f"{found[i].label}-{found[j].label} ({d:.3g} m)" for (i, j), d in near.items())
 
 
@@ -281,7 +281,7 @@ def _assembled(
     hulls: Hulls,
     pairs: Sequence[tuple[int, int]],
 ) -> tuple[Scene, Placed, UnitCore | None]:
-    """The scene of some pairs of members, its added shapes and its hulls."""
+    """Return the scene of some pairs of members, its added shapes and its hulls."""
     taking_part = _taking_part(pairs)
     number = {k: n for n, k in enumerate(taking_part)}
     geoms = [k for k in taking_part if not found[k].added]

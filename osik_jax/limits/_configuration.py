@@ -103,7 +103,7 @@ class ConfigurationLimit(Limit):
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows | None:
-        """Bounds on the rate of each ball joint's angle; None for a robot without ball joints."""
+        """Return bounds on the rate of each ball joint's angle; None for a robot without ball joints."""
         del kinematics
         balls = self._balls(robot, q, dt)
         if balls is None:
@@ -122,7 +122,7 @@ class ConfigurationLimit(Limit):
     def _reach(
         self, bound: Float[Array, " nv"], position: Float[Array, " nv"], dt: Float[Array, ""] | float, *, inward: float
     ) -> Float[Array, " nv"]:
-        """Velocity that leads towards the bound, rounded inward; an infinite bound stays so, with gradients 0."""
+        """Return the velocity to the bound, rounded inward; infinite bounds stay infinite, with gradients 0."""
         free = jnp.isinf(bound)
         way = jnp.where(free, 0.0, bound) - position
         way = way + inward * _ROUNDOFF * jnp.finfo(way.dtype).eps * jnp.abs(way)
@@ -153,7 +153,7 @@ def check_return_speed(speed: Array, names: Sequence[str] | None = None) -> None
 
 
 def _as_gain(robot: Robot, value: ArrayLike | Array | Mapping[str, float]) -> Float[Array, ""] | Float[Array, " nv"]:
-    """One for all joints as a scalar, others over v."""
+    """Return a scalar for a gain shared by all joints, and an array over v for others."""
     if isinstance(value, Mapping) or np.ndim(value):
         gain = dof_values(robot, value, jnp.ones(robot.nv), "gain")
     else:
@@ -169,7 +169,7 @@ def _check_gain(gain: Array) -> None:
 
 
 def _check(robot: Robot, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raises ValueError with the joints' names."""
+    """Raise ValueError with the joints' names."""
     names = dof_names(robot)
     unordered = np.flatnonzero(~(lower <= upper))
     if len(unordered):

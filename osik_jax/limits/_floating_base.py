@@ -64,7 +64,7 @@ class FloatingBaseVelocityLimit(Limit):
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-        """The speeds along the axes that v itself has."""
+        """Return the speeds along the axes that v itself has."""
         lower, upper = super().box(robot, q, dt)
         first = robot.tree.dof_address[self.joint]
         speeds, start = (self.linear, first) if self.axes == "world" else (self.angular, first + 3)
@@ -75,7 +75,10 @@ class FloatingBaseVelocityLimit(Limit):
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows | None:
-        """The others: ``R' p'`` in the base's axes, ``R w`` in the world's, R the base's rotation. (3,) or none."""
+        """Return rows for the other axes, with R the base's rotation. (3,) or none.
+
+        ``R' p'`` in the base's axes, ``R w`` in the world's.
+        """
         del q, dt
         speeds = self.linear if self.axes == "base" else self.angular
         if speeds is None:
@@ -93,7 +96,7 @@ class FloatingBaseVelocityLimit(Limit):
 
 
 def _free_joint(robot: Robot, name: str | None) -> int:
-    """Index of the free joint of that name, or of the only one."""
+    """Return the index of the free joint of that name, or of the only one."""
     tree = robot.tree
     free = {tree.joint_names[j]: j for j in tree.independent if tree.joint_types[j] == FREE}
     if not free:

@@ -52,7 +52,7 @@ class LinearLimit(Limit):
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows:
-        """The rows as they are."""
+        """Return the rows as they are."""
         del robot, kinematics, q, dt
         return LimitRows(self.matrix, self.lower, self.upper)
 

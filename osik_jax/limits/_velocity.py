@@ -45,7 +45,7 @@ class VelocityLimit(Limit):
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-        """(-velocity, velocity)."""
+        """Return (-velocity, velocity)."""
         del robot, q, dt
         return -self.velocity, self.velocity
 

@@ -42,7 +42,7 @@ class Replaceable(eqx.Module):
 
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Names that ``replace`` takes: the fields that hold numbers."""
+        """Return names that ``replace`` takes: the fields that hold numbers."""
         fields = dataclasses.fields(self)
         return tuple(f.name for f in fields if not f.metadata.get("static") and getattr(self, f.name) is not None)
 

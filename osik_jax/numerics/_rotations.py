@@ -56,7 +56,7 @@ def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B
 
 
 def _nearest(matrix: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:
-    """The orthogonal factor of the polar decomposition (N. Higham, "Functions of Matrices", 2008, section 8.3)."""
+    """Return the orthogonal factor of the polar decomposition (Higham, "Functions of Matrices", 2008, section 8.3)."""
     for _ in range(_ITERATIONS):
         gram = _product(jnp.swapaxes(matrix, -1, -2), matrix)
         matrix = 1.5 * matrix - 0.5 * _product(matrix, gram)
@@ -68,7 +68,7 @@ def _product(a: Float[Array, "*B 3 3"], b: Float[Array, "*B 3 3"]) -> Float[Arra
 
 
 def _refuse(valid: Bool[Array, "*B"], given: Array, what: str, right: str) -> None:
-    """Raises ValueError with the first of the values that can be seen not to be valid, and the places of up to ten."""
+    """Raise ValueError with the first of the values that can be seen not to be valid, and the places of up to ten."""
     seen, values = concrete(valid), concrete(given)
     if seen is None or values is None or seen.all():
         return

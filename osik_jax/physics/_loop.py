@@ -32,7 +32,7 @@ class Command(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """The configuration to servo to until the next step.
+        """Return the configuration to servo to until the next step.
 
         Args:
             robot: the robot.
@@ -52,7 +52,7 @@ class Integrated(Command):
     """
 
     def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """See ``Command``."""
+        """Return the configuration to servo to, as ``Command`` says."""
         return integrate(robot, last, velocity, dt)
 
 
@@ -73,7 +73,7 @@ class Lookahead(Command):
         self.time = jnp.asarray(time, float)
 
     def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """See ``Command``."""
+        """Return the configuration to servo to, as ``Command`` says."""
         return integrate(robot, sensed, velocity, self.time)
 
 
@@ -116,7 +116,7 @@ def simulate(
     command: Command | None = None,
     before_step: Callable[[float, Simulation], None] | None = None,
 ) -> Recording:
-    """Runs the loop from the simulation's present state, until the robot falls at the latest.
+    """Run the loop from the simulation's present state, until the robot falls at the latest.
 
     Each step senses the configuration, base and joints, solves for the velocity there, makes a servo target of it and
     lets MuJoCo run for ``dt``. One compiled program a step; MuJoCo runs on the host. As in ``rollout``, every
@@ -180,7 +180,7 @@ def _control_step(
     *,
     static: tuple[tuple[Any, ...], Any],
 ) -> tuple[Array, Solution]:
-    """The part of a step that is pure: the command and the solution."""
+    """Return the part of a step that is pure: the command and the solution."""
     tasks: Any = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
     todo: Any = tasks(t) if callable(tasks) else aim(tasks, target)
     velocity, warm_start = memory
@@ -190,7 +190,7 @@ def _control_step(
 
 
 def _cold_start(step: Callable[[Any], Solution], state: Any) -> Any:
-    """Zeros in the shape of the last velocity and of a warm start, from a step that is traced and not run.
+    """Return zeros in the shape of the last velocity and of a warm start, from a step that is traced and not run.
 
     So the first one compiles no program.
     """
@@ -199,7 +199,7 @@ def _cold_start(step: Callable[[Any], Solution], state: Any) -> Any:
 
 
 def _at(paths: Targets | None, k: int) -> Targets | None:
-    """The targets of step k."""
+    """Return the targets of step k."""
     return jax.tree.map(lambda path: path[k], paths)
 
 

@@ -37,7 +37,7 @@ class Servo:
 
 
 def choose_servos(robot: Robot, given: Mapping[str, Servo]) -> dict[str, Servo]:
-    """One for each independent joint but the free one, in the order of q, its effort filled in."""
+    """Return a servo, effort filled in, for each independent joint but the free one, in the order of q."""
     chosen = {joint: servo for pattern, servo in given.items() for joint in select_joints(robot, pattern)}
     own, limits = _own_servos(robot.mj_model), _efforts(robot.mj_model)
     out: dict[str, Servo] = {}
@@ -57,7 +57,7 @@ def choose_servos(robot: Robot, given: Mapping[str, Servo]) -> dict[str, Servo]:
 
 
 def _own_servos(model: mujoco.MjModel) -> dict[int, Servo]:
-    """The position actuators of a model, by joint."""
+    """Return the position actuators of a model, by joint."""
     out = {}
     for joint, a in _actuators(model).items():
         gain, bias = float(model.actuator_gainprm[a][0]), model.actuator_biasprm[a]
@@ -67,13 +67,13 @@ def _own_servos(model: mujoco.MjModel) -> dict[int, Servo]:
 
 
 def _actuators(model: mujoco.MjModel) -> dict[int, int]:
-    """Joint to the actuator on it."""
+    """Return the actuator of each joint that has one."""
     on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     return {int(model.actuator_trnid[a][0]): int(a) for a in np.flatnonzero(on_joint)}
 
 
 def _efforts(model: mujoco.MjModel) -> list[float]:
-    """The greatest effort of each joint: that of its actuator, else that of the joint, else none."""
+    """Return the greatest effort of each joint: that of its actuator, else that of the joint, else none."""
     actuators = _actuators(model)
     out = []
     for j in range(model.njnt):
@@ -85,7 +85,7 @@ def _efforts(model: mujoco.MjModel) -> list[float]:
 
 
 def add_servo(spec: mujoco.MjSpec, joint: str, servo: Servo) -> None:
-    """An actuator called like its joint."""
+    """Add an actuator named like its joint."""
     actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
     actuator.gainprm[0] = servo.stiffness

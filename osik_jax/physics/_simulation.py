@@ -38,16 +38,16 @@ class Simulation:
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The world's MuJoCo model."""
+        """Return the world's MuJoCo model."""
         return self.world.model
 
     @property
     def time(self) -> float:
-        """[s] since the reset."""
+        """Return the time since the reset [s]."""
         return float(self.data.time)
 
     def reset(self, q: Float[np.ndarray, " nq"] | Array) -> None:
-        """Puts the robot at rest at a configuration, its servos there too.
+        """Put the robot at rest at a configuration, its servos there too.
 
         Raises:
             ValueError: q has the wrong length or is not finite.
@@ -62,7 +62,10 @@ class Simulation:
         self._upright = self._base()
 
     def _base(self) -> tuple[float, np.ndarray]:
-        """Height of the base over the floor [m], and the world's vertical in its axes; of a fixed base, 1 and up."""
+        """Return the height of the base over the floor [m], and the world's vertical in its axes.
+
+        Of a fixed base: 1 and up.
+        """
         free = np.flatnonzero(self.model.jnt_type == FREE)
         if not len(free):
             return 1.0, np.array([0.0, 0.0, 1.0])
@@ -70,7 +73,7 @@ class Simulation:
         return float(self.data.xpos[body, 2]) - self.world.floor, self.data.xmat[body].reshape(3, 3)[2].copy()
 
     def fallen(self) -> bool:
-        """Whether the base tilts by more than 45 degrees from where the reset put it, or has lost 40 % of its height.
+        """Return whether the base tilts by over 45 degrees since the reset, or has lost 40 % of its height.
 
         Never true of a robot that is bolted down.
         """
@@ -78,11 +81,11 @@ class Simulation:
         return bool(up @ upright < math.cos(FALL_TILT) or height < FALL_HEIGHT * first)
 
     def sense(self) -> Float[np.ndarray, " nq"]:
-        """The configuration: base and joints, without noise. A mimic joint is read at its leader. (nq,)."""
+        """Return the configuration: base and joints, without noise. A mimic joint is read at its leader. (nq,)."""
         return self.data.qpos[self._sensed]
 
     def step(self, command: Float[np.ndarray, " nq"] | Array, duration: float) -> None:
-        """Holds the servos' targets for some time.
+        """Simulate for some time with the given servo targets.
 
         Args:
             command: configuration to servo to; what it says of the base is not read. (nq,)
@@ -108,7 +111,7 @@ class Simulation:
         return round(steps)
 
     def push(self, body: str, force: tuple[float, float, float]) -> None:
-        """A force on a body's centre of mass, in world axes [N], until it is set anew or the simulation is reset.
+        """Apply a force at a body's centre of mass, in world axes [N], until it is set anew or the simulation is reset.
 
         Raises:
             KeyError: no such body; the message lists those that exist.
@@ -123,7 +126,7 @@ class Simulation:
         return self.data.actuator_force.copy()
 
     def frame_pose(self, frame: str) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-        """Position [m] and rotation of a frame of the robot.
+        """Return position [m] and rotation of a frame of the robot.
 
         Raises:
             KeyError: no such frame.
@@ -131,7 +134,7 @@ class Simulation:
         return frame_pose(self.world.robot, self.data, frame)
 
     def com(self) -> Float[np.ndarray, "3"]:
-        """Centre of mass [m] of the robot. (3,)."""
+        """Return the centre of mass [m] of the robot. (3,)."""
         return self.world.own_masses @ self.data.xipos / self.world.own_masses.sum()
 
     def contact_points(self) -> Float[np.ndarray, "k 3"]:
@@ -140,7 +143,7 @@ class Simulation:
         return self.data.geom_xpos[self._points] - radius * np.array([0.0, 0.0, 1.0])
 
     def contact_forces(self) -> Float[np.ndarray, "k 3"]:
-        """The force of the floor on each contact point [N], world axes. (k, 3)."""
+        """Return the force of the floor on each contact point [N], world axes. (k, 3)."""
         out, wrench = np.zeros((len(self._points), 3)), np.zeros(6)
         row = {geom: k for k, geom in enumerate(self._points)}
         for c, contact in enumerate(self.data.contact):

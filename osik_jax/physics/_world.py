@@ -65,11 +65,11 @@ class World:
 
     @cached_property
     def own_masses(self) -> Float[np.ndarray, " bodies"]:
-        """Mass of each body [kg], 0 where it is fixed to the world or not the robot's."""
+        """Return the mass of each body [kg], 0 where it is fixed to the world or not the robot's."""
         return own_masses(self.robot)
 
     def contact_geoms(self, foot: str) -> list[int]:
-        """The spheres of a foot, by their number in the model."""
+        """Return the spheres of a foot, by their number in the model."""
         return [self.model.geom(_geom_name(foot, k)).id for k in range(len(self.feet[foot]))]
 
 
@@ -82,7 +82,7 @@ def build_world(
     floor: float | None = None,
     timestep: float = 0.001,
 ) -> World:
-    """Puts a robot on a floor.
+    """Put a robot on a floor.
 
     Masses, inertias, joint damping, armature and friction are those of ``robot.mj_model``, as MuJoCo compiled them; no
     geometry of it collides. A follower of a mimic joint is geared to its leader, a locked joint held where it is.
@@ -125,7 +125,7 @@ def build_world(
 
 
 def _contact_points(robot: Robot, feet: Feet | None) -> dict[str, Float[np.ndarray, "k 3"]]:
-    """Frames and their points."""
+    """Return the names of frames with their contact points."""
     names = robot.frame_names
     if feet is None:
         feet = [n.removesuffix("_corner_0") for n in names if n.endswith("_corner_0")]
@@ -147,7 +147,7 @@ def _contact_points(robot: Robot, feet: Feet | None) -> dict[str, Float[np.ndarr
 
 
 def contact_corners(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
-    """The frames ``NAME_corner_0``, ``..._1`` and so on, as points in the frame [m]; none: (0, 3)."""
+    """Return the frames ``NAME_corner_0``, ``..._1`` and so on, as points in the frame [m]; none: (0, 3)."""
     tree = robot.tree
     names = [f"{frame}_corner_{k}" for k in range(len(tree.frame_names))]
     found = [tree.frame(name) for name in names if name in tree.frame_names]
@@ -155,13 +155,13 @@ def contact_corners(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
 
 
 def _in_frame(robot: Robot, frame: str, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-    """Points of the body that a frame is fixed to, seen from the frame."""
+    """Return the points of the body that a frame is fixed to, seen from the frame."""
     index = robot.tree.frame(frame)
     return (points - np.asarray(robot.frame_position[index])) @ np.asarray(robot.frame_rotation[index])
 
 
 def sole_points(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
-    """The lower corners, at home, of the boxes that collide on the frame's body; without boxes, its corner sites."""
+    """Return the lower corners, at home, of colliding boxes on the frame's body; without boxes, its corner sites."""
     model, data = robot.mj_model, _home(robot)
     body = _model_body(robot, robot.tree.frame_bodies[robot.tree.frame(frame)])
     solid = (model.geom_bodyid == body) & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
@@ -174,7 +174,7 @@ def sole_points(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
 
 
 def _lower_corners(model: mujoco.MjModel, data: mujoco.MjData, box: int) -> Float[np.ndarray, "4 3"]:
-    """Counter-clockwise seen from above [m], in the world."""
+    """Return the lower corners, counter-clockwise seen from above, in the world [m]."""
     turn = data.geom_xmat[box].reshape(3, 3) * model.geom_size[box]
     down = int(np.argmax(np.abs(turn[2] / model.geom_size[box])))
     a, b = (turn[:, k] for k in range(3) if k != down)
@@ -189,7 +189,7 @@ def _home_poses(robot: Robot, frames: tuple[str, ...]) -> dict[str, tuple[np.nda
 
 
 def _home(robot: Robot) -> mujoco.MjData:
-    """MuJoCo's data of the robot's own model at ``robot.q0``."""
+    """Return MuJoCo's data of the robot's own model at ``robot.q0``."""
     data = mujoco.MjData(robot.mj_model)
     data.qpos[:] = np.asarray(robot.mujoco_qpos(robot.q0))
     mujoco.mj_kinematics(robot.mj_model, data)
@@ -208,7 +208,7 @@ def frame_pose(
 
 
 def _model_body(robot: Robot, body: int) -> int:
-    """MuJoCo's number of a body of the tree."""
+    """Return MuJoCo's number of a body of the tree."""
     names = [_body_name(robot.mj_model, b) for b in range(robot.mj_model.nbody)]
     return names.index(robot.tree.body_names[body])
 
@@ -227,7 +227,7 @@ def _body_name(model: mujoco.MjModel, body: int) -> str:
 
 
 def _add_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[mujoco.MjsBody]:
-    """The bodies of a compiled model with their inertias and joints, in the same order."""
+    """Return the bodies of a compiled model with their inertias and joints, in the same order."""
     bodies = [spec.worldbody]
     for b in range(1, model.nbody):
         body = bodies[model.body_parentid[b]].add_body(
@@ -297,7 +297,7 @@ def _add_contacts(
     rotation: Float[np.ndarray, "3 3"],
     friction: float,
 ) -> None:
-    """A massless sphere on each contact point, up along the floor's normal as the foot stands at home."""
+    """Add a massless sphere on each contact point, placed up along the floor's normal as the foot stands at home."""
     index = robot.tree.frame(foot)
     body = bodies[_model_body(robot, robot.tree.frame_bodies[index])]
     up = rotation.T @ np.array([0.0, 0.0, CONTACT_RADIUS])
@@ -316,7 +316,7 @@ def _add_contacts(
 
 
 def _add_ties(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Followers geared to their leaders, locked hinges and slides held."""
+    """Add equalities that gear followers to their leaders and hold locked hinges and slides."""
     tree, model = robot.tree, robot.mj_model
     offset, reference = np.asarray(robot.qpos_offset), model.qpos0
     for follower, leader, multiplier in tree.followers:
@@ -337,7 +337,7 @@ def _tie(spec: mujoco.MjSpec, joint: str, leader: str, constant: float, multipli
 
 
 def _compiled(spec: mujoco.MjSpec, source: mujoco.MjModel) -> mujoco.MjModel:
-    """The model, with the numbers of the robot's own that no version of MuJoCo spells alike."""
+    """Return the model, with the numbers of the robot's own that no version of MuJoCo spells alike."""
     model = spec.compile()
     for name in _COPIED:
         getattr(model, name)[:] = getattr(source, name)

@@ -44,11 +44,11 @@ class Frame(NamedTuple):
         return np.asarray(_beyond(self.robot, self.settings, given, route=self._route))
 
     def manipulability(self, q: Float[Array, "n nq"]) -> Float[np.ndarray, " n"]:
-        """Yoshikawa's index of configurations, of the motions that as many joints can make."""
+        """Return Yoshikawa's index of configurations, for the motions that this number of joints can make."""
         return np.asarray(_manipulability(self.robot, self.settings, q, route=self._route))
 
     def links(self) -> Float[np.ndarray, "k 3"]:
-        """Points on the joints that carry it, at home, and the frame's own [m]."""
+        """Return points on the joints that carry the frame, at home, and the frame's own [m]."""
         return np.asarray(_links(self.robot, self.settings, route=self._route))
 
     @property
@@ -57,7 +57,7 @@ class Frame(NamedTuple):
 
 
 def read_frame(robot: Robot, name: str, limits: Sequence[Limit] | None, key: int) -> Frame:
-    """A robot's frame, checked.
+    """Return a robot's frame, checked.
 
     Raises:
         KeyError: no such frame; the message lists those that exist.

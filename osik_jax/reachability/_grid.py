@@ -22,7 +22,7 @@ _FLAT = 1e-6
 
 
 def grid_around(robot: Robot, frame: str, positions: int = 20_000) -> Grid:
-    """A grid with the same spacing along x, y and z, over the box of all that a frame gets to.
+    """Return a grid with the same spacing along x, y and z, over the box of all that a frame gets to.
 
     The box is that of 4,096 configurations which fill the joints' ranges evenly, and a margin. A side along which the
     frame never moves, as a planar arm's, is a single coordinate.
@@ -55,7 +55,7 @@ def around(frame: Frame, positions: int) -> Grid:
 
 
 def _spacing(sides: Float[np.ndarray, "3"], positions: int) -> float:
-    """The smallest that makes no more than so many positions, by bisection."""
+    """Return the smallest spacing that makes at most a number of positions, by bisection."""
     enough, few = 2.0 * float(sides.max()) + 1e-9, 0.0
     for _ in range(60):
         spacing = 0.5 * (enough + few)
@@ -76,7 +76,7 @@ def _along(middle: float, side: float, spacing: float) -> Float[np.ndarray, " n"
 
 
 def checked_grid(grid: object) -> Grid:
-    """A grid that a user gives.
+    """Return a grid that a user gives.
 
     Raises:
         TypeError: no three sequences of numbers.

@@ -53,16 +53,16 @@ class ReachabilityMap:
 
     @property
     def share(self) -> Float[np.ndarray, "nx ny nz"]:
-        """Share of the orientations that are reached at each position."""
+        """Return the share of the orientations that are reached at each position."""
         return self.reached.mean(-1)
 
     @property
     def positions(self) -> Float[np.ndarray, "nx ny nz 3"]:
-        """The positions [m]."""
+        """Return the positions [m]."""
         return np.stack(np.meshgrid(self.x, self.y, self.z, indexing="ij"), -1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes a ``.npz`` with an array for each attribute, under its name only when complete.
+        """Write a ``.npz`` with an array for each attribute, under its name only when complete.
 
         Raises:
             OSError: it cannot be written.
@@ -72,7 +72,7 @@ class ReachabilityMap:
             np.savez_compressed(file, allow_pickle=False, format=np.array(_FORMAT), **arrays)
 
     def figure(self, at: tuple[float, float, float] | None = None) -> Figure:
-        """Slices across x, y and z, coloured by the share of orientations, with the robot at home; for matplotlib.
+        """Return a matplotlib figure of slices across x, y and z, coloured by the share of orientations, robot at home.
 
         Args:
             at: a point that the slices go through; each is the grid's nearest [m]. Default: of each axis, where most
@@ -91,7 +91,7 @@ class ReachabilityMap:
 
 
 def load_map(path: str | os.PathLike[str]) -> ReachabilityMap:
-    """The map that ``save``, or ``osik reach``, has written.
+    """Return the map that ``save``, or ``osik reach``, has written.
 
     Raises:
         OSError: it cannot be read.

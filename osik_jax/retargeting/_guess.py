@@ -39,7 +39,7 @@ _ROOM = 6e-3
 
 
 def guess_profile(robot: Robot) -> Profile:
-    """The profile of a robot with two legs and two arms, as its tree and its home configuration show it.
+    """Return the profile of a robot with two legs and two arms, as its tree and its home configuration show it.
 
     Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as the bodies that reach farthest to the
     sides. A knee or elbow is the joint that bends its limb far from both ends. A wrist is the last joint that moves the

@@ -283,7 +283,8 @@ def _heights(place: _Places, some: slice | np.ndarray) -> tuple[Array, Array]:
 def _soles(place: _Places, corners: slice, contact: Float[Array, "4"], weight: Float[Array, ""]) -> _Rows:
     """Return the rows of sole corners: height 0 in contact, at least the clearance otherwise.
 
-    Corners without contact weigh less, because their rows switch between iterations; the clearance may be entered.
+    Corners without contact weigh less, because their rows switch on and off between iterations; so a swinging foot may
+    come a little nearer to the floor than the clearance.
     """
     height, rates = _heights(place, corners)
     stands = jnp.repeat(contact, 2) > 0.5

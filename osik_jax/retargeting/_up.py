@@ -110,7 +110,11 @@ def find_evidence(motion: HumanMotion, roles: Mapping[str, str] | None) -> Evide
 
 
 def _tracks(motion: HumanMotion, roles: Mapping[str, str] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return the tops and bottoms of a person (F, 3), and all points that may touch the floor (F, k, 3)."""
+    """Return points over time: middle of the shoulders, middle of the ankles, and all points that may touch the floor.
+
+    Shapes (F, 3), (F, 3) and (F, k, 3). Without known joints, the head and the mean of the foot joints are taken; None
+    without these.
+    """
     try:
         roles = find_roles(motion.joint_names) if roles is None else roles
     except OsikValueError:

@@ -9,7 +9,7 @@ from ._tree import BALL, KinematicTree
 
 
 def independent_balls(tree: KinematicTree) -> list[int]:
-    """Ball joints that own entries of q and v."""
+    """Return ball joints that own entries of q and v."""
     return [joint for joint in tree.independent if tree.joint_types[joint] == BALL]
 
 

@@ -35,7 +35,7 @@ def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayL
 
 
 def configuration(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
-    """See ``Robot.configuration``."""
+    """Return ``Robot.configuration``, described there."""
     q = with_joints(robot, joints, base)
     if np.shape(q) == (robot.nq,):
         warn_of_far_joints(robot, q, "configuration")
@@ -43,7 +43,7 @@ def configuration(robot: RobotModel, joints: Mapping[str, float], base: Num[Arra
 
 
 def check_configuration(robot: RobotModel, q: Num[ArrayLike, " nq"], name: str) -> None:
-    """See ``Robot.check_configuration``."""
+    """Raise an error for an invalid q, see ``Robot.check_configuration``."""
     tree, shape = robot.tree, jnp.shape(q)
     if shape != (tree.nq,):
         raise OsikValueError(

@@ -12,7 +12,7 @@ _NAMES_SHOWN = 4
 
 
 def described(robot: RobotModel) -> str:
-    """Name, sizes and base; joints; frames; masses; limits. Numbers that are traced or batched are left out."""
+    """Return name, sizes and base, joints, frames, masses and limits as lines, without traced or batched numbers."""
     tree = robot.tree
     base = "floating base" if robot.floating_base else "fixed base"
     batch = np.shape(robot.q0)[:-1]

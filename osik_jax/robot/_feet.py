@@ -9,7 +9,7 @@ _FEET = (r"sole(?!.*corner)", r"foot", r"ankle", r"toe")
 
 
 def find_feet(frames: Iterable[tuple[str, int]], parents: Sequence[int]) -> tuple[str, ...]:
-    """One frame of each of two or more outermost bodies that are called like feet; none if there are fewer.
+    """Return one frame of each of two or more outermost bodies that are called like feet; none if there are fewer.
 
     Args:
         frames: names, and the body that each is fixed to.

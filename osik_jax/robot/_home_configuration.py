@@ -62,7 +62,7 @@ def _as_array(home: Any, dtype: Any) -> Array:
 
 
 def _keyframe(robot: RobotModel, home: Any) -> np.ndarray:
-    """The independent entries of a keyframe of the MuJoCo model."""
+    """Return the independent entries of a keyframe of the MuJoCo model."""
     model = robot.mj_model
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or str(k) for k in range(model.nkey)]
     if isinstance(home, str) and home in names:
@@ -79,7 +79,7 @@ def _keyframe(robot: RobotModel, home: Any) -> np.ndarray:
 
 
 def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Array:
-    """``q0`` with the named joints set: a number each, or all entries of a free (7) or ball joint (4)."""
+    """Return ``q0`` with named joints set: a number each, or all entries of a free (7) or ball joint (4)."""
     single: dict[str, Any] = {}
     several: dict[str, Any] = {}
     for name, value in values.items():

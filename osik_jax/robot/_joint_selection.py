@@ -17,7 +17,7 @@ from ._tree import DOF_WIDTH, FREE, HINGE, SLIDE
 
 
 def select_joints(robot: Robot, pattern: str) -> list[int]:
-    """Independent joints called ``pattern``, or those but the free ones that match it as a glob.
+    """Return independent joints called ``pattern``, or those but the free ones that match it as a glob.
 
     Raises:
         KeyError: there are none; the message lists the independent joints.
@@ -33,7 +33,7 @@ def select_joints(robot: Robot, pattern: str) -> list[int]:
 
 
 def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:
-    """Independent joints, in the order of v, that match any of the patterns; ``None``: all but the free joints.
+    """Return independent joints, in the order of v, that match any of the patterns; ``None``: all but the free joints.
 
     Raises:
         KeyError: a pattern matches no joint.
@@ -53,13 +53,13 @@ def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:
 
 
 def dofs_of(robot: Robot, joints: Sequence[int]) -> list[int]:
-    """Entries of v that belong to some independent joints, joint by joint."""
+    """Return the entries of v that belong to some independent joints, joint by joint."""
     tree = robot.tree
     return [tree.dof_address[j] + i for j in joints for i in range(DOF_WIDTH[tree.joint_types[j]])]
 
 
 def is_scalar(robot: Robot, joint: int) -> bool:
-    """Whether a joint is a hinge or a slide: one entry in q, one in v."""
+    """Return whether a joint is a hinge or a slide: one entry in q, one in v."""
     return robot.tree.joint_types[joint] in (HINGE, SLIDE)
 
 
@@ -80,7 +80,7 @@ def dof_names(robot: Robot) -> list[str]:
 
 
 def dof_values(robot: Robot, given: Any, default: Float[Array, " nv"], what: str) -> Float[Array, " nv"]:
-    """An array over v from what a user gives: nothing, an array (nv,), or a mapping from names or globs to values.
+    """Return an array over v from a user's input: nothing, an array (nv,), or a mapping from names or globs to values.
 
     Raises:
         KeyError: the mapping names a joint that does not exist.

@@ -17,7 +17,7 @@ Factors = Mapping[str, Float[Array, ""] | float] | Float[Array, ""] | float
 
 
 def scaled_leaves(robot: RobotModel, length: Factors, mass: Factors) -> dict[str, Array]:
-    """The leaves of a robot that other lengths and masses change, by field."""
+    """Return the leaves of a robot that other lengths and masses change, by field."""
     tree, dtype = robot.tree, robot.body_position.dtype
     longer, heavier = _factors(tree, length, "length", dtype), _factors(tree, mass, "mass", dtype)
     parent, carrier = np.asarray(tree.body_parents, int), np.asarray(tree.frame_bodies, int)
@@ -35,7 +35,7 @@ def scaled_leaves(robot: RobotModel, length: Factors, mass: Factors) -> dict[str
 
 
 def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) -> Float[Array, " nbody"]:
-    """One factor for each body; the world keeps 1."""
+    """Return one factor for each body; the world keeps 1."""
     factors = jnp.ones(len(tree.body_names), dtype)
     if not isinstance(given, Mapping):
         return factors.at[1:].set(given)
@@ -52,7 +52,7 @@ def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) ->
 
 
 def _bodies(tree: KinematicTree, pattern: str) -> list[int]:
-    """Moving bodies called ``pattern``, or that match it as a glob."""
+    """Return moving bodies called ``pattern``, or that match it as a glob."""
     names = dict(zip(tree.body_names[1:], range(1, len(tree.body_names)), strict=True))
     found = [body for name, body in names.items() if name == pattern] or [
         body for name, body in names.items() if fnmatch.fnmatchcase(name, pattern)

@@ -25,7 +25,7 @@ def load_robot(
     home: Home | None = None,
     root: str | Sequence[str] | None = None,
 ) -> Robot:
-    """Loads an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
+    """Load an embedded robot: ``"nao"`` (floating base, 26 joints) or ``"arm7"`` (7 joints, fixed base).
 
     ``"g1"``, ``"talos"``, ``"go2"`` (floating base), ``"ur5"``, ``"panda"``, ``"xarm7"``, ``"so101"``, ``"baxter"``,
     ``"tiago"`` and ``"allegro"`` (fixed base) are URDFs of the package example-robot-data, which has to be installed.

@@ -22,7 +22,7 @@ class MadeForRobot(eqx.Module):
     made_for: str | None = eqx.field(default=None, init=False, static=True, repr=False)
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Looks at the robot before the constructor does."""
+        """Check the robot before the constructor runs."""
         new = super().__new__(cls)
         if _takes_robot(cls) and (args or "robot" in kwargs):
             robot = args[0] if args else kwargs["robot"]
@@ -37,7 +37,7 @@ def _takes_robot(cls: type) -> bool:
 
 
 def check_robot(robot: Any, where: str) -> None:
-    """Raises TypeError where it is no robot, ValueError where it is a stack of robots."""
+    """Raise TypeError where it is no robot, ValueError where it is a stack of robots."""
     if not isinstance(robot, Robot):
         raise OsikTypeError(
             f"{where}: robot is {robot!r}; it is a Robot, as osik_jax.load_robot and Robot.from_urdf return"
@@ -51,7 +51,7 @@ def check_robot(robot: Any, where: str) -> None:
 
 
 def check_made_for(part: MadeForRobot, robot: Robot, what: str) -> None:
-    """Raises ValueError where the part was made for a robot with other joints."""
+    """Raise ValueError where the part was made for a robot with other joints."""
     if part.made_for is not None and part.made_for != robot.tree.dof_owners:
         raise OsikValueError(
             f"{what} is a {type(part).__name__} that was made for another robot, whose joints are: {part.made_for}. "

@@ -40,48 +40,48 @@ class RobotModel(eqx.Module):
 
     @property
     def nq(self) -> int:
-        """Length of q."""
+        """Return the length of q."""
         return self.tree.nq
 
     @property
     def nv(self) -> int:
-        """Length of v."""
+        """Return the length of v."""
         return self.tree.nv
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Independent joints in the order of v, free joints left out."""
+        """Return independent joints in the order of v, free joints left out."""
         return tuple(self.tree.joint_names[j] for j in self.tree.independent if self.tree.joint_types[j] != FREE)
 
     @property
     def body_names(self) -> tuple[str, ...]:
-        """Moving bodies, in the order of ``body_mass`` and the other arrays over bodies, whose entry 0 is the world."""
+        """Return moving bodies, in the order of ``body_mass`` and other arrays over bodies; entry 0 is the world."""
         return self.tree.body_names[1:]
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """Every frame that can be asked for by name: bodies, URDF links (fused or not), sites, geoms."""
+        """Return every frame that can be asked for by name: bodies, URDF links (fused or not), sites, geoms."""
         return self.tree.frame_names
 
     @property
     def mimic_joints(self) -> dict[str, tuple[str, float]]:
-        """Followers: name to (leader, multiplier)."""
+        """Return followers: name to (leader, multiplier)."""
         names = self.tree.joint_names
         return {names[f]: (names[leader], m) for f, leader, m in self.tree.followers}
 
     @property
     def locked_joints(self) -> tuple[str, ...]:
-        """Names of the joints frozen at load time."""
+        """Return the names of the joints frozen at load time."""
         return tuple(self.tree.joint_names[j] for j in self.tree.locked)
 
     @property
     def floating_base(self) -> bool:
-        """Whether the robot hangs from a free joint that is not locked; loose bodies of a scene do not count."""
+        """Return whether the robot hangs from a free joint that is not locked; loose bodies of a scene do not count."""
         return bool(self.tree.free_bases)
 
     @property
     def mj_model(self) -> mujoco.MjModel:
-        """The MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations.
+        """Return the MuJoCo model that the robot was made from; see ``mujoco_qpos`` for its configurations.
 
         Raises:
             ValueError: the robot is a stack of robots whose models differ.
@@ -114,6 +114,6 @@ class RobotModel(eqx.Module):
         return self.tree.dof_address[self.tree.owner(name)]
 
     def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
-        """The configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
+        """Return the configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
         index, coefficient = self.tree.qpos_source
         return jnp.asarray(q)[index] * coefficient + self.qpos_offset

@@ -19,7 +19,7 @@ _NAMES_SHOWN = 4
 
 
 def warn_of_far_joints(robot: RobotModel, q: Any, what: str) -> None:
-    """Gives one ``OsikWarning`` that names the hinges and slides of q (nq,) that are far outside their range.
+    """Give one ``OsikWarning`` that names the hinges and slides of q (nq,) that are far outside their range.
 
     Nothing is said of traced numbers.
     """
@@ -39,7 +39,7 @@ def warn_of_far_joints(robot: RobotModel, q: Any, what: str) -> None:
 
 
 def warn_of_fast_joints(names: Any, given: Any, own: Any, what: str) -> None:
-    """Gives one ``OsikWarning`` that names the entries whose given speed is more than ten times the file's.
+    """Give one ``OsikWarning`` that names the entries whose given speed is more than ten times the file's.
 
     Args:
         names: of each entry.

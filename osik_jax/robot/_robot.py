@@ -74,7 +74,7 @@ class Robot(RobotModel):
         package_dirs: Iterable[str | os.PathLike[str]] = (),
         root: str | Sequence[str] | None = None,
     ) -> Robot:
-        """Loads a URDF. Boxes, spheres, cylinders and capsules are kept as geoms; no mesh file is read unless asked.
+        """Load a URDF. Boxes, spheres, cylinders and capsules are kept as geoms; no mesh file is read unless asked.
 
         Every link is a frame, with or without a joint of its own. Limits come from ``<limit>``: no ``<limit>`` means
         none, an absent ``lower`` or ``upper`` is 0 as the format has it, and a velocity of 0 or none means unknown,
@@ -136,7 +136,7 @@ class Robot(RobotModel):
         home: Home | None = None,
         root: str | Sequence[str] | None = None,
     ) -> Robot:
-        """Loads an MJCF file or text.
+        """Load an MJCF file or text.
 
         Active joint equality constraints that are linear become exact mimic joints, those without a second joint lock
         the first; an ``EqualityConstraintTask`` keeps ``connect``, ``weld`` and the other joint constraints. Tendons
@@ -188,7 +188,7 @@ class Robot(RobotModel):
         home: Home | None = None,
         root: str | Sequence[str] | None = None,
     ) -> Robot:
-        """Takes a compiled MuJoCo model.
+        """Make a robot of a compiled MuJoCo model.
 
         Args:
             model: the model.
@@ -215,16 +215,16 @@ class Robot(RobotModel):
 
     @classmethod
     def _of(cls, model: RobotModel, home: Home | None) -> Self:
-        """The robot with the names and numbers that were read, and with another ``q0`` where one is given."""
+        """Return the robot with the names and numbers that were read, and with another ``q0`` where one is given."""
         robot = cls(*(getattr(model, field.name) for field in dataclasses.fields(RobotModel)))
         return robot if home is None else robot.with_home(home)
 
     def __repr__(self) -> str:
-        """The robot in five lines."""
+        """Return a description of the robot in five lines."""
         return described(self)
 
     def configuration(self, joints: Mapping[str, float], *, base: Num[ArrayLike, " nq"] | None = None) -> Array:
-        """``q0`` (or ``base``) with the named hinge and slide joints set; setting a follower moves its leader. (nq,).
+        """Return ``q0`` (or ``base``) with named hinges and slides set; setting a follower moves its leader. (nq,).
 
         Raises:
             KeyError: no such joint, or it is locked.
@@ -236,7 +236,7 @@ class Robot(RobotModel):
         return configuration(self, joints, base)
 
     def with_home(self, home: Home) -> Self:
-        """The same robot with another ``q0``, which is what tasks made from then on aim at by default.
+        """Return the same robot with another ``q0``, which is what tasks made from then on aim at by default.
 
         Works inside ``jit``, where values are not checked; nothing is compiled again.
 
@@ -257,7 +257,7 @@ class Robot(RobotModel):
         return eqx.tree_at(lambda robot: robot.q0, self, q0)
 
     def astype(self, dtype: DTypeLike) -> Self:
-        """The same robot in another precision: every number is cast, and everything else stays.
+        """Return the same robot in another precision: every number is cast, and everything else stays.
 
         A robot has the precision that was in force when it was made. After ``jax_enable_x64`` was switched on or off,
         ``robot.astype(float)`` is the robot in the precision now in force; tasks, limits and schemes are to be made
@@ -274,7 +274,7 @@ class Robot(RobotModel):
         return jax.tree.map(lambda leaf: leaf.astype(wanted), self)
 
     def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
-        """The same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
+        """Return the same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
 
         A link is made longer from its own origin: the joints of its children, its centre of mass, its frames and its
         geoms move away by the factor, and its geoms grow by it. Masses are scaled by their own factors only, inertias
@@ -293,7 +293,7 @@ class Robot(RobotModel):
         return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
 
     def to_mjcf(self, path: str | os.PathLike[str] | None = None) -> str:
-        """The robot as MJCF, as its leaves have it now: scaled, edited, joints locked.
+        """Return the robot as MJCF, as its leaves have it now: scaled, edited, joints locked.
 
         Locked joints are gone, their bodies posed at the locked values. Links that are fixed to others are one body
         with them and stay as frames. Mimic joints are joint equality constraints, velocity limits custom numerics
@@ -320,7 +320,7 @@ class Robot(RobotModel):
         return text
 
     def check_configuration(self, q: Num[ArrayLike, " nq"], name: str = "q") -> None:
-        """Raises ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
+        """Raise ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
 
         Args:
             q: what should be a configuration. (nq,)

@@ -82,7 +82,7 @@ class ModelHolder:
 
     @cached_property
     def _content(self) -> bytes:
-        """Digest of all that the model is made of."""
+        """Return the digest of all that the model is made of."""
         if self.model is None:
             return b""
         buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
@@ -104,7 +104,7 @@ class cached_arrays(Generic[_Arrays]):
         self.compute, self.name, self.__doc__ = compute, f"_cached_{compute.__name__}", compute.__doc__
 
     def __get__(self, tree: Any, owner: type | None = None) -> _Arrays:
-        """A copy of the arrays; they are computed on the first access."""
+        """Return a copy of the arrays; they are computed on the first access."""
         if tree is None:
             return cast(_Arrays, self)
         if self.name not in tree.__dict__:
@@ -157,18 +157,18 @@ class KinematicTree:
 
     @cached_property
     def _hash(self) -> int:
-        """Computed once: every call of a jitted function asks for it."""
+        """Return the hash, computed once because every call of a jitted function asks for it."""
         return hash(tuple(getattr(self, field.name) for field in dataclasses.fields(self)))
 
     @cached_property
     def independent(self) -> tuple[int, ...]:
-        """Joints that own entries of q and v."""
+        """Return joints that own entries of q and v."""
         dependent = {f for f, _, _ in self.followers} | set(self.locked)
         return tuple(j for j in range(len(self.joint_names)) if j not in dependent)
 
     @cached_property
     def dof_owners(self) -> str:
-        """Names of the joints that own entries of v, in its order: robots for which they differ do not mix."""
+        """Return the names of the joints that own entries of v, in its order; robots with different ones do not mix."""
         return ", ".join(self.joint_names[j] for j in self.independent)
 
     @cached_arrays
@@ -195,23 +195,23 @@ class KinematicTree:
 
     @cached_property
     def nq(self) -> int:
-        """Length of q."""
+        """Return the length of q."""
         return sum(QPOS_WIDTH[self.joint_types[j]] for j in self.independent)
 
     @cached_property
     def nv(self) -> int:
-        """Length of v."""
+        """Return the length of v."""
         return sum(DOF_WIDTH[self.joint_types[j]] for j in self.independent)
 
     @cached_arrays
     def turning(self) -> np.ndarray:
-        """Entries of v that turn something; slides and a base's translation bend no path. (nv,), bool."""
+        """Return the entries of v that turn something; slides and a base's translation bend no path. (nv,), bool."""
         parts = {FREE: [False] * 3 + [True] * 3, BALL: [True] * 3, SLIDE: [False], HINGE: [True]}
         return np.array([turns for j in self.independent for turns in parts[self.joint_types[j]]], bool)
 
     @cached_arrays
     def qpos_source(self) -> tuple[np.ndarray, np.ndarray]:
-        """``(index, coefficient)``: full qpos = coefficient * q[index] + offset (coefficient 0 where locked)."""
+        """Return ``(index, coefficient)``: full qpos = coefficient * q[index] + offset (coefficient 0 where locked)."""
         n = int(self.full_qpos_address[-1])
         index, coefficient = np.zeros(n, int), np.zeros(n)
         for joint, start in self.qpos_address.items():
@@ -248,27 +248,27 @@ class KinematicTree:
 
     @cached_arrays
     def dof_joint(self) -> np.ndarray:
-        """The joint that each full dof belongs to."""
+        """Return the joint that each full dof belongs to."""
         return np.repeat(np.arange(len(self.joint_types)), [DOF_WIDTH[t] for t in self.joint_types])
 
     @cached_arrays
     def dof_body(self) -> np.ndarray:
-        """The body that each full dof moves."""
+        """Return the body that each full dof moves."""
         return np.asarray(self.joint_bodies, int)[self.dof_joint]
 
     @cached_arrays
     def parents(self) -> np.ndarray:
-        """``body_parents`` as an array, of JAX's integers in either precision."""
+        """Return ``body_parents`` as an array, of JAX's integers in either precision."""
         return np.asarray(self.body_parents, np.int32)
 
     @cached_property
     def reference_body(self) -> int:
-        """The first moving body, or the world where nothing moves: points nearby are summed about its origin."""
+        """Return the first moving body, or the world where nothing moves: points nearby are summed about its origin."""
         return min(1, len(self.body_parents) - 1)
 
     @cached_property
     def tops(self) -> tuple[int, ...]:
-        """Topmost bodies of the robot.
+        """Return topmost bodies of the robot.
 
         Raises:
             ValueError: several trees of the scene may be the robot.
@@ -284,7 +284,7 @@ class KinematicTree:
 
     @cached_property
     def root(self) -> int:
-        """The first body of the robot that moves, or the world where nothing moves.
+        """Return the first body of the robot that moves, or the world where nothing moves.
 
         Raises:
             ValueError: as in ``tops``.
@@ -302,7 +302,7 @@ class KinematicTree:
 
     @cached_property
     def free_bases(self) -> tuple[int, ...]:
-        """The free joints, not locked, that the robot hangs from; those of all robots where several may be meant."""
+        """Return the free joints, not locked, on which the robot hangs; those of all robots if several may be meant."""
         tops = {top for tops in self.robots for top in tops} or set(self._below_the_world)
         return tuple(j for j in self.independent if self.joint_types[j] == FREE and self.joint_bodies[j] in tops)
 
@@ -321,7 +321,7 @@ class KinematicTree:
 
     @cached_arrays
     def descendants(self) -> np.ndarray:
-        """``descendants[a, b]``: body b is a or below it. (nbody, nbody), bool."""
+        """Return an array in which ``[a, b]`` says whether body b is a or below it. (nbody, nbody), bool."""
         n = len(self.body_parents)
         below = np.eye(n, dtype=bool)
         for body in range(n - 1, 0, -1):
@@ -330,11 +330,11 @@ class KinematicTree:
 
     @cached_arrays
     def moves(self) -> np.ndarray:
-        """``moves[b, i]``: full dof i moves body b. (nbody, full nv), bool."""
+        """Return an array in which ``[b, i]`` says whether full dof i moves body b. (nbody, full nv), bool."""
         return self.descendants[self.dof_body].T
 
     def frame(self, name: str) -> int:
-        """Index of a frame.
+        """Return the index of a frame.
 
         Raises:
             KeyError: no such frame; the message lists those that exist.
@@ -345,7 +345,7 @@ class KinematicTree:
             raise unknown_name("frame", name, self.frame_names) from None
 
     def joint(self, name: str) -> int:
-        """Index of a joint (independent, follower or locked).
+        """Return the index of a joint (independent, follower or locked).
 
         Raises:
             KeyError: no such joint; the message lists those that exist.
@@ -356,7 +356,7 @@ class KinematicTree:
             raise unknown_name("joint", name, self.joint_names) from None
 
     def owner(self, name: str) -> int:
-        """Index of the independent joint whose entries of q and v move a joint: its leader, or itself.
+        """Return the index of the independent joint whose entries of q and v move a joint: its leader, or itself.
 
         Raises:
             KeyError: no such joint, or it is locked.

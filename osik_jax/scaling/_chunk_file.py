@@ -49,26 +49,26 @@ class Part(NamedTuple):
 
     @property
     def file_name(self) -> str:
-        """Name of the file that the part is kept in."""
+        """Return the name of the file that the part is kept in."""
         own = f".{self.process}-of-{self.processes}" if self.processes > 1 else ""
         return f"{self.chunk:08d}{own}.npz"
 
     @classmethod
     def of(cls, path: Path) -> Part | None:
-        """The part that a file has by its name, None if it is no file of a chunk."""
+        """Return the part that a file has by its name, None if it is no file of a chunk."""
         match = _FILE.fullmatch(path.name)
         part = cls(*(int(number) for number in match.groups() if number is not None)) if match else None
         return part if part and part.file_name == path.name else None
 
 
 def chunk_files(folder: Path) -> dict[Part, Path]:
-    """All files of chunks in a folder, in order."""
+    """Return all files of chunks in a folder, in order."""
     found = {part: path for path in folder.iterdir() if (part := Part.of(path))} if folder.is_dir() else {}
     return dict(sorted(found.items()))
 
 
 def complete(parts: Iterable[Part]) -> dict[int, list[Part]]:
-    """The chunks of which all parts are there: one set of parts for each, where several numbers of processes wrote."""
+    """Return the chunks of which all parts are there: one set of parts each, if several numbers of processes wrote."""
     sets: dict[tuple[int, int], list[Part]] = {}
     for part in sorted(parts):
         sets.setdefault((part.chunk, part.processes), []).append(part)
@@ -76,7 +76,7 @@ def complete(parts: Iterable[Part]) -> dict[int, list[Part]]:
 
 
 def write_chunk(folder: Path, part: Part, job: str, blocks: Sequence[Block], arrays: Mapping[str, np.ndarray]) -> None:
-    """Writes the results of some lanes.
+    """Write the results of some lanes.
 
     Args:
         folder: where to.
@@ -105,7 +105,7 @@ def write_chunk(folder: Path, part: Part, job: str, blocks: Sequence[Block], arr
 
 
 def _check_type(name: str, dtype: np.dtype) -> None:
-    """Raises for Python objects, which only pickle keeps, and types that come back as bytes, such as bfloat16."""
+    """Raise for Python objects, which only pickle keeps, and types that come back as bytes, such as bfloat16."""
     known = not dtype.hasobject and np.dtype(dtype.str) == dtype
     if not known and dtype.names is None:
         raise OsikValueError(f"{name or 'the result'} is of type {dtype}, which no .npz keeps; NumPy's own numbers do")
@@ -113,7 +113,7 @@ def _check_type(name: str, dtype: np.dtype) -> None:
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Another name to write a file under, which is like no other; the file gets its own name if all goes well."""
+    """Yield a unique temporary name to write a file under; rename the file to its own name if all goes well."""
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
     try:
         yield partial
@@ -127,20 +127,20 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def remove_partial_files(folder: Path) -> None:
-    """Removes what killed processes left half written; no other process may be writing."""
+    """Remove what killed processes left half written; no other process may be writing."""
     for path in folder.glob(".*.npz.*.partial"):
         path.unlink(missing_ok=True)
 
 
 def unwritable(folder: Path, what: str, error: OSError) -> OSError:
-    """An error of the same kind that names the folder and says what becomes of the job."""
+    """Return an error of the same kind that names the folder and says what becomes of the job."""
     message = f"{what}: {error.strerror or error}; chunks that are finished stay, call again when this is cured"
     return OSError(error.errno or errno.EIO, message, str(folder))
 
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """The arrays of a file, to be read inside the block.
+    """Open a file for reading inside the block; yield its arrays.
 
     Raises:
         DamagedFile: one of them cannot be read.
@@ -158,7 +158,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def check_chunk(path: Path, part: Part, job: str) -> None:
-    """Reads a file once, against its checksums.
+    """Read a file once, against its checksums.
 
     Raises:
         DamagedFile: a byte that matters has changed, or the file is of another chunk.
@@ -174,7 +174,7 @@ def check_chunk(path: Path, part: Part, job: str) -> None:
 def read_chunk(
     path: Path, part: Part, job: str, names: Sequence[str] | None = None
 ) -> tuple[list[Block], dict[str, np.ndarray]]:
-    """The lanes that a file has, and some of its arrays by name, or all.
+    """Return the lanes that a file has, and some of its arrays by name, or all.
 
     Raises:
         DamagedFile: something of it cannot be read, or it is of another chunk.
@@ -187,12 +187,12 @@ def read_chunk(
 
 
 def result_names(file: Any) -> tuple[str, ...]:
-    """Names of the results in an opened file."""
+    """Return the names of the results in an opened file."""
     return tuple(file[_NAMES].tolist())
 
 
 def _check_marks(file: Any, path: Path, part: Part, job: str) -> None:
-    """Raises where a file is not of this part of this job, or where a damaged directory hides some of its arrays."""
+    """Raise where a file is not of this part of this job, or where a damaged directory hides some of its arrays."""
     if file.files and (_JOB not in file.files or str(file[_JOB]) != job):
         raise OtherJob(f"{path} has results of another job; name another folder, or take the file out of this one")
     found = Part(*file[_PART].tolist())

@@ -36,7 +36,7 @@ def run_in_chunks(
     progress: Progress = True,
     unit: str = "lanes",
 ) -> Any:
-    """``function(batch, *shared)``, some lanes at a time; on disk, a job that was killed goes on where it was.
+    """Return ``function(batch, *shared)``, computed some lanes at a time; on disk, a killed job continues where it was.
 
     While the devices work on a chunk, the one before is written. Every chunk has the same number of lanes (the last
     one is filled up with copies of its last lane), so one program does for all.
@@ -91,7 +91,7 @@ def run_in_chunks(
 
 
 def _to_disk(job: _Job, folder: Path, label: str, progress: Progress, unit: str) -> Any:
-    """Runs the chunks that are missing; returns a pytree of the structure of the results."""
+    """Run the chunks that are missing; return a pytree of the structure of the results."""
     process, processes, manifest = jax.process_index(), jax.process_count(), job.manifest(label)
     finished = claim(folder, manifest, process, processes)
     todo = _agreed(job.chunks, set(finished))
@@ -119,11 +119,11 @@ class _Job:
         self.chunks = -(-count // chunk)
 
     def size(self, k: int) -> int:
-        """Lanes of a chunk, less those that fill up the last one."""
+        """Return the lanes of a chunk, less those that fill up the last one."""
         return min(self.chunk, self.count - k * self.chunk)
 
     def lanes(self, k: int) -> Any:
-        """The lanes of a chunk."""
+        """Return the lanes of a chunk."""
         start, stop = k * self.chunk, k * self.chunk + self.size(k)
         if not callable(self.batch):
             return jax.tree.map(lambda a: a[start:stop], self.batch)
@@ -134,18 +134,18 @@ class _Job:
         return made
 
     def inputs(self, k: int) -> Any:
-        """The lanes of a chunk, filled up."""
+        """Return the lanes of a chunk, filled up."""
         missing = self.chunk - self.size(k)
         return jax.tree.map(
             lambda a: np.concatenate([a, np.repeat(a[-1:], missing, 0)]) if missing else a, self.lanes(k)
         )
 
     def run(self, k: int) -> Any:
-        """Results of a chunk, perhaps still being computed."""
+        """Return the results of a chunk, perhaps still being computed."""
         return self.function(self.inputs(k), *self.shared)
 
     def expected(self) -> Any:
-        """Shapes and types of a chunk's results, without computing them; None where JAX cannot trace the function."""
+        """Return shapes and types of a chunk's results without computing them; None if they cannot be traced."""
         try:
             return jax.eval_shape(self.function, self.inputs(0), *self.shared)
         except Exception:  # a function of NumPy, or one that is wrong: then running it says how
@@ -193,7 +193,7 @@ def _positive(value: Any, name: str) -> int:
 
 
 def _agreed(chunks: int, finished: set[int]) -> list[int]:
-    """Chunks that one process or another lacks: all run the same ones, for the program is of all of them."""
+    """Return chunks that one process or another lacks: all run the same ones, for the program is of all of them."""
     lacking = np.array([k not in finished for k in range(chunks)])
     if jax.process_count() > 1:
         from jax.experimental.multihost_utils import process_allgather
@@ -203,7 +203,7 @@ def _agreed(chunks: int, finished: set[int]) -> list[int]:
 
 
 def _one_ahead(job: _Job, todo: Sequence[int]) -> Iterator[tuple[int, Any]]:
-    """Results in order; the next chunk is under way while one is used. If it fails, the one before is used first."""
+    """Yield results in order while the next chunk is under way; its failure comes after the result before it."""
     waiting: tuple[int, Any] | None = None
     for k in todo:
         try:
@@ -220,7 +220,7 @@ def _one_ahead(job: _Job, todo: Sequence[int]) -> Iterator[tuple[int, Any]]:
 
 
 def _rows(result: Any, size: int, chunk: int) -> tuple[list[Block], dict[str, np.ndarray]]:
-    """The lanes of a result that this process has: which ones, and the arrays by name."""
+    """Return the lanes of a result that this process has: which ones, and the arrays by name."""
     names, leaves = leaf_names(result), jax.tree.leaves(result)
     wrong = [name for name, leaf in zip(names, leaves, strict=True) if np.shape(leaf)[:1] != (chunk,)]
     if wrong or not leaves:
@@ -241,7 +241,7 @@ def _rows(result: Any, size: int, chunk: int) -> tuple[list[Block], dict[str, np
 
 
 def _blocks(leaf: Any, chunk: int) -> dict[int, Any]:
-    """Rows on this process's devices, by the first lane."""
+    """Return rows on this process's devices, by the first lane."""
     if not isinstance(leaf, jax.Array) or leaf.is_fully_addressable:
         if jax.process_count() > 1:
             raise OsikValueError("the function's results are of this process alone; for several, make it with sharded")
@@ -257,7 +257,7 @@ class _Layout:
         self.known: tuple[int, dict[str, str]] | None = None
 
     def check(self, arrays: Mapping[str, np.ndarray], chunk: int) -> None:
-        """Raises ValueError where a chunk is not like the first one given."""
+        """Raise ValueError where a chunk is not like the first one given."""
         found = {name or "it": f"{array.dtype} {array.shape[1:]}" for name, array in arrays.items()}
         if self.known is None:
             self.known = chunk, found

@@ -15,7 +15,7 @@ from ..batching._names import leaf_names
 
 
 def fingerprint(tree: Any) -> dict[str, str]:
-    """Kind, shape and a hash of each array of a pytree, by name; and of its structure, under "structure"."""
+    """Return kind, shape and a hash of each array of a pytree, by name; and of its structure, under "structure"."""
     found = {
         name or "it": _described(np.asarray(leaf))
         for name, leaf in zip(leaf_names(tree), jax.tree.leaves(tree), strict=True)
@@ -25,7 +25,7 @@ def fingerprint(tree: Any) -> dict[str, str]:
 
 
 def identifier(manifest: Mapping[str, Any]) -> str:
-    """A hash of all that a manifest says; what is under "job", where it is kept, does not count."""
+    """Return a hash of all that a manifest says; what is under "job", where it is kept, does not count."""
     said = {key: value for key, value in manifest.items() if key != "job"}
     return _digest(json.dumps(said, sort_keys=True).encode())
 

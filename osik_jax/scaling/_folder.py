@@ -17,7 +17,7 @@ from ._saved import read_manifest, write_manifest
 
 
 def claim(folder: Path, manifest: Mapping[str, Any], process: int, processes: int) -> dict[int, list[Part]]:
-    """Makes a folder that of a job, and reads every finished chunk once, to see that it is of this job and whole.
+    """Make a folder that of a job, and read every finished chunk once, to check that it is whole and of this job.
 
     Damaged files are removed, with a warning, so that they are made anew.
 
@@ -46,7 +46,7 @@ def claim(folder: Path, manifest: Mapping[str, Any], process: int, processes: in
 
 
 def _old_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest that is there; a damaged one counts as none, for each chunk says of which job it is."""
+    """Return the manifest that is there; a damaged one counts as none, for each chunk says of which job it is."""
     try:
         return read_manifest(folder)
     except DamagedFile as damaged:
@@ -55,7 +55,7 @@ def _old_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def _undamaged(folder: Path, job: str, process: int, processes: int) -> list[Part]:
-    """This process's parts and those of other numbers of processes, without the damaged ones, which are removed."""
+    """Return this process's parts and those of other numbers of processes; damaged ones are removed."""
     parts = [part for part in chunk_files(folder) if part.processes != processes or part.process == process]
 
     def damage(part: Part) -> DamagedFile | None:
@@ -79,7 +79,7 @@ def _report(damaged: DamagedFile) -> None:
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Raises where results do not fit into a folder.
+    """Raise where results do not fit into a folder.
 
     Args:
         folder: where they go.

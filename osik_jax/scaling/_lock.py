@@ -20,7 +20,7 @@ except ImportError:  # Windows
 
 @contextlib.contextmanager
 def only_job(folder: Path, process: int = 0) -> Iterator[bool]:
-    """Makes the folder, and keeps other jobs out of it inside the block.
+    """Make the folder, and keep other jobs out of it inside the block.
 
     The operating system holds the lock for the process and drops it when the process ends, however it ends. So a lock
     file that a killed job left behind stops nobody.
@@ -55,7 +55,7 @@ def only_job(folder: Path, process: int = 0) -> Iterator[bool]:
 
 
 def _taken(path: Path) -> int | None:
-    """Descriptor of the locked file, None if it cannot be locked here."""
+    """Return the descriptor of the locked file, None if it cannot be locked here."""
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
@@ -73,14 +73,14 @@ def _taken(path: Path) -> int | None:
 
 
 def _sign(descriptor: int) -> None:
-    """Writes who has the lock, for others to read."""
+    """Write who has the lock, for others to read."""
     os.ftruncate(descriptor, 0)
     os.write(descriptor, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
     os.fsync(descriptor)
 
 
 def _locked(descriptor: int) -> bool:
-    """Locks a file; False if the file system cannot.
+    """Lock a file; False if the file system cannot.
 
     Raises:
         BlockingIOError: another process has locked it.

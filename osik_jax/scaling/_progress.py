@@ -15,14 +15,17 @@ Progress = bool | Callable[[int, int], Any]
 
 
 def check_progress(progress: Any) -> None:
-    """Raises TypeError for what is neither True, False nor a function."""
+    """Raise TypeError for what is neither True, False nor a function."""
     if not isinstance(progress, bool) and not callable(progress):
         raise OsikTypeError(f"progress is {progress!r}; it is True, False, or a function of the lanes done and of all")
 
 
 @contextlib.contextmanager
 def reported(total: int, done: int, progress: Progress, unit: str) -> Iterator[Callable[[int], None]]:
-    """A function to tell how many more lanes are done; it draws a bar that calls them so, or calls what is given."""
+    """Yield a function that takes the number of lanes newly done.
+
+    It draws a bar with that label, or calls a given function.
+    """
     with contextlib.ExitStack() as stack:
         update = stack.enter_context(progress_bar(total, done, unit=unit)) if progress is True else None
         start, own = time.perf_counter(), 0

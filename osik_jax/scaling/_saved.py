@@ -23,7 +23,7 @@ MANIFEST = "manifest.json"
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Writes what the chunks are of."""
+    """Write what the chunks are of."""
     with whole_file(folder / MANIFEST) as partial, partial.open("w") as file:
         json.dump(manifest, file, indent=1)
         file.flush()
@@ -71,14 +71,14 @@ class Saved:
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
-        """Number of lanes, size of chunks, versions, fingerprints of the inputs."""
+        """Return the number of lanes, size of chunks, versions, fingerprints of the inputs."""
         found = read_manifest(self.folder)
         if found is None:
             raise FileNotFoundError(f"{self.folder} has no {MANIFEST}: it is no folder of run_in_chunks")
         return found
 
     def __len__(self) -> int:
-        """Number of lanes, also of those that are missing."""
+        """Return the number of lanes, also of those that are missing."""
         return self.manifest["count"]
 
     @property
@@ -88,7 +88,7 @@ class Saved:
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """Chunks that are not there."""
+        """Return chunks that are not there."""
         there = complete(chunk_files(self.folder))
         return tuple(k for k in range(self.chunks) if k not in there)
 
@@ -101,7 +101,7 @@ class Saved:
         raise OsikValueError(f"{self.folder} has no finished chunk")
 
     def __getitem__(self, lanes: slice) -> Any:
-        """The results of a slice of lanes: a pytree like ``like``, or a dict by name.
+        """Return the results of a slice of lanes: a pytree like ``like``, or a dict by name.
 
         Raises:
             ValueError: lanes that are missing.
@@ -114,7 +114,7 @@ class Saved:
         return jax.tree.unflatten(jax.tree.structure(self.like), [arrays[name] for name in leaf_names(self.like)])
 
     def read(self, names: Sequence[str], lanes: slice = slice(None)) -> dict[str, np.ndarray]:
-        """Some of the arrays, by name, of a slice of lanes; nothing else is read.
+        """Return some of the arrays, by name, of a slice of lanes; nothing else is read.
 
         Raises:
             KeyError: no such array; the message lists them.
@@ -134,7 +134,7 @@ class Saved:
         return {name: np.concatenate([part[name] for part in parts])[::step] for name in names}
 
     def _parts(self, chunk: int) -> list[Part]:
-        """The parts that a chunk is in, one set of them where it was written by different numbers of processes."""
+        """Return the parts of a chunk: one set of them if different numbers of processes wrote it."""
         alone = Part(chunk)
         if (self.folder / alone.file_name).exists():
             return [alone]
@@ -142,7 +142,7 @@ class Saved:
         return complete(part for path in paths if (part := Part.of(path))).get(chunk, [])
 
     def _chunk(self, chunk: int, names: Sequence[str], start: int, stop: int) -> dict[str, np.ndarray]:
-        """Lanes start to stop of a chunk, counted from its first."""
+        """Return lanes start to stop of a chunk, counted from its first."""
         parts = self._parts(chunk)
         if not parts:
             count = len(self.missing)
@@ -164,7 +164,7 @@ class Saved:
 
 
 def _fill(whole: dict[str, np.ndarray], name: str, array: np.ndarray, blocks: list[Block], own: int) -> None:
-    """Puts the rows of an array where they belong."""
+    """Put the rows of an array where they belong."""
     if name not in whole:
         whole[name] = np.zeros((own, *array.shape[1:]), array.dtype)
     row = 0
@@ -174,7 +174,7 @@ def _fill(whole: dict[str, np.ndarray], name: str, array: np.ndarray, blocks: li
 
 
 def load(folder: str | os.PathLike[str], *, like: Any = None) -> Saved:
-    """The results that ``run_in_chunks`` wrote, or has written so far.
+    """Return the results that ``run_in_chunks`` wrote, or has written so far.
 
     Args:
         folder: its ``out``.

@@ -36,7 +36,7 @@ def sharded(
     mesh: Mesh | None = None,
     donate_argnums: int | Sequence[int] = (),
 ) -> ShardedFunction:
-    """Like ``jax.jit(jax.vmap(function, in_axes))``, with the batch split over devices.
+    """Return a function like ``jax.jit(jax.vmap(function, in_axes))``, with the batch split over devices.
 
     Each device runs its own lanes to their own end: no device waits for another one's slowest lane, and nothing is
     sent between them but gradients of what they share. Differentiable in both modes, and may be called inside ``jit``.
@@ -80,7 +80,7 @@ class ShardedFunction:
         functools.update_wrapper(self, function, updated=())
 
     def __call__(self, *args: Any) -> Any:
-        """Results of all lanes.
+        """Return the results of all lanes.
 
         A number of lanes that the devices do not divide is filled up with copies of the last lane, which are cut off
         again; that moves data between devices, so large batches had better divide.
@@ -97,7 +97,7 @@ class ShardedFunction:
         return jax.tree.map(lambda a: a[:count], out) if missing else out
 
     def place(self, *args: Any) -> tuple[Any, ...]:
-        """The arguments on the devices where the function wants them, so that calls in a loop copy nothing.
+        """Return the arguments on the devices where the function wants them, so that calls in a loop copy nothing.
 
         Raises:
             ValueError: as a call does, and where the devices do not divide the number of lanes.
@@ -109,7 +109,7 @@ class ShardedFunction:
         return jax.tree.unflatten(program.structure, program.placed(leaves))
 
     def _program(self, args: tuple[Any, ...]) -> tuple[list[Any], _Program]:
-        """The arrays of the arguments, and the program for what holds them."""
+        """Return the arrays of the arguments, and the program for what holds them."""
         leaves, structure = jax.tree.flatten(args)
         known = self._known.get(structure)
         if known is None:
@@ -150,7 +150,7 @@ class _Program:
         self.run = jax.jit(mapped, in_shardings=self.places, donate_argnums=donated)
 
     def count(self, leaves: list[Any]) -> int:
-        """Number of lanes."""
+        """Return the number of lanes."""
         lengths: set[int] = set()
         for i, axis in self._split:
             shape = np.shape(leaves[i])
@@ -163,17 +163,17 @@ class _Program:
         return lengths.pop()
 
     def reachable(self, leaves: list[Any]) -> list[Any]:
-        """The arrays, those that ``run`` would not take put where they are wanted."""
+        """Return the arrays, those that ``run`` would not take put where they are wanted."""
         if jax.process_count() > 1:
             return self.placed(leaves)
         return self._with_moved(leaves, [isinstance(a, jax.Array) and not isinstance(a, Tracer) for a in leaves])
 
     def placed(self, leaves: list[Any]) -> list[Any]:
-        """The arrays where they are wanted; Python numbers stay, for they take the precision of what they meet."""
+        """Return the arrays where they are wanted; Python numbers stay, because they adapt to any precision."""
         return self._with_moved(leaves, [not isinstance(a, (bool, int, float, complex)) for a in leaves])
 
     def _with_moved(self, leaves: list[Any], wanted: list[bool]) -> list[Any]:
-        """The arrays, those that are wanted and are elsewhere put where they belong."""
+        """Return the arrays, those that are wanted and are elsewhere put where they belong."""
         pairs = zip(leaves, self.places, strict=True)
         away = [i for i, (a, place) in enumerate(pairs) if wanted[i] and not _is_there(a, place)]
         there = moved([leaves[i] for i in away], [self.places[i] for i in away])
@@ -184,7 +184,7 @@ class _Program:
 
 
 def _making_empty_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, which makes the arrays without entries that it is given or holds anew.
+    """Return the function, which makes the arrays without entries that it is given or holds anew.
 
     With jaxlib 0.11.2 such an array that comes into a ``shard_map`` from outside ends the process (a segmentation fault
     of the Shardy partitioner, on every kind of device); a robot without geoms has some.
@@ -212,14 +212,14 @@ def _flat_axes(in_axes: Any, args: tuple[Any, ...]) -> list[int]:
 
 
 def _is_there(leaf: Any, place: NamedSharding) -> bool:
-    """Whether an array is where it is wanted."""
+    """Return whether an array is where it is wanted."""
     if not isinstance(leaf, jax.Array) or isinstance(leaf, Tracer) or not leaf.committed:
         return False
     return leaf.sharding == place or leaf.sharding.is_equivalent_to(place, leaf.ndim)  # a spec has several spellings
 
 
 def moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:
-    """Arrays on the devices where they are wanted, of other hosts too, each of which has them whole."""
+    """Return arrays on the devices where they are wanted, of other hosts too, each of which has them whole."""
     if not leaves:
         return []
     if jax.process_count() == 1:
@@ -237,7 +237,7 @@ def _filled(a: Any, axis: int, missing: int) -> Any:
 
 
 def _on_all_hosts(a: Any, place: NamedSharding) -> Any:
-    """One array over hosts from what each of them has whole; it takes its own part and asks nobody."""
+    """Return one array over hosts from what each of them has whole; it takes its own part and asks nobody."""
     if isinstance(a, Tracer) or (isinstance(a, jax.Array) and not a.is_fully_addressable):
         return jax.device_put(a, place)
     whole = np.asarray(a, jax.dtypes.canonicalize_dtype(a.dtype))

@@ -65,7 +65,7 @@ class NullSpace(Scheme):
 
     @property
     def saturates(self) -> bool:
-        """Whether the limits are hard."""
+        """Return whether the limits are hard."""
         return self.method == "saturated"
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:

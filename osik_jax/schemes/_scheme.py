@@ -243,7 +243,7 @@ class Scheme(Replaceable):
 
 
 def as_max_iterations(value: Any) -> int | None:
-    """A maximum of iterations: an integer from 0 up, Python's or NumPy's, or None.
+    """Return a maximum of iterations: an integer from 0 up, Python's or NumPy's, or None.
 
     Raises:
         ValueError: anything else.

@@ -78,7 +78,7 @@ class DualState(NamedTuple):
 def initial_state(
     tableau: Float[Array, "m m"], value: Float[Array, " m"], multiplier: Float[Array, " m"], active: Int[Array, " m"]
 ) -> DualState:
-    """Return the state at a known point, in the units of the tableau, with no step decided."""
+    """Return the state for given tableau, values, multipliers and active set, before the first step."""
     zero, zeros = jnp.asarray(0, jnp.int32), jnp.zeros_like(value)
     return DualState(
         tableau=tableau,
@@ -245,12 +245,14 @@ def _full_step(constraints: Constraints, row: Float[Array, " m"], entering: _Ent
 def _partial_step(
     s: DualState, sign: Float[Array, ""], column: Float[Array, " m"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Return the partial (dual) step length t1 of GI, and the active inequality whose multiplier reaches 0 first.
+    """Return the partial (dual) step length t1 (Goldfarb, Idnani), and the inequality that leaves the active set there.
+
+    Beyond t1 the multiplier of that inequality would have the wrong sign; t1 is infinite if there is none.
 
     Args:
         s: the iterate.
-        sign: of the entering constraint's multiplier.
-        column: of the tableau, how all else follows that multiplier.
+        sign: sign of the entering constraint's multiplier.
+        column: rates of all values and multipliers per unit of that multiplier: a column of the tableau. (m,)
     """
     bound_sign = jnp.where(s.active == AT_LOWER, 1.0, jnp.where(s.active == AT_UPPER, -1.0, 0.0)).astype(column.dtype)
     rate = bound_sign * sign * column

@@ -90,7 +90,10 @@ def _row_space_and_motion_jvp(
 def row_space_and_motion_of_rank(
     matrix: Float[Array, "m n"], target: Float[Array, " m"], rank: Int[Array, ""], cutoff: Float[Array, ""]
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Return the undamped result for a given rank; pivots up to the cutoff count as 0 regardless of the rank."""
+    """Return the projector on the rows and the least motion for a target, without damping, for a given rank.
+
+    Pivots up to the cutoff count as 0 even if the rank is higher.
+    """
     space, inverse = _by_pivots(matrix, rank, cutoff)
     return space, apply(inverse, target)
 
@@ -194,7 +197,7 @@ def _inverse_rate(
 def _transposed_rate(
     a: Float[Array, "m n"], X: Float[Array, "n m"], da: Float[Array, "m n"], v: Float[Array, " n"]
 ) -> Float[Array, " m"]:
-    """Return the derivative of X' v by the transpose of the same formula."""
+    """Return the derivative of X' v by the transpose of the formula in ``_inverse_rate``."""
     y = apply(X.T, v)
     wide = apply(da, apply(X, y))
     tall = apply(X.T, apply(X, apply(da, v - apply(X, apply(a, v)))))
@@ -235,7 +238,10 @@ def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[A
 
 @_by_singular_values.defjvp
 def _by_singular_values_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Differentiate K A', K and I - damping K where damped, the inverse and S at constant rank (GP) where not."""
+    """Return the derivatives of the inverse, the Gram inverse K and the projector S.
+
+    Damped: those of K A', K and I - damping K. Undamped: at constant rank, by Golub and Pereyra (1973).
+    """
     (a, cutoff, damping), (da, _, d_damping) = primals, tangents
     D, K, S = _by_singular_values(a, cutoff, damping)
     damped = damping > 0.0

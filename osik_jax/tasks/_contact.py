@@ -169,7 +169,7 @@ class ContactTask(PlaneTask):
         return direction - dot(normal, direction) * normal
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
-        """Return the anchor and the plane through the current contact point."""
+        """Return the fields for which the contact holds where it is: anchor, and plane through the contact point."""
         del q
         position, rotation = kinematics.frame_pose(robot, self.frame)
         held: dict[str, Any] = dict(offset=dot(self.normal, position + dot(rotation, self.point)))

@@ -77,9 +77,9 @@ def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 3"], arms: Float[Arra
 
 
 def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"]) -> Float[Array, ""]:
-    """Return the bound for any rows: the pull's length times the Frobenius norm of their Jacobian.
+    """Return a bound for any rows: the length of the pull times the Frobenius norm of a Jacobian.
 
-    Instead of their own, it may be a Jacobian that the rows combine.
+    The Jacobian is that of the rows, or that of the quantities which the rows combine (such as a frame's position).
     """
     return safe_norm(pull) * safe_norm(jacobian.ravel())
 

@@ -87,7 +87,7 @@ class JointCouplingTask(Task):
             self.target = as_vector(0.0 if target is None else target, (1,), "target", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
-        """Return one row."""
+        """Return one row: the error of the coupling, with the ratios at the joints' entries of v."""
         del kinematics
         dofs = np.array([robot.tree.dof_address[joint] for joint in self.joints])
         value = self._value(robot, q)

@@ -54,7 +54,10 @@ class KineticEnergyTask(Task):
 
 
 def _root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Return U with U' U = matrix (symmetric, positive semidefinite), with each dof in units of its own inertia."""
+    """Return the upper triangular U with U' U = M, the joint-space inertia (positive semidefinite).
+
+    The Cholesky factor is that of M with each dof in units of the square root of its own inertia; immovable dofs get 0.
+    """
     inertia = jnp.diagonal(matrix)
     moves = inertia > 0.0
     scale = jnp.where(moves, jnp.sqrt(jnp.where(moves, inertia, 1.0)), 0.0)

@@ -29,7 +29,7 @@ WeightLike = ArrayLike | Array | Mapping[str, float]
 
 
 def as_own_weight(value: Any) -> Float[Array, "..."]:
-    """Return a weight in its own precision, as the field of a user's task class or of a task that converted it.
+    """Return a scalar or a vector of weights as an array; float arrays keep their precision, all else becomes float.
 
     Raises:
         ValueError: it is neither a scalar nor a vector, or negative or not finite.

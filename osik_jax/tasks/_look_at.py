@@ -107,7 +107,7 @@ class LookAtTask(PointingTask):
         return self.pointing_rows(dot(rotation.T, sight), dot(turn, rate), dot(turn, dot(narrowing, velocity)))
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
-        """Return a target point 1 m ahead, in the frame that carries it."""
+        """Return the field ``target`` that the camera sees at q: a point 1 m ahead, in the frame that carries it."""
         del q
         point = _ahead(robot, kinematics, self.frame, self.axis)
         if self.target_frame is not None:

@@ -28,7 +28,7 @@ _BEHIND = -0.5
 plus the cosine.
 """
 _LEAST_SINE = 0.1
-"""Lower bound on the divisor of rows across the error, near the opposite direction."""
+"""Least sine of the error's angle that is divided by; angle / sine has no bound near the opposite direction."""
 _TIP = 0.01
 """Angle [rad] below which a cone's angle is rounded off, so that its gradient is 0 at 0."""
 
@@ -93,7 +93,10 @@ class PointingTask(FramedTask):
     def pointing_rows(
         self, direction: Float[Array, "3"], jacobian: Float[Array, "3 nv"], drift: Float[Array, "3"]
     ) -> TaskRows:
-        """Return the rows for a unit vector d in the frame's axes, whose rate there is ``jacobian v + drift``."""
+        """Return the rows that turn the frame's axis towards a unit vector d.
+
+        d is in the frame's axes, where its rate is ``jacobian v + drift``.
+        """
         error, derivative = deviation(unit(self.axis), direction)
         upper = None
         if self.half_angle is not None:

@@ -266,10 +266,10 @@ def _row_weight(value: Any, name: str, dtype: Any) -> Float[Array, "3"]:
 
 
 def option(name: str, value: str, available: tuple[str, ...]) -> str:
-    """Return a value, or raise ValueError that lists the options.
+    """Return a value that is one of the available options.
 
     Raises:
-        ValueError: it is not; the message lists them.
+        ValueError: it is not; the message lists the options.
     """
     if value not in available:
         raise OsikValueError(f"{name} is {value!r}; it is one of: {', '.join(map(repr, available))}")

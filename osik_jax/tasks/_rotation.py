@@ -59,8 +59,8 @@ def cross_matrix(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def dot(a: Array, b: Array) -> Array:
     """Return the matrix product, in full precision on every device.
 
-    Sums of three are written out where JAX's default is a GPU, whose library is slow with batches of them. On a CPU
-    gradients would be slower for it.
+    On a GPU, products over three entries are written out as sums, because its matrix library is slow for batches of
+    such small matrices. On a CPU this would make gradients slower.
     """
     if cuda_is_default() and a.ndim == 2 and a.shape[1] == 3:
         return compose(a, b) if b.ndim == 2 else rotate(a, b)

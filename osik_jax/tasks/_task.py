@@ -128,7 +128,7 @@ class Task(MadeForRobot, Replaceable):
         return self.replace(**self._held(robot, compiled_kinematics(robot, jnp.asarray(q)), jnp.asarray(q)))
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
-        """Return, by name, the numbers for which the error at q is 0."""
+        """Return the fields with which the error at q is 0, by name (``target`` mostly)."""
         raise OsikTypeError(f"this {type(self).__name__} has no target that a configuration could set")
 
     @property

@@ -36,7 +36,7 @@ class Evaluation(eqx.Module):
 
     @property
     def loss(self) -> Float[Array, ""]:
-        """Mean over those that were kept; NaN if there are none."""
+        """Return the mean over those that were kept; NaN if there are none."""
         return jnp.sum(jnp.where(self.kept, self.losses, 0.0)) / jnp.sum(self.kept)
 
     @property
@@ -54,12 +54,12 @@ class Problem(eqx.Module):
     mesh: Mesh | None = eqx.field(static=True, default=None)
 
     def one(self, vector: Float[Array, " p"], scenario: Scenarios) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-        """Loss of one scenario, and whether it can be kept."""
+        """Return the loss of one scenario, and whether it can be kept."""
         value, kept = scenario_loss(self.loss, self.space.apply(self.loop, vector), scenario)
         return value, kept
 
     def value(self, vector: Float[Array, " p"], scenarios: Scenarios, chunk: int) -> Evaluation:
-        """Losses at a vector of parameters."""
+        """Return losses at a vector of parameters."""
         numbers, static = taken_apart(self)
 
         def one(shared: Any, scenario: Scenarios) -> Any:
@@ -70,7 +70,7 @@ class Problem(eqx.Module):
     def gradient(
         self, vector: Float[Array, " p"], scenarios: Scenarios, chunk: int
     ) -> tuple[Evaluation, Float[Array, " p"]]:
-        """Losses at a vector of parameters, and the gradient of their mean.
+        """Return losses at a vector of parameters, and the gradient of their mean.
 
         Each scenario has a gradient of its own, so that one which is not finite is left out and spoils nothing.
         """
@@ -86,7 +86,7 @@ class Problem(eqx.Module):
 
 
 def scenario_loss(loss: LossFunction, loop: Loop, scenario: Scenarios) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Loss of one scenario, and whether it can be kept."""
+    """Return the loss of one scenario, and whether it can be kept."""
     trajectory, own = run_one(loop, scenario)
     value = jnp.asarray(loss(trajectory, own))
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
@@ -100,7 +100,7 @@ def scenario_loss(loss: LossFunction, loop: Loop, scenario: Scenarios) -> tuple[
 def over_scenarios(
     function: Callable[[Any, Any], Any], shared: Any, scenarios: Scenarios, chunk: int, mesh: Mesh | None
 ) -> Any:
-    """``function(shared, scenario)`` of each, some at a time, on each device of a mesh its own share.
+    """Return ``function(shared, scenario)`` of each scenario, some at a time; each device of a mesh takes its share.
 
     What the devices do not divide is filled up with copies of the last scenario, which are cut off again.
     """
@@ -123,18 +123,18 @@ def over_scenarios(
 
 
 def shares(scenarios: Scenarios, mesh: Mesh | None) -> Scenarios:
-    """The scenarios on the devices of a mesh: each has its own, or all where they do not divide."""
+    """Return the scenarios on the devices of a mesh: each has its own, or all where they do not divide."""
     uneven = mesh is not None and len(scenarios) % mesh.size
     return _placed(scenarios, mesh, PartitionSpec() if mesh is None or uneven else PartitionSpec(mesh.axis_names))
 
 
 def replicas(numbers: Any, mesh: Mesh | None) -> Any:
-    """Numbers on all devices of a mesh. Python's stay where they are, for they have no precision of their own."""
+    """Return numbers on all devices of a mesh. Python's numbers stay, because they have no precision of their own."""
     return _placed(numbers, mesh, PartitionSpec())
 
 
 def replicated(results: Any, mesh: Mesh | None) -> Any:
-    """Results of a program on all devices of a mesh, constants too, which it would leave on one."""
+    """Return the results of a program on all devices of a mesh, constants too, which it would leave on one."""
     return results if mesh is None else jax.lax.with_sharding_constraint(results, NamedSharding(mesh, PartitionSpec()))
 
 
@@ -148,7 +148,7 @@ def _placed(tree: Any, mesh: Mesh | None, spec: PartitionSpec) -> Any:
 
 
 def in_chunks(function: Callable[[Any], Any], batch: Any, chunk: int) -> Any:
-    """``vmap(function)(batch)``, some lanes at a time; what the last chunk lacks is filled up with its first lane."""
+    """Return ``vmap(function)(batch)``, some lanes at a time; the last chunk is filled up with its first lane."""
     count = jax.tree.leaves(batch)[0].shape[0]
     if chunk >= count:
         return jax.vmap(function)(batch)
@@ -192,7 +192,7 @@ def _evaluate(numbers: Any, scenarios: Scenarios, *, static: Static, chunk: int,
 
 
 def check_loss(loss: Any) -> None:
-    """Raises TypeError where a loss cannot be called with a trajectory and a loop."""
+    """Raise TypeError where a loss cannot be called with a trajectory and a loop."""
     if not callable(loss):
         raise OsikTypeError(
             f"the loss is {loss!r}; it is a function of a trajectory and a loop, such as Tracking('hand')"
@@ -204,7 +204,7 @@ def check_loss(loss: Any) -> None:
 
 
 def check_mesh(mesh: Any) -> None:
-    """Raises TypeError where a mesh is none."""
+    """Raise TypeError where a mesh is none."""
     if mesh is not None and not isinstance(mesh, Mesh):
         raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as osik_jax.scaling.device_mesh()")
 

@@ -43,12 +43,12 @@ class History:
 
     @classmethod
     def empty(cls, size: int) -> History:
-        """No iteration, of so many parameters."""
+        """Return a history of no iteration, for a number of parameters."""
         none, counts = np.zeros(0), np.zeros(0, int)
         return cls(none, none, counts, counts, none, none, np.zeros((0, size)))
 
     def __len__(self) -> int:
-        """Number of iterations."""
+        """Return the number of iterations."""
         return len(self.loss)
 
     def and_then(self, **row: Any) -> History:
@@ -57,7 +57,7 @@ class History:
 
     @property
     def best(self) -> int:
-        """The iteration with the lowest training loss among those that dropped fewest scenarios.
+        """Return the iteration with the lowest training loss among those that dropped fewest scenarios.
 
         A loss over fewer scenarios is no better: it may have lost the hard ones.
         """
@@ -65,7 +65,7 @@ class History:
         return int(np.lexsort((loss, self.dropped))[0])
 
     def stale(self, improvement: float) -> int:
-        """Iterations since the best loss last fell by more than this share, or fewer scenarios were dropped."""
+        """Return the number of iterations since the best loss fell by this share, or fewer scenarios were dropped."""
         last, best, fewest = 0, np.inf, np.inf
         for k, (loss, dropped) in enumerate(zip(self.loss, self.dropped, strict=True)):
             if dropped < fewest or (dropped == fewest and loss < best * (1.0 - improvement)):
@@ -89,7 +89,7 @@ class State:
 
 
 def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace) -> None:
-    """Writes a state as .npz, in the place of an older one only when it is complete."""
+    """Write a state as .npz, in the place of an older one only when it is complete."""
     arrays = {f"history/{name}": value for name, value in vars(state.history).items()}
     arrays |= {f"optimizer/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state.optimizer))}
     arrays |= {f"space/{name}": value for name, value in _described(space).items()}
@@ -101,7 +101,7 @@ def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace
 
 
 def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: Any) -> State:
-    """A state that ``save_state`` wrote.
+    """Return a state that ``save_state`` wrote.
 
     Args:
         path: of the file.

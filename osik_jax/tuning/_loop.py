@@ -78,7 +78,9 @@ class Loop(eqx.Module):
         return tuple(name.removeprefix("tasks.") for name in leaf_names(eqx.filter(self, is_number)))
 
     def replace(self, values: Mapping[str, Any]) -> Self:
-        """The loop with other numbers, by name: ``loop.replace({"hand.weight": 2.0})``. Signs are not checked.
+        """Return the loop with other numbers, by name: ``loop.replace({"hand.weight": 2.0})``.
+
+        Signs are not checked.
 
         Raises:
             KeyError: no such name; the message lists those that exist.
@@ -88,7 +90,7 @@ class Loop(eqx.Module):
         return eqx.combine(replace_named(numbers, self.names, values), rest)
 
     def rollout(self, q0: Float[Array, " nq"] | None = None, *, targets: Targets | None = None) -> Trajectory:
-        """The loop run from a configuration (default: the robot's home), with targets by step as ``rollout`` takes."""
+        """Return the loop run from a configuration (default: home), with targets by step as ``rollout`` takes."""
         return rollout(
             self.robot,
             self.robot.q0 if q0 is None else q0,

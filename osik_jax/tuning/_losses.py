@@ -55,7 +55,7 @@ class WeightedSum(Loss):
     weights: Float[Array, " k"]
 
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
-        """The sum."""
+        """Return the sum."""
         return sum(
             (weight * loss(trajectory, loop) for weight, loss in zip(self.weights, self.losses, strict=True)),
             start=jnp.zeros((), trajectory.q.dtype),
@@ -80,7 +80,7 @@ class Tracking(Loss):
         self.names, self.after = names, jnp.asarray(after, float)
 
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
-        """The mean squared error."""
+        """Return the mean squared error."""
         errors, tasks = trajectory.solution.error, _tasks_in_time(loop, trajectory.time)
         for name in self.names:
             if name not in errors:
@@ -90,7 +90,7 @@ class Tracking(Loss):
 
 
 def _tasks_in_time(loop: Loop, time: Float[Array, " steps"]) -> Mapping[str, Task]:
-    """The tasks, those that a function of time gives with one more axis."""
+    """Return the tasks, those that a function of time gives with one more axis."""
     return jax.vmap(loop.tasks)(time) if callable(loop.tasks) else loop.tasks
 
 
@@ -119,7 +119,7 @@ class Smoothness(Loss):
     from_rest: bool = eqx.field(static=True, default=True)
 
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
-        """The mean squared acceleration."""
+        """Return the mean squared acceleration."""
         velocity = trajectory.solution.velocity
         before = jnp.zeros_like(velocity[:1]) if self.from_rest else velocity[:0]
         change = jnp.diff(jnp.concatenate([before, velocity]), axis=0) / loop.dt
@@ -130,7 +130,7 @@ class Effort(Loss):
     """Mean over time of the squared speed, summed over the joints [rad^2/s^2, m^2/s^2]; a free base has no motor."""
 
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
-        """The mean squared speed."""
+        """Return the mean squared speed."""
         tree = loop.robot.tree
         driven = np.concatenate(
             [np.full(DOF_WIDTH[tree.joint_types[j]], tree.joint_types[j] != FREE) for j in tree.independent]
@@ -150,7 +150,7 @@ class JointLimitDistance(Loss):
     margin: Float[Array, ""] = eqx.field(default=0.1, converter=lambda value: jnp.asarray(value, float))
 
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
-        """The mean squared depth in the margin."""
+        """Return the mean squared depth in the margin."""
         robot = loop.robot
         scalar, index = scalar_layout(robot)
         lower, upper = robot.position_lower, robot.position_upper
@@ -173,7 +173,7 @@ class ComMargin(Loss):
     margin: Float[Array, ""] = eqx.field(default=0.02, converter=lambda value: jnp.asarray(value, float))
 
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
-        """The mean squared depth in the margin."""
+        """Return the mean squared depth in the margin."""
 
         def depth(q: Any) -> Float[Array, ""]:
             point = center_of_mass(loop.robot, forward_kinematics(loop.robot, q))

@@ -101,7 +101,7 @@ class ParameterSpace(eqx.Module):
         self.initial = self.vector(start)
 
     def numbers(self, vector: Float[Array, " p"]) -> Float[Array, " p"]:
-        """The loop's numbers from the vector without bounds."""
+        """Return the loop's numbers from the vector without bounds."""
         low, high, between, above, below = self._bounds()
         span = jnp.where(between, high - low, 1.0)
         z = self.scale * vector
@@ -111,7 +111,7 @@ class ParameterSpace(eqx.Module):
         return jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y)
 
     def vector(self, numbers: Float[Array, " p"]) -> Float[Array, " p"]:
-        """The inverse of ``numbers``."""
+        """Return the inverse of ``numbers``."""
         low, high, between, above, below = self._bounds()
         span = jnp.where(between, high - low, 1.0)
         y = jnp.where(self.log, jnp.log(jnp.where(self.log, numbers, 1.0)), numbers)
@@ -122,13 +122,13 @@ class ParameterSpace(eqx.Module):
         return jnp.where(between, inside, jnp.where(above | below, beyond, y)) / self.scale
 
     def _bounds(self) -> tuple[Array, Array, Array, Array, Array]:
-        """Bounds with 0 where there is none; and which entries have both, the lower alone, the upper alone."""
+        """Return bounds with 0 where there is none; and which entries have both, the lower alone, the upper alone."""
         has_low, has_high = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         low, high = jnp.where(has_low, self.lower, 0.0), jnp.where(has_high, self.upper, 0.0)
         return low, high, has_low & has_high, has_low & ~has_high, has_high & ~has_low
 
     def apply(self, loop: Loop, vector: Float[Array, " p"]) -> Loop:
-        """The loop with the numbers of a vector; differentiable in both."""
+        """Return the loop with the numbers of a vector; differentiable in both."""
         numbers, rest = eqx.partition(loop, is_number)
         leaves, structure = jax.tree.flatten(numbers)
         values, start = self.numbers(vector), 0
@@ -141,7 +141,7 @@ class ParameterSpace(eqx.Module):
         return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
 
     def by_name(self, vector: Float[Array, " p"]) -> dict[str, float]:
-        """The loop's numbers from the vector, by the names of the entries."""
+        """Return the loop's numbers from the vector, by the names of the entries."""
         return dict(zip(self.names, np.asarray(self.numbers(vector)).tolist(), strict=True))
 
 
@@ -213,13 +213,13 @@ def _entry(name: str, leaf: int, place: int, value: float, parameter: Parameter)
 
 
 def _is_log(name: str, start: float, low: float) -> bool:
-    """Whether a number has no meaning below zero, by the last part of its name, and is tuned above it."""
+    """Return whether a number has no meaning below zero, by the last part of its name, and is tuned above it."""
     field = name.split("[")[0] if "." not in name else name.rsplit(".", 1)[1].split("[")[0]
     return field in _NEVER_NEGATIVE and start > 0.0 and not (np.isfinite(low) and low < 0.0)
 
 
 def overlap(space: ParameterSpace, loop: Loop, values: Mapping[str, Any]) -> None:
-    """Raises ValueError where scenarios set a number that is tuned."""
+    """Raise ValueError where scenarios set a number that is tuned."""
     tuned = {slot.leaf for slot in space.slots}
     for name in values:
         both = [loop.names[leaf] for leaf in find_leaves(loop.names, name) if leaf in tuned]

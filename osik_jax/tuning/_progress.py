@@ -11,7 +11,7 @@ from ._history import History
 
 @contextlib.contextmanager
 def reported(iterations: int, *, shown: bool) -> Iterator[Callable[[History], None]]:
-    """A function to tell the history to, after each iteration; it draws a bar if wanted."""
+    """Yield a function that takes the history after each iteration; it draws a bar if wanted."""
     if not shown:
         yield lambda history: None
         return
@@ -20,7 +20,7 @@ def reported(iterations: int, *, shown: bool) -> Iterator[Callable[[History], No
 
 
 def describe(history: History) -> str:
-    """The last iteration in a line."""
+    """Return the last iteration in a line."""
     if not len(history):
         return "compiling"
     parts = [f"loss {history.loss[-1]:.3e}", f"best {history.loss[history.best]:.3e}"]

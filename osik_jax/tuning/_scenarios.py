@@ -56,13 +56,13 @@ class Scenarios(eqx.Module):
         return jax.tree.leaves(self)[0].shape[0]
 
     def __getitem__(self, which: Any) -> Scenarios:
-        """Some of them: a slice, or an array of indices or of booleans."""
+        """Return some of them: a slice, or an array of indices or of booleans."""
         if isinstance(which, int):
             raise OsikTypeError(f"scenarios are many: use [{which} : {which + 1}]")
         return jax.tree.map(lambda leaf: leaf[which], self)
 
     def fitted(self, loop: Loop) -> Scenarios:
-        """The same in the precision and shapes of a loop's numbers.
+        """Return the same in the precision and shapes of a loop's numbers.
 
         Raises:
             KeyError: a name that the loop does not have.
@@ -100,6 +100,6 @@ def _starts(q0: Array, loop: Loop) -> Float[Array, "n nq"]:
 
 
 def run_one(loop: Loop, scenario: Scenarios) -> tuple[Trajectory, Loop]:
-    """One scenario (no leading axis): its trajectory, and the loop with its numbers."""
+    """Return one scenario (no leading axis): its trajectory, and the loop with its numbers."""
     own = loop.replace(scenario.values) if scenario.values else loop
     return own.rollout(scenario.q0, targets=scenario.targets or None), own

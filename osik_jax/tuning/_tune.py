@@ -61,7 +61,7 @@ class Tuning:
     state: State
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the state as .npz, to go on from: ``tune(..., resume=path)``."""
+        """Write the state as .npz, to go on from: ``tune(..., resume=path)``."""
         save_state(path, self.state, self.space)
 
 
@@ -83,7 +83,7 @@ def tune(
     progress: bool = True,
     callback: Callable[[History], None] | None = None,
 ) -> Tuning:
-    """Lowers the mean loss of a closed loop over scenarios, by the gradient through its rollouts.
+    """Lower the mean loss of a closed loop over scenarios, by the gradient through its rollouts.
 
     Args:
         loss: a function of a scenario's trajectory and of its loop: ready ones such as ``Tracking("hand")`` and sums of
@@ -169,7 +169,7 @@ def _compiled_step(
     optimizer: optax.GradientTransformationExtraArgs,
     chunk: int | None,
 ) -> Callable[[State], State]:
-    """One iteration, on the host."""
+    """Return one iteration, on the host."""
     mesh = problem.mesh
     numbers, static = taken_apart(problem)
     numbers = replicas(numbers, mesh)
@@ -205,7 +205,7 @@ def _step(
     chunks: tuple[int, ...],
     optimizer: optax.GradientTransformationExtraArgs,
 ) -> tuple[Array, Any, dict[str, Array]]:
-    """The next vector and optimiser's state, and the row of the history."""
+    """Return the next vector and optimiser's state, and the row of the history."""
     problem: Problem = put_together(numbers, static)
     trained, gradient = problem.gradient(vector, batches[0], chunks[0])
     held = (

@@ -29,12 +29,12 @@ class LinkShape:
     """A shape of a link, in the link's frame.
 
     Attributes:
-        link: its name.
+        link: name of the link.
         kind: MuJoCo's geom type.
         size: MuJoCo's geom sizes [m]. (3,)
-        position: of a simple shape; meshes are in the link's frame already [m]. (3,)
-        rotation: likewise. (3, 3)
-        color: red, green, blue, alpha; ``None``: not said.
+        position: centre of a simple shape [m]; 0 for a mesh, whose vertices are in the link's frame. (3,)
+        rotation: rotation of a simple shape in the link's frame. (3, 3)
+        color: red, green, blue, alpha, 0 to 1; ``None``: the URDF gives none.
         mesh: vertices (k, 3) [m] and triangles (m, 3) of a mesh.
     """
 

@@ -147,9 +147,9 @@ def robot_parts(robot: Robot, *, style: Style = "auto", look: Look | None = None
 
     Args:
         robot: the robot.
-        style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the look,
-            else the geoms, of which most of the bodies that move have a visible one, else sticks.
-        look: what its URDF shows.
+        style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the look
+            if there is one, else the geoms if most moving bodies have a visible one, else sticks.
+        look: shapes and colours of its links, as its URDF gives them.
 
     Raises:
         ValueError: ``style="geoms"`` of a model that has no visible geom, or a look of another robot.

@@ -191,10 +191,10 @@ def light(
     """Return the colours of points under a bright sky and one lamp.
 
     Args:
-        colors: of their surfaces. (n, 3)
+        colors: surface colours without shading. (n, 3)
         normals: unit vectors, towards the camera. (n, 3)
         rays: unit vectors from the camera. (n, 3)
-        lit: how much of the lamp each sees, 0 to 1. (n,)
+        lit: share of the lamp that each point sees, 0 (in shadow) to 1. (n,)
     """
     lamp = lit * np.clip(normals @ TO_LAMP, 0.0, 1.0)
     half = TO_LAMP - rays

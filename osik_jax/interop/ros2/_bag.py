@@ -35,7 +35,7 @@ class Replay(NamedTuple):
 
     @property
     def difference(self) -> float:
-        """Largest difference of a joint [rad or m]."""
+        """Return the largest difference of a joint [rad or m]."""
         return float(np.abs(self.recorded - self.computed).max(initial=0.0))
 
 

@@ -85,7 +85,7 @@ class Settings:
 
     @property
     def dt(self) -> float:
-        """Length of a control step [s]."""
+        """Return the length of a control step [s]."""
         return 1.0 / self.rate
 
 

@@ -33,7 +33,7 @@ class Triangles(NamedTuple):
 
 
 def read_collada(path: Path) -> list[Triangles]:
-    """The triangles and polygons of the scene in metres, its axes as they are, whatever ``up_axis`` says.
+    """Return the triangles and polygons of the scene in metres, its axes as they are, whatever ``up_axis`` says.
 
     Skins, splines and lines are left out; of a texture, the mean colour is taken.
 
@@ -71,7 +71,7 @@ class _Document:
         self._ids = {element.get("id", ""): element for element in root.iter() if element.get("id")}
 
     def parts(self) -> list[Triangles]:
-        """Everything that the scene shows."""
+        """Return everything that the scene shows."""
         unit = self._root.find("asset/unit")
         scale = np.diag([float("1" if unit is None else unit.get("meter", "1"))] * 3 + [1.0])
         shown = self._root.find("scene/instance_visual_scene")
@@ -82,7 +82,7 @@ class _Document:
         return self._ids[element.attrib[key].lstrip("#")]
 
     def _node(self, node: _Element, above: Float[np.ndarray, "4 4"]) -> Iterator[Triangles]:
-        """The geometries below a node, in the world."""
+        """Yield the geometries below a node, in the world."""
         placed = above @ _transform(node)
         for instance in node.findall("instance_geometry"):
             yield from self._geometry(instance, placed)
@@ -110,7 +110,7 @@ class _Document:
         return numbers.reshape(-1, stride)[:, :3]
 
     def _color(self, material: _Element | None) -> _Color | None:
-        """The diffuse colour of a material; of a texture, the mean."""
+        """Return the diffuse colour of a material; of a texture, the mean."""
         effect = None if material is None else material.find("instance_effect")
         diffuse = None if effect is None else next(self._linked(effect).iter("diffuse"), None)
         if diffuse is None:
@@ -153,7 +153,7 @@ def _input(element: _Element, semantic: str) -> _Element:
 
 
 def _faces(group: _Element) -> Int[np.ndarray, "m 3"]:
-    """Indices of positions, polygons cut into fans; none of an element that has no faces."""
+    """Return the indices of positions, polygons cut into fans; none of an element that has no faces."""
     if group.tag not in ("triangles", "polylist", "polygons"):
         return np.zeros((0, 3), int)
     stride = 1 + max(int(e.get("offset", "0")) for e in group.findall("input"))
@@ -168,7 +168,7 @@ def _faces(group: _Element) -> Int[np.ndarray, "m 3"]:
 
 
 def _fans(corners: np.ndarray, counts: Sequence[int] | np.ndarray) -> Int[np.ndarray, "m 3"]:
-    """Triangles about the first corner of each polygon."""
+    """Return triangles about the first corner of each polygon."""
     counts = np.asarray(counts, int)
     first = np.concatenate([[0], np.cumsum(counts)[:-1]]) if len(counts) else np.zeros(0, int)
     start = np.repeat(first, np.maximum(counts - 2, 0))
@@ -177,7 +177,7 @@ def _fans(corners: np.ndarray, counts: Sequence[int] | np.ndarray) -> Int[np.nda
 
 
 def _transform(node: _Element) -> Float[np.ndarray, "4 4"]:
-    """The product of a node's transforms, in the order of the file."""
+    """Return the product of a node's transforms, in the order of the file."""
     out = np.eye(4)
     for element in node:
         if element.tag in _TRANSFORMS:
@@ -192,7 +192,7 @@ def _translation(shift: np.ndarray) -> Float[np.ndarray, "4 4"]:
 
 
 def _rotation(axis_angle: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """About an axis by an angle [deg]."""
+    """Return the rotation about an axis by an angle [deg]."""
     x, y, z = axis_angle[:3] / np.linalg.norm(axis_angle[:3])
     angle = np.deg2rad(axis_angle[3])
     cross, out = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), np.eye(4)

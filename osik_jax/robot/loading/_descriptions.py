@@ -20,7 +20,9 @@ _NEAREST = 8
 
 
 def described(name: str, options: LoadOptions) -> RobotModel:
-    """Names and numbers of a robot that ``robot_descriptions`` knows; its own packages are ``options.package_dirs``.
+    """Return names and numbers of a robot that ``robot_descriptions`` knows.
+
+    A URDF looks for its meshes in its own packages instead of ``options.package_dirs``.
 
     Raises:
         ImportError: the package is not installed.
@@ -42,7 +44,7 @@ def described(name: str, options: LoadOptions) -> RobotModel:
 
 
 def urdf_of_description(name: str) -> tuple[str, list[str]] | None:
-    """The file of a robot that comes as URDF, and the folders of its packages; ``None``: it comes otherwise."""
+    """Return the file of a robot that comes as URDF, and the folders of its packages; ``None``: it comes otherwise."""
     module = importlib.import_module(f"robot_descriptions.{name}")
     if hasattr(module, "MJCF_PATH") or not hasattr(module, "URDF_PATH"):
         return None
@@ -50,7 +52,7 @@ def urdf_of_description(name: str) -> tuple[str, list[str]] | None:
 
 
 def _known(name: str) -> tuple[str, ...]:
-    """The robots that the package lists; where it is not installed, none, unless one is asked for by its full name."""
+    """Return the robots that the package lists; none without the package, unless one is asked for by its full name."""
     try:
         package = importlib.import_module("robot_descriptions")
     except ImportError as missing:
@@ -61,7 +63,7 @@ def _known(name: str) -> tuple[str, ...]:
 
 
 def _unknown(name: str, known: Iterable[str]) -> KeyError:
-    """Hundreds are known: the message lists the short names, and those with names like this one."""
+    """Return the error for an unknown name; it lists the short names and similar ones, because hundreds are known."""
     available = (*NAMES, *known)
     close = difflib.get_close_matches(name, available, n=_NEAREST)
     short = name.removesuffix(SUFFIX)

@@ -27,6 +27,6 @@ NAMES = (*ROBOTS, *EXAMPLES)
 
 
 def embedded(name: str, options: LoadOptions) -> RobotModel:
-    """Names and numbers of an embedded robot, one of ``ROBOTS``."""
+    """Return names and numbers of an embedded robot, one of ``ROBOTS``."""
     text = (resources.files("osik_jax") / "robot" / "models" / f"{name}.xml").read_text(encoding="utf-8")
     return from_mjcf(text, options)

@@ -34,14 +34,14 @@ class Lock(NamedTuple):
 
 
 def as_mapping(locked: Iterable[str] | Mapping[str, float]) -> dict[str, float | None]:
-    """Names or globs of joints to lock; None where no value is given."""
+    """Return names or globs of joints to lock; None where no value is given."""
     if isinstance(locked, str):
         raise OsikTypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
     return dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked)
 
 
 def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
-    """Joints whose name is, or else matches the glob, ``pattern``; KeyError with the names where none does."""
+    """Return joints whose name is, or else matches the glob, ``pattern``; KeyError with the names where none does."""
     if pattern in names:
         return [names.index(pattern)]
     found = [j for j, name in enumerate(names) if fnmatch.fnmatchcase(name, str(pattern))]
@@ -51,7 +51,7 @@ def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
 
 
 def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[str, float | None]) -> dict[int, Lock]:
-    """Joint index to what is asked of it; without a value, a joint stays where qpos0 has it."""
+    """Return what is asked of each locked joint, by joint index; without a value, a joint stays where qpos0 has it."""
     out: dict[int, Lock] = {}
     for pattern, value in asked.items():
         for joint in match_joints(pattern, names):
@@ -93,7 +93,7 @@ def resolve_followers(
     constants: Mapping[int, np.ndarray],
     asked: Mapping[int, Lock],
 ) -> tuple[list[Follower], dict[int, np.ndarray]]:
-    """Followers of independent joints, chains followed to their end, and the values of all locked joints.
+    """Return the followers of independent joints, chains followed to their end, and the values of all locked joints.
 
     A follower whose leader is locked is locked where the leader puts it.
     """
@@ -119,7 +119,7 @@ def resolve_followers(
 
 
 def _end_of_chain(names: tuple[str, ...], table: Mapping[int, Follower], joint: int) -> Follower:
-    """The follower in terms of a leader that follows nobody."""
+    """Return the follower in terms of a leader that follows nobody."""
     _, leader, multiplier, offset = table[joint]
     seen = [joint]
     while leader in table:
@@ -140,7 +140,7 @@ def _check_lock(names: tuple[str, ...], follower: Follower, asked: Lock | None, 
 
 
 def qpos_offset(model: mujoco.MjModel, followers: list[Follower], locked: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Values of locked joints and offsets of followers in the model's qpos, 0 elsewhere."""
+    """Return the values of locked joints and offsets of followers in the model's qpos, 0 elsewhere."""
     out = np.zeros(model.nq)
     for joint, value in locked.items():
         out[model.jnt_qposadr[joint] :][: len(value)] = value

@@ -62,7 +62,7 @@ def unread_points(mesh: UnreadMesh) -> Float[np.ndarray, "k 3"]:
 
 
 def _has_area(part: Triangles) -> bool:
-    """MuJoCo wants four points and a surface of what it draws."""
+    """Return whether a mesh has the four points and the surface that MuJoCo needs to draw it."""
     if len(part.vertices) < 4 or not np.isfinite(part.vertices).all():
         return False
     a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
@@ -71,7 +71,7 @@ def _has_area(part: Triangles) -> bool:
 
 
 def _is_text(path: Path) -> bool:
-    """Binary files may start with the word "solid" too."""
+    """Return whether an STL file is text; binary files may start with the word "solid" too."""
     with path.open("rb") as file:
         start = file.read(512)
     return start.lstrip().startswith(b"solid") and _TEXT_STL in start

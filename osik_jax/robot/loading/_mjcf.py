@@ -20,7 +20,7 @@ FLOATING_BASE = "floating_base"
 
 
 def from_mjcf(mjcf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
-    """Names and numbers of a robot from an MJCF file or text; see ``Robot.from_mjcf``."""
+    """Return names and numbers of a robot from an MJCF file or text; see ``Robot.from_mjcf``."""
     source = read_source(mjcf, "MJCF")
     check_root(parse_xml(source), "mujoco", source)
     try:
@@ -49,7 +49,7 @@ def _free_joints(model: mujoco.MjModel) -> list[str]:
 
 
 def _compile(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, list[LoadNote]]:
-    """Compiles as is; if that fails, without what comes from files, then with some mass where MuJoCo demands it."""
+    """Compile as is; if that fails, without what comes from files, then with some mass where MuJoCo demands it."""
     notes: list[LoadNote] = []
     try:
         return spec.compile(), notes
@@ -76,7 +76,7 @@ def _needs_file(asset: Any) -> bool:
 
 
 def _strip_files(spec: mujoco.MjSpec, error: ValueError) -> list[LoadNote]:
-    """Deletes assets that come from files and all that uses them; ``error`` is why they cannot be read.
+    """Delete assets that come from files and all that uses them; ``error`` is why they cannot be read.
 
     The notes name what collides and is gone.
     """
@@ -106,7 +106,7 @@ def _strip_files(spec: mujoco.MjSpec, error: ValueError) -> list[LoadNote]:
 
 
 def _gives_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
-    """Whether the geom adds to its body's mass: MuJoCo's rules for bodies without an inertial."""
+    """Return whether the geom adds to its body's mass: MuJoCo's rules for bodies without an inertial."""
     first, last = spec.compiler.inertiagrouprange
     from_geoms = spec.compiler.inertiafromgeom
     if from_geoms == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE or geom.parent is spec.worldbody:
@@ -117,7 +117,7 @@ def _gives_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
 
 
 def _delete_references(spec: mujoco.MjSpec, geoms: set[str]) -> None:
-    """Deletes contact pairs and sensors that name any of these geoms."""
+    """Delete contact pairs and sensors that name any of these geoms."""
     for pair in list(spec.pairs):
         if {pair.geomname1, pair.geomname2} & geoms:
             spec.delete(pair)
@@ -128,7 +128,7 @@ def _delete_references(spec: mujoco.MjSpec, geoms: set[str]) -> None:
 
 
 def _add_base(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Puts a free joint on the one body of the world that carries joints, and its pose into the keyframes."""
+    """Put a free joint on the one body of the world that carries joints, and its pose into the keyframes."""
     owners = {int(model.body_rootid[b]) for b in model.jnt_bodyid}
     names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
     if len(owners) != 1:

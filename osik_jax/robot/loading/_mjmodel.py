@@ -78,7 +78,7 @@ def from_mjmodel(
     notes: Iterable[LoadNote] = (),
     meshes: Sequence[NamedMesh] = (),
 ) -> RobotModel:
-    """Names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
+    """Return names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
 
     Args:
         model: the model, with the floating base that it is to have.
@@ -149,7 +149,7 @@ def from_mjmodel(
 
 
 def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count: int) -> tuple[str, ...]:
-    """Names of a model's bodies, joints or geoms; one without a name is called by its kind and number."""
+    """Return the names of a model's bodies, joints or geoms; one without a name is called by its kind and number."""
     given = [mujoco.mj_id2name(model, kind, k) for k in range(count)]
     out = []
     for k, name in enumerate(given):
@@ -161,14 +161,14 @@ def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion (w, x, y, z) of a rotation matrix."""
+    """Return the unit quaternion (w, x, y, z) of a rotation matrix."""
     out = np.zeros(4)
     mujoco.mju_mat2Quat(out, np.asarray(rotation, float).ravel())
     return out
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrix (3, 3) of a unit quaternion (w, x, y, z)."""
+    """Return the rotation matrix (3, 3) of a unit quaternion (w, x, y, z)."""
     out = np.zeros(9)
     mujoco.mju_quat2Mat(out, np.asarray(quaternion, float))
     return out.reshape(3, 3)
@@ -192,7 +192,7 @@ def _check(model: mujoco.MjModel, names: tuple[str, ...], body_names: tuple[str,
 
 
 def _moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
-    """The world and the bodies with joints; where each body of the model sits on them."""
+    """Return the world and the bodies with joints, and on which of these each body of the model sits, and where."""
     bodies, placement = [0], [Placement(0, np.zeros(3), np.eye(3))]
     for b in range(1, model.nbody):
         if model.body_jntnum[b]:
@@ -223,7 +223,10 @@ def _placed(on: Placement, position: np.ndarray, quaternion: np.ndarray) -> Plac
 
 
 def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[Placement]) -> dict[str, Placement]:
-    """Bodies, named sites and named geoms. A site or geom called like what came before gets its kind as a prefix."""
+    """Return bodies, named sites and named geoms.
+
+    A site or geom called like what came before gets its kind as a prefix.
+    """
     out = dict(zip(body_names, placement, strict=True))
 
     def add(kind: str, name: str | None, body: int, position: np.ndarray, quaternion: np.ndarray) -> None:
@@ -241,7 +244,7 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
 
 
 def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Placement]) -> dict[str, ArrayLike]:
-    """Poses of the moving bodies in their parents; their inertial properties with all that is fixed to them."""
+    """Return the poses of moving bodies in their parents, and their inertial properties with all fixed to them."""
     mass, moment, inertia = np.zeros(len(bodies)), np.zeros((len(bodies), 3)), np.zeros((len(bodies), 3, 3))
     parts = [(b, place, place.position + place.rotation @ model.body_ipos[b]) for b, place in enumerate(placement)]
     parts = [part for part in parts if part[1].body]  # what is fixed to the world is no part of what moves
@@ -269,7 +272,7 @@ def _mesh_place(on: Placement, mesh: UnreadMesh) -> Placement:
 
 
 def _free_names(taken: Sequence[str], meshes: Sequence[NamedMesh]) -> list[str]:
-    """Names of the collision meshes; one without a name is called by its number, as ``element_names`` does."""
+    """Return the names of the collision meshes; one without a name is called by its number, as in ``element_names``."""
     out: list[str] = []
     for number, placed in enumerate(meshes, len(taken)):
         name = placed.name or f"geom{number}"
@@ -282,7 +285,7 @@ def _free_names(taken: Sequence[str], meshes: Sequence[NamedMesh]) -> list[str]:
 def _geom_arrays(
     model: mujoco.MjModel, placement: list[Placement], meshes: Sequence[Placement]
 ) -> dict[str, ArrayLike]:
-    """Poses of the geoms in the moving bodies, and their sizes; those of meshes that the model does not hold last."""
+    """Return the poses of the geoms in the moving bodies, and their sizes; meshes that the model does not hold last."""
     described = zip(model.geom_bodyid, model.geom_pos, model.geom_quat, strict=True)
     poses = [*(_placed(placement[body], position, quaternion) for body, position, quaternion in described), *meshes]
     size = np.where(model.geom_type[:, None] == mujoco.mjtGeom.mjGEOM_MESH, 1.0, model.geom_size)
@@ -296,7 +299,7 @@ def _geom_arrays(
 def _rates(
     model: mujoco.MjModel, names: tuple[str, ...], prefix: str, what: str, given: Mapping[str, float]
 ) -> np.ndarray:
-    """Greatest speed or acceleration of each joint: from the model's custom numerics, then from ``given``."""
+    """Return greatest speed or acceleration of each joint: from the model's custom numerics, then from ``given``."""
     numerics = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_NUMERIC, n) for n in range(model.nnumeric)]
     own = {
         numeric.removeprefix(prefix): float(model.numeric_data[model.numeric_adr[n]])
@@ -313,7 +316,10 @@ def _rates(
 
 
 def _ranges(model: mujoco.MjModel, names: tuple[str, ...], given: PositionLimits) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper limit of each joint: from the model, then from ``given``; of a ball, -+ its greatest angle."""
+    """Return lower and upper limit of each joint: the model's, then those of ``given``.
+
+    For a ball they are minus and plus its largest angle.
+    """
     low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     ball = model.jnt_type == BALL
     limited = model.jnt_limited.astype(bool) & np.isin(model.jnt_type, (HINGE, SLIDE))
@@ -332,7 +338,7 @@ def _ranges(model: mujoco.MjModel, names: tuple[str, ...], given: PositionLimits
 
 
 def _ball_range(limits: tuple[float, float], name: str) -> tuple[float, float]:
-    """Minus and plus the greatest angle by which a ball joint is turned; infinite from pi on, which none exceeds."""
+    """Return minus and plus the largest angle of a ball joint; infinite from pi on, because no angle exceeds pi."""
     lower, upper = limits
     if not upper > 0.0 or lower not in (0.0, -upper):
         raise OsikValueError(
@@ -354,7 +360,7 @@ def _range(limits: tuple[float, float], pattern: str) -> tuple[float, float]:
 def _position_limits(
     tree: KinematicTree, followers: list[Follower], low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position limits over v; a leader's are narrowed by those of its followers."""
+    """Return position limits over v; a leader's are narrowed by those of its followers."""
     low, high = low.copy(), high.copy()
     for joint, leader, multiplier, offset in followers:
         a, b = sorted(((low[joint] - offset) / multiplier, (high[joint] - offset) / multiplier))
@@ -368,7 +374,7 @@ def _position_limits(
 
 
 def _rate_limits(tree: KinematicTree, followers: list[Follower], rates: np.ndarray) -> np.ndarray:
-    """Greatest speeds or accelerations over v; a leader's are narrowed by those of its followers."""
+    """Return greatest speeds or accelerations over v; a leader's are narrowed by those of its followers."""
     rates = rates.copy()
     for joint, leader, multiplier, _ in followers:
         rates[leader] = min(rates[leader], rates[joint] / abs(multiplier))
@@ -376,12 +382,12 @@ def _rate_limits(tree: KinematicTree, followers: list[Follower], rates: np.ndarr
 
 
 def _over_dofs(tree: KinematicTree, values: np.ndarray) -> np.ndarray:
-    """Values of joints, repeated for each entry of v of the independent joints."""
+    """Return the values of joints, repeated for each entry of v of the independent joints."""
     return np.repeat(values[list(tree.independent)], [DOF_WIDTH[tree.joint_types[j]] for j in tree.independent])
 
 
 def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, given: PositionLimits) -> None:
-    """Names the joints whose range is one value, but for those whose range the user gave."""
+    """Name the joints whose range is one value, but for those whose range the user gave."""
     stated = {joint for pattern in given for joint in match_joints(pattern, tree.joint_names)}
     frozen = [j for j, dof in tree.dof_address.items() if upper[dof] - lower[dof] <= _ONE_VALUE and j not in stated]
     if frozen:
@@ -395,7 +401,7 @@ def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, g
 
 
 def _warn_of_report(report: LoadReport) -> None:
-    """One warning for all that the file asks for and the robot does not keep."""
+    """Give one warning for everything that the file asks for and the robot does not keep."""
     if report:
         shown = "; ".join(map(str, report[:_NOTES_SHOWN]))
         rest = f"; and {len(report) - _NOTES_SHOWN} more" if len(report) > _NOTES_SHOWN else ""
@@ -403,7 +409,7 @@ def _warn_of_report(report: LoadReport) -> None:
 
 
 def _home_notes(model: mujoco.MjModel, tree: KinematicTree, qpos: np.ndarray, q0: np.ndarray) -> Iterator[LoadNote]:
-    """Joints that the first keyframe has outside their range."""
+    """Yield notes on joints that the first keyframe has outside their range."""
     if not model.nkey:
         return
     key = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, 0) or "0"
@@ -415,7 +421,7 @@ def _home_notes(model: mujoco.MjModel, tree: KinematicTree, qpos: np.ndarray, q0
 
 
 def _home(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """The independent entries of a full qpos, joints brought inside their limits."""
+    """Return the independent entries of a full qpos, joints brought inside their limits."""
     q = np.zeros(tree.nq)
     for joint, start in tree.qpos_address.items():
         full, width = tree.full_qpos_address[joint], QPOS_WIDTH[tree.joint_types[joint]]

@@ -23,7 +23,7 @@ _FREE = "it moves freely"
 def model_notes(
     model: mujoco.MjModel, joints: tuple[str, ...], low: np.ndarray, high: np.ndarray, speed: np.ndarray
 ) -> Iterator[LoadNote]:
-    """Notes on a model whose joints have these names and, as they were read, these limits. (njnt,) each."""
+    """Yield notes on a model, given the names and the limits of its joints as they were read. (njnt,) each."""
     yield from _joint_notes(model, joints)
     yield from _equality_notes(model)
     yield from _tendon_notes(model, joints)
@@ -46,7 +46,7 @@ def _joint_notes(model: mujoco.MjModel, joints: tuple[str, ...]) -> Iterator[Loa
 
 
 def _equality_notes(model: mujoco.MjModel) -> Iterator[LoadNote]:
-    """Active equality constraints; linear ones between joints become followers or locks, which keep them exactly."""
+    """Yield notes on active equality constraints, except linear ones between joints, which followers and locks keep."""
     connect, weld, joint, tendon = (
         int(getattr(mujoco.mjtEq, f"mjEQ_{kind}")) for kind in ("CONNECT", "WELD", "JOINT", "TENDON")
     )
@@ -89,7 +89,7 @@ def _ends(model: mujoco.MjModel, equality: int) -> tuple[int, ...]:
 def _actuator_notes(
     model: mujoco.MjModel, joints: tuple[str, ...], low: np.ndarray, high: np.ndarray, speed: np.ndarray
 ) -> Iterator[LoadNote]:
-    """Servos whose setpoints are bounded more tightly than their joints."""
+    """Yield notes on servos whose setpoints are bounded more tightly than their joints."""
     for actuator in range(model.nu):
         setpoints = _setpoints(model, actuator)
         joint = int(model.actuator_trnid[actuator, 0])
@@ -109,7 +109,7 @@ def _actuator_notes(
 
 
 def _setpoints(model: mujoco.MjModel, actuator: int) -> tuple[str, float, float] | None:
-    """The setpoints of a joint's position or velocity servo: its kind, and least and greatest in the joint's units."""
+    """Return the setpoints of a joint's position or velocity servo: kind, least and greatest in the joint's units."""
     servo = (
         int(model.actuator_trntype[actuator]) in _JOINT_TRANSMISSIONS
         and int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
@@ -131,7 +131,7 @@ def _setpoints(model: mujoco.MjModel, actuator: int) -> tuple[str, float, float]
 
 
 def _contact_notes(model: mujoco.MjModel) -> Iterator[LoadNote]:
-    """Contacts that ``CollisionAvoidanceLimit`` takes in another way than MuJoCo."""
+    """Yield notes on contacts that ``CollisionAvoidanceLimit`` treats in another way than MuJoCo."""
     geom = mujoco.mjtObj.mjOBJ_GEOM
     for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True):
         masks = (model.geom_contype[a] & model.geom_conaffinity[b]) | (

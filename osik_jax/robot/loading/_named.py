@@ -17,7 +17,7 @@ ELSEWHERE = {"g1": "g1_mj_description", "talos": "talos_description"}
 
 
 def example_urdf(name: str) -> Path:
-    """The URDF of one of ``EXAMPLES``, in the package example-robot-data.
+    """Return the URDF of one of ``EXAMPLES``, in the package example-robot-data.
 
     Raises:
         KeyError: no such robot.
@@ -37,7 +37,7 @@ def example_urdf(name: str) -> Path:
 
 
 def named(name: str, options: LoadOptions) -> RobotModel:
-    """Names and numbers of a robot by its name.
+    """Return names and numbers of a robot by its name.
 
     Raises:
         FileNotFoundError: the robot is one of ``EXAMPLES``, and neither example-robot-data nor robot_descriptions is

@@ -14,7 +14,7 @@ _FILE_SCHEME = "file://"
 
 
 def is_uri(given: object) -> bool:
-    """Whether this is an address that ``Packages.path`` reads, and neither a plain path nor XML."""
+    """Return whether this is an address that ``Packages.path`` reads, and neither a plain path nor XML."""
     return isinstance(given, str) and given.startswith((*_PACKAGE_SCHEMES, _FILE_SCHEME))
 
 
@@ -31,7 +31,7 @@ class Packages:
         self.folders = tuple(Path(folder) for folder in folders)
 
     def path(self, address: object, *, beside: Path | None = None) -> Path:
-        """The file of an address.
+        """Return the file of an address.
 
         Args:
             address: ``package://NAME/...``, ``model://NAME/...``, ``file://...``, or a path.
@@ -67,7 +67,7 @@ class Packages:
 
 
 def _environment() -> Iterator[Path]:
-    """The folders that ROS 1 and ROS 2 look for packages in."""
+    """Yield the folders in which ROS 1 and ROS 2 look for packages."""
     for folder in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
         yield Path(folder)
     for folder in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):

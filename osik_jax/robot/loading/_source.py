@@ -16,7 +16,7 @@ _ROOTS = {"robot": "a URDF: use Robot.from_urdf", "mujoco": "an MJCF: use Robot.
 
 
 def is_mjcf(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is in MuJoCo's format, told by what is in it."""
+    """Return whether a file is in MuJoCo's format, told by what is in it."""
     text = Path(path).read_text(encoding="utf-8", errors="replace")
     return "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]
 
@@ -36,7 +36,7 @@ class Source(NamedTuple):
 
 
 def read_source(given: str | os.PathLike[str], kind: str) -> Source:
-    """Reads a file, or takes the text itself (anything that starts with ``<``).
+    """Read a file, or take the text itself (anything that starts with ``<``).
 
     Raises:
         FileNotFoundError: no such file; the message lists the files of the same suffix that lie there.
@@ -56,7 +56,7 @@ def read_source(given: str | os.PathLike[str], kind: str) -> Source:
 
 
 def parse_xml(source: Source) -> ElementTree.Element:
-    """The root element of XML that may break three rules, as robot files often do.
+    """Return the root element of XML that may break three rules, as robot files often do.
 
     Comments may hold ``--``, an ``&`` may stand alone, and prefixes of names (``drake:``) may be undeclared.
 
@@ -72,14 +72,14 @@ def parse_xml(source: Source) -> ElementTree.Element:
 
 
 def check_root(root: ElementTree.Element, expected: str, source: Source) -> None:
-    """Raises ValueError where the root element is not ``expected`` ("robot" or "mujoco")."""
+    """Raise ValueError where the root element is not ``expected`` ("robot" or "mujoco")."""
     if root.tag != expected:
         what = _ROOTS.get(root.tag, "not a robot description that can be read here")
         raise OsikValueError(f"{source.label}: the root element is <{root.tag}>, not <{expected}>: this is {what}")
 
 
 def _edited(content: str | bytes, edit: Callable[[str], str]) -> str | bytes:
-    """Text or the bytes of a file, edited as text of one byte a character."""
+    """Return text or the bytes of a file, edited as text of one byte a character."""
     if isinstance(content, bytes):  # latin-1 maps every byte to one character and back
         return edit(content.decode("latin-1")).encode("latin-1")
     return edit(content)

@@ -46,7 +46,7 @@ _Compiled = tuple[mujoco.MjModel, list[LoadNote]]
 
 
 def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
-    """Names and numbers of a robot from a URDF file or text; see ``Robot.from_urdf``."""
+    """Return names and numbers of a robot from a URDF file or text; see ``Robot.from_urdf``."""
     packages = Packages(options.package_dirs)
     source = read_source(packages.path(urdf) if is_uri(urdf) else urdf, "URDF")
     root = parse_xml(source)
@@ -74,7 +74,7 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
 
 
 def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
-    """Adds the floating base, as a joint from the world to the root link, where there should be one."""
+    """Add the floating base, as a joint from the world to the root link, where there should be one."""
     has_one = any(joint.kind == "floating" for joint in urdf.joints)
     wanted = _guess_floats(urdf, has_one, label) if floating_base is None else floating_base
     if urdf.root == WORLD:
@@ -89,7 +89,10 @@ def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
 
 
 def _guess_floats(urdf: Urdf, has_free_joint: bool, label: str) -> bool:
-    """Whether the base floats where nobody says so: with feet it does, and where it does not for want of feet warns."""
+    """Return whether the base floats if nobody says so: with feet it does; without feet it does not.
+
+    Where it does not, a warning is given.
+    """
     if urdf.root == WORLD or has_free_joint:
         return False
     bodies = {urdf.root: 0}
@@ -111,7 +114,7 @@ def _guess_floats(urdf: Urdf, has_free_joint: bool, label: str) -> bool:
 
 
 def _freed_from_world(urdf: Urdf) -> Urdf:
-    """Turns the one fixed joint below a root link called world into the floating base."""
+    """Turn the one fixed joint below a root link called world into the floating base."""
     first, *others = [joint for joint in urdf.joints if joint.parent == WORLD] or [None]
     if first is None or others or first.kind != "fixed":
         raise OsikValueError(
@@ -130,7 +133,7 @@ def _base_name(urdf: Urdf) -> str:
 
 
 def urdf_spec(urdf: Urdf) -> mujoco.MjSpec:
-    """The MuJoCo model: a body for every link but the root, which is the world.
+    """Return the MuJoCo model: a body for every link but the root, which is the world.
 
     Mimic joints are joint equality constraints; limits of speeds and accelerations are custom numerics, which
     ``from_mjmodel`` reads. A joint that is limited on one side has no range here, for MJCF has both limits or none.
@@ -206,7 +209,7 @@ def _add_geom(body: mujoco.MjsBody, shape: Shape, **form: Any) -> None:
 
 
 def _compiled(urdf: Urdf, packages: Packages, beside: Path | None, *, checked: bool) -> _Compiled:
-    """The model with the collision shapes that are meshes, and notes on those; see ``meshes_of``."""
+    """Return the model with the collision shapes that are meshes, and notes on those; see ``meshes_of``."""
     spec = urdf_spec(urdf)
     found, notes = meshes_of(urdf, packages, beside, checked=checked)
     for form in {form["name"]: form for _, _, form in found}.values():
@@ -236,7 +239,7 @@ def _unread_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> Itera
 
 
 def geom_size(shape: Shape) -> list[float]:
-    """MuJoCo's sizes: radius first, then half lengths."""
+    """Return MuJoCo's sizes: radius first, then half lengths."""
     if shape.kind == "box":
         return [edge / 2.0 for edge in shape.size]
     radius, *length = shape.size

@@ -98,7 +98,7 @@ class Urdf:
 
 
 def read_urdf(element: ElementTree.Element) -> Urdf:
-    """Links and joints of a ``<robot>`` element; everything else in it is ignored.
+    """Return links and joints of a ``<robot>`` element; everything else in it is ignored.
 
     Raises:
         ValueError: an element is broken, or the links do not form one tree; the message names it.
@@ -174,7 +174,7 @@ def _numbers(text: str, count: int, where: str) -> np.ndarray:
 
 
 def _floats(text: str) -> np.ndarray:
-    """The numbers in a text; empty where one of its words is none."""
+    """Return the numbers in a text; empty where one of its words is none."""
     try:
         return np.array([float(word) for word in text.split()])
     except ValueError:
@@ -182,7 +182,7 @@ def _floats(text: str) -> np.ndarray:
 
 
 def _text(element: ElementTree.Element, name: str, default: str) -> str:
-    """An attribute; one that is empty counts as absent."""
+    """Return an attribute; one that is empty counts as absent."""
     return element.get(name, "").strip() or default
 
 
@@ -192,7 +192,7 @@ def _number(element: ElementTree.Element, name: str, where: str, default: str | 
 
 
 def _bound(element: ElementTree.Element, name: str, where: str) -> float:
-    """A number that may be infinite, 0 where it is absent."""
+    """Return a number that may be infinite, 0 where it is absent."""
     text = _text(element, name, "0")
     values = _floats(text)
     if len(values) != 1 or np.isnan(values[0]):
@@ -222,7 +222,7 @@ def _from_quaternion(quaternion: np.ndarray, where: str) -> np.ndarray:
 
 
 def _from_angles(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Rotation about the fixed axes x, then y, then z [rad]."""
+    """Return the rotation about the fixed axes x, then y, then z [rad]."""
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
@@ -231,7 +231,10 @@ def _from_angles(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 
 def _link(element: ElementTree.Element, colors: Mapping[str, _Color], notes: list[LoadNote]) -> Link:
-    """A link. Shapes that are broken are left out: no kinematics needs them, and those for collisions are noted."""
+    """Return a link.
+
+    Shapes that are broken are left out: no kinematics needs them, and those for collisions are noted.
+    """
     name = _attribute(element, "name", "a <link>")
     where = f"link {name!r}"
     shapes = []
@@ -274,7 +277,7 @@ def _rgba(material: ElementTree.Element | None) -> _Color | None:
 
 
 def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], where: str) -> Shape | None:
-    """None for shapes without size."""
+    """Return a shape; None for one without size."""
     shapes = [e for e in element.findall("geometry/*") if e.tag in ("box", "sphere", "cylinder", "capsule", "mesh")]
     if not shapes:
         return None
@@ -339,7 +342,7 @@ def _axis(element: ElementTree.Element | None, where: str) -> np.ndarray:
 
 
 def _joint_limits(element: ElementTree.Element | None, kind: str, where: str) -> tuple[float, float, float, float]:
-    """``(lower, upper, speed, acceleration)``; no ``<limit>`` is no limit, and a speed of 0 is read as unknown.
+    """Return ``(lower, upper, speed, acceleration)``; without ``<limit>`` no limit, and a speed of 0 counts as unknown.
 
     URDF 1.2 has an acceleration and a deceleration; the lesser holds for both.
     """
@@ -368,7 +371,7 @@ def _mimic(element: ElementTree.Element | None, where: str) -> Mimic | None:
 
 
 def _root(links: Mapping[str, Link], joints: Mapping[str, Joint]) -> str:
-    """The one link without a parent."""
+    """Return the one link without a parent."""
     parent_joint: dict[str, str] = {}
     for joint in joints.values():
         for role, link in (("parent", joint.parent), ("child", joint.child)):
@@ -391,7 +394,7 @@ def _root(links: Mapping[str, Link], joints: Mapping[str, Joint]) -> str:
 
 
 def _parents_first(root: str, links: Mapping[str, Link], joints: Mapping[str, Joint]) -> Iterator[Joint]:
-    """Joints from the root outwards; a ValueError names the links that cannot be reached."""
+    """Yield joints from the root outwards; raise ValueError with the links that cannot be reached."""
     below: dict[str, list[Joint]] = {name: [] for name in links}
     for joint in joints.values():
         below[joint.parent].append(joint)

@@ -24,7 +24,9 @@ _LINE = 1e-6
 def meshes_of(
     urdf: Urdf, packages: Packages, beside: Path | None, *, checked: bool
 ) -> tuple[list[tuple[str, Shape, dict[str, Any]]], list[LoadNote]]:
-    """The collision shapes that are meshes: link, shape and what ``MjSpec.add_mesh`` takes; a file at one scale is one.
+    """Return the collision shapes that are meshes: link, shape and the arguments of ``MjSpec.add_mesh``.
+
+    Shapes with the same file and scale have the same arguments.
 
     Args:
         urdf: the robot.
@@ -98,7 +100,7 @@ def _repaired(path: Path, made: dict[str, Any]) -> tuple[dict[str, Any] | None, 
 
 
 def _compiled(form: dict[str, Any], *, with_hull: bool = True) -> mujoco.MjModel:
-    """The mesh alone; by default with its hull, which a model of a URDF has too and which a flat mesh has not."""
+    """Return the mesh alone; by default with its hull, which a model of a URDF has too, but not a flat mesh."""
     spec = mujoco.MjSpec()
     spec.add_mesh(**form)
     collides = int(with_hull)
@@ -109,7 +111,7 @@ def _compiled(form: dict[str, Any], *, with_hull: bool = True) -> mujoco.MjModel
 
 
 def thickened(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Points on both sides of the plane that the given ones are in; ValueError where they are on one line."""
+    """Return points on both sides of the plane that the given ones are in; ValueError where they are on one line."""
     _, extents, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     if not extents[1] > _LINE * extents[0]:
         raise OsikValueError("the points are on one line")

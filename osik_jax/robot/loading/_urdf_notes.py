@@ -24,7 +24,7 @@ _UNREAD = 100.0
 
 
 def urdf_notes(root: ElementTree.Element, joints: Mapping[str, Joint]) -> Iterator[LoadNote]:
-    """Notes on a ``<robot>`` element whose joints were read."""
+    """Yield notes on a ``<robot>`` element whose joints were read."""
     for element in root:
         kind = _tag(element)
         if kind == "joint":
@@ -82,7 +82,7 @@ def _safety_notes(safety: ElementTree.Element | None, joint: Joint) -> Iterator[
 
 
 def number_of(element: ElementTree.Element, name: str) -> float | None:
-    """A finite number that an attribute holds, else None."""
+    """Return a finite number that an attribute holds, else None."""
     try:
         value = float(element.get(name, ""))
     except ValueError:
@@ -114,7 +114,7 @@ def _transmission_notes(element: ElementTree.Element) -> Iterator[LoadNote]:
 
 
 def _control_notes(element: ElementTree.Element, joints: Mapping[str, Joint]) -> Iterator[LoadNote]:
-    """Limits and couplings that ros2_control has for joints."""
+    """Yield notes on limits and couplings of joints that ros2_control has."""
     for part in element.iter("joint"):
         joint = joints.get(part.get("name", ""))
         if joint is None or joint.kind not in SCALAR:
@@ -132,7 +132,7 @@ def _control_notes(element: ElementTree.Element, joints: Mapping[str, Joint]) ->
 
 
 def float_of(text: str | None) -> float | None:
-    """A number in a text, else None."""
+    """Return a number in a text, else None."""
     try:
         return float(text or "")
     except ValueError:

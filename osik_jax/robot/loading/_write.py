@@ -46,7 +46,7 @@ class _JointPlace(NamedTuple):
 
 
 def to_mjcf(robot: RobotModel) -> str:
-    """The robot as MJCF; see ``Robot.to_mjcf``."""
+    """Return the robot as MJCF; see ``Robot.to_mjcf``."""
     if np.ndim(robot.body_position) != 2:
         raise OsikValueError(
             f"a stack of robots, body_position {np.shape(robot.body_position)}: write them one by one, "
@@ -70,12 +70,12 @@ def to_mjcf(robot: RobotModel) -> str:
 
 
 def _model_name(robot: RobotModel) -> str:
-    """MuJoCo keeps it at the start of the model's names."""
+    """Return the model's name, which MuJoCo keeps at the start of all names."""
     return robot.mj_model.names.partition(b"\0")[0].decode() or "robot"
 
 
 def _text(values: ArrayLike) -> str:
-    """Numbers that read back as they are."""
+    """Return numbers that read back as they are."""
     return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, float)))
 
 
@@ -152,7 +152,7 @@ def _about(anchor: np.ndarray, rotation: np.ndarray) -> Pose:
 
 
 def _seen_from(motion: Pose, place: _JointPlace) -> _JointPlace:
-    """A joint of the same body, told in the frame that a locked joint after it has moved.
+    """Return a joint of the same body, told in the frame that a locked joint after it has moved.
 
     That does not change its coordinate: MuJoCo lets nothing that turns come after a ball joint.
     """
@@ -161,7 +161,7 @@ def _seen_from(motion: Pose, place: _JointPlace) -> _JointPlace:
 
 
 def _add_inertial(robot: RobotModel, body: int, element: ElementTree.Element, *, moving: bool) -> None:
-    """Mass and principal moments, at least what MuJoCo asks of what moves."""
+    """Write mass and principal moments, raised to the least that MuJoCo accepts for moving bodies."""
     mass, least = float(robot.body_mass[body]), LEAST_INERTIA if moving else 0.0
     if max(mass, least) == 0.0:
         return
@@ -196,7 +196,7 @@ def _add_joint(robot: RobotModel, place: _JointPlace, element: ElementTree.Eleme
 
 
 def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
-    """Limits of an independent joint; a follower has those of its leader, which the leader keeps."""
+    """Return the limits of an independent joint; a follower has those of its leader, which the leader keeps."""
     tree, name = robot.tree, robot.tree.joint_names[joint]
     if joint not in tree.dof_address:
         return {}
@@ -216,14 +216,14 @@ def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
 
 
 def _dofs(robot: RobotModel, joint: int) -> slice:
-    """The entries of v that belong to an independent joint."""
+    """Return the entries of v that belong to an independent joint."""
     tree = robot.tree
     start = tree.dof_address[joint]
     return slice(start, start + tree.full_dof_address[joint + 1] - tree.full_dof_address[joint])
 
 
 def _one(values: ArrayLike, joint: str, what: str) -> float:
-    """The one value that all dofs of a joint share."""
+    """Return the one value that all dofs of a joint share."""
     first, *others = np.asarray(values, float)
     if any(other != first for other in others):
         raise OsikValueError(f"the dofs of joint {joint!r} differ in {what}: MJCF has one value a joint")
@@ -234,7 +234,7 @@ def _one(values: ArrayLike, joint: str, what: str) -> float:
 
 
 def _add_frames(robot: RobotModel, bodies: list[ElementTree.Element]) -> None:
-    """Geoms of simple shapes, and as sites all frames that are neither those nor bodies."""
+    """Write geoms of simple shapes, and as sites all frames that are neither those nor bodies."""
     tree = robot.tree
     done = dict.fromkeys(tree.body_names, IDENTITY) | _add_geoms(robot, bodies)
     for k, (name, body) in enumerate(zip(tree.frame_names, tree.frame_bodies, strict=True)):
@@ -252,7 +252,7 @@ def _pose(position: ArrayLike, rotation: ArrayLike) -> Pose:
 
 
 def _add_geoms(robot: RobotModel, bodies: list[ElementTree.Element]) -> dict[str, Pose]:
-    """The shapes that need no file; the frames that are their names, and where they are."""
+    """Return the shapes that need no file; the frames that are their names, and where they are."""
     model, tree = robot.mj_model, robot.tree
     done: dict[str, Pose] = {}
     for g in (g for g, kind in enumerate(tree.geom_types) if kind in _SHAPES):
@@ -268,7 +268,7 @@ def _add_geoms(robot: RobotModel, bodies: list[ElementTree.Element]) -> dict[str
 
 
 def _appearance(model: mujoco.MjModel, geom: int) -> dict[str, str | ArrayLike]:
-    """Kind, colour and what it collides with; masses are the bodies'."""
+    """Return kind, colour and what it collides with; masses are the bodies'."""
     material = model.geom_matid[geom]
     return dict(
         type=_SHAPES[int(model.geom_type[geom])],
@@ -297,14 +297,14 @@ def _add_rates(robot: RobotModel, element: ElementTree.Element) -> None:
 
 
 def _add_roots(tree: KinematicTree, element: ElementTree.Element) -> None:
-    """Writes which trees are the robot, where there are several and that is clear."""
+    """Write which trees are the robot, where there are several and that is clear."""
     trees = sum(not parent for parent in tree.body_parents[1:])
     if trees > 1 and len(tree.robots) <= 1:
         ElementTree.SubElement(element, "text", name=ROBOT_ROOTS, data=" ".join(tree.body_names[b] for b in tree.tops))
 
 
 def _add_followers(robot: RobotModel, element: ElementTree.Element) -> None:
-    """``q_follower - reference = constant + multiplier (q_leader - reference)``, as MuJoCo has it."""
+    """Write ``q_follower - reference = constant + multiplier (q_leader - reference)``, as MuJoCo has it."""
     tree = robot.tree
     for follower, leader, multiplier in tree.followers:
         offset = float(robot.qpos_offset[tree.full_qpos_address[follower]])

@@ -101,7 +101,7 @@ def _solve_at_active_sets(sets: ActiveJoints, problem: Problem, backend: Backend
 def _level(
     joints: ActiveJoints, problem: ScaledMotion, best: Callable[[Float[Array, "n n"]], Float[Array, ""]]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
-    """Return step, projector and scale of one level; ``best`` is its scale at the least cost."""
+    """Return step, projector and scale of one level; ``best`` computes the scale of least damped cost."""
     scale, projector = _scale_and_projector(problem, joints)
     # one factorisation after another: see docs/installation.md
     scale, active = jax.lax.optimization_barrier((scale, joints.active))

@@ -111,8 +111,8 @@ def damped_step_length(
 ) -> Float[Array, ""]:
     """Return the length of a step from start, 1 at most, that minimises the damped cost of a level.
 
-    The motion of a level without bounds is the damped optimum; the bounds of some joints may ask far larger motions of
-    the others for the same motion of the rows, and that is not worth its cost. The cost of a part t of the step d,
+    Without bounds, the motion of a level is the damped optimum. Where bounds stop some joints, the others may need far
+    larger motions for the same rows, which cost more than they gain; so only a part t of the step d is taken. Its cost,
     ``1/2 |t A d - error|^2 + 1/2 damping t^2 |d|^2``, is least at ``t = error'A d / (|A d|^2 + damping |d|^2)``.
 
     Args:

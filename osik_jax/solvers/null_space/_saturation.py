@@ -75,8 +75,8 @@ def solve_saturated(
 ) -> BoundedAnswer:
     """Solve level after level, then approach the secondary motion within the remaining freedom.
 
-    The levels are solved in double precision whatever the data are, for a joint is at its bound or is not. At the
-    active sets that were found, the derivative is in the precision of the data.
+    The levels are solved in double precision whatever the data are, because roundoff would decide which joints are at
+    their bounds. The derivative, at the active sets that were found, is in the precision of the data.
 
     Args:
         levels: highest priority first, weights multiplied in.

@@ -42,15 +42,16 @@ def least_cost(
     rank_tol: Float[Array, " B"],
     max_iterations: int,
 ) -> tuple[SaturationResult, Int[Array, " B"], Float[Array, " B"]]:
-    """Return the ends of damped levels, their kind (``STRAIGHT``, ``PART``, ``WHOLE``), and the fraction of the way.
+    """Return where damped levels stop on the way to their largest scale: the answer, a kind and a fraction.
 
-    Where the searches fail, that is a part of the straight way to the end of the path; else it is 1.
+    ``WHOLE``: at the largest scale. ``PART``: at the scale of least damped cost. ``STRAIGHT``: no such scale was found,
+    and the answer is that fraction of the straight line to the largest scale. Otherwise the fraction is 1.
 
     Args:
         problem: the motions; every array has a leading axis of problems, as have the following.
-        end: the largest scale.
+        end: the answers at the largest scale.
         level: the levels, A the rows of each that take part at ``start``.
-        damping: of each, in squared singular values.
+        damping: damping of each level, in squared singular values.
         rank_tol: as in ``level_motion``.
         max_iterations: limit on the changes of the active set (static).
     """

@@ -51,7 +51,7 @@ class Quadratic(eqx.Module):
         return jnp.sum(jnp.abs(self.matrix), 1)
 
     def lowest_valid(self, number: float) -> list[np.ndarray]:
-        """Return the lowest valid entries of each array: ``number``, and 0 on the diagonal of H."""
+        """Return the lower ends of the valid ranges of H and g: ``number``, and 0 on the diagonal of H."""
         n = len(self.linear)
         return [np.where(np.eye(n, dtype=bool), 0.0, number), np.full(n, number)]
 
@@ -108,7 +108,7 @@ class LeastSquares(eqx.Module):
         return apply(size.T, self.weight * jnp.sum(size, 1)) + self.damping
 
     def lowest_valid(self, number: float) -> list[np.ndarray]:
-        """Return the lowest valid entries of each array: ``number``, and 0 for weights and damping."""
+        """Return the lower ends of the valid ranges of each array: ``number``, and 0 for weights and damping."""
         m, n = self.matrix.shape
         return [np.full((m, n), number), np.full(m, number), np.zeros(m), np.zeros(n), np.full(n, number)]
 

@@ -2,11 +2,12 @@
 
 Whole-body tasks have fewer rows than the robot has dofs: 18 for two feet, the centre of mass and a hand, 35 dofs of a
 G1. With B the rows of A times the roots of their weights, and the active rows of C, each column over the root of its
-damping (Sherman, Morrison and Woodbury; docs/derivations.md, "The row-space solve"),
+damping (Sherman, Morrison and Woodbury),
 
     S z = [W^(1/2) (b - A c); d - C c],    x = c + D^(-1/2) B'z,    S = B B' + diag(1, compliance),
 
-where x is free; the Hessian is never formed, nor factored.
+where x is free; elsewhere c is the bound. The Hessian is never formed, nor factored. It follows from stationarity,
+D (x - c) = A'W^(1/2) z_1 + C'z_2, with z_1 = W^(1/2) (b - A x) and z_2 the multipliers of the active rows.
 
 What is lost: the correction of a refinement cancels down to weight / damping in units of machine epsilon, and S is
 singular where rows depend on each other. Where the first is too much, or a pivot too small, the problem is left to the

@@ -189,7 +189,7 @@ class BatchView(Served):
         self.loop.aim(name, jax.tree.map(lambda *rows: np.stack(rows), *each), owner=owner)
 
     def _gone(self, client: ClientHandle) -> None:
-        """Stop the robots whose handles were held by a visitor who closed the page."""
+        """Release the handles of a visitor who closed the page; the robots stop where they are."""
         for gizmos in self._gizmos:
             gizmos.drop(client.client_id)
         self.loop.release(client.client_id)

@@ -141,7 +141,7 @@ def _plain(value: Any) -> Any:
 
 
 def _live(value: Any) -> Any:
-    """Return the constructor argument that plain data describes."""
+    """Return the value for a constructor's argument from plain data: a number, a name, or a target by its kind."""
     if isinstance(value, Mapping) and "kind" in value:
         cls = _PARTS[value["kind"]]
         return cls(**{name: np.asarray(one, float) for name, one in value.items() if name != "kind"})

@@ -30,7 +30,7 @@ class _Shown(NamedTuple):
 
 
 class ObstacleNodes:
-    """Obstacles of a page."""
+    """Obstacles as nodes of a page's scene, with handles to drag, turn and resize them."""
 
     def __init__(self, scene: SceneApi, size: float, dragged: Dragged) -> None:
         """Take the size of the robot [m] and the drag callback."""

@@ -71,7 +71,7 @@ def _is_parked(one: Obstacle) -> bool:
 
 
 def _slots(limit: Limit) -> Iterator[Obstacle]:
-    """Return the world's balls and boxes, all out of use."""
+    """Return the balls and boxes that a collision limit has in the world, whether in use or put away."""
     if not isinstance(limit, CollisionAvoidanceLimit):
         return
     scene, own = limit.scene, len(limit.scene.geoms)

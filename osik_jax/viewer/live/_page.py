@@ -146,7 +146,7 @@ class LiveView(Served):
         self._desk.move_obstacle(obstacle, position=position, rotation=rotation)
 
     def _gone(self, client: ClientHandle) -> None:
-        """Release everything of a visitor who closed the page."""
+        """Release the handles and the dragged robots of a visitor who closed the page."""
         self._gizmos.drop(client.client_id)
         self._obstacles.drop(client.client_id)
         self.loop.release(client.client_id)

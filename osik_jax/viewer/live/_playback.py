@@ -37,7 +37,7 @@ class Motion:
     """
 
     def __init__(self, runs: Mapping[str, Float[np.ndarray, "T nq"]], times: Mapping[str, np.ndarray]) -> None:
-        """Take runs with their times [s]."""
+        """Take configurations by name of the run, and the times of each run's frames [s]."""
         self.runs, self.times = dict(runs), dict(times)
 
     @property

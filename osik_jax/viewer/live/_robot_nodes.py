@@ -39,12 +39,12 @@ class RobotNodes:
         """Add the robot at ``robot.q0``.
 
         Args:
-            scene: of viser.
+            scene: viser's scene.
             robot: the robot.
-            look: what its URDF shows.
-            name: of its node.
-            offset: by which it is moved [m].
-            opacity: of a robot that can be seen through; None: solid.
+            look: shapes and colours of its links, as its URDF gives them.
+            name: name of its node in the scene.
+            offset: translation of the whole robot [m].
+            opacity: below 1 for a robot that can be seen through; None: solid.
         """
         shapes = robot_parts(robot, look=look)
         data = next(mujoco_poses(robot, np.asarray(robot.q0)))

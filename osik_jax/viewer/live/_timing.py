@@ -13,9 +13,9 @@ class Timing:
     """Percentiles over the last steps of a loop.
 
     Attributes:
-        steps: how many steps there were in all.
-        period: of the starts of steps: median, 99th percentile and longest [s].
-        step: of the time that a step takes: median, 99th percentile and longest [s].
+        steps: number of steps since the start or the last pause.
+        period: time from one start to the next: median, 99th percentile and longest [s].
+        step: time spent computing a step: median, 99th percentile and longest [s].
     """
 
     steps: int
