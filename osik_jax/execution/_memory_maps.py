@@ -12,7 +12,7 @@ _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _SHARE = 0.75
 """Fraction of the system's maximum at which a warning is given, about 25 programs before the process would end."""
 _seen: dict[str, int] = {}
-"""By name of a function, its number of programs at the last call."""
+"""Number of programs at the last call, by name of the function."""
 _warned: list[int] = []
 """The number of maps of which the process has been warned; empty before."""
 
