@@ -182,14 +182,6 @@ LAST_CORRECTION = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}
 """Correction relative to the answer, below which it is the last; the next would be its square, or roundoff."""
 MAX_REFINEMENTS = 5
 """Largest number of iterative refinements; two are usual."""
-MAX_ROW_RATIO = 0.9
-"""Rows per variable above which the factor of the Hessian is as fast."""
-ROW_SPACE_PIVOT = 1e4
-"""Pivot in units of machine epsilon times the diagonal element, below which rows are dependent."""
-MAX_CONTRACTION = 1e-4
-"""Largest ratio of two corrections for which refinement is trusted to converge."""
-ROW_SPACE_CORRECTION, ROW_SPACE_ACCURACY = 1e-6, 1e-13
-"""Limits relative to x: of the last correction, and of the predicted next one."""
 GRADIENT_STEPS = 100
 """Steps of the projected gradient method that follow a MAX_ITERATIONS answer."""
 

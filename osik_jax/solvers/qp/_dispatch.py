@@ -19,7 +19,6 @@ from ...execution._backends import Backend, on_platforms, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
-from ...execution._platform import cpu_is_default, is_symbolic
 from ...numerics._constants import (
     AT_LOWER,
     AT_UPPER,
@@ -38,7 +37,6 @@ from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
 from ._problem import QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, unpack
-from ._row_space import has_few_rows, try_row_space
 from ._search import SearchResult, initial_result, search, usable_guess, violated_conditions
 
 _BLOCKS, _MIN_BLOCK = 16, 1024
@@ -64,10 +62,7 @@ def _solve_on_platform(max_iterations: int, backend: Backend, qp: QP, guess: Arr
         kernels["core-cuda"] = cuda_candidates(kkt_tol, max_iterations)
     if takes(backend, "core", fits=isinstance(qp.cost, LeastSquares)):
         kernels["core"] = core_candidates(kkt_tol, max_iterations)
-    # in a batch on a CPU, problems of few rows are tried in the space of the rows first: it costs less than a round
-    lanes = tolerance.shape[0]
-    by_rows = not is_symbolic(lanes) and lanes > 1 and cpu_is_default() and has_few_rows(qp)
-    search_all = partial(search, max_iterations=max_iterations, first_try=try_row_space if by_rows else None)
+    search_all = partial(search, max_iterations=max_iterations)
     return certified_or_searched(kernels, search_all, qp, guess, tolerance, no_candidates=initial_result)
 
 

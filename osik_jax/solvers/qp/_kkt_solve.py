@@ -77,27 +77,24 @@ def solve_on_active_set(
     x, y = jnp.where(factor.free, 0.0, target[:, :n]), jnp.zeros_like(target[:, n:])
     dx, dy = correction(x, y)
     root = jnp.abs(jnp.diagonal(factor.cholesky, axis1=1, axis2=2))
-    limit = jnp.asarray(LAST_CORRECTION[x.dtype], x.dtype)
-    return refine(correction, x + dx, y + dy, root=root, limit=limit)[:2]
+    return _refine(correction, x + dx, y + dy, root)
 
 
-def refine(
+def _refine(
     correction: Callable[[Array, Array], tuple[Array, Array]],
     x: Float[Array, "B n"],
     y: Float[Array, "B p"],
-    *,
     root: Float[Array, "B n"],
-    limit: Float[Array, "..."],
-) -> tuple[Float[Array, "B n"], Float[Array, "B p"], Bool[Array, " B"]]:
-    """Refine x and y until the last correction of each problem is small; return them, and whether it is.
+) -> tuple[Float[Array, "B n"], Float[Array, "B p"]]:
+    """Return x and y, refined until the last correction of each problem is small.
 
     Args:
         correction: from x and y of all problems to their corrections, by exact residuals.
         x: minimisers to be refined.
         y: row multipliers to be refined.
         root: root of the curvature of each variable, which takes the units out of x.
-        limit: the relative size of a small correction of x. () or (B,)
     """
+    limit = LAST_CORRECTION[x.dtype]
 
     def is_running(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         *_, relative, count = state
@@ -109,8 +106,7 @@ def refine(
         return x + dx, y + dy, jax.vmap(_relative_size)(dx * root, (x + dx) * root), count + 1
 
     start = (x, y, jnp.full(x.shape[0], jnp.inf, x.dtype), jnp.asarray(0))
-    x, y, relative, _ = jax.lax.while_loop(is_running, again, start)
-    return x, y, relative <= limit
+    return jax.lax.while_loop(is_running, again, start)[:2]
 
 
 def _relative_size(dx: Float[Array, " n"], x: Float[Array, " n"]) -> Float[Array, ""]:

@@ -75,8 +75,7 @@ class QPSolution(eqx.Module):
             into the box, which NUMERICAL_ERROR has. (n,)
         status: a ``Status`` code.
         iterations: constraints added to or dropped from the active set.
-        factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search. A
-            first row-space solve that is not optimal is not counted.
+        factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search.
         kkt_residual: without units, at most 1e-9 (1e-5 in float32) where SOLVED. The larger of two: the largest
             gradient of the Lagrangian at a variable without an active bound, or multiplier of the wrong sign, relative
             to the largest sum of absolute terms of that gradient; the largest violation of a row, relative to its

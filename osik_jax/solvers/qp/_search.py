@@ -55,10 +55,6 @@ class SearchResult(NamedTuple):
     residual: Float[Array, ""]  # of the optimality conditions
 
 
-FirstTry = Callable[[QP, SearchResult, Array], SearchResult]
-"""Function from problems, starts and tolerances to results; ``done`` if the first guess was right."""
-
-
 def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
     """Return the initial iterate of a search: nothing solved, the usable part of the guess active."""
     batch, n, dtype = guess.shape[0], qp.lower.shape[1] - qp.rows.shape[1], qp.lower.dtype
@@ -87,7 +83,6 @@ def search(
     *,
     max_iterations: int,
     by_pivots: bool = True,
-    first_try: FirstTry | None = None,
 ) -> SearchResult:
     """Solve a batch: every argument has a leading axis of problems.
 
@@ -101,12 +96,10 @@ def search(
         max_iterations: limit on the changes of the active set (static).
         by_pivots: whether the dual method goes on from a guess that is wrong; without it projected Newton does at once
             (static). A kernel has tried the former by then, and it is much of what there is to compile.
-        first_try: what answers, in double precision, problems whose guess is right; the others are searched a few at a
-            time. None: all are searched (static).
     """
     kkt_tol = KKT_TOLERANCE[qp.lower.dtype]
     rounds = partial(_search_rounds, max_iterations=max_iterations, kkt_tol=kkt_tol, by_pivots=by_pivots)
-    return in_double(partial(_solve_batch, rounds=rounds, first_try=first_try, kkt_tol=kkt_tol))(qp, guess, tolerance)
+    return in_double(partial(_solve_batch, rounds=rounds, kkt_tol=kkt_tol))(qp, guess, tolerance)
 
 
 def _solve_batch(
@@ -115,16 +108,10 @@ def _solve_batch(
     tolerance: Float[Array, " B"],
     *,
     rounds: Callable[[tuple[QP, Array], SearchResult], SearchResult],
-    first_try: FirstTry | None,
     kkt_tol: float,
 ) -> SearchResult:
     """Return the answers, or the end of projected gradient steps for problems without one."""
-    start = initial_result(qp, guess, tolerance)
-    if first_try is None:
-        result = rounds((qp, tolerance), start)
-    else:
-        tried = first_try(qp, start, tolerance)
-        result = with_a_few((qp, tolerance), tried, tried.done, rounds)
+    result = rounds((qp, tolerance), initial_result(qp, guess, tolerance))
     # the certificate: no answer without it, however the search ended
     residual = jax.vmap(kkt_residual)(qp, result.x, result.row_multipliers, result.active)
     result = result._replace(residual=residual, optimal=result.optimal & (residual <= kkt_tol))
