@@ -28,6 +28,7 @@ from rich.table import Table
 import osik_jax as osik
 from osik_jax import tuning
 from osik_jax.runtime import configure_cpu
+from osik_jax.tuning._losses import LossFunction
 
 FEET = {"left_foot": "l_sole", "right_foot": "r_sole"}
 HANDS = {"left_hand": "l_gripper", "right_hand": "r_gripper"}
@@ -40,7 +41,7 @@ FAILED = 1e9
 class Experiment(NamedTuple):
     """What is tuned, on what, and by what it is judged."""
 
-    loss: tuning.LossFunction
+    loss: LossFunction
     parameters: list[str | tuning.Parameter]
     loop: tuning.Loop
     training: tuning.Scenarios

@@ -127,7 +127,7 @@ def _check(command: Demo) -> None:
     if not command.schemes:
         raise CommandError("--schemes is empty; name at least one of: weighted, null-space, hierarchical")
     if command.renderer == "mujoco" and command.animation:
-        from ..viewer import check_opengl
+        from ..viewer._opengl import check_opengl
 
         try:
             check_opengl()

@@ -48,7 +48,8 @@ class Ros2:
     def run(self) -> int:
         """Run the command; return the exit code: 1 where a replay does not reproduce its commands."""
         with told():
-            from ..interop.ros2 import Controller, Settings, dds, read_settings
+            from ..interop.ros2 import Controller, Settings, dds
+            from ..interop.ros2._settings import read_settings
 
             settings = Settings() if self.config is None else read_settings(self.config)
             if (self.robot is None) == (settings.controller is None):

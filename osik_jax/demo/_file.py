@@ -14,7 +14,8 @@ from ..limits import ConfigurationLimit, VelocityLimit
 from ..robot import Robot
 from ..robot._feet import find_feet
 from ..tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
-from ..viewer import Look, robot_outline
+from ..viewer import Look
+from ..viewer._outline import robot_outline
 from ._motion import GAIN, Goal, Motion, Stance, along, contact_corners, tracking
 from ._start import Rows, raised, start
 from ._sway import SWAY, sway, sway_of

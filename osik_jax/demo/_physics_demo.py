@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..viewer import RendererName, compare_figure
+from ..viewer._figures import compare_figure
+from ..viewer._opengl import RendererName
 from ._motion import Motion
 from ._physics import PhysicsRun, run_physics
 from ._physics_report import physics_panels, physics_report

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from rich.table import Table
 
 from ..physics import World
-from ..viewer import Panel
+from ..viewer._figures import Panel
 from ._motion import Motion
 from ._physics import FEEDBACK_GAIN, PhysicsMeasurement, PhysicsRun
 from ._report import inside, limit_count, number, report, solved, table_of_schemes

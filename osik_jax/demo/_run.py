@@ -14,7 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..control import rollout
-from ..viewer import Curves, Panel, RendererName, animate, compare_figure, hero_picture
+from ..viewer import Curves, animate, hero_picture
+from ..viewer._figures import Panel, compare_figure
+from ..viewer._opengl import RendererName
 from ._measure import Measurement, measure
 from ._motion import Motion
 from ._report import Outcome, report, write_report

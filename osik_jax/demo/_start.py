@@ -15,7 +15,7 @@ from ..kinematics._home import compiled_kinematics
 from ..robot import Robot
 from ..robot._tree import HINGE, SLIDE
 from ..tasks import FrameTask
-from ..viewer import Outline
+from ..viewer._outline import Outline
 
 _SINK = 0.05
 """Share of the waist's height by which a standing robot first bends its legs."""

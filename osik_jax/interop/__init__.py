@@ -2,5 +2,4 @@
 
 from ._export import export_controller as export_controller
 from ._exported import ExportedController as ExportedController
-from ._exported import Port as Port
 from ._exported import load_controller as load_controller

@@ -1,12 +1,10 @@
 """Motion retargeting: a recorded human motion becomes a motion of a legged robot."""
 
-from ._bvh import read_bvh as read_bvh
 from ._fit import Fit as Fit
 from ._fit import FitLoss as FitLoss
 from ._fit import fit as fit
 from ._goals import Weights as Weights
 from ._guess import guess_profile as guess_profile
-from ._keypoints import read_keypoints as read_keypoints
 from ._live import LiveFrame as LiveFrame
 from ._live import LiveRetargeter as LiveRetargeter
 from ._live import LiveStatus as LiveStatus

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 
 from ..execution._workers import cores
 from ..limits import Limit
-from ..scaling import ShardedFunction, sharded
+from ..scaling import sharded
+from ..scaling._sharded import ShardedFunction
 from ._finish import follow
 from ._goals import Goals, Weights
 from ._person import Person

@@ -29,9 +29,11 @@ def load_motion(
 
     Args:
         path: the file.
-        unit: unit of a BVH file, see ``read_bvh``.
-        up: the file's axis that points up, see ``read_bvh`` and ``read_keypoints``. None: found from the motion.
-        trim: whether rest-pose frames of a BVH file are left out, see ``read_bvh``.
+        unit: length of one unit of a BVH file [m], or ``"m"``, ``"cm"``, ``"mm"``, ``"inch"``, ``"cmu"``. None: the one
+            of these in which the person is 1 to 2.3 m large. Other files are in metres.
+        up: the file's axis that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. None: the axis
+            along which the person stands in the motion. An ``OsikWarning`` is given if the rest pose disagrees.
+        trim: leave out rest-pose frames at the start of a BVH file, with an ``OsikWarning``.
 
     Raises:
         FileNotFoundError: no such file.

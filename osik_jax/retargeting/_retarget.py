@@ -16,8 +16,9 @@ import numpy as np
 from .._errors import OsikValueError
 from ..execution._workers import cores
 from ..robot import Robot
-from ..scaling import Saved, run_in_chunks
+from ..scaling import run_in_chunks
 from ..scaling._progress import reported
+from ..scaling._saved import Saved
 from ._finish import follow
 from ._lanes import (
     LENGTHS,

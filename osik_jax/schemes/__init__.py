@@ -2,7 +2,6 @@
 
 from ._hierarchical import HierarchicalQP as HierarchicalQP
 from ._null_space import NullSpace as NullSpace
-from ._null_space import limit_potential_gradient as limit_potential_gradient
 from ._scheme import Scheme as Scheme
 from ._scheme import SchemeAnswer as SchemeAnswer
 from ._scheme import VelocityProblem as VelocityProblem

@@ -5,8 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..execution._backends import check_backend
-from ..solvers import Backend, WorkingSet, solve_hqp
+from ..execution._backends import Backend, check_backend
+from ..solvers import WorkingSet, solve_hqp
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iterations, status_with
 
 

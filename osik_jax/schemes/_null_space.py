@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from ..execution._backends import check_backend
+from ..execution._backends import Backend, check_backend
 from ..numerics._guarded import clipped
-from ..solvers import Backend, Level, NullSpaceSolution, solve_nullspace
+from ..solvers import Level, NullSpaceSolution, solve_nullspace
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
 NullSpaceMethod = Literal["classical", "reverse", "saturated"]

@@ -12,12 +12,12 @@ from jaxtyping import Array, Float, Int
 
 from .._errors import OsikValueError
 from ..core import _cuda
-from ..execution._backends import check_backend, takes
+from ..execution._backends import Backend, check_backend, takes
 from ..numerics._arguments import concrete
 from ..numerics._constants import DIAGONAL_RATIO, SINGLE_DAMPING
 from ..numerics._dense import short_sum
 from ..numerics._guarded import quotient
-from ..solvers import Backend, Level, solve_least_squares_qp
+from ..solvers import Level, solve_least_squares_qp
 from ..tasks import TaskRows
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iterations
 

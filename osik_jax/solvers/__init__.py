@@ -1,6 +1,5 @@
 """Solvers on arrays, without robots: quadratic programs, hierarchies, null-space projection."""
 
-from ..execution._backends import Backend as Backend
 from ._damping import Damping as Damping
 from ._level import Level as Level
 from ._status import Status as Status

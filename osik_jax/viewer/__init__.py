@@ -5,18 +5,12 @@ Not imported with the package, because it loads matplotlib.
 
 from ._animate import Curves as Curves
 from ._animate import animate as animate
-from ._figures import Panel as Panel
-from ._figures import compare_figure as compare_figure
 from ._figures import hero_picture as hero_picture
 from ._look import Look as Look
 from ._look import read_look as read_look
 from ._mujoco import mujoco_frame_pose as mujoco_frame_pose
 from ._mujoco import mujoco_poses as mujoco_poses
 from ._mujoco import robot_com as robot_com
-from ._opengl import RendererName as RendererName
-from ._opengl import check_opengl as check_opengl
-from ._outline import Outline as Outline
-from ._outline import robot_outline as robot_outline
 from .live import BatchView as BatchView
 from .live import LiveView as LiveView
 from .live import ReachView as ReachView

@@ -23,7 +23,8 @@ from used_memory import used_memory
 import osik_jax as osik
 from osik_jax.core import _library
 from osik_jax.execution import _candidates
-from osik_jax.solvers import Backend, Damping, Level, Status, solve_nullspace
+from osik_jax.execution._backends import Backend
+from osik_jax.solvers import Damping, Level, Status, solve_nullspace
 from osik_jax.solvers._row_factors import row_factors
 from osik_jax.solvers.null_space import _saturation
 

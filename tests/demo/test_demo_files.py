@@ -16,6 +16,7 @@ from osik_jax.demo._measure import measure
 from osik_jax.demo._schemes import SCHEMES
 from osik_jax.demo._start import strides
 from osik_jax.demo._sway import JointPath, sway_of
+from osik_jax.viewer._outline import robot_outline
 
 LINK = """<link name="{0}"><inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>
 </inertial><visual><origin xyz="0 0 {1}"/><geometry><cylinder radius="{2}" length="{3}"/></geometry></visual></link>"""
@@ -139,7 +140,7 @@ def test_a_walker_stands_on_the_floor():
     path = urdf("solo_description/robots/solo12.urdf")
     robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
     motion = file_motion(robot, name="solo12", look=look)
-    assert viewer.robot_outline(robot, motion.q0, look).lowest == pytest.approx(0.0, abs=1e-9)
+    assert robot_outline(robot, motion.q0, look).lowest == pytest.approx(0.0, abs=1e-9)
     heights = [kinematics_at(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
     assert len(heights) == 4 and np.ptp(heights) < 1e-3 and max(heights) < 0.05
     assert motion.notes == ()

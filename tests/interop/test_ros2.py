@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax.interop.ros2 import Controller, Received, Settings, read_settings
-from osik_jax.interop.ros2._settings import dds_name, topic_of_frame
+from osik_jax.interop.ros2 import Controller, Received, Settings
+from osik_jax.interop.ros2._settings import dds_name, read_settings, topic_of_frame
 
 PERIOD = 5_000_000
 START = 1_800_000_000_000_000_000

@@ -12,15 +12,8 @@ from motion_files import FIGURE, Figure, dancer, with_first, write_bvh
 from scipy.spatial.transform import Rotation
 
 from osik_jax import OsikWarning
-from osik_jax.retargeting import (
-    HumanMotion,
-    RobotMotion,
-    find_roles,
-    load_motion,
-    load_robot_motion,
-    read_bvh,
-    write_csv,
-)
+from osik_jax.retargeting import HumanMotion, RobotMotion, find_roles, load_motion, load_robot_motion, write_csv
+from osik_jax.retargeting._bvh import read_bvh
 from osik_jax.retargeting._person import measure
 from osik_jax.retargeting._up import find_up
 

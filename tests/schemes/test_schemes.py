@@ -17,7 +17,7 @@ import scipy.optimize
 from task_checks import kinematics_at, moved_by
 
 import osik_jax as osik
-from osik_jax.schemes import limit_potential_gradient
+from osik_jax.schemes._null_space import limit_potential_gradient
 
 DT = 0.005
 DAMPING = 1e-4

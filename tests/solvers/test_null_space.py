@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from osik_jax.schemes import limit_potential_gradient
+from osik_jax.schemes._null_space import limit_potential_gradient
 from osik_jax.solvers import Level, Status, solve_nullspace
 
 N = 8

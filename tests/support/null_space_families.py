@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from osik_jax.solvers import Backend, Damping, Level, NullSpaceSolution, solve_nullspace
+from osik_jax.execution._backends import Backend
+from osik_jax.solvers import Damping, Level, NullSpaceSolution, solve_nullspace
 
 LANES = 12
 

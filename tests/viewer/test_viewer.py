@@ -14,6 +14,8 @@ from PIL import Image
 import osik_jax as osik
 from osik_jax import viewer
 from osik_jax.viewer import _animate, _opengl
+from osik_jax.viewer._figures import Panel, compare_figure
+from osik_jax.viewer._opengl import check_opengl
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raycast import RayCaster
 from osik_jax.viewer._shapes import robot_surface
@@ -276,8 +278,8 @@ def test_constants_do_not_look_like_curves():
     """Rounding errors about a constant, and errors that are 0 throughout, on linear and on logarithmic axes."""
     time = np.linspace(0.0, 1.0, 11)
     noise = {"one": 0.5 + 1e-16 * np.sin(40.0 * time)}
-    panels = [viewer.Panel("margin", noise, span=0.1), viewer.Panel("error", {"one": 0.0 * time}, floor=1e-5)]
-    linear, log = viewer.compare_figure(time, panels).axes
+    panels = [Panel("margin", noise, span=0.1), Panel("error", {"one": 0.0 * time}, floor=1e-5)]
+    linear, log = compare_figure(time, panels).axes
     assert np.ptp(linear.get_ylim()) >= 0.1 and log.get_ylim() == pytest.approx((1e-5, 1e-3))
 
 
@@ -296,14 +298,14 @@ def test_without_opengl_rays_are_cast(nao, monkeypatch):
     with pytest.raises(RuntimeError, match="no OpenGL context"):
         _opengl.make_renderer("mujoco", stage, camera, (32, 32), floor=0.0)
     with pytest.raises(RuntimeError, match="no OpenGL context"):
-        viewer.check_opengl()
+        check_opengl()
     assert len(tries) == 1
 
 
 def test_without_a_screen_asking_twice_is_safe():
     """MuJoCo's own renderer aborts the process at its second failure."""
     code = """
-from osik_jax.viewer import check_opengl
+from osik_jax.viewer._opengl import check_opengl
 for _ in range(2):
     try:
         check_opengl()
@@ -357,9 +359,9 @@ def test_with_opengl_mujocos_renderer_draws(nao, monkeypatch):
 def test_comparison_draws_the_curves_it_gets(tmp_path):
     time = np.linspace(0.0, 1.0, 11)
     curves = {"one": 1e-3 * (1.0 + time), "two": 1e-6 * (1.0 + time)}
-    figure = viewer.compare_figure(
+    figure = compare_figure(
         time,
-        [viewer.Panel("drift [mm]", curves, floor=1e-5, bound=0.1), viewer.Panel("margin [mm]", curves, bound=0.0)],
+        [Panel("drift [mm]", curves, floor=1e-5, bound=0.1), Panel("margin [mm]", curves, bound=0.0)],
     )
     log, linear = figure.axes
     np.testing.assert_allclose(np.asarray(log.lines[0].get_ydata()), curves["one"])
