@@ -62,6 +62,7 @@ def lane(tree, i):
 
 
 class TestBatchesEqualLoops:
+    @pytest.mark.slow
     def test_over_configurations_and_targets(self, arm, tasks, limits, start):
         """The batch of targets comes out of a vmapped replace, with the same axes."""
         shifts = jnp.linspace(-0.1, 0.1, LANES * 3).reshape(LANES, 3)
@@ -96,6 +97,7 @@ class TestBatchesEqualLoops:
         own = limits[0], osik.VelocityLimit(arm, velocity={"*": 0.4})
         np.testing.assert_allclose(got[1], velocity(arm, arm.q0, tipped, own), atol=1e-10)
 
+    @pytest.mark.slow
     def test_over_task_sets_and_robots(self, arm, tasks, limits, start):
         sets = [
             {**tasks, "hand": moved(tasks["hand"], 0.1 * i), "posture": tasks["posture"].replace(gain=float(i))}

@@ -131,6 +131,7 @@ class TestNumbers:
 
 
 class TestMotions:
+    @pytest.mark.slow
     def test_ours_and_minks_are_one_inside(self, work, monkeypatch):
         """Nothing is out of reach in the first second: all that differs is the damping."""
         work = without_turning(work, posture=True)
@@ -165,6 +166,7 @@ class TestResults:
         (one,) = _results.entrants(everything=False, only="g1, hierarchy, float64, no")
         assert one == Entrant("g1", "hierarchy", "float64", False)
 
+    @pytest.mark.slow
     def test_hard_feet_are_constraints(self, humanoid):
         tasks = _motion.OurLoop(humanoid, _motion.SCHEMES[_motion.HARD_FEET], posture=True)
         changed = tasks.change(tasks.robot, tasks.tasks)

@@ -39,6 +39,7 @@ def paths(work):
     return {name: motion_of(peer(name)(work), work) for name in ("osik_jax", "mink")}
 
 
+@pytest.mark.slow
 def test_ours_is_minks_motion(work, paths, monkeypatch):
     """Without curvature damping. Orientation errors are written in other ways, which differ by the angle's square."""
     assert np.abs(paths["mink"] - work.start).max() > 0.02
@@ -129,6 +130,7 @@ def test_every_robot_can_do_its_workload(name):
         assert not failures(judged(work, motion_of(peer("mink")(work), work, steps=600, lane=lane), lane))
 
 
+@pytest.mark.slow
 def test_processes_take_turns_and_who_is_missing_is_left_out(work, tmp_path, capsys):
     said: list[str] = []
     with Race(work, pythons={"placo": "no-such-python"}, report=said.append) as race:

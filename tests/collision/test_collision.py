@@ -587,6 +587,7 @@ class TestTooNearAtHome:
         hand, _ = kinematics_at(arm, arm.q0).frame_pose(arm, "geom:hand")
         return {"ball": CollisionShape.sphere(0.05, hand + jnp.array([0.0, 0.06 + 0.05 + 0.005, 0.0]))}
 
+    @pytest.mark.slow
     def test_pairs_asked_for_by_name_are_kept_and_part(self, arm, shapes):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -647,6 +648,7 @@ PALM = """
 </body>"""
 
 
+@pytest.mark.slow
 def test_added_shapes_are_the_geoms_that_they_describe():
     """On a turned frame of the hand, and a slope in the world; distances of both from the upper arm are MuJoCo's."""
     stones = {"rock": POINTS, "stone": POINTS * [0.5, 1.5, 1.0]}

@@ -109,6 +109,7 @@ def test_a_floor_in_the_world_is_no_neighbour_of_the_first_link():
     assert named(limit) == expected("floor one", "floor two", "pole one", "pole two", "foot two", "edge two")
 
 
+@pytest.mark.variants(slow=["fused by glob"])
 @pytest.mark.parametrize(
     ("pairs", "kept"),
     [
@@ -169,6 +170,7 @@ def test_an_obstacle_meets_the_links_of_a_urdf():
     )
 
 
+@pytest.mark.slow
 def test_distances_are_those_of_mujocos_own_reading():
     """MuJoCo reads the same URDF; its cylinders are round, ours are prisms around them."""
     text = f"<robot name='r'>{''.join(CHAIN)}</robot>"
@@ -276,6 +278,7 @@ def coal_hull(points):
     return coal.Convex.convexHull(listed, True, "")
 
 
+@pytest.mark.variants(slow=["0.1", "0.16"])
 @pytest.mark.parametrize("apart", [0.25, 0.16, 0.1])
 def test_distances_of_large_hulls_are_those_of_coal(apart):
     """Apart, just apart and overlapping; the hulls are replaced by smaller ones that cover them."""
@@ -315,7 +318,7 @@ ROBOTS = {
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.variants(slow=["g1", "talos", "tiago"])
+@pytest.mark.variants(slow=["g1", "talos", "tiago", "panda", "solo"])
 def test_the_default_call_works_on_known_robots(name):
     """With shapes of all links that have some; distances at home are MuJoCo's, or up to 4 mm less."""
     path, floats, (one, other) = ROBOTS[name]

@@ -74,7 +74,7 @@ def assert_same(ours, theirs, atol):
 
 
 class TestRollout:
-    @pytest.mark.variants(slow=["hierarchical"])
+    @pytest.mark.variants(slow=["hierarchical", "weighted"])
     @all_schemes
     def test_equals_a_python_loop(self, arm, home, tasks, limits, name):
         """Every number of the solution but the warm start, with a target that moves."""
@@ -233,7 +233,7 @@ def stack(lanes):
 
 
 class TestBatches:
-    @pytest.mark.variants(slow=["hierarchical"])
+    @pytest.mark.variants(slow=["hierarchical", "null-space"])
     @all_schemes
     def test_vmap_over_everything_equals_a_loop(self, arm, home, name):
         """Configurations, targets, weights, gains, bounds, limits, dt, link lengths and the scheme's own numbers."""
@@ -346,6 +346,7 @@ class TestDerivatives:
         }
         return f, x
 
+    @pytest.mark.slow
     @pytest.mark.variants(slow=["null-space"])
     @pytest.mark.parametrize("name", ["weighted", "null-space"])
     def test_one_step_in_both_modes(self, arm, home, limits, name):
@@ -361,6 +362,7 @@ class TestDerivatives:
             assert float(pushed(unit)) == pytest.approx(float(reverse[k]), abs=1e-9 * scale), k
         assert (np.abs(reverse) > 1e-4).sum() >= 10
 
+    @pytest.mark.slow
     def test_through_a_rollout(self, arm, home, limits):
         """Reverse mode through the scan: a cost of the whole path with respect to a gain and a weight."""
         p, R = home

@@ -111,6 +111,7 @@ def test_out_of_reach_it_comes_to_rest(scheme, beyond):
     assert np.isfinite(np.asarray(beyond[scheme].q)).all()
 
 
+@pytest.mark.variants(slow=["weighted", "null-space", "reverse"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_inside_it_is_as_exact_as_without(scheme, arm):
     """A hand that follows a circle, the whole error asked for in one step."""
@@ -244,6 +245,7 @@ def test_its_share_is_traced(arm):
     assert len(traces) == 1
 
 
+@pytest.mark.slow
 def test_products_as_a_gpu_takes_them_are_the_same(arm, monkeypatch):
     """Small products are written out where JAX's default is a GPU; here that is only said."""
     q = bent(arm)

@@ -148,7 +148,7 @@ def touching(rng):
 class TestSwitches:
     """Where an active set is about to change, or there is none."""
 
-    @pytest.mark.variants(release=["hierarchy"])
+    @pytest.mark.variants(slow=["qp"], release=["hierarchy"])
     @pytest.mark.parametrize("solver", ["qp", "hierarchy"])
     def test_a_bound_exactly_touched_has_the_derivative_of_one_side(self, rng, solver):
         def solve(a):
@@ -163,6 +163,7 @@ class TestSwitches:
         assert errors.min(1).max() < 1e-6
         assert (errors.max(1) > 1e-3).mean() > 0.9  # the other side has another
 
+    @pytest.mark.slow
     @pytest.mark.variants(release=["3e-12"])
     @pytest.mark.parametrize("column", [3e-12, 9e-11, 1.2e-10, 4e-10, 1e-8])
     def test_a_column_at_the_rank_tolerance_stopped_by_its_bound(self, column):
@@ -197,6 +198,7 @@ class TestSwitches:
 
 
 class TestHessian:
+    @pytest.mark.slow
     def test_of_a_quadratic_program(self, rng):
         """Forward over reverse at a fixed active set, against central differences of the gradient."""
         data = [jnp.asarray(a[0]) for a in quadratic_programs(rng, rows=5)[0]]

@@ -157,6 +157,7 @@ class TestAtTheStart:
 
 
 class TestAStepThatIsNone:
+    @pytest.mark.variants(slow=["hierarchy"])
     @pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
     def test_a_traced_dt_that_is_none_moves_nothing(self, arm, scheme):
         """A dt of 0 would divide, a negative one turn limits round: the status says so, and the robot stays."""
@@ -209,6 +210,7 @@ class TestDampingInSinglePrecision:
         np.testing.assert_allclose(self.shares(jnp.float64), expected, rtol=0, atol=1e-4)
         np.testing.assert_allclose(self.shares(jnp.float32), expected, rtol=0, atol=1e-3)
 
+    @pytest.mark.slow
     def test_such_levels_are_solved(self):
         """And the answer is about that in double precision."""
         rows, goal, unmet = self.problems()

@@ -93,6 +93,7 @@ class TestSchemes:
         assert scheme.method == "saturated"
         assert (float(scheme.margin), float(scheme.potential_gain)) == (0.1, 0.0)
 
+    @pytest.mark.slow
     def test_inside_jit_and_in_batches(self, arm):
         scheme = osik.WeightedQP(curvature_damping=0.0)
         task = {"hand": osik.FrameTask(arm, "hand", target=(np.ones(3), np.eye(3)))}

@@ -45,6 +45,7 @@ METHODS = {
 }
 
 
+@pytest.mark.variants(slow=["hierarchical", "forward"])
 @pytest.mark.parametrize(
     "method", [pytest.param(name, marks=pytest.mark.slow if name == "saturated" else ()) for name in METHODS]
 )

@@ -128,7 +128,20 @@ CHECKS: list[Callable[[Names], None]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.variants(slow=["so101_pose", "nao_one_foot", "go2_body"])
+@pytest.mark.variants(
+    slow=[
+        "so101_pose",
+        "nao_one_foot",
+        "go2_body",
+        "ur5_keeps_off_a_post",
+        "tiago_drives",
+        "panda_thousand_targets",
+        "baxter_two_arms",
+        "panda_draws",
+        "xarm_elbow",
+        "tune_a_weight",
+    ]
+)
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.filterwarnings("error::osik_jax.OsikWarning")
 def test_runs(

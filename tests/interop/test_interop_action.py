@@ -134,6 +134,7 @@ def test_what_does_not_fit_is_told(arm):
         TaskSpaceAction(floating, wrist, joints=(floating.tree.joint_names[floating.tree.independent[0]],))
 
 
+@pytest.mark.slow
 def test_a_batch_of_environments_in_mjx(arm):
     """Servos in MJX follow the joint targets: the hand of each goes its own way, as far as its actions say."""
     robot, tasks = arm

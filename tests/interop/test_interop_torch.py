@@ -146,6 +146,7 @@ def test_what_cannot_be_is_told():
         torch.autograd.grad(wrap(jnp.sin)(x).sum(), x, create_graph=True)
 
 
+@pytest.mark.slow
 def test_the_last_layer_of_a_policy(arm):
     """A network learns through the step which target gives a velocity; the layer has no parameters of its own."""
     step, q, p = arm

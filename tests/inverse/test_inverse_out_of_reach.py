@@ -95,6 +95,7 @@ def test_least_error_of_poses_beside_scipy(arm, rng):
         assert np.sqrt(2.0 * cost(q)[0]) < least_distance(arm, cost, rng, starts=60) + 1e-4
 
 
+@pytest.mark.slow
 def test_limbs_that_share_no_joint_stay_on_their_targets():
     robot = osik.Robot.from_mjcf(
         HEAD + FINGER.format(y=0, n="a") + FINGER.format(y=0.1, n="b") + "</worldbody></mujoco>"

@@ -84,6 +84,7 @@ def test_a_joint_outside_its_range_comes_back():
     assert np.radians(29.8) < angles(path.q)[-1] <= np.radians(30.0)
 
 
+@pytest.mark.slow
 def test_inverse_kinematics_keeps_the_range_to_its_end():
     robot = osik.Robot.from_mjcf(mjcf(30.0))
     beyond = osik.inverse_kinematics(robot, {"tip": [0.3, 0.0, 0.5]}, seeds=2, restarts=0)
@@ -133,6 +134,7 @@ def test_ranges_are_written():
     np.testing.assert_array_equal(again.position_lower, robot.position_lower)
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_where_the_axis_is_not_known():
     robot = osik.Robot.from_mjcf(mjcf(25.0))
     limit = osik.ConfigurationLimit(robot)

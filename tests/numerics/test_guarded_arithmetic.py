@@ -149,6 +149,7 @@ def _rates_of_saturated(precision, distances, directions, shifts):
         return jax.jit(jax.vmap(rate))(*given)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_saturated_null_space_near_a_target_in_single_precision(rng):
     """Steps of roundoff: a division of XLA that underflows, and whether all of a step is worth its cost."""
     distances = np.concatenate([[1e-2, 1e-3, 1e-4, 1e-6], 10.0 ** rng.uniform(-6, -2, 12)])

@@ -144,6 +144,7 @@ class Frame:
         self.q = q
 
 
+@pytest.mark.slow
 def test_limits_hold_on_a_noisy_stream_with_holes(nao, motion, live):
     rng = np.random.default_rng(0)
     noisy = motion.positions + rng.normal(scale=0.03, size=motion.positions.shape)

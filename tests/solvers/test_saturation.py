@@ -345,6 +345,7 @@ class TestByHand:
         np.testing.assert_array_equal(answer.status, Status.SOLVED)
         assert ((np.abs(answer.x).max(1) == 0.0) & (np.asarray(answer.scales)[:, 0] == 0.0)).any()
 
+    @pytest.mark.variants(slow=["jax"])
     @pytest.mark.parametrize("backend", ["jax", "auto"])
     def test_levels_without_a_null_space_keep_those_above_to_rounding(self, backend):
         """Ten rows in ten variables; joints at their bounds then stop the second level, and nothing is left to move."""
