@@ -43,7 +43,7 @@ def test_the_arm_on_wheels():
     np.testing.assert_array_equal(np.isfinite(robot.position_upper), [False] * 4 + [True, False] * 3)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("turned", [True, False])
 def test_a_step_of_a_g1_is_pinks_in_its_form_alone(g1, rng, turned):
     decoupled, _, coupled, both = step._apart(g1, rng, (0.05, 0.3), turned, 0.1)

@@ -39,7 +39,7 @@ def test_a_row_is_right(path):
     assert row["compile_seconds"] > 0.0 and row["program_bytes"] > row["batch"] * 7 * 8
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
     other = tmp_path / "results.json"
     other.write_text(path.read_text())

@@ -318,7 +318,7 @@ ROBOTS = {
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.variants(slow=["g1", "talos", "tiago", "panda", "solo"])
+@pytest.mark.variants(release=["tiago", "talos"], slow=["g1", "talos", "tiago", "panda", "solo"])
 def test_the_default_call_works_on_known_robots(name):
     """With shapes of all links that have some; distances at home are MuJoCo's, or up to 4 mm less."""
     path, floats, (one, other) = ROBOTS[name]

@@ -136,7 +136,7 @@ def test_inside_it_is_as_exact_as_without(scheme, arm):
     assert damped.max() < 1e-3
 
 
-@pytest.mark.variants(release=["null-space", "reverse"])
+@pytest.mark.variants(release=["null-space", "reverse", "hierarchical"])
 @pytest.mark.parametrize(
     "scheme", ["weighted", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SCHEMES)[1:])]
 )
@@ -171,7 +171,7 @@ def test_derivatives_with_the_damping_on(scheme, arm):
 
 
 @pytest.mark.variants(release=["hierarchical", "weighted", "null-space"])
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("scheme", [*SCHEMES, "saturated"])
 def test_derivatives_where_little_room_is_left(scheme, arm):
     """On the way to a target out of reach, with a posture below: by target, gain, configuration and share."""

@@ -102,7 +102,7 @@ class TestArrays:
         out = check(lambda a: qp_answer(solve_factored(a)), straight, least_squares(rng, rows=5))
         assert_exact(out, most=0.9)
 
-    @pytest.mark.variants(release=["more-rows-than-variables"])
+    @pytest.mark.variants(release=["more-rows-than-variables", "few-rows"])
     @pytest.mark.parametrize("sizes, n", [((3, 4, 4), 10), ((2, 9), 6)], ids=["few-rows", "more-rows-than-variables"])
     def test_hierarchies(self, rng, sizes, n):
         """Levels of equalities and inequalities with weights, over a box: the answer and what levels lack."""
@@ -226,7 +226,7 @@ class TestHessian:
         one, back, two, far = np.split(np.asarray(slopes), 4)
         return (8.0 * (one - back) - (two - far)) / 12e-4, np.concatenate([a[0].ravel() for a in active])
 
-    @pytest.mark.variants(release=["saturated", "projections", "quadratic program"])
+    @pytest.mark.variants(release=["saturated", "projections", "quadratic program", "hierarchy"])
     @pytest.mark.slow
     @pytest.mark.parametrize("name", ["quadratic program", "hierarchy", "projections", "saturated"])
     def test_through_a_loop(self, name):

@@ -23,7 +23,7 @@ def arm():
 
 
 class TestHessian:
-    @pytest.mark.variants(release=["null-space", "hierarchical"])
+    @pytest.mark.variants(release=["null-space", "hierarchical", "weighted"])
     @all_schemes
     def test_of_a_step(self, arm, rng, name):
         """Forward over reverse, with speeds at their bounds, against central differences of the gradient; symmetric."""
@@ -71,7 +71,7 @@ def path_cost(setting, steps):
 
 
 class TestRollout:
-    @pytest.mark.variants(release=["hierarchical", "null-space"])
+    @pytest.mark.variants(release=["hierarchical", "null-space", "weighted"])
     @all_schemes
     def test_over_two_hundred_steps(self, arm, rng, name):
         """Both modes against central differences, through changes of the active set along the way."""
@@ -92,7 +92,7 @@ class TestRollout:
             assert float(reverse @ d) == pytest.approx(expected, rel=1e-5)
             assert float(push(d)) == pytest.approx(float(reverse @ d), rel=1e-9)
 
-    @pytest.mark.variants(release=["hierarchical"])
+    @pytest.mark.variants(release=["hierarchical", "weighted"])
     @pytest.mark.parametrize("name", ["weighted", "hierarchical"])
     def test_memory_of_the_gradient(self, arm, name):
         """A step more keeps the state of a step, not what its solver went through."""

@@ -53,6 +53,7 @@ def scattered(rng, setting, spread, cases=CASES):
 
 
 class TestStep:
+    @pytest.mark.release
     @pytest.mark.variants(release=["hierarchical", "null-space"])
     @all_schemes
     def test_a_thousand_steps_of_the_arm(self, arm, rng, name):

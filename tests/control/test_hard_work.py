@@ -133,7 +133,7 @@ class TestOutOfReach:
 class TestAtTheStart:
     """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives."""
 
-    @pytest.mark.variants(release=["saturated null space", "hierarchy"])
+    @pytest.mark.variants(release=["saturated null space", "hierarchy", "null space"])
     @pytest.mark.variants(slow=["null space"], release=["damped null space", "reverse order"])
     @pytest.mark.parametrize(
         "method", [name if name in QUICK_METHODS else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]

@@ -122,7 +122,7 @@ def test_a_step_compiles_once(arm, home, name):
     assert np.abs(c.velocity - b.velocity).max() > 1e-6
 
 
-@pytest.mark.variants(slow=["weighted"])
+@pytest.mark.variants(release=["hierarchical", "null-space"], slow=["weighted"])
 @pytest.mark.parametrize(
     "name", ["weighted", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SCHEMES)[1:])]
 )

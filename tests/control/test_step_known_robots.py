@@ -93,6 +93,7 @@ def seen_by_mujoco(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return np.array(places), np.array(joints)
 
 
+@pytest.mark.variants(release=["tiago", "romeo", "solo12", "panda", "ur5"])
 def test_every_step_is_solved(case: Case):
     np.testing.assert_array_equal(case.run.solution.status, osik.Status.SOLVED)
     assert np.isfinite(case.run.q).all()

@@ -45,7 +45,7 @@ METHODS = {
 }
 
 
-@pytest.mark.variants(slow=["hierarchical", "forward"])
+@pytest.mark.variants(release=["saturated"], slow=["hierarchical", "forward"])
 @pytest.mark.parametrize(
     "method", [pytest.param(name, marks=pytest.mark.slow if name == "saturated" else ()) for name in METHODS]
 )
@@ -71,7 +71,7 @@ SCHEMES = {
 }
 
 
-@pytest.mark.variants(release=["saturated", "hierarchical"])
+@pytest.mark.variants(release=["saturated", "hierarchical", "weighted"])
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_where_the_world_is(rng, scheme):

@@ -114,7 +114,9 @@ def test_the_reverse_order_with_the_factors_of_the_kernel(name):
     np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-8)
 
 
-@pytest.mark.variants(release=["level without rows", "repeated and damped"])
+@pytest.mark.variants(
+    release=["level without rows", "repeated and damped", "nothing left", "more rows than variables", "dependent"]
+)
 @pytest.mark.parametrize(
     "name",
     [
@@ -179,7 +181,7 @@ def test_factors_of_rows(rng, m, n, rank, scale, damping):
     np.testing.assert_array_equal(np.tril(triangle, -1), 0.0)
 
 
-@pytest.mark.variants(release=["nothing left-forward", "independent-forward"])
+@pytest.mark.variants(release=["nothing left-forward", "independent-forward", "damped-reverse"])
 @pytest.mark.variants(slow=["damped-reverse"], release=["damped inequalities-saturated", "damped inequalities-forward"])
 @pytest.mark.parametrize(
     ("name", "method"),
@@ -293,7 +295,10 @@ def in_used_memory(request):
     return found
 
 
-@pytest.mark.variants(slow=[f"{method}-{name}" for name in IN_USED_MEMORY[1:] for method in METHODS])
+@pytest.mark.variants(
+    release=["forward-damped, more rows"],
+    slow=[f"{method}-{name}" for name in IN_USED_MEMORY[1:] for method in METHODS],
+)
 @pytest.mark.parametrize("in_used_memory", IN_USED_MEMORY, indirect=True)
 @pytest.mark.parametrize("method", METHODS)
 def test_memory_that_was_used_before_says_nothing(method, in_used_memory):

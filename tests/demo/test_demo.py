@@ -179,7 +179,7 @@ def test_double_support_reaches_its_numbers(sway):
     assert waist[-1, 1] == pytest.approx(0.0, abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_single_support_reaches_its_numbers(lift):
     motion, run = lift
     check_requirements(motion, run, lifted=motion.stances[1].lifted)
