@@ -1,0 +1,61 @@
+"""Tests of the core's solvers, with the core built by AddressSanitizer and UndefinedBehaviorSanitizer."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from osik_jax.core import _build
+
+TESTS = Path(__file__).parents[1]
+SOME = (
+    "core/test_core_qps.py::test_recorded_problems",
+    "core/test_core_qps.py::test_lanes_that_are_left_to_the_search",
+    "core/test_core_hierarchies.py::test_recorded_hierarchies",
+    "core/test_core_null_space.py::test_as_numpy",
+    "core/test_core_null_space.py::test_saturation_of_recorded_problems_whatever_rounding_does",
+    "core/test_core_plans.py::test_the_centre_of_mass_is_kept_as_by_the_plain_method",
+    "kinematics/test_core_kinematics.py::test_beside_mujoco",
+)
+ALL = (
+    *("core/test_core_qps.py", "core/test_core_hierarchies.py", "core/test_core_null_space.py"),
+    *("core/test_core_hard_data.py", "core/test_core_plans.py", "kinematics/test_core_kinematics.py"),
+)
+
+
+def sanitizers(compiler: str) -> str:
+    """Return the libraries that a process which loads the core has to load first; "" if there are none."""
+    found = [
+        subprocess.run([compiler, f"-print-file-name=lib{name}.so"], capture_output=True, text=True).stdout.strip()
+        for name in ("asan", "ubsan")
+    ]
+    return " ".join(found) if all(Path(path).is_absolute() for path in found) else ""
+
+
+@pytest.mark.slow
+@pytest.mark.variants(release=["all"])
+@pytest.mark.parametrize("tests", [SOME, ALL], ids=["some", "all"])
+def test_sanitizers_find_nothing(tests, tmp_path):
+    compiler = shutil.which(os.environ.get("CXX") or "c++")
+    preload = sanitizers(compiler) if compiler and sys.platform == "linux" else ""
+    if not preload:
+        pytest.skip("needs a compiler with libasan and libubsan")
+    library = tmp_path / "core.so"
+    flags = ["-std=c++20", "-O1", "-g", "-Wno-psabi", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
+    text = [str(path) for path in _build.sources() if path.suffix == ".cpp"]
+    command = [str(compiler), *flags, '-DOSIK_SOURCES="sanitized"', "-shared", "-fPIC", *text, "-o", str(library)]
+    subprocess.run(command, check=True)
+    # leaks are those of Python and XLA
+    env = os.environ | dict(LD_PRELOAD=preload, OSIK_CORE_LIBRARY=str(library), ASAN_OPTIONS="detect_leaks=0")
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *tests],
+        cwd=TESTS,
+        env=env,
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 0, (ran.stdout + ran.stderr)[-4000:]
+    assert " passed" in ran.stdout
