@@ -48,6 +48,8 @@ class Retarget:
     """A BVH or AMC file, keypoints as .npz or .csv, or a folder of such files; with --source, motions of that robot."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
+    base: Literal["floating", "fixed"] = "floating"
+    """Whether the base of a robot that comes as a file moves; "fixed" for an upper body, whose arms follow alone."""
     source: str | None = None
     """The robot whose motion CLIP is (motion.npz, or a CSV with --source-fps), by file or name. Default: a person."""
     source_fps: float | None = None
@@ -146,7 +148,7 @@ def _fit(command: Retarget, file: Path) -> None:
         if not os.path.isdir(command.clip):
             raise OsikValueError(f"--fit takes a folder of clips; {command.clip} is none")
         found, learned, held_out = fit_to_file(
-            _robot_to_retarget(command.robot),
+            _robot_to_retarget(command.robot, command.base),
             Path(command.clip),
             file,
             profile=None if command.profile is None else retargeting.load_profile(command.profile),
@@ -167,7 +169,7 @@ def _retargeter(command: Retarget) -> Retargeter:
 
     profile = None if command.profile is None else retargeting.load_profile(command.profile)
     return retargeting.Retargeter(
-        _robot_to_retarget(command.robot),
+        _robot_to_retarget(command.robot, command.base),
         profile=profile,
         acceleration=command.acceleration,
         smoothness=command.smooth,
@@ -248,7 +250,7 @@ def _retarget_live(command: Retarget) -> None:
         if os.path.isdir(command.clip):
             raise OsikValueError(f"--live takes one clip, and {command.clip} is a folder")
         profile = None if command.profile is None else retargeting.load_profile(command.profile)
-        robot, mapping = _robot_to_retarget(command.robot), _mapping(command.mapping)
+        robot, mapping = _robot_to_retarget(command.robot, command.base), _mapping(command.mapping)
 
         def make(standing: retargeting.HumanMotion) -> retargeting.LiveRetargeter:
             return retargeting.LiveRetargeter(
@@ -291,9 +293,10 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
     from ..retargeting._notes import notes
 
     joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
+    soles = {name: "-" if value is None else f"{value:.2f}" for name, value in feet.items()}
     console.print(
-        f"segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {feet['slip_mm_max']:.2f} mm, soles "
-        f"{feet['float_mm_max']:.2f} mm above and {feet['below_floor_mm_max']:.2f} mm below the floor at most, "
+        f"segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {soles['slip_mm_max']} mm, soles "
+        f"{soles['float_mm_max']} mm above and {soles['below_floor_mm_max']} mm below the floor at most, "
         f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
     )
     console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
@@ -301,11 +304,11 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _robot_to_retarget(source: str) -> Robot:
-    """Return a robot by name or file, its base floating."""
+def _robot_to_retarget(source: str, base: str = "floating") -> Robot:
+    """Return a robot by name or file; one that comes with the package is as it is."""
     from ..robot.loading import ROBOTS
 
-    return read_robot(source, "auto" if source in ROBOTS else "floating")
+    return read_robot(source, "auto" if source in ROBOTS else base)
 
 
 def _number_or_name(text: str) -> str | float:

@@ -13,18 +13,20 @@ namespace osik {
 // The arrays of a robot with its profile, in the order of retargeting/_plan_kernel.py.
 struct ClipRobot {
   struct Counts {
-    int bodies, joints, values, full, keys, capsules, above, pairs, bends, most_pairs, root, places, straight, limbs,
-        scalars, quaternions, dofs;
+    int bodies, joints, values, full, keys, capsules, above, pairs, turned, most_pairs, root, places, straight, limbs,
+        reaches, roots, corners, scalars, quaternions, dofs;
   } c;
   const int *parents, *types, *owners, *source, *columns;  // [bodies], [joints] twice, [values], [full]
-  const int *places, *joints, *limbs, *above, *pairs;  // [places] body of each; [dofs] place in q or -1; [limbs, 2] keys;
-                                                       // [above], [pairs, 2] capsules
+  const int *places, *joints, *limbs, *roots;          // [places] body of each; [dofs] place in q or -1; [limbs, 2] keys,
+                                                       // the reaches last; [roots] places, 2 or none
+  const int *above, *pairs;                            // [above], [pairs, 2] capsules
   const int *moves, *scalar, *quaternion;              // [bodies, full] flags; [2, scalars], [2, quaternions]
   const double *coefficient, *offset, *reference, *body_position, *body_quaternion, *joint_position, *joint_axis;
-  const double *factors, *points, *turns, *home, *radii, *lower, *upper, *rest, *step, *change, *mass, *center;
+  const double *factors, *points, *turns, *home, *reach, *rise, *radii;  // [reaches] and [corners] lengths
+  const double *lower, *upper, *rest, *step, *change, *mass, *center;
   enum Weight {
     LIMB, PELVIS, TORSO, ROOT_X, ROOT_Y, ROOT_Z, FOOT, POSTURE, STANCE, APART, LIMIT, MARGIN, STIFFNESS, CLEARANCE,
-    SWINGING, SHORTEST, SMOOTH, SMOOTH_BASE, SPEED, BALANCE, INSIDE, WEIGHTS
+    SWINGING, SHORTEST, TIED, SMOOTH, SMOOTH_BASE, SPEED, BALANCE, INSIDE, WEIGHTS
   };
   double weight[WEIGHTS];
 
@@ -33,14 +35,15 @@ struct ClipRobot {
     __builtin_memcpy(&c, take(sizeof c / sizeof(int)), sizeof c);
     parents = take(c.bodies), types = take(c.joints), owners = take(c.joints), source = take(c.values);
     columns = take(c.full), places = take(c.places), joints = take(c.dofs), limbs = take(2 * c.limbs);
-    above = take(c.above), pairs = take(2 * c.pairs), moves = take(c.bodies * c.full), scalar = take(2 * c.scalars);
+    roots = take(c.roots), above = take(c.above), pairs = take(2 * c.pairs), moves = take(c.bodies * c.full), scalar = take(2 * c.scalars);
     quaternion = take(2 * c.quaternions);
   }
   void read(const double* at) {
     auto take = [&](int count) { return at += count, at - count; };
     coefficient = take(c.values), offset = take(c.values), reference = take(c.values), body_position = take(3 * c.bodies);
     body_quaternion = take(4 * c.bodies), joint_position = take(3 * c.joints), joint_axis = take(3 * c.joints);
-    factors = take(c.full), points = take(3 * c.places), turns = take(36), home = take(36), radii = take(c.capsules);
+    factors = take(c.full), points = take(3 * c.places), turns = take(36), home = take(36), reach = take(c.reaches);
+    rise = take(c.corners), radii = take(c.capsules);
     lower = take(c.dofs), upper = take(c.dofs), rest = take(c.dofs), step = take(c.dofs), change = take(c.dofs);
     mass = take(c.bodies), center = take(3 * c.bodies);
     for (double& w : weight) w = *at++;
@@ -49,7 +52,7 @@ struct ClipRobot {
 
 // Goals of a clip of F frames.
 struct ClipGoals {
-  const double *directions, *pelvis, *torso, *root, *feet, *contact, *present;  // [F, 24], [F, 9], [F, 9], [F, 3],
+  const double *directions, *pelvis, *torso, *root, *feet, *contact, *present;  // [F, 3 limbs], [F, 9], [F, 9], [F, 3],
                                                                                 // [F, 18], [F, 4], [F]
 };
 
@@ -62,8 +65,8 @@ template <class Team> struct ClipFrames {
   using V = Vec3<double>;
   using M = Mat3<double>;
   using R = ClipRobot;
-  static constexpr int ROWS = 61, POINTS = ClipSystem::POINTS, CORNERS = 8;
-  // ROWS without those of capsules and the floor: at most 16 of limbs, 3 and 12 of rotations, 8 and 8 of soles, and some
+  static constexpr int ROWS = 45, POINTS = ClipSystem::POINTS;
+  // ROWS without those of limbs, capsules and the floor: at most 3 and 12 of rotations, 8 and 8 of soles, and some
   Team t;
   R& robot;
   const ClipGoals& goals;
@@ -79,7 +82,7 @@ template <class Team> struct ClipFrames {
   double* J;
 
   static int wide_of(const R::Counts& c) { return Team::stride(c.full); }
-  static int most_of(const R::Counts& c) { return ROWS + 2 * c.above + c.most_pairs; }
+  static int most_of(const R::Counts& c) { return ROWS + 3 * c.limbs + 2 * c.above + c.most_pairs; }
   static size_t doubles(const R::Counts& c, int N) {
     const int wide = wide_of(c);
     return c.values + 12 * c.bodies + 9 * c.full + (7 + c.bodies) * wide + 3 * c.places + 36 + 2 * c.pairs +
@@ -156,15 +159,25 @@ template <class Team> struct ClipFrames {
 
   // ---- goals
   // Directions of limbs. A direction d changes across it by (I - d d') / length times what the segment changes by: two
-  // rows do for the three. A limb shorter than what counts as a length has no row.
+  // rows do for the three. A limb shorter than what counts as a length has no row. A reach is the segment itself, in
+  // units of its length.
   double ask_limbs(const double* wanted) {
     double cost = 0.0;
-    for (int limb = 0; limb + 1 < robot.c.limbs; ++limb) {
+    const int directed = robot.c.limbs - robot.c.reaches;
+    for (int limb = 0; limb < robot.c.limbs; ++limb) {
       const int a = robot.limbs[2 * limb], b = robot.limbs[2 * limb + 1];
       const V segment = point_at(b) - point_at(a);
-      const double length = std::sqrt(inner(segment, segment)), inverse = 1.0 / larger(length, w[R::SHORTEST]);
+      const double length = limb < directed ? std::sqrt(inner(segment, segment)) : robot.reach[limb - directed];
+      const double inverse = 1.0 / larger(length, w[R::SHORTEST]);
       const V d = inverse * segment, off = d - V::of(wanted + 3 * limb);
       cost += 0.5 * w[R::LIMB] * inner(off, off);
+      if (limb >= directed) {
+        for (int k = 0; k < 3; ++k) {
+          add_point(b, inverse * axis(k)), add_point(a, -inverse * axis(k));
+          add_row(std::sqrt(w[R::LIMB]), inner(axis(k), off));
+        }
+        continue;
+      }
       if (length < w[R::SHORTEST]) continue;
       const V first = capsules::across(segment, segment, segment);
       for (const V side : {first, cross(d, first)}) {
@@ -185,9 +198,10 @@ template <class Team> struct ClipFrames {
     }
     return 0.5 * weight * inner(off, off);
   }
-  // Midpoint of the hips.
+  // Midpoint of the hips, or of what stands for them.
   double ask_root(const double* wanted) {
-    const int left = robot.limbs[2 * robot.c.limbs - 2], right = robot.limbs[2 * robot.c.limbs - 1];
+    if (!robot.c.roots) return 0.0;
+    const int left = robot.roots[0], right = robot.roots[1];
     const V off = 0.5 * (point_at(left) + point_at(right)) - V::of(wanted);
     const double residual[3] = {off.x, off.y, off.z};
     double cost = 0.0;
@@ -207,11 +221,11 @@ template <class Team> struct ClipFrames {
   }
   // Soles that stand, and soles and capsules that are below their clearance.
   double ask_floor(const double* contact) {
-    const int sole = robot.c.keys + 4, first = robot.c.keys + 12;
+    const int sole = robot.c.keys + 4, first = first_capsule();
     double cost = 0.0;
-    for (int corner = 0; corner < CORNERS; ++corner) {
+    for (int corner = 0; corner < robot.c.corners; ++corner) {
       const bool stands = contact[corner / 2] > 0.5;
-      const double gap = point_at(sole + corner).z - (stands ? 0.0 : w[R::CLEARANCE]);
+      const double gap = point_at(sole + corner).z - robot.rise[corner] - (stands ? 0.0 : w[R::CLEARANCE]);
       cost += ask_height(sole + corner, gap, stands ? w[R::STANCE] : gap < 0.0 ? w[R::SWINGING] * w[R::STANCE] : 0.0);
     }
     for (int a = 0; a < robot.c.above; ++a)
@@ -222,9 +236,10 @@ template <class Team> struct ClipFrames {
       }
     return cost;
   }
+  int first_capsule() const { return robot.c.keys + 4 + robot.c.corners; }
   Capsule capsule(int i) const {
-    const V start = point_at(robot.c.keys + 12 + 2 * i);
-    return {start, point_at(robot.c.keys + 13 + 2 * i) - start, robot.radii[i]};
+    const int first = first_capsule() + 2 * i;
+    return {point_at(first), point_at(first + 1) - point_at(first), robot.radii[i]};
   }
   Nearest nearest_of(int pair) const { return nearest(capsule(robot.pairs[2 * pair]), capsule(robot.pairs[2 * pair + 1])); }
   // The pairs of capsules that are nearer than the margin, the nearest ones: `close`. Returns how many.
@@ -253,7 +268,7 @@ template <class Team> struct ClipFrames {
   }
   double ask_apart() {
     const double root_weight = std::sqrt(w[R::STIFFNESS] * w[R::APART]);
-    const int found = find_close(), first = robot.c.keys + 12;
+    const int found = find_close(), first = first_capsule();
     double cost = 0.0;
     for (int i = 0; i < found; ++i) {
       const int p = int(close[2 * i]);
@@ -277,14 +292,14 @@ template <class Team> struct ClipFrames {
   // the largest d . corner of the standing corners
   double support(const double* contact, V d) const {
     double farthest = -INFINITE;
-    for (int k = 0; k < CORNERS; ++k)
+    for (int k = 0; k < robot.c.corners; ++k)
       if (contact[k / 2] > 0.5) farthest = larger(farthest, inner(d, point_at(robot.c.keys + 4 + k)));
     return farthest;
   }
   Overhang find_overhang(const double* contact, V center) const {
     const int first = robot.c.keys + 4;
     Overhang o{-INFINITE, INFINITE, {0, 0, 0}, 0, 0, 0.0};
-    for (int i = 0; i < CORNERS; ++i) {
+    for (int i = 0; i < robot.c.corners; ++i) {
       if (!(contact[i / 2] > 0.5)) continue;
       const V start = point_at(first + i), off{center.x - start.x, center.y - start.y, 0.0};
       const double away = std::sqrt(inner(off, off));
@@ -293,7 +308,7 @@ template <class Team> struct ClipFrames {
         const double distance = inner(d, center) - support(contact, d);
         if (distance > o.distance) o.distance = distance, o.direction = d, o.a = o.b = i, o.ratio = 0.0;
       }
-      for (int j = i + 1; j < CORNERS; ++j) {
+      for (int j = i + 1; j < robot.c.corners; ++j) {
         const V end = point_at(first + j), edge{end.x - start.x, end.y - start.y, 0.0};
         const double length = std::sqrt(inner(edge, edge));
         if (!(contact[j / 2] > 0.5) || !(length > w[R::SHORTEST])) continue;
@@ -331,7 +346,7 @@ template <class Team> struct ClipFrames {
   // Where the middles of heels and toes are, x and y in turn, and how dofs move them.
   void stand(double* moving, double* points) {
     const int first = robot.c.keys + 4;
-    for (int i = 0; i < 4; ++i) {
+    for (int i = 0; i < robot.c.corners / 2; ++i) {
       const V middle = 0.5 * (point_at(first + 2 * i) + point_at(first + 2 * i + 1));
       for (int k = 0; k < 2; ++k) {
         add_point_of(robot.places[first + 2 * i], middle, axis(k));
@@ -357,10 +372,12 @@ template <class Team> struct ClipFrames {
   Cost ask(int frame) {  // all rows of a frame with a weight
     row = 0;
     Cost cost;
-    cost.soft += ask_limbs(goals.directions + 24 * frame) + ask_root(goals.root + 3 * frame);
-    cost.soft += ask_rotation(0, goals.pelvis + 9 * frame, w[R::PELVIS]);
-    for (int i = 0; i < 2; ++i) cost.soft += ask_rotation(2 + i, goals.feet + 18 * frame + 9 * i, w[R::FOOT]);
-    if (robot.c.bends) cost.soft += ask_rotation(1, goals.torso + 9 * frame, w[R::TORSO]);
+    auto turned = [&](int i) { return robot.c.turned >> i & 1; };
+    cost.soft += ask_limbs(goals.directions + size_t(3) * robot.c.limbs * frame) + ask_root(goals.root + 3 * frame);
+    if (turned(0)) cost.soft += ask_rotation(0, goals.pelvis + 9 * frame, w[R::PELVIS]);
+    for (int i = 0; i < 2; ++i)
+      if (turned(2 + i)) cost.soft += ask_rotation(2 + i, goals.feet + 18 * frame + 9 * i, w[R::FOOT]);
+    if (turned(1)) cost.soft += ask_rotation(1, goals.torso + 9 * frame, w[R::TORSO]);
     const double* contact = goals.contact + 4 * frame;
     cost.penalty += ask_floor(contact) + ask_apart() + ask_balance(contact);
     return cost;
@@ -385,7 +402,9 @@ template <class Team> struct ClipFrames {
   // Gauss-Newton's system of all frames at the configurations q [F, nq], and its cost.
   Cost ask_clip(const double* q, int frames, int nq, const ClipSystem& out) {
     Cost cost;
-    for (int k = 0; k < POINTS; ++k) tie_weight[2][k] = tie_move[2][k] = 0.0;
+    for (int k = 0; k < POINTS; ++k) tie_weight[2][k] = tie_move[2][k] = at[0][k] = at[1][k] = 0.0;
+    if (!robot.c.corners)
+      for (int e = 0; e < frames * POINTS * N; ++e) out.moving[e] = 0.0;
     for (int f = 0; f < frames; ++f) {
       const int now = f % 2, last = 1 - now;
       const bool there = goals.present[f] != 0.0;
@@ -397,7 +416,7 @@ template <class Team> struct ClipFrames {
         stand(out.moving + f * POINTS * N, at[now]);
       }
       for (int k = 0; k < POINTS; ++k) {
-        const double weight = f > 0 ? w[R::STANCE] * contact[k / 2] * contact[k / 2 - 4] : 0.0;
+        const double weight = f > 0 ? w[R::TIED] * w[R::STANCE] * contact[k / 2] * contact[k / 2 - 4] : 0.0;
         const double move = weight != 0.0 ? at[now][k] - at[last][k] : 0.0;
         out.weight[f * POINTS + k] = tie_weight[now][k] = w[R::STIFFNESS] * weight, tie_move[now][k] = move;
         cost.penalty += 0.5 * weight * move * move;

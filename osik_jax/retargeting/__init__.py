@@ -4,6 +4,7 @@ from ._fit import Fit as Fit
 from ._fit import FitLoss as FitLoss
 from ._fit import fit as fit
 from ._goals import Weights as Weights
+from ._guess import describe_profile as describe_profile
 from ._guess import guess_profile as guess_profile
 from ._live import LiveFrame as LiveFrame
 from ._live import LiveRetargeter as LiveRetargeter

@@ -20,11 +20,12 @@ from ..limits import CollisionAvoidanceLimit
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._contact import stretches
+from ._facing import facing_at_home
 from ._goals import Goals
-from ._person import Person
-from ._profile import Profile
-from ._roles import LIMBS, SIDES
-from ._terms import Bounds
+from ._person import Person, axes_from, directions
+from ._profile import Limb, Profile
+from ._roles import LEGS, SIDES
+from ._terms import Bounds, reach_length
 
 JOINTS_APART = 3
 _CAPSULE = "capsule "
@@ -99,29 +100,31 @@ class Build:
     """Dimensions and limits of a robot with its profile, taken at its home configuration, as NumPy arrays.
 
     Attributes:
+        profile: the robot's profile.
         points: world positions of the keypoints [m]. (3,) each
-        leg: length of thigh and shank, mean of both legs [m].
-        ankle: height of the ankles above the soles [m].
-        hips: vector from the root body's origin to the midpoint of the hips [m]. (3,)
+        size: total length of the limbs that give the scale (``_measured``) [m].
+        ankle: height of the ankles above the soles, or of the pelvis if the robot does not walk [m].
+        root: the point that follows the person's path: midpoint of the hips, or the pelvis without legs [m]. (3,)
+        base: origin of the root body [m]. (3,)
         turn: rotation matrix of the root body. (3, 3)
-        scale: factor on the person's path; None: the ratio of leg lengths times ``stretch``.
-        stretch: factor on the ratio of leg lengths.
+        facing: forward, left and up axes of the robot as columns. (3, 3)
         start: the home configuration with limbs bent (``_with_bent_limbs``). (nq,)
-        base: index of the base's free joint in q.
+        free: index of the base's free joint in q; None: the base is fixed.
         lower: lower joint limits [rad or m]. (nv,)
         upper: upper joint limits [rad or m]. (nv,)
         speed: speed limits [rad/s or m/s]. (nv,)
     """
 
+    profile: Profile
     points: Mapping[str, Float[np.ndarray, "3"]]
-    leg: float
+    size: float
     ankle: float
-    hips: Float[np.ndarray, "3"]
+    root: Float[np.ndarray, "3"]
+    base: Float[np.ndarray, "3"]
     turn: Float[np.ndarray, "3 3"]
-    scale: float | None
-    stretch: float
+    facing: Float[np.ndarray, "3 3"]
     start: Float[np.ndarray, " nq"]
-    base: int
+    free: int | None
     lower: Float[np.ndarray, " nv"]
     upper: Float[np.ndarray, " nv"]
     speed: Float[np.ndarray, " nv"]
@@ -130,36 +133,87 @@ class Build:
     def of(cls, robot: Robot, profile: Profile) -> Build:
         """Measure a robot at its home configuration."""
         kinematics = jax.tree.map(np.asarray, home_kinematics(robot))
-        root = robot.tree.body_names[robot.tree.root]
-        places = [*profile.keypoints.values(), *profile.corners, (root, (0.0, 0.0, 0.0))]
+        root, origin = robot.tree.body_names[robot.tree.root], (0.0, 0.0, 0.0)
+        places = [*profile.keypoints.values(), *profile.corners, (profile.pelvis, origin), (root, origin)]
         positions, turns = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
         positions = positions + np.einsum("kij,kj->ki", turns, np.array([point for _, point in places]))
         points = dict(zip(profile.keypoints, positions, strict=False))
-        soles = positions[len(points) : -1, 2]
-        ankles = [points[f"{side}_ankle"][2] for side in SIDES]
+        lengths = {(a, b): float(np.linalg.norm(points[b] - points[a])) for a, b in _measured(profile)}
+        lengths |= {limb: reach_length(robot, profile, limb) for limb in profile.reached if limb in lengths}
+        ankle = 0.0
+        if profile.feet:
+            ends = profile.standing if len(profile.feet) == 4 else [f"{side}_ankle" for side in SIDES]
+            above = [points[role][2] for role in ends] if profile.walks else positions[-2, 2]
+            ankle = float(np.mean(above) - np.mean(positions[len(points) : -2, 2] - profile.rises))
+        bases = robot.tree.free_bases
         return cls(
+            profile=profile,
             points=points,
-            leg=0.5 * float(sum(np.linalg.norm(points[b] - points[a]) for a, b in LIMBS[:4])),
-            ankle=float(np.mean(ankles) - np.mean(soles)),
-            hips=0.5 * (points["left_hip"] + points["right_hip"]) - positions[-1],
+            size=sum(lengths.values()),
+            ankle=ankle,
+            root=0.5 * (points["left_hip"] + points["right_hip"]) if profile.walks else positions[-2],
+            base=positions[-1],
             turn=turns[-1],
-            scale=profile.scale,
-            stretch=profile.stretch,
+            facing=facing_at_home(robot, profile.across),
             start=_with_bent_limbs(robot, profile),
-            base=robot.tree.qpos_address[robot.tree.free_bases[0]],
+            free=robot.tree.qpos_address[bases[0]] if bases else None,
             lower=np.asarray(robot.position_lower),
             upper=np.asarray(robot.position_upper),
             speed=np.asarray(robot.velocity_limit),
         )
 
+    def seen(self, person: Person) -> Person:
+        """Return the person without the motion that the robot's base cannot follow.
+
+        A walking robot follows the person in the world. A robot on wheels stays upright and follows heading and path. A
+        robot whose feet stay in place follows orientations relative to the heading. A robot with a fixed base follows
+        limbs relative to the trunk: to the pelvis if its own trunk bends, else to the chest.
+        """
+        profile, frames = self.profile, len(person.root)
+        if profile.walks and self.free is not None:
+            return person
+        trunk = person.torso if profile.torso is None else person.pelvis
+        heading = axes_from(trunk[..., 1] * [1.0, 1.0, 0.0], np.array([0.0, 0.0, 1.0]))
+        fixed = self.free is None
+        to = heading if profile.rolls and not fixed else np.broadcast_to(self.facing, trunk.shape)
+        turn = to @ np.swapaxes(trunk if fixed or profile.rolls else heading, 1, 2)
+        root = np.tile(self.root, (frames, 1))
+        root[:, 2] = self.root[2] if fixed else self.ankle
+        if profile.rolls and not fixed:
+            root[:, :2] = self.scale(person) * person.root[:, :2]
+        points = {role: root + np.einsum("fij,fj->fi", turn, at - person.root) for role, at in person.points.items()}
+        return dataclasses.replace(
+            person,
+            points=points,
+            pelvis=turn @ trunk,
+            torso=turn @ person.torso,
+            root=root,
+            feet=turn[:, None] @ person.feet,
+            contact=np.full((frames, 4), bool(profile.feet) and not fixed),
+        )
+
+    def scale(self, person: Person) -> float:
+        """Return the factor on the person's path: the profile's, or the ratio of limb lengths times ``stretch``."""
+        profile = self.profile
+        if profile.scale is not None:
+            return profile.scale
+        return profile.stretch * self.size / sum(person.lengths[limb] for limb in _measured(profile))
+
     def goals(self, person: Person) -> Goals:
-        """Return the goals for a person's motion: the hip path scaled by leg length, with the robot's ankle height."""
-        scale = self.stretch * self.leg / person.leg if self.scale is None else self.scale
-        root = scale * person.root
-        root[:, 2] += self.ankle - scale * person.ankle
+        """Return the goals for a person (``seen``): hip path, ankle height and directions on the robot."""
+        profile, root = self.profile, person.root
+        if profile.walks and self.free is not None:
+            scale = self.scale(person)
+            root = scale * root
+            root[:, 2] += self.ankle - scale * person.ankle
+        reached, followed = profile.reached, profile.followed
+        wanted = directions(person.points, followed)
+        for k, (a, b) in enumerate(reached, len(followed) - len(reached)):
+            wanted[:, k] = (person.points[b] - person.points[a]) / person.lengths[a, b]
         dtype = self.start.dtype
         parts: dict[str, Any] = {  # NumPy's arrays: each one of JAX's would cost more than its numbers
-            **{name: getattr(person, name) for name in ("directions", "pelvis", "torso", "feet")},
+            **{name: getattr(person, name) for name in ("pelvis", "torso", "feet")},
+            "directions": wanted,
             "contact": _firmness(person.contact) if dtype == np.float64 else person.contact,
             "root": root,
             "present": np.ones(len(root)),
@@ -170,9 +224,10 @@ class Build:
         """Return configurations with the start posture in all frames and the pelvis at the goal pose. (F, nq)."""
         turn = np.asarray(goals.pelvis)
         q = np.tile(self.start, (len(turn), 1))
-        base = self.base
-        q[:, base : base + 3] = np.asarray(goals.root) - turn @ self.hips
-        q[:, base + 3 : base + 7] = Rotation.from_matrix(turn @ self.turn).as_quat(scalar_first=True)
+        if self.free is not None:
+            at = self.free
+            q[:, at : at + 3] = np.asarray(goals.root) - turn @ (self.root - self.base)
+            q[:, at + 3 : at + 7] = Rotation.from_matrix(turn @ self.turn).as_quat(scalar_first=True)
         return q
 
     def bounds(self, acceleration: Float[np.ndarray, " nv"], dt: float) -> Bounds:
@@ -181,6 +236,11 @@ class Build:
         step, change = _SHARE * self.speed * dt, _SHARE * np.asarray(acceleration) * dt**2
         parts: list[Any] = [self.lower + inset, self.upper - inset, step, change]
         return Bounds(*(part.astype(self.start.dtype) for part in parts))
+
+
+def _measured(profile: Profile) -> tuple[Limb, ...]:
+    """Return the limbs whose lengths are compared with the person's: the legs, or all limbs without legs."""
+    return LEGS if profile.walks and len(profile.feet) == 2 else profile.reached or profile.followed
 
 
 def _firmness(contact: Bool[np.ndarray, "F 4"]) -> Float[np.ndarray, "F 4"]:
@@ -205,10 +265,11 @@ def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]
     """
     q = np.array(robot.q0)
     scalar, index = scalar_layout(robot)
-    ends = [profile.keypoints[end][0] for _, end in LIMBS]
+    ends = [profile.keypoints[end][0] for _, end in profile.followed]
+    legs = [end.endswith(("knee", "ankle")) for _, end in profile.followed]
     bodies = [robot.tree.frame_bodies[robot.tree.frame(frame)] for frame in ends]
     each = np.asarray(independent_columns(robot.tree, jnp.asarray(robot.tree.moves[bodies], float))).astype(bool)
-    moves, at_end = each.any(0), np.where(each[:4].any(0), _AT_END, _ARM_AT_END)
+    moves, at_end = each.any(0), np.where(each[legs].any(0), _AT_END, _ARM_AT_END)
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     for dof in np.flatnonzero(scalar & moves & np.isfinite(upper - lower)):
         width, home = upper[dof] - lower[dof], q[index[dof]]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from ..kinematics._home import home_kinematics
 from ..robot import Robot
@@ -19,22 +21,35 @@ def by_name(names: list[str]) -> list[str]:
     return names[::-1] if left == [False, True] and right == [True, False] else names
 
 
-def facing_x(robot: Robot, left: str, right: str) -> Robot:
+def facing_at_home(robot: Robot, across: tuple[str, str] | None) -> Float[np.ndarray, "3 3"]:
+    """Return the axes of a robot at home, forward, left and up as columns, to a quarter turn about the vertical.
+
+    Args:
+        robot: the robot.
+        across: a frame of its left side, and one of its right side; None: it faces x.
+    """
+    if across is None:
+        return np.eye(3)
+    kinematics = home_kinematics(robot)
+    left = np.asarray(kinematics.frame_pose(robot, across[0])[0] - kinematics.frame_pose(robot, across[1])[0])
+    quarters = round(float(np.arctan2(left[1], left[0])) / (0.5 * np.pi)) - 1
+    c, s = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters % 4]
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], float)
+
+
+def facing_x(robot: Robot, across: tuple[str, str] | None) -> Robot:
     """Return the robot with its home rotated by quarter turns about the vertical, so that its left points along y.
 
     Args:
-        robot: with a free base.
-        left: name of a frame on its left side.
-        right: name of the mirrored frame on its right side.
+        robot: with a free base; one that is fixed stays as it is.
+        across: as of ``facing_at_home``.
     """
-    kinematics = home_kinematics(robot)
-    across = np.asarray(kinematics.frame_pose(robot, left)[0] - kinematics.frame_pose(robot, right)[0])
-    quarters = round(float(np.arctan2(across[1], across[0])) / (0.5 * np.pi)) - 1
-    if quarters % 4 == 0:
+    facing = facing_at_home(robot, across)
+    if not robot.floating_base or (facing == np.eye(3)).all():
         return robot
-    angle, q = -0.25 * np.pi * quarters, np.array(robot.q0)
-    at = robot.tree.qpos_address[robot.tree.free_bases[0]]
-    c, s, (w, x, y, z) = np.cos(angle), np.sin(angle), q[at + 3 : at + 7]
-    q[at : at + 2] = np.array([[c * c - s * s, -2.0 * c * s], [2.0 * c * s, c * c - s * s]]) @ q[at : at + 2]
-    q[at + 3 : at + 7] = [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
+    q, at = np.array(robot.q0), robot.tree.qpos_address[robot.tree.free_bases[0]]
+    back = Rotation.from_matrix(facing.T)
+    q[at : at + 3] = facing.T @ q[at : at + 3]
+    turned = back * Rotation.from_quat(q[at + 3 : at + 7], scalar_first=True)
+    q[at + 3 : at + 7] = turned.as_quat(scalar_first=True)
     return robot.with_home(q)

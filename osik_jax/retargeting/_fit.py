@@ -24,8 +24,7 @@ from ._motion import HumanMotion
 from ._on_robot import ACCELERATION
 from ._plan import at_solution, make_plan, mend_plan
 from ._profile import Profile
-from ._retarget import Retargeter, checked_by_name
-from ._roles import LIMBS
+from ._retarget import Retargeter
 from ._terms import Body, Bounds, frame_rows
 
 TUNED = ("pelvis", "torso", "root", "foot", "posture", "smooth", "smooth_base")
@@ -206,7 +205,7 @@ class _Setting:
 
         The hip path is scaled by the profile's scale and counted from ankle height.
         """
-        clips = [self.own._read(*checked_by_name(motion, mapping, None)) for motion in (*motions, *held_out)]
+        clips = [self.own._read(*self.own._checked_by_name(motion, mapping, None)) for motion in (*motions, *held_out)]
         length = max(len(clip.start) for clip in clips)
         lift = np.array([0.0, 0.0, self.build.ankle])
         found = []
@@ -252,8 +251,9 @@ class _Setting:
         moved = dataclasses.replace(own, keypoints=keypoints, weights=dataclasses.replace(own.weights, **weights))
         if own.scale is not None:
             return dataclasses.replace(moved, scale=round(own.scale * factor, 4))
-        # moved keypoints change the measured leg length, which the stretch compensates
-        longer = Build.of(self.own.robot, moved).leg / self.build.leg
+        # legs that were measured between other places are of another length
+        # moved keypoints change the measured limb length, which the stretch compensates
+        longer = Build.of(self.own.robot, moved).size / self.build.size
         return dataclasses.replace(moved, stretch=round(own.stretch * factor / longer, 4))
 
 
@@ -330,17 +330,19 @@ def _measured(given: _Given, q: Float[Array, "F nq"]) -> Float[Array, "5"]:
         return positions + rotate(turns, body.offsets), turns[keys : keys + 4]
 
     points, turns = jax.vmap(placed)(q)
-    first, second = (np.array([body.keys.index(limb[i]) for limb in LIMBS]) for i in range(2))
+    first, second = (np.array([limb[i] for limb in body.limbs]) for i in range(2))
     across = points[:, second] - points[:, first]
-    direction = across / jnp.linalg.norm(across, axis=-1, keepdims=True)
+    length = jnp.linalg.norm(across, axis=-1)
+    length = length.at[:, len(first) - len(body.lengths) :].set(body.lengths)
+    direction = across / length[..., None]
     tracking = jnp.sum((direction - goals.directions) ** 2, -1).mean(-1)
     wanted = jnp.stack([goals.pelvis, goals.torso, goals.feet[:, 0], goals.feet[:, 1]], 1) @ body.home
+    asked = np.array(body.turned, int)
     # |R - W|^2 / 2 = 2 - 2 cos of the angle between R and W: its square, up to the fourth power
-    turning = 0.5 * jnp.sum((turns - wanted) ** 2, (-1, -2)).mean(-1)
-    soles = points[:, keys + 4 : keys + 12].reshape(len(q), 4, 2, 3).mean(2)
-    both = goals.contact[1:] * goals.contact[:-1]
-    slip = _weighted_mean(both, jnp.sum((soles[1:] - soles[:-1])[..., :2] ** 2, -1))
+    turning = 0.5 * jnp.sum((turns - wanted)[:, asked] ** 2, (-1, -2)).sum(-1) / max(len(asked), 1)
     rows = jax.vmap(lambda x, goal: frame_rows(body, x, goal, weights, problem.bounds))(q, goals)
+    stance, both = rows.stance.reshape(len(q), 4, 2), goals.contact[1:] * goals.contact[:-1]
+    slip = _weighted_mean(both, jnp.sum((stance[1:] - stance[:-1]) ** 2, -1))
     left = jnp.sum(rows.stiff * rows.residual**2, -1) + jnp.sum(rows.joints.stiff_weight * rows.joints.stiff**2, -1)
     move = jax.vmap(lambda a, b: difference(robot, a, b))(q[:-1], q[1:])[:, scalar_layout(robot)[0]]
     bend = (problem.rate**2 * (move[1:] - move[:-1])) ** 2

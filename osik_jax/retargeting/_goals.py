@@ -19,16 +19,17 @@ class Goals(eqx.Module):
     """Goals of one frame; for a clip every leaf has a leading axis of frames.
 
     Attributes:
-        directions: unit vectors along each of ``LIMBS``. (8, 3)
+        directions: unit vectors along each of the limbs that are followed; of a reach, the vector over its nominal
+            length. (limbs, 3)
         pelvis: axes of the pelvis as columns. (3, 3)
         torso: axes of the chest as columns. (3, 3)
-        root: midpoint of the hips [m]. (3,)
+        root: midpoint of the hips, or the pelvis of a robot without legs [m]. (3,)
         feet: axes of the left and right foot as columns. (2, 3, 3)
-        contact: for left heel, left toe, right heel, right toe: 1 in contact, more in a long contact, else 0. (4,)
+        contact: for each point of ``Profile.standing``: 1 in contact, more in a long contact, else 0. (4,)
         present: 1 for a frame of the clip, 0 for padding behind its end. ()
     """
 
-    directions: Float[Array, "*B 8 3"]
+    directions: Float[Array, "*B limbs 3"]
     pelvis: Float[Array, "*B 3 3"]
     torso: Float[Array, "*B 3 3"]
     root: Float[Array, "*B 3"]

@@ -9,19 +9,20 @@ import re
 import mujoco
 import numpy as np
 
-from .._errors import OsikValueError
+from .._errors import OsikValueError, warn
 from ..kinematics import Kinematics
 from ..kinematics._home import home_kinematics
 from ..physics._world import contact_corners, sole_points
 from ..robot import Robot
 from ..robot._feet import find_feet
 from ..robot._own_masses import own_masses
+from ..robot._tree import BALL, FREE, HINGE
 from ._body import JOINTS_APART, joints_between
 from ._facing import by_name, facing_x
-from ._limbs import ORIGIN, Chain, find_arm, find_chains, find_leg
+from ._limbs import ORIGIN, Chain, Limb, base_body, find_arm, find_chains, find_leg
 from ._link_shapes import by_inertia, by_shapes, is_credible, shrunk
 from ._profile import Capsule, Foot, Place, Point, Profile
-from ._roles import SIDES
+from ._roles import CHAINS, LEGS, LIMBS, NEEDED, SIDES
 
 # A foot without shapes, as shares of half the leg (ankle height: of the leg); the heel's share of its length.
 _FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
@@ -29,6 +30,13 @@ _FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
 # length of a hand as a share of the forearm.
 _LEG_RADIUS, _ARM_RADIUS, _TRUNK_RADIUS = 0.18, 0.18, 0.3
 _HAND = 0.6
+_NO_ARM = r"head|neck|camera|wheel|caster|laser|antenna|tail"
+"""Names of bodies at the ends of what is no arm."""
+_LEAST_ARM = 4
+"""Joints that two bodies have in common where they belong to one arm, at least: a trunk has three at most."""
+_ARMS = ("left_arm", "right_arm")
+_NAMED = 8
+"""Joints that a description names, at most."""
 _LEAST_MASS, _LEAST_SIZE, _THINNEST, _WIDE, _LONG, _SHELL = 3e-3, 1e-3, 0.1, 1.6, 1.15, 1.2
 """Thresholds of capsules: least link mass (share of the robot's), least half thickness [m] and least thickness over
 length, width over thickness above which a trunk gets two capsules, and capsule length and radius over the inertia
@@ -39,79 +47,225 @@ _ROOM = 6e-3
 
 
 def guess_profile(robot: Robot) -> Profile:
-    """Return the profile of a robot with two legs and two arms, as its tree and its home configuration show it.
+    """Return the profile of a robot with limbs of a person, as its tree and its home configuration show it.
 
     Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as the bodies that reach farthest to the
     sides. A knee or elbow is the joint that bends its limb far from both ends. A wrist is the last joint that moves the
     whole hand; if that is the elbow, the wrist is a fixed hand frame, or the far end of the link's mesh or mass. Soles
     are corner frames (``NAME_corner_0`` and so on), boxes or spheres of the feet; a foot without them gets a length
-    after its leg. Check the profile, and save it with ``save_profile`` to edit it.
+    after its leg, or is a point where no joint moves it beside the shank. Check the profile, and save it with
+    ``save_profile`` to edit it.
+
+    A robot may lack legs or arms, and its arms may end at the elbow. With a fixed base its limbs follow the person's
+    beside the trunk. A free base stands on two feet, on four, or on wheels (bodies called ``wheel`` or ``caster``). On
+    four feet, legs follow those of a person or an animal on all fours; where there are arms too, these follow and the
+    feet stay where they are. An ``OsikWarning`` says what is found where that is not two legs and two arms
+    (``describe_profile``).
 
     Raises:
-        ValueError: the base does not float, or two legs and two arms are not found.
+        ValueError: neither two legs nor two arms are found, or a free base has neither feet nor wheels.
     """
-    if not robot.floating_base:
+    tree = robot.tree
+    robot, kinematics, feet = _facing_feet(robot)
+    bodies = [tree.frame_bodies[tree.frame(name)] for name in feet.values()]
+    legs = dict(zip(feet, find_chains(robot, kinematics, bodies), strict=True))
+    arms = _arms(robot, kinematics, {body for leg in legs.values() for body in leg.bodies})
+    if not (arms or legs):
         raise OsikValueError(
-            "a robot that is bolted down cannot walk as a person does: load it with floating_base=True"
+            "neither two arms nor legs of a person are found. A robot that is bolted down needs two arms, one to the "
+            "left and one to the right at home (x forward, y left); one with legs has to be loaded with "
+            "floating_base=True. Else give a profile"
         )
-    kinematics, tree = home_kinematics(robot), robot.tree
-    feet = find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
-    if len(feet) != 2:
-        raise OsikValueError(f"two feet are needed, and {len(feet)} frames look like some: {', '.join(feet) or 'none'}")
-    feet = by_name(sorted(feet, key=lambda name: -_y(kinematics.frame_pose(robot, name)[0])))
-    robot = facing_x(robot, feet[0], feet[1])
-    kinematics = home_kinematics(robot)
-    legs = find_chains(robot, kinematics, [tree.frame_bodies[tree.frame(name)] for name in feet])
-    used = {body for leg in legs for body in leg.bodies}
-    arms = find_chains(robot, kinematics, _hands(robot, kinematics, used))
     keypoints: dict[str, Place] = {}
-    for side, leg, arm in zip(SIDES, legs, arms, strict=True):
-        bodies = dict(zip(("hip", "knee", "ankle"), find_leg(robot, kinematics, leg), strict=True))
-        shoulder, elbow, wrist = find_arm(robot, kinematics, arm)
-        bodies |= dict(shoulder=shoulder, elbow=elbow)
-        keypoints |= {f"{side}_{role}": (tree.body_names[body], ORIGIN) for role, body in bodies.items()}
-        keypoints[f"{side}_wrist"] = wrist
-    trunk = tree.body_parents[arms[0].bodies[0]]
-    root = tree.root
-    found = Profile(
+    found: dict[str, Limb] = {name: find_arm(robot, kinematics, arm) for name, arm in arms.items()}
+    for name, leg in legs.items() if len(legs) == 2 or not arms else ():
+        found[name] = find_leg(robot, kinematics, leg, feet[name], pointed=len(legs) == 4)
+    for name, limb in found.items():
+        side, part = name.split("_")[0], "arm" if name in arms or name.endswith("_front") else "leg"
+        places = zip(CHAINS[part], limb, strict=True)
+        keypoints |= {f"{side}_{role}": place for role, place in places if place is not None}
+    soles = {name: _foot(robot, kinematics, feet[name], leg, found.get(name)) for name, leg in legs.items()}
+    if robot.floating_base and not legs:
+        soles = _wheels(robot, kinematics)
+    profile = Profile(
         keypoints=dict(sorted(keypoints.items())),
-        pelvis=tree.body_names[root],
-        torso=None if trunk == root else tree.body_names[trunk],
-        feet={side: _foot(robot, kinematics, name, leg) for side, name, leg in zip(SIDES, feet, legs, strict=True)},
+        pelvis=tree.frame_names[tree.frame_bodies.index(base_body(robot))],
+        torso=_torso(robot, list(arms.values())),
+        feet=soles if robot.floating_base else {},
+        rolls=robot.floating_base and not legs,
     )
-    return Profile(found.keypoints, found.pelvis, found.torso, found.feet, _capsules(robot, kinematics, found))
+    profile = dataclasses.replace(profile, capsules=_capsules(robot, kinematics, profile))
+    if set(profile.keypoints) != set(NEEDED):
+        warn(f"a profile is guessed: {describe_profile(robot, profile)}")
+    return profile
 
 
-def _y(position) -> float:
-    return float(position[1])
+def describe_profile(robot: Robot, profile: Profile) -> str:
+    """Say in words what of a person a robot's profile has, what it lacks, and which joints follow nothing."""
+    tree, parts = robot.tree, []
+    for side in SIDES:
+        for part, roles in CHAINS.items():
+            known = [role for role in roles if f"{side}_{role}" in profile.keypoints]
+            ends = [role for role in roles if role not in known]
+            end = f" (no {ends[0]})" if ends else ""
+            parts.append(f"{side} {part} to the {known[-1]}{end}" if known else f"no {side} {part}")
+    if not robot.floating_base:
+        parts.append("the base is fixed")
+    else:
+        parts.append("wheels that roll anywhere" if profile.rolls else f"{len(profile.feet)} feet")
+        parts += [] if profile.walks or profile.rolls else ["the feet stay where they are"]
+    parts.append("a trunk that does not turn" if profile.torso is None else f"a trunk that turns {profile.torso}")
+    bodies = [tree.frame_bodies[tree.frame(frame)] for frame in profile.frames]
+    moved = set(np.flatnonzero(tree.descendants[:, bodies].any(1)).tolist())
+    idle = [
+        name
+        for name, body, kind in zip(tree.joint_names, tree.joint_bodies, tree.joint_types, strict=True)
+        if kind != FREE and body not in moved and name in robot.joint_names
+    ]
+    shown = ", ".join(idle[:_NAMED]) + (f" and {len(idle) - _NAMED} more" if len(idle) > _NAMED else "")
+    return "; ".join(parts) + (f"; joints that move nothing of it stay at home: {shown}" if idle else "")
 
 
-def _hands(robot: Robot, kinematics: Kinematics, used: set[int]) -> list[int]:
-    """Return the outermost non-leg bodies that reach farthest to the left and to the right."""
-    tree, position = robot.tree, np.asarray(kinematics.body_position)
-    outermost = sorted(set(range(2, len(tree.body_parents))) - set(tree.body_parents) - used)
-    named = [b for b in outermost if re.search(r"head|neck|camera", tree.body_names[b], re.IGNORECASE) is None]
-    if len(named) < 2:
-        raise OsikValueError(f"two arms are needed; bodies at ends of limbs: {[tree.body_names[b] for b in named]}")
-    left, right = max(named, key=lambda b: position[b, 1]), min(named, key=lambda b: position[b, 1])
-    if not position[left, 1] > 0.0 > position[right, 1]:
+def _facing_feet(robot: Robot) -> tuple[Robot, Kinematics, dict[str, str]]:
+    """Return the robot facing x with its home kinematics, and its feet by their names in a profile, if it has some.
+
+    Raises:
+        ValueError: frames that look like feet are neither two nor four.
+    """
+    tree = robot.tree
+    names = find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
+    kinematics = home_kinematics(robot)
+    if not names:
+        return robot, kinematics, {}
+    if len(names) not in (2, 4):
+        raise OsikValueError(f"two or four feet are needed, and {len(names)} frames look like some: {', '.join(names)}")
+
+    def at(name: str) -> np.ndarray:
+        return np.asarray(kinematics.frame_pose(robot, name)[0])
+
+    lefts = sorted(names, key=lambda name: -at(name)[1])[: len(names) // 2]
+    pairs = []
+    for left in lefts:
+        distances = {other: float(np.linalg.norm(at(other) - at(left))) for other in names if other not in lefts}
+        pairs.append(by_name([left, min(distances, key=distances.__getitem__)]))
+    robot = facing_x(robot, (pairs[0][0], pairs[0][1]))
+    kinematics = home_kinematics(robot)
+    out = {}
+    for row, pair in zip(("", "_front"), sorted(pairs, key=lambda pair: at(pair[0])[0]), strict=False):
+        out |= {f"{side}{row}": name for side, name in zip(SIDES, pair, strict=True)}
+    return robot, kinematics, dict(sorted(out.items()))
+
+
+def _arms(robot: Robot, kinematics: Kinematics, used: set[int]) -> dict[str, Chain]:
+    """Return the arms by side: the non-leg bodies that reach farthest to the left and to the right, heads left out.
+
+    A single arm is the right one, of a robot that has legs, a head or wheels.
+    """
+    tree, position, base = robot.tree, np.asarray(kinematics.body_position), base_body(robot)
+    leaves = set(range(2 if robot.floating_base else 1, len(tree.body_parents))) - set(tree.body_parents) - used
+    ends = [b for b in sorted(leaves) if re.search(_NO_ARM, tree.body_names[b], re.IGNORECASE) is None]
+    if not ends:
+        return {}
+    left, right = max(ends, key=lambda b: position[b, 1]), min(ends, key=lambda b: position[b, 1])
+    # fingers of one hand have an arm in common
+    shared = set(np.flatnonzero(tree.descendants[:, left] & tree.descendants[:, right]).tolist()) - {0, base}
+    try:
+        if len(shared) >= _LEAST_ARM:
+            left = right = max(ends, key=lambda b: float(np.linalg.norm(position[b] - position[base])))
+        if position[left, 1] > 0.0 > position[right, 1]:
+            return dict(zip(_ARMS, find_chains(robot, kinematics, [left, right], 2), strict=True))
+        if left == right and (used or len(ends) < len(leaves)):
+            return {_ARMS[1]: find_chains(robot, kinematics, [left])[0]}
+    except OsikValueError:
+        pass  # too few joints: ears, wipers
+    return {}
+
+
+def _torso(robot: Robot, arms: list[Chain]) -> str | None:
+    """Return the body that the arms hang from, where a joint turns it; None: there is none."""
+    tree = robot.tree
+    base = base_body(robot)
+    trunk = tree.body_parents[arms[0].bodies[0]] if arms else base
+    above = set(np.flatnonzero(tree.descendants[:, trunk]).tolist()) - {0, base}
+    turns = any(
+        body in above and kind in (HINGE, BALL) and joint not in tree.locked
+        for joint, (body, kind) in enumerate(zip(tree.joint_bodies, tree.joint_types, strict=True))
+    )
+    return tree.body_names[trunk] if turns else None
+
+
+def _wheels(robot: Robot, kinematics: Kinematics) -> dict[str, Foot]:
+    """Return the two halves of the rectangle that wheels stand on, at the height of their lowest point, as feet.
+
+    Raises:
+        ValueError: there are no wheels.
+    """
+    tree = robot.tree
+    wheels = [b for b, name in enumerate(tree.body_names) if re.search(r"wheel|caster", name, re.IGNORECASE)]
+    if not wheels:
         raise OsikValueError(
-            "no arm is on the left or on the right of the base; x has to be forward and y left at home"
+            "nothing holds the robot's base: it has no feet and no wheels that are called so. Load it with "
+            "floating_base=False"
         )
-    return [left, right]
+    at = np.asarray(kinematics.body_position)[wheels]
+    radii = np.zeros(len(wheels))
+    for geom, body in enumerate(tree.geom_bodies):
+        if body in wheels:
+            radii[wheels.index(body)] = max(radii[wheels.index(body)], float(robot.geom_size[geom, 0]))
+    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, tree.body_names[tree.root]))
+    # without shapes, the floor is where the root is: base_footprint and its like
+    low = float((at[:, 2] - radii).min() if radii.any() else min(float(position[2]), at[:, 2].min()))
+    rear, front = float(at[:, 0].min()), float(at[:, 0].max())
+    wide = float(np.abs(at[:, 1]).max())
+    front, rear = (front, rear) if front - rear > wide else (rear + wide, rear - wide)
+    feet = {}
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        edges = sorted((0.5 * sign * wide, sign * wide), reverse=True)
+        heel, toe = (_pair((np.array([[x, y, low] for y in edges]) - position) @ rotation) for x in (rear, front))
+        feet[side] = Foot(tree.body_names[tree.root], heel, toe)
+    return feet
 
 
-def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain) -> Foot:
-    """Return the sole's corners, else those of a foot sized after the leg (at height 0 of a frame called a sole)."""
+def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain, limb: Limb | None) -> Foot:
+    """Return the sole's corners, else those of a foot sized after the leg (at height 0 of a frame called a sole).
+
+    A foot that no joint moves beside the shank is a ball about its frame, as large as the sphere that is there.
+    """
+    if limb is None or limb.end == (frame, ORIGIN):
+        return _ball(robot, kinematics, frame)
     corners = _corners(robot, kinematics, frame)
     if len(corners) >= 4:
         ordered = corners[np.argsort(corners[:, 0])]
-        return Foot(frame, *(_pair(part[np.argsort(-part[:, 1])]) for part in (ordered[:2], ordered[-2:])))
+        heel, toe = (_pair(part[np.argsort(-part[:, 1])]) for part in (ordered[:2], ordered[-2:]))
+        return Foot(frame, heel, toe)
     length = float(np.linalg.norm(np.diff(leg.anchors, axis=0), axis=-1).sum())
     foot, width, height = _FOOT_LENGTH * length / 2, _FOOT_WIDTH * length / 2, _FOOT_HEIGHT * length
     height = 0.0 if "sole" in frame.lower() else height
     rear, front = -_HEEL * foot, (1.0 - _HEEL) * foot
-    return Foot(frame, *(_pair(np.array([[x, width, -height], [x, -width, -height]])) for x in (rear, front)))
+    heel, toe = (_pair(np.array([[x, width, -height], [x, -width, -height]])) for x in (rear, front))
+    return Foot(frame, heel, toe)
+
+
+def _ball(robot: Robot, kinematics: Kinematics, frame: str) -> Foot:
+    """Return a round foot: the sphere nearest to a frame on its body, or the frame as a point."""
+    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
+    found = [(float(np.linalg.norm(at - position)), at, radius) for at, radius in _spheres(robot, kinematics, frame)]
+    distance, at, radius = min(found, key=lambda ball: ball[0], default=(0.0, position, 0.0))
+    at, radius = (at, radius) if distance <= 2.0 * radius else (position, 0.0)
+    point = _pair(np.tile((at - position) @ rotation, (2, 1)))
+    return Foot(frame, point, point, round(radius, 6))
+
+
+def _spheres(robot: Robot, kinematics: Kinematics, frame: str) -> list[tuple[np.ndarray, float]]:
+    """Return the centres [m] in the world and the radii [m] of the spheres of a frame's body."""
+    tree, model = robot.tree, robot.mj_model
+    body = tree.frame_bodies[tree.frame(frame)]
+    turn, origin = np.asarray(kinematics.body_rotation[body]), np.asarray(kinematics.body_position[body])
+    return [
+        (origin + turn @ np.asarray(robot.geom_position[geom]), float(robot.geom_size[geom, 0]))
+        for geom in range(model.ngeom)
+        if tree.geom_bodies[geom] == body and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
+    ]
 
 
 def _corners(robot: Robot, kinematics: Kinematics, frame: str) -> np.ndarray:
@@ -119,17 +273,9 @@ def _corners(robot: Robot, kinematics: Kinematics, frame: str) -> np.ndarray:
     for corners in (contact_corners(robot, frame), sole_points(robot, frame)):
         if len(corners):
             return corners
-    tree, model = robot.tree, robot.mj_model
-    body = tree.frame_bodies[tree.frame(frame)]
-    balls = [
-        geom
-        for geom in range(model.ngeom)
-        if tree.geom_bodies[geom] == body and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
-    ]
+    balls = _spheres(robot, kinematics, frame)
     position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-    turn, origin = np.asarray(kinematics.body_rotation[body]), np.asarray(kinematics.body_position[body])
-    points = np.array([origin + turn @ np.asarray(robot.geom_position[g]) for g in balls]).reshape(-1, 3)
-    points[:, 2] -= np.array([float(robot.geom_size[g, 0]) for g in balls])
+    points = np.array([at - [0.0, 0.0, radius] for at, radius in balls]).reshape(-1, 3)
     return (points - position) @ rotation
 
 
@@ -144,10 +290,12 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
     seen = _massive(robot, (profile.pelvis, profile.torso), _frames_of_hands(robot, profile))
     bodies = {tree.frame_bodies[tree.frame(capsule.frame)] for capsule in seen}
 
+    shoulders = [profile.keypoints[f"{side}_shoulder"][0] for side in SIDES if f"{side}_shoulder" in profile.keypoints]
+
     def is_seen(frame: str, end: str | None) -> bool:
         first = tree.frame_bodies[tree.frame(frame)]
-        if end == profile.keypoints["left_shoulder"][0] and frame != end:  # the trunk carries both arms
-            arms = [tree.frame_bodies[tree.frame(profile.keypoints[f"{side}_shoulder"][0])] for side in SIDES]
+        if end in shoulders and frame not in shoulders:  # the trunk carries both arms
+            arms = [tree.frame_bodies[tree.frame(shoulder)] for shoulder in shoulders]
             return bool(
                 bodies & set(np.flatnonzero(tree.descendants[first] & tree.descendants[:, arms].all(1)).tolist())
             )
@@ -160,7 +308,8 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
     plain = _plain_capsules(kinematics, profile, robot)
     missing = [capsule for capsule, end in plain if not is_seen(capsule.frame, end)]
     soles = [kinematics.frame_pose(robot, frame) for frame, _ in profile.corners]
-    floor = min(float((p + R @ np.array(x))[2]) for (p, R), (_, x) in zip(soles, profile.corners, strict=True))
+    corners = zip(soles, profile.corners, profile.rises, strict=True)
+    floor = min((float((p + R @ np.array(x))[2]) - rise for (p, R), (_, x), rise in corners), default=-np.inf)
     return _apart_at_home(robot, kinematics, [*seen, *missing], floor)
 
 
@@ -202,10 +351,12 @@ def _between(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> floa
 def _frames_of_hands(robot: Robot, profile: Profile) -> set[str]:
     """Return the frames moved by the wrists' last joints."""
     tree = robot.tree
-    elbows, wrists = ({tree.frame_bodies[tree.frame(profile.keypoints[f"{side}_{role}"][0])] for side in SIDES}
-                      for role in ("elbow", "wrist"))  # fmt: skip
-    wrists = sorted(wrists - elbows)  # without a wrist joint the hand belongs to the forearm
-    turned = set(np.flatnonzero(tree.descendants[wrists].any(0)).tolist())
+    elbows, wrists = (
+        {tree.frame_bodies[tree.frame(place[0])] for name, place in profile.keypoints.items() if name.endswith(role)}
+        for role in ("elbow", "wrist")
+    )
+    hands = np.array(sorted(wrists - elbows), int)  # without a wrist joint the hand belongs to the forearm
+    turned = set(np.flatnonzero(tree.descendants[hands].any(0)).tolist())
     return {name for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body in turned}
 
 
@@ -314,31 +465,28 @@ def _plain_capsules(kinematics: Kinematics, profile: Profile, robot: Robot) -> l
         position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
         return _pair((np.stack([start, end]) - position) @ rotation)
 
-    out = []
+    out, known = [], profile.keypoints
     for side in SIDES:
-        for a, b, ratio in (
-            ("hip", "knee", _LEG_RADIUS),
-            ("knee", "ankle", _LEG_RADIUS),
-            ("shoulder", "elbow", _ARM_RADIUS),
-            ("elbow", "wrist", _ARM_RADIUS),
-        ):
-            start, end = place(f"{side}_{a}"), place(f"{side}_{b}")
+        limbs = [limb for limb in LIMBS if limb[0].startswith(side) and set(limb) <= set(known)]
+        for a, b in limbs:
+            start, end = place(a), place(b)
             length = float(np.linalg.norm(end - start))
-            radius = ratio * length
+            radius = (_LEG_RADIUS if (a, b) in LEGS else _ARM_RADIUS) * length
             along = (end - start) / length
-            frame = profile.keypoints[f"{side}_{a}"][0]
-            ends = inside(frame, start + radius * along, end - 0.5 * radius * along)
-            out.append((Capsule(frame, *ends, round(radius, 6)), profile.keypoints[f"{side}_{b}"][0]))
-        elbow, wrist = place(f"{side}_elbow"), place(f"{side}_wrist")
-        radius = 1.2 * _ARM_RADIUS * float(np.linalg.norm(wrist - elbow))
-        frame = profile.keypoints[f"{side}_wrist"][0]
-        ends = inside(frame, wrist, wrist + _HAND * (wrist - elbow))
-        out.append((Capsule(frame, *ends, round(radius, 6)), None))
+            ends = inside(known[a][0], start + radius * along, end - 0.5 * radius * along)
+            out.append((Capsule(known[a][0], *ends, round(radius, 6)), known[b][0]))
+        if f"{side}_wrist" in known and len(profile.feet) != 4:
+            elbow, wrist = place(f"{side}_elbow"), place(f"{side}_wrist")
+            radius = 1.2 * _ARM_RADIUS * float(np.linalg.norm(wrist - elbow))
+            frame = known[f"{side}_wrist"][0]
+            ends = inside(frame, wrist, wrist + _HAND * (wrist - elbow))
+            out.append((Capsule(frame, *ends, round(radius, 6)), None))
+    if not {f"{side}_{role}" for side in SIDES for role in ("shoulder", "hip")} <= set(known):
+        return out
     shoulders, hips = ([place(f"{side}_{role}") for side in SIDES] for role in ("shoulder", "hip"))
     top, bottom = 0.5 * (shoulders[0] + shoulders[1]), 0.5 * (hips[0] + hips[1])
     radius = _TRUNK_RADIUS * float(np.linalg.norm(shoulders[0] - shoulders[1]))
     trunk = profile.torso or profile.pelvis
     up = (top - bottom) / np.linalg.norm(top - bottom)
     ends = inside(trunk, bottom + 1.5 * radius * up, top - 0.5 * radius * up)
-    arm = profile.keypoints["left_shoulder"][0]
-    return [*out, (Capsule(trunk, *ends, round(radius, 6)), arm)]
+    return [*out, (Capsule(trunk, *ends, round(radius, 6)), known["left_shoulder"][0])]

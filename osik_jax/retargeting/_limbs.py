@@ -41,73 +41,94 @@ class Chain(NamedTuple):
     anchors: Float[np.ndarray, "k 3"]
 
 
-class Arm(NamedTuple):
-    """Shoulder body, elbow body and wrist place of an arm."""
+class Limb(NamedTuple):
+    """The joints of a limb: hip, knee and ankle, or shoulder, elbow and wrist; None: the limb ends before."""
 
-    shoulder: int
-    elbow: int
-    wrist: Place
+    first: Place
+    bend: Place
+    end: Place | None
 
 
-def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int]) -> list[Chain]:
-    """Return the left and the right limb that end in two given bodies.
+def base_body(robot: Robot) -> int:
+    """Return the body that all limbs hang from: the root of a free base, else the world."""
+    return robot.tree.root if robot.floating_base else 0
+
+
+def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int], least: int = 3) -> list[Chain]:
+    """Return the limbs that end in some bodies, those with ``least`` joints.
 
     Raises:
-        ValueError: a limb has fewer than three joints.
+        ValueError: a limb has fewer joints.
     """
-    left, right = ends
-    return [_chain(robot, kinematics, left, right), _chain(robot, kinematics, right, left)]
+    chains = []
+    for end in ends:
+        others = [other for other in ends if other != end]
+        above = robot.tree.descendants[:, end] & ~robot.tree.descendants[:, np.array(others, int)].any(1)
+        bodies = tuple(int(b) for b in np.flatnonzero(above) if b not in (0, base_body(robot)))
+        if len(bodies) < least:
+            raise OsikValueError(
+                f"the limb that ends in {robot.tree.body_names[end]} has {len(bodies)} joints; it needs {least}"
+            )
+        chains.append(Chain(bodies, np.asarray(kinematics.body_position)[list(bodies)]))
+    return chains
 
 
-def _chain(robot: Robot, kinematics: Kinematics, end: int, other: int) -> Chain:
-    """Return the chain to ``end`` from the first body that is not shared with the other side's limb."""
-    above = robot.tree.descendants[:, end] & ~robot.tree.descendants[:, other]
-    bodies = tuple(int(b) for b in np.flatnonzero(above) if b != robot.tree.root)
-    if len(bodies) < 3:
-        raise OsikValueError(
-            f"the limb that ends in {robot.tree.body_names[end]} has {len(bodies)} joints; it needs three"
-        )
-    return Chain(bodies, np.asarray(kinematics.body_position)[list(bodies)])
-
-
-def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain) -> tuple[int, int, int]:
-    """Return the bodies of hip, knee and ankle.
+def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain, foot: str, *, pointed: bool = False) -> Limb:
+    """Return where a leg bends and where it ends: at its foot, if that is ``pointed`` or no joint moves it.
 
     Raises:
         ValueError: no joint between the ends of the leg bends it.
     """
     knee = _bend(robot, kinematics, leg, 0)
     ankle = None if knee is None else _after(leg.anchors, knee)
-    if knee is None or ankle is None:
+    if knee is not None and ankle is not None and not pointed:
+        return Limb(*(_body(robot, leg.bodies[i]) for i in (max(knee - 2, 0), knee, ankle)))
+    at = np.asarray(kinematics.frame_pose(robot, foot)[0])
+    extended = Chain((*leg.bodies, leg.bodies[-1]), np.concatenate([leg.anchors, at[None]]))
+    knee = _bend(robot, kinematics, extended, 0)
+    if knee is None or not knee:
         raise _stiff(robot, leg)
-    return leg.bodies[max(knee - 2, 0)], leg.bodies[knee], leg.bodies[ankle]
+    return Limb(_body(robot, leg.bodies[knee - 1]), _body(robot, leg.bodies[knee]), (foot, ORIGIN))
 
 
-def find_arm(robot: Robot, kinematics: Kinematics, arm: Chain) -> Arm:
-    """Return the shoulder, elbow and wrist of an arm.
+def find_arm(robot: Robot, kinematics: Kinematics, arm: Chain) -> Limb:
+    """Return where an arm bends and where it ends.
 
-    The elbow is the joint that bends the arm far from the shoulder and from the last joint of the hand; that last joint
-    is the wrist. If no joint between them bends the arm, the wrist is the end of the last link.
+    The elbow is the joint that bends the arm far from the shoulder and from the last joint of the hand, and the wrist
+    is that last joint. Where no joint between them bends the arm, the arm has no wrist joint: the end of its last link
+    is the wrist. Where none bends it so either, the arm ends at the elbow: at its last joint, or at the end of its last
+    link if that is far from there.
 
     Raises:
-        ValueError: no joint bends the arm.
+        ValueError: the arm has no length.
     """
     hand = _hand(robot, arm)
     own = Chain(arm.bodies[: hand + 1], arm.anchors[: hand + 1])
     elbow = _bend(robot, kinematics, own, 1)
     if elbow is not None:
-        return Arm(own.bodies[min(1, elbow - 1)], own.bodies[elbow], (_name(robot, own.bodies[hand]), ORIGIN))
+        return _limb(robot, own, elbow, _body(robot, own.bodies[hand]))
     fingers = [i for i in range(hand + 1, len(arm.bodies)) if _apart(arm.anchors[i], arm.anchors[hand])]
     if fingers:
-        wrist = _name(robot, arm.bodies[fingers[0]]), ORIGIN
-        end = arm.anchors[fingers[0]]
+        wrist, end = _body(robot, arm.bodies[fingers[0]]), arm.anchors[fingers[0]]
     else:
         wrist, end = _end(robot, kinematics, arm, hand)
     extended = Chain((*own.bodies, own.bodies[-1]), np.concatenate([own.anchors, end[None]]))
     elbow = _bend(robot, kinematics, extended, 1)
-    if elbow is None:
+    if elbow is not None:
+        return _limb(robot, own, elbow, wrist)
+    lengths = np.linalg.norm(extended.anchors[-2:] - own.anchors[min(1, hand)], axis=-1)
+    if not lengths.max() > _SAME:
         raise _stiff(robot, arm)
-    return Arm(own.bodies[min(1, elbow - 1)], own.bodies[elbow], wrist)
+    last = _body(robot, own.bodies[-1]) if lengths[0] > (1.0 - _SHORTEST) * lengths[1] else wrist
+    return Limb(_body(robot, own.bodies[min(1, hand)]), last, None)
+
+
+def _limb(robot: Robot, own: Chain, elbow: int, wrist: Place) -> Limb:
+    return Limb(_body(robot, own.bodies[min(1, elbow - 1)]), _body(robot, own.bodies[elbow]), wrist)
+
+
+def _body(robot: Robot, body: int) -> Place:
+    return _name(robot, body), ORIGIN
 
 
 def _name(robot: Robot, body: int) -> str:
@@ -201,7 +222,8 @@ def _end(robot: Robot, kinematics: Kinematics, arm: Chain, last: int) -> tuple[P
         if far:
             nearest = min(far, key=lambda name: (far[name], name))
             return (nearest, ORIGIN), at[nearest]
-    end = _far_end(robot, body, anchor, _MOST_FOREARM / _LEAST_FOREARM * least)
+    most = _MOST_FOREARM / _LEAST_FOREARM * least if least > 0.0 else np.inf  # no upper arm to compare with
+    end = _far_end(robot, body, anchor, most)
     position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, _name(robot, body)))
     x, y, z = np.round((end - position) @ rotation, 6).tolist()
     return (_name(robot, body), (x, y, z)), end

@@ -23,7 +23,6 @@ from ._on_robot import ACCELERATION, OnRobot
 from ._person import measure, read_person
 from ._plan import make_plan, mend_plan
 from ._profile import Profile
-from ._skeletons import find_roles
 from ._stance import Stance, hold_feet
 from ._terms import Body, Bounds
 
@@ -117,7 +116,7 @@ class LiveRetargeter(OnRobot):
     the motion is as close to that of ``Retargeter`` as the look-ahead allows.
 
     Args:
-        robot: with a free base, two legs and two arms; x forward, y left, z up at home.
+        robot: with limbs of a person, see ``guess_profile``; z up at home.
         standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
             height and floor.
         profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
@@ -130,7 +129,7 @@ class LiveRetargeter(OnRobot):
             and those of a plan that violates a bound. None: 60 % of the time between frames.
 
     Raises:
-        ValueError: no two legs and two arms are found, joints are missing, or a number is out of range.
+        ValueError: no limbs are found, nothing holds a free base, joints are missing, or a number is out of range.
         KeyError: the profile, ``mapping`` or ``acceleration`` names something that does not exist.
     """
 
@@ -158,8 +157,8 @@ class LiveRetargeter(OnRobot):
         self.frames_ahead = max(1, round(look_ahead * standing.fps))
         self.iterations, self.budget = int(iterations), _SHARE * self._dt if budget is None else float(budget)
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
-        self._standing, self.roles = standing, find_roles(standing.joint_names, mapping)
-        self._measures = measure(standing, self.roles)
+        self._standing, self.roles = standing, self._roles(standing, mapping)
+        self._measures = measure(standing, self.roles, self.profile.standing)
         self._window_bounds = self._bounds(self._dt)
         self._iteration_seconds = 0.0
         self.reset()
@@ -241,7 +240,8 @@ class LiveRetargeter(OnRobot):
             _filled(seen, self._known),
             contact=contact,
         )
-        person, now = read_person(motion, self.roles, self._measures), self._history
+        own = read_person(motion, self.roles, self._measures, self.profile.standing)
+        person, now = self._build.seen(own), self._history
         goals = jax.tree.map(lambda leaf: leaf[now - _PAST :], self._build.goals(person))
         self._plan = plan = self._advanced(goals, person.contact[now], began)
         off, feet_off, q = float(plan.off), float(plan.feet_off), np.asarray(plan.q[_PAST])
@@ -266,7 +266,8 @@ class LiveRetargeter(OnRobot):
         else:
             before = np.asarray(self._plan.q)
             q = np.concatenate([before[1:], before[-1:]])
-            q[-1, :3] += guess[-1, :3] - guess[-2, :3]
+            if (at := self._build.free) is not None:
+                q[-1, at : at + 3] += guess[-1, at : at + 3] - guess[-2, at : at + 3]
             velocity, stance, damping = self._plan.velocity, self._plan.stance, self._plan.damping
         start, first = time.perf_counter(), self._plan is None
         left = self.budget - (start - began)

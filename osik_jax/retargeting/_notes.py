@@ -32,7 +32,7 @@ def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]
     if balance is not None and margin is not None and margin < 0.0:
         out.append(f"a bound gave way: the centre of mass is {-margin:.1f} mm outside the feet")
     share = figures["feet"]["contact_share"]
-    if share < _LEAST_STANDING:
+    if share is not None and share < _LEAST_STANDING:
         out.append(
             f"feet stand in {100.0 * share:.0f} % of the frames, and nothing holds them elsewhere; where the person "
             "walks or stands, check the unit, the up axis and the contact labels of the clip"

@@ -12,9 +12,11 @@ from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._body import Build, pairs_apart
 from ._facing import facing_x
+from ._motion import HumanMotion
 from ._profile import Profile
 from ._profile_file import check_profile, find_profile
-from ._roles import SIDES
+from ._skeletons import find_roles
+from ._source_motion import SourceMotion
 from ._terms import Body, Bounds
 
 ACCELERATION = 240.0
@@ -24,7 +26,7 @@ class OnRobot:
     """Robot with profile, limits and derived data, computed once for all clips.
 
     Args:
-        robot: robot with a free base, two legs and two arms.
+        robot: the robot.
         profile: the robot's profile. None: a bundled one or a guess (``find_profile``).
         acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         balance: as of ``Retargeter``.
@@ -36,7 +38,7 @@ class OnRobot:
         limits: limits of position, speed and acceleration, which hold exactly.
 
     Raises:
-        ValueError: the base does not float, no two legs and two arms are found, or a number is out of range.
+        ValueError: no limbs are found, nothing holds a free base, or a number is out of range.
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
 
@@ -47,19 +49,36 @@ class OnRobot:
         acceleration: float | Mapping[str, float],
         balance: float | None,
     ):
-        if not robot.floating_base:
-            raise OsikValueError("retargeting moves a robot's base: load the robot with floating_base=True")
         if balance is not None and not (np.isfinite(balance) and balance >= 0.0):
             raise OsikValueError(f"balance is {balance}; it is a length in metres, 0 or more")
         self.balance = balance
         self.profile = find_profile(robot) if profile is None else profile
         check_profile(robot, self.profile)
-        hips = (self.profile.keypoints[f"{side}_hip"][0] for side in SIDES)
-        robot = self.robot = facing_x(robot, *hips)
+        if robot.floating_base and not self.profile.feet:
+            raise OsikValueError(
+                "nothing holds the robot's base: the profile has no feet. Load the robot with floating_base=False, or "
+                "give the profile feet; those of a base on wheels have rolls = true"
+            )
+        if balance is not None and not (self.profile.walks and robot.floating_base):
+            raise OsikValueError("balance is that of a robot on feet; this one has no legs that walk")
+        robot = self.robot = facing_x(robot, self.profile.across)
         self.limits = ConfigurationLimit(robot), VelocityLimit(robot), _on_joints(robot, acceleration)
         self._acceleration = np.asarray(self.limits[2].acceleration)
         self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile), balance)
         self._build = Build.of(robot, self.profile)
+
+    def _roles(self, motion: HumanMotion | SourceMotion, mapping: Mapping[str, str] | None) -> dict[str, str]:
+        """Return the clip's joint for each role, none of a robot; the ends of the limbs to follow have to be there."""
+        needed = tuple(dict.fromkeys(role for limb in self.profile.followed for role in limb))
+        if isinstance(motion, HumanMotion):
+            return find_roles(motion.joint_names, mapping, needed)
+        source = motion.seen
+        missing = [role for role in needed if role not in source.keypoints]
+        if missing:
+            raise OsikValueError(f"the robot that is followed has no {', '.join(missing)}")
+        if self.profile.walks and source.standing != self.profile.standing:
+            raise OsikValueError(f"{len(self.profile.feet)} feet cannot follow {len(source.feet)}: they walk otherwise")
+        return {}
 
     def _bounds(self, dt: float) -> Bounds:
         """Return the joint bounds of a plan with one frame per ``dt`` seconds."""

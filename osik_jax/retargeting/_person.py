@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,7 +12,8 @@ from .._errors import OsikValueError, warn
 from ._contact import find_contact, find_noise
 from ._floor import Floor, find_floor
 from ._motion import CONTACT_POINTS, HumanMotion
-from ._roles import LIMBS, SIDES
+from ._profile import Limb
+from ._roles import LEGS, LIMBS, REACHES, SIDES
 from ._up import find_up
 
 # Vectors shorter than this [m] have no direction; a spine shorter than 1 mm means chest and hips are one joint.
@@ -33,32 +34,46 @@ class Person:
     Attributes:
         fps: frame rate [1/s].
         points: positions by role, heels and toes included [m]. (F, 3) each
-        directions: unit vectors along each of ``LIMBS``. (F, 8, 3)
         pelvis: forward, left and up axes of the pelvis as columns. (F, 3, 3)
         torso: forward, left and up axes of the chest as columns. (F, 3, 3)
-        root: midpoint of the hips [m]. (F, 3)
+        root: midpoint of the hips, or of the shoulders if the hips are unknown [m]. (F, 3)
         feet: forward, left and up axes of the left and right foot as columns. (F, 2, 3, 3)
-        contact: whether left heel, left toe, right heel and right toe stand. (F, 4)
-        leg: length of a leg, thigh and shank [m].
+        contact: whether the points of ``Profile.standing`` stand: left heel, left toe, right heel and right toe, or the
+            four feet of a four-legged robot. (F, 4)
+        lengths: lengths of the limbs and reaches with known ends [m].
         ankle: height of the ankles above the floor when standing [m].
     """
 
     fps: float
     points: Mapping[str, Float[np.ndarray, "F 3"]]
-    directions: Float[np.ndarray, "F 8 3"]
     pelvis: Float[np.ndarray, "F 3 3"]
     torso: Float[np.ndarray, "F 3 3"]
     root: Float[np.ndarray, "F 3"]
     feet: Float[np.ndarray, "F 2 3 3"]
     contact: Bool[np.ndarray, "F 4"]
-    leg: float
+    lengths: Mapping[Limb, float]
     ankle: float
+
+    @property
+    def directions(self) -> Float[np.ndarray, "F limbs 3"]:
+        """Return unit vectors along those of ``LIMBS`` with known ends."""
+        return directions(self.points, [limb for limb in LIMBS if set(limb) <= set(self.points)])
+
+    @property
+    def leg(self) -> float:
+        """Return the length of a leg, thigh and shank [m]."""
+        return 0.5 * float(sum(self.lengths[limb] for limb in LEGS))
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
     """Return vectors scaled to unit length; the x axis where the length is 0. (..., 3)."""
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.where(length > _SHORTEST, vector / np.maximum(length, _SHORTEST), np.eye(3)[0])
+
+
+def directions(points: Mapping[str, np.ndarray], limbs: Sequence[Limb]) -> Float[np.ndarray, "F limbs 3"]:
+    """Return unit vectors along limbs. (F, limbs, 3)."""
+    return unit(np.stack([points[b] - points[a] for a, b in limbs], 1))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -87,15 +102,15 @@ class Measures:
     """Constant measures of a person: leg length, ankle height, floor, noise and reference poses.
 
     Attributes:
-        leg: length of a leg, thigh and shank [m].
-        ankle: height of the ankles above the floor when standing [m].
+        lengths: lengths of the limbs and reaches with known ends [m].
+        ankle: height of the ankles above the floor when standing; 0 if unknown [m].
         floor: the floor under the clip.
-        noise: standard deviation of each coordinate of heels and toes [m].
+        noise: standard deviation of each coordinate of the standing points [m].
         flat: per side, positions of knee, ankle and toe while the foot is flat on the floor [m]. (1, 3) each
         straight: axes of pelvis and chest in the rest pose; None if unknown. (1, 3, 3) each
     """
 
-    leg: float
+    lengths: Mapping[Limb, float]
     ankle: float
     floor: Floor
     noise: float
@@ -103,12 +118,13 @@ class Measures:
     straight: tuple[np.ndarray, np.ndarray] | None
 
 
-def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
+def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, ...] = CONTACT_POINTS) -> Measures:
     """Measure a person and the floor from a clip.
 
     Args:
         motion: the clip.
-        roles: joint name of the clip for each role (``find_roles``).
+        roles: of each of a person's joints, what the clip calls it (``find_roles``).
+        standing: the points that say when feet stand; none where none do.
 
     An ``OsikWarning`` is given if z does not seem to point up.
 
@@ -116,6 +132,44 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
         ValueError: the legs are shorter than 0.1 m or longer than 3 m, so the clip is not in metres.
     """
     points = {role: motion.track(name) for role, name in roles.items()}
+    legs, on_four = _has_legs(points), bool(standing) and standing != CONTACT_POINTS
+    if not on_four:
+        _check_up(motion, roles)
+    straight, flat = None, {}
+    if legs:
+        flat = {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
+    if on_four:
+        turns = _turns(points)
+        middle = np.argsort(turns[0][:, 2, 2], kind="stable")[len(turns[0]) // 2]
+        straight = turns[0][middle, None], turns[1][middle, None]
+    elif motion.rest_positions is not None:
+        at = {role: motion.joint_names.index(name) for role, name in roles.items()}
+        rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
+        flat = {side: {**rest, **_toes(rest, side)} for side in SIDES} if legs else {}
+        straight = _turns(rest)
+    known = [limb for limb in LIMBS if set(limb) <= set(points)]
+    lengths = {(a, b): float(np.linalg.norm(points[b] - points[a], axis=-1).mean()) for a, b in known}
+    reaches = [limb for limb in REACHES if set(limb) <= set(points)]
+    lengths |= {(a, b): float(np.median(np.linalg.norm(points[b] - points[a], axis=-1))) for a, b in reaches}
+    if legs and not on_four:
+        leg = 0.5 * sum(lengths[limb] for limb in LEGS)
+        if not _LEGS[0] < leg < _LEGS[1]:
+            raise OsikValueError(f"the legs of {motion.name} are {leg:.4g} m long; positions are metres")
+    soles = _with_soles(points, flat)
+    found = np.stack([soles[name] for name in standing if name in soles] or [np.zeros((motion.frames, 3))], 1)
+    noise, seen = find_noise(found), all(name in soles for name in standing) and bool(standing)
+    floor = find_floor(found, motion.fps, noise) if motion.ground is None and seen else Floor(motion.ground or 0.0)
+    ends = standing if on_four else ("left_ankle", "right_ankle")
+    ankle = 0.0
+    if set(ends) <= set(points):
+        ankles = floor.leveled(np.stack([points[role] for role in ends], 1), motion.fps)
+        # the height of an ankle over a flat foot; single frames may be lower, so not the minimum
+        ankle = float(np.percentile(ankles[..., 2].min(1), 5))
+    return Measures(lengths, ankle, floor, noise, flat, straight)
+
+
+def _check_up(motion: HumanMotion, roles: Mapping[str, str]) -> None:
+    """Warn if z does not seem to point up."""
     up, other = find_up(motion, "z", roles)
     other = up if up != "z" else other
     if other is not None:
@@ -123,68 +177,81 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
             f"{motion.name}: z is taken to point up, and the motion looks as if {other} did; "
             f"load_motion(path, up={other!r}) and --up={other} turn {other} up"
         )
-    straight, flat = None, {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
-    if motion.rest_positions is not None:
-        at = {role: motion.joint_names.index(name) for role, name in roles.items()}
-        rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
-        flat = {side: {**rest, **_toes(rest, side)} for side in SIDES}
-        straight = _turns(_with_soles(rest, flat))
-    leg = 0.5 * float(sum(np.linalg.norm(points[b] - points[a], axis=-1).mean() for a, b in LIMBS[:4]))
-    if not _LEGS[0] < leg < _LEGS[1]:
-        raise OsikValueError(f"the legs of {motion.name} are {leg:.4g} m long; positions are metres")
-    soles = _with_soles(points, flat)
-    found = np.stack([soles[name] for name in CONTACT_POINTS], 1)
-    noise = find_noise(found)
-    floor = find_floor(found, motion.fps, noise) if motion.ground is None else Floor(motion.ground)
-    ankles = np.stack([points["left_ankle"], points["right_ankle"]], 1)
-    # the height of an ankle over a flat foot; single frames may be lower, so not the minimum
-    ankle = float(np.percentile(floor.leveled(ankles, motion.fps)[..., 2].min(1), 5))
-    return Measures(leg, ankle, floor, noise, flat, straight)
 
 
-def read_person(motion: HumanMotion, roles: Mapping[str, str], measures: Measures | None = None) -> Person:
+def read_person(
+    motion: HumanMotion,
+    roles: Mapping[str, str],
+    measures: Measures | None = None,
+    standing: tuple[str, ...] = CONTACT_POINTS,
+) -> Person:
     """Return the person of a clip.
 
     Args:
         motion: the clip.
         roles: joint name of the clip for each role (``find_roles``).
         measures: measures of the person if the clip is too short to show them; None: measured from the clip.
+        standing: the points whose contact with the floor counts (``Profile.standing``); empty: none.
     """
-    known = measure(motion, roles) if measures is None else measures
+    known = measure(motion, roles, standing) if measures is None else measures
     # a drift counts from the first frame of the measured clip, which another clip does not share
     floor = known.floor if measures is None else dataclasses.replace(known.floor, drift=0.0)
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
     points = {role: floor.leveled(track, motion.fps) for role, track in points.items()}
-    contact = motion.contact
-    if contact is None:
-        soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
+    contact = None if standing != CONTACT_POINTS and "left_toe" in roles else motion.contact
+    if contact is None and standing and set(standing) <= set(points):
+        soles = np.stack([points[name] for name in standing], 1)
         contact = find_contact(soles, motion.fps, 0.0, noise=known.noise)
     turns, straight = _turns(points), known.straight
     pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
+    level = np.broadcast_to(np.eye(3), (motion.frames, 2, 3, 3))
+    root = _middle(points, "hip", "shoulder")
     return Person(
         fps=motion.fps,
         points=points,
-        directions=unit(np.stack([points[b] - points[a] for a, b in LIMBS], 1)),
         pelvis=pelvis,
         torso=torso,
-        root=0.5 * (points["left_hip"] + points["right_hip"]),
-        feet=np.stack([_foot(points, side) for side in SIDES], 1),
-        contact=np.asarray(contact, bool),
-        leg=known.leg,
+        root=root,
+        feet=np.stack([_foot(points, side) for side in SIDES], 1) if _has_legs(points) else level,
+        contact=np.zeros((motion.frames, 4), bool) if contact is None else np.asarray(contact, bool),
+        lengths=known.lengths,
         ankle=known.ankle,
     )
 
 
+def _has_legs(points: Mapping[str, np.ndarray]) -> bool:
+    """Return whether both legs are known from hip to ankle."""
+    return all(role in points for limb in LEGS for role in limb)
+
+
+def _middle(points: Mapping[str, np.ndarray], *parts: str) -> np.ndarray:
+    """Return the midpoint of the left and the right of the first part of which one at least is known. (F, 3)."""
+    for part in parts:
+        found = [points[f"{side}_{part}"] for side in SIDES if f"{side}_{part}" in points]
+        if found:
+            return 0.5 * (found[0] + found[-1])
+    raise OsikValueError(f"none of these is known: {', '.join(parts)}")
+
+
 def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the axes of the pelvis and of the chest as columns. (F, 3, 3) each."""
-    hips = 0.5 * (points["left_hip"] + points["right_hip"])
-    shoulders = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
-    neck = points.get("neck", shoulders)
-    chest = points.get("chest", hips)
-    spine = chest - hips
-    up = np.where(np.linalg.norm(spine, axis=-1, keepdims=True) > _SPINE, spine, neck - hips)
-    pelvis = axes_from(points["left_hip"] - points["right_hip"], up)
-    return pelvis, axes_from(points["left_shoulder"] - points["right_shoulder"], neck - chest)
+    """Return the axes of pelvis and chest as columns; upright if the clip lacks joints. (F, 3, 3) each."""
+    low, vertical = _middle(points, "hip", "shoulder"), np.array([0.0, 0.0, 1.0])
+    high = points["neck"] if "neck" in points else _middle(points, "shoulder", "hip")
+    chest = points.get("chest", low)
+    across = {
+        part: points[f"left_{part}"] - points[f"right_{part}"]
+        for part in ("hip", "shoulder")
+        if f"left_{part}" in points and f"right_{part}" in points
+    }
+
+    def axes(parts: tuple[str, str], up: np.ndarray) -> np.ndarray:
+        up = np.where(np.linalg.norm(up, axis=-1, keepdims=True) > _SPINE, up, vertical)
+        left = next((across[part] for part in parts if part in across), np.broadcast_to(np.eye(3)[1], up.shape))
+        return axes_from(left, up)
+
+    spine = chest - low
+    up = np.where(np.linalg.norm(spine, axis=-1, keepdims=True) > _SPINE, spine, high - low)
+    return axes(("hip", "shoulder"), up), axes(("shoulder", "hip"), high - chest)
 
 
 def _from_rest(axes: np.ndarray, rest: np.ndarray) -> np.ndarray:
@@ -204,7 +271,7 @@ def _with_soles(
 ) -> dict[str, np.ndarray]:
     """Return the points with missing heels and toes added, fixed to the foot as in its flat pose."""
     out = dict(points)
-    for side in SIDES:
+    for side in flat:
         out |= _toes(out, side)
         if f"{side}_heel" not in out:
             out[f"{side}_heel"] = _heel(out, flat[side], side)

@@ -17,10 +17,7 @@ from ..numerics._dense import product
 from ..robot._joint_selection import scalar_layout
 from ._balance import mass_fractions
 from ._goals import Goals, Weights
-from ._roles import LIMBS
 from ._terms import CLEARANCE, PAIRS, SHORTEST, SWINGING, Body, Bounds
-
-_HIPS = ("left_hip", "right_hip")
 
 
 def descended(
@@ -71,7 +68,6 @@ def _structure(body: Body) -> np.ndarray:
     columns, _ = dof_columns(tree)
     scalar, index = scalar_layout(body.robot)
     scalar_q, scalar_v, quaternions = layout(body.robot)
-    limbs = [[body.keys.index(end) for end in limb] for limb in (*LIMBS, _HIPS)]
     counts = dict(
         bodies=len(tree.body_parents),
         joints=len(tree.joint_types),
@@ -81,25 +77,29 @@ def _structure(body: Body) -> np.ndarray:
         capsules=body.radii.shape[-1],
         above=len(body.above),
         pairs=len(body.pairs),
-        bends=int(body.bends),
+        turned=sum(1 << i for i in body.turned),
         most_pairs=min(PAIRS, len(body.pairs)),
         root=tree.root,
         places=len(places),
         straight=int(np.array_equal(columns, np.arange(tree.nv))),
-        limbs=len(limbs),
+        limbs=len(body.limbs),
+        reaches=body.lengths.shape[-1],
+        roots=len(body.roots),
+        corners=body.corners,
         scalars=len(scalar_q),
         turns=len(quaternions),
         dofs=tree.nv,
     )
     parts = [list(counts.values()), tree.body_parents, tree.joint_types, tree.joint_bodies, tree.qpos_source[0]]
-    parts += [columns, places, np.where(scalar, index, -1), limbs, body.above, body.pairs, tree.moves]
+    parts += [columns, places, np.where(scalar, index, -1), body.limbs, body.roots]
+    parts += [body.above, body.pairs, tree.moves]
     parts += [scalar_q, scalar_v, np.array(quaternions).T]
     return np.concatenate([np.asarray(part, np.int32).ravel() for part in parts])
 
 
 def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"]:
     """Return the float arrays of ``ClipRobot``: robot, profile and weights; the stiffness entry is 0. (_, k)."""
-    none = np.zeros(1)
+    none, fixed = np.zeros(1), (0.0, CLEARANCE, SWINGING, SHORTEST, 1.0 - body.rolls)
     balance = (none, none) if body.inside is None else (weights.balance, body.inside)
     robot, ids = body.robot, np.array([body.robot.tree.frame(name) for name in body.frames])
     turned, rotations, w = ids[len(body.keys) : len(body.keys) + 4], robot.frame_rotation, weights
@@ -107,9 +107,8 @@ def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"
     return side_by_side(
         robot.tree.qpos_source[1][None], robot.qpos_offset, robot.joint_reference, robot.body_position,
         robot.body_quaternion, robot.joint_position, robot.joint_axis, dof_columns(robot.tree)[1][None], points,
-        rotations[:, turned], body.home, body.radii, bounds.lower, bounds.upper,
+        rotations[:, turned], body.home, body.lengths, body.rises, body.radii, bounds.lower, bounds.upper,
         robot.q0[:, scalar_layout(robot)[1]], bounds.step, bounds.change, mass_fractions(robot),
         robot.body_com, w.limb, w.pelvis, w.torso, w.root, w.foot,
-        w.posture, w.stance, w.apart, w.limit, w.margin, np.array([[0.0, CLEARANCE, SWINGING, SHORTEST]]), w.smooth,
-        w.smooth_base, w.speed, *balance,
+        w.posture, w.stance, w.apart, w.limit, w.margin, np.array([fixed]), w.smooth, w.smooth_base, w.speed, *balance,
     )  # fmt: skip

@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
-from .._errors import OsikValueError
+from .._errors import OsikValueError, unknown_name
 from ._goals import Weights
-from ._roles import NEEDED, SIDES
+from ._roles import LIMBS, NEEDED, REACHES, STANDING
 
 Point = tuple[float, float, float]
 Place = tuple[str, Point]
 """A frame of the robot, and a point in it [m]."""
+Limb = tuple[str, str]
+"""Two roles, the first and the second end of a limb."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,11 +24,13 @@ class Foot:
         frame: a frame of the robot with x forward and z up when the foot stands.
         heel: the rear left and the rear right corner in that frame [m].
         toe: the front left and the front right corner in that frame [m].
+        radius: radius of a round foot, whose corners are its centre [m].
     """
 
     frame: str
     heel: tuple[Point, Point]
     toe: tuple[Point, Point]
+    radius: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,38 +49,106 @@ class Capsule:
 
 @dataclasses.dataclass(frozen=True)
 class Profile:
-    """Mapping from a person to a robot, with shapes and weights.
+    """A robot as retargeting sees it.
 
     Attributes:
-        keypoints: place on the robot of each of a person's hips, knees, ankles, shoulders, elbows and wrists.
+        keypoints: place on the robot of those of a person's hips, knees, ankles, shoulders, elbows and wrists that it
+            has. A limb may end early or be absent.
         pelvis: the frame that follows the orientation of the person's pelvis; x forward, z up.
         torso: the frame that follows the orientation of the person's chest; None: the robot's trunk is rigid.
-        feet: the left and the right foot.
+        feet: ``left`` and ``right``; ``left_front`` and ``right_front`` too on four feet; empty without feet.
         capsules: shapes that are kept apart and above the floor.
-        scale: factor on the person's path; None: the ratio of leg lengths times ``stretch``.
-        stretch: factor on the ratio of leg lengths.
+        scale: factor on the person's path; None: the ratio of leg lengths (arm lengths without legs) times ``stretch``.
+        stretch: factor on the ratio of lengths.
         weights: weights of the cost terms.
+        limbs: segments whose directions are tracked, as pairs of roles; None: all between keypoints, if they do not end
+            where a reach does.
+        reaches: pairs of roles whose vector is tracked, direction and length, relative to nominal lengths of robot and
+            person; None: hip to ankle and shoulder to wrist of a robot that walks on four feet.
+        rolls: whether the feet are wheels that roll in any direction: they stay on the floor and move along it.
+
+    Raises:
+        ValueError: a limb lacks its beginning, no limb is left, or feet, scale or stretch are invalid.
+        KeyError: a role does not exist.
     """
 
     keypoints: Mapping[str, Place]
     pelvis: str
-    torso: str | None
-    feet: Mapping[str, Foot]
+    torso: str | None = None
+    feet: Mapping[str, Foot] = dataclasses.field(default_factory=dict)
     capsules: tuple[Capsule, ...] = ()
     scale: float | None = None
     stretch: float = 1.0
     weights: Weights = dataclasses.field(default_factory=Weights)
+    limbs: tuple[Limb, ...] | None = None
+    reaches: tuple[Limb, ...] | None = None
+    rolls: bool = False
 
     def __post_init__(self) -> None:
-        missing = [role for role in NEEDED if role not in self.keypoints]
+        hips = "left_hip", "right_hip"
+        missing = [a for a, b in (*LIMBS, hips, hips[::-1]) if b in self.keypoints and a not in self.keypoints]
         if missing:
-            raise OsikValueError(f"the profile has no keypoints {', '.join(missing)}; it needs {', '.join(NEEDED)}")
-        if set(self.feet) != set(SIDES):
-            raise OsikValueError(f"the profile has feet {', '.join(self.feet) or 'none'}; it needs left and right")
+            raise OsikValueError(
+                f"the profile has no keypoints {', '.join(dict.fromkeys(missing))}; a limb begins at a hip or a "
+                "shoulder, and there are two hips or none"
+            )
+        for role in self.keypoints:
+            if role not in NEEDED:
+                raise unknown_name("keypoint", role, NEEDED)
+        for role in (role for limb in (*(self.limbs or ()), *(self.reaches or ())) for role in limb):
+            if role not in self.keypoints:
+                raise unknown_name("keypoint", role, tuple(self.keypoints))
+        if not self.followed:
+            raise OsikValueError("the profile has no limb: give the keypoints of a leg or an arm")
+        if self.feet and tuple(sorted(self.feet)) not in STANDING:
+            known = " or ".join(", ".join(names) for names in STANDING)
+            raise OsikValueError(f"the profile has feet {', '.join(self.feet)}; it has {known}, or none")
         if self.scale is not None and not self.scale > 0.0:
             raise OsikValueError(f"scale is {self.scale}; it is robot over person, more than 0")
         if not self.stretch > 0.0:
             raise OsikValueError(f"stretch is {self.stretch}; it has to be more than 0")
+
+    @property
+    def reached(self) -> tuple[Limb, ...]:
+        """Return the reaches that are tracked."""
+        on_four = REACHES if len(self.feet) == 4 and self.walks else ()
+        return (
+            tuple(limb for limb in on_four if set(limb) <= set(self.keypoints))
+            if self.reaches is None
+            else self.reaches
+        )
+
+    @property
+    def followed(self) -> tuple[Limb, ...]:
+        """Return all limbs that are tracked, the reaches last."""
+        limbs, reached = self.limbs, self.reached
+        if limbs is None:
+            ends = {role for limb in reached for role in limb}
+            limbs = tuple(limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
+        return (*limbs, *reached)
+
+    @property
+    def walks(self) -> bool:
+        """Return whether the robot has legs that walk: feet and hips, and no wheels."""
+        return bool(self.feet) and "left_hip" in self.keypoints and not self.rolls
+
+    @property
+    def standing(self) -> tuple[str, ...]:
+        """Return the four points of a person whose contact with the floor the feet share; none without feet."""
+        return STANDING.get(tuple(sorted(self.feet)), ())
+
+    @property
+    def across(self) -> tuple[str, str] | None:
+        """Return a frame on the left and its mirror on the right; None: no pair of hips or shoulders is known."""
+        pairs = [("left_" + part, "right_" + part) for part in ("hip", "shoulder")]
+        found = [pair for pair in pairs if set(pair) <= set(self.keypoints)]
+        return (self.keypoints[found[0][0]][0], self.keypoints[found[0][1]][0]) if found else None
+
+    @property
+    def turned(self) -> tuple[str, str, str, str]:
+        """Return the frames of pelvis, chest, left and right foot; the pelvis again if one is absent."""
+        left, right = (self.feet[side].frame if side in self.feet else self.pelvis for side in ("left", "right"))
+        return self.pelvis, self.torso or self.pelvis, left, right
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -87,10 +159,24 @@ class Profile:
 
     @property
     def corners(self) -> tuple[Place, ...]:
-        """Return the soles' corners: of the left foot two heel and two toe corners, then of the right foot."""
-        return tuple(
-            (self.feet[side].frame, point)
-            for side in ("left", "right")
-            for part in (self.feet[side].heel, self.feet[side].toe)
-            for point in part
-        )
+        """Return two corners for each point of ``standing``.
+
+        Of two feet, these are the corners of heel and toe; of four, the midpoints of heel and of toe.
+        """
+        parts = []
+        for name in sorted(self.feet):
+            foot = self.feet[name]
+            pairs = (foot.heel, foot.toe) if len(self.feet) == 2 else ((_middle(*foot.heel), _middle(*foot.toe)),)
+            parts += [(foot.frame, point) for pair in pairs for point in pair]
+        return tuple(parts)
+
+    @property
+    def rises(self) -> tuple[float, ...]:
+        """Return the height of each corner above the floor in contact: the radius of its foot [m]."""
+        each = 8 // max(len(self.feet), 1)
+        return tuple(self.feet[name].radius for name in sorted(self.feet) for _ in range(each))
+
+
+def _middle(a: Point, b: Point) -> Point:
+    """Return the midpoint of two points [m]."""
+    return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import tomllib
 from collections.abc import Mapping
@@ -16,8 +17,7 @@ from .._errors import OsikValueError, unknown_name
 from ..robot import Robot
 from ._goals import Weights
 from ._guess import guess_profile
-from ._profile import Capsule, Foot, Place, Point, Profile
-from ._roles import SIDES
+from ._profile import Capsule, Foot, Limb, Place, Point, Profile
 
 BUNDLED = ("nao", "g1", "talos")
 
@@ -67,11 +67,15 @@ def profile_text(profile: Profile) -> str:
     lines += [] if profile.torso is None else [f'torso = "{profile.torso}"']
     lines += [] if profile.scale is None else [f"scale = {profile.scale!r}"]
     lines += [] if profile.stretch == 1.0 else [f"stretch = {profile.stretch!r}"]
+    lines += ["rolls = true"] if profile.rolls else []
+    given = {name: getattr(profile, name) for name in ("limbs", "reaches")}
+    lines += [f"{name} = {json.dumps(limbs)}" for name, limbs in given.items() if limbs is not None]
     lines += ["", "[keypoints]"]
     lines += [f'{role} = {{ frame = "{f}", point = {_point(p)} }}' for role, (f, p) in profile.keypoints.items()]
     for side, foot in profile.feet.items():
         lines += ["", f"[feet.{side}]", f'frame = "{foot.frame}"']
         lines += [f"{part} = [{', '.join(_point(p) for p in getattr(foot, part))}]" for part in ("heel", "toe")]
+        lines += [f"radius = {foot.radius!r}"] if foot.radius else []
     lines += ["", "[weights]"]
     for field in dataclasses.fields(Weights):
         value = np.asarray(getattr(profile.weights, field.name), float)
@@ -89,7 +93,7 @@ def _point(values: Any) -> str:
 def _parsed(text: str, source: str) -> Profile:
     try:
         data = tomllib.loads(text)
-        known = {"pelvis", "torso", "scale", "stretch", "keypoints", "feet", "weights", "capsules"}
+        known = {field.name for field in dataclasses.fields(Profile)}
         for name in data:
             if name not in known:
                 raise unknown_name("entry", name, tuple(sorted(known)))
@@ -97,11 +101,14 @@ def _parsed(text: str, source: str) -> Profile:
             keypoints={role: _place(entry, f"keypoints.{role}") for role, entry in _entry(data, "keypoints").items()},
             pelvis=str(_entry(data, "pelvis")),
             torso=data.get("torso"),
-            feet={side: _foot(_entry(data, "feet"), side) for side in SIDES},
+            feet={name: _foot(entry, name) for name, entry in data.get("feet", {}).items()},
             capsules=tuple(_capsule(entry, i) for i, entry in enumerate(data.get("capsules", ()))),
             scale=data.get("scale"),
             stretch=data.get("stretch", 1.0),
             weights=_weights(data.get("weights", {})),
+            limbs=_limbs(data, "limbs"),
+            reaches=_limbs(data, "reaches"),
+            rolls=data.get("rolls", False) is True,
         )
     except tomllib.TOMLDecodeError as error:
         raise OsikValueError(f"{source} is no TOML: {error}") from None
@@ -127,15 +134,27 @@ def _as_point(value: Any, what: str) -> Point:
     return x, y, z
 
 
-def _foot(feet: Mapping[str, Any], side: str) -> Foot:
-    entry = _entry(feet, side)
+def _limbs(data: Mapping[str, Any], name: str) -> tuple[Limb, ...] | None:
+    pairs = data.get(name)
+    if pairs is None:
+        return None
+    for pair in pairs:
+        if not (isinstance(pair, list) and len(pair) == 2):
+            raise OsikValueError(f"{name} has {pair!r}; a limb is two roles, from the first to the second")
+    return tuple((str(a), str(b)) for a, b in pairs)
+
+
+def _foot(entry: Mapping[str, Any], name: str) -> Foot:
     parts = []
     for part in ("heel", "toe"):
         points = _entry(entry, part)
         if len(points) != 2:
-            raise OsikValueError(f"feet.{side}.{part} has {len(points)} points; it is the left and the right corner")
-        parts.append((_as_point(points[0], f"feet.{side}.{part}"), _as_point(points[1], f"feet.{side}.{part}")))
-    return Foot(str(_entry(entry, "frame")), *parts)
+            raise OsikValueError(f"feet.{name}.{part} has {len(points)} points; it is the left and the right corner")
+        parts.append((_as_point(points[0], f"feet.{name}.{part}"), _as_point(points[1], f"feet.{name}.{part}")))
+    radius = float(entry.get("radius", 0.0))
+    if not radius >= 0.0:
+        raise OsikValueError(f"feet.{name}.radius is {radius}; it is a length in metres, 0 or more")
+    return Foot(str(_entry(entry, "frame")), parts[0], parts[1], radius)
 
 
 def _capsule(entry: Mapping[str, Any], number: int) -> Capsule:

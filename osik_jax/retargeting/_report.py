@@ -12,19 +12,15 @@ from jaxtyping import Bool, Float
 from ..physics._world import frame_pose
 from ..tasks._polygon import hull
 from ._body import JOINTS_APART, joints_between
+from ._contact import stretches
 from ._notes import notes
 from ._places import Places, find_places
 from ._profile import Profile
 from ._retargeted import Retargeted
-from ._roles import LIMBS, SIDES
+from ._roles import CHAINS, SIDES
 
 JUMP = 15.0
-"""Change of a joint's speed between two frames that counts as a jump [rad/s]."""
-_CHAINS = {
-    f"{side}_{limb}": tuple(f"{side}_{role}" for role in roles)
-    for side in SIDES
-    for limb, roles in (("leg", ("hip", "knee", "ankle")), ("arm", ("shoulder", "elbow", "wrist")))
-}
+"""A change of joint speed from one frame to the next that counts as a jump [rad/s]."""
 
 
 def report(result: Retargeted) -> dict[str, Any]:
@@ -45,7 +41,7 @@ def report(result: Retargeted) -> dict[str, Any]:
         "iterations": result.iterations,
         "off_plan_rad": float(result.off_plan.max()),
         "joints": _joints(result),
-        "feet": _feet(places, result.contact, result.motion.fps),
+        "feet": _feet(places, result),
         "balance": _balance(places.soles, places.center, result.contact),
         "shapes": {"penetration_mm_max": _penetration(result, places.capsules)},
         "tracking": _tracking(result, places.keypoints),
@@ -84,28 +80,32 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
-def _feet(places: Places, contact: Bool[np.ndarray, "F 4"], fps: float) -> dict[str, Any]:
-    points = places.standing
+def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
+    """Figures of the feet; None of a robot whose base is fixed or has none, and no slip of wheels."""
+    names = ("contact_share", "slip_mm_max", "float_mm_max", "below_floor_mm_max")
+    if not result.profile.feet or not result.robot.floating_base:
+        return dict.fromkeys(names)
+    points, contact = places.standing, result.contact
     slip = [0.0]
     for k in range(4):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], contact[:, k], [False]]).astype(int)))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
+        for start, end in stretches(contact[:, k]):
             track = points[start:end, k, :2]
             slip.append(float(np.linalg.norm(track - track[0], axis=-1).max()))
     heights = points[..., 2][contact]
-    return {
-        "contact_share": float(contact.any(1).mean()),
-        "slip_mm_max": 1e3 * max(slip),
-        "float_mm_max": 1e3 * float(max(0.0, heights.max(initial=0.0))),
-        "below_floor_mm_max": 1e3 * float(max(0.0, -places.soles[..., 2].min())),
-    }
+    values = (
+        float(contact.any(1).mean()),
+        None if result.profile.rolls else 1e3 * max(slip),
+        1e3 * float(max(0.0, heights.max(initial=0.0))),
+        1e3 * float(max(0.0, -places.soles[..., 2].min())),
+    )
+    return dict(zip(names, values, strict=True))
 
 
 def _balance(
     corners: Float[np.ndarray, "F 8 3"], center: Float[np.ndarray, "F 3"], contact: Bool[np.ndarray, "F 4"]
 ) -> dict[str, Any]:
     margins = []
-    both = contact[:, :2].any(1) & contact[:, 2:].any(1)
+    both = contact[:, :2].any(1) & contact[:, 2:].any(1) & (corners.shape[1] > 0)
     for f in np.flatnonzero(both):
         polygon = hull(corners[f, np.repeat(contact[f], 2), :2])
         if polygon is not None:
@@ -173,11 +173,15 @@ def _place(model: mujoco.MjModel, data: mujoco.MjData, ends: Float[np.ndarray, "
 def _tracking(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) -> dict[str, Any]:
     person = {name: result.human[:, k] for k, name in enumerate(result.human_names)}
     errors = {}
-    for name, (first, *others) in _CHAINS.items():
-        h, r = (np.concatenate([points[o] - points[first] for o in others]) for points in (person, robot))
-        scale = np.sum(h * r) / np.sum(h * h)
-        errors[name] = 1e3 * float(np.linalg.norm(scale * h - r, axis=-1).mean())
-    angles = {f"{a}-{b}": _angle(person[b] - person[a], robot[b] - robot[a]) for a, b in LIMBS}
+    for name, roles in ((f"{side}_{limb}", roles) for side in SIDES for limb, roles in CHAINS.items()):
+        side = name.split("_")[0]
+        first, *others = [role for part in roles if (role := f"{side}_{part}") in robot and role in person] or [""]
+        if others:
+            h, r = (np.concatenate([points[o] - points[first] for o in others]) for points in (person, robot))
+            scale = np.sum(h * r) / np.sum(h * h)
+            errors[name] = 1e3 * float(np.linalg.norm(scale * h - r, axis=-1).mean())
+    limbs = result.profile.followed
+    angles = {f"{a}-{b}": _angle(person[b] - person[a], robot[b] - robot[a]) for a, b in limbs}
     return {
         "limb_error_mm": errors,
         "limb_error_mm_mean": float(np.mean(list(errors.values()))),

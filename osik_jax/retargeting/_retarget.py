@@ -38,7 +38,6 @@ from ._person import read_person
 from ._plan import make_plan
 from ._profile import Profile
 from ._retargeted import Retargeted, as_retargeted
-from ._skeletons import find_roles
 from ._source_motion import SourceMotion
 
 Source = HumanMotion | SourceMotion
@@ -49,7 +48,7 @@ class Retargeter(OnRobot):
     """Retargeter for any number of clips to one robot; data that does not depend on the clip is computed once.
 
     Args:
-        robot: robot with a free base, two legs and two arms; x forward, y left, z up at home.
+        robot: robot with limbs of a person (``guess_profile``), z up at home.
         profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
         acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         smoothness: time below which motion is smoothed out [s]: its fourth power is added to the weight of
@@ -59,7 +58,7 @@ class Retargeter(OnRobot):
         max_iterations: largest number of iterations of the plan.
 
     Raises:
-        ValueError: no two legs and two arms are found, or a number is out of range.
+        ValueError: no limbs are found, nothing holds a free base, or a number is out of range.
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
 
@@ -117,7 +116,7 @@ class Retargeter(OnRobot):
         Raises:
             ValueError, KeyError: as of ``retarget``; the message starts with the clip's name.
         """
-        checked = [checked_by_name(motion, mapping, fps) for motion in motions]
+        checked = [self._checked_by_name(motion, mapping, fps) for motion in motions]
         if out is None and one_a_core():
             with ThreadPoolExecutor(cores()) as pool, reported(len(checked), 0, progress, "clips") as advance:
                 made = []
@@ -148,11 +147,28 @@ class Retargeter(OnRobot):
 
     def _prepared(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
         """Return a clip as arrays for planning, after checking it."""
-        return self._read(*_checked(motion, mapping, fps))
+        return self._read(*self._checked(motion, mapping, fps))
+
+    def _checked(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+        """Return a clip at the requested rate and its joints by role; raise ValueError if it cannot be retargeted."""
+        motion = motion if fps is None else motion.resampled(fps)
+        if motion.frames < 3:
+            raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
+        return motion, self._roles(motion, mapping)
+
+    def _checked_by_name(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+        try:
+            return self._checked(motion, mapping, fps)
+        except (ValueError, KeyError) as error:
+            raise type(error)(f"{motion.name}: {error.args[0]}") from error
 
     def _read(self, motion: Source, roles: Mapping[str, str]) -> Clip:
         """Return a checked clip as arrays for planning; ``roles`` maps roles to the clip's joint names."""
-        person = motion.person() if isinstance(motion, SourceMotion) else read_person(motion, roles)
+        if isinstance(motion, SourceMotion):
+            own = motion.person()
+        else:
+            own = read_person(motion, roles, standing=self.profile.standing)
+        person = self._build.seen(own)
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
         dt = 1.0 / motion.fps
@@ -195,21 +211,6 @@ class Retargeter(OnRobot):
         return dataclasses.replace(made, iterations=int(solved.iterations), cost=cost)
 
 
-def _checked(motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
-    """Return a clip at the requested rate and its joints by role, or raise ValueError if it cannot be retargeted."""
-    motion = motion if fps is None else motion.resampled(fps)
-    if motion.frames < 3:
-        raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
-    return motion, {} if isinstance(motion, SourceMotion) else find_roles(motion.joint_names, mapping)
-
-
-def checked_by_name(motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
-    try:
-        return _checked(motion, mapping, fps)
-    except (ValueError, KeyError) as error:
-        raise type(error)(f"{motion.name}: {error.args[0]}") from error
-
-
 def retarget(
     robot: Robot,
     motion: Source,
@@ -231,7 +232,7 @@ def retarget(
     remaining distance.
 
     Args:
-        robot: robot with a free base, two legs and two arms; x forward, y left, z up at home.
+        robot: robot with limbs of a person (``guess_profile``), z up at home.
         motion: clip of a person, or of another robot (``SourceMotion``).
         profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
         mapping: role to joint name of the clip, see ``find_roles``. None: by common names.
@@ -243,8 +244,8 @@ def retarget(
         max_iterations: largest number of iterations of the plan.
 
     Raises:
-        ValueError: the clip has fewer than three frames or lacks a needed joint, or the robot does not have two legs
-            and two arms.
+        ValueError: the clip has fewer than three frames or lacks a needed joint, or the robot has no limbs of a
+            person.
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
     own = Retargeter(

@@ -25,7 +25,8 @@ class RobotMotion:
     Attributes:
         fps: frame rate [1/s].
         joint_names: joints of the columns of ``qpos`` after the seven of the free joint.
-        qpos: position of the base [m], its quaternion w x y z, then one number per joint [rad or m]. (F, 7 + joints)
+        qpos: position of the base [m], its quaternion w x y z, then one number per joint [rad or m]; of a robot whose
+            base is fixed the joints alone. (F, 7 + joints) or (F, joints)
         contact: whether left heel, left toe, right heel and right toe stand; None: unknown. (F, 4)
 
     Raises:
@@ -38,22 +39,28 @@ class RobotMotion:
     contact: Bool[np.ndarray, "F 4"] | None = None
 
     def __post_init__(self) -> None:
-        if self.qpos.ndim != 2 or self.qpos.shape[1] != 7 + len(self.joint_names) or not len(self.qpos):
+        joints = len(self.joint_names)
+        if self.qpos.ndim != 2 or self.qpos.shape[1] not in (joints, 7 + joints) or not len(self.qpos):
             raise OsikValueError(
-                f"qpos has shape {self.qpos.shape}, expected (F, {7 + len(self.joint_names)}): the free joint's seven "
-                f"numbers and {len(self.joint_names)} joints"
+                f"qpos has shape {self.qpos.shape}, expected (F, {7 + joints}): the free joint's seven numbers and "
+                f"{joints} joints; or (F, {joints}), where the base is fixed"
             )
         if not np.isfinite(self.qpos).all():
             raise OsikValueError(f"qpos is not finite in frame {int(np.argwhere(~np.isfinite(self.qpos))[0][0])}")
         off = np.abs(np.linalg.norm(self.qpos[:, 3:7], axis=1) - 1.0)
         # tolerance for the rounding of numbers in files
-        if off.max() > 1e-3:
+        if self.is_free and off.max() > 1e-3:
             raise OsikValueError(
                 f"the base's quaternion (columns 3 to 6) is not of unit length in frame {off.argmax()}"
             )
         check_rate(self.fps)
         if self.contact is not None and np.shape(self.contact) != (len(self.qpos), 4):
             raise OsikValueError(f"contact has shape {np.shape(self.contact)}, expected {(len(self.qpos), 4)}")
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the base moves, by the free joint's columns."""
+        return self.qpos.shape[1] > len(self.joint_names)
 
     def resampled(self, fps: float) -> RobotMotion:
         """Return the motion at another rate: linear interpolation of joints, spherical interpolation of the base.
@@ -66,7 +73,8 @@ class RobotMotion:
         before, part = instants(len(self.qpos), self.fps, fps)
         low, high = self.qpos[before], self.qpos[before + 1]
         qpos = low + part[:, None] * (high - low)
-        qpos[:, 3:7] = slerp(low[:, 3:7], high[:, 3:7], part)
+        if self.is_free:
+            qpos[:, 3:7] = slerp(low[:, 3:7], high[:, 3:7], part)
         contact = self.contact
         if contact is not None:
             contact = np.where((part < 0.5)[:, None], contact[before], contact[before + 1])
@@ -84,12 +92,14 @@ def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> R
     tree = robot.tree
     index, coefficient = tree.qpos_source
     qpos = q[:, index] * coefficient + np.asarray(robot.qpos_offset)
-    joints = [j for j, kind in enumerate(tree.joint_types) if kind != FREE]
-    (base,) = tree.free_bases
-    addresses = tree.full_qpos_address
-    at = int(addresses[base])
-    columns = [*range(at, at + 7), *(int(addresses[j]) for j in joints)]
-    return RobotMotion(float(fps), joints_in_mujoco_order(robot), qpos[:, columns])
+    joints = [int(tree.full_qpos_address[j]) for j, kind in enumerate(tree.joint_types) if kind != FREE]
+    return RobotMotion(float(fps), joints_in_mujoco_order(robot), qpos[:, [*base_columns(robot), *joints]])
+
+
+def base_columns(robot: Robot) -> list[int]:
+    """Return where the free joint's seven numbers are in a configuration of MuJoCo's model; none for a fixed base."""
+    tree = robot.tree
+    return [int(tree.full_qpos_address[base]) + k for base in tree.free_bases for k in range(7)]
 
 
 def load_robot_motion(
@@ -120,18 +130,20 @@ def load_robot_motion(
     if not source.is_file():
         raise FileNotFoundError(f"no such file: {source}")
     rows = [_numbers(source, number, line) for number, line in enumerate(source.read_text().splitlines(), 1) if line]
-    ragged = [number for number, row in enumerate(rows, 1) if len(row) != 7 + len(joint_names)]
+    joints = len(joint_names)
+    fixed = bool(rows) and len(rows[0]) == joints
+    ragged = [number for number, row in enumerate(rows, 1) if len(row) != joints + 7 * (not fixed)]
     if ragged:
-        raise OsikValueError(
-            f"{source}, line {ragged[0]}: {len(rows[ragged[0] - 1])} numbers, not {7 + len(joint_names)}"
-        )
+        raise OsikValueError(f"{source}, line {ragged[0]}: {len(rows[ragged[0] - 1])} numbers, not {7 + joints}")
     values = np.array(rows).reshape(len(rows), -1)
-    return RobotMotion(fps, tuple(joint_names), values[:, [0, 1, 2, 6, 3, 4, 5, *range(7, values.shape[1])]])
+    base = [] if fixed else [0, 1, 2, 6, 3, 4, 5]
+    return RobotMotion(fps, tuple(joint_names), values[:, [*base, *range(len(base), values.shape[1])]])
 
 
 def write_csv(motion: RobotMotion, path: str | os.PathLike[str]) -> None:
     """Write the CSV layout of GMR and mjlab: position, quaternion x y z w, joints; no headings."""
-    columns = [0, 1, 2, 4, 5, 6, 3, *range(7, motion.qpos.shape[1])]
+    base = [0, 1, 2, 4, 5, 6, 3] if motion.is_free else []
+    columns = [*base, *range(len(base), motion.qpos.shape[1])]
     np.savetxt(path, motion.qpos[:, columns], fmt="%.9g", delimiter=",")
 
 

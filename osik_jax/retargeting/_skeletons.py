@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from .._errors import OsikValueError, unknown_name
 from ._roles import NEEDED, OPTIONAL, SIDES
@@ -44,7 +44,9 @@ Part = tuple[str, str]
 """Side ("" for the trunk) and word of the tables."""
 
 
-def find_roles(joint_names: tuple[str, ...], mapping: Mapping[str, str] | None = None) -> dict[str, str]:
+def find_roles(
+    joint_names: tuple[str, ...], mapping: Mapping[str, str] | None = None, needed: Sequence[str] = NEEDED
+) -> dict[str, str]:
     """Return the clip's joint for each of a person's roles.
 
     Names are compared without case and separators, with the word for the side (``left``, ``l``) before or after. A
@@ -53,6 +55,7 @@ def find_roles(joint_names: tuple[str, ...], mapping: Mapping[str, str] | None =
     Args:
         joint_names: joint names of the clip.
         mapping: role (``ROLES``) to joint name of the clip; None: inferred from the names.
+        needed: roles that have to be found.
 
     Returns:
         role to joint name of the clip.
@@ -62,14 +65,14 @@ def find_roles(joint_names: tuple[str, ...], mapping: Mapping[str, str] | None =
         ValueError: joints that retargeting needs are not found; the message says which are, and which are not.
     """
     if mapping is not None:
-        return _checked(joint_names, mapping)
+        return _checked(joint_names, mapping, needed)
     groups: dict[str, dict[Part, str]] = {}
     for name in joint_names:
         for prefix, part in _readings(_plain(name)):
             groups.setdefault(prefix, {}).setdefault(part, name)
     found = [_assigned(groups[prefix]) for prefix in sorted(groups, key=len)]
-    best = max(found, key=lambda roles: (sum(role in roles for role in NEEDED), len(roles)), default={})
-    _check_complete(joint_names, best)
+    best = max(found, key=lambda roles: (sum(role in roles for role in needed), len(roles)), default={})
+    _check_complete(joint_names, best, needed)
     return best
 
 
@@ -138,18 +141,18 @@ def _trunk(parts: Mapping[str, str]) -> dict[str, str]:
     return {role: parts[there[0]] for role, own in words.items() if (there := [word for word in own if word in parts])}
 
 
-def _checked(joint_names: tuple[str, ...], mapping: Mapping[str, str]) -> dict[str, str]:
+def _checked(joint_names: tuple[str, ...], mapping: Mapping[str, str], needed: Sequence[str]) -> dict[str, str]:
     for role, name in mapping.items():
         if role not in ROLES:
             raise unknown_name("role", role, ROLES)
         if name not in joint_names:
             raise unknown_name("joint of the clip", name, joint_names)
-    _check_complete(joint_names, mapping)
+    _check_complete(joint_names, mapping, needed)
     return dict(mapping)
 
 
-def _check_complete(joint_names: tuple[str, ...], roles: Mapping[str, str]) -> None:
-    missing = [role for role in NEEDED if role not in roles]
+def _check_complete(joint_names: tuple[str, ...], roles: Mapping[str, str], needed: Sequence[str]) -> None:
+    missing = [role for role in needed if role not in roles]
     if missing:
         found = ", ".join(f"{role}={name}" for role, name in roles.items()) or "none"
         others = [name for name in joint_names if name not in roles.values()]

@@ -13,13 +13,12 @@ from ..robot import Robot
 from ._contact import find_contact, find_noise
 from ._facing import facing_x
 from ._floor import Floor, find_floor
-from ._motion import CONTACT_POINTS
-from ._person import Person, unit
+from ._person import Person
 from ._places import find_places
 from ._profile import Profile
 from ._profile_file import check_profile, find_profile
-from ._robot_motion import RobotMotion, joints_in_mujoco_order, load_robot_motion
-from ._roles import LIMBS, SIDES
+from ._robot_motion import RobotMotion, base_columns, joints_in_mujoco_order, load_robot_motion
+from ._roles import LIMBS, REACHES, SIDES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +42,11 @@ class SourceMotion:
     name: str = "robot"
 
     def __post_init__(self) -> None:
-        if not self.robot.floating_base:
-            raise OsikValueError("a source has a base that moves: load the robot with floating_base=True")
+        if self.robot.floating_base != self.motion.is_free:
+            raise OsikValueError(
+                f"the base of the motion {'moves' if self.motion.is_free else 'is fixed'}: load the robot with "
+                f"floating_base={self.motion.is_free}"
+            )
         known = joints_in_mujoco_order(self.robot)
         for name in self.motion.joint_names:
             if name not in known:
@@ -63,49 +65,56 @@ class SourceMotion:
         """Return the number of frames."""
         return len(self.motion.qpos)
 
+    @property
+    def seen(self) -> Profile:
+        """The profile that it has, also where none was given."""
+        assert self.profile is not None  # since it was made
+        return self.profile
+
     def resampled(self, fps: float) -> SourceMotion:
         """Return the motion at another rate; see ``HumanMotion.resampled``."""
         return dataclasses.replace(self, motion=self.motion.resampled(fps))
 
     def person(self) -> Person:
         """Return the robot's motion as that of a person: limb directions, trunk and foot orientations, contacts."""
-        profile, fps = self.profile, self.motion.fps
-        assert profile is not None
-        hips = (profile.keypoints[f"{side}_hip"][0] for side in SIDES)
-        home = np.asarray(self.robot.mujoco_qpos(facing_x(self.robot, *hips).q0))
+        profile, fps = self.seen, self.motion.fps
+        home = np.asarray(self.robot.mujoco_qpos(facing_x(self.robot, profile.across).q0))
         found = find_places(self.robot, profile, np.concatenate([home[None], self._qpos(home)]))
         upright = {role: track[0] for role, track in found.keypoints.items()}
-        ankles, soles = np.mean([upright[f"{side}_ankle"][2] for side in SIDES]), found.soles[0, :, 2].mean()
+        ends = profile.standing if len(profile.feet) == 4 else [f"{side}_ankle" for side in SIDES]
+        ankle = 0.0
+        if profile.walks:
+            ankle = float(np.mean([upright[role][2] for role in ends]) - found.soles[0, :, 2].mean())
         standing, contact = found.standing[1:], self.motion.contact
-        noise, floor = find_noise(standing), Floor(0.0)
-        if contact is None:
-            floor = find_floor(standing, fps, noise)
+        floor = Floor(0.0)
         points = {role: track[1:] for role, track in found.keypoints.items()}
-        points |= {role: standing[:, k] for k, role in enumerate(CONTACT_POINTS)}
+        if profile.feet and contact is None:
+            noise = find_noise(standing)
+            floor = find_floor(standing, fps, noise)
+            contact = find_contact(floor.leveled(standing, fps), fps, 0.0, noise=noise)
+        if len(profile.feet) == 2:
+            points |= {role: standing[:, k] for k, role in enumerate(profile.standing)}
         points = {role: floor.leveled(track, fps) for role, track in points.items()}
-        if contact is None:
-            leveled = np.stack([points[role] for role in CONTACT_POINTS], 1)
-            contact = find_contact(leveled, fps, 0.0, noise=noise)
         turns = found.turns[1:] @ np.swapaxes(found.turns[0], -1, -2)
+        limbs = [limb for limb in (*LIMBS, *REACHES) if set(limb) <= set(upright)]
+        middle = [points[f"{side}_{'hip' if 'left_hip' in points else 'shoulder'}"] for side in SIDES]
         return Person(
             fps=fps,
             points=points,
-            directions=unit(np.stack([points[b] - points[a] for a, b in LIMBS], 1)),
             pelvis=turns[:, 0],
             torso=turns[:, 1],
-            root=0.5 * (points["left_hip"] + points["right_hip"]),
+            root=0.5 * (middle[0] + middle[1]),
             feet=turns[:, 2:],
-            contact=contact,
-            leg=0.5 * float(sum(np.linalg.norm(upright[b] - upright[a]) for a, b in LIMBS[:4])),
-            ankle=float(ankles - soles),
+            contact=np.zeros((self.frames, 4), bool) if contact is None else contact,
+            lengths={(a, b): float(np.linalg.norm(upright[b] - upright[a])) for a, b in limbs},
+            ankle=ankle,
         )
 
     def _qpos(self, home: np.ndarray) -> np.ndarray:
         """Return the motion as configurations of the robot's MuJoCo model. (F, nq)."""
-        tree, model = self.robot.tree, self.robot.mj_model
-        (base,) = tree.free_bases
-        at = int(tree.full_qpos_address[base])
-        columns = [*range(at, at + 7), *(int(model.joint(name).qposadr[0]) for name in self.motion.joint_names)]
+        model = self.robot.mj_model
+        joints = [int(model.joint(name).qposadr[0]) for name in self.motion.joint_names]
+        columns = [*base_columns(self.robot), *joints]
         qpos = np.tile(home, (self.frames, 1))
         qpos[:, columns] = self.motion.qpos
         return qpos

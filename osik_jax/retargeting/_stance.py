@@ -78,7 +78,9 @@ def hold_feet(
         contact: whether left heel, left toe, right heel and right toe stand after the step. (4,)
         stance: contacts before the step.
     """
-    held = contact & stance.stands
+    if not body.corners:
+        return Held(integrate(body.robot, q, step), step, stance, jnp.zeros((), step.dtype))
+    held = contact & stance.stands & (not body.rolls)
 
     def goes_on(state: _State) -> Bool[Array, ""]:
         return (state.error > _SMALL) & (state.iterations < _MOST_ITERATIONS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,12 +21,15 @@ from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ..tasks._rotation import dot, rotation_log
 from ._balance import mass_fractions, overhang
+from ._facing import facing_at_home
 from ._goals import Goals, Weights
-from ._profile import Place, Profile
-from ._roles import LIMBS
+from ._profile import Limb, Place, Profile
+from ._roles import CHAINS, SIDES
 
 # Guard of a limb's direction: a shorter limb [m] has none.
 SHORTEST = 1e-6
+# Length of a standing leg over its stretched length, for robots whose legs are straight at home.
+STANDING_SHARE = 0.85
 # Pairs of capsules that get rows; the nearest ones are chosen in each iteration.
 PAIRS = 12
 CLEARANCE, SWINGING = 3e-3, 2e-3
@@ -39,11 +43,18 @@ class Body(eqx.Module):
         robot: the robot.
         offsets: position of each place in its frame [m]. (places, 3)
         radii: radii of the capsules [m]. (capsules,)
-        home: rotation matrices of pelvis, chest and feet at home, where the person's axes equal the world's. (4, 3, 3)
+        home: rotation matrices of pelvis, chest and feet at home, relative to the robot's forward, left and up axes.
+            (4, 3, 3)
+        lengths: nominal lengths of the reaches [m]. (reaches,)
+        rises: heights of the corners above the floor in contact: radii of round feet [m]. (corners,)
         inside: margin of the centre of mass inside the support polygon [m]; None: not bounded.
         frames: frame of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static).
         keys: the role of each keypoint (static).
-        bends: whether the trunk bends (static).
+        limbs: first and second keypoint of each limb that is followed, the reaches last (static).
+        turned: indices into ``home`` of the orientations that are followed (static).
+        roots: the two places whose midpoint follows the root's path; empty if the base is fixed (static).
+        corners: number of the feet's corners: 8, or 0 without feet or with a fixed base (static).
+        rolls: whether points in contact may move along the floor (static).
         above: capsules kept above the floor: not the feet's, which have corners, nor capsules inside others (static).
         pairs: pairs of capsules that are kept apart (static).
     """
@@ -52,10 +63,16 @@ class Body(eqx.Module):
     offsets: Float[Array, "places 3"]
     radii: Float[Array, " capsules"]
     home: Float[Array, "4 3 3"]
+    lengths: Float[Array, " reaches"]
+    rises: Float[Array, " corners"]
     inside: Float[Array, ""] | None
     frames: tuple[str, ...] = eqx.field(static=True)
     keys: tuple[str, ...] = eqx.field(static=True)
-    bends: bool = eqx.field(static=True)
+    limbs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    turned: tuple[int, ...] = eqx.field(static=True)
+    roots: tuple[int, ...] = eqx.field(static=True)
+    corners: int = eqx.field(static=True)
+    rolls: bool = eqx.field(static=True)
     above: tuple[int, ...] = eqx.field(static=True)
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
@@ -65,32 +82,54 @@ class Body(eqx.Module):
 
         ``pairs``: the capsules that are kept apart. ``inside``: margin of balance [m], None for no balance.
         """
-        origin = (0.0, 0.0, 0.0)
-        places: list[Place] = list(profile.keypoints.values())
-        places += [(profile.pelvis, origin), (profile.torso or profile.pelvis, origin)]
-        places += [(profile.feet[side].frame, origin) for side in ("left", "right")]
-        places += profile.corners
-        turned = [frame for frame, _ in places[len(profile.keypoints) : len(profile.keypoints) + 4]]
+        keys, free = tuple(profile.keypoints), robot.floating_base
+        corners = profile.corners if free else ()
+        places: list[Place] = [*profile.keypoints.values(), *((frame, (0.0, 0.0, 0.0)) for frame in profile.turned)]
+        places += corners
         for capsule in profile.capsules:
             places += [(capsule.frame, capsule.start), (capsule.frame, capsule.end)]
         feet = {robot.tree.frame_bodies[robot.tree.frame(foot.frame)] for foot in profile.feet.values()}
         bodies = [robot.tree.frame_bodies[robot.tree.frame(capsule.frame)] for capsule in profile.capsules]
+        flat = [2 + i for i, side in enumerate(SIDES) if side in profile.feet and not profile.feet[side].radius]
+        turned = [*([0] if free else []), *(flat if profile.walks else []), *([] if profile.torso is None else [1])]
+        hips = (keys.index("left_hip"), keys.index("right_hip")) if profile.walks else (len(keys), len(keys))
+        at_home = home_kinematics(robot)
+        home = at_home.frame_poses(robot, profile.turned)[1]
         return cls(
             robot=robot,
             offsets=jnp.array([point for _, point in places], robot.q0.dtype),
             radii=jnp.array([capsule.radius for capsule in profile.capsules], robot.q0.dtype),
-            home=home_kinematics(robot).frame_poses(robot, turned)[1],
+            home=jnp.asarray(facing_at_home(robot, profile.across).T, home.dtype) @ home,
+            lengths=jnp.array([reach_length(robot, profile, limb) for limb in profile.reached], robot.q0.dtype),
+            rises=jnp.array(profile.rises[: len(corners)], robot.q0.dtype),
             inside=None if inside is None else jnp.asarray(inside, robot.q0.dtype),
             frames=tuple(frame for frame, _ in places),
-            keys=tuple(profile.keypoints),
-            bends=profile.torso is not None,
+            keys=keys,
+            limbs=tuple((keys.index(a), keys.index(b)) for a, b in profile.followed),
+            turned=tuple(turned),
+            roots=hips if free else (),
+            corners=len(corners),
+            rolls=profile.rolls,
             above=tuple(
                 i
                 for i, (body, own) in enumerate(zip(bodies, profile.capsules, strict=True))
-                if body not in feet and not any(wider.hides(own) for wider in profile.capsules)
+                if free and body not in feet and not any(wider.hides(own) for wider in profile.capsules)
             ),
             pairs=tuple((int(i), int(j)) for i, j in pairs),
         )
+
+
+def reach_length(robot: Robot, profile: Profile, limb: Limb) -> float:
+    """Return the nominal length of a reach [m]: that at home, at most ``STANDING_SHARE`` of the stretched limb."""
+    side, part = limb[1].split("_")
+    roles = next((chain for chain in CHAINS.values() if part in chain), ())
+    between = [role for name in roles if (role := f"{side}_{name}") in profile.keypoints]
+    kinematics, points = home_kinematics(robot), []
+    for frame, point in (profile.keypoints[role] for role in (limb if set(limb) - set(between) else between)):
+        position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
+        points.append(position + rotation @ np.array(point))
+    stretched = sum(float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(points))
+    return min(float(np.linalg.norm(points[-1] - points[0])), STANDING_SHARE * stretched)
 
 
 class Joints(NamedTuple):
@@ -111,7 +150,7 @@ class FrameRows(NamedTuple):
         soft: weights of goals, 0 in the rows of bounds. (m,)
         stiff: weights of bounds, 0 in the rows of goals. (m,)
         joints: terms of single joints.
-        stance: x and y of left heel, left toe, right heel and right toe [m]. (8,)
+        stance: x and y of the four points of ``Profile.standing`` [m], 0 without feet. (8,)
         stance_jacobian: derivative of ``stance``. (8, nv)
     """
 
@@ -184,28 +223,32 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
     index = np.array([names.index(name) for name in body.frames])
     positions, rotations = kinematics.frame_poses(robot, names)
     bodies = np.array([robot.tree.frame_bodies[robot.tree.frame(name)] for name in body.frames])
-    k = len(body.keys)
+    k, first = len(body.keys), len(body.keys) + 4 + body.corners
     place = _Places(
         positions[index] + rotate(rotations[index], body.offsets),
         rotations[index[k : k + 4]],
         robot.tree.moves[bodies],
         _Motion.of(robot, kinematics),
     )
-    turned = [_turn(place, k, 0, dot(goals.pelvis, body.home[0]), weights.pelvis)]
-    turned += [_turn(place, k, 2 + i, dot(goals.feet[i], body.home[2 + i]), weights.foot) for i in range(2)]
-    if body.bends:
-        turned.append(_turn(place, k, 1, dot(goals.torso, body.home[1]), weights.torso))
-    soft = [_limbs(place, body.keys, goals, weights), _root(place, body.keys, goals, weights), *turned]
-    corners = slice(k + 4, k + 12)
-    stiff = [_soles(place, corners, goals.contact, weights.stance)]
+    turns = (goals.pelvis, weights.pelvis), (goals.torso, weights.torso), *((foot, weights.foot) for foot in goals.feet)
+    soft = [_limbs(place, body, goals, weights)]
+    soft += [_root(place, body.roots, goals, weights)] if body.roots else []
+    soft += [_turn(place, k, i, dot(turns[i][0], body.home[i]), turns[i][1]) for i in body.turned]
+    corners = slice(k + 4, first)
+    stiff = [_soles(place, corners, body.rises, goals.contact, weights.stance)] if body.corners else []
     if body.above:
-        stiff.append(_floor(place, k + 12, body, weights.stance))
+        stiff.append(_floor(place, first, body, weights.stance))
     if body.pairs:
-        stiff.append(_apart(place, k + 12, body, weights))
+        stiff.append(_apart(place, first, body, weights))
     if body.inside is not None:
         stiff.append(_balanced(place, corners, kinematics, robot, goals.contact, body.inside, weights.balance))
-    wishes, needs = (_Rows(*(jnp.concatenate(column) for column in zip(*part, strict=True))) for part in (soft, stiff))
-    stance, along = _stance(place, corners)
+    wishes = _Rows(*(jnp.concatenate(column) for column in zip(*soft, strict=True)))
+    needs = jax.tree.map(lambda row: row[:0], wishes)
+    if stiff:
+        needs = _Rows(*(jnp.concatenate(column) for column in zip(*stiff, strict=True)))
+    stance, along = jnp.zeros(8, q.dtype), jnp.zeros((8, wishes.rates.shape[1]), q.dtype)
+    if body.corners:
+        stance, along = _stance(place, corners)
     rates = independent_columns(robot.tree, jnp.concatenate([wishes.rates, needs.rates, along]))
     return FrameRows(
         residual=jnp.concatenate([wishes.residual, needs.residual]),
@@ -219,13 +262,13 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
 
 
 def soles(body: Body, kinematics: Kinematics) -> tuple[Float[Array, "8 3"], Float[Array, "8 3 nv"]]:
-    """Return the soles' corners in the world [m] and their derivatives. (8, 3), (8, 3, nv)."""
+    """Return the lowest points of the soles' corners in the world [m], and their derivatives."""
     robot, first = body.robot, len(body.keys) + 4
     frames, offsets = body.frames[first : first + 8], body.offsets[first : first + 8]
     names = tuple(dict.fromkeys(frames))
     index = np.array([names.index(name) for name in frames])
     positions, rotations = kinematics.frame_poses(robot, names)
-    points = positions[index] + rotate(rotations[index], offsets)
+    points = (positions[index] + rotate(rotations[index], offsets)).at[:, 2].add(-body.rises)
     moves = robot.tree.moves[np.repeat([robot.tree.frame_bodies[robot.tree.frame(name)] for name in frames], 3)]
     axes = jnp.tile(jnp.eye(3, dtype=points.dtype), (8, 1))
     rates = _Motion.of(robot, kinematics).rates(moves, axes, jnp.repeat(points, 3, 0))
@@ -241,13 +284,22 @@ class _Places(NamedTuple):
     motion: _Motion
 
 
-def _limbs(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights) -> _Rows:
-    """Return the rows of limb directions: ``d - u``, with derivative ``d' = (I - d d^T) / length (J_b - J_a)``."""
-    first, second = (np.array([keys.index(limb[i]) for limb in LIMBS]) for i in range(2))
+def _limbs(place: _Places, body: Body, goals: Goals, weights: Weights) -> _Rows:
+    """Return the error of each limb's direction, ``d - u``, with ``d' = (I - d d^T) / length (J_b - J_a)``.
+
+    A reach has the vector over its nominal length in place of d, with ``d' = (J_b - J_a) / length``.
+    """
+    first, second = (np.array([limb[i] for limb in body.limbs]) for i in range(2))
     across = place.points[second] - place.points[first]
-    length = jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), SHORTEST)
+    reaches = body.lengths.shape[-1]
+    length = jnp.linalg.norm(across, axis=-1)
+    length = length.at[len(length) - reaches :].set(body.lengths) if reaches else length
+    length = jnp.maximum(length, SHORTEST)[:, None]
     direction = across / length
-    sideways = (jnp.eye(3, dtype=length.dtype) - direction[:, :, None] * direction[:, None]) / length[..., None]
+    directed = (np.arange(len(first)) < len(first) - reaches)[:, None, None]
+    sideways = (jnp.eye(3, dtype=length.dtype) - directed * direction[:, :, None] * direction[:, None]) / length[
+        ..., None
+    ]
     sideways = sideways.reshape(-1, 3)
     ends = []
     for index in (first, second):
@@ -264,12 +316,12 @@ def _turn(place: _Places, first: int, i: int, wanted: Float[Array, "3 3"], weigh
     return _Rows(rotation_log(dot(place.rotations[i], wanted.T)), rates, jnp.full(3, weight))
 
 
-def _root(place: _Places, keys: tuple[str, ...], goals: Goals, weights: Weights) -> _Rows:
-    rates, hips = [], [keys.index("left_hip"), keys.index("right_hip")]
-    for hip in hips:
-        point = jnp.broadcast_to(place.points[hip], (3, 3))
-        rates.append(place.motion.rates(place.moves[np.full(3, hip)], 0.5 * jnp.eye(3, dtype=point.dtype), point))
-    residual = place.points[np.array(hips)].mean(0) - goals.root
+def _root(place: _Places, roots: tuple[int, ...], goals: Goals, weights: Weights) -> _Rows:
+    rates = []
+    for root in roots:
+        point = jnp.broadcast_to(place.points[root], (3, 3))
+        rates.append(place.motion.rates(place.moves[np.full(3, root)], 0.5 * jnp.eye(3, dtype=point.dtype), point))
+    residual = place.points[np.array(roots)].mean(0) - goals.root
     return _Rows(residual, rates[0] + rates[1], weights.root)
 
 
@@ -280,15 +332,15 @@ def _heights(place: _Places, some: slice | np.ndarray) -> tuple[Array, Array]:
     return points[:, 2], place.motion.rates(place.moves[some], up, points)
 
 
-def _soles(place: _Places, corners: slice, contact: Float[Array, "4"], weight: Float[Array, ""]) -> _Rows:
-    """Return the rows of sole corners: height 0 in contact, at least the clearance otherwise.
+def _soles(place: _Places, corners: slice, rises: Array, contact: Float[Array, "4"], weight: Float[Array, ""]) -> _Rows:
+    """Corners that stand are at height 0, the others not below a clearance.
 
     Corners without contact weigh less, because their rows switch on and off between iterations; so a swinging foot may
     come a little nearer to the floor than the clearance.
     """
     height, rates = _heights(place, corners)
     stands = jnp.repeat(contact, 2) > 0.5
-    gap = height - jnp.where(stands, 0.0, CLEARANCE)
+    gap = height - rises - jnp.where(stands, 0.0, CLEARANCE)
     return _Rows(gap, rates, jnp.where(stands, weight, jnp.where(gap < 0.0, SWINGING * weight, 0.0)))
 
 

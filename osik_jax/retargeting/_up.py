@@ -123,7 +123,14 @@ def _tracks(motion: HumanMotion, roles: Mapping[str, str] | None) -> tuple[np.nd
             return None
         return motion.positions[:, heads[-1]], motion.positions[:, feet].mean(1), motion.positions
     at = {role: motion.track(name) for role, name in roles.items()}
-    top, bottom = (0.5 * (at[f"left_{role}"] + at[f"right_{role}"]) for role in ("shoulder", "ankle"))
+    middles = {
+        part: 0.5 * (at[f"left_{part}"] + at[f"right_{part}"])
+        for part in ("shoulder", "hip", "ankle")
+        if {f"left_{part}", f"right_{part}"} <= set(at)
+    }
+    if len(middles) < 2:
+        return None
+    top, *_, bottom = middles.values()
     return top, bottom, np.stack(list(at.values()), 1)
 
 

@@ -103,9 +103,14 @@ def test_fingers_do_not_make_the_wrist_an_elbow():
     assert [profile.keypoints[f"right_{role}"][0] for role in ("elbow", "wrist")] == ["right_elbow", "right_claw"]
 
 
-def test_arms_that_do_not_bend_are_refused():
-    with pytest.raises(ValueError, match="no joint between its ends that bends it"):
-        guess_profile(stick_robot('<geom size="0.02"/>', '<geom size="0.02"/>', yaw=False))
+def test_arms_that_do_not_bend_end_at_the_elbow():
+    robot = stick_robot('<geom size="0.02"/>', '<geom size="0.02"/>', yaw=False)
+    with pytest.warns(osik.OsikWarning, match=r"left arm to the elbow \(no wrist\)"):
+        profile = guess_profile(robot)
+    assert {role.split("_")[1] for role in profile.keypoints} == {"hip", "knee", "ankle", "shoulder", "elbow"}
+    for side in ("left", "right"):
+        shoulder, elbow = places(robot, profile, f"{side}_shoulder", f"{side}_elbow")
+        assert np.linalg.norm(elbow - shoulder) == pytest.approx(np.hypot(UPPER, 0.02), abs=1e-9)
 
 
 @pytest.mark.slow

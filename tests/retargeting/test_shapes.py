@@ -1,0 +1,330 @@
+"""Robots that lack limbs, roll or stand on four feet: small models, judged by MuJoCo and by equal motions."""
+
+import dataclasses
+import warnings
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from core_checks import needs_core
+from motion_files import dancer, write_bvh
+from scipy.spatial.transform import Rotation
+
+import osik_jax as osik
+from osik_jax.retargeting import (
+    HumanMotion,
+    LiveRetargeter,
+    Retargeter,
+    SourceMotion,
+    describe_profile,
+    find_roles,
+    guess_profile,
+    load_motion,
+    load_profile,
+    load_robot_motion,
+    report,
+    save_profile,
+    write_csv,
+)
+from osik_jax.retargeting._person import read_person
+from osik_jax.retargeting._plan import _Clip, _descended, _descended_plain
+
+FPS = 30.0
+LEG = """<body name="{s}_hip_yaw" pos="0 {y} 0"><joint name="{s}_hip_yaw" axis="0 0 1" range="-60 60"/>
+  <geom size="0.04"/><body name="{s}_hip_roll"><joint name="{s}_hip_roll" axis="1 0 0" range="-40 40"/>
+  <geom size="0.04"/>
+  <body name="{s}_hip_pitch"><joint name="{s}_hip_pitch" axis="0 1 0" range="-120 90"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.05"/>
+  <body name="{s}_shin" pos="0 0 -0.4"><joint name="{s}_knee" axis="0 1 0" range="0 140"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.04"/>
+  <body name="{s}_ankle" pos="0 0 -0.4"><joint name="{s}_ankle_pitch" axis="0 1 0" range="-50 50"/><geom size="0.03"/>
+  <body name="{s}_foot"><joint name="{s}_ankle_roll" axis="1 0 0" range="-30 30"/>
+    <geom type="box" pos="0.04 0 -0.05" size="0.1 0.04 0.02"/></body></body></body></body></body></body>"""
+ARM = """<body name="{s}_pitch" pos="0 {y} 0.4"><joint name="{s}_pitch" axis="0 1 0" range="-170 170"/>
+  <geom size="0.03"/>
+  <body name="{s}_roll" pos="0 {dy} 0"><joint name="{s}_roll" axis="1 0 0" range="-150 150"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.25" size="0.03"/>{forearm}</body></body>"""
+FOREARM = """<body name="{s}_yaw" pos="0 0 -0.1"><joint name="{s}_yaw" axis="0 0 1" range="-170 170"/>
+  <geom size="0.03"/>
+  <body name="{s}_elbow" pos="0 0 -0.15"><joint name="{s}_elbow" axis="0 1 0" range="-60 90"/>
+  <geom type="capsule" fromto="0.03 0 0 0.25 0 0" size="0.03"/></body></body>"""
+WHEEL = """<body name="{s}_wheel" pos="0 {y} -0.3"><joint name="{s}_wheel" axis="0 1 0" limited="false"/>
+  <geom type="cylinder" size="0.1 0.02" euler="90 0 0"/></body>"""
+PAW = """<body name="{s}_hip" pos="{x} {y} 0"><joint name="{s}_abduction" axis="1 0 0" range="-45 45"/>
+  <geom size="0.03"/>
+  <body name="{s}_thigh" pos="0 {dy} 0"><joint name="{s}_thigh" axis="0 1 0" range="-120 120"/>
+  <geom type="capsule" fromto="0 0 0 -0.12 0 -0.2" size="0.02"/>
+  <body name="{s}_shank" pos="-0.12 0 -0.2"><joint name="{s}_shank" axis="0 1 0" range="-60 100"/>
+  <geom type="capsule" fromto="0 0 0 0.12 0 -0.2" size="0.015"/><geom name="{s}_ball" pos="0.12 0 -0.2" size="0.02"/>
+  <site name="{s}_foot" pos="0.12 0 -0.2"/></body></body></body>"""
+SIDES = (("left", 1.0), ("right", -1.0))
+
+
+def robot_of(*parts, free=True, turn=0.0, forearm=FOREARM):
+    """A trunk with the parts that are named on both sides, turned about the vertical [deg]."""
+    inside = ""
+    for s, sign in SIDES:
+        arm = ARM.replace("{forearm}", forearm)
+        texts = {"legs": LEG, "arms": arm, "wheels": WHEEL}
+        inside += "".join(texts[part].format(s=s, y=0.15 * sign, dy=0.05 * sign) for part in parts)
+    return osik.Robot.from_mjcf(
+        f"""<mujoco><compiler autolimits="true"/><default><geom contype="0" conaffinity="0"/></default><worldbody>
+        <body name="base" pos="0 0 0.85" euler="0 0 {turn}">{"<freejoint/>" if free else ""}
+        <geom type="box" pos="0 0 0.2" size="0.06 0.1 0.2"/>{inside}</body></worldbody></mujoco>""",
+    )
+
+
+def on_four(arm=""):
+    """A robot on four feet with knees that point backwards; its feet are balls of 2 cm. Its floor is at z = 0.6 m."""
+    legs = ""
+    for row, x in (("front", 0.25), ("hind", -0.25)):
+        for s, sign in SIDES:
+            legs += PAW.format(s=f"{s}_{row}", x=x, y=0.08 * sign, dy=0.06 * sign)
+    return osik.Robot.from_mjcf(
+        f"""<mujoco><compiler autolimits="true"/><default><geom contype="0" conaffinity="0"/></default><worldbody>
+        <body name="trunk" pos="0 0 1.02"><freejoint/><geom type="box" size="0.25 0.07 0.05"/>{legs}{arm}</body>
+        </worldbody></mujoco>""",
+    )
+
+
+def trotting(frames=36, speed=0.4, period=0.6, lift=0.06):
+    """A dog: diagonal pairs of paws stand for half of the period; knees point forward, elbows backward."""
+    time, points = np.arange(frames) / FPS, {}
+    for s, sign in SIDES:
+        rows = (("hip", "knee", "ankle"), -0.3, 0.0), (("shoulder", "elbow", "wrist"), 0.3, 0.5)
+        for names, x, phase in rows:
+            phase = (phase + 0.5 * (sign < 0.0)) % 1.0
+            steps, part = np.divmod(time / period + phase, 1.0)
+            swing = np.clip(2.0 * part - 1.0, 0.0, 1.0)
+            at = (steps - phase + 0.25 + swing**2 * (3.0 - 2.0 * swing)) * period * speed
+            still = np.full(frames, 0.1 * sign)
+            top = np.stack([speed * time + x, still, 0.45 + 0.01 * np.sin(4.0 * np.pi * time / period)], 1)
+            paw = np.stack([at + x, still, lift * np.sin(np.pi * swing) ** 2], 1)
+            bend = [0.06 if x < 0.0 else -0.06, 0.0, 0.0]
+            tracks = zip(names, (top, 0.5 * (top + paw) + bend, paw), strict=True)
+            points |= {f"{s}_{name}": track for name, track in tracks}
+    return HumanMotion("trot", FPS, tuple(points), np.stack(list(points.values()), 1))
+
+
+def quietly(make, *arguments, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", osik.OsikWarning)
+        return make(*arguments, **options)
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory):
+    return load_motion(write_bvh(tmp_path_factory.mktemp("clips") / "dance.bvh", dancer(20), 0.01))
+
+
+def judged(result):
+    """The report; what has to hold of every robot is asserted."""
+    figures = report(result)
+    joints = figures["joints"]
+    assert joints["beyond_range_max"] == 0.0 and joints["speed_over_limit_max"] <= 1.0 + 1e-6
+    assert joints["jump_frames"] == 0 and figures["shapes"]["penetration_mm_max"] < 1.0
+    return figures
+
+
+def test_arms_on_a_fixed_base_follow_beside_the_trunk(motion, tmp_path):
+    """Wherever the person goes and however the trunk is turned, the arms are the same; the robot faces y."""
+    robot = robot_of("arms", free=False, turn=90.0)
+    retargeter = quietly(Retargeter, robot)
+    assert "the base is fixed" in describe_profile(robot, retargeter.profile) and not retargeter.profile.feet
+    result = retargeter.retarget(motion)
+    assert judged(result)["tracking"]["segment_angle_deg_mean"] < 1.0
+    turns = Rotation.from_euler("zy", np.linspace([0, 0], [80, 30], motion.frames), degrees=True).as_matrix()
+    way = np.linspace([0.0, 0.0, 0.0], [2.0, 1.0, 0.1], motion.frames)
+    carried = np.einsum("fij,fkj->fki", turns, motion.positions) + way[:, None]
+    elsewhere = dataclasses.replace(motion, positions=carried, rotations=None, rest_positions=None)
+    plain = dataclasses.replace(motion, rotations=None, rest_positions=None)
+    other, own = quietly(retargeter.retarget, elsewhere), retargeter.retarget(plain)
+    np.testing.assert_allclose(other.q, own.q, atol=1e-6)
+    # directions by MuJoCo beside those of the clip, turned as the robot faces
+    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+    data.qpos[:] = result.motion.qpos[7]
+    mujoco.mj_kinematics(model, data)
+    upper = data.body("left_elbow").xpos - data.body("left_roll").xpos
+    names = find_roles(motion.joint_names)
+    asked = motion.track(names["left_elbow"])[7] - motion.track(names["left_shoulder"])[7]
+    asked = Rotation.from_euler("z", 90.0, degrees=True).apply(asked)
+    assert np.degrees(np.arccos(upper @ asked / np.linalg.norm(upper) / np.linalg.norm(asked))) < 1.0
+    # its files have no free joint
+    result.save(tmp_path / "motion.npz")
+    write_csv(result.motion, tmp_path / "motion.csv")
+    joints = result.motion.joint_names
+    for loaded in (
+        load_robot_motion(tmp_path / "motion.npz"),
+        load_robot_motion(tmp_path / "motion.csv", joint_names=joints, fps=FPS),
+    ):
+        assert not loaded.is_free and loaded.joint_names == joints
+        np.testing.assert_allclose(loaded.qpos, result.motion.qpos, atol=1e-8)
+
+
+def test_an_upper_body_needs_no_legs_in_the_clip(motion):
+    names = find_roles(motion.joint_names)
+    lower = {names[f"{side}_{role}"] for side, _ in SIDES for role in ("knee", "ankle", "toe")}
+    kept = [i for i, name in enumerate(motion.joint_names) if name not in lower]
+    half = HumanMotion("half", FPS, tuple(motion.joint_names[i] for i in kept), motion.positions[:, kept])
+    retargeter = quietly(Retargeter, robot_of("arms", free=False))
+    whole = dataclasses.replace(motion, rotations=None, rest_positions=None)
+    np.testing.assert_allclose(retargeter.retarget(half).q, retargeter.retarget(whole).q, atol=1e-6)
+    with pytest.raises(ValueError, match="has no left_wrist"):
+        left = [i for i, name in enumerate(half.joint_names) if name != names["left_wrist"]]
+        retargeter.retarget(HumanMotion("half", FPS, tuple(half.joint_names[i] for i in left), half.positions[:, left]))
+
+
+def test_legs_without_arms_and_arms_that_end_at_the_elbow_walk_as_the_person(motion):
+    for robot, lacks in ((robot_of("legs"), "no left arm"), (robot_of("legs", "arms", forearm=""), "no wrist")):
+        with pytest.warns(osik.OsikWarning, match=lacks):
+            retargeter = Retargeter(robot)
+        figures = judged(retargeter.retarget(motion))
+        assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
+        assert figures["feet"]["contact_share"] == 1.0 and figures["tracking"]["segment_angle_deg_mean"] < 2.0
+
+
+def test_a_base_on_wheels_takes_heading_and_path_and_stays_level(motion):
+    robot = robot_of("arms", "wheels")
+    retargeter = quietly(Retargeter, robot)
+    assert retargeter.profile.rolls and len(retargeter.profile.feet) == 2
+    way = np.linspace([0.0, 0.0, 0.0], [0.6, 0.3, 0.0], motion.frames)
+    turns = Rotation.from_euler("zy", np.linspace([0, 0], [60, 20], motion.frames), degrees=True).as_matrix()
+    moved = np.einsum("fij,fkj->fki", turns, motion.positions) + way[:, None]
+    clip = dataclasses.replace(motion, positions=moved, rotations=None, rest_positions=None)
+    result = quietly(retargeter.retarget, clip)
+    figures = judged(result)
+    assert figures["feet"]["float_mm_max"] < 0.2 and figures["feet"]["below_floor_mm_max"] < 0.2
+    assert figures["feet"]["slip_mm_max"] is None
+    base = Rotation.from_quat(result.q[:, 3:7], scalar_first=True)
+    np.testing.assert_allclose(base.as_matrix()[:, 2, 2], 1.0, atol=1e-5)
+    heading = base.as_euler("zyx", degrees=True)[:, 0]
+    assert heading[-1] - heading[0] == pytest.approx(60.0, abs=2.0)
+    person = read_person(clip, find_roles(clip.joint_names))
+    scale = retargeter._build.scale(person)
+    walked = result.q[-1, :2] - result.q[0, :2]
+    np.testing.assert_allclose(walked, scale * (person.root[-1] - person.root[0])[:2], atol=0.02)
+    assert figures["tracking"]["segment_angle_deg_mean"] < 2.0
+
+
+def test_four_feet_follow_a_dog(tmp_path):
+    robot = on_four()
+    retargeter = quietly(Retargeter, robot)
+    profile = retargeter.profile
+    assert tuple(profile.feet) == ("left", "left_front", "right", "right_front") and not profile.limbs
+    assert {foot.radius for foot in profile.feet.values()} == {0.02} and len(profile.reached) == 4
+    clip = trotting()
+    result = retargeter.retarget(clip)
+    figures = judged(result)
+    np.testing.assert_allclose(result.contact.mean(0), 0.5, atol=0.1)
+    # by MuJoCo: balls that stand are where they landed and touch the floor; the others are lifted
+    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+    names = [f"{s}_{row}_ball" for s, _ in SIDES for row in ("hind", "front")]
+    balls = np.zeros((len(result.q), 4, 3))
+    for frame, qpos in enumerate(result.motion.qpos):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        balls[frame] = [data.geom(name).xpos for name in names]
+    assert np.abs(balls[..., 2][result.contact] - 0.02).max() < 2e-4 and balls[..., 2].min() > 0.0198
+    both = result.contact[1:] & result.contact[:-1]
+    assert np.linalg.norm(np.diff(balls, axis=0)[..., :2], axis=-1)[both].max() < 5e-5
+    scale = retargeter._build.scale(read_person(clip, find_roles(clip.joint_names), standing=profile.standing))
+    assert balls[..., 2].max() - 0.02 == pytest.approx(0.06 * scale, rel=0.2)
+    assert result.q[-1, 0] - result.q[0, 0] == pytest.approx(scale * 0.4 * (clip.frames - 1) / FPS, rel=0.05)
+    assert figures["feet"]["slip_mm_max"] < 0.5
+    # and the profile comes back from its file
+    save_profile(profile, tmp_path / "robot.toml")
+    assert load_profile(tmp_path / "robot.toml") == profile
+
+
+def test_four_feet_stay_where_an_arm_follows(motion):
+    """The feet stand all the time, and the trunk leans as the person's does beside the heading."""
+    arm = ARM.format(s="right", y=0, dy=-0.05, forearm=FOREARM.format(s="right"))
+    robot = on_four(f'<body name="mount" pos="0.4 0 0.2">{arm}</body>')
+    with pytest.warns(osik.OsikWarning, match="no left arm; .*right arm to the wrist; 4 feet; the feet stay"):
+        retargeter = Retargeter(robot)
+    assert not retargeter.profile.walks and not retargeter.profile.reached
+    turns = Rotation.from_euler("ZY", np.linspace([0, 0], [60, 10], motion.frames), degrees=True).as_matrix()
+    turned = np.einsum("fij,fkj->fki", turns, motion.positions)
+    result = quietly(
+        retargeter.retarget, dataclasses.replace(motion, positions=turned, rotations=None, rest_positions=None)
+    )
+    figures = judged(result)
+    assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.1
+    assert figures["feet"]["float_mm_max"] < 0.1 and figures["tracking"]["segment_angle_deg_mean"] < 3.0
+    lean = Rotation.from_quat(result.q[:, 3:7], scalar_first=True).as_euler("zyx", degrees=True)
+    assert lean[-1, 1] - lean[0, 1] == pytest.approx(10.0, abs=3.0) and np.abs(lean[:, 0]).max() < 3.0
+    np.testing.assert_allclose(result.q[:, 2], 0.42, atol=0.02)
+
+
+@needs_core
+@pytest.mark.parametrize("shape", ["four feet", "wheels", "fixed"])
+def test_the_core_plans_other_shapes_as_the_plain_method(shape, motion):
+    shapes = {
+        "four feet": on_four,
+        "wheels": partial(robot_of, "arms", "wheels"),
+        "fixed": partial(robot_of, "arms", free=False),
+    }
+    own = quietly(Retargeter, shapes[shape]())
+    few = dataclasses.replace(motion, positions=motion.positions[:9], rotations=None)
+    short = trotting(9) if shape == "four feet" else few
+    asked = own._prepared(short, None, None)
+    clip = jax.tree.map(
+        jnp.asarray, _Clip(own._body, asked.goals, own.profile.weights, asked.bounds, jnp.ones(len(asked.start)))
+    )
+    q = jnp.asarray(asked.start + 0.1 * np.random.default_rng(0).normal(size=asked.start.shape))
+    kernel, plain = (jax.jit(partial(f, until="mended"))(clip, q, jnp.array(3)) for f in (_descended, _descended_plain))
+    np.testing.assert_allclose(kernel.cost, plain.cost, rtol=1e-7)
+    np.testing.assert_allclose(kernel.q, plain.q, rtol=1e-7, atol=1e-8)
+    assert float(kernel.cost.sum()) < float(own_cost(clip, q))
+
+
+def own_cost(clip, q):
+    """The cost before the first iteration."""
+    return jax.jit(partial(_descended_plain, until="mended"))(clip, q, jnp.array(0)).cost.sum()
+
+
+def test_a_stream_drives_a_fixed_base(motion):
+    robot = robot_of("arms", free=False)
+    live = quietly(LiveRetargeter, robot, motion, look_ahead=0.1)
+    frames = [live.step(positions) for positions in motion.positions[:8]]
+    frames = [frame for frame in frames if frame is not None] + live.finish()
+    assert len(frames) == 8 and all(frame.feet_off == 0.0 and not frame.contact.any() for frame in frames)
+    whole = Retargeter(robot, profile=live.profile).retarget(motion)
+    np.testing.assert_allclose(frames[-1].q, whole.q[7], atol=0.1)
+
+
+def test_profiles_of_other_shapes_say_what_is_wrong():
+    profile = quietly(guess_profile, on_four())
+    robot = robot_of("legs", "arms")
+    with pytest.raises(ValueError, match="nothing holds the robot's base"):
+        Retargeter(robot, profile=dataclasses.replace(quietly(guess_profile, robot), feet={}))
+    with pytest.raises(ValueError, match="it has no feet and no wheels"):
+        guess_profile(robot_of("arms"))
+    with pytest.raises(ValueError, match="no keypoints right_hip"):
+        dataclasses.replace(profile, keypoints={r: p for r, p in profile.keypoints.items() if r != "right_hip"})
+    with pytest.raises(KeyError, match="no keypoint 'tail'"):
+        dataclasses.replace(profile, keypoints={**profile.keypoints, "tail": ("trunk", (0.0, 0.0, 0.0))})
+    with pytest.raises(ValueError, match="has feet left, left_front, right;"):
+        dataclasses.replace(profile, feet={name: foot for name, foot in profile.feet.items() if name != "right_front"})
+    fixed = robot_of("arms", free=False)
+    with pytest.raises(ValueError, match="balance is that of a robot on feet"):
+        Retargeter(fixed, profile=quietly(guess_profile, fixed), balance=0.01)
+
+
+def test_a_robot_follows_one_with_the_limbs_that_it_has(motion):
+    """Arms of a humanoid on a fixed base; no arms, and other feet, are refused."""
+    walker = robot_of("legs", "arms")
+    danced = Retargeter(walker).retarget(motion)
+    source = SourceMotion(walker, danced.motion, danced.profile)
+    retargeter = quietly(Retargeter, robot_of("arms", free=False))
+    followed = retargeter.retarget(source)
+    own = retargeter.retarget(motion)
+    np.testing.assert_allclose(followed.q, own.q, atol=0.05)
+    legs = quietly(Retargeter, robot_of("legs")).retarget(motion)
+    with pytest.raises(ValueError, match="has no left_shoulder, left_elbow"):
+        retargeter.retarget(SourceMotion(legs.robot, legs.motion, legs.profile))
+    with pytest.raises(ValueError, match="4 feet cannot follow 2"):
+        quietly(Retargeter, on_four()).retarget(source)
