@@ -31,7 +31,8 @@ class HumanMotion:
         rotations: joint orientations in the world as quaternions w x y z, of length 1 within 2 % and then normalised;
             None: unknown. (F, J, 4)
         rest_positions: joint positions in the pose in which all rotations are the identity [m]; None: unknown. (J, 3)
-        contact: whether left heel, left toe, right heel and right toe stand on the ground; None: detected. (F, 4)
+        contact: whether left heel, left toe, right heel and right toe stand on the ground; without toes, the
+            left hind, left front, right hind and right front paw of an animal; None: detected. (F, 4)
         ground: height of the floor [m]; None: detected.
 
     Raises:

@@ -26,7 +26,8 @@ class Retargeted:
         q: configurations of ``robot``. (F, nq)
         human: positions of the person's joints, floor at height 0 [m]. (F, J, 3)
         human_names: roles of these joints, and ``root``, the midpoint of the hips.
-        contact: whether left heel, left toe, right heel and right toe stand. (F, 4)
+        contact: whether left heel, left toe, right heel and right toe stand, or the points of ``Profile.standing`` of a
+            robot of another shape. (F, 4)
         iterations: iterations of the plan; 0 for a live stream.
         cost: final cost of the goals, and of the violated bounds; 0 for a live stream.
         off_plan: largest distance of a joint from the plan in each frame because of a limit [rad or m]. (F,)
