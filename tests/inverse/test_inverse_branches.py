@@ -79,6 +79,17 @@ def test_nearest_and_usual_answers_are_next_to_q0_across_turns(joint):
             np.testing.assert_allclose(found.q, start - 0.02, atol=2e-3)
 
 
+@pytest.mark.parametrize(("limit", "dtype"), [(600.283, "float64"), (1e10, "float64"), (1e10, "float32")])
+def test_ranges_that_stand_for_none_do_not_spread_the_searches(rng, limit, dtype):
+    """Files write 1e10 for no limit; a configuration of 1e9 rad has lost its angle to rounding."""
+    robot = two_links(f'range="-{limit} {limit}"').astype(dtype)
+    positions = np.stack([place(q) for q in rng.uniform(-3.0, 3.0, (20, 2))])
+    found = osik.inverse_kinematics(robot, {"tip": positions}, seeds=16)
+    q = np.asarray(found.q, float)
+    assert np.asarray(found.converged).all() and np.abs(q).max() < 2 * np.pi
+    assert max(np.linalg.norm(place(one) - p) for one, p in zip(q, positions, strict=True)) < 1.1e-3
+
+
 def test_finds_all_analytic_solutions_of_a_ur10e():
     """Joints within two turns: eight branches, some of them 0.02 rad apart."""
     robot = arm_of(LINKS, AXES, 'range="-6.2832 6.2832"')

@@ -1,6 +1,7 @@
 """Hundreds of hard QPs a family: known optimum, optimality recomputed in NumPy, daqp, quadprog and SciPy beside it."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from optimality import by_daqp, by_quadprog, kkt_residual, least_violation, least_violation_residual
@@ -89,6 +90,32 @@ def test_contradictions_get_the_least_violating_answer(family, rng):
     for i in range(0, COUNT, 20):
         np.testing.assert_allclose(distance[i], least_violation(p, i), rtol=1e-9, atol=1e-8)
     assert max(least_violation_residual(p, i, x[i]) for i in range(COUNT)) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", [inconsistent_equalities, inconsistent_rows])
+def test_rates_of_the_least_violating_answer_by_differences(family, rng):
+    """``INFEASIBLE_COMPLIANCE``: ten times as much moves these rates by 3e-5, a tenth loses as much to rounding."""
+    p = family(rng, 120)
+    along = rng.normal(size=p.row_lower.shape), np.abs(p.g).max(1, keepdims=True) * rng.normal(size=p.g.shape)
+
+    def moved(s):
+        by, cost = along
+        data = p._replace(g=p.g + s * cost, row_lower=p.row_lower + s * by, row_upper=p.row_upper + s * by).data
+        return jax.vmap(solve_qp)(*(jnp.asarray(array, jnp.result_type(s)) for array in data)).x
+
+    solve, step = jax.jit(moved), 3e-6
+    near, far = ((np.asarray(solve(h)) - np.asarray(solve(-h))) / (2.0 * h) for h in (step, 3.0 * step))
+    size = np.maximum(np.abs(near).max(1), 1e-3)  # where nearly all variables are at bounds, little moves
+    smooth = np.abs(near - far).max(1) < 1e-6 * size  # no bound becomes active within the step
+    assert smooth.sum() > 80
+
+    def errors(dtype):
+        _, rate = jax.jit(lambda s: jax.jvp(moved, (s,), (jnp.ones_like(s),)))(jnp.zeros((), dtype))
+        return (np.abs(np.asarray(rate) - near).max(1) / size)[smooth]
+
+    assert errors("float64").max() < 1e-5
+    assert np.median(errors("float32")) < 0.05  # 0.9 with the compliance of double precision
 
 
 def least_squares_residual(p, x):

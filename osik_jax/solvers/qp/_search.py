@@ -159,7 +159,7 @@ def _by_newton(qp: QP, result: SearchResult, *, kkt_tol: float, max_iterations: 
     # a minimiser gets one more round; the least violation of infeasible rows is final
     infeasible = end.converged & end.infeasible
     optimal = end.converged & ~end.infeasible
-    softened = jnp.maximum(INFEASIBLE_COMPLIANCE * largest[:, None], qp.compliance)
+    softened = jnp.maximum(INFEASIBLE_COMPLIANCE[largest.dtype] * largest[:, None], qp.compliance)
     return result._replace(
         x=end.x,
         row_multipliers=end.row_multipliers,
