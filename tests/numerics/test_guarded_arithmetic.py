@@ -198,7 +198,7 @@ def _rates_by_weight_and_dt(precision, name):
         return [np.asarray(a, float) for a in (*found, size)]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("name", SCHEMES)
 def test_derivatives_by_tiny_weights_and_times_in_single_precision(name):
     (single, reverse, _), (double, _, size) = (_rates_by_weight_and_dt(p, name) for p in ("float32", "float64"))

@@ -102,7 +102,7 @@ def test_rates_of_the_least_violating_answer_by_differences(family, rng):
     def moved(s):
         by, cost = along
         data = p._replace(g=p.g + s * cost, row_lower=p.row_lower + s * by, row_upper=p.row_upper + s * by).data
-        return jax.vmap(solve_qp)(*(jnp.asarray(array, jnp.result_type(s)) for array in data)).x
+        return jax.vmap(solve_qp)(*data).x
 
     solve, step = jax.jit(moved), 3e-6
     near, far = ((np.asarray(solve(h)) - np.asarray(solve(-h))) / (2.0 * h) for h in (step, 3.0 * step))
@@ -110,12 +110,8 @@ def test_rates_of_the_least_violating_answer_by_differences(family, rng):
     smooth = np.abs(near - far).max(1) < 1e-6 * size  # no bound becomes active within the step
     assert smooth.sum() > 80
 
-    def errors(dtype):
-        _, rate = jax.jit(lambda s: jax.jvp(moved, (s,), (jnp.ones_like(s),)))(jnp.zeros((), dtype))
-        return (np.abs(np.asarray(rate) - near).max(1) / size)[smooth]
-
-    assert errors("float64").max() < 1e-5
-    assert np.median(errors("float32")) < 0.05  # 0.9 with the compliance of double precision
+    _, rate = jax.jit(lambda s: jax.jvp(moved, (s,), (jnp.ones_like(s),)))(jnp.zeros(()))
+    assert (np.abs(np.asarray(rate) - near).max(1) / size)[smooth].max() < 1e-5
 
 
 def least_squares_residual(p, x):
