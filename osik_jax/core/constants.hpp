@@ -7,8 +7,8 @@ constexpr double EPSILON = 2.220446049250313e-16;
 
 // damping of a level, and the box that it leaves to the levels below
 constexpr int DAMPING_ITERATIONS = 3;
-constexpr double DAMPING_RIDGE = 1e-13, NEGLIGIBLE_DAMPING = 1e-13, COST_FRACTION = 0.1, MIN_RADIUS = 1e-6,
-                 NEGLIGIBLE_CURVATURE = 1e-6, TIE_ROUNDOFF = 100.0;
+constexpr double BLOCKING_PART = 1e-5, DAMPING_RIDGE = 1e-13, NEGLIGIBLE_DAMPING = 1e-13, COST_FRACTION = 0.1,
+                 MIN_RADIUS = 1e-6, NEGLIGIBLE_CURVATURE = 1e-6, TIE_ROUNDOFF = 100.0;
 
 // hierarchy
 constexpr int MAX_STALLED = 20, MAX_ATTEMPTS = 4;

@@ -545,6 +545,17 @@ template <class Team> struct Hierarchy {
   }
 
   // ---- damping of a level, and the box that it leaves to those below
+  // one sweep that projects base + Z WORK onto each violated row of the levels above in turn
+  OSIK_FN void stay_inside(const double* base) {
+    for (int q = n; q < h; ++q) {
+      if (!may_block(q)) continue;
+      const double square = t.dot(Z + q * ld, Z + q * ld, first_active, n);
+      if (!(square > BLOCKING_PART * BLOCKING_PART * HARD_NORM[q] * HARD_NORM[q])) continue;
+      const double value = t.dot(hard + (q - n) * ld, base, 0, n) + t.dot(Z + q * ld, WORK, first_active, n);
+      const double gap = clip(value, HARD_LOWER[q], HARD_UPPER[q]) - value;
+      t.axpy(WORK, gap / square, Z + q * ld, first_active, n);
+    }
+  }
   OSIK_METHOD double level_damping(double constant) {
     const double least = NEGLIGIBLE_DAMPING * longest_square;
     double total = constant;
@@ -575,6 +586,7 @@ template <class Team> struct Hierarchy {
           for (int a = 0; a < rows; ++a) sum.fma(RIGHT[a], c.load(R + a * ld));
           c.store(WORK, sum);
         });
+        stay_inside(base);
         from_basis(first_active, n, end);
         t.each(0, n, [&](int i) { end[i] = clip(base[i] + end[i], HARD_LOWER[i], HARD_UPPER[i]); });
         const double square = t.sum(0, rows, [&](int a) {

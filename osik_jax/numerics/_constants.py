@@ -35,6 +35,8 @@ EPSILON = float(np.finfo(np.float64).eps)
 
 DAMPING_ITERATIONS = 3
 """Iterations towards the fixed point of a level's damping; each shrinks the error by the factor unmet / s^2."""
+BLOCKING_PART = 1e-5
+"""Length inside the null space of frozen rows, relative to the whole row, up to which a row above blocks no step."""
 DAMPING_RIDGE = 1e-13
 """Ridge relative to the trace of the Gram matrix of a level's rows; it keeps the Cholesky factor positive."""
 DAMPING_RIDGE_ROUNDOFF = 10.0
@@ -367,6 +369,8 @@ NEAR_ERROR = 0.06
 """Error in lever arms, below which the whole bound is used, so that a stretched arm leaves and reaches its boundary
 without oscillation.
 """
+NEAR_PART = 0.4
+"""Fraction of the curvature bound that counts at the target."""
 FARTHEST_ERROR = 1e6
 """Largest error that is considered, in units of ``NEAR_ERROR``; a larger one makes no difference."""
 ROW_ROUNDOFF = 10.0

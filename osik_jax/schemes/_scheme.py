@@ -15,13 +15,13 @@ from .._errors import OsikValueError
 from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
 from ..numerics._constants import BELOW_OTHERS, CONSTRAINT_TOL, STANDING_SPEED
-from ..numerics._dense import apply, short_sum
+from ..numerics._dense import apply, product, short_sum
 from ..numerics._guarded import quotient, safe_norm
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
 from ..solvers._level import positive_root
 from ..tasks import TaskRows
-from ..tasks._curvature import fraction_to_damp, row_sums
+from ..tasks._curvature import fraction_to_damp, near_part, row_sums, share_of_far
 
 
 class VelocityProblem(eqx.Module):
@@ -64,25 +64,25 @@ class VelocityProblem(eqx.Module):
         ranked = [(name, rank) for name, rank in self.priorities if name not in self.hard]
         return [[name for name, own in ranked if own == rank] for rank in sorted({rank for _, rank in ranked})]
 
-    def curvature(self, names: Iterable[str]) -> Float[Array, ""]:
-        """Return a bound on what the linear model of these tasks leaves out, as a damping of the velocity.
+    def curvature(self, names: Iterable[str]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return a bound on what the linear model of these tasks leaves out, and the part of it to damp.
 
         A step leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
         different chains, so their parts add up like the sides of a right angle.
-        """
-        return safe_norm(self._bounds([self.rows[name] for name in names]))
 
-    def curvature_damping(self, names: Iterable[str]) -> Float[Array, ""]:
-        """Return the damping of the velocity that makes up for what the linear model of these tasks leaves out.
+        Where all of them are near their targets, less than the whole bound counts (``near_part``). The part to damp is
+        what the tasks' own rows do not resist (``fraction_to_damp``). Of inequality tasks, whose rows may be inactive,
+        it is the whole bound.
 
-        It is the part of ``curvature`` that the tasks' own rows do not resist (``fraction_to_damp``); of inequality
-        tasks, whose rows may be inactive, all of it.
+        Returns:
+            The bound and the damping, in the units of weight times J^2.
         """
         rows = [self.rows[name] for name in names]
         rest = [own for own in rows if not own.is_equality]
         equal = [own for own in rows if own.is_equality and own.dofs is None]  # rows on single dofs bend nothing
+        of_rest = self._bounds(rest)
         if not equal:
-            return safe_norm(self._bounds(rest))
+            return safe_norm(of_rest), safe_norm(of_rest)
         # what each row adds to its task's distance and stiffness: few operations whatever the number of tasks;
         # weights and Jacobians are NaN where the step is not valid, and times NaN a derivative of 0 is NaN
         divisor, pull = (
@@ -101,9 +101,11 @@ class VelocityProblem(eqx.Module):
         parts = jnp.stack([error * quotient(weight * pull, divisor), weight * squared])
         of_task = np.repeat(np.eye(len(equal), dtype=bool), [len(own.error) for own in equal], axis=1)
         distance, stiffness = jnp.sum(jnp.where(of_task, parts[:, None], 0.0), axis=2)
+        far = share_of_far(distance)
         bounds = self._bounds(equal)
-        fraction = fraction_to_damp(bounds, distance, stiffness)
-        return safe_norm(jnp.concatenate([self._bounds(rest), fraction * bounds]))
+        bounds = near_part(jnp.max(jnp.where(bounds > 0.0, far, 0.0))) * bounds
+        to_damp = fraction_to_damp(bounds, far, stiffness) * bounds
+        return safe_norm(jnp.concatenate([of_rest, bounds])), safe_norm(jnp.concatenate([of_rest, to_damp]))
 
     def _bounds(self, rows: Sequence[TaskRows]) -> Float[Array, " k"]:
         """Return dt times the curvature of each; no number where all tasks are hard."""
@@ -127,7 +129,7 @@ class VelocityProblem(eqx.Module):
             curvature: kappa, the factor of each priority's curvature damping.
             below_others: whether the rows of the levels above a priority balance what it cannot meet.
         """
-        found = []
+        found, above = [], list(self.hard)
         if constraints is not None:
             found.append(Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping())
         for names in self.by_priority():
@@ -136,12 +138,39 @@ class VelocityProblem(eqx.Module):
             found.append(
                 Damping(
                     constant,
-                    factor * self.curvature_damping(names),
+                    factor * self.curvature(names)[1] + curvature * self.curvature_above(names, above),
                     safe_norm(jnp.concatenate(residuals)),
                     factor * self.bends(names),
                 )
             )
+            above = above + names
         return found
+
+    def curvature_above(self, names: Iterable[str], above: Sequence[str]) -> Float[Array, ""]:
+        """Return the bound on the curvature that these tasks meet in the rows above them.
+
+        What a task cannot meet, the rows above balance, and these bend: a closed loop at its toggle point moves only at
+        second order. The force of the task and that of the rows above have about the same norm in the joints. Tasks
+        that bend themselves are damped for that (``curvature``), so for them hard tasks count alone.
+        """
+        rows = [self.rows[name] for name in names]
+        linear = [own.weight * own.pull for own in rows if own.dofs is not None]
+        curved = [product(own.weight * own.pull, own.jacobian) for own in rows if own.dofs is None]
+        parts = [
+            safe_norm(jnp.concatenate(forces)) * self._bending(by)
+            for forces, by in ((linear, above), (curved, self.hard))
+            if forces and by
+        ]
+        return safe_norm(jnp.stack(parts)) if parts else jnp.zeros((), self.lower.dtype)
+
+    def _bending(self, names: Sequence[str]) -> Float[Array, ""]:
+        """Return the curvature of tasks for a unit force in the joints: that for a unit residual, over their size."""
+        rows = [self.rows[name] for name in names]
+        weight, jacobian = (jnp.concatenate([getattr(own, field) for own in rows]) for field in ("weight", "jacobian"))
+        squared = weight * short_sum(jacobian**2)
+        # NaN where the step is not valid, and times NaN a derivative of 0 is NaN
+        size = positive_root(jnp.sum(jnp.where(jnp.isnan(squared), 0.0, squared)))
+        return quotient(jnp.max(self.bends(names)), jnp.where(size > 0.0, size, 1.0))
 
     def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
         """Return what a motion of each dof costs these tasks at second order, for a unit residual (``row_sums``).

@@ -58,7 +58,8 @@ class WeightedQP(Scheme):
         """Return the velocity of one step; the warm start is the active set, of the box and of the inequality rows."""
         equalities = [rows for rows in problem.soft().values() if rows.is_equality]
         intervals = [rows for rows in problem.soft().values() if not rows.is_equality]
-        curvature, damping = problem.curvature(problem.soft()), problem.curvature_damping(problem.soft())
+        curvature, damping = problem.curvature(problem.soft())
+        of_hard = problem.curvature_above(problem.soft(), problem.hard)
         answer = solve_least_squares_qp(
             *_stack([rows for rows in equalities if rows.dofs is None], problem),
             problem.lower,
@@ -68,8 +69,8 @@ class WeightedQP(Scheme):
                 [rows for rows in equalities if rows.dofs is not None],
                 problem,
                 self.damping,
-                self.curvature_damping * curvature,
-                self.curvature_damping * damping,
+                self.curvature_damping * (curvature + of_hard),
+                self.curvature_damping * (damping + of_hard),
                 self.backend,
             ),
             warm_start=warm_start,

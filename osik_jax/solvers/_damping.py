@@ -13,12 +13,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikValueError
 from ..numerics._constants import (
+    BLOCKING_PART,
     COST_FRACTION,
     DAMPING_ITERATIONS,
     DAMPING_RIDGE,
@@ -104,6 +106,7 @@ def level_damping(
     projector: Float[Array, "n n"],
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
+    above: HardRows | None = None,
 ) -> Float[Array, ""]:
     """Return the damping of one level, ``constant + unmet ratio``; 0 if its gradient would be roundoff.
 
@@ -117,6 +120,7 @@ def level_damping(
         projector: onto what they leave free.
         lower: lower bounds of the box, -inf where unbounded.
         upper: upper bounds of the box, inf where unbounded.
+        above: rows of the levels above that the step may not violate; None for none.
     """
     # the level's step does not depend on what x has in the projector's range
     base = x - apply(projector, x)
@@ -131,16 +135,53 @@ def level_damping(
     ridge = max(DAMPING_RIDGE, DAMPING_RIDGE_ROUNDOFF * float(jnp.finfo(gram.dtype).eps)) * jnp.trace(gram)
     demand = jnp.where(damping.demand > 0.0, damping.demand, 1.0)
     ratio = jnp.ones_like(damping.unmet)
+    blocking = None if above is None or not len(above.matrix) else _blocking(above, projector)
     for _ in range(DAMPING_ITERATIONS):
         # the damped step J'(J J' + damping I)^-1 goal, clipped into the box
         total = damping.constant + damping.unmet * ratio + ridge
         factor = jnp.linalg.cholesky(gram + jnp.where(total > 0.0, total, 1.0) * eye)
-        end = clipped(base + apply(rows.T, cho_solve((factor, True), goal)), lower, upper)
+        end = base + apply(rows.T, cho_solve((factor, True), goal))
+        # without the rows above, a level that they stop would count as met, and nothing would bound its step
+        end = clipped(end if blocking is None else _kept_inside(end, blocking), lower, upper)
         residual = safe_norm(level.distance(end))
         ratio = jnp.minimum(quotient(residual, demand), 1.0)
     total = damping.constant + damping.unmet * ratio
     longest_square = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
     return jnp.where(total > NEGLIGIBLE_DAMPING * longest_square, total, 0.0)
+
+
+class HardRows(NamedTuple):
+    """Rows ``lower <= matrix x <= upper`` of the levels above; unbounded rows stop nothing."""
+
+    matrix: Float[Array, "r n"]
+    lower: Float[Array, " r"]
+    upper: Float[Array, " r"]
+
+
+class _Blocking(NamedTuple):
+    """Rows of the levels above, and the direction of unit gain in the projector's range that moves each."""
+
+    rows: HardRows
+    direction: Float[Array, "r n"]
+
+
+def _blocking(above: HardRows, projector: Float[Array, "n n"]) -> _Blocking:
+    inside = product(above.matrix, projector)
+    square = jnp.sum(inside**2, -1)
+    # a row that depends on the frozen rows does not move
+    moves = square > BLOCKING_PART**2 * jnp.sum(above.matrix**2, -1)
+    return _Blocking(above, jnp.where(moves[:, None], inside / jnp.where(moves, square, 1.0)[:, None], 0.0))
+
+
+def _kept_inside(x: Float[Array, " n"], blocking: _Blocking) -> Float[Array, " n"]:
+    """Return x after one sweep that projects it onto each violated row in turn."""
+
+    def project(x: Array, now: _Blocking) -> tuple[Array, None]:
+        (row, lower, upper), direction = now
+        value = jnp.sum(row * x)
+        return x + (jnp.clip(value, lower, upper) - value) * direction, None
+
+    return jax.lax.scan(project, x, blocking)[0]
 
 
 def narrow_box(

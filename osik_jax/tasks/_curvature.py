@@ -29,7 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..execution._platform import cuda_is_default
-from ..numerics._constants import FARTHEST_ERROR, LEVER_ROUNDOFF, NEAR_ERROR, UNHELD_PART
+from ..numerics._constants import FARTHEST_ERROR, LEVER_ROUNDOFF, NEAR_ERROR, NEAR_PART, UNHELD_PART
 from ..numerics._dense import short_sum
 from ..numerics._guarded import largest, quotient, safe_norm
 from ._rotation import dot
@@ -84,8 +84,31 @@ def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"])
     return safe_norm(pull) * safe_norm(jacobian.ravel())
 
 
+def share_of_far(distance: Float[Array, " k"]) -> Float[Array, " k"]:
+    """Return 0 for a task at its target, and 1 for a task whose error is many lever arms. (k,).
+
+    Args:
+        distance: the errors, in lever arms: times their weighted pulls, over the curvatures. (k,)
+    """
+    ratio = jnp.clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR)
+    return ratio**2 / (1.0 + ratio**2)
+
+
+def near_part(far: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the fraction of the curvature bounds that counts: less than 1 where all tasks are near their targets.
+
+    A step is stable from half of the greatest eigenvalue on, and near the target the directions that the rows hardly
+    resist bend by a quarter of it at most. More damping makes the frame lag behind a target that moves through
+    configurations in which some direction is weak.
+
+    Args:
+        far: ``share_of_far`` of the farthest task.
+    """
+    return NEAR_PART + (1.0 - NEAR_PART) * far
+
+
 def fraction_to_damp(
-    bound: Float[Array, " k"], distance: Float[Array, " k"], stiffness: Float[Array, " k"]
+    bound: Float[Array, " k"], far: Float[Array, " k"], stiffness: Float[Array, " k"]
 ) -> Float[Array, " k"]:
     """Return the fraction of each task's curvature bound to damp; the task's own rows resist the rest.
 
@@ -95,11 +118,9 @@ def fraction_to_damp(
 
     Args:
         bound: dt times the curvature, b. (k,)
-        distance: the errors, in lever arms: times their weighted pulls, over the curvatures. (k,)
+        far: ``share_of_far`` of the tasks. (k,)
         stiffness: squared Frobenius norm of the Jacobian, its weights' roots multiplied in, g. (k,)
     """
-    ratio = jnp.clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR)
-    far = ratio**2 / (1.0 + ratio**2)
     total = 0.5 * bound + stiffness
     resisted = quotient(stiffness, jnp.where(total > 0.0, total, 1.0))
     return 1.0 - (1.0 - UNHELD_PART) * far * resisted

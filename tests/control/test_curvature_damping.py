@@ -50,6 +50,18 @@ def second_derivative(model, q, pull, body, h=1e-5):
     return np.array(rows)
 
 
+@pytest.mark.parametrize(("away", "part"), [(1e-4, 0.4), (10.0, 1.0)])
+def test_near_all_targets_the_bound_counts_in_part(arm, away, part):
+    """A foot that stays does not make less of a hand that is far from its target."""
+    q = bent(arm)
+    place = kinematics_at(arm, q).frame_pose(arm, "hand")[0]
+    elbow = osik.FrameTask(arm, "link4", rows="position", target=kinematics_at(arm, q).frame_pose(arm, "link4"))
+    hand = osik.FrameTask(arm, "hand", rows="position", gain=1.0 / DT, target=(place.at[0].add(away), jnp.eye(3)))
+    problem = osik.build_problem(arm, q, {"elbow": elbow, "hand": hand}, dt=DT)
+    bound, _ = problem.curvature(["elbow", "hand"])
+    assert float(bound) == pytest.approx(part * DT * float(problem.rows["hand"].curvature), rel=1e-3)
+
+
 @pytest.mark.slow
 def test_the_bound_is_near_the_greatest_curvature(arm, rng):
     """Half of the greatest eigenvalue is what a step needs to be stable; here it is never less than 0.6 of it."""
@@ -220,6 +232,7 @@ def test_a_posture_makes_up_for_it_in_a_weighted_program(arm, posture, error):
     bend = DT * float(rows.curvature)
     arms = 0.0 if error == 0.0 else error * 4.0 * 10.0 * error / float(rows.curvature)
     far, stiffness = arms**2 / (0.06**2 + arms**2), 4.0 * (J**2).sum()
+    bend *= 0.4 + 0.6 * far
     added = kappa * bend * (1.0 - 0.96 * far * 2.0 * stiffness / (bend + 2.0 * stiffness))
     held = damping + posture
     held += added * kappa * bend / (kappa * bend + 30.0 * held)

@@ -129,6 +129,35 @@ class TestOutOfReach:
             for lane in path:
                 assert np.linalg.norm(places_of(nao, lane[LATE::50], foot) - start, axis=1).max() < 2e-3
 
+    @pytest.mark.slow
+    def test_a_g1_whose_balance_is_a_polygon_comes_to_rest(self):
+        """Rows of the polygon stop the hand's level, whose gain is low; feet stay within 0.1 mm by MuJoCo C."""
+        bent = {"hip_pitch": -0.3, "knee": 0.6, "ankle_pitch": -0.3}
+        home = {f"{side}_{joint}_joint": angle for side in ("left", "right") for joint, angle in bent.items()}
+        g1 = osik.load_robot("g1", home=home)
+        feet = ("left_ankle_roll_link", "right_ankle_roll_link")
+        sole = [[x, y, -0.03] for x in (-0.05, 0.12) for y in (-0.025, 0.025)]
+        polygon = osik.support_polygon(g1, g1.q0, feet, margin=0.02, corners=dict.fromkeys(feet, sole))
+        tasks: dict[str, osik.Task] = {foot: osik.FrameTask(g1, foot, priority=1) for foot in feet}
+        tasks["com"] = osik.ComTask(g1, polygon=polygon, priority=2)
+        tasks["hand"] = osik.FrameTask(g1, "right_rubber_hand", rows="position", priority=3)
+        tasks["posture"] = osik.PostureTask(g1, priority=4)
+        middle, away = places_of(g1, [g1.q0], "right_rubber_hand")[0], np.array([[0.7, 0.0, -0.42], [0.8, 0.0, -0.48]])
+
+        @jax.jit
+        @jax.vmap
+        def motion(place):
+            aimed = tasks | {"hand": tasks["hand"].replace(gain=2.0, target=(place, jnp.eye(3)))}
+            run = osik.rollout(g1, g1.q0, aimed, scheme=osik.HierarchicalQP(), dt=DT, steps=STEPS)
+            return run.solution.velocity, run.solution.status, run.q
+
+        velocity, status, path = (np.asarray(part) for part in motion(jnp.asarray(middle + away)))
+        assert_calm(g1, velocity, status, 600)
+        for foot in feet:
+            start = places_of(g1, [g1.q0], foot)[0]
+            for lane in path:
+                assert np.linalg.norm(places_of(g1, lane[LATE::50], foot) - start, axis=1).max() < 1e-4
+
 
 class TestAtTheStart:
     """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives."""

@@ -73,6 +73,33 @@ def test_a_bounded_level_is_the_damped_least_squares(levels):
         np.testing.assert_allclose(A @ x, A @ best, rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("backend", ["auto", "jax"])
+def test_a_level_that_rows_above_stop_is_damped_as_out_of_reach(backend):
+    """The first level stops x_0, so x_1 has to do the second level's motion, of which it does 0.05 for each unit.
+
+    With the damping d the answer is x_1 = 0.05 / (0.05^2 + d). The damping is between 0.02 times the fixed point of
+    the ratio, which is 1 - 0.05^2 / 0.02, and 0.02. Without it x_1 is 20.
+    """
+    above = Level(np.array([[1.0, 0.0, 0.0]]), np.array([-np.inf]), np.array([0.0]))
+    level = Level(np.array([[1.0, 0.05, 0.0]]), np.array([1.0]))
+    far = np.full(3, 100.0)
+    dampings = [Damping(), Damping(unmet=0.02, demand=1.0)]
+    found = solve_hqp([above, level], -far, far, damping=dampings, backend=backend)
+    assert found.status == Status.SOLVED
+    fixed_point = 1.0 - 0.05**2 / 0.02
+    assert found.x[1] * (1.0 + 1e-6) >= 0.05 / (0.05**2 + 0.02)
+    assert found.x[1] < 0.05 / (0.05**2 + 0.02 * fixed_point)
+    np.testing.assert_allclose(found.x[0], 0.0, atol=1e-9)
+
+    def change(t):  # of the row and its bound
+        moved = Level(jnp.array([[1.0, 0.1 * t, 0.0]]), above.lower, jnp.array([0.3 * t]))
+        return solve_hqp([moved, level], -far, far, damping=dampings, backend=backend).x[1]
+
+    expected = (change(1e-5) - change(-1e-5)) / 2e-5
+    assert abs(expected) > 0.1
+    np.testing.assert_allclose(jax.jvp(change, (0.0,), (1.0,))[1], expected, rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_derivatives_are_those_of_the_values(levels):
     upper = jnp.full(N, 0.4)

@@ -202,6 +202,36 @@ def linkage():
 
 
 class TestFourBar:
+    @pytest.mark.parametrize(
+        ("form", "pull", "scheme"),
+        [
+            ("hard", "angle", osik.WeightedQP()),
+            ("first", "angle", osik.HierarchicalQP()),
+            ("hard", "point", osik.HierarchicalQP()),
+            pytest.param("hard", "point", osik.WeightedQP(), marks=pytest.mark.slow),
+            pytest.param("hard", "angle", osik.NullSpace(method="saturated"), marks=pytest.mark.slow),
+        ],
+    )
+    def test_a_loop_pulled_past_its_toggle_rests_there(self, linkage, form, pull, scheme):
+        """Crank and rod stretch to a line of 0.8 m, from where the rocker cannot go on; its angle by the cosine law."""
+        start, dead_point = _assembled(2.0), np.pi - np.arccos((0.6**2 + 0.5**2 - 0.8**2) / (2.0 * 0.6 * 0.5))
+        beyond = dead_point - 0.5
+        tasks = {"loop": osik.EqualityConstraintTask(linkage, hard=form == "hard", priority=1)}
+        if pull == "angle":
+            tasks["rocker"] = osik.PostureTask(
+                linkage, joints=("rocker",), target=np.r_[0.0, 0.0, beyond], weight=1.0, gain=5.0, priority=2
+            )
+        else:
+            place = np.array([0.6 + 0.5 * np.cos(beyond), 0.5 * np.sin(beyond), 0.0])
+            tasks["rocker"] = osik.FrameTask(linkage, "top", target=place, rows="position", gain=5.0, priority=2)
+        limits = osik.VelocityLimit(linkage, velocity={"*": 2.0})
+        path = osik.rollout(linkage, jnp.asarray(start), tasks, scheme=scheme, limits=(limits,), dt=0.01, steps=400)
+        assert (np.asarray(path.solution.status) == osik.Status.SOLVED).all()
+        assert np.abs(path.solution.velocity[-50:]).max() < 1e-2
+        assert np.linalg.norm(path.solution.error["loop"], axis=1).max() < 5e-4
+        assert np.linalg.norm(path.solution.error["loop"][-1]) < 1e-6
+        np.testing.assert_allclose(path.q[-1][2], dead_point, atol=2e-3)
+
     @pytest.mark.slow
     @pytest.mark.parametrize("form", ["hard", "first"])
     def test_the_loop_stays_closed_while_the_crank_turns(self, linkage, form):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._lanes import choose
 from ...numerics._constants import MAX_DETOUR, MAX_RESIDUAL
-from .._damping import level_damping
+from .._damping import HardRows, level_damping
 from .._level import Level
 from ._active_rows import drop_dependent, factor_active_rows
 from ._freeze import CascadeState, LevelOutcome, freeze, skip
@@ -244,15 +244,21 @@ def _level_problem(
     bounded = jnp.isfinite(state.lower) | jnp.isfinite(state.upper)
     n = len(state.x)
     terms = jax.tree.map(lambda a: a[k], hierarchy.damping)
+    may_block = ~state.frozen & bounded & (level_of_hard < k)
+    above = HardRows(
+        hierarchy.hard[n:],
+        jnp.where(may_block, state.lower, -jnp.inf)[n:],
+        jnp.where(may_block, state.upper, jnp.inf)[n:],
+    )
     return LevelProblem(
         level=level,
-        damping=level_damping(terms, level, state.x, state.projector, state.lower[:n], state.upper[:n]),
+        damping=level_damping(terms, level, state.x, state.projector, state.lower[:n], state.upper[:n], above),
         damping_terms=terms,
         is_equality=hierarchy.is_equality[k],
         hard=hierarchy.hard,
         lower=state.lower,
         upper=state.upper,
-        may_block=~state.frozen & bounded & (level_of_hard < k),
+        may_block=may_block,
         is_own=level_of_hard == k,
         is_own_inequality=(level_of_hard == k) & ~hierarchy.hard_is_equality,
         hard_of_row=jnp.asarray(layout.hard_of_row, int)[k],

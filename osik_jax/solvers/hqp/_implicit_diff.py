@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from ...execution._rules import custom_jvp
 from ...numerics._dense import apply, product
-from .._damping import Damping, level_damping, narrow_box
+from .._damping import Damping, HardRows, level_damping, narrow_box
 from .._inverses import row_space_and_motion, row_space_and_motion_of_rank
 from .._level import Level
 from ._padding import PaddedHierarchy
@@ -67,11 +67,19 @@ def _solve_at_active_sets(
     n = hierarchy.hard.shape[1]
     pinned = hierarchy.hard_is_equality[:n]
 
-    def solve_level(state: tuple[Array, ...], now: tuple[ActiveSets, Level, Damping]) -> tuple[tuple[Array, ...], None]:
-        sets, level, terms = now
+    def solve_level(
+        state: tuple[Array, ...], now: tuple[Array, ActiveSets, Level, Damping]
+    ) -> tuple[tuple[Array, ...], None]:
+        k, sets, level, terms = now
         x, projector, low, high, curvature = state
         hard = hierarchy.hard, hierarchy.hard_lower.at[:n].set(low), hierarchy.hard_upper.at[:n].set(high)
-        damping = level_damping(terms, level, x, projector, low, high)
+        # rows in the cost of a level above depend on what is frozen, and stop nothing
+        above = HardRows(
+            hierarchy.hard[n:],
+            jnp.where(hierarchy.hard_level < k, hierarchy.hard_lower, -jnp.inf)[n:],
+            jnp.where(hierarchy.hard_level < k, hierarchy.hard_upper, jnp.inf)[n:],
+        )
+        damping = level_damping(terms, level, x, projector, low, high, above)
         # the level moves within what all active rows leave free; below it only the frozen ones are equalities
         x, free = _fit_rows(*_active_first(*hard, sets.active), n, x, projector, singular_tol)
         _, free_below = _fit_rows(*_active_first(*hard, sets.frozen), n, x, projector, singular_tol)
@@ -87,7 +95,8 @@ def _solve_at_active_sets(
         *box,
         jnp.zeros_like(box[0]),
     )
-    return jax.lax.scan(solve_level, start, (active_sets, hierarchy.levels, hierarchy.damping))[0][0]
+    numbers = jnp.arange(len(hierarchy.levels.lower))
+    return jax.lax.scan(solve_level, start, (numbers, active_sets, hierarchy.levels, hierarchy.damping))[0][0]
 
 
 def _active_first(matrix: Array, lower: Array, upper: Array, active: Array) -> tuple[Array, Array, Array, Array]:

@@ -50,6 +50,7 @@ class PaddedHierarchy(NamedTuple):
     hard_lower: Float[Array, " h"]
     hard_upper: Float[Array, " h"]
     hard_is_equality: Bool[Array, " h"]
+    hard_level: Int[Array, " h"]  # level of each hard row; -1 for the box
 
 
 class LevelProblem(NamedTuple):
@@ -138,6 +139,7 @@ def pad_hierarchy(
         hard_is_equality=jnp.concatenate(
             [pinned, *(rows for level, rows in zip(levels, is_equality, strict=True) if not level.equality)]
         ),
+        hard_level=jnp.array(level_of_hard, jnp.int32),
     )
     return layout, hierarchy
 
