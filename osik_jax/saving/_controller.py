@@ -13,11 +13,14 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._errors import OsikValueError, OsikWarning
 from ..control._checks import check_setting, check_tasks, checked_limits
-from ..limits import CollisionAvoidanceLimit, Limit, Limits
+from ..control._step import build_problem
+from ..kinematics import integrate
+from ..limits import Limit, Limits
 from ..robot import Robot, load_robot
 from ..robot.loading import is_mjcf
 from ..schemes import Scheme
@@ -25,7 +28,9 @@ from ..schemes._default import scheme_for
 from ..tasks import Task
 from ._parts import decode, encode
 
-_FORMAT = "osik-jax controller 1"
+_FORMAT = "osik-jax controller 2"
+_ACCURACY = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-4}
+"""Largest difference of a step's numbers, relative to the largest of each array, that is roundoff of an MJCF."""
 
 
 class Controller(NamedTuple):
@@ -58,8 +63,8 @@ def save_controller(
 ) -> None:
     """Write a controller to a JSON file, for ``load_controller``.
 
-    All numbers of the robot are in the file, so a robot that was scaled or moved home comes back as it is. Joints,
-    frames and bodies are in it by name.
+    Joints, frames and bodies are in the file by name. Without ``source``, the robot is written as MJCF and read again
+    before the file is written: what a step asks for must be the same for both.
 
     Args:
         path: of the file.
@@ -69,12 +74,13 @@ def save_controller(
         limits: as in ``solve``.
         dt: time of a step [s].
         source: where the robot comes from: a name that ``load_robot`` takes, or the path of a URDF or MJCF file, which
-            has to be there when the controller is loaded; the robot's numbers then are in the file to the last bit.
-            Default: the file has the robot as ``Robot.to_mjcf`` writes it, without meshes and locked joints.
+            has to be there when the controller is loaded. All numbers of the robot are then in the file to the last
+            bit, so a robot that was scaled or moved home comes back as it is. Default: the file has the robot as
+            ``Robot.to_mjcf`` writes it, without meshes and locked joints.
 
     Raises:
         TypeError, ValueError: as in ``solve``; a task, limit or scheme of a class that is not in osik_jax; a robot that
-            its source does not make again, or without one a limit on the distances of its meshes.
+            its source does not make again, or whose MJCF gives other numbers, for example the distances of its meshes.
         OSError: the file cannot be written.
     """
     check_setting("save_controller(path, robot, tasks)", robot, scheme, dt)
@@ -83,12 +89,14 @@ def save_controller(
     used, tree = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme, robot.tree
     content = {
         "format": _FORMAT,
-        "robot": _source(robot, source, given),
+        "robot": _source(robot, source),
         "dt": float(dt),
         "scheme": encode(used, "scheme", tree),
         "limits": [encode(limit, f"limits[{place}]", tree) for place, limit in enumerate(given)],
         "tasks": [[name, encode(task, f"tasks[{name!r}]", tree)] for name, task in tasks.items()],
     }
+    if source is None:
+        _check_written(robot, dict(tasks), given, content)
     Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
@@ -106,7 +114,11 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
         known = False
     if not known:
         raise OsikValueError(f"{path} is no controller that save_controller wrote ({_FORMAT})")
-    robot = _robot(content["robot"])
+    return _made(content, _robot(content["robot"]))
+
+
+def _made(content: Mapping[str, Any], robot: Robot) -> Controller:
+    """Return the controller of a file's content, for the robot that the content makes."""
     return Controller(
         robot=robot,
         tasks={name: decode(task, robot.tree) for name, task in content["tasks"]},
@@ -116,22 +128,15 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
     )
 
 
-def _source(robot: Robot, source: str | os.PathLike[str] | None, limits: Sequence[Limit]) -> dict[str, Any]:
+def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, Any]:
     """Return how to make the robot again: its model; or a name or a file with its hash, and all of its numbers."""
+    options = {"floating_base": robot.floating_base, "locked_joints": list(robot.locked_joints)}
     if source is None:
-        found: dict[str, Any] = {"mjcf": robot.to_mjcf()}
-    elif Path(source).is_file():
-        found = {"file": str(Path(source).resolve()), "sha256": _hash(Path(source))}
-    else:
-        found = {"name": str(source)}
-    found |= {"floating_base": robot.floating_base, "locked_joints": list(robot.locked_joints)}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OsikWarning)  # what the robot does not keep was said when it was loaded
-        again = _loaded(found)
-    if source is None:
-        _check_written(robot, again, limits)
-        return found
-    if _structure(again) != _structure(robot):
+        return {"mjcf": robot.to_mjcf()} | options
+    file = Path(source)
+    found = {"file": str(file.resolve()), "sha256": _hash(file)} if file.is_file() else {"name": str(source)}
+    found |= options
+    if _structure(_quietly_loaded(found)) != _structure(robot):
         raise OsikValueError(
             "the robot cannot be made again from its source: its joints, frames or shapes differ. Give source= as the "
             "name or file that it was loaded from, without options other than floating_base and locked_joints"
@@ -139,16 +144,51 @@ def _source(robot: Robot, source: str | os.PathLike[str] | None, limits: Sequenc
     return found | {"numbers": {name: encode(getattr(robot, name), name, robot.tree) for name in _numbers(robot)}}
 
 
-def _check_written(robot: Robot, again: Robot, limits: Sequence[Limit]) -> None:
-    """Raise where tasks or limits need a part of the robot that its MJCF does not have."""
-    if again.tree.dof_owners != robot.tree.dof_owners or set(again.frame_names) != set(robot.frame_names):
-        raise OsikValueError("the robot's MJCF does not have all of its joints and frames: give source=")
-    own = any(isinstance(limit, CollisionAvoidanceLimit) and limit.scene.geoms for limit in limits)
-    if own and again.tree.geom_names != robot.tree.geom_names:
-        raise OsikValueError(
-            "a CollisionAvoidanceLimit needs meshes, which the robot's MJCF does not have: give source= as the name or "
-            "file that the robot was loaded from"
-        )
+def _check_written(robot: Robot, tasks: dict[str, Task], limits: Limits, content: Mapping[str, Any]) -> None:
+    """Raise where a robot read from its MJCF, with tasks and limits read for it, asks for another step.
+
+    Locked joints and fused bodies are written as one body, so masses, shapes and numbers of bodies may differ. What
+    counts is what a step sees: it is compared at home and beside it.
+    """
+    try:
+        again = _made(content, _quietly_loaded(content["robot"]))
+        same = again.robot.tree.dof_owners == robot.tree.dof_owners
+        aside = 0.1 * np.sin(1.0 + np.arange(robot.nv))
+        for q in (robot.q0, integrate(robot, robot.q0, aside)) if same else ():
+            problems = (
+                build_problem(robot, q, tasks, limits=limits, dt=content["dt"]),
+                build_problem(again.robot, q, again.tasks, limits=again.limits, dt=content["dt"]),
+            )
+            same &= _are_close(*problems)
+    except (IndexError, KeyError, TypeError, ValueError) as problem:
+        raise OsikValueError(f"the robot's MJCF does not make it again: {problem}. {_REMEDY}") from problem
+    if not same:
+        raise OsikValueError(f"the robot's MJCF gives another step: masses, shapes or joints differ. {_REMEDY}")
+
+
+_REMEDY = "Give source= as the name or file that the robot was loaded from"
+
+
+def _are_close(one: Any, other: Any) -> bool:
+    """Return whether two trees have the same structure, and arrays that differ by roundoff."""
+    a, b = (jax.tree.flatten(tree) for tree in (one, other))
+    if a[1] != b[1] or any(np.shape(x) != np.shape(y) for x, y in zip(a[0], b[0], strict=True)):
+        return False
+    for x, y in zip(*(map(np.asarray, leaves) for leaves in (a[0], b[0])), strict=True):
+        if not np.issubdtype(x.dtype, np.floating):
+            same = np.array_equal(x, y)
+        else:
+            largest = np.abs(x[np.isfinite(x)]).max(initial=1e-3)
+            same = np.allclose(x, y, rtol=0.0, atol=_ACCURACY[jnp.dtype(x.dtype)] * largest, equal_nan=True)
+        if not same:
+            return False
+    return True
+
+
+def _quietly_loaded(described: Mapping[str, Any]) -> Robot:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OsikWarning)  # what the robot does not keep was said when it was loaded
+        return _loaded(described)
 
 
 def _robot(described: Mapping[str, Any]) -> Robot:

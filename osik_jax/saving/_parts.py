@@ -93,6 +93,9 @@ def decode(data: Any, tree: KinematicTree) -> Any:
         return {"tuple": tuple, "list": list, "frozenset": frozenset}[data["sequence"]](items)
     if "names" in data:
         names, of = getattr(tree, data["names"]), data["of"]
+        for name in [of] if isinstance(of, str) else of:
+            if name not in names:
+                raise OsikValueError(f"the robot has no {name!r} in its {data['names']}")
         return names.index(of) if isinstance(of, str) else tuple(map(names.index, of))
     cls = _class(data["class"])
     if "value" in data:

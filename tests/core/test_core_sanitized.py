@@ -21,6 +21,7 @@ SOME = (
     "kinematics/test_core_kinematics.py::test_beside_mujoco",
 )
 ALL = (
+    *("-m", ""),  # slow ones too
     *("core/test_core_qps.py", "core/test_core_hierarchies.py", "core/test_core_null_space.py"),
     *("core/test_core_hard_data.py", "core/test_core_plans.py", "kinematics/test_core_kinematics.py"),
 )

@@ -59,7 +59,10 @@ def all_limits(arm) -> list[osik.Limit]:
 
 def same(a: Any, b: Any) -> bool:
     first, second = jax.tree.flatten(a), jax.tree.flatten(b)
-    return first[1] == second[1] and all(np.array_equal(x, y) for x, y in zip(first[0], second[0], strict=True))
+    return first[1] == second[1] and all(
+        np.array_equal(x, y) and np.asarray(x).dtype == np.asarray(y).dtype
+        for x, y in zip(first[0], second[0], strict=True)
+    )
 
 
 @pytest.mark.parametrize("scheme", [osik.WeightedQP(2e-6), osik.HierarchicalQP(), osik.NullSpace(method="reverse")])
@@ -184,12 +187,57 @@ def test_a_limit_on_meshes_needs_the_source(tmp_path):
     text = wedge + link.format(0, "a") + link.format(1, "b") + "</worldbody></mujoco>"
     robot = osik.Robot.from_mjcf(text)
     tasks, limits = {"p": osik.PostureTask(robot)}, [osik.CollisionAvoidanceLimit(robot)]
-    with pytest.raises(ValueError, match=r"needs meshes, which the robot's MJCF does not have: give source="):
+    with pytest.raises(ValueError, match=r"MJCF .*[Gg]ive source="):
         osik.save_controller(tmp_path / "c.json", robot, tasks, limits=limits)
     osik.save_controller(tmp_path / "c.json", robot, tasks)
     (tmp_path / "r.xml").write_text(text)
     osik.save_controller(tmp_path / "f.json", robot, tasks, limits=limits, source=tmp_path / "r.xml")
     assert same(osik.load_controller(tmp_path / "f.json").limits[0], limits[0])
+
+
+FUSED = """<mujoco><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom size=".05"/>
+  <body name="b" pos="0 0 .3"><joint name="b" axis="1 0 0"/><geom size=".06"/>
+    <body name="d" pos="0 0 .3"><joint name="d" axis="0 1 0"/><geom size=".07"/></body></body>
+  <body name="c" pos="0 0 .5"><geom size=".2"/></body></body></worldbody>{}</mujoco>"""
+GEAR = '<equality><joint joint1="d" joint2="a" polycoef="0 1 .5 0 0"/></equality>'
+
+
+def moved(robot):
+    return {"com": osik.ComTask(robot, target=[0.1, 0.0, 0.3]), "posture": osik.PostureTask(robot)}
+
+
+def shaped(robot, frame):
+    shapes = {"own": osik.CollisionShape.sphere(0.03, frame=frame), "table": TABLE}
+    return [osik.CollisionAvoidanceLimit(robot, shapes=shapes, pairs=[("own", "table")])]
+
+
+@pytest.mark.parametrize(
+    "case", ["shapes of fused links", "mass of a locked joint", "shape on a locked link", "gear of a locked joint"]
+)
+def test_a_robot_whose_text_gives_another_step_needs_the_source(tmp_path, case):
+    """What is written is read again and compared; it may be the same after all, and then is saved."""
+    limits: list[osik.Limit] = []
+    if case == "shapes of fused links":
+        robot = osik.Robot.from_mjcf(FUSED.format(""))
+        tasks, limits = {"p": osik.PostureTask(robot)}, [osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf)]
+    elif case == "gear of a locked joint":
+        robot = osik.Robot.from_mjcf(FUSED.format(GEAR), locked_joints={"a": 0.2})
+        tasks = {"gear": osik.EqualityConstraintTask(robot), "p": osik.PostureTask(robot)}
+    else:
+        robot = osik.load_robot("arm7", locked_joints={"joint1" if case.startswith("mass") else "joint7": 0.4})
+        tasks = moved(robot)
+        limits = shaped(robot, "hand") if case.startswith("shape") else []
+    path = tmp_path / "c.json"
+    try:
+        osik.save_controller(path, robot, tasks, limits=limits, scheme=osik.WeightedQP())
+    except ValueError as refused:
+        assert "Give source=" in str(refused) and not path.exists()
+        return
+    found = osik.load_controller(path)
+    q = np.asarray(robot.q0) + 0.2
+    answer = osik.solve(found.robot, q, found.tasks, scheme=found.scheme, limits=found.limits)
+    expected = osik.solve(robot, q, tasks, scheme=osik.WeightedQP(), limits=limits)
+    np.testing.assert_allclose(answer.velocity, expected.velocity, atol=1e-9)
 
 
 def test_other_files_and_classes_are_refused(tmp_path, arm):
