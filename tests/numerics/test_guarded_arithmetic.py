@@ -106,6 +106,7 @@ def _rates_of_limits_by_dt(precision, angle):
 
         def bounds(dt):
             rows = ranges.rows(robot, kinematics, q, dt)
+            assert rows is not None
             boxes = [jnp.stack(osik.limit_box(robot, q, (limit,), dt)) for limit in (ranges, braking)]
             return jnp.concatenate([*(jnp.ravel(box) for box in boxes), rows.upper])
 

@@ -136,8 +136,8 @@ def test_base_waist_and_retargeting_root_are_the_robots(nao, scene):
     assert nao.body_names[0] in tasks and "cube" not in tasks
     profile = find_profile(nao)
     builds = Build.of(nao, profile), Build.of(scene, profile)
-    np.testing.assert_allclose(builds[1].hips, builds[0].hips, atol=1e-12)
-    assert builds[1].base == scene.joint_qpos_index(base_name(scene))
+    np.testing.assert_allclose(builds[1].root, builds[0].root, atol=1e-12)
+    assert builds[1].free == scene.joint_qpos_index(base_name(scene))
 
 
 def test_the_world_of_physics_has_the_robots_mass(nao):

@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -177,7 +177,7 @@ def test_a_robot_of_no_source_keeps_what_is_numbered(tmp_path, locked):
     answers = [osik.solve(r, r.q0, t, scheme=osik.WeightedQP(), limits=limit) for r, t, limit in given]
     np.testing.assert_allclose(answers[1].velocity, answers[0].velocity, atol=1e-9)
     kinematics = [osik.forward_kinematics(r, r.q0) for r in (robot, found.robot)]
-    near = [limit.distances(r, k) for (r, _, (limit,)), k in zip(given, kinematics, strict=True)]
+    near = [cast(Any, limit).distances(r, k) for (r, _, (limit,)), k in zip(given, kinematics, strict=True)]
     np.testing.assert_allclose(near[1], near[0], atol=1e-12)
 
 
@@ -206,7 +206,7 @@ def moved(robot):
     return {"com": osik.ComTask(robot, target=[0.1, 0.0, 0.3]), "posture": osik.PostureTask(robot)}
 
 
-def shaped(robot, frame):
+def shaped(robot, frame) -> list[osik.Limit]:
     shapes = {"own": osik.CollisionShape.sphere(0.03, frame=frame), "table": TABLE}
     return [osik.CollisionAvoidanceLimit(robot, shapes=shapes, pairs=[("own", "table")])]
 
@@ -219,7 +219,8 @@ def test_a_robot_whose_text_gives_another_step_needs_the_source(tmp_path, case):
     limits: list[osik.Limit] = []
     if case == "shapes of fused links":
         robot = osik.Robot.from_mjcf(FUSED.format(""))
-        tasks, limits = {"p": osik.PostureTask(robot)}, [osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf)]
+        tasks = {"p": osik.PostureTask(robot)}
+        limits = [osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf)]
     elif case == "gear of a locked joint":
         robot = osik.Robot.from_mjcf(FUSED.format(GEAR), locked_joints={"a": 0.2})
         tasks = {"gear": osik.EqualityConstraintTask(robot), "p": osik.PostureTask(robot)}

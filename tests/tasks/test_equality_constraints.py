@@ -216,7 +216,8 @@ class TestFourBar:
         """Crank and rod stretch to a line of 0.8 m, from where the rocker cannot go on; its angle by the cosine law."""
         start, dead_point = _assembled(2.0), np.pi - np.arccos((0.6**2 + 0.5**2 - 0.8**2) / (2.0 * 0.6 * 0.5))
         beyond = dead_point - 0.5
-        tasks = {"loop": osik.EqualityConstraintTask(linkage, hard=form == "hard", priority=1)}
+        tasks: dict[str, osik.Task] = {}
+        tasks["loop"] = osik.EqualityConstraintTask(linkage, hard=form == "hard", priority=1)
         if pull == "angle":
             tasks["rocker"] = osik.PostureTask(
                 linkage, joints=("rocker",), target=np.r_[0.0, 0.0, beyond], weight=1.0, gain=5.0, priority=2
