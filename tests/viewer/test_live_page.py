@@ -199,7 +199,7 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
 
 def test_without_viser_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
-    with pytest.raises(ImportError, match=r"pip install 'osik-jax\[viewer\]'"):
+    with pytest.raises(ImportError, match=r'pip install "\.\[viewer\]"'):
         serve(ARM, {"posture": osik.PostureTask(ARM, weight=1.0)}, port=0)
 
 
