@@ -39,7 +39,7 @@ def at_most_inverse(gain: Float[Array, ""], dt: Float[Array, ""] | float) -> Flo
     return jnp.where(is_capped, 1.0 / jnp.where(is_capped, dt, 1.0), gain)
 
 
-def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, ""] | float) -> Float[Array, "*S"]:
+def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, "*#S"] | float) -> Float[Array, "*S"]:
     """Return way / dt; a rate so fast that it is no bound (``_FASTEST``) has a derivative of 0, not an infinite one."""
     dt = jnp.asarray(dt, way.dtype)
     is_far = jnp.abs(way) > _FASTEST * dt
@@ -59,6 +59,15 @@ def largest(vector: Float[Array, "..."]) -> Float[Array, ""]:
     """Return the largest absolute entry, 1 where all are 0; a constant for derivatives."""
     found = jnp.max(jnp.abs(jax.lax.stop_gradient(vector)), initial=0.0)
     return jnp.where((found > 0.0) & (found < jnp.inf), found, 1.0)
+
+
+def greatest(vector: Float[Array, " m"]) -> Float[Array, ""]:
+    """Return the largest entry of a vector; its derivative is that of the entry.
+
+    That of ``jnp.max`` divides by the number of entries that equal the maximum. Where XLA computes the entries twice
+    and rounds them differently, there is none.
+    """
+    return vector[jnp.argmax(vector)]
 
 
 def clipped(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:

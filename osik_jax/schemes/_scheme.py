@@ -16,7 +16,7 @@ from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
 from ..numerics._constants import BELOW_OTHERS, CONSTRAINT_TOL, STANDING_SPEED
 from ..numerics._dense import apply, product, short_sum
-from ..numerics._guarded import quotient, safe_norm
+from ..numerics._guarded import greatest, quotient, safe_norm
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
 from ..solvers._level import positive_root
@@ -103,7 +103,7 @@ class VelocityProblem(eqx.Module):
         distance, stiffness = jnp.sum(jnp.where(of_task, parts[:, None], 0.0), axis=2)
         far = share_of_far(distance)
         bounds = self._bounds(equal)
-        bounds = near_part(jnp.max(jnp.where(bounds > 0.0, far, 0.0))) * bounds
+        bounds = near_part(greatest(jnp.where(bounds > 0.0, far, 0.0))) * bounds
         to_damp = fraction_to_damp(bounds, far, stiffness) * bounds
         return safe_norm(jnp.concatenate([of_rest, bounds])), safe_norm(jnp.concatenate([of_rest, to_damp]))
 
@@ -170,7 +170,7 @@ class VelocityProblem(eqx.Module):
         squared = weight * short_sum(jacobian**2)
         # NaN where the step is not valid, and times NaN a derivative of 0 is NaN
         size = positive_root(jnp.sum(jnp.where(jnp.isnan(squared), 0.0, squared)))
-        return quotient(jnp.max(self.bends(names)), jnp.where(size > 0.0, size, 1.0))
+        return quotient(greatest(self.bends(names)), jnp.where(size > 0.0, size, 1.0))
 
     def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
         """Return what a motion of each dof costs these tasks at second order, for a unit residual (``row_sums``).
