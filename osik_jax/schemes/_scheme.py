@@ -15,7 +15,7 @@ from .._errors import OsikValueError
 from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
 from ..numerics._constants import BELOW_OTHERS, CONSTRAINT_TOL, STANDING_SPEED
-from ..numerics._dense import apply, product, short_sum
+from ..numerics._dense import apply, short_sum
 from ..numerics._guarded import greatest, quotient, safe_norm
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
@@ -155,7 +155,7 @@ class VelocityProblem(eqx.Module):
         """
         rows = [self.rows[name] for name in names]
         linear = [own.weight * own.pull for own in rows if own.dofs is not None]
-        curved = [product(own.weight * own.pull, own.jacobian) for own in rows if own.dofs is None]
+        curved = [apply(own.jacobian.T, own.weight * own.pull) for own in rows if own.dofs is None]
         parts = [
             safe_norm(jnp.concatenate(forces)) * self._bending(by)
             for forces, by in ((linear, above), (curved, self.hard))
