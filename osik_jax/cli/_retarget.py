@@ -49,7 +49,7 @@ class Retarget:
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
     base: Literal["floating", "fixed"] = "floating"
-    """Whether the base of a robot that comes as a file moves; "fixed" for an upper body, whose arms follow alone."""
+    """Base of a robot that comes as a file: "floating" moves, "fixed" stands still and only the limbs follow."""
     source: str | None = None
     """The robot whose motion CLIP is (motion.npz, or a CSV with --source-fps), by file or name. Default: a person."""
     source_fps: float | None = None

@@ -251,7 +251,6 @@ class _Setting:
         moved = dataclasses.replace(own, keypoints=keypoints, weights=dataclasses.replace(own.weights, **weights))
         if own.scale is not None:
             return dataclasses.replace(moved, scale=round(own.scale * factor, 4))
-        # legs that were measured between other places are of another length
         # moved keypoints change the measured limb length, which the stretch compensates
         longer = Build.of(self.own.robot, moved).size / self.build.size
         return dataclasses.replace(moved, stretch=round(own.stretch * factor / longer, 4))

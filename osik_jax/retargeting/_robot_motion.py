@@ -59,7 +59,7 @@ class RobotMotion:
 
     @property
     def is_free(self) -> bool:
-        """Whether the base moves, by the free joint's columns."""
+        """Return whether ``qpos`` has the seven columns of a free joint, so that the base moves."""
         return self.qpos.shape[1] > len(self.joint_names)
 
     def resampled(self, fps: float) -> RobotMotion:
