@@ -10,7 +10,6 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import jax
 import pytest
 from prose import assert_fit_to_read
 
@@ -121,15 +120,12 @@ def test_code_runs(
     text = page.read_text()
     monkeypatch.chdir(tmp_path)  # for the files that a page writes
     namespace: dict[str, Any] = {"__name__": "documentation"}
-    try:
-        for block in BLOCK.finditer(text):
-            title, code = block.groups()
-            if title in LIBRARIES and importlib.util.find_spec(title) is None:
-                continue
-            line = text[: block.start(2)].count("\n")
-            exec(compile("\n" * line + code, str(page), "exec"), namespace)
-    finally:
-        jax.config.update("jax_enable_x64", True)
+    for block in BLOCK.finditer(text):
+        title, code = block.groups()
+        if title in LIBRARIES and importlib.util.find_spec(title) is None:
+            continue
+        line = text[: block.start(2)].count("\n")
+        exec(compile("\n" * line + code, str(page), "exec"), namespace)
     if page == README:
         assert capsys.readouterr().out.startswith("True [")
         assert namespace["found"].converged
