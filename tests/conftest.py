@@ -91,7 +91,7 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(autouse=True)
 def restore_settings() -> Iterator[None]:
-    """Puts back what a notebook, a page or an example sets for the whole process: the style of figures and precision."""
+    """Puts back what a notebook, a page or an example sets for the whole process: figure style and precision."""
     matplotlib = sys.modules.get("matplotlib")
     with matplotlib.rc_context() if matplotlib else contextlib.nullcontext():
         yield
