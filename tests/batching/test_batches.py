@@ -62,7 +62,7 @@ def lane(tree, i):
 
 
 class TestBatchesEqualLoops:
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_over_configurations_and_targets(self, arm, tasks, limits, start):
         """The batch of targets comes out of a vmapped replace, with the same axes."""
         shifts = jnp.linspace(-0.1, 0.1, LANES * 3).reshape(LANES, 3)
@@ -76,6 +76,7 @@ class TestBatchesEqualLoops:
         ]
         np.testing.assert_allclose(got, np.stack(loop), atol=1e-10)
 
+    @pytest.mark.slow
     def test_over_weights_and_gains(self, arm, tasks, limits):
         values = {"*.weight": jnp.array([0.1, 1.0, 10.0]), "hand.gain.maximum": jnp.array([2.0, 4.0, 8.0])}
         axes = osik.batch_axes(tasks, *values)

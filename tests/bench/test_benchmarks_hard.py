@@ -131,7 +131,7 @@ class TestNumbers:
 
 
 class TestMotions:
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_ours_and_minks_are_one_inside(self, work, monkeypatch):
         """Nothing is out of reach in the first second: all that differs is the damping."""
         work = without_turning(work, posture=True)

@@ -49,7 +49,7 @@ def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
     assert forward["seconds"] > 0.0 and gradient["seconds"] > 0.0  # which is longer is not sure in so short a run
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_job_goes_on_where_it_was(tmp_path, monkeypatch, capsys):
     """Of three chunks the middle one is lost: it alone is run, and comes out as it was."""
     command = ["job", str(tmp_path), "--robot", "arm7", "--steps", "18", "--length", "2", "--chunk", "3"]

@@ -48,6 +48,7 @@ def test_ours_is_minks_motion(work, paths, monkeypatch):
     np.testing.assert_allclose(motion, paths["mink"], rtol=0, atol=1e-5)
 
 
+@pytest.mark.variants(release=["osik_jax"])
 @pytest.mark.parametrize("name", ["osik_jax", "mink"])
 def test_a_good_motion_counts(work, paths, name):
     score = judged(work, paths[name])

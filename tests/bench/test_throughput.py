@@ -54,7 +54,7 @@ def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
         throughput.kept(other)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_reference_is_the_rollout():
     """The carried step is ``rollout``'s: errors after the checked steps."""
     given = throughput.setting("arm7")
@@ -83,7 +83,7 @@ def test_a_sweep_ends_before_a_call_takes_too_long(monkeypatch):
     assert [row["batch"] for row in found] == [1, 8, 10]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_jumps_are_counted():
     given, sample = throughput.setting("arm7"), []
     row = jumps.measure(given, osik.WeightedQP(), robots=4, scans=1, radius=0.5, sample=sample)

@@ -156,6 +156,7 @@ def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path, arm_file):
     assert told[0] == f"osik: cannot write to {tmp_path / 'out'}: File too large; it may be incomplete"
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_in_one_line(tmp_path, arm_file):
     """Ctrl-C once the time that it takes has been told."""
     words = [sys.executable, "-m", "osik_jax.cli", "demo", "--robot", str(arm_file), "--duration", "60", "--out"]
@@ -205,7 +206,7 @@ def test_info_lists_joints_limits_frames_and_mass(capsys):
     assert numbers[4] == pytest.approx(float(robot.velocity_limit[dof]), abs=5e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_demo_of_a_file_writes_its_folder(capsys, tmp_path, arm_file):
     out = tmp_path / "out"
     arguments = [

@@ -185,6 +185,7 @@ EXACT += [("floor", kind) for kind in ("sphere", "capsule", "box", "mesh")]
 APART = [("capsule", "box"), ("sphere", "mesh"), ("capsule", "mesh"), ("box", "mesh"), ("mesh", "mesh")]
 
 
+@pytest.mark.variants(release=["sphere-sphere"])
 @pytest.mark.parametrize("kinds", EXACT, ids="-".join)
 def test_distance_is_that_of_mujoco(zoo, mujoco_distances, kinds):
     """Apart and overlapping."""
@@ -310,7 +311,7 @@ def _slopes(robot, limit):
     return _jit(jax.vmap(lambda q: (jax.jacfwd(numbers)(q), jax.jacrev(numbers)(q))))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_of_rows(arm, avoidance):
     """Second derivatives too: against differences of the rows' Jacobians, where nothing jumps."""
     q = np.random.default_rng(3).uniform(-1.5, 1.5, (30, 3))
@@ -480,7 +481,7 @@ def _tips(arm, q):
     return jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "tip")[0])(q)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_step_of_a_closed_loop_penetrates(arm, among):
     """Forty targets that the arm can reach: with the limit 15 mm are kept, without it more than half hit something."""
     reachable = np.random.default_rng(6).uniform(-2.0, 2.0, (40, 3))
@@ -492,6 +493,7 @@ def test_no_step_of_a_closed_loop_penetrates(arm, among):
     assert (np.asarray(status) == osik.Status.SOLVED).all()
 
 
+@pytest.mark.slow
 def test_pairs_that_start_too_near_come_apart(arm, among):
     """From inside the ball at the speed of recovery, until the distance is kept."""
     around = among.moved("ball", position=np.array([0.55, 0.02, 0.4]), size=np.array([0.05, 0.0, 0.0]))

@@ -109,7 +109,7 @@ def test_a_floor_in_the_world_is_no_neighbour_of_the_first_link():
     assert named(limit) == expected("floor one", "floor two", "pole one", "pole two", "foot two", "edge two")
 
 
-@pytest.mark.variants(slow=["fused by glob"])
+@pytest.mark.variants(slow=["fused by glob"], release=["glob of links"])
 @pytest.mark.parametrize(
     ("pairs", "kept"),
     [
@@ -170,7 +170,7 @@ def test_an_obstacle_meets_the_links_of_a_urdf():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_distances_are_those_of_mujocos_own_reading():
     """MuJoCo reads the same URDF; its cylinders are round, ours are prisms around them."""
     text = f"<robot name='r'>{''.join(CHAIN)}</robot>"
@@ -232,6 +232,7 @@ def meshed(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_meshes_are_read_when_a_limit_needs_them(meshed):
     """With the same distances as meshes that MuJoCo has read, for longer links too."""
     late, early = (osik.Robot.from_urdf(meshed, floating_base=False, collision_meshes=read) for read in (False, True))

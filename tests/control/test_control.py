@@ -74,7 +74,7 @@ def assert_same(ours, theirs, atol):
 
 
 class TestRollout:
-    @pytest.mark.variants(slow=["hierarchical", "weighted"])
+    @pytest.mark.variants(release=["hierarchical", "weighted"])
     @all_schemes
     def test_equals_a_python_loop(self, arm, home, tasks, limits, name):
         """Every number of the solution but the warm start, with a target that moves."""
@@ -95,6 +95,7 @@ class TestRollout:
         np.testing.assert_array_equal(run.solution.status, osik.Status.SOLVED)
         assert np.abs(q[-1] - q[0]).max() > 0.05
 
+    @pytest.mark.slow
     def test_functions_of_time_for_tasks_and_feedback(self, arm, home, tasks, limits):
         """Feedback: the configuration that the last step led to comes back changed."""
         p, R = paths(home)
@@ -250,6 +251,7 @@ class TestBatches:
         for change, size in zip(CHANGES[1:], moved, strict=True):
             assert (size < 1e-9) if change in idle else (size > 1e-6), change
 
+    @pytest.mark.variants(release=["hierarchical"])
     @all_schemes
     def test_nan_stays_in_its_lane(self, arm, home, name):
         """Neighbours to the last bit; the lane itself stands still, as far as its box lets it, and says so."""
@@ -347,7 +349,7 @@ class TestDerivatives:
         return f, x
 
     @pytest.mark.slow
-    @pytest.mark.variants(slow=["null-space"])
+    @pytest.mark.variants(release=["null-space", "weighted"])
     @pytest.mark.parametrize("name", ["weighted", "null-space"])
     def test_one_step_in_both_modes(self, arm, home, limits, name):
         f, x = self.cost(arm, home, limits, name)
@@ -362,7 +364,7 @@ class TestDerivatives:
             assert float(pushed(unit)) == pytest.approx(float(reverse[k]), abs=1e-9 * scale), k
         assert (np.abs(reverse) > 1e-4).sum() >= 10
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_through_a_rollout(self, arm, home, limits):
         """Reverse mode through the scan: a cost of the whole path with respect to a gain and a weight."""
         p, R = home

@@ -50,6 +50,7 @@ def second_derivative(model, q, pull, body, h=1e-5):
     return np.array(rows)
 
 
+@pytest.mark.variants(release=["0.0001-0.4"])
 @pytest.mark.parametrize(("away", "part"), [(1e-4, 0.4), (10.0, 1.0)])
 def test_near_all_targets_the_bound_counts_in_part(arm, away, part):
     """A foot that stays does not make less of a hand that is far from its target."""
@@ -115,6 +116,7 @@ def beyond(arm):
     return {name: run(make) for name, make in SCHEMES.items()}
 
 
+@pytest.mark.variants(release=["weighted"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_out_of_reach_it_comes_to_rest(scheme, beyond):
     v = np.asarray(beyond[scheme].solution.velocity)[:, 400:]

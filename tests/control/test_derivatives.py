@@ -97,6 +97,7 @@ class TestArrays:
         out = check(lambda a: qp_answer(solve_qp(*a)), straight, quadratic_programs(rng, rows=5))
         assert_exact(out, most=0.9)
 
+    @pytest.mark.release
     def test_least_squares_with_soft_rows(self, rng):
         """And with respect to A, b, weights, damping and the compliance of rows, hard and soft."""
         out = check(lambda a: qp_answer(solve_factored(a)), straight, least_squares(rng, rows=5))
@@ -113,7 +114,7 @@ class TestArrays:
 
         assert_exact(check(solve, straight, hierarchies(rng, sizes, n)), most=0.9)
 
-    @pytest.mark.variants(release=["undamped", "saturated", "reverse"])
+    @pytest.mark.variants(release=["undamped", "saturated", "reverse", "damped"])
     @pytest.mark.parametrize("method", ["damped", "undamped", "reverse", "saturated"])
     def test_null_space(self, rng, method):
         """Levels, secondary motion, damping and bounds; undamped: the Moore-Penrose inverse at its rank."""
@@ -198,7 +199,7 @@ class TestSwitches:
 
 
 class TestHessian:
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_of_a_quadratic_program(self, rng):
         """Forward over reverse at a fixed active set, against central differences of the gradient."""
         data = [jnp.asarray(a[0]) for a in quadratic_programs(rng, rows=5)[0]]

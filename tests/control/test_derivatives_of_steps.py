@@ -63,7 +63,7 @@ class TestStep:
 
 
 class TestFailedLanes:
-    @pytest.mark.variants(release=["hierarchical", "null-space"])
+    @pytest.mark.variants(release=["hierarchical", "null-space", "weighted"])
     @all_schemes
     def test_a_bad_lane_gives_shared_numbers_nothing(self, arm, rng, name):
         """The gradient with respect to what eight lanes share is that of the seven good ones, in both modes."""
@@ -106,7 +106,7 @@ class TestFailedLanes:
 class TestSingular:
     """Where a derivative may not exist, or be infinite or NaN if written carelessly: finite, the modes agree."""
 
-    @pytest.mark.variants(release=["null-space", "weighted"])
+    @pytest.mark.variants(release=["null-space", "weighted", "hierarchical"])
     @all_schemes
     def test_at_the_target_stretched_and_pinned(self, arm, name):
         """Errors of exactly 0, a stretched arm with a target out of reach, a joint at its bound, a pinned joint."""

@@ -113,7 +113,7 @@ class TestOutOfReach:
             left = np.linalg.norm(places_of(arm, path[lane, -1:], "hand")[0] - place)
             assert left == pytest.approx(np.linalg.norm(nearest - place), rel=0.01)
 
-    @pytest.mark.variants(release=["hierarchy-600"])
+    @pytest.mark.variants(release=["hierarchy-600", "weighted-400"])
     @pytest.mark.parametrize(("scheme", "rest"), [("weighted", 400), ("hierarchy", 600)])
     @pytest.mark.slow
     def test_a_nao_comes_to_rest_on_its_feet(self, nao, scheme, rest):
@@ -129,7 +129,7 @@ class TestOutOfReach:
             for lane in path:
                 assert np.linalg.norm(places_of(nao, lane[LATE::50], foot) - start, axis=1).max() < 2e-3
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_a_g1_whose_balance_is_a_polygon_comes_to_rest(self):
         """Rows of the polygon stop the hand's level, whose gain is low; feet stay within 0.1 mm by MuJoCo C."""
         bent = {"hip_pitch": -0.3, "knee": 0.6, "ankle_pitch": -0.3}
@@ -162,7 +162,7 @@ class TestOutOfReach:
 class TestAtTheStart:
     """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives."""
 
-    @pytest.mark.variants(release=["saturated null space", "hierarchy", "null space"])
+    @pytest.mark.variants(release=["saturated null space", "hierarchy", "null space", "weighted"])
     @pytest.mark.variants(slow=["null space"], release=["damped null space", "reverse order"])
     @pytest.mark.parametrize(
         "method", [name if name in QUICK_METHODS else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]

@@ -103,6 +103,7 @@ def longer(robot):
     return eqx.tree_at(lambda r: r.body_position, robot, robot.body_position * 1.1)
 
 
+@pytest.mark.variants(release=["hierarchical", "weighted"])
 @all_schemes
 def test_a_step_compiles_once(arm, home, name):
     before, after = SCHEMES[name]

@@ -93,13 +93,14 @@ def seen_by_mujoco(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return np.array(places), np.array(joints)
 
 
-@pytest.mark.variants(release=["tiago", "romeo", "solo12", "panda", "ur5"])
+@pytest.mark.variants(release=["tiago", "romeo", "solo12", "panda", "ur5", "talos", "g1"])
 def test_every_step_is_solved(case: Case):
     np.testing.assert_array_equal(case.run.solution.status, osik.Status.SOLVED)
     assert np.isfinite(case.run.q).all()
     assert case.run.solution.kkt_residual.max() < 1e-8
 
 
+@pytest.mark.variants(release=["tiago", "romeo", "panda", "solo12"])
 def test_the_frame_goes_where_it_is_sent(case: Case):
     """The error falls by 1 - gain dt a step, less what posture and speed limits take."""
     places, _ = seen_by_mujoco(case)

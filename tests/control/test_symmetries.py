@@ -71,7 +71,7 @@ SCHEMES = {
 }
 
 
-@pytest.mark.variants(release=["saturated", "hierarchical", "weighted"])
+@pytest.mark.variants(release=["saturated", "hierarchical", "weighted", "null-space"])
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_where_the_world_is(rng, scheme):

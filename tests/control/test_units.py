@@ -82,6 +82,7 @@ def test_speeds_above_ten_times_the_files(arm):
         assert told(lambda fine=fine: osik.VelocityLimit(arm, velocity=fine)) == []
 
 
+@pytest.mark.slow
 def test_gains_that_diverge(arm, tasks):
     both = tasks | {"rest": osik.PostureTask(arm, gain=0.1)}
     for call in (lambda: osik.rollout(arm, arm.q0, both, dt=5, steps=2), lambda: osik.solve(arm, arm.q0, both, dt=5.0)):

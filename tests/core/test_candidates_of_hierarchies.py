@@ -97,6 +97,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 def test_right_answers_are_taken(batch):
     end, taken = completed(batch, batch.answers)
     assert taken.all()
@@ -116,6 +117,7 @@ def test_wrong_answers_are_not(batch, wrong, monkeypatch):
     np.testing.assert_allclose(end.x, batch.answers.x, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @needs_core
 def test_when_the_kernel_is_asked(monkeypatch):
     asked = []

@@ -81,6 +81,7 @@ def assert_right(batch: Batch, end: _search.SearchResult) -> None:
     assert (np.abs(off).max(1) / np.abs(np.asarray(cost.target)).max(1)).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_right_candidates_are_taken(batch):
     end, taken = completed(batch, candidate_of(batch.answers))
     assert taken.all() and (end.factorizations == 1).all()
@@ -195,6 +196,7 @@ def test_a_cpu_beside_a_gpu_keeps_to_xla(batch, beside_a_gpu):
     np.testing.assert_allclose(answer.x, batch.answers.x, atol=1e-6)
 
 
+@pytest.mark.variants(release=["switched off"])
 @pytest.mark.parametrize("why", ["switched off", "no NVRTC", "no core", "many rows"])
 def test_when_the_kernel_is_not_asked(beside_a_gpu, monkeypatch, why):
     A, n, options = np.ones((4, 5), np.float32), 5, {}

@@ -81,6 +81,7 @@ def test_answers_are_those_of_the_search(families, damped):
     assert agree.mean() > 0.99  # what is left: rows whose rank is at the tolerance
 
 
+@pytest.mark.variants(release=["False"])
 @pytest.mark.parametrize("damped", [False, True])
 def test_foreign_warm_starts_change_no_answer(families, damped, rng):
     """Working sets of other problems, and bounds of 1e10; ties that roundoff may break in two ways are among them."""
@@ -116,6 +117,7 @@ def test_recorded_hierarchies(precision, nothing_is_searched):
     assert np.mean(warm.factorizations) < 0.3 * np.mean(cold.factorizations)
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop_and_a_bad_lane_leaves_its_neighbours_alone(families):
     p = jax.tree.map(lambda a: a[:5].copy(), families)
     p.levels[1].A[3, 0, 0] = np.nan
@@ -149,7 +151,7 @@ def test_what_the_kernel_leaves_over_is_searched(families, monkeypatch):
     np.testing.assert_allclose(s.x, right.x, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_are_those_of_differences():
     A = np.random.default_rng(3).normal(size=(7, 5))
     box = np.full(5, 0.4)

@@ -49,6 +49,9 @@ def solved(p: Problems, *, backend: Backend = "core", method="forward"):
 every_family = pytest.mark.parametrize("p", FAMILIES.values(), ids=FAMILIES)
 
 
+@pytest.mark.variants(
+    release=["nothing left", "repeated", "independent", "inequalities", "damped, more rows", "a humanoid's"]
+)
 @every_family
 def test_lane_by_lane_as_the_plain_method(p):
     found, expected = solved(p), solved(p, backend="jax")
@@ -296,8 +299,13 @@ def in_used_memory(request):
 
 
 @pytest.mark.variants(
-    release=["forward-damped, more rows"],
-    slow=[f"{method}-{name}" for name in IN_USED_MEMORY[1:] for method in METHODS],
+    slow=["{method}-{name}"],
+    release=[
+        "forward-damped, more rows",
+        "forward-dependent and damped",
+        "reverse-damped, more rows",
+        "forward-a humanoid's",
+    ],
 )
 @pytest.mark.parametrize("in_used_memory", IN_USED_MEMORY, indirect=True)
 @pytest.mark.parametrize("method", METHODS)
@@ -358,6 +366,7 @@ def test_the_scheme():
         np.testing.assert_allclose(found.velocity, expected.velocity, rtol=0, atol=1e-9)
 
 
+@pytest.mark.variants(release=["float64"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_beside_a_gpu_too_the_kernel_and_the_search_return_the_same_types(monkeypatch, precision):
     """There both are branches of one program, and with JAX's default precision what is computed in double is a part."""

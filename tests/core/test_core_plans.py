@@ -73,6 +73,7 @@ def test_a_plan_ends_with_the_same_step_as_by_the_plain_method(nao, motion):
     assert by_kernel.iterations == plainly.iterations < 100
 
 
+@pytest.mark.slow
 def test_the_centre_of_mass_is_kept_as_by_the_plain_method(nao, motion):
     clip, q = clip_of(nao, motion, 0.02)
     by_kernel, plainly = compiled("mended")
@@ -85,7 +86,7 @@ def test_the_centre_of_mass_is_kept_as_by_the_plain_method(nao, motion):
         assert (np.abs(without.q - by_kernel(*given).q).max() > 1e-3) == (contact[0] > 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_locked_joints_and_rows_of_whole_blocks(motion):
     robot = osik.load_robot("nao", locked_joints=dict.fromkeys(LOCKED, 0.1))
     assert robot.nv % 8 == 0

@@ -91,6 +91,7 @@ def test_as_daqp():
         np.testing.assert_allclose(found.x[i], x, atol=1e-6)
 
 
+@pytest.mark.variants(release=["g1-float64"])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("robot", ["nao", "g1"])
 def test_recorded_problems(robot, dtype):

@@ -37,7 +37,7 @@ def sanitizers(compiler: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.variants(release=["all"])
+@pytest.mark.variants(release=["all", "some"])
 @pytest.mark.parametrize("tests", [SOME, ALL], ids=["some", "all"])
 def test_sanitizers_find_nothing(tests, tmp_path):
     compiler = shutil.which(os.environ.get("CXX") or "c++")

@@ -170,6 +170,7 @@ def check_requirements(motion, run, lifted=None):
     assert (run.outcome.status == osik.solvers.Status.SOLVED).all()
 
 
+@pytest.mark.slow
 def test_double_support_reaches_its_numbers(sway):
     motion, run = sway
     assert len(run.q) == 1601
@@ -200,6 +201,7 @@ def test_own_figures_agree_with_the_measurement(sway):
         np.testing.assert_allclose(full[own], run.v[k], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_demo_writes_every_file(short):
     folder, summary, _ = short
     assert {p.name for p in folder.iterdir()} >= {"motion.gif", "comparison.png", "motion.npz", "report.json"}

@@ -42,7 +42,7 @@ def judged(motion, run, **changes):
     return physics_figures(measure_physics(motion, run.world, recording, run.plan.q))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_single_support_reaches_its_numbers(lift):
     """What is wanted: 1 cm, 3 degrees and 5 mm, from the sensed configurations."""
     motion, _, summary, run = lift

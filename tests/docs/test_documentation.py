@@ -106,6 +106,16 @@ LONG = {
 }
 
 
+@pytest.mark.variants(
+    slow=[
+        "docs/conventions.md",
+        "docs/robots.md",
+        "docs/ros2.md",
+        "docs/choosing_a_scheme.md",
+        "docs/deploying.md",
+        "docs/interop.md",
+    ]
+)
 @pytest.mark.parametrize(
     "page",
     [

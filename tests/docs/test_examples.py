@@ -132,15 +132,15 @@ CHECKS: list[Callable[[Names], None]] = [
     slow=[
         "so101_pose",
         "nao_one_foot",
-        "go2_body",
         "ur5_keeps_off_a_post",
         "tiago_drives",
         "panda_thousand_targets",
-        "baxter_two_arms",
-        "panda_draws",
-        "xarm_elbow",
-        "tune_a_weight",
-    ]
+        "so101_teleoperation",
+        "ur5_pose",
+        "allegro_grasp",
+        "g1_reaches",
+    ],
+    release=["panda_draws", "baxter_two_arms", "xarm_elbow", "go2_body", "tune_a_weight"],
 )
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.filterwarnings("error::osik_jax.OsikWarning")

@@ -72,7 +72,7 @@ print(json.dumps([*counts, counted_maps()]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.skipif(maps.counted_maps() is None, reason="the system does not say which memory maps a process has")
 def test_cleared_caches_give_memory_maps_back():
     """As the page on troubleshooting tells; in another process, for tests here keep what they compiled."""

@@ -43,6 +43,7 @@ def configured(**settings):
     return environment, config, lapack
 
 
+@pytest.mark.slow
 def test_an_import_changes_nothing_and_prints_nothing():
     done = in_a_process(IMPORT, PYTHONWARNINGS="error")
     before, after = json.loads(done.stdout)
@@ -50,6 +51,7 @@ def test_an_import_changes_nothing_and_prints_nothing():
     assert done.stderr == ""
 
 
+@pytest.mark.slow
 def test_a_wide_pool_one_lapack_thread_and_programs_run_where_they_are_called():
     environment, config, lapack = configured()
     assert int(environment.get("PJRT_NPROC", os.cpu_count())) >= 8
@@ -58,6 +60,7 @@ def test_a_wide_pool_one_lapack_thread_and_programs_run_where_they_are_called():
     assert config["jax_cpu_enable_async_dispatch"] is False
 
 
+@pytest.mark.slow
 def test_the_users_settings_stay():
     chosen = "--xla_cpu_enable_concurrency_optimized_scheduler=true"
     environment, config, lapack = configured(
@@ -68,11 +71,13 @@ def test_the_users_settings_stay():
     assert config["jax_cpu_enable_async_dispatch"] is True
 
 
+@pytest.mark.slow
 def test_other_flags_stay_beside_ours():
     other = "--xla_cpu_enable_fast_min_max=true"
     assert configured(XLA_FLAGS=other)[0]["XLA_FLAGS"] == f"{other} {SERIAL}"
 
 
+@pytest.mark.slow
 def test_older_fusions_are_a_flag_where_jaxlib_has_them():
     script = (
         STATE + "from osik_jax.runtime import configure_cpu\n"
@@ -88,6 +93,7 @@ def test_older_fusions_are_a_flag_where_jaxlib_has_them():
         assert "before 0.11" in told
 
 
+@pytest.mark.slow
 def test_too_late_is_told_and_changes_nothing():
     script = (
         STATE + "import jax.numpy as jnp; jnp.zeros(3); before = state(); from osik_jax.runtime import configure_cpu\n"
@@ -121,6 +127,7 @@ print("done")
 """
 
 
+@pytest.mark.slow
 def test_batches_of_factorisations_side_by_side_come_to_an_end():
     """Without ``configure_cpu`` the same program may wait for ever on two cores (jaxlib 0.10.2)."""
     env = {k: v for k, v in os.environ.items() if k not in OURS}
@@ -154,7 +161,7 @@ print("done")
 
 
 @pytest.mark.slow
-@pytest.mark.variants(release=["hqp"])
+@pytest.mark.variants(release=["hqp", "nullspace"])
 @pytest.mark.parametrize("solver", ["nullspace", "hqp"])
 def test_kernels_wait_for_no_workers(solver):
     """Two batches side by side on two cores, nothing configured: null spaces with ``backend="jax"`` wait for ever."""
@@ -177,7 +184,7 @@ jax.grad(lambda q: osik.solve(robot, q, tasks).velocity.sum())(robot.q0)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_program_warns_of_nothing():
     """As ``python -W error`` runs it: a step of each scheme, a rollout, a derivative."""
     done = in_a_process(WITHOUT_WARNINGS, PYTHONWARNINGS="error")
@@ -200,7 +207,7 @@ print(alone, [str(w.message) for w in seen if "configure_cpu" in str(w.message)]
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_batches_on_few_cores_that_are_not_configured_are_warned_of_once():
     assert in_a_process(WARNED).stdout.strip() == f"0 {int(splits(jaxlib_version()))}"
     assert in_a_process(WARNED, PJRT_NPROC="8").stdout.strip() == "0 0"
@@ -243,7 +250,7 @@ for solve in qp, hqp:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_searches_on_few_workers_have_no_call_that_is_split():
     """With a pool that is wide enough they have: there, blocks are as long as the cache likes them."""
     few = in_a_process(WHOLE).stdout.split()
@@ -251,7 +258,7 @@ def test_searches_on_few_workers_have_no_call_that_is_split():
     assert in_a_process(WHOLE, PJRT_NPROC="8").stdout.split() == ["True", "True"] * 2
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_batches_of_qps_side_by_side_come_to_an_end():
     """Two cores, nothing configured, plain JAX: in blocks of 16 lanes they can wait for ever (jaxlib 0.10.2)."""
     assert in_a_process(f"SOLVER = 'qp'\n{SIDE_BY_SIDE}").stdout == "done\n"

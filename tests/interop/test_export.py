@@ -34,7 +34,7 @@ def step():
     return made, robot.q0 + 0.1
 
 
-@pytest.mark.variants(release=["classical", "reverse", "saturated"])
+@pytest.mark.variants(release=["classical", "reverse", "saturated", "hierarchical", "weighted"])
 @pytest.mark.parametrize("name", SCHEMES)
 def test_a_step_is_exported(name, step):
     made, q = step
@@ -50,7 +50,7 @@ def test_a_hierarchy_is_not_exported_unasked(step):
         jax.export.export(made("hierarchical"))(q)
 
 
-@pytest.mark.variants(release=["classical", "reverse", "saturated"])
+@pytest.mark.variants(release=["classical", "reverse", "saturated", "hierarchical", "weighted"])
 @pytest.mark.parametrize("name", SCHEMES)
 def test_a_symbolic_batch_is_exported(name, step):
     """One program for batches of any size: the numbers of ``vmap`` with each size."""

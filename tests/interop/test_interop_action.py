@@ -72,6 +72,7 @@ def test_joints_stay_within_their_limits_whatever_the_action(arm):
     assert near < 1e-6 and np.isclose(np.abs(path.velocity), robot.velocity_limit).any()  # both are reached
 
 
+@pytest.mark.slow
 def test_several_frames_and_the_joints_of_actuators():
     robot = osik.load_robot("nao")
     tasks = {
@@ -95,6 +96,7 @@ def test_several_frames_and_the_joints_of_actuators():
     np.testing.assert_array_equal(out.position, np.asarray(out.q)[7:][::-1])
 
 
+@pytest.mark.slow
 def test_a_nan_holds_the_robot_and_gradients_are_finite(arm):
     robot, tasks = arm
     action = TaskSpaceAction(robot, tasks, dt=DT)
@@ -134,7 +136,7 @@ def test_what_does_not_fit_is_told(arm):
         TaskSpaceAction(floating, wrist, joints=(floating.tree.joint_names[floating.tree.independent[0]],))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_batch_of_environments_in_mjx(arm):
     """Servos in MJX follow the joint targets: the hand of each goes its own way, as far as its actions say."""
     robot, tasks = arm

@@ -118,10 +118,12 @@ def run_elsewhere(folder, schemes, precision, counts, atol):
                 check(found[name], wanted, count, atol)
 
 
+@pytest.mark.slow
 def test_a_batch_of_any_size_without_osik_jax(tmp_path):
     run_elsewhere(tmp_path, ["weighted"], "float64", [1, 7], 1e-9)
 
 
+@pytest.mark.variants(release=["float32-0.002"])
 @pytest.mark.slow
 @pytest.mark.parametrize(("precision", "atol"), [("float64", 1e-9), ("float32", 2e-3)])
 def test_every_scheme_and_4096_lanes_without_osik_jax(tmp_path, precision, atol):
@@ -153,6 +155,7 @@ def test_names_shapes_and_units(remembering):
     assert (loaded.dt, loaded.batch, loaded.platforms) == (0.01, None, ("cpu",))
 
 
+@pytest.mark.slow
 def test_a_loop_that_remembers_its_velocity(remembering):
     """Fed with its own velocity, an exported step with a limit on accelerations is ``rollout``."""
     robot, tasks, limits, data = remembering
@@ -228,7 +231,7 @@ def test_another_release_of_jax_or_another_platform_is_refused(remembering):
         load_controller(edited(format="another"))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_fixed_batch_and_programs_for_cuda():
     """A GPU's program of a fixed batch has no blocks of 16 lanes, which are for the caches of a CPU."""
     robot, tasks = controller()

@@ -166,6 +166,7 @@ def session(tmp_path_factory):
     return Session(tmp_path_factory.mktemp("ros2"), seconds=3.0)
 
 
+@pytest.mark.slow
 def test_a_robot_in_another_process_follows_targets_by_name(session):
     assert session.exit_code == 0
     assert session.commands[-1].joint_names == [f"joint{number}" for number in range(1, 8)]

@@ -43,6 +43,7 @@ def modulo_turns(x, other):
     return np.abs(np.angle(np.exp(1j * (np.asarray(x) - other)))).max(-1)
 
 
+@pytest.mark.variants(release=["home0"])
 @pytest.mark.parametrize("home", [(0.0, 0.0), (50.0, -3.0)])
 def test_joints_without_limits_have_two_branches_next_to_q0(home):
     robot = two_links("")

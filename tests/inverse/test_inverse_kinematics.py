@@ -83,6 +83,7 @@ def assert_within_limits(robot, q):
     assert (q >= np.asarray(robot.position_lower)).all() and (q <= np.asarray(robot.position_upper)).all()
 
 
+@pytest.mark.variants(release=["float32"])
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_finds_what_is_reachable(arm, rng, precision):
@@ -236,7 +237,7 @@ def test_changing_numbers_compiles_nothing(arm, rng):
     assert program._cache_size() == before
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_tasks_on_an_arm_with_a_wall_and_preferences(arm):
     """Steps of the scheme: a barrier that a frame does not pass, a posture that fades out."""
     start = np.asarray(arm.q0)
@@ -255,7 +256,7 @@ def test_tasks_on_an_arm_with_a_wall_and_preferences(arm):
     assert_within_limits(arm, found.q)
 
 
-@pytest.mark.variants(release=["False"])
+@pytest.mark.variants(release=["False", "True"])
 @pytest.mark.slow
 @pytest.mark.parametrize("hard", [False, True])
 def test_floating_base_with_feet_held_and_balance(rng, hard):
@@ -284,7 +285,7 @@ def test_floating_base_with_feet_held_and_balance(rng, hard):
     assert (joints >= np.asarray(nao.position_lower)[6:]).all() and (joints <= np.asarray(nao.position_upper)[6:]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_configurations_keep_clear_of_an_obstacle(arm):
     """A ball in the arm's way: the hand gets to its target around it, or the ball is named as what stops it."""
     start = np.asarray(arm.q0)

@@ -89,7 +89,7 @@ def assert_near(ours, theirs, atol=ROUNDING):
     jax.tree.map(partial(np.testing.assert_allclose, rtol=0.0, atol=atol), ours, theirs)
 
 
-@pytest.mark.variants(slow=["coupled"], release=["toy"])
+@pytest.mark.variants(slow=["coupled"], release=["toy", "nao"])
 @pytest.mark.parametrize("name", NAMES)
 def test_beside_the_plain_method(robots, name):
     """Alone, in a batch that shares the robot, and in one of robots with other links, masses and axes."""
@@ -196,7 +196,7 @@ def pose_tasks(robot: osik.Robot, **options) -> dict[str, osik.Task]:
 
 
 @pytest.mark.variants(
-    slow=["pose"], release=["twist", "adaptive", "geometric", "frame's axes", "some", "geometric, frame's"]
+    slow=["pose"], release=["twist", "adaptive", "geometric", "frame's axes", "some", "geometric, frame's", "position"]
 )
 @pytest.mark.parametrize("case", OPTIONS)
 def test_rows_of_poses(robots, case):

@@ -217,6 +217,7 @@ def test_everything_equals_mujoco_c(robots, evaluators, name):
     assert_trees_close(evaluators[name](robot, q), expected, 1e-9)
 
 
+@pytest.mark.variants(release=["toy"])
 @pytest.mark.parametrize("name", NAMES)
 def test_everything_equals_mujoco_c_in_single_precision(robots, name):
     q = random_configurations(robots[name], seed=2)
@@ -312,6 +313,7 @@ def test_jacobians_equal_central_differences_along_the_tangent(robots, evaluator
         np.testing.assert_allclose(here[f"{point}_jacobian"], numeric, atol=1e-8, rtol=0)
 
 
+@pytest.mark.variants(release=["toy"])
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_of_poses_equal_central_differences(robots, evaluators, name):
     robot, step = robots[name], 1e-6

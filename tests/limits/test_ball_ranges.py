@@ -35,6 +35,7 @@ def nearest_in_cap(target: np.ndarray, angle: float) -> np.ndarray:
     return CENTER + LENGTH * np.array([*(np.sin(tilt) * across), np.cos(tilt)])
 
 
+@pytest.mark.variants(release=["HierarchicalQP-12.0", "WeightedQP-12.0"])
 @pytest.mark.parametrize("degrees", [12.0, 75.0])
 @pytest.mark.parametrize("scheme", [osik.WeightedQP, osik.HierarchicalQP])
 def test_no_step_leaves_the_range_and_the_nearest_point_is_reached(degrees: float, scheme: type):
@@ -52,6 +53,7 @@ def test_no_step_leaves_the_range_and_the_nearest_point_is_reached(degrees: floa
         assert np.linalg.norm(tip - nearest_in_cap(target, most)) < 0.003 * most * LENGTH + 1e-5
 
 
+@pytest.mark.slow
 def test_random_steps_at_the_end_of_the_range_stay_inside():
     """Any velocity that box and row allow, of joints anywhere in the range, ends inside: corners of the box too."""
     robot = osik.Robot.from_mjcf(mjcf(40.0))
@@ -84,7 +86,7 @@ def test_a_joint_outside_its_range_comes_back():
     assert np.radians(29.8) < angles(path.q)[-1] <= np.radians(30.0)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_inverse_kinematics_keeps_the_range_to_its_end():
     robot = osik.Robot.from_mjcf(mjcf(30.0))
     beyond = osik.inverse_kinematics(robot, {"tip": [0.3, 0.0, 0.5]}, seeds=2, restarts=0)

@@ -241,6 +241,7 @@ class TestGain:
         array = osik.ConfigurationLimit(robot, gain=limit.gain)
         np.testing.assert_array_equal(array.gain, limit.gain)
 
+    @pytest.mark.variants(release=["0.5"])
     @pytest.mark.parametrize("gain", [0.5, 1.0])
     def test_a_joint_outside_comes_back(self, robot, gain):
         """Each step leaves at most the share that the gain says, whatever the tasks want; the speed limit holds."""

@@ -187,6 +187,7 @@ class TestBarrier:
             make(arm, "hand", lower=1.0, upper=0.0)
 
 
+@pytest.mark.slow
 def test_derivatives_of_rows(flying):
     """With respect to the configuration and all numbers of the limits, in both modes."""
     rng = np.random.default_rng(3)

@@ -56,6 +56,7 @@ FAR = np.array([1.0, 0.7])
 """A configuration from which the range binds joint a, the speed joint b, at most."""
 
 
+@pytest.mark.variants(release=["collision", "acceleration"])
 @pytest.mark.parametrize("name", ["acceleration", "collision", "barrier", "linear"])
 def test_the_own_box_holds_beside_any_other_limit(arm, name):
     expected = np.array([[-1.0, -2.0], [(np.pi / 3 - 1.0) / DT, (np.pi / 4 - 0.7) / DT]]).clip([-1.0, -2.0], [1.0, 2.0])
@@ -99,6 +100,7 @@ def test_a_limit_of_another_robot_is_refused_beside_no_limits(arm):
         box(arm, (osik.no_limits, added(arm)["base"]))
 
 
+@pytest.mark.variants(release=["collision"])
 @pytest.mark.parametrize("name", ["acceleration", "collision"])
 def test_a_rollout_stays_in_the_ranges_and_speeds(arm, name):
     """The reported case: with a collision limit alone, joints ran 3.9 rad out of their ranges."""
@@ -139,7 +141,7 @@ BEYOND = np.array([1.5, -0.5])
 """Joint a is 0.45 rad beyond its range; no other configuration brings the tip to this pose."""
 
 
-@pytest.mark.variants(slow=["barrier"])
+@pytest.mark.variants(release=["barrier"])
 @pytest.mark.parametrize("name", ["speed", "barrier"])
 def test_inverse_kinematics_keeps_the_ranges_beside_other_limits(arm, name):
     limits = {"speed": osik.VelocityLimit(arm), "barrier": added(arm)["barrier"]}

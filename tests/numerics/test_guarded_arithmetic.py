@@ -119,6 +119,7 @@ def _rates_of_limits_by_dt(precision, angle):
         return [np.asarray(a, float) for a in jax.jit(jax.vmap(rates))(jnp.asarray(TIMES, precision))]
 
 
+@pytest.mark.variants(release=["0.1"])
 @pytest.mark.parametrize("angle", [0.1, 1.04, 1.2])
 def test_rates_of_limits_by_tiny_times_in_single_precision(angle):
     """Of a ball far from the end of its range, near to it and beyond it: 1 / dt^2 overflows from 1e-19 down."""
@@ -150,7 +151,7 @@ def _rates_of_saturated(precision, distances, directions, shifts):
         return jax.jit(jax.vmap(rate))(*given)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_of_the_saturated_null_space_near_a_target_in_single_precision(rng):
     """Steps of roundoff: a division of XLA that underflows, and whether all of a step is worth its cost."""
     distances = np.concatenate([[1e-2, 1e-3, 1e-4, 1e-6], 10.0 ** rng.uniform(-6, -2, 12)])

@@ -214,6 +214,7 @@ def leaning(dance):
     return bent_forward(load_motion(dance))
 
 
+@pytest.mark.slow
 def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, leaning, dance, tmp_path, capsys):
     free, kept = retarget(nao, leaning), retarget(nao, leaning, balance=0.01)
     assert kept.contact.all()
@@ -301,7 +302,7 @@ print(json.dumps({
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_batch_is_split_over_devices(dance):
     found = finish(start(SPLIT, dance, devices=2))
     assert 2 in found["devices"] and found["off"] < 1e-6
@@ -574,6 +575,7 @@ def test_the_left_of_two_is_told_by_name():
         assert by_name(pair) == pair
 
 
+@pytest.mark.slow
 def test_what_stands_for_long_does_not_creep(nao, tmp_path):
     # what a foot gives way adds up: 0.12 mm in these 20 s, before it was held more firmly the longer it stands
     motion = load_motion(write_bvh(tmp_path / "long.bvh", dancer(600)))
@@ -628,6 +630,7 @@ def test_a_g1_is_guessed_from_its_urdf():
         np.testing.assert_allclose(own.keypoints[role][1], guess.keypoints[role][1], atol=0.02)  # a fit moves it
 
 
+@pytest.mark.variants(release=["romeo_description/urdf/romeo.urdf-l_wrist"])
 @pytest.mark.parametrize(
     ("urdf", "wrist"),
     [
@@ -847,7 +850,7 @@ def test_a_profile_comes_back_from_its_file(tmp_path):
     assert load_profile(tmp_path / "robot.toml") == changed
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_gradient_of_a_fit_is_the_slope_of_its_loss(nao, dance):
     """By central differences, over plans that go on from the same one; what the gradient leaves out is small here."""
     own = load_profile("nao")

@@ -56,7 +56,7 @@ def assert_limits_hold(robot, frames, fps, acceleration=240.0):
     assert np.abs(np.diff(speed, axis=0)).max() * fps <= acceleration * (1.0 + 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_centre_of_mass_stays_over_the_feet_frame_by_frame(nao, motion):
     margins = []
     for balance in (None, 0.01):
@@ -80,6 +80,7 @@ def test_frame_by_frame_is_near_the_whole_clip(nao, motion, live):
     assert_limits_hold(nao, frames, motion.fps)
 
 
+@pytest.mark.slow
 def test_feet_hold_exactly_at_any_rate_with_few_iterations(nao, motion):
     """MuJoCo's feet, from the written positions; three iterations of a plan leave millimetres by themselves."""
     fast = motion.resampled(120.0)
@@ -123,6 +124,7 @@ def test_feet_hold_where_a_frame_has_hardly_any_time(nao, motion):
     assert_limits_hold(nao, frames, 120.0)
 
 
+@pytest.mark.slow
 def test_a_foot_that_cannot_land_in_time_is_told(nao, motion):
     """A foot that was lifted is said to stand from one frame to the next; heights are MuJoCo's."""
     live = LiveRetargeter(nao, motion, look_ahead=1 / FPS, acceleration=20.0, budget=1.0)
@@ -157,6 +159,7 @@ def test_limits_hold_on_a_noisy_stream_with_holes(nao, motion, live):
     assert_limits_hold(nao, frames, motion.fps)
 
 
+@pytest.mark.slow
 def test_a_person_who_is_lost_leaves_the_robot_at_rest(nao, motion, live):
     frames = streamed(live, [*motion.positions[:20], *[None] * 25])
     assert [frame.status for frame in frames][-20:] == [LiveStatus.LOST] * 20

@@ -226,6 +226,7 @@ def test_limits_that_are_no_numbers_are_refused(limit: str):
         Robot.from_urdf(urdf(limit), floating_base=False)
 
 
+@pytest.mark.variants(release=["1e10"])
 @pytest.mark.parametrize("bound", ["1e10", "600.283", "101"])
 def test_huge_limits_count_as_none_for_starts(bound: str):
     """The two joints' answers stay within some turns, in both precisions, and the true error is small."""

@@ -280,6 +280,7 @@ class TestPrecision:
                     run(robot, robot.q0, tasks)
             self.assert_at_rest(cast, tasks, jnp.float32)
 
+    @pytest.mark.slow
     def test_double_precision_switched_on(self):
         with jax.enable_x64(False):
             robot = osik.load_robot("arm7")

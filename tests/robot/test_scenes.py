@@ -69,6 +69,7 @@ def com_target(robot):
     return np.asarray(target)
 
 
+@pytest.mark.variants(release=["cube first"])
 def test_the_cube_has_no_part_in_the_centre_of_mass(nao, scene):
     q, whole = posed(nao, scene)
     alone, together = osik.forward_kinematics(nao, q), osik.forward_kinematics(scene, whole)
@@ -87,6 +88,7 @@ def test_the_cube_has_no_part_in_the_centre_of_mass(nao, scene):
     assert "5.3" in repr(nao) and repr(scene).split("mass ")[1][:5] == repr(nao).split("mass ")[1][:5]
 
 
+@pytest.mark.variants(release=["cube first"])
 def test_kernels_leave_the_cube_out_too(nao, scene):
     _, whole = posed(nao, scene, seed=1)
     plain = moving_center(scene, osik.forward_kinematics(scene, whole))
@@ -102,6 +104,7 @@ def test_kernels_leave_the_cube_out_too(nao, scene):
     assert not np.delete(np.asarray(velocities[1]), own(scene)[1]).any()
 
 
+@pytest.mark.variants(release=["cube first"])
 def test_momentum_is_the_robots_and_the_mass_matrix_everything(nao, scene):
     q, whole = posed(nao, scene, seed=2)
     alone, together = osik.forward_kinematics(nao, q), osik.forward_kinematics(scene, whole)
@@ -113,6 +116,7 @@ def test_momentum_is_the_robots_and_the_mass_matrix_everything(nao, scene):
     np.testing.assert_allclose(np.diag(matrix)[cube : cube + 3], 5.0, rtol=1e-12)
 
 
+@pytest.mark.variants(release=["cube first"])
 def test_balance_is_met_by_the_robot_alone(nao, scene):
     """A centre of mass beyond the polygon: the robot leans, and the cube stays where it is."""
     feet = {name: osik.FrameTask(scene, name, hard=True) for name in FEET}
@@ -168,6 +172,7 @@ def mujoco_center(robot, *bodies):
     return mass @ data.subtree_com[ids] / mass.sum()
 
 
+@pytest.mark.variants(release=["limited left"])
 @pytest.mark.parametrize(
     ("options", "bodies"),
     [

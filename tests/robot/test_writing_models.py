@@ -121,6 +121,7 @@ def test_names_limits_and_masses_come_back(pair: tuple[Robot, Robot]):
     assert float(again.body_mass.sum()) == pytest.approx(float(robot.body_mass.sum()), rel=1e-12)
 
 
+@pytest.mark.variants(release=["odd"])
 def test_frames_and_centre_of_mass_come_back(pair: tuple[Robot, Robot]):
     robot, again = pair
     q = jnp.asarray(random_configurations(robot))

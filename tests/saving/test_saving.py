@@ -137,6 +137,7 @@ def with_what_an_arm_has_not(robot) -> tuple[dict[str, osik.Task], list[osik.Lim
 SCHEMES = [osik.WeightedQP(), osik.HierarchicalQP(), *(osik.NullSpace(method=m) for m in ("classical", "saturated"))]
 
 
+@pytest.mark.variants(release=["scheme1", "scheme3", "scheme0"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_loops_wheels_and_limits_of_a_base_come_back(tmp_path, scheme):
     with pytest.warns(osik.OsikWarning, match="EqualityConstraintTask"):
@@ -158,6 +159,7 @@ TABLE = osik.CollisionShape.box((0.5, 0.5, 0.02), (0.6, 0.0, -0.1))
 TOOL = osik.CollisionShape.sphere(0.03, frame="hand")
 
 
+@pytest.mark.variants(release=["locked0"])
 @pytest.mark.parametrize("locked", [{}, {"joint3": 0.4, "joint5": -0.3}])
 def test_a_robot_of_no_source_keeps_what_is_numbered(tmp_path, locked):
     """Fused links come after the others in the file, and locked joints are gone: numbers of frames and joints move."""
@@ -181,6 +183,7 @@ def test_a_robot_of_no_source_keeps_what_is_numbered(tmp_path, locked):
     np.testing.assert_allclose(near[1], near[0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_limit_on_meshes_needs_the_source(tmp_path):
     wedge = '<mujoco><asset><mesh name="wedge" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/></asset><worldbody>'
     link = '<body pos="{} 0 0"><joint name="{}" axis="0 1 0"/><geom type="mesh" mesh="wedge"/></body>'
@@ -211,6 +214,7 @@ def shaped(robot, frame) -> list[osik.Limit]:
     return [osik.CollisionAvoidanceLimit(robot, shapes=shapes, pairs=[("own", "table")])]
 
 
+@pytest.mark.variants(release=["mass of a locked joint", "shapes of fused links"])
 @pytest.mark.parametrize(
     "case", ["shapes of fused links", "mass of a locked joint", "shape on a locked link", "gear of a locked joint"]
 )

@@ -37,7 +37,7 @@ print(json.dumps(bool(np.array_equal(saved[:]["y"], 3.0 * np.arange(64.0) ** 2))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_killed_again_and_again(tmp_path):
     """Each run dies while it writes its fourth file: a lock, a manifest or half a chunk is left and stops nobody."""
     folder, finished, kills = tmp_path / "job", {}, 0
@@ -55,7 +55,7 @@ def test_killed_again_and_again(tmp_path):
     assert all((folder / name).stat().st_mtime_ns == then for name, (then, _) in finished.items())
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_three_processes_in_one_folder(tmp_path):
     """The first does the job; the others are told its number at once. Once it is killed, another one goes on."""
     folder = tmp_path / "job"

@@ -65,7 +65,7 @@ def eight():
     return finish(start(EIGHT, devices=8))
 
 
-@pytest.mark.variants(release=["WeightedQP"])
+@pytest.mark.variants(release=["WeightedQP", "NullSpace"])
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["WeightedQP", "NullSpace", "HierarchicalQP"])
 def test_eight_devices_give_what_vmap_gives(eight, scheme):
@@ -117,7 +117,7 @@ print(json.dumps([len(jax.devices()), len(jax.local_devices()), missing, kept, t
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_two_hosts_write_their_own_lanes(tmp_path):
     """And again where the part of one is lost: both run that chunk, and no other."""
     x, port = np.random.default_rng(0).uniform(size=(22, 3)), free_port()

@@ -393,6 +393,7 @@ def lexicographic_residual(case, q, v, active=1e-9):
 
 
 class TestHierarchicalQP:
+    @pytest.mark.variants(release=["nao"])
     @pytest.mark.parametrize("name", ["arm", "nao"])
     def test_is_the_lexicographic_optimum_and_keeps_its_box_exactly(self, name, request, rng):
         """The arm: the second level contradicts the first. NAO: an inequality at the second. Speeds bind in both."""

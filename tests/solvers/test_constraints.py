@@ -224,6 +224,7 @@ def spoiled(lanes):
 
 
 class TestContradictions:
+    @pytest.mark.variants(release=["saturated"])
     @pytest.mark.parametrize("name", SCHEMES)
     def test_in_their_lane_only(self, arm, lanes, spoiled, name):
         clean = solve_lanes(cases(arm, lanes), SCHEMES[name])
@@ -315,7 +316,7 @@ def test_mistakes(arm):
 
 @pytest.mark.slow
 class TestDerivatives:
-    @pytest.mark.variants(release=["hierarchical", "null-space"])
+    @pytest.mark.variants(release=["hierarchical", "null-space", "weighted"])
     @pytest.mark.parametrize("name", ["weighted", "null-space", "hierarchical"])
     def test_against_differences(self, arm, lanes, name):
         """With respect to the configuration, a target, and the rows and bounds of the limit."""

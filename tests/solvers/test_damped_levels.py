@@ -73,6 +73,7 @@ def test_a_bounded_level_is_the_damped_least_squares(levels):
         np.testing.assert_allclose(A @ x, A @ best, rtol=0, atol=1e-8)
 
 
+@pytest.mark.variants(release=["jax"])
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 def test_a_level_that_rows_above_stop_is_damped_as_out_of_reach(backend):
     """The first level stops x_0, so x_1 has to do the second level's motion, of which it does 0.05 for each unit.
@@ -100,7 +101,7 @@ def test_a_level_that_rows_above_stop_is_damped_as_out_of_reach(backend):
     np.testing.assert_allclose(jax.jvp(change, (0.0,), (1.0,))[1], expected, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_are_those_of_the_values(levels):
     upper = jnp.full(N, 0.4)
     (A, b), (C, d), _ = [(A[0], b[0]) for A, b in levels]

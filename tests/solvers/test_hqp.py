@@ -34,6 +34,7 @@ def recorded():
     return r, solved(r)
 
 
+@pytest.mark.variants(release=["False-auto", "False-jax"])
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 @pytest.mark.parametrize("unit_rows", [False, True])
 def test_recorded_hierarchies(unit_rows, backend):
@@ -52,6 +53,7 @@ def test_recorded_hierarchies(unit_rows, backend):
         np.testing.assert_allclose(norms[IMPROVED, 1], second_level_by_quadprog(r, IMPROVED, x), atol=2e-8)
 
 
+@pytest.mark.variants(release=["False-auto", "False-jax"])
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 @pytest.mark.parametrize("unit_rows", [False, True])
 def test_recorded_hierarchies_in_single_precision(unit_rows, backend):
@@ -149,6 +151,7 @@ def test_inequalities_at_any_level_and_weights_inside_a_level():
     np.testing.assert_allclose(solve_hqp(off, -box[:1], box[:1]).x, [0.0], atol=1e-12)
 
 
+@pytest.mark.variants(release=["solve_hqp"])
 @pytest.mark.parametrize("solver", [solve_hqp, solve_nullspace])
 def test_known_equalities_are_kept_whatever_their_upper_bounds_round_to(rng, solver):
     """A compiler may compute one expression twice: an equality in two roundings still stands before lower levels."""
@@ -206,6 +209,7 @@ def test_a_bad_lane_leaves_its_neighbours_alone(recorded):
     np.testing.assert_array_equal(np.asarray(s.x)[others], np.asarray(good.x)[others])
 
 
+@pytest.mark.variants(release=["solve_nullspace"])
 @pytest.mark.parametrize("solver", [solve_hqp, solve_nullspace])
 def test_unordered_bounds_are_infeasible_and_their_middle_stands_for_them(solver):
     def solve(lower, upper, low, high):
@@ -229,7 +233,7 @@ def test_shapes_that_do_not_fit_are_named():
         Level(jnp.ones((2, 4)), jnp.zeros(2), jnp.zeros(2), equalities=[True])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_are_those_of_the_solution_map(rng, recorded):
     """Along a random change of all data (zeros by structure kept): forward, reverse, central differences."""
     r, _ = recorded

@@ -48,6 +48,7 @@ def answers():
     return answer
 
 
+@pytest.mark.variants(release=["many_levels", "conflicting", "stretched"])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_level_is_certified(family, answers):
     """Each level's gradient is held by multipliers of the levels above; so is x, the gradient of |x|^2 / 2."""

@@ -36,6 +36,7 @@ def kkt(H, g, lower, upper, x, C=None, row_lower=None, row_upper=None, y: Any = 
     return max(stationarity, (low - s).max(), (s - high).max(), pushed_up.max(), pushed_down.max())
 
 
+@pytest.mark.variants(release=["nao"])
 @pytest.mark.parametrize("robot", ["g1", "nao"])
 def test_recorded_qps_in_both_forms(robot):
     p = recorded_qps(robot)
@@ -54,6 +55,7 @@ def test_recorded_qps_in_both_forms(robot):
         assert (np.asarray(s.iterations)[p.regime == 0] == 0).all()  # no active bound: the first guess is the answer
 
 
+@pytest.mark.variants(release=["jax"])
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 def test_a_long_batch_in_a_program_of_single_precision(backend):
     """Lanes that are left are gathered inside of the search's double precision, in both forms and on every JAX."""
@@ -210,6 +212,7 @@ def test_shapes_that_do_not_fit_are_named():
         solve_qp(jnp.eye(2), jnp.zeros(2), -jnp.ones(3), jnp.ones(2))
 
 
+@pytest.mark.slow
 def test_damping_towards_a_centre(rng):
     """The centre's pull written as rows of the matrix, one for each variable: the same answer and derivatives."""
     lanes, m, n = 20, 4, 9

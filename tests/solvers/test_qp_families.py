@@ -42,6 +42,7 @@ def solved(p: QPs):
     return s, x
 
 
+@pytest.mark.variants(release=["mixed-0"])
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("family", PLANTED)
 def test_planted_solutions(family, seed):
@@ -92,6 +93,7 @@ def test_contradictions_get_the_least_violating_answer(family, rng):
     assert max(least_violation_residual(p, i, x[i]) for i in range(COUNT)) < 1e-5
 
 
+@pytest.mark.variants(release=["inconsistent_equalities", "inconsistent_rows"])
 @pytest.mark.slow
 @pytest.mark.parametrize("family", [inconsistent_equalities, inconsistent_rows])
 def test_rates_of_the_least_violating_answer_by_differences(family, rng):
@@ -137,6 +139,7 @@ def by_bounded_least_squares(p, i):
     return x
 
 
+@pytest.mark.variants(release=["whole_body"])
 @pytest.mark.parametrize("family", [whole_body, redundant])
 def test_whole_body_least_squares(family, rng):
     p = family(rng, COUNT)

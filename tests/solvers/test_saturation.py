@@ -142,7 +142,7 @@ def largest_scale(above, A, x, d, lower, upper, unit):
 
 
 class TestProperties:
-    @pytest.mark.variants(slow=["easy"])
+    @pytest.mark.variants(slow=["easy"], release=["tight"])
     @every_family
     def test_every_answer_is_in_its_box_to_the_last_bit(self, solved, name):
         p, answers = solved[name]
@@ -236,7 +236,7 @@ class TestProperties:
                     assert move.x[joint] == pytest.approx(x[joint], abs=1e-6)
 
     @needs_core
-    @pytest.mark.variants(release=["easy"])
+    @pytest.mark.variants(release=["easy", "tight"])
     @pytest.mark.parametrize("name", FAMILIES)
     def test_the_kernel_and_the_plain_method_decide_alike(self, solved, name):
         """The same answer in every lane. Joints that one of them holds at a bound are there in the other, held or not.
@@ -295,6 +295,7 @@ class TestByHand:
         assert float(answer.scales[0]) == pytest.approx(2.0 / 3.0, abs=1e-15)
         np.testing.assert_allclose(answer.slacks[0], [-1.0, -1.0 / 3.0], rtol=0, atol=1e-15)
 
+    @pytest.mark.variants(release=["3e-08-False"])
     @pytest.mark.parametrize("entry, moves", [(3e-8, False), (3e-6, True)])
     def test_a_joint_that_moves_the_task_by_rounding_alone_is_at_rest(self, entry, moves):
         """In single precision; the largest scale takes what any other joint can add, however little."""
@@ -333,6 +334,7 @@ class TestByHand:
         answer = solve_nullspace([Level([[1.0, 1.0]], [0.0])], jnp.array([0.4, -1.0]), jnp.array([1.0, 1.0]))
         np.testing.assert_allclose(answer.x, [0.4, -0.4], rtol=0, atol=1e-15)
 
+    @pytest.mark.variants(release=["jax"])
     @pytest.mark.parametrize("backend", ["jax", "auto"])
     def test_joints_at_their_bounds_in_zero_stop_a_level_at_the_scale_0(self, backend):
         """x is 0 and nothing moves: the numbers that x is made of have no size that roundoff is small beside."""
@@ -364,6 +366,7 @@ class TestByHand:
         off = np.abs(np.einsum("bmn,bn->bm", A[0], np.asarray(second.x - first.x))).max(1)
         assert off[stopped].max() < 1e-12
 
+    @pytest.mark.slow
     def test_one_sided_bounds(self):
         level = [Level([[1.0, 1.0]], [-4.0])]
         for bound in (dict(lower=np.array([-1.0, -9.0])), dict(upper=np.array([1.0, -3.0]))):
@@ -592,6 +595,7 @@ class TestScheme:
         limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": speed})
         return osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=limits)
 
+    @pytest.mark.slow
     def test_saturation_keeps_limits_and_priorities(self, arm, tasks):
         plain, hard = (osik.NullSpace(method=method, curvature_damping=0.0) for method in ("classical", "saturated"))
         loose, tight, far = (self.answer(arm, tasks, s, v) for s, v in ((plain, 0.1), (hard, 0.1), (hard, 1e6)))
@@ -631,6 +635,7 @@ def one_row_with_its_derivative(wanted, lower, upper, *, backend):
     return answer, derivative
 
 
+@pytest.mark.variants(release=["core-0.1", "jax-0.1"])
 @pytest.mark.parametrize("excess", [0.1, 1e-7])
 @pytest.mark.parametrize("backend", ["jax", pytest.param("core", marks=needs_core)])
 def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend, excess):

@@ -53,6 +53,7 @@ def test_rounded_quaternions(arm, value):
     np.testing.assert_allclose(exact_quaternion(jnp.array([value] * 2), "q"), [value / np.linalg.norm(value)] * 2)
 
 
+@pytest.mark.slow
 def test_bad_lanes_get_a_status_and_the_others_their_answer(arm):
     """Under jit, in one call: five matrices that are no rotation beside three that are, one of them rounded."""
     task = osik.FrameTask(arm, "hand")

@@ -66,7 +66,7 @@ class TestWays:
         for k in range(3):
             assert_the_pose(jax.tree.map(lambda part, k=k: part[k], targets))
 
-    @pytest.mark.variants(release=["rotation matrix"])
+    @pytest.mark.variants(release=["rotation matrix", "quaternion"])
     @pytest.mark.parametrize("way", TRACED)
     def test_at_every_step_of_a_rollout(self, arm, way):
         task, steps = osik.FrameTask(arm, "hand"), 3

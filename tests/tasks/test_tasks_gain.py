@@ -96,6 +96,7 @@ class TestCappedByTheStep:
     def rows(self, arm, tasks):
         return osik.build_problem(arm, arm.q0, tasks, dt=self.DT).rows
 
+    @pytest.mark.variants(release=["10.5"])
     @pytest.mark.parametrize("many", [10.5, 1e6])
     def test_rows_of_every_kind_are_those_of_one_over_dt(self, arm, goal, many):
         expected = self.rows(arm, self.tasks(arm, goal, 10.0))
@@ -130,6 +131,7 @@ class TestCappedByTheStep:
         assert float(jax.grad(wanted)(10.0)) == pytest.approx(1.0)
         assert float(jax.grad(wanted)(11.0)) == 0.0
 
+    @pytest.mark.variants(release=["jax"])
     @pytest.mark.parametrize("backend", ["auto", "jax"])
     def test_kernels_get_the_capped_gain(self, arm, goal, backend):
         many, one = (
@@ -144,6 +146,7 @@ class TestCappedByTheStep:
         )
         np.testing.assert_allclose(many, one, atol=1e-9)
 
+    @pytest.mark.variants(release=["scheme0", "scheme2"])
     @pytest.mark.parametrize("scheme", [osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace(method="saturated")])
     def test_errors_fall_at_every_step_however_long_the_step_is(self, arm, goal, scheme):
         """A step as an iteration: dt = 1 with the default gain of 10."""

@@ -320,6 +320,7 @@ class TestLosses:
 
 
 class TestTune:
+    @pytest.mark.slow
     def test_reports_what_it_returns(self, loop, scenarios):
         seen = []
         tuned = run(loop, scenarios[:3], held_out=scenarios[3:], iterations=6, callback=seen.append)
@@ -454,6 +455,7 @@ def test_progress_shows_the_loss(loop, scenarios, capsys):
     assert f"loss {tuned.history.loss[-1]:.3e}" in shown and f"held out {tuned.history.held_out[-1]:.3e}" in shown
 
 
+@pytest.mark.slow
 def test_without_optax_it_says_what_to_install():
     code = "import sys; sys.modules['optax'] = None; import osik_jax; import osik_jax.tuning"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

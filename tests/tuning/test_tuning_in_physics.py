@@ -92,6 +92,7 @@ def test_without_tuning_the_waist_stays_behind(loop):
     assert not fell and behind > 0.04
 
 
+@pytest.mark.release
 def test_what_the_bound_is_for(tuned):
     """The kinematic loop takes gains up to 1 / dt and more; servos and floor do not."""
     names = [f"{name}.gain" for name in tuned.loop.tasks]

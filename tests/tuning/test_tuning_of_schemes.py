@@ -18,7 +18,7 @@ SCHEMES = {
 }
 
 
-@pytest.mark.variants(release=["hierarchical", "null-space"])
+@pytest.mark.variants(release=["hierarchical", "null-space", "weighted"])
 @pytest.mark.parametrize("name", SCHEMES)
 def test_the_step_is_the_gradient(name):
     """Plain descent with rate 1, against central differences of the loss that the same program reports."""

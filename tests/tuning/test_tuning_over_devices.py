@@ -82,7 +82,7 @@ def test_eight_devices_tune_as_one(eight):
     assert eight["eight"]["compiled"] == eight["one"]["compiled"]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_eight_devices_evaluate_as_one(eight):
     assert len(eight["one"]["losses"]) == 13
     np.testing.assert_allclose(eight["eight"]["losses"], eight["one"]["losses"], rtol=1e-12)

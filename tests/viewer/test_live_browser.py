@@ -125,6 +125,7 @@ def enter(view: LiveView, page: Page) -> None:
     let_it_draw(page, 3000)
 
 
+@pytest.mark.release
 def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, tmp_path: Path) -> None:
     page, ahead, up = visit.page, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     enter(view, page)
@@ -192,6 +193,7 @@ def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit,
     visit.check()
 
 
+@pytest.mark.release
 def test_a_visitor_who_leaves_in_the_middle_of_a_drag_while_another_stays(view: LiveView, visit: Visit) -> None:
     page = visit.page
     enter(view, page)

@@ -302,6 +302,7 @@ def test_without_opengl_rays_are_cast(nao, monkeypatch):
     assert len(tries) == 1
 
 
+@pytest.mark.slow
 def test_without_a_screen_asking_twice_is_safe():
     """MuJoCo's own renderer aborts the process at its second failure."""
     code = """
@@ -417,6 +418,7 @@ def test_importing_the_library_loads_no_drawing():
     assert out.stdout.strip().splitlines()[-1] == "[]"
 
 
+@pytest.mark.slow
 def test_drawing_leaves_pyplot_alone():
     code = "import sys, osik_jax.viewer; print('matplotlib.pyplot' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
