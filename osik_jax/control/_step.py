@@ -114,6 +114,7 @@ def build_problem(
     limits: Limits | None = None,
     dt: Float[Array, ""] | float = 0.005,
     targets: Targets | None = None,
+    kinematics: Kinematics | None = None,
 ) -> VelocityProblem:
     """Return what ``solve`` hands to its scheme: the rows of the tasks, the box and the rows of the limits, assembled.
 
@@ -128,6 +129,8 @@ def build_problem(
         limits: as in ``solve``.
         dt: as in ``solve``.
         targets: as in ``solve``.
+        kinematics: at q. Default: ``forward_kinematics(robot, q)``; that of another library is made by
+            ``osik_jax.interop.kinematics.kinematics_from``.
 
     Raises:
         KeyError, TypeError, ValueError: as in ``solve``.
@@ -138,7 +141,9 @@ def build_problem(
     check_target_names(tasks, targets)
     q = checked_configuration(robot, q)
     aimed = aim(dict(tasks), targets)
-    return velocity_problem(robot, forward_kinematics(robot, q), q, aimed, bounds, in_type_of(dt, q))
+    if kinematics is None:
+        kinematics = forward_kinematics(robot, q)
+    return velocity_problem(robot, kinematics, q, aimed, bounds, in_type_of(dt, q))
 
 
 @jax.jit
