@@ -79,6 +79,9 @@ class Retarget:
     """Leave out the rest pose at the start of a BVH, if the motion jumps from it."""
     animation: bool = True
     """Write the film (motion.gif); of a folder none is written."""
+    report: bool = False
+    """Write a page as well (report.html) that plays person and robot without network, with contacts, limits and notes.
+    Needs the extra viewer; of a folder none is written."""
     fit: Path | None = None
     """Fit a profile (weights, scale, keypoints) to the clips of a folder and write it to this TOML file, instead of
     motions. Every fourth clip is held out and selects the step that is kept."""
@@ -110,11 +113,17 @@ class Retarget:
         console = Console()
         with told():
             motion = _reader(self)(Path(self.clip))
-            retargeter = _retargeter(self)
+            retargeter, page = _retargeter(self), _page(self)
             mapping = _mapping(self.mapping)
             console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
             _, figures = retarget_to_folder(
-                retargeter, motion, self.out, mapping=mapping, fps=self.fps, animation=self.animation
+                retargeter,
+                motion,
+                self.out,
+                mapping=mapping,
+                fps=self.fps,
+                animation=self.animation,
+                **page,
             )
         _print_retargeted(console, figures, self)
         return 0
@@ -270,11 +279,11 @@ def _retarget_live(command: Retarget) -> None:
             return
         motion = _reader(command)(Path(command.clip))
         assert isinstance(motion, retargeting.HumanMotion)  # without --source
-        motion = motion if command.fps is None else motion.resampled(command.fps)
+        motion, page = motion if command.fps is None else motion.resampled(command.fps), _page(command)
         command.out.mkdir(parents=True, exist_ok=True)
         console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")
         result, frames = replay(make, motion)
-        figures = write_folder(result, motion.name, command.out, animation=command.animation)
+        figures = write_folder(result, motion.name, command.out, animation=command.animation, **page)
     spent = 1e3 * np.array([frame.seconds for frame in frames])
     ahead = max(1, round(command.look_ahead * motion.fps))
     waiting = 1e3 * ahead / motion.fps
@@ -309,6 +318,17 @@ def _robot_to_retarget(source: str, base: str = "floating") -> Robot:
     from ..robot.loading import ROBOTS
 
     return read_robot(source, "auto" if source in ROBOTS else base)
+
+
+def _page(command: Retarget) -> dict[str, Any]:
+    """Return whether a page is written, and what the robot's URDF shows; the extra has to be installed."""
+    if not command.report:
+        return {}
+    from ..viewer.live._needs import import_viser
+    from ..viewer.live._source import RobotSource, source_look
+
+    import_viser()
+    return {"page": True, "look": source_look(RobotSource(command.robot))}
 
 
 def _number_or_name(text: str) -> str | float:

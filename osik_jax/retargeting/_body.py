@@ -22,7 +22,7 @@ from ..robot._joint_selection import scalar_layout
 from ._contact import stretches
 from ._facing import facing_at_home
 from ._goals import Goals
-from ._person import Person, axes_from, directions
+from ._person import Person, axes_from, directions, palm_axes
 from ._profile import Limb, Profile
 from ._roles import LEGS, SIDES
 from ._terms import Bounds, reach_length
@@ -102,7 +102,7 @@ class Build:
     Attributes:
         profile: the robot's profile.
         points: world positions of the keypoints [m]. (3,) each
-        size: total length of the limbs that give the scale (``_measured``) [m].
+        lengths: lengths of the limbs that give the scale (``_measured``) [m].
         ankle: height of the ankles above the soles, or of the pelvis if the robot does not walk [m].
         root: the point that follows the person's path: midpoint of the hips, or the pelvis without legs [m]. (3,)
         base: origin of the root body [m]. (3,)
@@ -117,7 +117,7 @@ class Build:
 
     profile: Profile
     points: Mapping[str, Float[np.ndarray, "3"]]
-    size: float
+    lengths: Mapping[Limb, float]
     ankle: float
     root: Float[np.ndarray, "3"]
     base: Float[np.ndarray, "3"]
@@ -149,18 +149,23 @@ class Build:
         return cls(
             profile=profile,
             points=points,
-            size=sum(lengths.values()),
+            lengths=lengths,
             ankle=ankle,
             root=0.5 * (points["left_hip"] + points["right_hip"]) if profile.walks else positions[-2],
             base=positions[-1],
             turn=turns[-1],
-            facing=facing_at_home(robot, profile.across),
+            facing=palm_axes(points) if profile.is_hand else facing_at_home(robot, profile.across),
             start=_with_bent_limbs(robot, profile),
             free=robot.tree.qpos_address[bases[0]] if bases else None,
             lower=np.asarray(robot.position_lower),
             upper=np.asarray(robot.position_upper),
             speed=np.asarray(robot.velocity_limit),
         )
+
+    @property
+    def size(self) -> float:
+        """Return the total length of the limbs that give the scale [m]."""
+        return sum(self.lengths.values())
 
     def seen(self, person: Person) -> Person:
         """Return the person without the motion that the robot's base cannot follow.
@@ -209,7 +214,8 @@ class Build:
         reached, followed = profile.reached, profile.followed
         wanted = directions(person.points, followed)
         for k, (a, b) in enumerate(reached, len(followed) - len(reached)):
-            wanted[:, k] = (person.points[b] - person.points[a]) / person.lengths[a, b]
+            length = person.lengths[a, b] if profile.walks else self.lengths[a, b] / self.scale(person)
+            wanted[:, k] = (person.points[b] - person.points[a]) / length
         dtype = self.start.dtype
         parts: dict[str, Any] = {  # NumPy's arrays: each one of JAX's would cost more than its numbers
             **{name: getattr(person, name) for name in ("pelvis", "torso", "feet")},

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..robot import Robot
 from ._film import film
 from ._fit import Fit, fit
 from ._load import Reader, clips_in
 from ._motion import HumanMotion
+from ._page import write_report
 from ._profile import Profile
 from ._profile_file import save_profile
 from ._report import report
@@ -19,6 +20,9 @@ from ._retarget import Retargeter
 from ._retargeted import Retargeted
 from ._robot_motion import write_csv
 from ._source_motion import SourceMotion
+
+if TYPE_CHECKING:
+    from ..viewer import Look
 
 _HELD_OUT = 4
 """Every fourth clip is held out of a fit: it selects the step that is kept but not its direction."""
@@ -32,8 +36,10 @@ def retarget_to_folder(
     mapping: dict[str, str] | None,
     fps: float | None,
     animation: bool,
+    page: bool = False,
+    look: Look | None = None,
 ) -> tuple[Retargeted, dict[str, Any]]:
-    """Retarget a clip and write motion (.npz and .csv), report, profile and optionally a GIF to a folder.
+    """Retarget a clip and write motion (.npz and .csv), report, profile and optionally a GIF and a page to a folder.
 
     Returns:
         the retargeted motion and its report.
@@ -44,7 +50,7 @@ def retarget_to_folder(
     """
     out.mkdir(parents=True, exist_ok=True)
     result = retargeter.retarget(motion, mapping=mapping, fps=fps)
-    return result, write_folder(result, motion.name, out, animation=animation)
+    return result, write_folder(result, motion.name, out, animation=animation, page=page, look=look)
 
 
 def fit_to_file(
@@ -81,13 +87,17 @@ def fit_to_file(
     return found, len(learned), len(held_out)
 
 
-def write_folder(result: Retargeted, name: str, out: Path, *, animation: bool) -> dict[str, Any]:
-    """Write the files of ``retarget_to_folder`` and return the report."""
+def write_folder(
+    result: Retargeted, name: str, out: Path, *, animation: bool, page: bool = False, look: Look | None = None
+) -> dict[str, Any]:
+    """Write the files of ``retarget_to_folder`` and return the report; ``look`` is that of the page."""
     figures = {"clip": name, **report(result)}
     write_motion(result, figures, out)
     save_profile(result.profile, out / "profile.toml")
     if animation:
         film(result, out / "motion.gif")
+    if page:
+        write_report(result, figures, out / "motion.npz", out / "report.html", look=look)
     return figures
 
 

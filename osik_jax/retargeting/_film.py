@@ -13,17 +13,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ._retargeted import Retargeted
-from ._roles import LIMBS
+from ._roles import bones
 
-_TRUNK = (
-    ("left_hip", "right_hip"),
-    ("left_shoulder", "right_shoulder"),
-    ("left_hip", "left_shoulder"),
-    ("right_hip", "right_shoulder"),
-    ("neck", "head"),
-    ("left_heel", "left_toe"),
-    ("right_heel", "right_toe"),
-)
 _AZIMUTH, _ELEVATION = np.radians(50.0), np.radians(12.0)
 _INK, _BLUE, _GREY = "#1f2933", "#1565c0", "#9aa3ad"
 _RATE = 15.0
@@ -69,8 +60,7 @@ def film(result: Retargeted, path: str | os.PathLike[str]) -> Path:
 
 def _person_sticks(result: Retargeted) -> Float[np.ndarray, "F k 2 3"]:
     points = {name: result.human[:, k] for k, name in enumerate(result.human_names)}
-    known = [(a, b) for a, b in (*LIMBS, *_TRUNK) if a in points and b in points]
-    return np.stack([np.stack([points[a], points[b]], 1) for a, b in known], 1)
+    return np.stack([np.stack([points[a], points[b]], 1) for a, b in bones(points)], 1)
 
 
 def _robot_sticks(result: Retargeted) -> Float[np.ndarray, "F k 2 3"]:

@@ -111,7 +111,7 @@ def find_arm(robot: Robot, kinematics: Kinematics, arm: Chain) -> Limb:
     if fingers:
         wrist, end = _body(robot, arm.bodies[fingers[0]]), arm.anchors[fingers[0]]
     else:
-        wrist, end = _end(robot, kinematics, arm, hand)
+        wrist, end = find_end(robot, kinematics, arm, hand)
     extended = Chain((*own.bodies, own.bodies[-1]), np.concatenate([own.anchors, end[None]]))
     elbow = _bend(robot, kinematics, extended, 1)
     if elbow is not None:
@@ -206,7 +206,7 @@ def _hand(robot: Robot, arm: Chain) -> int:
     return len(arm.bodies) - 1
 
 
-def _end(robot: Robot, kinematics: Kinematics, arm: Chain, last: int) -> tuple[Place, np.ndarray]:
+def find_end(robot: Robot, kinematics: Kinematics, arm: Chain, last: int) -> tuple[Place, np.ndarray]:
     """Return the end of an arm's last link as a place and in the world [m]: a hand frame, else its far end."""
     tree, body, anchor = robot.tree, arm.bodies[last], arm.anchors[last]
     least = _LEAST_FOREARM * float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,7 +14,7 @@ from ._contact import find_contact, find_noise
 from ._floor import Floor, find_floor
 from ._motion import CONTACT_POINTS, HumanMotion
 from ._profile import Limb
-from ._roles import LEGS, LIMBS, REACHES, SIDES
+from ._roles import FINGER_REACHES, FINGERS, LEGS, LIMBS, REACHES, SIDES, chain
 from ._up import find_up
 
 # Vectors shorter than this [m] have no direction; a spine shorter than 1 mm means chest and hips are one joint.
@@ -142,15 +143,15 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
         turns = _turns(points)
         middle = np.argsort(turns[0][:, 2, 2], kind="stable")[len(turns[0]) // 2]
         straight = turns[0][middle, None], turns[1][middle, None]
-    elif motion.rest_positions is not None:
+    elif motion.rest_positions is not None and "wrist" not in roles:
         at = {role: motion.joint_names.index(name) for role, name in roles.items()}
         rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
         flat = {side: {**rest, **_toes(rest, side)} for side in SIDES} if legs else {}
         straight = _turns(rest)
     known = [limb for limb in LIMBS if set(limb) <= set(points)]
     lengths = {(a, b): float(np.linalg.norm(points[b] - points[a], axis=-1).mean()) for a, b in known}
-    reaches = [limb for limb in REACHES if set(limb) <= set(points)]
-    lengths |= {(a, b): float(np.median(np.linalg.norm(points[b] - points[a], axis=-1))) for a, b in reaches}
+    reaches = [limb for limb in (*REACHES, *FINGER_REACHES) if set(limb) <= set(points)]
+    lengths |= {limb: bone_length(points, limb) for limb in reaches}
     if legs and not on_four:
         leg = 0.5 * sum(lengths[limb] for limb in LEGS)
         if not _LEGS[0] < leg < _LEGS[1]:
@@ -205,7 +206,7 @@ def read_person(
     turns, straight = _turns(points), known.straight
     pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
     level = np.broadcast_to(np.eye(3), (motion.frames, 2, 3, 3))
-    root = _middle(points, "hip", "shoulder")
+    root = path_of(points)
     return Person(
         fps=motion.fps,
         points=points,
@@ -217,6 +218,13 @@ def read_person(
         lengths=known.lengths,
         ankle=known.ankle,
     )
+
+
+def bone_length(points: Mapping[str, np.ndarray], limb: Limb) -> float:
+    """Return the median length of a reach [m]: between its ends, or along the bones of a finger."""
+    roles = [role for role in chain(limb) if role in points] if limb in FINGER_REACHES else limb
+    bones = [np.linalg.norm(points[b] - points[a], axis=-1) for a, b in itertools.pairwise(roles)]
+    return float(np.median(sum(bones)))
 
 
 def _has_legs(points: Mapping[str, np.ndarray]) -> bool:
@@ -233,8 +241,27 @@ def _middle(points: Mapping[str, np.ndarray], *parts: str) -> np.ndarray:
     raise OsikValueError(f"none of these is known: {', '.join(parts)}")
 
 
+def path_of(points: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the point of a person that the robot's path follows: the wrist of a hand, else the middle of the hips."""
+    return points["wrist"] if "wrist" in points else _middle(points, "hip", "shoulder")
+
+
+def palm_axes(points: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return a hand's axes as columns: z from wrist to knuckles, y as near to the index as possible. (..., 3, 3).
+
+    The knuckles of fingers that one hand has and another lacks do not turn z: it goes to the middle finger's, if known.
+    """
+    knuckles = {finger: points[f"{finger}_1"] for finger in FINGERS[1:] if f"{finger}_1" in points}
+    first, *_, last = knuckles.values()
+    z = unit(knuckles.get("middle", 0.5 * (first + last)) - points["wrist"])
+    x = unit(_cross(first - last, z))
+    return np.stack([x, _cross(z, x), z], -1)
+
+
 def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes of pelvis and chest as columns; upright if the clip lacks joints. (F, 3, 3) each."""
+    if "wrist" in points:
+        return (palm_axes(points),) * 2
     low, vertical = _middle(points, "hip", "shoulder"), np.array([0.0, 0.0, 1.0])
     high = points["neck"] if "neck" in points else _middle(points, "shoulder", "hip")
     chest = points.get("chest", low)

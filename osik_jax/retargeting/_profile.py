@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from .._errors import OsikValueError, unknown_name
 from ._goals import Weights
-from ._roles import LIMBS, NEEDED, REACHES, STANDING
+from ._roles import FINGER_REACHES, FINGERS, HAND, LIMBS, NEEDED, REACHES, STANDING
 
 Point = tuple[float, float, float]
 Place = tuple[str, Point]
@@ -53,7 +53,7 @@ class Profile:
 
     Attributes:
         keypoints: place on the robot of those of a person's hips, knees, ankles, shoulders, elbows and wrists that it
-            has. A limb may end early or be absent.
+            has. A limb may end early or be absent. A hand has ``wrist`` and ``thumb_1`` to ``little_4`` instead.
         pelvis: the frame that follows the orientation of the person's pelvis; x forward, z up.
         torso: the frame that follows the orientation of the person's chest; None: the robot's trunk is rigid.
         feet: ``left`` and ``right``; ``left_front`` and ``right_front`` too on four feet; empty without feet.
@@ -64,7 +64,8 @@ class Profile:
         limbs: segments whose directions are tracked, as pairs of roles; None: all between keypoints, if they do not end
             where a reach does.
         reaches: pairs of roles whose vector is tracked, direction and length, relative to nominal lengths of robot and
-            person; None: hip to ankle and shoulder to wrist of a robot that walks on four feet.
+            person; None: hip to ankle and shoulder to wrist of a robot that walks on four feet, wrist to fingertips of
+            a hand.
         rolls: whether the feet are wheels that roll in any direction: they stay on the floor and move along it.
 
     Raises:
@@ -93,11 +94,14 @@ class Profile:
                 "shoulder, and there are two hips or none"
             )
         for role in self.keypoints:
-            if role not in NEEDED:
-                raise unknown_name("keypoint", role, NEEDED)
+            if role not in (*NEEDED, *HAND):
+                raise unknown_name("keypoint", role, (*NEEDED, *HAND))
         for role in (role for limb in (*(self.limbs or ()), *(self.reaches or ())) for role in limb):
             if role not in self.keypoints:
                 raise unknown_name("keypoint", role, tuple(self.keypoints))
+        knuckles = [finger for finger in FINGERS[1:] if f"{finger}_1" in self.keypoints]
+        if self.is_hand and (len(knuckles) < 2 or "wrist" not in self.keypoints):
+            raise OsikValueError("a hand has a keypoint wrist, and index_1, middle_1, ring_1 or little_1: two of these")
         if not self.followed:
             raise OsikValueError("the profile has no limb: give the keypoints of a leg or an arm")
         if self.feet and tuple(sorted(self.feet)) not in STANDING:
@@ -111,7 +115,7 @@ class Profile:
     @property
     def reached(self) -> tuple[Limb, ...]:
         """Return the reaches that are tracked."""
-        on_four = REACHES if len(self.feet) == 4 and self.walks else ()
+        on_four = FINGER_REACHES if self.is_hand else REACHES if len(self.feet) == 4 and self.walks else ()
         return (
             tuple(limb for limb in on_four if set(limb) <= set(self.keypoints))
             if self.reaches is None
@@ -126,6 +130,11 @@ class Profile:
             ends = {role for limb in reached for role in limb}
             limbs = tuple(limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
         return (*limbs, *reached)
+
+    @property
+    def is_hand(self) -> bool:
+        """Return whether the robot is a hand, which follows the wrist and the fingers of a person's."""
+        return not set(HAND).isdisjoint(self.keypoints)
 
     @property
     def walks(self) -> bool:

@@ -173,9 +173,13 @@ def _place(model: mujoco.MjModel, data: mujoco.MjData, ends: Float[np.ndarray, "
 def _tracking(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) -> dict[str, Any]:
     person = {name: result.human[:, k] for k, name in enumerate(result.human_names)}
     errors = {}
-    for name, roles in ((f"{side}_{limb}", roles) for side in SIDES for limb, roles in CHAINS.items()):
-        side = name.split("_")[0]
-        first, *others = [role for part in roles if (role := f"{side}_{part}") in robot and role in person] or [""]
+    chains = {
+        f"{side}_{limb}": [f"{side}_{role}" for role in roles] for side in SIDES for limb, roles in CHAINS.items()
+    }
+    if result.profile.is_hand:
+        chains = {tip.removesuffix("_4"): [first, tip] for first, tip in result.profile.reached}
+    for name, roles in chains.items():
+        first, *others = [role for role in roles if role in robot and role in person] or [""]
         if others:
             h, r = (np.concatenate([points[o] - points[first] for o in others]) for points in (person, robot))
             scale = np.sum(h * r) / np.sum(h * h)

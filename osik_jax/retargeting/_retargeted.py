@@ -13,6 +13,7 @@ from ..robot import Robot
 from ._person import Person
 from ._profile import Profile
 from ._robot_motion import RobotMotion, in_mujoco_order
+from ._roles import bones
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,8 +48,13 @@ class Retargeted:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file.
 
-        Arrays: ``fps``, ``qpos``, ``joint_names``, ``human``, ``human_names``, ``contact`` and ``ground`` (0).
+        Arrays: ``fps``, ``qpos``, ``joint_names``, ``human``, ``human_names``, ``contact`` and ``ground`` (0); for
+        pictures ``human_bones``, pairs of indices into ``human_names``, and ``human_standing``, those of the points of
+        ``contact``.
         """
+        names = self.human_names
+        pairs = [(names.index(a), names.index(b)) for a, b in bones(names)]
+        standing = [names.index(name) for name in self.profile.standing if name in names]
         np.savez_compressed(
             Path(path),
             fps=self.motion.fps,
@@ -56,6 +62,8 @@ class Retargeted:
             joint_names=np.array(self.motion.joint_names),
             human=self.human,
             human_names=np.array(self.human_names),
+            human_bones=np.array(pairs, int).reshape(-1, 2),
+            human_standing=np.array(standing, int),
             contact=self.contact,
             ground=0.0,
         )

@@ -8,9 +8,9 @@ import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from .._errors import OsikValueError, unknown_name
-from ._roles import NEEDED, OPTIONAL, SIDES
+from ._roles import FINGERS, HAND, NEEDED, OPTIONAL, SIDES
 
-ROLES = (*NEEDED, *OPTIONAL)
+ROLES = (*NEEDED, *OPTIONAL, *HAND)
 """All roles: a person's joints and points in retargeting."""
 _LIMB_WORDS = {
     "hip": "upleg upperleg thigh femur hip leg 足",
@@ -66,6 +66,10 @@ def find_roles(
     """
     if mapping is not None:
         return _checked(joint_names, mapping, needed)
+    if "wrist" in needed:
+        fingers = {role: name for name in joint_names for role, word in _hand_words() if _plain(name).endswith(word)}
+        _check_complete(joint_names, fingers, needed)
+        return fingers
     groups: dict[str, dict[Part, str]] = {}
     for name in joint_names:
         for prefix, part in _readings(_plain(name)):
@@ -93,6 +97,18 @@ def _spellings() -> dict[str, Part]:
     for word in (word for words in _TRUNK_WORDS.values() for word in words.split()):
         out |= {spelling: ("", word) for own in _MIDDLE_WORDS for spelling in (f"{own}{word}", f"{word}{own}")}
     return out
+
+
+@functools.cache
+def _hand_words() -> tuple[tuple[str, str], ...]:
+    """Return the ways to write the keypoints of a hand, with their roles: index_1, MediaPipe's index_finger_mcp."""
+    out = [("wrist", "wrist")]
+    for finger in FINGERS:
+        parts = ("cmc", "mcp", "ip", "tip") if finger == "thumb" else ("mcp", "pip", "dip", "tip")
+        for word in (finger, "pinky") if finger == "little" else (finger,):
+            for joint, part in enumerate(parts, 1):
+                out += [(f"{finger}_{joint}", w) for w in (f"{word}{joint}", f"{word}{part}", f"{word}finger{part}")]
+    return tuple(out)
 
 
 @functools.cache

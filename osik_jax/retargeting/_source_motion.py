@@ -13,12 +13,12 @@ from ..robot import Robot
 from ._contact import find_contact, find_noise
 from ._facing import facing_x
 from ._floor import Floor, find_floor
-from ._person import Person
+from ._person import Person, bone_length, palm_axes, path_of
 from ._places import find_places
 from ._profile import Profile
 from ._profile_file import check_profile, find_profile
 from ._robot_motion import RobotMotion, base_columns, joints_in_mujoco_order, load_robot_motion
-from ._roles import LIMBS, REACHES, SIDES
+from ._roles import FINGER_REACHES, LIMBS, REACHES, SIDES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,17 +96,18 @@ class SourceMotion:
             points |= {role: standing[:, k] for k, role in enumerate(profile.standing)}
         points = {role: floor.leveled(track, fps) for role, track in points.items()}
         turns = found.turns[1:] @ np.swapaxes(found.turns[0], -1, -2)
-        limbs = [limb for limb in (*LIMBS, *REACHES) if set(limb) <= set(upright)]
-        middle = [points[f"{side}_{'hip' if 'left_hip' in points else 'shoulder'}"] for side in SIDES]
+        if profile.is_hand:
+            turns[:, :2] = palm_axes(points)[:, None]
+        limbs = [limb for limb in (*LIMBS, *REACHES, *FINGER_REACHES) if set(limb) <= set(upright)]
         return Person(
             fps=fps,
             points=points,
             pelvis=turns[:, 0],
             torso=turns[:, 1],
-            root=0.5 * (middle[0] + middle[1]),
+            root=path_of(points),
             feet=turns[:, 2:],
             contact=np.zeros((self.frames, 4), bool) if contact is None else contact,
-            lengths={(a, b): float(np.linalg.norm(upright[b] - upright[a])) for a, b in limbs},
+            lengths={limb: bone_length(upright, limb) for limb in limbs},
             ankle=ankle,
         )
 

@@ -24,7 +24,7 @@ from ._balance import mass_fractions, overhang
 from ._facing import facing_at_home
 from ._goals import Goals, Weights
 from ._profile import Limb, Place, Profile
-from ._roles import CHAINS, SIDES
+from ._roles import SIDES, chain
 
 # Guard of a limb's direction: a shorter limb [m] has none.
 SHORTEST = 1e-6
@@ -121,15 +121,14 @@ class Body(eqx.Module):
 
 def reach_length(robot: Robot, profile: Profile, limb: Limb) -> float:
     """Return the nominal length of a reach [m]: that at home, at most ``STANDING_SHARE`` of the stretched limb."""
-    side, part = limb[1].split("_")
-    roles = next((chain for chain in CHAINS.values() if part in chain), ())
-    between = [role for name in roles if (role := f"{side}_{name}") in profile.keypoints]
+    known = [role for role in chain(limb) if role in profile.keypoints]
     kinematics, points = home_kinematics(robot), []
-    for frame, point in (profile.keypoints[role] for role in (limb if set(limb) - set(between) else between)):
+    for frame, point in (profile.keypoints[role] for role in known):
         position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
         points.append(position + rotation @ np.array(point))
     stretched = sum(float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(points))
-    return min(float(np.linalg.norm(points[-1] - points[0])), STANDING_SHARE * stretched)
+    bent = min(float(np.linalg.norm(points[-1] - points[0])), STANDING_SHARE * stretched)
+    return stretched if profile.is_hand else bent
 
 
 class Joints(NamedTuple):

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from made_up_map import WHOLE, made_up_map
+from motion_files import dancer, write_bvh
 from playwright.sync_api import Page, sync_playwright
 from waiting import until
 
 import osik_jax as osik
+from osik_jax.cli._retarget import Retarget
 from osik_jax.viewer import LiveView, ReachView, export_html, serve_reach, serve_session
 from osik_jax.viewer._mujoco import mujoco_frame_pose, mujoco_poses
 from osik_jax.viewer.live._default import default_session
@@ -229,6 +231,22 @@ def test_an_exported_page_plays_without_a_server(visit: Visit, tmp_path: Path) -
     page.wait_for_timeout(2000)
     assert float(clock.input_value()) != before
     page.screenshot(path=tmp_path / "exported.png")
+    visit.check()
+
+
+def test_a_retargeted_motion_plays_beside_the_person(visit: Visit, tmp_path: Path) -> None:
+    clip = write_bvh(tmp_path / "dance.bvh", dancer(40), 0.01)
+    assert Retarget(clip=str(clip), out=tmp_path / "out", report=True, animation=False).run() == 0
+    page: Any = visit.page
+    visit.requests.clear()
+    page.goto((tmp_path / "out" / "report.html").as_uri())
+    slider, mark = page.locator("#root [role=slider]").first, page.locator("#osik .now").first
+    slider.wait_for(state="attached")
+    assert float(slider.get_attribute("aria-valuemax")) == pytest.approx(40 / 30, abs=1e-6)
+    seen = set()
+    assert until(lambda: len(seen.add(mark.evaluate("e => e.style.left")) or seen) > 3)
+    page.get_by_text("What gave way").wait_for()
+    page.screenshot(path=tmp_path / "retargeted.png")
     visit.check()
 
 

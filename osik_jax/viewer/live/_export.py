@@ -53,8 +53,10 @@ def export_html(
     return write_page(robot, _motion(robot, trajectory, dt), Path(path), look=look, title=title)
 
 
-def write_page(robot: Robot, motion: Motion, out: Path, *, look: Look | None, title: str) -> Path:
-    """Write the page of an already loaded motion.
+def write_page(
+    robot: Robot, motion: Motion, out: Path, *, look: Look | None, title: str, beside: str | None = None
+) -> Path:
+    """Write the page of an already loaded motion; ``beside`` is HTML that is shown beside it.
 
     Raises:
         ImportError: viser is not installed.
@@ -70,7 +72,11 @@ def write_page(robot: Robot, motion: Motion, out: Path, *, look: Look | None, ti
         page = serializer.as_html()
     finally:
         close_server(server)
-    out.write_text(page.replace("<title>Viser</title>", f"<title>{_escaped(title)}</title>", 1), encoding="utf-8")
+    page = page.replace("<title>Viser</title>", f"<title>{_escaped(title)}</title>", 1)
+    if beside is not None:
+        start, end = page.rsplit("</body>", 1)
+        page = f"{start}{beside}</body>{end}"
+    out.write_text(page, encoding="utf-8")
     return out
 
 

@@ -19,6 +19,7 @@ from .._outline import floor_height
 from .._parts import robot_parts
 from ._robot_nodes import RobotNodes, add_label, side_by_side
 from ._server import Served
+from ._stick_figure import StickFigure, StickNodes
 from ._surroundings import add_surroundings
 
 _FRAME = 1.0 / 30.0
@@ -34,11 +35,17 @@ class Motion:
     Attributes:
         runs: name to configurations. {name: (T, nq)}
         times: name to the time of each configuration [s]. {name: (T,)}
+        person: the person whose motion the first run is, at its times; None: nobody's.
     """
 
-    def __init__(self, runs: Mapping[str, Float[np.ndarray, "T nq"]], times: Mapping[str, np.ndarray]) -> None:
+    def __init__(
+        self,
+        runs: Mapping[str, Float[np.ndarray, "T nq"]],
+        times: Mapping[str, np.ndarray],
+        person: StickFigure | None = None,
+    ) -> None:
         """Take configurations by name of the run, and the times of each run's frames [s]."""
-        self.runs, self.times = dict(runs), dict(times)
+        self.runs, self.times, self.person = dict(runs), dict(times), person
 
     @property
     def duration(self) -> float:
@@ -47,7 +54,11 @@ class Motion:
 
     def at(self, name: str, now: float) -> Float[np.ndarray, " nq"]:
         """Return the configuration of a run at a time [s]; its last one after the end."""
-        return self.runs[name][max(int(np.searchsorted(self.times[name], now, side="right")) - 1, 0)]
+        return self.runs[name][self.frame(name, now)]
+
+    def frame(self, name: str, now: float) -> int:
+        """Return the index of a run's configuration at a time [s]."""
+        return max(int(np.searchsorted(self.times[name], now, side="right")) - 1, 0)
 
 
 def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
@@ -55,7 +66,7 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
 
     Runs are arrays (T, nq) called ``q`` or ``q_NAME``; times are ``time_NAME`` or ``time``, one fewer where they are
     those of the steps; without any, there are 200 configurations a second. What ``osik retarget`` writes is ``qpos``
-    with ``joint_names`` and ``fps``.
+    with ``joint_names`` and ``fps``; its person is shown too.
 
     Raises:
         FileNotFoundError: no such file.
@@ -68,7 +79,9 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
         raise FileNotFoundError(f"no such file: {path}") from None
     except Exception as error:
         raise OsikValueError(f"{path} is no motion: it is not a .npz file of numpy") from error
+    person = None
     if {"qpos", "joint_names", "fps"} <= arrays.keys():
+        person = StickFigure.of(arrays)
         arrays = _retargeted(arrays, robot, path)
     runs = {n.removeprefix("q").lstrip("_") or "motion": a for n, a in arrays.items() if n == "q" or n[:2] == "q_"}
     if not runs:
@@ -79,21 +92,22 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
                 f"{path}: run {name!r} has shape {q.shape}, and the robot's configurations have {robot.nq} finite "
                 "numbers: is it the motion of another robot? Say which with --robot"
             )
-    return Motion(runs, {name: _times(name, len(q), arrays) for name, q in runs.items()})
+    return Motion(runs, {name: _times(name, len(q), arrays) for name, q in runs.items()}, person)
 
 
 def _retargeted(arrays: Mapping[str, np.ndarray], robot: Robot, path: Any) -> dict[str, np.ndarray]:
     """Return the arrays q and time of a motion whose joints are given by name."""
     qpos, names = np.asarray(arrays["qpos"], float), [str(name) for name in arrays["joint_names"]]
     tree = robot.tree
-    unknown = sorted(set(names) - set(tree.joint_names))
-    if unknown or not robot.floating_base or qpos.ndim != 2 or qpos.shape[1] != 7 + len(names):
-        what = f"it has no joint {unknown[0]}" if unknown else "its base is fixed, or the columns are others"
-        raise OsikValueError(f"{path} is the motion of another robot ({what}): say which with --robot")
-    free = tree.qpos_address[tree.free_bases[0]]
+    unknown, base = sorted(set(names) - set(tree.joint_names)), 7 * robot.floating_base
+    if unknown or qpos.ndim != 2 or qpos.shape[1] != base + len(names):
+        what = f"it has no joint {unknown[0]}" if unknown else "its base moves otherwise, or the columns are others"
+        raise OsikValueError(f"{path} is the motion of another robot ({what}): say which with --robot and --base")
     q = np.tile(np.asarray(robot.q0, float), (len(qpos), 1))
-    q[:, free : free + 7] = qpos[:, :7]
-    for column, name in enumerate(names, 7):
+    if base:
+        free = tree.qpos_address[tree.free_bases[0]]
+        q[:, free : free + 7] = qpos[:, :7]
+    for column, name in enumerate(names, base):
         joint = tree.joint_names.index(name)
         if joint in tree.independent:
             q[:, tree.qpos_address[joint]] = qpos[:, column]
@@ -112,16 +126,25 @@ def _times(name: str, count: int, arrays: Mapping[str, np.ndarray]) -> Float[np.
 
 
 class Cast:
-    """Robots of a motion, side by side in one scene."""
+    """Robots of a motion, side by side in one scene, and on their left the person, as large as a robot."""
 
     def __init__(self, server: Any, robot: Robot, motion: Motion, look: Look | None, *, panel: bool) -> None:
         """Add a robot per run, the floor and a camera, optionally with room for a panel."""
         shapes, self._robot, self._motion = robot_parts(robot, look=look), robot, motion
         spans = np.concatenate([_span(robot, shapes, q) for q in motion.runs.values()])
-        offsets = side_by_side(spans, len(motion.runs))
-        seen = np.concatenate([spans + offset for offset in offsets])
         first = next(iter(motion.runs.values()))
-        add_surroundings(server, seen, floor_height(robot, shapes, mujoco_poses(robot, first[:1])), panel=panel)
+        floor = floor_height(robot, shapes, mujoco_poses(robot, first[:1]))
+        person, self._person = motion.person, None
+        if person is not None:
+            base = [robot.tree.qpos_address[b] + k for b in robot.tree.free_bases for k in range(3)]
+            person = person.sized(_span(robot, shapes, first[:1]), first[:, base] if base else np.zeros((1, 3)), floor)
+            spans = np.concatenate([spans, person.points.reshape(-1, 3)])
+        offsets = side_by_side(spans, len(motion.runs) + (person is not None))
+        seen = np.concatenate([spans + offset for offset in offsets])
+        add_surroundings(server, seen, floor, panel=panel)
+        if person is not None:
+            self._person = StickNodes(server.scene, person, offsets[0])
+            add_label(server.scene, "person", person.points.reshape(-1, 3) + offsets.pop(0))
         self._nodes: dict[str, RobotNodes] = {}
         for name, offset in zip(motion.runs, offsets, strict=True):
             self._nodes[name] = RobotNodes(server.scene, robot, look=look, name=f"robot {name}", offset=offset)
@@ -132,6 +155,8 @@ class Cast:
         """Move all robots to a time [s]."""
         for name, nodes in self._nodes.items():
             nodes.place(next(mujoco_poses(self._robot, self._motion.at(name, now))))
+        if self._person is not None:
+            self._person.place(self._motion.frame(next(iter(self._nodes)), now))
 
 
 def _span(robot: Robot, shapes: Any, q: Float[np.ndarray, "T nq"]) -> Float[np.ndarray, "points 3"]:

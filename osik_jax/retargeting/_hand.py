@@ -1,0 +1,150 @@
+"""Profile of a robot hand, inferred from its kinematic tree: palm, fingers, knuckles and tips."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from ..kinematics import Kinematics
+from ..kinematics._home import home_kinematics
+from ..robot import Robot
+from ._goals import Weights
+from ._limbs import ORIGIN, Chain, find_end
+from ._profile import Place, Profile
+from ._roles import FINGERS
+
+_PARTS = r"(?=j\d|base|hub|meta|knuck|prox|mid|dist)"
+_WORDS = {
+    "thumb": "thumb|(?:^|[ _])th" + _PARTS,
+    "index": "index|fore_?finger|(?:^|[ _])ff" + _PARTS,
+    "ring": "ring|(?:^|[ _])rf" + _PARTS,
+    "little": "little|pinky|(?:^|[ _])lf" + _PARTS,
+    "middle": "middle|(?:^|[ _])mf" + _PARTS,
+}
+"""Names of the bodies and joints of each finger, the middle one last: links of others are called middle too. The Shadow
+hand's have two letters (``rh_FFJ4``).
+"""
+_BASE = r"palm|hand|wrist|base"
+_HAND = r"hand|palm|finger|thumb"
+_MOST_WRIST, _LEAST_FINGERS, _LEAST_JOINTS, _LARGEST = 2, 3, 2, 0.4
+"""What a hand is: at most two joints before the palm, at least three fingers of at least two joints, and joints within
+0.4 m of each other.
+"""
+_SAME = 2e-3
+"""Joints nearer to each other than this [m] are one knuckle."""
+WEIGHTS = Weights(limb=100.0)
+"""Weights of a hand. With a body's, posture pulls fingertips off by a millimetre, and the damping of the plan's steps
+(1 at least) outweighs the rows of fingers: a tip that is out of reach ends the iterations before the others are there.
+"""
+
+
+def guess_hand(robot: Robot) -> Profile | None:
+    """Return the profile of a robot hand with a fixed base, or None if the robot is none.
+
+    Fingers are told by their names. Without names the thumb is the finger that points most away from the others, and
+    the others are in order from its side. The wrist is the palm's joint, else a frame of the palm that is
+    about as far behind the middle knuckle as that finger is long, else the point there.
+    """
+    tree = robot.tree
+    if robot.floating_base or not any(re.search(_HAND, name, re.IGNORECASE) for name in tree.frame_names):
+        return None
+    kinematics = home_kinematics(robot)
+    palm, chains = _palm(robot, kinematics)
+    if len(chains) < _LEAST_FINGERS or len(chains) > len(FINGERS):
+        return None
+    keypoints: dict[str, Place] = {}
+    points: dict[str, np.ndarray] = {}
+    tips = [find_end(robot, kinematics, chain, len(chain.bodies) - 1) for chain in chains]
+    for finger, k in _named(robot, chains, np.array([at for _, at in tips])).items():
+        knuckles = _knuckles(chains[k])
+        for joint, i in enumerate(knuckles, 1):
+            keypoints[f"{finger}_{joint}"] = tree.body_names[chains[k].bodies[i]], ORIGIN
+        keypoints[f"{finger}_4"] = tips[k][0]
+        points |= {f"{finger}_1": chains[k].anchors[knuckles[0]], f"{finger}_4": tips[k][1]}
+    wrist = _wrist(robot, kinematics, palm, points)
+    return Profile(keypoints={"wrist": wrist, **keypoints}, pelvis=wrist[0], weights=WEIGHTS)
+
+
+def _palm(robot: Robot, kinematics: Kinematics) -> tuple[int, list[Chain]]:
+    """Return the body that the most fingers begin at, and the fingers; none if the robot is no hand."""
+    tree, position = robot.tree, np.asarray(kinematics.body_position)
+    own = _joints_of(robot)
+    best: tuple[int, list[Chain]] = (0, [])
+    for palm in range(len(tree.body_parents)):
+        above = np.flatnonzero(tree.descendants[:, palm])
+        if sum(own[b] for b in above) > _MOST_WRIST:
+            continue
+        chains = []
+        for child in (b for b, parent in enumerate(tree.body_parents) if parent == palm and b != palm):
+            below = np.flatnonzero(tree.descendants[child])
+            last = max(below, key=lambda b: (sum(own[np.flatnonzero(tree.descendants[:, b])]), -b))
+            bodies = [int(b) for b in np.flatnonzero(tree.descendants[:, last] & tree.descendants[child]) if own[b]]
+            if sum(own[bodies]) >= _LEAST_JOINTS:
+                chains.append(Chain(tuple(bodies), position[bodies]))
+        if len(chains) > len(best[1]):
+            at = np.concatenate([chain.anchors for chain in chains])
+            best = (palm, chains) if np.ptp(at, axis=0).max() < _LARGEST else best
+    return best
+
+
+def _joints_of(robot: Robot) -> np.ndarray:
+    """Return the number of joints of each body. (bodies,)."""
+    return np.bincount(np.asarray(robot.tree.joint_bodies, int), minlength=len(robot.tree.body_parents))
+
+
+def _named(robot: Robot, chains: list[Chain], tips: np.ndarray) -> dict[str, int]:
+    """Return the index of each finger's chain, in the order of ``FINGERS``."""
+    tree, found = robot.tree, {}
+    parts = [[tree.body_names[b] for b in chain.bodies] for chain in chains]
+    for chain, names in zip(chains, parts, strict=True):
+        names += [n for n, body in zip(tree.joint_names, tree.joint_bodies, strict=True) if body in chain.bodies]
+    for finger, word in _WORDS.items():
+        own = [k for k, names in enumerate(parts) if re.search(word, " ".join(names), re.IGNORECASE)]
+        left = [k for k in own if k not in found.values()]
+        found |= {finger: left[0]} if len(left) == 1 else {}
+    if len(found) == len(chains):
+        return {finger: found[finger] for finger in FINGERS if finger in found}
+    first = np.array([chain.anchors[0] for chain in chains])
+    along = (tips - first) / np.maximum(np.linalg.norm(tips - first, axis=-1, keepdims=True), _SAME)
+    thumb = int(np.argmin((along @ along.T).sum(1)))
+    others = [k for k in range(len(chains)) if k != thumb]
+    from_middle = first - first[others].mean(0)
+    across = np.linalg.svd(from_middle[others])[2][0]
+    side = from_middle @ (across if across @ from_middle[thumb] >= 0.0 else -across)
+    return dict(zip(FINGERS, [thumb, *sorted(others, key=lambda k: -side[k])], strict=False))
+
+
+def _away(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(a - b))
+
+
+def _knuckles(chain: Chain) -> list[int]:
+    """Return the indices of the last three joints of a finger that are at different places."""
+    apart = [i for i, at in enumerate(chain.anchors) if not i or _away(at, chain.anchors[i - 1]) > _SAME]
+    return apart[-3:]
+
+
+def _wrist(robot: Robot, kinematics: Kinematics, palm: int, points: dict[str, np.ndarray]) -> Place:
+    """Return the wrist as a place on the palm."""
+    finger = next(name for name in ("middle", "index", "ring") if f"{name}_1" in points)
+    knuckle, along = points[f"{finger}_1"], points[f"{finger}_4"] - points[f"{finger}_1"]
+    if _joints_of(robot)[palm]:
+        return _frame(robot, palm), ORIGIN
+    names = zip(robot.tree.frame_names, robot.tree.frame_bodies, strict=True)
+    named = [name for name, body in names if body == palm and re.search(_BASE, name, re.IGNORECASE)]
+    length, at = float(np.linalg.norm(along)), {name: kinematics.frame_pose(robot, name) for name in named}
+    far = {name: _away(np.asarray(position), knuckle) for name, (position, _) in at.items()}
+    behind = {name: _away(np.asarray(at[name][0]), knuckle - along) for name in named if far[name] > 0.5 * length}
+    nearest = min(behind, key=lambda name: behind[name], default="")
+    if nearest and behind[nearest] < 0.5 * length:
+        return nearest, ORIGIN
+    frame = min(far, key=lambda name: far[name], default=_frame(robot, palm))
+    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
+    x, y, z = np.round((knuckle - along - position) @ rotation, 6).tolist()
+    return frame, (x, y, z)
+
+
+def _frame(robot: Robot, body: int) -> str:
+    """Return the frame of a body."""
+    return robot.tree.frame_names[robot.tree.frame_bodies.index(body)]

@@ -1,0 +1,140 @@
+"""Offline page of a retargeted motion: person and robot side by side, and a panel with contacts, limits and notes."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from ._contact import stretches
+from ._retargeted import Retargeted
+
+if TYPE_CHECKING:
+    from ..viewer import Look
+
+_AT_END, _MOST_JOINTS = 0.01, 8
+"""Share of a joint's range within which it counts as at its end, and joints that the panel lists."""
+_FIGURES = {
+    "segments off, mean [deg]": ("tracking", "segment_angle_deg_mean"),
+    "feet slip [mm]": ("feet", "slip_mm_max"),
+    "feet above the floor [mm]": ("feet", "float_mm_max"),
+    "soles below the floor [mm]": ("feet", "below_floor_mm_max"),
+    "shapes overlap [mm]": ("shapes", "penetration_mm_max"),
+    "beyond joint ranges [rad]": ("joints", "beyond_range_max"),
+    "speed over its limit": ("joints", "speed_over_limit_max"),
+    "acceleration [rad/s²]": ("joints", "acceleration_max"),
+    "frames with a jump": ("joints", "jump_frames"),
+}
+_STYLE = """<style>
+#root{position:fixed;left:0;top:0;bottom:0;width:calc(100% - 340px)}
+#osik{position:fixed;right:0;top:0;bottom:0;width:340px;box-sizing:border-box;padding:14px 16px;overflow:auto;
+font:13px/1.4 system-ui,sans-serif;color:#1f2933;background:#fff;border-left:1px solid #d9dfe7}
+#osik h1{font-size:16px;margin:0 0 2px}#osik h2{font-size:13px;margin:14px 0 4px}#osik p,#osik ul{margin:2px 0}
+#osik ul{padding-left:18px}#osik table{border-collapse:collapse;width:100%}#osik td{padding:1px 0}
+#osik td+td{text-align:right;font-variant-numeric:tabular-nums}#osik .gave{color:#b3261e}
+#osik svg{display:block;width:100%;height:12px;background:#eef1f5;margin-bottom:4px}
+#osik .lines{position:relative}#osik .now{position:absolute;top:0;bottom:0;width:1px;background:#1c6fb8}
+</style>"""
+_SCRIPT = """<script>
+setInterval(()=>{const s=document.querySelector('#root [role=slider]');if(!s)return;
+const now=Number(s.getAttribute('aria-valuenow'))/Math.max(Number(s.getAttribute('aria-valuemax')),1e-9);
+document.querySelectorAll('#osik .now').forEach(e=>e.style.left=100*now+'%')},50)
+</script>"""
+
+
+def write_report(
+    result: Retargeted, figures: Mapping[str, Any], motion: Path, out: Path, *, look: Look | None = None
+) -> None:
+    """Write one HTML file that shows a retargeted motion without server or network.
+
+    Args:
+        result: the motion.
+        figures: its report.
+        motion: the ``motion.npz`` that it was saved to.
+        out: the page.
+        look: what the robot's URDF shows, from ``read_look``; None: the model's own shapes.
+
+    Raises:
+        ImportError: viser is not installed (the extra ``viewer``).
+    """
+    from ..viewer.live._export import write_page
+    from ..viewer.live._playback import read_motion
+
+    panel = _STYLE + _panel(result, figures) + _SCRIPT
+    title = str(figures.get("clip", motion.stem))
+    write_page(result.robot, read_motion(motion, result.robot), out, look=look, title=title, beside=panel)
+
+
+def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
+    """Return the panel: notes, contacts and limits over time, joints at their ends, and figures."""
+    frames, fps = figures["frames"], figures["fps"]
+    parts = [f"<aside id=osik><h1>{_text(figures.get('clip', ''))}</h1><p>{frames} frames, {fps:g} a second</p>"]
+    notes = figures["notes"]
+    parts.append("<h2>What gave way</h2>")
+    parts.append(_items(notes, " class=gave") if notes else "<p>nothing</p>")
+    names = result.profile.standing
+    parts.append("<h2>Contact</h2>")
+    rows = {name.replace("_", " "): result.contact[:, k] for k, name in enumerate(names)}
+    parts.append(_lines(rows, "#2a9d62") if names else "<p>the robot has no feet</p>")
+    ends, fast = _at_ends(result), _share_of_speed(result)
+    parts.append("<h2>Limits</h2>")
+    strips = {"a joint at an end of its range": ends.any(1), "a joint at its speed limit": (fast > 0.97).any(1)}
+    parts.append(_lines({**strips, "limits keep it from the plan": result.off_plan > 1e-3}, "#d97b1f"))
+    share = {name: ends[:, k].mean() for k, name in enumerate(result.robot.joint_names) if ends[:, k].any()}
+    longest = sorted(share, key=lambda name: -share[name])[:_MOST_JOINTS]
+    parts.append("<h2>Joints at an end of their range</h2>")
+    parts.append(_table({name: f"{100.0 * share[name]:.0f} %" for name in longest}) if share else "<p>none</p>")
+    parts.append("<h2>Largest values</h2>")
+    parts.append(_table({text: _number(figures[group][name]) for text, (group, name) in _FIGURES.items()}))
+    return "".join(parts) + "</aside>"
+
+
+def _at_ends(result: Retargeted) -> Bool[np.ndarray, "F joints"]:
+    """Return whether each joint is within 1 % of an end of its range."""
+    robot, names = result.robot, result.robot.joint_names
+    dofs = [robot.joint_dof_index(name) for name in names]
+    q = result.q[:, [robot.joint_qpos_index(name) for name in names]]
+    low, high = np.asarray(robot.position_lower)[dofs], np.asarray(robot.position_upper)[dofs]
+    room = np.where(np.isfinite(high - low), _AT_END * (high - low), 0.0)
+    return (q <= low + room) | (q >= high - room)
+
+
+def _share_of_speed(result: Retargeted) -> np.ndarray:
+    """Return each joint's speed over its limit, 0 in the first frame. (F, joints)."""
+    robot, names = result.robot, result.robot.joint_names
+    q = result.q[:, [robot.joint_qpos_index(name) for name in names]]
+    limit = np.asarray(robot.velocity_limit)[[robot.joint_dof_index(name) for name in names]]
+    return np.abs(np.diff(q, axis=0, prepend=q[:1])) * result.motion.fps / limit
+
+
+def _lines(rows: Mapping[str, Bool[np.ndarray, " F"]], color: str) -> str:
+    """Return a strip per row, coloured where it holds, under one mark of the present time."""
+    out = []
+    for name, flags in rows.items():
+        bars = "".join(f'<rect x="{a}" width="{b - a}" height="1" fill="{color}"/>' for a, b in stretches(flags))
+        out.append(
+            f'<p>{_text(name)}</p><svg viewBox="0 0 {len(flags)} 1" preserveAspectRatio="none" role=img '
+            f'aria-label="{_text(name)}">{bars}</svg>'
+        )
+    return f"<div class=lines>{''.join(out)}<div class=now></div></div>"
+
+
+def _table(rows: Mapping[str, str]) -> str:
+    return "<table>" + "".join(f"<tr><td>{_text(a)}<td>{_text(b)}" for a, b in rows.items()) + "</table>"
+
+
+def _number(value: float | None) -> str:
+    """Return a number with two decimals, whole ones without."""
+    return "-" if value is None else f"{value:.2f}".removesuffix(".00")
+
+
+def _items(texts: Iterable[str], attributes: str) -> str:
+    return f"<ul{attributes}>" + "".join(f"<li>{_text(text)}" for text in texts) + "</ul>"
+
+
+def _text(text: str) -> str:
+    return html.escape(str(text))

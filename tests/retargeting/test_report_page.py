@@ -1,0 +1,84 @@
+"""The page of ``osik retarget --report``: what it says is what MuJoCo and the contacts say, and it needs no network."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from motion_files import dancer, write_bvh
+
+import osik_jax as osik
+from osik_jax.cli._retarget import Retarget
+from osik_jax.retargeting import HumanMotion, Retargeter, load_profile, report
+from osik_jax.retargeting._command import write_folder
+from osik_jax.viewer.live._playback import read_motion
+
+FRAMES = 20
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    clip = write_bvh(folder / "dance <1>.bvh", dancer(FRAMES), 0.01)
+    assert Retarget(clip=str(clip), robot="nao", out=folder / "out", report=True, animation=False).run() == 0
+    return folder / "out"
+
+
+def strips(page: str) -> dict[str, np.ndarray]:
+    """The strips of a page: whether each is coloured in each frame."""
+    out = {}
+    for name, inside in re.findall(r'aria-label="(.*?)">(.*?)</svg>', page):
+        out[name] = np.zeros(FRAMES, bool)
+        for start, width in re.findall(r'x="(\d+)" width="(\d+)"', inside):
+            out[name][int(start) : int(start) + int(width)] = True
+    return out
+
+
+def test_the_page_says_what_the_motion_is(written: Path) -> None:
+    page = (written / "report.html").read_text(encoding="utf-8")
+    assert "dance &lt;1>" in page and "dance &lt;1&gt;" in page and f"{FRAMES} frames, 30 a second" in page
+    assert ' src="http' not in page and ' href="http' not in page and page.count("</body>") == 1
+    assert "<h2>What gave way</h2><p>nothing</p>" in page
+    found = strips(page)
+    with np.load(written / "motion.npz") as file:
+        contact, qpos, names = file["contact"], file["qpos"], list(file["joint_names"])
+    for k, name in enumerate(("left heel", "left toe", "right heel", "right toe")):
+        np.testing.assert_array_equal(found[name], contact[:, k])
+    robot = osik.load_robot("nao")
+    at_end = np.zeros(FRAMES, bool)
+    for name in robot.joint_names:  # by MuJoCo's ranges
+        low, high = robot.mj_model.joint(name).range
+        q = qpos[:, 7 + names.index(name)]
+        at_end |= (q <= low + 0.01 * (high - low)) | (q >= high - 0.01 * (high - low))
+    np.testing.assert_array_equal(found["a joint at an end of its range"], at_end)
+
+
+def test_view_plays_the_person_beside_the_robot(written: Path) -> None:
+    motion = read_motion(written / "motion.npz", osik.load_robot("nao"))
+    person = motion.person
+    assert person is not None and len(motion.runs["motion"]) == len(person.points) == FRAMES
+    lengths = np.stack([np.linalg.norm(person.points[:, a] - person.points[:, b], axis=-1) for a, b in person.bones])
+    assert len(lengths) >= 14 and np.ptp(lengths[:8], axis=1).max() < 1e-6  # limbs are bones of one length
+    sized = person.sized(np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.5]]), motion.runs["motion"][:, :3], 0.2)
+    assert np.linalg.norm(np.ptp(sized.points[0], axis=0)) == pytest.approx(np.hypot(0.3, 0.5))
+    assert sized.points[0, :, 2].min() == pytest.approx(0.2)
+
+
+def test_what_gave_way_is_told(tmp_path: Path) -> None:
+    """A person who slides with a foot that is said to stand far apart: the page names the bound."""
+    robot = osik.load_robot("nao")
+    points = {}
+    for side, y in (("left", 0.1), ("right", -0.1)):
+        away = np.linspace(0.0, 0.9 * np.sign(y), FRAMES)[:, None] * [0.0, 1.0, 0.0]
+        parts = dict(hip=0.9, shoulder=1.4, elbow=1.1, wrist=0.9, knee=0.5, ankle=0.08, heel=0.0, toe=0.0)
+        for name, z in parts.items():
+            x = {"heel": -0.05, "toe": 0.15}.get(name, 0.0)
+            points[f"{side}_{name}"] = np.tile([x, y, z], (FRAMES, 1)) + (away if z < 0.6 else 0.0)
+    motion = HumanMotion("slides", 30.0, tuple(points), np.stack(list(points.values()), 1),
+                         contact=np.ones((FRAMES, 4), bool))  # fmt: skip
+    result = Retargeter(robot, max_iterations=2).retarget(motion)
+    notes = report(result)["notes"]
+    write_folder(result, "slides", tmp_path, animation=False, page=True)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert notes and all(f"<li>{note}" in page for note in notes)
+    assert load_profile(tmp_path / "profile.toml") == load_profile("nao")
