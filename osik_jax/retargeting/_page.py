@@ -16,8 +16,10 @@ from ._retargeted import Retargeted
 if TYPE_CHECKING:
     from ..viewer import Look
 
-_AT_END, _MOST_JOINTS = 0.01, 8
-"""Share of a joint's range within which it counts as at its end, and joints that the panel lists."""
+_AT_END, _AT_SPEED, _OFF, _MOST_JOINTS = 0.01, 0.97, 1e-3, 8
+"""Share of a joint's range within which it counts as at its end, share of its speed limit from which it counts as at
+that, distance from the plan that counts [rad or m], and joints that the panel lists.
+"""
 _FIGURES = {
     "segments off, mean [deg]": ("tracking", "segment_angle_deg_mean"),
     "feet slip [mm]": ("feet", "slip_mm_max"),
@@ -82,8 +84,12 @@ def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
     parts.append(_lines(rows, "#2a9d62") if names else "<p>the robot has no feet</p>")
     ends, fast = _at_ends(result), _share_of_speed(result)
     parts.append("<h2>Limits</h2>")
-    strips = {"a joint at an end of its range": ends.any(1), "a joint at its speed limit": (fast > 0.97).any(1)}
-    parts.append(_lines({**strips, "limits keep it from the plan": result.off_plan > 1e-3}, "#d97b1f"))
+    strips = {
+        "a joint at an end of its range": ends.any(1),
+        "a joint at its speed limit": (fast > _AT_SPEED).any(1),
+        "limits keep it from the plan": np.asarray(result.off_plan > _OFF),
+    }
+    parts.append(_lines(strips, "#d97b1f"))
     share = {name: ends[:, k].mean() for k, name in enumerate(result.robot.joint_names) if ends[:, k].any()}
     longest = sorted(share, key=lambda name: -share[name])[:_MOST_JOINTS]
     parts.append("<h2>Joints at an end of their range</h2>")
@@ -111,8 +117,8 @@ def _share_of_speed(result: Retargeted) -> np.ndarray:
     return np.abs(np.diff(q, axis=0, prepend=q[:1])) * result.motion.fps / limit
 
 
-def _lines(rows: Mapping[str, Bool[np.ndarray, " F"]], color: str) -> str:
-    """Return a strip per row, coloured where it holds, under one mark of the present time."""
+def _lines(rows: Mapping[str, Any], color: str) -> str:
+    """Return a strip per row of flags (F,), coloured where it holds, under one mark of the present time."""
     out = []
     for name, flags in rows.items():
         bars = "".join(f'<rect x="{a}" width="{b - a}" height="1" fill="{color}"/>' for a, b in stretches(flags))

@@ -261,7 +261,7 @@ def palm_axes(points: Mapping[str, np.ndarray]) -> np.ndarray:
 def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes of pelvis and chest as columns; upright if the clip lacks joints. (F, 3, 3) each."""
     if "wrist" in points:
-        return (palm_axes(points),) * 2
+        return palm_axes(points), palm_axes(points)
     low, vertical = _middle(points, "hip", "shoulder"), np.array([0.0, 0.0, 1.0])
     high = points["neck"] if "neck" in points else _middle(points, "shoulder", "hip")
     chest = points.get("chest", low)

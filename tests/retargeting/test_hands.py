@@ -186,13 +186,17 @@ def test_fingers_are_found_and_reach_what_a_search_reaches(names, options, axes)
     errors, goals = off(robot, profile, result, motion, factor)
     low, high = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     tips, rng = [role for role in profile.keypoints if role.endswith("_4")], np.random.default_rng(1)
-    for frame in (0, 6, 10):
+    data, wrist = mujoco.MjData(robot.mj_model), placed(robot, profile, [robot.mujoco_qpos(robot.q0)])["wrist"][0]
+    index, coefficient = robot.tree.qpos_source
+    for frame in (0, 10):
 
         def residual(q, frame=frame):
-            own = placed(robot, profile, [robot.mujoco_qpos(q)])
-            return np.concatenate([own[tip][0] - own["wrist"][0] - goals[frame, k] for k, tip in enumerate(tips)])
+            data.qpos[:] = q[index] * coefficient + np.asarray(robot.qpos_offset)
+            mujoco.mj_kinematics(robot.mj_model, data)
+            own = [data.site(profile.keypoints[tip][0]).xpos for tip in tips]
+            return np.concatenate([at - wrist - goals[frame, k] for k, at in enumerate(own)])
 
-        starts = [np.clip(result.q[frame], low, high), *rng.uniform(low, high, (3, robot.nv))]
+        starts = [np.clip(result.q[frame], low, high), *rng.uniform(low, high, (2, robot.nv))]
         found = [least_squares(residual, start, bounds=(low, high)) for start in starts]
         best = np.sqrt(2.0 * min(own.cost for own in found) / len(tips))
         own = np.sqrt((errors[frame] ** 2).mean())
