@@ -440,7 +440,8 @@ def test_files_come_back(danced, tmp_path):
     back = load_robot_motion(tmp_path / "motion.npz")
     np.testing.assert_array_equal(back.qpos, danced.motion.qpos)
     with np.load(tmp_path / "motion.npz", allow_pickle=False) as data:
-        assert set(data.files) == {"fps", "qpos", "joint_names", "human", "human_names", "contact", "ground"}
+        pictured = {"human", "human_names", "human_bones", "human_standing"}
+        assert set(data.files) == {"fps", "qpos", "joint_names", *pictured, "contact", "ground"}
         assert data["human"].shape == (30, len(data["human_names"]), 3) and data["contact"].shape == (30, 4)
         names = data["human_names"].tolist()
     assert {"left_heel", "right_toe", "left_wrist", "root"} <= set(names)
