@@ -33,9 +33,9 @@ _MOST_WRIST, _LEAST_FINGERS, _LEAST_JOINTS, _LARGEST = 2, 3, 2, 0.4
 """
 _SAME = 2e-3
 """Joints nearer to each other than this [m] are one knuckle."""
-WEIGHTS = Weights(limb=100.0)
-"""Weights of a hand. With a body's, posture pulls fingertips off by a millimetre, and the damping of the plan's steps
-(1 at least) outweighs the rows of fingers: a tip that is out of reach ends the iterations before the others are there.
+_LIMB = 100.0
+"""Weight of a hand's reaches. With a body's, posture pulls tips off by a millimetre, and the damping of the plan's
+steps (1 at least) outweighs the rows of fingers: a tip out of reach ends the iterations before the others are there.
 """
 
 
@@ -63,7 +63,7 @@ def guess_hand(robot: Robot) -> Profile | None:
         keypoints[f"{finger}_4"] = tips[k][0]
         points |= {f"{finger}_1": chains[k].anchors[knuckles[0]], f"{finger}_4": tips[k][1]}
     wrist = _wrist(robot, kinematics, palm, points)
-    return Profile(keypoints={"wrist": wrist, **keypoints}, pelvis=wrist[0], weights=WEIGHTS)
+    return Profile(keypoints={"wrist": wrist, **keypoints}, pelvis=wrist[0], weights=Weights(limb=_LIMB))
 
 
 def _palm(robot: Robot, kinematics: Kinematics) -> tuple[int, list[Chain]]:

@@ -31,6 +31,16 @@ CONFIGURE = (
 )
 
 
+IMPORT_ALL = """
+import importlib, pkgutil, osik_jax
+from osik_jax.runtime import configure_cpu
+for module in pkgutil.iter_modules(osik_jax.__path__):
+    if module.ispkg:
+        importlib.import_module(f"osik_jax.{module.name}")
+configure_cpu()
+"""
+
+
 def in_a_process(script, **settings):
     env = {k: v for k, v in os.environ.items() if k not in OURS} | settings
     command = [sys.executable, "-c", script]
@@ -49,6 +59,11 @@ def test_an_import_changes_nothing_and_prints_nothing():
     before, after = json.loads(done.stdout)
     assert before == after
     assert done.stderr == ""
+
+
+@pytest.mark.slow
+def test_no_import_computes():
+    in_a_process(IMPORT_ALL)  # the settings are refused once JAX has made its client
 
 
 @pytest.mark.slow
