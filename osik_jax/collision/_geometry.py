@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ..kinematics._rigid import rotate
+from ..numerics._guarded import greatest
 from ._distance import Core
 
 CYLINDER_SIDES = 16
@@ -223,7 +224,7 @@ def world_cores(
         position[:, None] + rotate(turn, vertices * factors),
         rotate(turn, unit_rows(normals * areas)),
         rotate(turn, edges * factors),
-        jnp.where(rounded, size[:, 0], radius * jnp.max(jnp.abs(factors[:, 0]), -1)),
+        jnp.where(rounded, size[:, 0], radius * greatest(jnp.abs(factors[:, 0]))),
     )
 
 

@@ -17,6 +17,7 @@ from ..execution._rules import blocked
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._forward import kinematics_by
 from ..limits import ConfigurationLimit, Limit, Limits, limit_box, limit_rows, with_own_limits
+from ..numerics._guarded import greatest
 from ..numerics._placeholder import positive, with_placeholder
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
@@ -180,7 +181,7 @@ def step(
         iterations=answer.iterations,
         factorizations=answer.factorizations,
         kkt_residual=jnp.where(failed, jnp.finfo(v.dtype).max, answer.kkt_residual),
-        box_violation=jnp.max(_finite(_beyond_limits(given, v))),
+        box_violation=greatest(_finite(_beyond_limits(given, v))),
         slack={name: _finite(jnp.where(is_valid[name], slack, 0.0)) for name, slack in problem.slack(v).items()},
         error={name: _finite(jnp.where(is_valid[name], rows.error, 0.0)) for name, rows in problem.rows.items()},
         warm_start=answer.warm_start,

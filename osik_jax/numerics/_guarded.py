@@ -61,13 +61,13 @@ def largest(vector: Float[Array, "..."]) -> Float[Array, ""]:
     return jnp.where((found > 0.0) & (found < jnp.inf), found, 1.0)
 
 
-def greatest(vector: Float[Array, " m"]) -> Float[Array, ""]:
-    """Return the largest entry of a vector; its derivative is that of the entry.
+def greatest(vectors: Float[Array, "*S m"]) -> Float[Array, "*S"]:
+    """Return the largest entry of each vector; its derivative is that of the entry, of the first one in a tie.
 
     That of ``jnp.max`` divides by the number of entries that equal the maximum. Where XLA computes the entries twice
     and rounds them differently, there is none.
     """
-    return vector[jnp.argmax(vector)]
+    return jnp.take_along_axis(vectors, jnp.argmax(vectors, -1, keepdims=True), -1)[..., 0]
 
 
 def clipped(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -33,8 +33,8 @@ _HISTORY, _LEAST_HISTORY = 0.27, 4
 _LONGEST = 2.0
 """Longest allowed look-ahead [s]."""
 _FIRST_ITERATIONS = 100
-_SHARE = 0.6
-"""Default share of a frame's time that computing may take."""
+_SHARE, _BUDGET = 0.6, 4e-3
+"""Default share of a frame's time that computing may take, and the most [s]. At low rates more time gains little."""
 _CALMER = 0.2
 """Weight of the newest frame in the running mean of an iteration's time."""
 _LEAST_ITERATIONS = 5
@@ -126,7 +126,7 @@ class LiveRetargeter(OnRobot):
         look_ahead: delay of the robot behind the person, one frame to 2 s [s].
         iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
         budget: computing time per frame [s]. An iteration that would exceed it is not started, except the first five
-            and those of a plan that violates a bound. None: 60 % of the time between frames.
+            and those of a plan that violates a bound. None: 60 % of the time between frames, 4 ms at most.
 
     Raises:
         ValueError: no limbs are found, nothing holds a free base, joints are missing, or a number is out of range.
@@ -155,7 +155,8 @@ class LiveRetargeter(OnRobot):
         super().__init__(robot, profile, acceleration, balance)
         self._dt = 1.0 / standing.fps
         self.frames_ahead = max(1, round(look_ahead * standing.fps))
-        self.iterations, self.budget = int(iterations), _SHARE * self._dt if budget is None else float(budget)
+        self.iterations = int(iterations)
+        self.budget = min(_SHARE * self._dt, _BUDGET) if budget is None else float(budget)
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
         self._standing, self.roles = standing, self._roles(standing, mapping)
         self._measures = measure(standing, self.roles, self.profile.standing)

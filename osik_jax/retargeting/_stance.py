@@ -48,8 +48,11 @@ class Held(NamedTuple):
 
 
 class _State(NamedTuple):
+    """A step, the dofs that may still change, and the best step so far with its largest error [m]."""
+
     step: Float[Array, " nv"]
     free: Float[Array, " nv"]
+    best: Float[Array, " nv"]
     error: Float[Array, ""]
     iterations: Int[Array, ""]
 
@@ -66,8 +69,8 @@ def hold_feet(
     """Change a step as little as possible so that contacts hold, inside bounds that hold exactly.
 
     Newton's method on the heights of the soles' corners and on the places of contact points. Each iteration takes the
-    minimum-norm change of the step; dofs that reach a bound stay there. If the bounds do not allow a solution, ``off``
-    is the remaining error.
+    minimum-norm change of the step; dofs that reach a bound stay there. If the bounds do not allow a solution, the step
+    is the best of all iterations, the planned one included, and ``off`` is the remaining error.
 
     Args:
         body: the robot.
@@ -86,16 +89,23 @@ def hold_feet(
         return (state.error > _SMALL) & (state.iterations < _MOST_ITERATIONS)
 
     def improved(state: _State) -> _State:
-        residual, jacobian = _rows(body, integrate(body.robot, q, state.step), contact, held, stance.landed)
+        residual, jacobian, state = evaluated(state)
         rates = jacobian * state.free
         gram = rates @ rates.T + _DAMPING * jnp.eye(len(residual), dtype=residual.dtype)
         wanted = state.step - rates.T @ jnp.linalg.solve(gram, residual)
         new = jnp.clip(wanted, lower, upper)
-        error = jnp.abs(residual).max()
-        return _State(new, state.free * (new == wanted), error, state.iterations + 1)
+        return state._replace(step=new, free=state.free * (new == wanted), iterations=state.iterations + 1)
 
-    first = _State(step, jnp.ones_like(step), jnp.asarray(jnp.inf, step.dtype), jnp.array(0))
-    step = jax.lax.while_loop(goes_on, improved, first).step
+    def evaluated(state: _State) -> tuple[Array, Array, _State]:
+        residual, jacobian = _rows(body, integrate(body.robot, q, state.step), contact, held, stance.landed)
+        slip = jnp.linalg.norm(residual[:8].reshape(4, 2), axis=-1)
+        error = jnp.maximum(slip.max(), jnp.abs(residual[8:]).max())
+        best = jnp.where(error < state.error, state.step, state.best)
+        return residual, jacobian, state._replace(best=best, error=jnp.minimum(error, state.error))
+
+    first = _State(step, jnp.ones_like(step), step, jnp.asarray(jnp.inf, step.dtype), jnp.array(0))
+    # with most dofs at their bounds the others may make steps that the linear model does not describe
+    step = evaluated(jax.lax.while_loop(goes_on, improved, first))[2].best
     after = integrate(body.robot, q, step)
     points = soles(body, forward_kinematics(body.robot, after))[0]
     places = points.reshape(4, 2, 3).mean(1)[:, :2]

@@ -132,7 +132,7 @@ def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, An
     """Return how to make the robot again: its model; or a name or a file with its hash, and all of its numbers."""
     options = {"floating_base": robot.floating_base, "locked_joints": list(robot.locked_joints)}
     if source is None:
-        return {"mjcf": robot.to_mjcf()} | options
+        return {"mjcf": robot.to_mjcf(), "dtype": str(robot.q0.dtype)} | options
     file = Path(source)
     found = {"file": str(file.resolve()), "sha256": _hash(file)} if file.is_file() else {"name": str(source)}
     found |= options
@@ -200,7 +200,8 @@ def _robot(described: Mapping[str, Any]) -> Robot:
 def _loaded(described: Mapping[str, Any]) -> Robot:
     options: Any = {"floating_base": described["floating_base"]}
     if "mjcf" in described:
-        return Robot.from_mjcf(described["mjcf"], **options)
+        kind = jax.dtypes.canonicalize_dtype(described.get("dtype", float))  # double precision only where JAX has it
+        return Robot.from_mjcf(described["mjcf"], **options).astype(kind)
     options["locked_joints"] = tuple(described["locked_joints"])
     if "name" in described:
         return load_robot(described["name"], **options)

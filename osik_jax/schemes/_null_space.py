@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -94,7 +95,7 @@ class NullSpace(Scheme):
             residual = _first_residual(first, answer, problem)
             return SchemeAnswer(answer.x, status, answer.iterations, count + answer.iterations, residual)
         gradient = first.matrix.T @ first.distance(answer.x)
-        return SchemeAnswer(answer.x, status, count, count, jnp.max(jnp.abs(gradient)))
+        return SchemeAnswer(answer.x, status, count, count, jax.lax.stop_gradient(jnp.max(jnp.abs(gradient))))
 
     def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
         """Return where the first level begins: an inequality row that holds there takes no part in it."""
@@ -106,7 +107,9 @@ def _first_residual(first: Level, answer: NullSpaceSolution, problem: VelocityPr
     """Return what the first priority misses of its scaled motion, as a gradient over the joints that can move."""
     start = clipped(jnp.zeros_like(answer.x), problem.lower, problem.upper)
     left = first.matrix @ (answer.x - start) + answer.scales[0] * first.distance(start)
-    return jnp.max(jnp.abs(jnp.where(problem.lower == problem.upper, 0.0, first.matrix.T @ left)))
+    return jax.lax.stop_gradient(
+        jnp.max(jnp.abs(jnp.where(problem.lower == problem.upper, 0.0, first.matrix.T @ left)))
+    )
 
 
 def limit_potential_gradient(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -151,14 +152,15 @@ class VelocityProblem(eqx.Module):
 
         What a task cannot meet, the rows above balance, and these bend: a closed loop at its toggle point moves only at
         second order. The force of the task and that of the rows above have about the same norm in the joints. Tasks
-        that bend themselves are damped for that (``curvature``), so for them hard tasks count alone.
+        that bend themselves are damped for that (``curvature``), so for them hard tasks and closed loops count alone.
         """
+        stiff = [name for name in above if name in self.hard or self.rows[name].closes_loop]
         rows = [self.rows[name] for name in names]
         linear = [own.weight * own.pull for own in rows if own.dofs is not None]
         curved = [apply(own.jacobian.T, own.weight * own.pull) for own in rows if own.dofs is None]
         parts = [
             safe_norm(jnp.concatenate(forces)) * self._bending(by)
-            for forces, by in ((linear, above), (curved, self.hard))
+            for forces, by in ((linear, above), (curved, stiff))
             if forces and by
         ]
         return safe_norm(jnp.stack(parts)) if parts else jnp.zeros((), self.lower.dtype)
@@ -179,7 +181,7 @@ class VelocityProblem(eqx.Module):
         world's axes point. Where a robot stands, its legs keep its base from turning.
         """
         arms = [jnp.broadcast_to(self.rows[name].levers, self.lower.shape) for name in names]
-        farthest = jnp.max(jnp.stack(arms), axis=0)
+        farthest = reduce(jnp.maximum, arms)  # a maximum over an axis has no derivative where XLA rounds it twice
         return jnp.where(self.scalar, self.dt * row_sums(jnp.where(self.turning, farthest, 0.0)), 0.0)
 
     def level(self, names: Sequence[str]) -> Level:

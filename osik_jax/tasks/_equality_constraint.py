@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -114,7 +115,8 @@ class EqualityConstraintTask(Task):
         counts = np.array([len(own) for own, _ in parts])
         weight = jnp.broadcast_to(self.weight, counts.shape)[np.repeat(np.arange(len(counts)), counts)]
         bound = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
-        return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
+        rows = task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
+        return replace(rows, closes_loop=True)
 
     @property
     def _weight_rows(self) -> int:

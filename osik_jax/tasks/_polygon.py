@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics._home import compiled_kinematics
+from ..numerics._guarded import greatest
 from ..robot import Robot
 
 _COLLINEAR = 1e-6
@@ -36,7 +37,7 @@ class SupportPolygon(eqx.Module):
 
         Outside it is minus the largest violation of an edge's line.
         """
-        return jnp.min(self.offsets - jnp.sum(self.normals * jnp.asarray(xy)[..., None, :], -1), -1)
+        return -greatest(jnp.sum(self.normals * jnp.asarray(xy)[..., None, :], -1) - self.offsets)
 
     def contains(self, xy: Float[Array, "... 2"] | ArrayLike) -> Bool[Array, "..."]:
         """Return whether points lie inside or on the edge."""

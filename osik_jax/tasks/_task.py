@@ -51,6 +51,8 @@ class TaskRows(eqx.Module):
             wanted, wanted, weight)``). Other arrays of equal numbers are an interval of width 0, and so are those that
             came out of ``jit``, which returns a copy of each: schemes then find the same velocity with more work, but
             for the curvature damping, of which inequality rows get all.
+        closes_loop: whether the rows are a constraint of the mechanism, which carries whatever force the tasks below it
+            need (static).
     """
 
     error: Float[Array, " m"]
@@ -63,6 +65,7 @@ class TaskRows(eqx.Module):
     levers: Float[Array, "..."] = eqx.field(default=0.0, converter=jnp.asarray)
     dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
     is_equality: bool = eqx.field(default=None, static=True)  # pyright: ignore[reportAssignmentType]  # None: not said
+    closes_loop: bool = eqx.field(default=False, static=True)
 
     def __post_init__(self) -> None:
         if self.is_equality is None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
-from osik_jax.numerics._guarded import clipped, quotient, safe_norm
+from osik_jax.numerics._guarded import clipped, greatest, quotient, safe_norm
 
 SIZES = [1e-30, 1e-20, 1e-12, 1.0, 1e12]
 
@@ -49,6 +49,32 @@ def test_a_clip_between_equal_bounds_has_their_derivative():
     np.testing.assert_array_equal(clipped(x, -jnp.ones(5), jnp.ones(5)), np.clip(x, -1.0, 1.0))
     slopes = jax.vmap(jax.grad(lambda x: clipped(x, -jnp.ones(()), jnp.ones(()))))(x)
     np.testing.assert_array_equal(slopes, [0.0, 0.5, 1.0, 0.5, 0.0])
+
+
+def test_the_derivative_of_the_largest_entry_is_that_of_one_entry():
+    """Of a tie it is that of one of the tied entries, whether compiled or not, and never their sum or NaN."""
+    slopes = jnp.array([[1.0, -2.0, 4.0, 0.5], [3.0, 7.0, 3.0, -1.0]])
+    places = jnp.array([[0.1, 0.3, 0.3, 0.3], [2.0, 0.0, 2.0, 2.0]])
+
+    def at(t):
+        return greatest(places + t * slopes)
+
+    np.testing.assert_array_equal(at(0.0), [0.3, 2.0])
+    one_sided = np.array([at(h) - at(0.0) for h in (1e-6, -1e-6)]) / np.array([[1e-6], [-1e-6]])
+    for found in (jax.jacfwd(at)(0.0), jax.jit(jax.jacrev(at))(0.0)):
+        assert found[0] in (-2.0, 4.0, 0.5) and found[1] in (3.0, -1.0)
+        assert (np.min(one_sided, 0) - 1e-6 <= found).all() and (found <= np.max(one_sided, 0) + 1e-6).all()
+
+
+def test_the_distance_to_a_polygon_on_the_bisector_of_a_corner_has_the_derivative_of_an_edge():
+    square = osik.SupportPolygon(
+        jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), jnp.ones(4), jnp.array([[1.0, 1.0]] * 4)
+    )
+    places = jnp.array([[0.3, 0.3], [0.2, 0.7], [0.0, 0.0]])
+    np.testing.assert_allclose(square.distance(places), [0.7, 0.3, 1.0])
+    found = jax.jit(jax.vmap(jax.grad(square.distance)))(places)
+    assert found[0].tolist() in ([-1.0, 0.0], [0.0, -1.0]) and found[1].tolist() == [0.0, -1.0]
+    assert np.abs(found[2]).sum() == 1.0
 
 
 ARM = osik.load_robot("arm7")

@@ -6,6 +6,7 @@ import json
 from functools import partial
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ import osik_jax as osik
 from osik_jax import cli
 from osik_jax.retargeting import LiveRetargeter, LiveStatus, load_motion, report, retarget
 from osik_jax.retargeting._live_command import replay, stream
+from osik_jax.retargeting._stance import Stance, hold_feet
+from osik_jax.retargeting._terms import soles
 
 FPS, LOOK_AHEAD = 30.0, 5
 
@@ -98,6 +101,37 @@ def test_feet_hold_exactly_at_any_rate_with_few_iterations(nao, motion):
     assert np.abs(corners[..., 2]).max() < 2e-6 and np.ptp(corners[..., :2], axis=0).max() < 4e-6
     assert max(frame.feet_off for frame in frames) < 2e-6
     assert_limits_hold(nao, frames, 120.0)
+
+
+def test_a_step_whose_bounds_let_no_foot_hold_is_no_worse_than_planned(nao, live, rng):
+    """A free base, as after a jump of the plan, and three joints in four that are hardly free; soles by MuJoCo."""
+    cases, base = 60, 6
+    step = np.concatenate([rng.normal(size=(cases, base)) * 1e-3, rng.normal(size=(cases, nao.nv - base)) * 1e-3], 1)
+    room = np.where(rng.random(step.shape) < 0.75, 1e-5, 0.02) * rng.random(step.shape)
+    lower, upper = step - room, step + np.where(rng.random(step.shape) < 0.5, 0.0, room)
+    points = soles(live._body, osik.forward_kinematics(nao, nao.q0))[0].reshape(4, 2, 3).mean(1)
+    stance = Stance(points[:, :2], np.ones(4, bool))
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(0, 0, 0))
+    def held(step, lower, upper):
+        found = hold_feet(live._body, nao.q0, step, lower, upper, np.ones(4, bool), stance)
+        return found.q, found.step, found.off
+
+    q, found, off = (np.asarray(part) for part in held(step, lower, upper))
+    planned = np.asarray(held(step, step, step)[2])
+    assert (found >= lower - 1e-15).all() and (found <= upper + 1e-15).all()
+    assert (off <= planned * (1.0 + 1e-9)).all() and (off < 0.5 * planned).any() and off.max() > 1e-4
+    data = mujoco.MjData(nao.mj_model)
+    data.qpos[:] = np.asarray(nao.mujoco_qpos(nao.q0))
+    mujoco.mj_kinematics(nao.mj_model, data)
+    names = [f"{side}_sole_corner_{k}" for side in "lr" for k in range(4)]
+    floor = data.site(names[0]).xpos[2]
+    for one, error in zip(q, off, strict=True):
+        data.qpos[:] = np.asarray(nao.mujoco_qpos(one))
+        mujoco.mj_kinematics(nao.mj_model, data)
+        heights = np.abs([data.site(name).xpos[2] for name in names])
+        assert heights.max() <= error + 1e-9, floor
 
 
 def lifted_until(motion, frame, count, aside):

@@ -205,6 +205,21 @@ FUSED = """<mujoco><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom
 GEAR = '<equality><joint joint1="d" joint2="a" polycoef="0 1 .5 0 0"/></equality>'
 
 
+@pytest.mark.parametrize("source", [None, "arm7"])
+def test_a_robot_of_single_precision_stays_one(arm, tmp_path, source):
+    """The whole controller is of one precision, so a step of it is too."""
+    single = arm.astype("float32")
+    tasks = {"hand": osik.FrameTask(single, "hand", target=np.array([0.4, 0.1, 0.5]), rows="position")}
+    osik.save_controller(tmp_path / "c.json", single, tasks, source=source)
+    found = osik.load_controller(tmp_path / "c.json")
+    kinds = {jax.tree.leaves(part)[0].dtype for part in (found.robot, found.tasks, found.scheme)}
+    assert kinds == {jnp.dtype("float32")}
+    assert {leaf.dtype for leaf in jax.tree.leaves(found.robot)} == {leaf.dtype for leaf in jax.tree.leaves(single)}
+    one, other = (osik.solve(r, r.q0, t) for r, t in ((single, tasks), (found.robot, found.tasks)))
+    assert other.velocity.dtype == one.velocity.dtype
+    np.testing.assert_allclose(other.velocity, one.velocity, rtol=0.0, atol=1e-4)
+
+
 def moved(robot):
     return {"com": osik.ComTask(robot, target=[0.1, 0.0, 0.3]), "posture": osik.PostureTask(robot)}
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from ._mjmodel import EQUALITY_END_PREFIX, element_names, rotation_matrix
+from ._mjmodel import element_names, equality_end_sites, rotation_matrix
 
 KINDS = {
     int(mujoco.mjtEq.mjEQ_CONNECT): "connect",
@@ -52,10 +52,10 @@ def constraint_ends(model: mujoco.MjModel, frame_names: Sequence[str], e: int) -
         weld = int(model.eq_type[e]) == mujoco.mjtEq.mjEQ_WELD  # whose anchors are in the other order
         relative = rotation_matrix(model.eq_data[e, 6:10]) if weld else np.eye(3)
         return Ends((bodies[ids[0]], bodies[ids[1]]), anchors[::-1] if weld else anchors, relative)
-    names = [model.site(i).name for i in ids]
-    if all(name.startswith(EQUALITY_END_PREFIX) for name in names):
+    if set(ids) <= equality_end_sites(model):
         first, second = (rotation_matrix(model.site_quat[i]) for i in ids)
         owners = [bodies[model.site_bodyid[i]] for i in ids]
         return Ends((owners[0], owners[1]), model.site_pos[ids], first @ second.T)
+    names = [model.site(i).name for i in ids]
     frames = [f"site:{name}" if f"site:{name}" in frame_names else name for name in names]
     return Ends((frames[0], frames[1]), np.zeros((2, 3)), np.eye(3))

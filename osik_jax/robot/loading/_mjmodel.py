@@ -36,7 +36,7 @@ ACCELERATION_LIMIT_PREFIX = "acceleration_limit/"
 """A custom numeric of this name and a joint's holds the joint's greatest acceleration [rad/s^2 or m/s^2]."""
 
 EQUALITY_END_PREFIX = "equality_end/"
-"""Sites of such names are ends of the constraints that ``to_mjcf`` writes, and no frames of the robot."""
+"""A site of this name and a constraint's is an end of that constraint, as ``to_mjcf`` writes it."""
 
 LEAST_INERTIA = 2e-15
 """Mass [kg] and moments [kg m^2] of moving bodies that have none: MuJoCo asks for more than 1e-15."""
@@ -160,6 +160,17 @@ def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count
     return tuple(out)
 
 
+def equality_end_sites(model: mujoco.MjModel) -> set[int]:
+    """Return the sites that ``to_mjcf`` added as ends of constraints; they are no frames of the robot."""
+    names = element_names(model, mujoco.mjtObj.mjOBJ_EQUALITY, "equality", model.neq)
+    found: set[int] = set()
+    for e in np.flatnonzero(model.eq_objtype == int(mujoco.mjtObj.mjOBJ_SITE)):
+        ends = {int(model.eq_obj1id[e]), int(model.eq_obj2id[e])}
+        if all(model.site(site).name.startswith(f"{EQUALITY_END_PREFIX}{names[e]}/") for site in ends):
+            found |= ends
+    return found
+
+
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """Return the unit quaternion (w, x, y, z) of a rotation matrix."""
     out = np.zeros(4)
@@ -233,10 +244,9 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
         if name:
             out[name if name not in out else f"{kind}:{name}"] = _placed(placement[body], position, quaternion)
 
-    for s in range(model.nsite):
+    for s in sorted(set(range(model.nsite)) - equality_end_sites(model)):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
-        if not (name or "").startswith(EQUALITY_END_PREFIX):
-            add("site", name, model.site_bodyid[s], model.site_pos[s], model.site_quat[s])
+        add("site", name, model.site_bodyid[s], model.site_pos[s], model.site_quat[s])
     for g in range(model.ngeom):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g)
         add("geom", name, model.geom_bodyid[g], model.geom_pos[g], model.geom_quat[g])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -341,10 +342,16 @@ def _end_sites(robot: RobotModel, bodies: list[ElementTree.Element], ends: Ends,
     turns = first.rotation @ ends.relative @ second.rotation.T, np.eye(3)  # of a weld the two are to agree
     made = []
     for k, pose, anchor, turn in zip(numbers, (first, second), ends.anchors, turns, strict=True):
-        made.append(f"{EQUALITY_END_PREFIX}{name}/{len(made) + 1}")
+        made.append(_free_name(f"{EQUALITY_END_PREFIX}{name}/{len(made) + 1}", robot.tree.frame_names))
         position = pose.position + pose.rotation @ anchor
         _put(bodies[robot.tree.frame_bodies[k]], "site", name=made[-1], pos=position, quat=quaternion(turn))
     return made
+
+
+def _free_name(name: str, taken: Sequence[str]) -> str:
+    while name in taken:
+        name += "_"
+    return name
 
 
 def _add_home(robot: RobotModel, element: ElementTree.Element) -> None:

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from ...execution._backends import Backend
 from ...numerics._constants import FULL_STEP, NEGLIGIBLE_STEP
 from ...numerics._dense import apply, product
-from ...numerics._guarded import quotient
+from ...numerics._guarded import greatest, quotient
 from .._damping import Damping, level_damping, narrow_box
 from .._inverses import row_space_and_motion
 from ..hqp import Level
@@ -68,7 +68,7 @@ def _step_length(
     stops = gap < jnp.abs(motion)
     # the double where keeps quotients by tiny numbers, whose derivatives are infinite, out of the derivative
     lengths = jnp.where(stops, quotient(jnp.where(stops, gap, 1.0), jnp.where(stops, jnp.abs(motion), 1.0)), 1.0)
-    return jnp.min(lengths)
+    return -greatest(-lengths)
 
 
 def level_motion(
