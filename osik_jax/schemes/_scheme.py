@@ -152,15 +152,16 @@ class VelocityProblem(eqx.Module):
 
         What a task cannot meet, the rows above balance, and these bend: a closed loop at its toggle point moves only at
         second order. The force of the task and that of the rows above have about the same norm in the joints. Tasks
-        that bend themselves are damped for that (``curvature``), so for them hard tasks and closed loops count alone.
+        that bend themselves are damped for that (``curvature``), so for them closed loops count alone. Feet do not
+        count: legs bend little while they stand, and a hand would lag behind a target that it can reach.
         """
-        stiff = [name for name in above if name in self.hard or self.rows[name].closes_loop]
+        loops = [name for name in above if self.rows[name].closes_loop]
         rows = [self.rows[name] for name in names]
         linear = [own.weight * own.pull for own in rows if own.dofs is not None]
         curved = [apply(own.jacobian.T, own.weight * own.pull) for own in rows if own.dofs is None]
         parts = [
             safe_norm(jnp.concatenate(forces)) * self._bending(by)
-            for forces, by in ((linear, above), (curved, stiff))
+            for forces, by in ((linear, above), (curved, loops))
             if forces and by
         ]
         return safe_norm(jnp.stack(parts)) if parts else jnp.zeros((), self.lower.dtype)

@@ -159,6 +159,27 @@ class TestOutOfReach:
                 assert np.linalg.norm(places_of(g1, lane[LATE::50], foot) - start, axis=1).max() < 1e-4
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
+def test_a_hand_follows_a_curve_within_reach_while_the_feet_are_hard(nao, scheme):
+    """The benchmark's curve of 4 to 6 cm; feet that bend no path must not damp the hand. Places by MuJoCo C."""
+    work, steps = workload("nao"), 400
+    tasks: dict[str, osik.Task] = {foot: osik.FrameTask(nao, foot, hard=True, gain=200.0) for foot in FEET}
+    priority = 1 if scheme == "weighted" else 2
+    tasks["com"] = osik.ComTask(nao, weight=25.0, gain=200.0, priority=1)
+    tasks["hand"] = osik.FrameTask(nao, work.hand, rows="position", gain=200.0, priority=priority)
+    curve = np.array([work.hand_at(k) for k in range(steps)])
+    start = places_of(nao, [nao.q0], work.hand)[0]
+    curve += start - curve[0]
+    run = osik.rollout(nao, nao.q0, tasks, scheme=SCHEMES[scheme](), dt=DT, steps=steps, targets={"hand": curve})
+    assert (np.asarray(run.solution.status) == Status.SOLVED).all()
+    path = np.asarray(run.q)[1:]
+    off = np.linalg.norm(places_of(nao, path[100::5], work.hand) - curve[100::5], axis=1)
+    assert np.ptp(curve, axis=0).max() > 0.05 and off.max() < 1e-3
+    for foot in FEET:
+        assert np.linalg.norm(places_of(nao, path[::20], foot) - places_of(nao, [nao.q0], foot)[0], axis=1).max() < 1e-4
+
+
 class TestAtTheStart:
     """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives."""
 
