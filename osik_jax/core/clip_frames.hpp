@@ -52,8 +52,9 @@ struct ClipRobot {
 
 // Goals of a clip of F frames.
 struct ClipGoals {
-  const double *directions, *pelvis, *torso, *root, *feet, *contact, *present;  // [F, 3 limbs], [F, 9], [F, 9], [F, 3],
-                                                                                // [F, 18], [F, 4], [F]
+  const double *directions, *pelvis, *torso, *root, *feet, *contact, *held, *present;  // [F, 3 limbs], [F, 9], [F, 9],
+                                                                                       // [F, 3], [F, 18], [F, 4],
+                                                                                       // [F, reaches], [F]
 };
 
 struct Cost {
@@ -160,21 +161,23 @@ template <class Team> struct ClipFrames {
   // ---- goals
   // Directions of limbs. A direction d changes across it by (I - d d') / length times what the segment changes by: two
   // rows do for the three. A limb shorter than what counts as a length has no row. A reach is the segment itself, in
-  // units of its length.
-  double ask_limbs(const double* wanted) {
+  // units of its length; `held` is its weight relative to a limb's.
+  double ask_limbs(const double* wanted, const double* held) {
     double cost = 0.0;
     const int directed = robot.c.limbs - robot.c.reaches;
     for (int limb = 0; limb < robot.c.limbs; ++limb) {
       const int a = robot.limbs[2 * limb], b = robot.limbs[2 * limb + 1];
+      const double weight = limb < directed ? w[R::LIMB] : w[R::LIMB] * held[limb - directed];
+      if (weight == 0.0) continue;
       const V segment = point_at(b) - point_at(a);
       const double length = limb < directed ? std::sqrt(inner(segment, segment)) : robot.reach[limb - directed];
       const double inverse = 1.0 / larger(length, w[R::SHORTEST]);
       const V d = inverse * segment, off = d - V::of(wanted + 3 * limb);
-      cost += 0.5 * w[R::LIMB] * inner(off, off);
+      cost += 0.5 * weight * inner(off, off);
       if (limb >= directed) {
         for (int k = 0; k < 3; ++k) {
           add_point(b, inverse * axis(k)), add_point(a, -inverse * axis(k));
-          add_row(std::sqrt(w[R::LIMB]), inner(axis(k), off));
+          add_row(std::sqrt(weight), inner(axis(k), off));
         }
         continue;
       }
@@ -182,7 +185,7 @@ template <class Team> struct ClipFrames {
       const V first = capsules::across(segment, segment, segment);
       for (const V side : {first, cross(d, first)}) {
         add_point(b, inverse * side), add_point(a, -inverse * side);
-        add_row(std::sqrt(w[R::LIMB]), inner(side, off));
+        add_row(std::sqrt(weight), inner(side, off));
       }
     }
     return cost;
@@ -373,7 +376,7 @@ template <class Team> struct ClipFrames {
     row = 0;
     Cost cost;
     auto turned = [&](int i) { return robot.c.turned >> i & 1; };
-    cost.soft += ask_limbs(goals.directions + size_t(3) * robot.c.limbs * frame) + ask_root(goals.root + 3 * frame);
+    cost.soft += ask_limbs(goals.directions + size_t(3) * robot.c.limbs * frame, goals.held + size_t(robot.c.reaches) * frame) + ask_root(goals.root + 3 * frame);
     if (turned(0)) cost.soft += ask_rotation(0, goals.pelvis + 9 * frame, w[R::PELVIS]);
     for (int i = 0; i < 2; ++i)
       if (turned(2 + i)) cost.soft += ask_rotation(2 + i, goals.feet + 18 * frame + 9 * i, w[R::FOOT]);

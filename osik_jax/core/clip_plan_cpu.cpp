@@ -20,19 +20,19 @@ void plan(const xla::Call& call) {
     return call.in<double>(k) + (call.size(k, 0) == 1 ? 0 : size_t(clip) * call.size(k, 1));
   };
   ClipRobot robot;
-  robot.read(call.in<int>(11));
+  robot.read(call.in<int>(12));
   const size_t size = size_t(frames) * nq;
   std::vector<double> space(ClipPlan<Team>::doubles(robot, frames)), other(size);
   for (int b = 0; b < clips; ++b) {
-    robot.read(numbers(9, b));
+    robot.read(numbers(10, b));
     ClipMethod method;
-    __builtin_memcpy(&method, numbers(10, b), sizeof method);
+    __builtin_memcpy(&method, numbers(11, b), sizeof method);
     const ClipGoals goals{numbers(1, b), numbers(2, b), numbers(3, b), numbers(4, b),
-                          numbers(5, b), numbers(6, b), numbers(7, b)};
+                          numbers(5, b), numbers(6, b), numbers(7, b), numbers(8, b)};
     double* q = call.out<double>(0) + b * size;
     for (size_t e = 0; e < size; ++e) q[e] = numbers(0, b)[e];
     ClipPlan<Team> clip(robot, goals, method, frames, nq, space.data());
-    call.out<double>(2)[b] = clip.descend(numbers(8, b), q, other.data(), call.out<double>(1) + 2 * b);
+    call.out<double>(2)[b] = clip.descend(numbers(9, b), q, other.data(), call.out<double>(1) + 2 * b);
   }
 }
 }  // namespace

@@ -11,6 +11,7 @@ from ._live import LiveRetargeter as LiveRetargeter
 from ._live import LiveStatus as LiveStatus
 from ._load import load_motion as load_motion
 from ._motion import HumanMotion as HumanMotion
+from ._motion import Touch as Touch
 from ._profile import Capsule as Capsule
 from ._profile import Foot as Foot
 from ._profile import Profile as Profile

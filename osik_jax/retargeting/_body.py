@@ -5,14 +5,16 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
+from .._errors import OsikValueError
 from ..collision import CollisionShape
 from ..kinematics._forward import independent_columns
 from ..kinematics._home import home_kinematics
@@ -25,10 +27,15 @@ from ._goals import Goals
 from ._person import Person, axes_from, directions, palm_axes
 from ._profile import Limb, Profile
 from ._roles import LEGS, SIDES
-from ._terms import Bounds, reach_length
+from ._rotations import moved_poses
+from ._terms import ORIGIN, Bounds, reach_length
 
 JOINTS_APART = 3
 _CAPSULE = "capsule "
+_TOUCH, _NEARS = 1e5, 0.03
+"""Weight of what is held [1/m^2], relative to that of limbs, and the time in which it grows tenfold before [s]: a hand
+that begins to move in the frame before would have to accelerate beyond its limits.
+"""
 # A plan stays 1 mrad (or 1 mm) inside the ranges and below 98 % of speed and acceleration limits, so that the
 # last pass, which holds the limits exactly, can follow it.
 _INSET, _SHARE = 1e-3, 0.98
@@ -194,6 +201,10 @@ class Build:
             torso=turn @ person.torso,
             root=root,
             feet=turn[:, None] @ person.feet,
+            objects={
+                name: moved_poses(poses, turn, root - np.einsum("fij,fj->fi", turn, person.root))
+                for name, poses in person.objects.items()
+            },
             contact=np.full((frames, 4), bool(profile.feet) and not fixed),
         )
 
@@ -211,7 +222,7 @@ class Build:
             scale = self.scale(person)
             root = scale * root
             root[:, 2] += self.ankle - scale * person.ankle
-        reached, followed = profile.reached, profile.followed
+        reached, followed, touches = profile.reached, profile.followed, self.touches(person)
         wanted = directions(person.points, followed)
         for k, (a, b) in enumerate(reached, len(followed) - len(reached)):
             length = person.lengths[a, b] if profile.walks else self.lengths[a, b] / self.scale(person)
@@ -219,12 +230,48 @@ class Build:
         dtype = self.start.dtype
         parts: dict[str, Any] = {  # NumPy's arrays: each one of JAX's would cost more than its numbers
             **{name: getattr(person, name) for name in ("pelvis", "torso", "feet")},
-            "directions": wanted,
+            "directions": np.concatenate([wanted, *(touch.goal[:, None] for touch in touches)], 1),
+            "held": np.stack(
+                [*np.ones((len(reached), len(root))), *(_pull(touch.held, person.fps) for touch in touches)], -1
+            )
+            if reached or touches
+            else np.zeros((len(root), 0)),
             "contact": _firmness(person.contact) if dtype == np.float64 else person.contact,
             "root": root,
             "present": np.ones(len(root)),
         }
         return Goals(**{name: part.astype(dtype) for name, part in parts.items()})
+
+    def touches(self, person: Person) -> tuple[TouchGoal, ...]:
+        """Return what the robot's joints hold, for a person (``seen``)."""
+        out, scale = [], self.scale(person) if person.touches else 1.0
+        for touch in person.touches:
+            if touch.role not in self.points:
+                raise OsikValueError(f"the profile has no keypoint {touch.role}, which holds {touch.other}")
+            at = person.points[touch.role]
+            if touch.other in person.objects:
+                goal = self._in_world(person, held_point(person.objects[touch.other], at, touch.held), scale)
+                out.append(TouchGoal(ORIGIN, touch.role, goal, touch.held))
+            elif touch.other in self.points:
+                goal = scale * (at - person.points[touch.other])
+                out.append(TouchGoal(touch.other, touch.role, goal, touch.held))
+            else:
+                raise OsikValueError(
+                    f"{touch.role} holds {touch.other}, which is no object of the clip and no keypoint"
+                )
+        return tuple(out)
+
+    def objects(self, person: Person) -> dict[str, Float[np.ndarray, "F 7"]]:
+        """Return the poses of a person's objects (``seen``) in the robot's world, scaled as its path."""
+        return {
+            name: np.concatenate([self._in_world(person, poses[:, :3], self.scale(person)), poses[:, 3:]], -1)
+            for name, poses in person.objects.items()
+        }
+
+    def _in_world(self, person: Person, at: Float[np.ndarray, "F 3"], scale: float) -> Float[np.ndarray, "F 3"]:
+        """Return points of a person's world in the robot's: scaled, about the root if the base does not walk."""
+        walks = self.profile.walks and self.free is not None
+        return scale * at if walks else person.root + scale * (at - person.root)
 
     def first_guess(self, goals: Goals) -> Float[np.ndarray, "F nq"]:
         """Return configurations with the start posture in all frames and the pelvis at the goal pose. (F, nq)."""
@@ -242,6 +289,41 @@ class Build:
         step, change = _SHARE * self.speed * dt, _SHARE * np.asarray(acceleration) * dt**2
         parts: list[Any] = [self.lower + inset, self.upper - inset, step, change]
         return Bounds(*(part.astype(self.start.dtype) for part in parts))
+
+
+class TouchGoal(NamedTuple):
+    """What a joint holds.
+
+    Attributes:
+        first: another joint's role, or ``ORIGIN``.
+        second: the joint's role.
+        goal: vector from the first to the second [m]. (F, 3)
+        held: whether it is held. (F,)
+    """
+
+    first: str
+    second: str
+    goal: Float[np.ndarray, "F 3"]
+    held: Bool[np.ndarray, " F"]
+
+
+def _pull(held: Bool[np.ndarray, " F"], fps: float) -> Float[np.ndarray, " F"]:
+    """Return the weight of what is held: full while it is, and growing before and falling after. (F,)."""
+    if not held.any():
+        return np.zeros(len(held))
+    weight = _TOUCH * 10.0 ** (-distance_transform_edt(~held) / (_NEARS * fps))
+    return np.where(weight >= 1.0, weight, 0.0)
+
+
+def held_point(
+    poses: Float[np.ndarray, "F 7"], at: Float[np.ndarray, "F 3"], held: Bool[np.ndarray, " F"]
+) -> Float[np.ndarray, "F 3"]:
+    """Return a joint's positions as if it did not move on the object while it holds it [m]. (F, 3)."""
+    turns, out = Rotation.from_quat(poses[:, 3:], scalar_first=True), at.copy()
+    inside = turns.inv().apply(at - poses[:, :3])
+    for start, end in stretches(held):
+        out[start:end] = poses[start:end, :3] + turns[start:end].apply(inside[start:end].mean(0))
+    return out
 
 
 def _measured(profile: Profile) -> tuple[Limb, ...]:

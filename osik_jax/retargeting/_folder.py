@@ -21,6 +21,7 @@ from ..scaling._progress import Progress, reported
 from ._command import write_json, write_motion
 from ._lanes import Clip, one_a_core, shared_length
 from ._load import Reader, clips_in
+from ._profile import Limb
 from ._profile_file import profile_text, save_profile
 from ._report import report
 from ._retarget import Retargeter, Source
@@ -115,7 +116,7 @@ class _Work:
         self.failed: dict[str, str] = {}
         self._lanes = cores() if one_a_core() else min(chunk, max(1, len(sources) - len(self.found)))
         self._lengths = _Lengths()
-        self._waiting: dict[int, list[tuple[str, Clip]]] = {}
+        self._waiting: dict[tuple[int, tuple[Limb, ...]], list[tuple[str, Clip]]] = {}
 
     def add(
         self,
@@ -131,13 +132,14 @@ class _Work:
             self.failed[name] = _reason(error)
             return 1
         length = self._lengths.of(shared_length(clip))
-        waiting = self._waiting.setdefault(length, [])
+        alike = length, clip.touching
+        waiting = self._waiting.setdefault(alike, [])
         waiting.append((name, clip))
-        return self._finish(length, self._waiting.pop(length)) if len(waiting) == self._lanes else 0
+        return self._finish(length, self._waiting.pop(alike)) if len(waiting) == self._lanes else 0
 
     def rest(self) -> Iterator[int]:
         """Retarget all waiting clips, one batch per length; yield the number finished."""
-        for length, waiting in self._waiting.items():
+        for (length, _), waiting in self._waiting.items():
             yield self._finish(length, waiting)
 
     def _finish(self, length: int, clips: list[tuple[str, Clip]]) -> int:

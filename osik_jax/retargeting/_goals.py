@@ -26,6 +26,7 @@ class Goals(eqx.Module):
         root: midpoint of the hips, or the pelvis of a robot without legs [m]. (3,)
         feet: axes of the left and right foot as columns. (2, 3, 3)
         contact: for each point of ``Profile.standing``: 1 in contact, more in a long contact, else 0. (4,)
+        held: weight of each reach relative to ``limb``: 1; of what a joint holds more, or 0. (reaches,)
         present: 1 for a frame of the clip, 0 for padding behind its end. ()
     """
 
@@ -35,6 +36,7 @@ class Goals(eqx.Module):
     root: Float[Array, "*B 3"]
     feet: Float[Array, "*B 2 3 3"]
     contact: Float[Array, "*B 4"]
+    held: Float[Array, "*B reaches"]
     present: Float[Array, "*B"]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._errors import OsikValueError
 from .._npz import open_npz
-from ._motion import CONTACT_POINTS, LARGEST, HumanMotion
+from ._motion import CONTACT_POINTS, LARGEST, HumanMotion, Touch
 from ._optitrack import is_optitrack, read_optitrack
 from ._rotations import continuous
 from ._smpl import is_smpl, read_smpl
@@ -24,8 +24,9 @@ def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> Hum
     """Read ``.npz`` or ``.csv`` keypoints [m], z up.
 
     ``.npz``: ``fps``, ``positions`` (F, J, 3), ``joint_names`` (J,); optional ``rotations`` (F, J, 4; w x y z),
-    ``rest_positions`` (J, 3), ``contact`` (F, 4; left heel, left toe, right heel, right toe, or F, 2; left, right) and
-    ``ground``. Nothing is unpickled.
+    ``rest_positions`` (J, 3), ``contact`` (F, 4; left heel, left toe, right heel, right toe, or F, 2; left, right),
+    ``ground``, ``object.NAME`` (F, 7; position and w x y z) and ``touch.ROLE.NAME`` (F,; see ``Touch``). Nothing is
+    unpickled.
 
     ``.csv``: a header line with ``time`` and ``NAME.x``, ``NAME.y``, ``NAME.z`` of each joint, optionally
     ``contact.left_heel`` and so on (0 or 1); then one line per frame at a constant rate.
@@ -87,6 +88,12 @@ def _from_npz(path: Path) -> HumanMotion:
             rest_positions=_numbers(path, arrays, "rest_positions"),
             contact=None if contact is None else contact.astype(bool),
             ground=None if ground is None else float(_number(path, arrays, "ground")),
+            objects={name[7:]: _numbers(path, arrays, name) for name in arrays if name.startswith("object.")},
+            touches=tuple(
+                Touch(*name.split(".", 2)[1:], held=arrays[name].astype(bool))
+                for name in arrays
+                if name.startswith("touch.") and name.count(".") > 1
+            ),
         )
     except ValueError as error:
         raise OsikValueError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from None

@@ -17,10 +17,12 @@ from ..execution._workers import cores
 from ..limits import Limit
 from ..scaling import sharded
 from ..scaling._sharded import ShardedFunction
+from ._body import TouchGoal
 from ._finish import follow
 from ._goals import Goals, Weights
 from ._person import Person
 from ._plan import make_plan
+from ._profile import Limb
 from ._terms import Body, Bounds
 
 LENGTHS = 16
@@ -45,6 +47,12 @@ class Clip(NamedTuple):
     start: np.ndarray
     bounds: Bounds
     dt: float
+    touches: tuple[TouchGoal, ...] = ()
+
+    @property
+    def touching(self) -> tuple[Limb, ...]:
+        """Return the pairs that are held together."""
+        return tuple((touch.first, touch.second) for touch in self.touches)
 
 
 def as_lane(clip: Clip, length: int) -> _Lane:

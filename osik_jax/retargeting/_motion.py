@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,6 +21,21 @@ _FASTEST = 1e5
 
 
 @dataclasses.dataclass(frozen=True)
+class Touch:
+    """A joint that holds an object or another joint.
+
+    Attributes:
+        role: the joint, such as ``left_wrist``.
+        other: an object of the clip, or the role of another joint.
+        held: whether it holds it. (F,)
+    """
+
+    role: str
+    other: str
+    held: Bool[np.ndarray, " F"]
+
+
+@dataclasses.dataclass(frozen=True)
 class HumanMotion:
     """A person's motion: joint positions at a constant rate, in a world whose z axis points up.
 
@@ -34,6 +50,8 @@ class HumanMotion:
         contact: whether left heel, left toe, right heel and right toe stand on the ground; without toes, the
             left hind, left front, right hind and right front paw of an animal; None: detected. (F, 4)
         ground: height of the floor [m]; None: detected.
+        objects: pose of each object: position [m] and quaternion w x y z. (F, 7) each
+        touches: joints that hold objects or each other; the robot keeps them together.
 
     Raises:
         ValueError: shapes that do not agree, numbers that are not finite or over 1e6 m, quaternions that are not of
@@ -48,6 +66,8 @@ class HumanMotion:
     rest_positions: Float[np.ndarray, "J 3"] | None = None
     contact: Bool[np.ndarray, "F 4"] | None = None
     ground: float | None = None
+    objects: Mapping[str, Float[np.ndarray, "F 7"]] = dataclasses.field(default_factory=dict)
+    touches: tuple[Touch, ...] = ()
 
     def __post_init__(self) -> None:
         frames, joints = len(self.positions), len(self.joint_names)
@@ -65,6 +85,13 @@ class HumanMotion:
             raise OsikValueError(
                 f"contact has shape {np.shape(self.contact)}, expected {(frames, 4)}: {CONTACT_POINTS}"
             )
+        for name, poses in self.objects.items():
+            _check_array(f"objects[{name!r}]", poses, (frames, 7))
+            if np.abs(np.linalg.norm(poses[:, 3:], axis=-1) - 1.0).max() > ROUNDED:
+                raise OsikValueError(f"the pose of {name} is its position and a unit quaternion w x y z")
+        for touch in self.touches:
+            if touch.held.shape != (frames,):
+                raise OsikValueError(f"held of {touch.role} has shape {touch.held.shape}, expected {(frames,)}")
         if self.ground is not None and not abs(self.ground) <= LARGEST:
             raise OsikValueError(f"ground is {self.ground}; it is a height in metres")
         if self.rotations is not None:
@@ -115,8 +142,15 @@ class HumanMotion:
         if contact is not None:
             contact = np.where((part < 0.5)[:, None], contact[before], contact[before + 1])
         low, high = self.positions[before], self.positions[before + 1]
+        nearer = np.where(part < 0.5, before, before + 1)
+        objects = {}
+        for name, poses in self.objects.items():
+            at = poses[before, :3] + part[:, None] * (poses[before + 1, :3] - poses[before, :3])
+            objects[name] = np.concatenate([at, slerp(poses[before, 3:], poses[before + 1, 3:], part)], -1)
         return dataclasses.replace(
             self,
+            objects=objects,
+            touches=tuple(dataclasses.replace(touch, held=touch.held[nearer]) for touch in self.touches),
             fps=float(fps),
             positions=low + part[:, None, None] * (high - low),
             rotations=rotations,

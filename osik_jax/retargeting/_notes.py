@@ -10,6 +10,7 @@ _BOUNDS = {
     ("feet", "float_mm_max"): (2.0, "feet that stand are {:.1f} mm above the floor"),
     ("feet", "below_floor_mm_max"): (2.0, "soles are {:.1f} mm below the floor"),
     ("shapes", "penetration_mm_max"): (1.0, "shapes overlap by {:.1f} mm"),
+    ("touches", "off_mm_max"): (5.0, "hands are {:.1f} mm off what they hold"),
     ("joints", "beyond_range_max"): (1e-6, "a joint is {:.2g} rad or m beyond its range"),
     ("joints", "speed_over_limit_max"): (1.0 + 1e-6, "a joint has {:.3g} times its greatest speed"),
 }

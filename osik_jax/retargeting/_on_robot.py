@@ -13,7 +13,7 @@ from ..robot._joint_selection import scalar_layout
 from ._body import Build, pairs_apart
 from ._facing import facing_x
 from ._motion import HumanMotion
-from ._profile import Profile
+from ._profile import Limb, Profile
 from ._profile_file import check_profile, find_profile
 from ._roles import chain
 from ._skeletons import find_roles
@@ -65,8 +65,16 @@ class OnRobot:
         robot = self.robot = facing_x(robot, self.profile.across)
         self.limits = ConfigurationLimit(robot), VelocityLimit(robot), _on_joints(robot, acceleration)
         self._acceleration = np.asarray(self.limits[2].acceleration)
-        self._body = Body.of(robot, self.profile, pairs_apart(robot, self.profile), balance)
+        self._pairs = pairs_apart(robot, self.profile)
+        self._body = Body.of(robot, self.profile, self._pairs, balance)
+        self._bodies: dict[tuple[Limb, ...], Body] = {(): self._body}
         self._build = Build.of(robot, self.profile)
+
+    def _body_that(self, touching: tuple[Limb, ...]) -> Body:
+        """Return the body whose joints hold something."""
+        if touching not in self._bodies:
+            self._bodies[touching] = Body.of(self.robot, self.profile, self._pairs, self.balance, touching)
+        return self._bodies[touching]
 
     def _roles(self, motion: HumanMotion | SourceMotion, mapping: Mapping[str, str] | None) -> dict[str, str]:
         """Return the clip's joint for each role, none of a robot; the ends of the limbs to follow have to be there."""

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from .._errors import OsikValueError, warn
 from ._contact import find_contact, find_noise
 from ._floor import Floor, find_floor
-from ._motion import CONTACT_POINTS, HumanMotion
+from ._motion import CONTACT_POINTS, HumanMotion, Touch
 from ._profile import Limb
 from ._roles import FINGER_REACHES, FINGERS, LEGS, LIMBS, REACHES, SIDES, chain
 from ._up import find_up
@@ -43,6 +43,8 @@ class Person:
             four feet of a four-legged robot. (F, 4)
         lengths: lengths of the limbs and reaches with known ends [m].
         ankle: height of the ankles above the floor when standing [m].
+        objects: poses of objects, as of ``HumanMotion``. (F, 7) each
+        touches: as of ``HumanMotion``.
     """
 
     fps: float
@@ -54,6 +56,8 @@ class Person:
     contact: Bool[np.ndarray, "F 4"]
     lengths: Mapping[Limb, float]
     ankle: float
+    objects: Mapping[str, Float[np.ndarray, "F 7"]] = dataclasses.field(default_factory=dict)
+    touches: tuple[Touch, ...] = ()
 
     @property
     def directions(self) -> Float[np.ndarray, "F limbs 3"]:
@@ -217,6 +221,11 @@ def read_person(
         contact=np.zeros((motion.frames, 4), bool) if contact is None else np.asarray(contact, bool),
         lengths=known.lengths,
         ankle=known.ankle,
+        objects={
+            name: np.concatenate([floor.leveled(poses[:, :3], motion.fps), poses[:, 3:]], -1)
+            for name, poses in motion.objects.items()
+        },
+        touches=motion.touches,
     )
 
 

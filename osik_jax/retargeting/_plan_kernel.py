@@ -48,7 +48,8 @@ def descended(
     """
     frames, nq = q.shape[1:]
     integers = _structure(body)
-    wishes = goals.directions, goals.pelvis, goals.torso, goals.root, goals.feet, goals.contact, goals.present
+    wishes = goals.directions, goals.pelvis, goals.torso, goals.root, goals.feet, goals.contact
+    wishes += goals.held, goals.present
     method = side_by_side(np.array([rules]), damping, most.astype(q.dtype), np.array([endings]))
     given = [q, *wishes, free, _numbers(body, weights, bounds), method]
     lanes = max(len(a) for a in given)

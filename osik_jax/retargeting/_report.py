@@ -32,7 +32,8 @@ def report(result: Retargeted) -> dict[str, Any]:
     support, the share of frames with the centre of mass over the support polygon, and its least distance inside the
     edge (negative outside). ``shapes``: depth of overlaps between the profile's capsules. ``tracking``: keypoint errors
     per limb, at the scale that fits each limb best, and the angle between the person's segments and the robot's.
-    ``notes``: sentences on violated bounds and on clips whose feet stand in less than 20 % of the frames.
+    ``touches``: distance of joints from their place on what they hold. ``notes``: sentences on violated bounds and on
+    clips whose feet stand in less than 20 % of the frames.
     """
     places = find_places(result.robot, result.profile, _in_model(result))
     figures = {
@@ -45,6 +46,7 @@ def report(result: Retargeted) -> dict[str, Any]:
         "balance": _balance(places.soles, places.center, result.contact),
         "shapes": {"penetration_mm_max": _penetration(result, places.capsules)},
         "tracking": _tracking(result, places.keypoints),
+        "touches": {"off_mm_max": _off_touch(result, places.keypoints)},
     }
     return {**figures, "notes": notes(figures)}
 
@@ -192,6 +194,15 @@ def _tracking(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) ->
         "segment_angle_deg": angles,
         "segment_angle_deg_mean": float(np.mean(list(angles.values()))),
     }
+
+
+def _off_touch(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) -> float | None:
+    """Return the largest distance [mm] of a joint from where it holds something; None if it never does."""
+    off = [0.0]
+    for first, second, goal, held in result.touches:
+        at = robot[second] - robot.get(first, np.zeros(3))
+        off.append(float(np.linalg.norm(at - goal, axis=-1)[held].max(initial=0.0)))
+    return 1e3 * max(off) if result.touches else None
 
 
 def _angle(a: Float[np.ndarray, "F 3"], b: Float[np.ndarray, "F 3"]) -> float:

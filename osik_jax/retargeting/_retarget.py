@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -36,7 +37,7 @@ from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
 from ._person import read_person
 from ._plan import make_plan
-from ._profile import Profile
+from ._profile import Limb, Profile
 from ._retargeted import Retargeted, as_retargeted
 from ._source_motion import SourceMotion
 
@@ -84,7 +85,9 @@ class Retargeter(OnRobot):
         """Retarget one clip; see the function ``retarget``."""
         clip = self._prepared(motion, mapping, fps)
         weights = self.profile.weights.smoother(self.smoothness, clip.dt)
-        plan = make_plan(self._body, clip.goals, weights, clip.bounds, clip.start, self.max_iterations)
+        plan = make_plan(
+            self._body_that(clip.touching), clip.goals, weights, clip.bounds, clip.start, self.max_iterations
+        )
         q, off = follow(self.robot, plan.q, self.limits, clip.dt)
         return self._finished(clip, Solved(q, off, plan.iterations, plan.cost))
 
@@ -125,18 +128,18 @@ class Retargeter(OnRobot):
                     advance(1)
             return made
         clips = [self._read(*motion) for motion in checked]
-        groups: dict[int, list[int]] = {}
+        groups: dict[tuple[int, tuple[Limb, ...]], list[int]] = {}
         for i, clip in enumerate(clips):
-            groups.setdefault(shared_length(clip), []).append(i)
+            groups.setdefault((shared_length(clip), clip.touching), []).append(i)
         found: dict[int, Retargeted] = {}
-        for length, members in sorted(groups.items()):
+        for (length, touching), members in sorted(groups.items()):
             lanes = [as_lane(clips[i], length) for i in members]
             solved = run_in_chunks(
                 solve_side_by_side,
                 jax.tree.map(lambda *leaves: np.stack(leaves), *lanes),
                 chunk=even(len(members), chunk),
-                shared=self._shared,
-                out=None if out is None else Path(out) / f"frames_{length}",
+                shared=self._shared(touching),
+                out=None if out is None else Path(out) / "_".join([f"frames_{length}", *itertools.chain(*touching)]),
                 progress=progress,
                 unit="clips",
             )
@@ -172,10 +175,10 @@ class Retargeter(OnRobot):
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
         dt = 1.0 / motion.fps
-        return Clip(person, motion.frames, goals, start, self._bounds(dt), dt)
+        return Clip(person, motion.frames, goals, start, self._bounds(dt), dt, self._build.touches(person))
 
     def _solved(self, clips: Sequence[Clip], length: int, lanes: int) -> list[Callable[[], Retargeted]]:
-        """Retarget clips of at most ``length`` frames (``shared_length`` or more).
+        """Retarget clips of at most ``length`` frames (``shared_length`` or more) that hold the same.
 
         ``lanes``: the batch size of the compiled program, at least the number of clips.
 
@@ -186,29 +189,31 @@ class Retargeter(OnRobot):
         if not one_a_core():
             batch += batch[-1:] * (lanes - len(batch))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *batch)
-        results = jax.tree.map(np.asarray, solve_side_by_side(stacked, *self._shared))
+        results = jax.tree.map(np.asarray, solve_side_by_side(stacked, *self._shared(clips[0].touching)))
         return [
             partial(self._finished, clip, jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
             for lane, clip in enumerate(clips)
         ]
 
-    @property
-    def _shared(self) -> tuple[Any, ...]:
+    def _shared(self, touching: tuple[Limb, ...]) -> tuple[Any, ...]:
         """Return the arguments of ``solve_lane`` that all lanes share."""
         smoothness = np.asarray(self.smoothness, self._build.start.dtype)
-        return self._body, self.profile.weights, self.limits, np.asarray(self.max_iterations), smoothness
+        return self._body_that(touching), self.profile.weights, self.limits, np.asarray(self.max_iterations), smoothness
 
     def _made_by_a_core(self, checked: _Checked) -> Retargeted:
         """Retarget one checked clip in one thread; other threads compute while this one holds the GIL."""
         clip = self._read(*checked)
-        solved = solve_lane(as_lane(clip, shared_length(clip)), *self._shared)
+        solved = solve_lane(as_lane(clip, shared_length(clip)), *self._shared(clip.touching))
         return self._finished(clip, jax.tree.map(np.asarray, solved))
 
     def _finished(self, clip: Clip, solved: Solved) -> Retargeted:
         q, off = (np.asarray(part)[: clip.frames] for part in (solved.q, solved.off_plan))
         cost = float(solved.cost[0]), float(solved.cost[1])
         made = as_retargeted(self.robot, self.profile, clip.person, q, off)
-        return dataclasses.replace(made, iterations=int(solved.iterations), cost=cost)
+        objects = self._build.objects(clip.person) if clip.person.objects else {}
+        return dataclasses.replace(
+            made, iterations=int(solved.iterations), cost=cost, objects=objects, touches=clip.touches
+        )
 
 
 def retarget(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..robot import Robot
+from ._body import TouchGoal
 from ._person import Person
 from ._profile import Profile
 from ._robot_motion import RobotMotion, in_mujoco_order
@@ -31,6 +34,8 @@ class Retargeted:
             robot of another shape. (F, 4)
         iterations: iterations of the plan; 0 for a live stream.
         cost: final cost of the goals, and of the violated bounds; 0 for a live stream.
+        objects: poses of the clip's objects in the robot's world. (F, 7) each
+        touches: what the robot's joints hold.
         off_plan: largest distance of a joint from the plan in each frame because of a limit [rad or m]. (F,)
     """
 
@@ -44,17 +49,20 @@ class Retargeted:
     iterations: int
     cost: tuple[float, float]
     off_plan: Float[np.ndarray, " F"]
+    objects: Mapping[str, Float[np.ndarray, "F 7"]] = dataclasses.field(default_factory=dict)
+    touches: tuple[TouchGoal, ...] = ()
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file.
 
         Arrays: ``fps``, ``qpos``, ``joint_names``, ``human``, ``human_names``, ``contact`` and ``ground`` (0); for
         pictures ``human_bones``, pairs of indices into ``human_names``, and ``human_standing``, those of the points of
-        ``contact``.
+        ``contact``; ``object.NAME``, the poses of objects.
         """
         names = self.human_names
         pairs = [(names.index(a), names.index(b)) for a, b in bones(names)]
         standing = [names.index(name) for name in self.profile.standing if name in names]
+        objects: dict[str, Any] = {f"object.{name}": poses for name, poses in self.objects.items()}
         np.savez_compressed(
             Path(path),
             fps=self.motion.fps,
@@ -66,6 +74,7 @@ class Retargeted:
             human_standing=np.array(standing, int),
             contact=self.contact,
             ground=0.0,
+            **objects,
         )
 
 

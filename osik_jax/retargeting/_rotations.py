@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 Axis = str
 _UNIT = {"x": 0, "y": 1, "z": 2}
@@ -54,3 +56,12 @@ def slerp(a: np.ndarray, b: np.ndarray, part: np.ndarray) -> np.ndarray:
 def matrix(quaternion: np.ndarray) -> np.ndarray:
     """Return the rotation matrices of unit quaternions. (..., 3, 3)."""
     return np.stack([rotate(quaternion, axis) for axis in np.eye(3)], -1)
+
+
+def moved_poses(
+    poses: Float[np.ndarray, "F 7"], turn: Float[np.ndarray, "_ 3 3"], by: Float[np.ndarray, "F 3"] | float = 0.0
+) -> Float[np.ndarray, "F 7"]:
+    """Return poses that are turned about the origin and moved [m]. (F, 7)."""
+    turned = Rotation.from_matrix(turn) * Rotation.from_quat(poses[:, 3:], scalar_first=True)
+    at = (turn @ poses[:, :3, None])[..., 0] + by
+    return np.concatenate([at, turned.as_quat(scalar_first=True)], -1)

@@ -28,6 +28,8 @@ from ._roles import SIDES, chain
 
 # Guard of a limb's direction: a shorter limb [m] has none.
 SHORTEST = 1e-6
+ORIGIN = "origin"
+"""The world's origin as the first point of a reach: the second follows a path in the world."""
 # Length of a standing leg over its stretched length, for robots whose legs are straight at home.
 STANDING_SHARE = 0.85
 # Pairs of capsules that get rows; the nearest ones are chosen in each iteration.
@@ -77,14 +79,28 @@ class Body(eqx.Module):
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, robot: Robot, profile: Profile, pairs: Sequence[tuple[int, int]], inside: float | None = None) -> Body:
+    def of(
+        cls,
+        robot: Robot,
+        profile: Profile,
+        pairs: Sequence[tuple[int, int]],
+        inside: float | None = None,
+        touching: Sequence[Limb] = (),
+    ) -> Body:
         """Return the arrays for a robot and a profile.
 
-        ``pairs``: the capsules that are kept apart. ``inside``: margin of balance [m], None for no balance.
+        Args:
+            robot: the robot.
+            profile: its profile.
+            pairs: the capsules that are kept apart.
+            inside: margin of balance [m], None for no balance.
+            touching: reaches of length 1 m after those of the profile; they may begin at ``ORIGIN``.
         """
-        keys, free = tuple(profile.keypoints), robot.floating_base
+        fixed: dict[str, Place] = {ORIGIN: (robot.tree.body_names[0], (0.0, 0.0, 0.0))} if touching else {}
+        points = {**profile.keypoints, **fixed}
+        keys, free = tuple(points), robot.floating_base
         corners = profile.corners if free else ()
-        places: list[Place] = [*profile.keypoints.values(), *((frame, (0.0, 0.0, 0.0)) for frame in profile.turned)]
+        places: list[Place] = [*points.values(), *((frame, (0.0, 0.0, 0.0)) for frame in profile.turned)]
         places += corners
         for capsule in profile.capsules:
             places += [(capsule.frame, capsule.start), (capsule.frame, capsule.end)]
@@ -95,17 +111,18 @@ class Body(eqx.Module):
         hips = (keys.index("left_hip"), keys.index("right_hip")) if profile.walks else (len(keys), len(keys))
         at_home = home_kinematics(robot)
         home = at_home.frame_poses(robot, profile.turned)[1]
+        lengths = [*(reach_length(robot, profile, limb) for limb in profile.reached), *(1.0 for _ in touching)]
         return cls(
             robot=robot,
             offsets=jnp.array([point for _, point in places], robot.q0.dtype),
             radii=jnp.array([capsule.radius for capsule in profile.capsules], robot.q0.dtype),
             home=jnp.asarray(facing_at_home(robot, profile.across).T, home.dtype) @ home,
-            lengths=jnp.array([reach_length(robot, profile, limb) for limb in profile.reached], robot.q0.dtype),
+            lengths=jnp.array(lengths, robot.q0.dtype),
             rises=jnp.array(profile.rises[: len(corners)], robot.q0.dtype),
             inside=None if inside is None else jnp.asarray(inside, robot.q0.dtype),
             frames=tuple(frame for frame, _ in places),
             keys=keys,
-            limbs=tuple((keys.index(a), keys.index(b)) for a, b in profile.followed),
+            limbs=tuple((keys.index(a), keys.index(b)) for a, b in (*profile.followed, *touching)),
             turned=tuple(turned),
             roots=hips if free else (),
             corners=len(corners),
@@ -305,7 +322,8 @@ def _limbs(place: _Places, body: Body, goals: Goals, weights: Weights) -> _Rows:
         index = np.repeat(index, 3)
         ends.append(place.motion.rates(place.moves[index], sideways, place.points[index]))
     residual = (direction - goals.directions).ravel()
-    return _Rows(residual, ends[1] - ends[0], jnp.full(residual.shape, weights.limb))
+    weight = jnp.concatenate([jnp.ones(len(first) - reaches, residual.dtype), goals.held])
+    return _Rows(residual, ends[1] - ends[0], weights.limb * jnp.repeat(weight, 3))
 
 
 def _turn(place: _Places, first: int, i: int, wanted: Float[Array, "3 3"], weight: Float[Array, ""]) -> _Rows:

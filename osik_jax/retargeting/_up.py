@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError, warn
 from ._motion import HumanMotion
-from ._rotations import continuous, multiply
+from ._rotations import continuous, moved_poses, multiply
 from ._skeletons import find_roles
 
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -160,6 +160,7 @@ def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMo
         rotations = continuous(rotations)
     return dataclasses.replace(
         motion,
+        objects={name: moved_poses(poses, turn[None]) for name, poses in motion.objects.items()},
         positions=motion.positions @ turn.T,
         rotations=rotations,
         rest_positions=None if rest is None else rest @ rest_turn.T,

@@ -121,10 +121,16 @@ def retarget_a_person(names: Names) -> None:
     assert names["figures"]["joints"]["beyond_range_max"] == 0.0
 
 
+def carry_a_box(names: Names) -> None:
+    assert names["figures"]["touches"]["off_mm_max"] < 0.5
+    assert names["figures"]["feet"]["slip_mm_max"] < 0.1
+    assert names["figures"]["joints"]["beyond_range_max"] == 0.0 and not names["figures"]["notes"]
+
+
 CHECKS: list[Callable[[Names], None]] = [
     ur5_pose, panda_draws, xarm_elbow, so101_pose, so101_teleoperation, allegro_grasp, tiago_drives, go2_body,
     g1_reaches, nao_one_foot, baxter_two_arms, ur5_keeps_off_a_post, panda_thousand_targets, tune_a_weight,
-    retarget_a_person,
+    retarget_a_person, carry_a_box,
 ]  # fmt: skip
 
 
@@ -139,6 +145,7 @@ CHECKS: list[Callable[[Names], None]] = [
         "ur5_pose",
         "allegro_grasp",
         "g1_reaches",
+        "carry_a_box",
     ],
     release=["panda_draws", "baxter_two_arms", "xarm_elbow", "go2_body", "tune_a_weight"],
 )
