@@ -39,6 +39,7 @@ from ._checks import (
     warn_of_ignored_priorities,
     warn_of_large_gains,
 )
+from ._compiled_step import compiled, is_compiled
 from ._solution import Solution
 
 Tasks = Mapping[str, Task]
@@ -148,7 +149,6 @@ def build_problem(
 
 
 @jax.jit
-@blocked(BLOCK)
 def step(
     robot: Robot,
     q: Array,
@@ -159,7 +159,22 @@ def step(
     warm_start: Any = None,
 ) -> Solution:
     chosen = scheme_for(tasks, q.dtype) if scheme is None else scheme
-    bounds = with_own_limits(robot, limits)
+    given = robot, q, tasks, chosen, with_own_limits(robot, limits), dt, warm_start
+    return (_compiled_step if is_compiled(*given) else _plain_step)(*given)
+
+
+@jax.jit
+@blocked(BLOCK)
+def _plain_step(
+    robot: Robot,
+    q: Array,
+    tasks: dict[str, Task],
+    chosen: Scheme,
+    bounds: tuple[Limit, ...],
+    dt: Array | float,
+    warm_start: Any,
+) -> Solution:
+    """Return the step's solution from its parts, one after another: the definition."""
     dt = positive(dt)
     raw_box = jax.lax.stop_gradient(limit_box(robot, q, bounds, dt))
     (robot, q), is_valid_pose = with_placeholder((robot, q))
@@ -186,6 +201,9 @@ def step(
         error={name: _finite(jnp.where(is_valid[name], rows.error, 0.0)) for name, rows in problem.rows.items()},
         warm_start=answer.warm_start,
     )
+
+
+_compiled_step = compiled(_plain_step)
 
 
 def _with_nan(problem: VelocityProblem, raw_box: tuple[Array, Array], is_valid: Array) -> VelocityProblem:

@@ -12,28 +12,12 @@ namespace {
 using Real = double;
 using Team = Serial<Real>;
 
-// The numbers of one lane of an argument, handed out one array after another.
-struct Lane {
-  const Real* at;
-  Lane(const xla::Call& call, int k, int lane) : at(call.in<Real>(k)) {
-    const xla::Buffer& buffer = call.argument(k);
-    size_t count = 1;
-    for (int axis = 1; axis < buffer.rank; ++axis) count *= buffer.dimensions[axis];
-    if (buffer.dimensions[0] > 1) at += count * lane;
-  }
-  operator const Real*() const { return at; }
-  const Real* take(int count) { return (at += count) - count; }
-};
-
 // Arguments 0 to 4 are the fields of Kinematics.
 Placed<Real> placed(const xla::Call& call, int lane) {
-  auto field = [&](int k) { return const_cast<Real*>(Lane(call, k, lane).at); };  // only read
+  auto field = [&](int k) { return const_cast<Real*>(xla::lane_of(call, k, lane)); };  // only read
   return {field(0), field(1), field(2), field(3), field(4)};
 }
-struct Integers {
-  const int* at;
-  const int* take(int count) { return (at += count) - count; }
-};
+using Integers = xla::Reader<int>;
 
 // Arguments and results as in kinematics/_kernels.py: bodies.
 void place(const xla::Call& call) {
@@ -46,10 +30,10 @@ void place(const xla::Call& call) {
   const int* source = integers.take(nq);
   std::vector<Real> q(nq);
   for (int lane = 0; lane < lanes; ++lane) {
-    const Lane given(call, 0, lane);
-    Lane numbers(call, 1, lane);
+    const Real* given = xla::lane_of(call, 0, lane);
+    xla::Reader<Real> numbers{xla::lane_of(call, 1, lane)};
     const Real *factor = numbers.take(nq), *offset = numbers.take(nq);
-    for (int i = 0; i < nq; ++i) q[i] = factor[i] * given.at[source[i]] + offset[i];
+    for (int i = 0; i < nq; ++i) q[i] = factor[i] * given[source[i]] + offset[i];
     tree.reference = numbers.take(nq), tree.position = numbers.take(3 * bodies), tree.quaternion = numbers.take(4 * bodies);
     tree.joint_position = numbers.take(3 * joints), tree.joint_axis = numbers.take(3 * joints);
     const size_t body = size_t(lane) * bodies, dof = size_t(lane) * dofs;
@@ -65,7 +49,7 @@ void move_frames(const xla::Call& call) {
   Integers integers{call.in<int>(6)};
   const int *carrier = integers.take(count), *column = integers.take(dofs), *moved = integers.at;
   for (int lane = 0; lane < lanes; ++lane) {
-    Lane numbers(call, 5, lane);
+    xla::Reader<Real> numbers{xla::lane_of(call, 5, lane)};
     const DofColumns<Real> columns{dofs, nv, column, numbers.take(dofs)};
     const Real *offset = numbers.take(3 * count), *turn = numbers.take(9 * count);
     const Placed<Real> there = placed(call, lane);
@@ -87,7 +71,7 @@ struct Center {
       : bodies(call.size(0, 1)), dofs(call.size(2, 1)), nv(nv), integers{call.in<int>(6)}, parents(integers.take(bodies)),
         owner(integers.take(dofs)), column(integers.take(dofs)), below(4 * bodies) {}
   void find(const xla::Call& call, int lane, Real* point, Real* J) {
-    Lane numbers(call, 5, lane);
+    xla::Reader<Real> numbers{xla::lane_of(call, 5, lane)};
     const DofColumns<Real> columns{dofs, nv, column, numbers.take(dofs)};
     const Real *mass = numbers.take(bodies), *center = numbers.take(3 * bodies);
     move_center(columns, placed(call, lane), bodies, parents, owner, mass, center, below.data(), point, J);
@@ -117,9 +101,9 @@ void find_center_rows(const xla::Call& call) {
   Real point[3];
   for (int lane = 0; lane < lanes; ++lane) {
     center.find(call, lane, point, J.data());
-    Lane numbers(call, 7, lane);
+    xla::Reader<Real> numbers{xla::lane_of(call, 7, lane)};
     CenterGoal<Real> goal{m, axes, turning};
-    goal.target = numbers.take(m), goal.velocity = numbers.take(m), goal.weight = numbers.take(m), goal.gain = numbers;
+    goal.target = numbers.take(m), goal.velocity = numbers.take(m), goal.weight = numbers.take(m), goal.gain = numbers.at;
     center_rows(Team(), goal, point, J.data(), nv, rows_of(call, lane));
   }
 }
@@ -130,12 +114,12 @@ void find_pose_rows(const xla::Call& call) {
   const int nv = int(call.result(1).dimensions[2]);
   const int* options = call.in<int>(4);
   for (int lane = 0; lane < lanes; ++lane) {
-    Lane numbers(call, 3, lane);
+    xla::Reader<Real> numbers{xla::lane_of(call, 3, lane)};
     PoseGoal<Real> goal{};
     goal.position = numbers.take(3), goal.rotation = numbers.take(9), goal.velocity = numbers.take(6);
-    goal.weight = numbers.take(m), goal.gain = numbers, goal.kept = options;
+    goal.weight = numbers.take(m), goal.gain = numbers.at, goal.kept = options;
     goal.in_frame = options[6] != 0, goal.geometric = options[7] != 0;
-    pose_rows(Team(), goal, Lane(call, 0, lane).at, Lane(call, 1, lane).at, Lane(call, 2, lane).at, nv,
+    pose_rows(Team(), goal, xla::lane_of(call, 0, lane), xla::lane_of(call, 1, lane), xla::lane_of(call, 2, lane), nv,
               rows_of(call, lane));
   }
 }

@@ -4,10 +4,30 @@
 
 namespace osik {
 
-// The rows of one task with m rows; fields of TaskRows (tasks/_task.py). The wanted velocity is both bounds.
+// The rows of one task with m rows; fields of TaskRows (tasks/_task.py). An equality has no upper bounds (null).
 template <class Real> struct Rows {
-  Real *error, *jacobian, *wanted, *curvature, *pull, *levers;  // [m], [m, nv], [m], [1], [m], [nv]
+  Real *error, *jacobian, *lower, *curvature, *pull, *levers;  // [m], [m, nv], [m], [1], [m], [nv]
+  Real* upper = nullptr;                                       // [m]
 };
+
+// An interval of the error, [m] each; null for an equality.
+template <class Real> struct Bounds {
+  const Real *lower = nullptr, *upper = nullptr;
+};
+
+// The bounds on the rate of row i, and its pull: tasks/_task.py, task_rows.
+template <class Real>
+OSIK_FN void ask(const Rows<Real>& to, const Bounds<Real>& bounds, int i, Real error, Real forward, Real gain) {
+  to.error[i] = error;
+  if (!bounds.lower) {
+    to.pull[i] = gain * error, to.lower[i] = forward - to.pull[i];
+    return;
+  }
+  const Real low = bounds.lower[i], high = bounds.upper[i];
+  auto approach = [&](Real bound) { return fabs(bound) < Real(INFINITE) ? gain * (bound - error) + forward : bound; };
+  to.pull[i] = gain * (error > high ? error - high : error < low ? error - low : Real(0));
+  to.lower[i] = approach(low), to.upper[i] = approach(high);
+}
 
 // The pose that a task asks for, and how.
 template <class Real> struct PoseGoal {
@@ -15,6 +35,7 @@ template <class Real> struct PoseGoal {
   const Real *weight, *gain;                   // [m] of the rows that are kept, [1]
   const int* kept;                             // [6] flags
   bool in_frame, geometric;                    // rows along the frame's axes; without the inverse left Jacobian
+  Bounds<Real> bounds;
 };
 
 // The Frobenius norm of the matrix with entries pull . (axis_i x arm_j), from the sums of products of axes and of arms:
@@ -84,7 +105,7 @@ void pose_rows(const Team& t, const PoseGoal<Real>& goal, const Real* position, 
     Real pull[6] = {};
     for (int i = 0, row = 0; i < 6; ++i)
       if (goal.kept[i]) {
-        to.error[row] = error[i], to.pull[row] = *goal.gain * error[i], to.wanted[row] = forward[i] - to.pull[row];
+        ask(to, goal.bounds, row, error[i], forward[i], *goal.gain);
         pull[i] = goal.weight[row] * to.pull[row];
         ++row;
       }
@@ -93,28 +114,35 @@ void pose_rows(const Team& t, const PoseGoal<Real>& goal, const Real* position, 
   });
 }
 
-// The point that a task asks the centre of mass to be at, along `m` of the world's axes.
+// Where a task asks the centre of mass to be, along `m` of the world's axes or normals of edges on the ground.
 template <class Real> struct CenterGoal {
   int m;
   const int *axes, *turning;                       // [m] 0 for x, 1 for y, 2 for z; [nv] whether a dof turns something
-  const Real *target, *velocity, *weight, *gain;   // [m], [m], [m], [1]
+  const Real *target, *velocity, *weight, *gain;   // [m] or null for 0, [m] or null for 0, [m], [1]
+  const Real* normals = nullptr;                   // [m, 2] in place of axes
+  Bounds<Real> bounds = {};
 };
 
 // Rows of a task on the centre of mass `point` [3] with Jacobian J [3, nv].
 template <class Team, class Real>
 void center_rows(const Team& t, const CenterGoal<Real>& goal, const Real* point, const Real* J, int nv,
                  const Rows<Real>& to) {
+  auto along = [&](int i, Real x, Real y, Real z) {
+    if (goal.normals) return goal.normals[2 * i] * x + goal.normals[2 * i + 1] * y;
+    return goal.axes[i] == 0 ? x : goal.axes[i] == 1 ? y : z;
+  };
   t.each(0, nv, [&](int j) {
     Real square = 0;
     for (int i = 0; i < goal.m; ++i) {
-      const Real entry = J[goal.axes[i] * nv + j];
+      const Real entry = along(i, J[j], J[nv + j], J[2 * nv + j]);
       to.jacobian[i * nv + j] = entry, square += goal.weight[i] * entry * entry;
     }
     to.levers[j] = sqrt(square);
   });
   t.each(0, goal.m, [&](int i) {
-    to.error[i] = point[goal.axes[i]] - goal.target[i];
-    to.pull[i] = *goal.gain * to.error[i], to.wanted[i] = goal.velocity[i] - to.pull[i];
+    const Real value = along(i, point[0], point[1], point[2]);
+    ask(to, goal.bounds, i, goal.target ? value - goal.target[i] : value, goal.velocity ? goal.velocity[i] : Real(0),
+        *goal.gain);
   });
   // the length of the weighted pull times the Frobenius norm of the columns of dofs that turn something
   const Real largest = t.most(Real(0), 0, goal.m, [&](int i, Real) { return fabs(goal.weight[i] * to.pull[i]); });

@@ -1,13 +1,22 @@
-// XLA's call of the weighted QP on a CPU: one problem of a batch after another, in double precision.
+// XLA's calls of the weighted QP and of its certificate on a CPU: one problem of a batch after another, in double precision.
 #include <utility>
 #include <vector>
 
-#include "weighted_qp.hpp"
+#include "certificates.hpp"
 #include "xla.hpp"
 
 using namespace osik;
 
 namespace {
+// The numbers of a problem but its matrix, one array after another; returns where they end.
+const double* read(QPData<double>& d, const double* at, const QPSizes& s) {
+  const int m = s.m, n = s.n, p = s.p, N = n + p;
+  for (auto [field, count] : {std::pair{&d.target, m}, {&d.weight, m}, {&d.damping, n}, {&d.center, n}, {&d.rows, p * n},
+                              {&d.compliance, p}, {&d.lower, N}, {&d.upper, N}})
+    *field = at, at += count;
+  return at;
+}
+
 // Arguments and results as in solvers/qp/_core.py; the second argument has all numbers of a problem but the matrix.
 void solve_weighted_qps(const xla::Call& call) {
   using Method = WeightedQP<Serial<double>>;
@@ -20,14 +29,28 @@ void solve_weighted_qps(const xla::Call& call) {
   QPAnswer<double> a{call.out<double>(0), call.out<double>(1), call.out<int>(2), call.out<int>(3)};
   for (int k = 0; k < batch; ++k) {
     QPData<double> d{matrix, packed};
-    const double* at = packed;
-    for (auto [field, count] : {std::pair{&d.target, m}, {&d.weight, m}, {&d.damping, n}, {&d.center, n}, {&d.rows, p * n},
-                                {&d.compliance, p}, {&d.lower, N}, {&d.upper, N}})
-      *field = at, at += count;
+    const double* at = read(d, packed, s);
     d.guess = guess, d.tolerance = tolerance[k];
     method.solve(d, a);
     matrix += size_t(m) * n, packed = at, guess += N;
     a.x += n, a.multipliers += p, a.active += N, a.report += 3;
+  }
+}
+
+// Arguments: matrix, other numbers, x, multipliers of the rows, labels, [B, 2] tolerance and largest residual. Results:
+// whether the certificate holds, and the residual.
+void judge_weighted_qps(const xla::Call& call) {
+  const int batch = call.size(0, 0), m = call.size(0, 1), n = call.size(0, 2), N = call.size(4, 1), p = N - n;
+  const QPSizes s{m, n, p, 0};
+  QPCertificate certificate(s);
+  const double* packed = call.in<double>(1);
+  for (size_t k = 0; k < size_t(batch); ++k) {
+    const double* tolerances = call.in<double>(5) + 2 * k;
+    QPData<double> d{call.in<double>(0) + k * m * n};
+    packed = read(d, packed, s), d.tolerance = tolerances[0];
+    const Certificate found = certificate.judge(d, call.in<double>(2) + k * n, call.in<double>(3) + k * p,
+                                                call.in<int>(4) + k * N, tolerances[1]);
+    call.out<int>(0)[k] = found.holds, call.out<double>(1)[k] = found.residual;
   }
 }
 }  // namespace
@@ -40,4 +63,5 @@ int osik_weighted_qp_bytes(int m, int n, int p, int single) {
   const QPSizes s{m, n, p, 0};
   return single ? WeightedQP<WarpSizes<float>>::bytes(s) : WeightedQP<WarpSizes<double>>::bytes(s);
 }
+void* osik_weighted_qp_certificate(xla::CallFrame* frame) { return xla::handle<judge_weighted_qps>(frame); }
 }

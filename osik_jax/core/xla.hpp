@@ -127,6 +127,23 @@ struct Call {
   template <class T> T* out(int k) const { return static_cast<T*>(result(k).data); }
 };
 
+// Hands out one array after another of a buffer.
+template <class T> struct Reader {
+  const T* at;
+  const T* take(int count) { return (at += count) - count; }
+};
+
+// How many numbers one lane of a buffer has. Its leading axis is that of the lanes, or has length 1 where all share it.
+inline size_t numbers_of_lane(const Buffer& buffer) {
+  size_t count = 1;
+  for (int axis = 1; axis < buffer.rank; ++axis) count *= buffer.dimensions[axis];
+  return count;
+}
+inline const double* lane_of(const Call& call, int k, int lane) {
+  const Buffer& buffer = call.argument(k);
+  return call.in<double>(k) + (buffer.dimensions[0] > 1 ? numbers_of_lane(buffer) * lane : 0);
+}
+
 // An error that XLA raises in Python with this message.
 inline void* error(CallFrame* frame, const char* message) {
   ErrorArguments arguments{sizeof(ErrorArguments), nullptr, message, INTERNAL_ERROR};

@@ -22,17 +22,21 @@ from ..robot._tree import KinematicTree
 
 def bodies(robot: Robot, q: Float[Array, "lanes nq"]) -> tuple[Array, ...]:
     """Return the fields of ``Kinematics``."""
-    tree = robot.tree
-    index, coefficient = tree.qpos_source
-    integers = np.concatenate([[len(index)], tree.body_parents, tree.joint_types, tree.joint_bodies, index])
+    tree, integers = robot.tree, tree_integers(robot.tree)
     numbers = side_by_side(
-        *(coefficient[None], robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion),
-        *(robot.joint_position, robot.joint_axis),
+        *(tree.qpos_source[1][None], robot.qpos_offset, robot.joint_reference, robot.body_position),
+        *(robot.body_quaternion, robot.joint_position, robot.joint_axis),
     )
     lanes, count, full = max(len(q), len(numbers)), len(tree.body_parents), len(tree.dof_joint)
     shapes = (count, 3), (count, 3, 3), (full, 3), (full, 3), (full, 3)
     outputs = [((lanes, *shape), float) for shape in shapes]
     return tuple(_library.call("kinematics", outputs, q, numbers, integers.astype(np.int32)))
+
+
+def tree_integers(tree: KinematicTree) -> np.ndarray:
+    """Return the length of MuJoCo's configuration, then the indices of ``Tree`` in the core and of ``qpos_source``."""
+    index, _ = tree.qpos_source
+    return np.concatenate([[len(index)], tree.body_parents, tree.joint_types, tree.joint_bodies, index])
 
 
 def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Array, Array, Array]:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..numerics._arguments import check_bounds, concrete, entries
+from ..numerics._constants import RANGE_ROUNDOFF
 from ..numerics._guarded import rate_of_way
 from ..robot import Robot
 from ..robot._balls import independent_balls
@@ -21,7 +22,6 @@ from ._ball import MARGIN, SHORTEST, BallRates, ball_rates
 from ._box import Kind, Limit
 from ._rows import LimitRows
 
-_ROUNDOFF = 8.0  # machine epsilons of the way to a bound that are kept clear of it, so that q + v dt stays within
 _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE = 0.5, 0.25
 """[rad/s] and [m/s]. ISO 10218-1 calls 0.25 m/s reduced speed; half a metre from a hinge, 0.5 rad/s is the same."""
 
@@ -125,7 +125,7 @@ class ConfigurationLimit(Limit):
         """Return the velocity to the bound, rounded inward; infinite bounds stay infinite, with gradients 0."""
         free = jnp.isinf(bound)
         way = jnp.where(free, 0.0, bound) - position
-        way = way + inward * _ROUNDOFF * jnp.finfo(way.dtype).eps * jnp.abs(way)
+        way = way + inward * RANGE_ROUNDOFF * jnp.finfo(way.dtype).eps * jnp.abs(way)
         return jnp.where(free, bound, rate_of_way(self.gain * way, dt))
 
     def _convert(self, name: str, value: Any) -> Any:

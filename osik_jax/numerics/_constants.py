@@ -378,3 +378,5 @@ ROW_ROUNDOFF = 10.0
 """
 INERTIA_ROUNDOFF = 4.0
 """Inertia given to a motion without any, in units of machine epsilon per dof, relative to the inertia of its dofs."""
+RANGE_ROUNDOFF = 8.0
+"""Machine epsilons of the way to a bound that are kept clear of it, so that q + v dt stays within."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +21,20 @@ _ITERATIONS = 4
 """Number of Newton-Schulz iterations: each takes a residual e below e^2, so four take 0.04 below 1e-16."""
 
 
+def _evaluated(function: Callable[[Array, str], Array]) -> Callable[[Array, str], Array]:
+    """Return the function that evaluates numbers which are there while a program is traced: they stay constants."""
+
+    @wraps(function)
+    def evaluated(given: Array, what: str) -> Array:
+        if concrete(given) is None:
+            return function(given, what)
+        with jax.ensure_compile_time_eval():
+            return function(given, what)
+
+    return evaluated
+
+
+@_evaluated
 def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B 4"]:
     """Return quaternions divided by their lengths, which are 1 within 2 %.
 
@@ -33,6 +50,7 @@ def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B
     return jnp.where(valid, safe / length, jnp.nan)
 
 
+@_evaluated
 def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B 3 3"]:
     """Return the rotation matrices that are nearest to the given ones, whose columns have length 1 within 2 %.
 

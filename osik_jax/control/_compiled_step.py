@@ -1,0 +1,330 @@
+"""A control step in one call of the compiled core (``core/step.hpp``), for the tasks and limits that it knows.
+
+``_step.py`` is the definition, the derivative, what solves steps whose answer the core cannot certify, and what runs
+for all other tasks, limits, schemes and platforms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..core import _library
+from ..execution._backends import cuda_is_default, takes
+from ..execution._blocks import BLOCK
+from ..execution._candidates import Candidates, certified_or_searched
+from ..execution._computed import in_shared_lanes, over_lanes, side_by_side
+from ..execution._lanes import lanes_of, with_the_rest
+from ..execution._rules import custom_jvp
+from ..kinematics._kernels import dof_columns, tree_integers
+from ..limits import AccelerationLimit, ConfigurationLimit, Limit, NoLimits, VelocityLimit, limit_box
+from ..numerics._constants import FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
+from ..robot import Robot
+from ..robot._balls import independent_balls
+from ..robot._joint_selection import dofs_of, is_scalar, scalar_layout
+from ..schemes import HierarchicalQP, Scheme, WeightedQP
+from ..solvers.hqp import Tolerances
+from ..tasks import AdaptiveGain, ComTask, FrameTask, PostureTask, RelativeFrameTask, Task
+from ..tasks._com import axis_numbers
+from ._solution import Solution
+
+_SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
+_LIMITS = (*_SIMPLE_LIMITS, AccelerationLimit)
+_POSE, _CENTER, _POSTURE = range(3)
+Step = Callable[..., Solution]
+
+
+def is_compiled(
+    robot: Robot,
+    q: Array,
+    tasks: Mapping[str, Task],
+    scheme: Scheme,
+    limits: Sequence[Limit],
+    dt: Any,
+    warm_start: Any,
+) -> bool:
+    """Return whether the core knows steps of this kind and is there."""
+    if type(scheme) not in (WeightedQP, HierarchicalQP) or cuda_is_default():
+        return False
+    kinds = {jnp.result_type(a) for a in jax.tree.leaves((robot, q, tasks, scheme, limits, dt))}
+    one_precision = {kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)} == {jnp.result_type(float)}
+    has_rows = any(type(limit) is ConfigurationLimit for limit in limits) and bool(independent_balls(robot.tree))
+    fits = one_precision and not has_rows and all(type(limit) in _LIMITS for limit in limits)
+    if not fits or not all(_is_known(robot, task) for task in tasks.values()):
+        return False
+    labels = _Layout(robot, tasks, scheme).labels
+    same = warm_start is None or [jnp.shape(a) for a in jax.tree.leaves(warm_start)] == labels
+    return same and takes(getattr(scheme, "backend", "jax"), "core", fits=True)
+
+
+def _is_known(robot: Robot, task: Task) -> bool:
+    if task.hard or isinstance(task.gain, AdaptiveGain):
+        return False
+    if type(task) is PostureTask:
+        return all(is_scalar(robot, joint) for joint in task.joints)
+    return type(task) is ComTask or (type(task) in (FrameTask, RelativeFrameTask) and not task.coupled)
+
+
+class _Arrays:
+    """The arrays in which the numbers of a step are handed to the core, and where each leaf of the arguments is.
+
+    What usually changes from step to step (configuration, poses and points to reach, dt, warm start) is an array by
+    itself. All else is side by side in one array of what lanes share and one of what is their own: usually constants,
+    which are then made once, where each would cost an operation in every step.
+
+    Attributes:
+        arrays: with a leading axis, of the lanes or of length 1.
+        lanes: their number.
+    """
+
+    def __init__(self, given: tuple[Any, ...]) -> None:
+        paths, self.tree = jax.tree_util.tree_flatten_with_path(given)
+        leaves = [leaf for _, leaf in paths]
+        self.lanes = lanes_of(leaves)
+        groups: dict[Any, list[int]] = {False: [], True: []}
+        for i, (path, leaf) in enumerate(paths):
+            alone = _is_moving(given, path) or not jnp.issubdtype(leaf.dtype, jnp.floating)
+            groups.setdefault(i + 2 if alone else len(leaf) > 1, []).append(i)
+        # integers come last: the core counts the arrays of numbers alone
+        members = sorted(filter(None, groups.values()), key=lambda of: jnp.issubdtype(leaves[of[0]].dtype, jnp.integer))
+        self.places, self.arrays, self.shapes = {}, [], [leaf.shape[1:] for leaf in leaves]
+        for own in members:
+            sizes = [leaves[i][0].size for i in own]
+            for i, size, end in zip(own, sizes, np.cumsum(sizes), strict=True):
+                self.places[i] = len(self.arrays), int(end) - size, size
+            self.arrays.append(leaves[own[0]] if len(own) == 1 else side_by_side(*(leaves[i] for i in own)))
+
+    def leaves(self, arrays: Sequence[Array]) -> tuple[Any, ...]:
+        """Return the arguments again, from the arrays of all lanes or of some."""
+        found = []
+        for i, shape in enumerate(self.shapes):
+            array, start, size = self.places[i]
+            lanes = len(arrays[array])
+            found.append(arrays[array].reshape(lanes, -1)[:, start : start + size].reshape(lanes, *shape))
+        return jax.tree.unflatten(self.tree, found)
+
+    def numbered(self) -> tuple[Any, ...]:
+        """Return the arguments with the number of each leaf in its place."""
+        return jax.tree.unflatten(self.tree, range(len(self.shapes)))
+
+
+def _is_moving(given: tuple[Any, ...], path: tuple[Any, ...]) -> bool:
+    """Return whether an array usually changes from step to step, from its path among the arguments ``(robot, ...)``."""
+    if path[0].idx != 2:
+        return path[0].idx in (1, 5)
+    of_task = any(isinstance(key, jax.tree_util.GetAttrKey) and key.name == "target" for key in path)
+    return of_task and not isinstance(given[2][path[1].key], PostureTask)
+
+
+class _Layout:
+    """Sizes and indices of a step's rows, in the order of the core's ``StepSizes``.
+
+    Attributes:
+        labels: shapes of the warm start's arrays.
+        rows: of all tasks.
+    """
+
+    def __init__(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme) -> None:
+        self.robot, self.tasks, self.scheme = robot, tasks, scheme
+        nv, by_weight = robot.nv, isinstance(scheme, WeightedQP)
+        self.parts = {name: _rows_of(robot, task) for name, task in tasks.items()}
+        self.count = count = {name: rows for name, (_, rows, _) in self.parts.items()}
+        self.rows = sum(count.values())
+        self.bounded = bounded = {name: task.lower is not None or _polygon(task) for name, task in tasks.items()}
+        self.single = single = {
+            name: by_weight and isinstance(task, PostureTask) and not bounded[name] for name, task in tasks.items()
+        }
+        ranks = sorted({task.priority for task in tasks.values()})
+        self.level = level = {name: ranks.index(task.priority) for name, task in tasks.items()}
+        self.of_level = [sum(count[name] for name in tasks if level[name] == k) for k in range(len(ranks))] + [0]
+        mixed = {level[name] for name in tasks if bounded[name]}
+        self.hard = [(k, row) for k in sorted(mixed) for row in range(self.of_level[k])]
+        intervals, dense = (
+            sum(count[name] for name in tasks if bounded[name] == flag and not single[name]) for flag in (True, False)
+        )
+        levels, longest, h = len(self.of_level), max(self.of_level), nv + len(self.hard)
+        if by_weight:
+            self.labels, self.sizes = [(nv + intervals,)], (dense, intervals, 0, 0, 20 * (nv + intervals))
+        else:
+            self.labels, self.sizes = [(levels, h), (levels, longest)], (longest, 0, levels, h, 10 * (nv + longest))
+
+    def integers(self, places: Mapping[int, tuple[int, int, int]], given: tuple[Any, ...], box: int) -> np.ndarray:
+        """Return what ``Step`` in ``core/step.hpp`` reads.
+
+        Args:
+            places: of the leaves: array, offset and size.
+            given: the arguments of the step with the numbers of leaves in their place.
+            box: number of the leaf with the lower bounds of the box, before that of the upper ones; -1: by the limits.
+        """
+        robot, q, tasks, scheme, limits, dt, _ = given
+        tree, nv, by_weight = self.robot.tree, self.robot.nv, isinstance(scheme, WeightedQP)
+        of_limits = [] if box >= 0 else [_leaves_of_limit(limit) for limit in limits if type(limit) is not NoLimits]
+        *sizes, limit = self.sizes
+        limit = limit if scheme.max_iterations is None else scheme.max_iterations
+        bodies, joints, full = len(tree.body_names), len(tree.joint_types), len(tree.dof_joint)
+        nq, *of_tree = tree_integers(tree)
+        scalar, place = scalar_layout(self.robot)
+        numbers = [not by_weight, len(places), nq, self.robot.nq, bodies, joints, full, nv, len(tasks)]
+        numbers += [len(of_limits), self.rows, *sizes, limit]
+        numbers += [number for leaf in sorted(places) for number in places[leaf]]
+        numbers += [q, dt, scheme.damping, scheme.curvature_damping, box, box + 1]
+        numbers += [robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion]
+        numbers += [robot.joint_position, robot.joint_axis, robot.body_mass, robot.body_com]
+        numbers += [robot.frame_position, robot.frame_rotation]
+        numbers += [number for own in sorted(of_limits) for number in own]
+        numbers += [*of_tree, *dof_columns(tree)[0], *tree.dof_body, *tree.turning, *np.where(scalar, place, -1)]
+        if not by_weight:
+            numbers += [*self.of_level, *([-1] * nv), *(k for k, _ in self.hard), *(row for _, row in self.hard)]
+        first = _offsets(
+            self.count,
+            sorted(tasks, key=lambda name: 2 * self.single[name] + self.bounded[name] if by_weight else 0),
+        )
+        out = _offsets(self.count, sorted(tasks))
+        for name, (kind, rows, options) in self.parts.items():
+            numbers += [kind, rows, first[name], out[name], self.level[name], self.bounded[name], self.single[name]]
+            numbers += [len(options), *_leaves_of_task(tasks[name]), *options]
+        return np.array(numbers, np.int32)
+
+    def constants(self, dtype: Any) -> np.ndarray:
+        """Return what ``StepData`` has under this name."""
+        tree = self.robot.tree
+        if isinstance(self.scheme, WeightedQP):
+            tolerances = [FEASIBILITY, KKT_TOLERANCE[dtype]]
+        else:
+            tolerances = list(Tolerances(rank=HIERARCHY_RANK[dtype]))
+        return np.concatenate([tree.qpos_source[1], dof_columns(tree)[1], tolerances])
+
+
+def _leaves_of_limit(limit: Any) -> list[Any]:
+    if isinstance(limit, ConfigurationLimit):
+        return [1, limit.lower, limit.upper, limit.gain, limit.return_speed]
+    return [0, *[limit.velocity] * 4]
+
+
+def _leaves_of_task(task: Any) -> list[Any]:
+    """Return the leaves of a task in the order of ``Step::add_task``, -1 for none."""
+    lower, upper, own = task.lower, task.upper, task.target
+    if _polygon(task):
+        upper, own = task.polygon.offsets, task.polygon.normals
+    own = own if isinstance(own, tuple) else (own, None)
+    weights = [task.position_weight, task.orientation_weight] if isinstance(task, FrameTask | RelativeFrameTask) else []
+    leaves = [task.gain, task.weight, task.target_velocity, lower, upper, *own, *weights, None, None]
+    return [-1 if leaf is None else leaf for leaf in leaves[:9]]
+
+
+def _offsets(count: Mapping[str, int], order: Sequence[str]) -> dict[str, int]:
+    """Return where the rows of each task begin, if the tasks stand in this order."""
+    ends = np.cumsum([0, *(count[name] for name in order)])
+    return dict(zip(order, ends.tolist(), strict=False))
+
+
+def _polygon(task: Task) -> bool:
+    return isinstance(task, ComTask) and task.polygon is not None
+
+
+def _rows_of(robot: Robot, task: Any) -> tuple[int, int, list[int]]:
+    """Return the kind of a task, its number of rows, and its indices and flags."""
+    tree = robot.tree
+    if isinstance(task, PostureTask):
+        places, dofs = [tree.qpos_address[joint] for joint in task.joints], dofs_of(robot, task.joints)
+        return _POSTURE, len(dofs), [*places, *dofs]
+    if isinstance(task, ComTask):
+        rows = task.polygon.offsets.shape[-1] if task.polygon is not None else len(task.axes)
+        axes = [0] * rows if _polygon(task) else axis_numbers(task.axes).tolist()
+        below = tree.is_own if task.subtree is None else tree.descendants[tree.frame_bodies[tree.frame(task.subtree)]]
+        counts = np.asarray(below) | (task.subtree is None and bool(np.asarray(tree.is_own)[1:].all()))
+        return _CENTER, rows, [_polygon(task), *axes, *counts]
+    options = [task.axes == "frame", task.orientation_jacobian == "geometric", *task.kept, len(task.frames)]
+    for frame in map(tree.frame, task.frames):
+        carrier = tree.frame_bodies[frame]
+        options += [frame, carrier, *tree.moves[carrier]]
+    return _POSE, sum(task.kept), options
+
+
+def compiled(plain: Step) -> Step:
+    """Return the step by the compiled core: of those arguments that ``is_compiled`` accepts.
+
+    Args:
+        plain: the definition, which has the derivative too and solves what is not certified.
+    """
+    lanes = in_shared_lanes(partial(_steps, plain))
+
+    @custom_jvp
+    def computed(*given: Any) -> Solution:
+        return lanes(*given)
+
+    @computed.defjvp
+    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        return jax.jvp(plain, primals, tangents)
+
+    return computed
+
+
+def _steps(plain: Step, *given: Any) -> Solution:
+    """Return the steps of all lanes; every array has a leading axis, of the lanes or of length 1."""
+    one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), given)
+    like, wide, packed = jax.eval_shape(plain, *one), over_lanes(plain), _Arrays(given)
+
+    def search(*arrays: Array) -> tuple[Array, Array]:
+        # XLA would take the leaves apart before the branch, and make each one anew in every step, searched or not
+        return _packed(wide(*packed.leaves(jax.lax.optimization_barrier(arrays))))
+
+    def search_rest(state: tuple[Array, Array, Array], *arrays: Array) -> tuple[Array, Array]:
+        *found, done = state
+
+        def again(at: Array, _: Any) -> tuple[Array, Array]:
+            return search(*(a[at] if len(a) == len(done) > 1 else a for a in arrays))
+
+        return with_the_rest(tuple(found), done != 0, again, BLOCK)
+
+    def by_core(*arrays: Array) -> tuple[Array, Array, Array]:
+        return _by_core(packed, *arrays)
+
+    return _unpacked(like, *certified_or_searched({"core": Candidates(by_core, search_rest)}, search, *packed.arrays))
+
+
+def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array, Array]:
+    """Return all numbers and all integers of the solutions, as ``_packed`` has them, and which are certified."""
+    robot, q, tasks, scheme, limits, dt, warm_start = packed.leaves(arrays)
+    layout, numbered, places = _Layout(robot, tasks, scheme), packed.numbered(), dict(packed.places)
+    guesses, box = jax.tree.leaves(warm_start), -1
+    given = [a for a in arrays if jnp.issubdtype(a.dtype, jnp.floating)]
+    guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
+    if not (q.dtype == jnp.float64 and all(type(limit) in _SIMPLE_LIMITS for limit in limits)):
+        box = len(places)
+        for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):
+            places[len(places)] = len(given), 0, robot.tree.nv
+            given.append(bound)
+    integers = layout.integers(places, numbered, box)
+    labels = sum(int(np.prod(shape)) for shape in layout.labels)
+    shapes = ((packed.lanes, robot.tree.nv + 2 + 2 * layout.rows), float), ((packed.lanes, 3 + labels), int)
+    constants = layout.constants(q.dtype)
+    numbers, integers, done = _library.call(
+        "step", (*shapes, ((packed.lanes,), int)), integers, *guesses, *given, constants
+    )
+    return numbers, integers, done
+
+
+def _packed(solutions: Solution) -> tuple[Float[Array, "lanes k"], Array]:
+    """Return all numbers and all integers of each lane's solution as two arrays."""
+    leaves = [a.reshape(len(a), -1) for a in jax.tree.leaves(solutions)]
+    numbers, integers = ([a for a in leaves if jnp.issubdtype(a.dtype, jnp.floating) == kind] for kind in (True, False))
+    return jnp.concatenate(numbers, 1), jnp.concatenate([a.astype(jnp.int32) for a in integers], 1)
+
+
+def _unpacked(like: Solution, numbers: Float[Array, "lanes k"], integers: Array) -> Solution:
+    """Return the solutions of all lanes, from what ``_packed`` returns; ``like`` has the shapes of one."""
+    leaves, tree = jax.tree.flatten(like)
+    at, found = {True: 0, False: 0}, []
+    for leaf in leaves:
+        kind = jnp.issubdtype(leaf.dtype, jnp.floating)
+        part = (numbers if kind else integers)[:, at[kind] : at[kind] + leaf.size]
+        found.append(part.reshape(-1, *leaf.shape).astype(leaf.dtype))
+        at[kind] += leaf.size
+    return jax.tree.unflatten(tree, found)

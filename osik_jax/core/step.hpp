@@ -1,0 +1,430 @@
+// One control step in one call: what control/_step.py defines, for the tasks that control/_compiled_step.py takes.
+//
+//   configuration -> bodies -> rows of all tasks -> damping -> weighted QP or hierarchy -> certificate -> velocity
+//
+// The rows of task k are rows first .. first + m of the matrix of all rows. The weighted scheme has the equalities of
+// frames and of the centre of mass first (`dense` rows), then the inequalities (`intervals`), then the equalities of
+// single dofs, which are terms of its diagonal. A step whose answer is not certified is left to plain JAX.
+#pragma once
+#include <vector>
+
+#include "certificates.hpp"
+#include "task_rows.hpp"
+
+namespace osik {
+
+enum StepScheme { WEIGHTED = 0, HIERARCHICAL = 1 };
+enum StepTask { POSE = 0, CENTER = 1, POSTURE = 2 };
+enum StepLimit { SPEED = 0, RANGE = 1 };  // in the order in which they narrow the box
+
+// Sizes of a step; m, p, L and h are those of QPSizes and Sizes.
+struct StepSizes {
+  int scheme, leaves, nq, given, bodies, joints, dofs, nv, tasks, limits, rows, m, p, L, h, max_iterations;
+};
+
+// An array of numbers of one lane. A scalar is each entry of an array that it stands for.
+struct Leaf {
+  const double* at;
+  int size;
+  double operator[](int i) const { return at[size > 1 ? i : 0]; }
+};
+
+// What is given of one step, and what it returns.
+struct StepData {
+  const double* constants;        // factors of the configuration [nq] and of the dofs [dofs], then the tolerances
+  const double* const* arrays;    // of this lane; a leaf of the layout is in one of them
+  const int *guess, *guess_own;   // labels of the warm start, those of a hierarchy's levels beside them; null for none
+};
+struct StepResult {
+  double* numbers;  // velocity [nv], residual, violation of the box, slacks and errors of all rows
+  int* integers;    // status, iterations, factorizations, labels for the next warm start
+  int* done;        // whether the answer is certified
+};
+
+// The Euclidean norm, whose squares neither overflow nor underflow.
+inline double safe_norm(const double* v, int count) {
+  double size = 0, squares = 0;
+  for (int i = 0; i < count; ++i) size = larger(size, fabs(v[i]));
+  if (!(size > 0 && size < INFINITE)) size = 1;
+  for (int i = 0; i < count; ++i) squares += square(v[i] / size);
+  return size * sqrt(squares);
+}
+
+class Step {
+  using Team = Serial<double>;
+  using Numbers = std::vector<double>;
+  struct Task {
+    int kind, m, first, out, level, bounded, diagonal;  // out: of its slack and error; diagonal: equality of single dofs
+    const int *leaves, *options;                        // gain, weight, target velocity, bounds, then those of its kind
+    Rows<double> rows;
+    double* weight;
+  };
+  struct Place {  // of a leaf
+    int array, offset, size;
+  };
+  // the robot's leaves, in the order of the layout
+  enum { OFFSET, REFERENCE, POSITION, QUATERNION, ANCHOR, AXIS, MASS, CENTER_OF_MASS, FRAME_POSITION, FRAME_ROTATION,
+         ROBOT_LEAVES };
+  StepSizes s;
+  std::vector<int> layout;
+  std::vector<Task> tasks;
+  Tree<double> tree;
+  DofColumns<double> columns;
+  const Place* places;
+  const int *of_step, *of_robot;                      // leaves: q, dt, damping, curvature damping, box; those of the robot
+  const int *source, *owner, *turning, *scalar;       // [nq] entry of the given q, [dofs] body, [nv], [nv] place in q or -1
+  const int *limits;                                  // [limits, 5] kind and leaves of each
+  const int *row_counts, *level_of_hard, *row_of_hard;
+  Numbers q, poses, J, error, low, high, weight, pull, levers, curvature, frames, below, bounds, parts, lower, upper, zeros;
+  std::vector<int> no_labels;
+  Placed<double> placed;
+  const double* const* arrays;  // of the step at hand
+  const double* tolerances;
+  double dt, damping, kappa;
+
+ public:
+  Step(const int* given, int count) : layout(given, given + count) {
+    const int* at = layout.data();
+    auto take = [&](int n) { return (at += n) - n; };
+    s = *reinterpret_cast<const StepSizes*>(take(sizeof(StepSizes) / sizeof(int)));
+    const int R = s.rows, nv = s.nv;
+    places = reinterpret_cast<const Place*>(take(3 * s.leaves));
+    of_step = take(6), of_robot = take(ROBOT_LEAVES), limits = take(5 * s.limits);
+    tree.bodies = s.bodies, tree.joints = s.joints, tree.dofs = s.dofs;
+    tree.parents = take(s.bodies), tree.types = take(s.joints), tree.owners = take(s.joints), source = take(s.nq);
+    columns = {s.dofs, nv, take(s.dofs), nullptr};
+    owner = take(s.dofs), turning = take(nv), scalar = take(nv);
+    row_counts = take(s.L), level_of_hard = take(s.h), row_of_hard = take(s.h > nv ? s.h - nv : 0);
+    q.resize(s.nq), poses.resize(12 * s.bodies + 9 * s.dofs), J.resize(R * nv + 8), frames.resize(12 * nv + 24);
+    for (Numbers* v : {&error, &low, &high, &weight, &pull}) v->resize(R + 8);
+    levers.resize(s.tasks * nv), curvature.resize(s.tasks), below.resize(4 * s.bodies), zeros.resize(R + 1);
+    bounds.resize(s.tasks), parts.resize(larger(R + s.tasks, s.bodies) + 8), lower.resize(nv), upper.resize(nv);
+    no_labels.resize(s.L * s.h + s.L * s.m + nv + s.p);
+    double *body = poses.data(), *dof = body + 12 * s.bodies;
+    placed = {body, body + 3 * s.bodies, dof, dof + 3 * s.dofs, dof + 6 * s.dofs};
+    for (int k = 0; k < s.tasks; ++k) {
+      const int *o = take(8), *leaves = take(9);
+      const size_t i = o[2];
+      tasks.push_back({o[0], o[1], o[2], o[3], o[4], o[5], o[6], leaves, take(o[7]),
+                       {&error[i], &J[i * nv], &low[i], &curvature[k], &pull[i], &levers[k * nv], o[5] ? &high[i] : nullptr},
+                       &weight[i]});
+    }
+    begin_solvers();
+  }
+  bool has(const int* given, int count) const {
+    return size_t(count) == layout.size() && std::equal(given, given + count, layout.begin());
+  }
+
+  // valid: whether no number of the arrays is NaN
+  void take(const StepData& d, const StepResult& to, bool valid) {
+    Certificate found{false, 0};
+    for (int j = 0; j < s.nv; ++j) to.numbers[j] = 0;
+    if (valid && find_rows(d)) found = s.scheme == WEIGHTED ? solve_weighted(d, to) : solve_hierarchy(d, to);
+    *to.done = found.holds;
+    report(to, found.residual);
+  }
+
+ private:
+  Leaf leaf(int k) const { return {arrays[places[k].array] + places[k].offset, places[k].size}; }
+  // the entries of a leaf, 0 where there is none
+  const double* leaf_or_zeros(int k) const { return k < 0 ? zeros.data() : leaf(k).at; }
+  static bool all_finite(const double* v, int count) {
+    bool finite = true;
+    for (int i = 0; i < count; ++i) finite &= fabs(v[i]) <= LARGEST_DOUBLE;
+    return finite;
+  }
+
+  // ---- box, kinematics and rows of tasks; returns whether all numbers are valid
+  bool find_rows(const StepData& d) {
+    arrays = d.arrays;
+    auto robot = [&](int k) { return leaf(of_robot[k]).at; };
+    const double *given = leaf(of_step[0]).at, *factor = d.constants, *offset = robot(OFFSET);
+    dt = *leaf(of_step[1]).at, damping = *leaf(of_step[2]).at, kappa = *leaf(of_step[3]).at;
+    tolerances = d.constants + s.nq + s.dofs;
+    if (!(dt > 0 && dt <= LARGEST_DOUBLE && damping >= 0) || !all_finite(given, s.given) || !find_box(given)) return false;
+    for (int i = 0; i < s.nq; ++i) q[i] = factor[i] * given[source[i]] + offset[i];
+    tree.reference = robot(REFERENCE), tree.position = robot(POSITION), tree.quaternion = robot(QUATERNION);
+    tree.joint_position = robot(ANCHOR), tree.joint_axis = robot(AXIS), columns.factor = d.constants + s.nq;
+    place_bodies(tree, q.data(), placed);
+    for (const Task& task : tasks)
+      if (!add_task(task, given)) return false;
+    return true;
+  }
+  // limits/_box.py: of ConfigurationLimit and VelocityLimit, or as it is given
+  bool find_box(const double* given) {
+    const int nv = s.nv;
+    for (int j = 0; j < nv; ++j) lower[j] = of_step[4] < 0 ? -INFINITE : leaf(of_step[4]).at[j];
+    for (int j = 0; j < nv; ++j) upper[j] = of_step[4] < 0 ? INFINITE : leaf(of_step[5]).at[j];
+    for (int k = 0; k < s.limits; ++k) {
+      const int* limit = limits + 5 * k;
+      const bool of_speed = limit[0] == SPEED;
+      const Leaf low = leaf(limit[1]), high = leaf(limit[2]), gain = leaf(limit[3]), speed = leaf(limit[4]);
+      auto reach = [&](double bound, double at, double inward, int j) {  // rounded inward
+        const double way = bound - at;
+        return fabs(bound) < INFINITE ? gain[j] * (way + inward * RANGE_ROUNDOFF * EPSILON * fabs(way)) / dt : bound;
+      };
+      for (int j = 0; j < nv; ++j) {
+        double a = -high[j], b = high[j];
+        if (!of_speed) {
+          const bool is_scalar = scalar[j] >= 0;
+          const double at = is_scalar ? given[scalar[j]] : 0.0;
+          a = reach(is_scalar ? low[j] : -INFINITE, at, 1, j), b = reach(is_scalar ? high[j] : INFINITE, at, -1, j);
+          b = larger(b, -speed[j]), a = a < speed[j] ? a : speed[j], a = a < b ? a : b;
+        }
+        const double first = lower[j];
+        lower[j] = clip(a, first, upper[j]), upper[j] = clip(b, first, upper[j]);
+      }
+    }
+    bool valid = true;
+    for (int j = 0; j < nv; ++j) valid &= lower[j] <= upper[j];
+    return valid;
+  }
+  // leaves of a task: gain, weight, target velocity (or none), bounds (or none), then those of its kind
+  bool add_task(const Task& task, const double* given) {
+    const int m = task.m, nv = s.nv, *options = task.options, *leaves = task.leaves;
+    const double own_gain = *leaf(leaves[0]).at, gain = own_gain > 1 / dt ? 1 / dt : own_gain;
+    const Leaf weights = leaf(leaves[1]);
+    const double* velocity = leaf_or_zeros(leaves[2]);
+    Bounds<double> interval;
+    bool valid = fabs(own_gain) <= LARGEST_DOUBLE;
+    if (task.bounded) {
+      for (int i = 0; i < m; ++i) high[task.first + i] = -INFINITE;  // a polygon has upper bounds alone
+      interval = {leaves[3] < 0 ? &high[task.first] : leaf(leaves[3]).at, leaf(leaves[4]).at};
+      for (int i = 0; i < m; ++i) {
+        const double a = interval.lower[i], b = interval.upper[i];
+        valid &= a <= b && a < INFINITE && b > -INFINITE;
+      }
+    }
+    if (task.kind == POSE) {
+      const double *position = leaf(leaves[5]).at, *rotation = leaf(leaves[6]).at;
+      const int count = options[8];
+      PoseGoal<double> goal{position, rotation, velocity, task.weight, &gain, options + 2, options[0] != 0, options[1] != 0};
+      for (int i = 0, row = 0; i < 6; ++i)
+        if (goal.kept[i]) task.weight[row] = weights[row] * leaf(leaves[7 + i / 3])[i % 3], ++row;
+      valid &= all_finite(position, 3) && all_finite(rotation, 9) && all_finite(velocity, 6);
+      goal.bounds = interval;
+      double *at = frames.data(), *turn = at + 6, *jacobian = at + 24;
+      for (int f = 0; f < count; ++f) {
+        const int* frame = options + 9 + f * (2 + s.dofs);  // number, carrier, whether each dof moves it
+        move_frame(columns, placed, frame[1], leaf(of_robot[FRAME_POSITION]).at + 3 * frame[0],
+                   leaf(of_robot[FRAME_ROTATION]).at + 9 * frame[0], frame + 2, at + 3 * f, turn + 9 * f,
+                   jacobian + 6 * nv * f);
+      }
+      if (count == 2) see_from_root(at, turn, jacobian);
+      if (valid) pose_rows(Team(), goal, at, turn, jacobian, nv, task.rows);
+    } else if (task.kind == CENTER) {  // options: whether there is a polygon, axes, whether each body counts
+      CenterGoal<double> goal{m, options + 1, turning, nullptr, velocity, task.weight, &gain};
+      for (int i = 0; i < m; ++i) task.weight[i] = weights[i];
+      if (options[0]) goal.normals = leaf(leaves[5]).at, valid &= all_finite(goal.normals, 2 * m);
+      else if (!task.bounded) goal.target = leaf(leaves[5]).at, valid &= all_finite(goal.target, m);
+      valid &= all_finite(velocity, m);
+      goal.bounds = interval;
+      const double* own = leaf(of_robot[MASS]).at;
+      for (int b = 0; b < s.bodies; ++b) parts[b] = options[1 + m + b] ? own[b] : 0.0;
+      move_center(columns, placed, s.bodies, tree.parents, owner, parts.data(), leaf(of_robot[CENTER_OF_MASS]).at,
+                  below.data(), frames.data(), frames.data() + 3);
+      if (valid) center_rows(Team(), goal, frames.data(), frames.data() + 3, nv, task.rows);
+    } else {  // options: place in q and dof of each row
+      const double* target = task.bounded ? nullptr : leaf(leaves[5]).at;
+      if (target) valid &= all_finite(target, s.given);
+      valid &= all_finite(velocity, m);
+      *task.rows.curvature = 0;
+      for (int j = 0; j < nv; ++j) task.rows.levers[j] = 0;
+      for (int i = 0; i < m; ++i) {
+        const double value = given[options[i]] - (target ? target[options[i]] : 0.0);
+        task.weight[i] = weights[i];
+        ask(task.rows, interval, i, value, velocity[i], gain);
+        if (task.diagonal) continue;
+        for (int j = 0; j < nv; ++j) task.rows.jacobian[i * nv + j] = j == options[m + i];
+      }
+    }
+    for (int i = 0; i < m; ++i) valid &= task.weight[i] >= 0 && task.weight[i] <= LARGEST_DOUBLE;
+    return valid;
+  }
+  // the first frame's pose and Jacobian in the axes of the second (tasks/_relative_frame.py)
+  void see_from_root(double* position, double* rotation, double* jacobian) {
+    using V = Vec3<double>;
+    const Mat3<double> turn = Mat3<double>::of(rotation + 9).transposed();
+    const V apart = V::of(position) - V::of(position + 3);
+    double* to = jacobian;
+    for (const double *root = jacobian + 6 * s.nv; to < jacobian + s.nv; ++to, ++root) {
+      auto entry = [&](const double* from, int i) { return V{from[i * s.nv], from[(i + 1) * s.nv], from[(i + 2) * s.nv]}; };
+      const V angular = entry(root, 3), linear = turn * (entry(to, 0) - entry(root, 0) + cross(apart, angular));
+      const V axis = turn * (entry(to, 3) - angular);
+      int i = 0;
+      for (double value : {linear.x, linear.y, linear.z, axis.x, axis.y, axis.z}) to[i++ * s.nv] = value;
+    }
+    (turn * apart).put(position), (turn * Mat3<double>::of(rotation)).put(rotation);
+  }
+
+  // ---- damping of some tasks (schemes/_scheme.py)
+  template <class Chosen> double curvature_of(Chosen chosen) {
+    int count = 0;
+    for (int k = 0; k < s.tasks; ++k)
+      if (chosen(tasks[k])) bounds[count++] = dt * curvature[k];
+    return safe_norm(bounds.data(), count);
+  }
+  // the part of the curvature that the tasks' own rows do not resist: fraction_to_damp in tasks/_curvature.py
+  template <class Chosen> double curvature_damping(Chosen chosen) {
+    int count = 0;
+    for (int k = 0; k < s.tasks; ++k) {
+      const Task& task = tasks[k];
+      if (!chosen(task) || (task.kind == POSTURE && !task.bounded)) continue;
+      const double bound = dt * curvature[k];
+      double distance = 0, stiffness = 0;
+      for (int i = 0; i < task.m && !task.bounded; ++i) {
+        const double *row = task.rows.jacobian + i * s.nv, divisor = curvature[k] > 0 ? curvature[k] : 1;
+        distance += task.rows.error[i] * (task.weight[i] * (task.rows.pull[i] / divisor));
+        stiffness += task.weight[i] * Team::own_dot(row, row, 0, s.nv);
+      }
+      const double far = square(clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR)), total = 0.5 * bound + stiffness;
+      bounds[count++] = bound * (1 - (1 - UNHELD_PART) * (far / (1 + far)) * (stiffness / (total > 0 ? total : 1)));
+    }
+    return safe_norm(bounds.data(), count);
+  }
+
+  // ---- the weighted scheme (schemes/_weighted.py)
+  Numbers solver_space, qp_bounds, diagonal, center, compliance, multipliers;
+  std::vector<WeightedQP<Team>> qp;
+  std::vector<QPCertificate> certificate;
+
+  Certificate solve_weighted(const StepData& d, const StepResult& to) {
+    const int n = s.nv, N = n + s.p;
+    const double bound = kappa * curvature_of([](const Task&) { return true; });
+    const double rest = kappa * curvature_damping([](const Task&) { return true; });
+    for (int j = 0; j < n; ++j) diagonal[j] = damping, center[j] = 0, qp_bounds[j] = lower[j], qp_bounds[N + j] = upper[j];
+    for (const Task& task : tasks)
+      for (int i = 0; i < task.m && task.diagonal; ++i) {
+        const int dof = task.options[task.m + i];
+        diagonal[dof] += task.weight[i], center[dof] += task.weight[i] * task.rows.lower[i];
+      }
+    for (int j = 0; j < n; ++j) {
+      const double total = bound + DIAGONAL_RATIO * diagonal[j];
+      diagonal[j] += rest * (bound / (total > 0 ? total : 1));
+      center[j] /= diagonal[j] > 0 ? diagonal[j] : 1;
+    }
+    for (int i = 0; i < s.p; ++i) {  // a row of weight 0 has no bounds
+      const double own = weight[s.m + i];
+      compliance[i] = 1 / (own > 0 ? own : 1);
+      qp_bounds[n + i] = own > 0 ? low[s.m + i] : -INFINITE, qp_bounds[N + n + i] = own > 0 ? high[s.m + i] : INFINITE;
+    }
+    const QPData<double> data{J.data(),          low.data(),         weight.data(),    diagonal.data(),
+                              center.data(),     J.data() + s.m * n, compliance.data(), qp_bounds.data(),
+                              qp_bounds.data() + N, d.guess ? d.guess : no_labels.data(), tolerances[0]};
+    int report[3], *active = to.integers + 3;
+    qp[0].solve(data, {to.numbers, multipliers.data(), active, report});
+    to.integers[0] = 0, to.integers[1] = report[1], to.integers[2] = report[2];
+    if (!report[0] || report[1] > s.max_iterations) return {false, 0};
+    const Certificate found = certificate[0].judge(data, to.numbers, multipliers.data(), active, tolerances[1]);
+    for (int j = 0; j < n; ++j) to.numbers[j] = clip(to.numbers[j], lower[j], upper[j]);
+    return found;
+  }
+
+  // ---- the hierarchy (schemes/_hierarchical.py)
+  Numbers level_rows, level_lower, level_upper, hard, hard_lower, hard_upper, dampings, bends, found_numbers;
+  std::vector<int> equality, pinned, found_labels;
+  std::vector<char> hierarchy_space;
+  std::vector<Hierarchy<Team>> hierarchy;
+
+  Sizes sizes() const { return {s.L, s.m, s.nv, s.h, s.max_iterations, row_counts, level_of_hard, row_of_hard}; }
+  // the rows of all levels, their weights' roots multiplied in, and the hard ones among them
+  void add_levels() {
+    const int n = s.nv;
+    std::vector<int>& end = found_labels;  // rows of each level so far
+    for (int k = 0; k < s.L; ++k) end[k] = 0;
+    for (int j = 0; j < n; ++j) hard_lower[j] = lower[j], hard_upper[j] = upper[j], pinned[j] = lower[j] >= upper[j];
+    for (const Task& task : tasks)
+      for (int i = 0; i < task.m; ++i) {
+        const int row = task.level * s.m + end[task.level]++;
+        const double own = task.weight[i], root = sqrt(own), a = task.rows.lower[i], b = task.bounded ? task.rows.upper[i] : a;
+        for (int j = 0; j < n; ++j) level_rows[row * n + j] = root * task.rows.jacobian[i * n + j];
+        equality[row] = !task.bounded || (a >= b && own > 0);
+        if (own > 0) level_lower[row] = fabs(a) < INFINITE ? root * a : a, level_upper[row] = fabs(b) < INFINITE ? root * b : b;
+        else level_lower[row] = task.bounded ? -INFINITE : 0, level_upper[row] = task.bounded ? INFINITE : 0;
+      }
+    for (int i = n; i < s.h; ++i) {
+      const int row = level_of_hard[i] * s.m + row_of_hard[i - n];
+      for (int j = 0; j < n; ++j) hard[(i - n) * n + j] = level_rows[row * n + j];
+      hard_lower[i] = level_lower[row], hard_upper[i] = level_upper[row], pinned[i] = equality[row];
+    }
+  }
+  // the damping of each level: dampings in schemes/_scheme.py
+  void add_dampings() {
+    const int n = s.nv;
+    for (int level = 0; level + 1 < s.L; ++level) {
+      auto chosen = [&](const Task& task) { return task.level == level; };
+      const double factor = (level ? BELOW_OTHERS : 1.0) * kappa;
+      double *farthest = center.data(), *own = &bends[level * n], largest = 0, sum = 0;
+      int count = 0, before = 0;
+      for (int j = 0; j < n; ++j) farthest[j] = 0;
+      for (int k = 0; k < s.tasks; ++k)
+        if (chosen(tasks[k])) {
+          for (int i = 0; i < tasks[k].m; ++i) parts[count++] = sqrt(tasks[k].weight[i]) * tasks[k].rows.pull[i];
+          for (int j = 0; j < n; ++j) farthest[j] = turning[j] ? larger(farthest[j], levers[k * n + j]) : 0.0;
+        }
+      dampings[3 * level] = damping, dampings[3 * level + 1] = factor * curvature_damping(chosen);
+      dampings[3 * level + 2] = safe_norm(parts.data(), count);
+      for (int j = 0; j < n; ++j) largest = larger(largest, farthest[j]);
+      for (int j = 0; j < n; ++j) {  // row_sums in tasks/_curvature.py: the lever of the one farther from the root
+        const bool moves = farthest[j] > LEVER_ROUNDOFF * largest;
+        farthest[j] = moves ? farthest[j] : 0.0, own[j] = farthest[j] * before, before += moves;
+      }
+      for (int j = n - 1; j >= 0; --j) {
+        sum += farthest[j], own[j] += farthest[j] > 0 ? sum : 0.0;
+        own[j] = scalar[j] >= 0 ? factor * (dt * own[j]) : 0.0;
+      }
+    }
+  }
+  Certificate solve_hierarchy(const StepData& d, const StepResult& to) {
+    const int n = s.nv, L = s.L, h = s.h, m = s.m;
+    add_levels();
+    add_dampings();
+    const Problem p{level_rows.data(), level_lower.data(), level_upper.data(), hard.data(),     hard_lower.data(),
+                    hard_upper.data(), dampings.data(),    bends.data(),       tolerances,  equality.data(),
+                    pinned.data(),     d.guess ? d.guess : no_labels.data(), d.guess ? d.guess_own : no_labels.data(),    n, 1, false};
+    double* f = found_numbers.data();
+    int *i = found_labels.data(), *active = to.integers + 3, report[3];
+    const Answer a{to.numbers, f, f + L * h, f + L * h + L, f + L * h + 2 * L, i, active, i + n, i + n + L * h,
+                   active + L * h, i + n + L * h + L * m, report};
+    hierarchy[0].solve(p, a);
+    to.integers[0] = 0, to.integers[1] = report[1], to.integers[2] = report[2];
+    const Certificate found = judge(sizes(), p, a);
+    for (int j = 0; j < n; ++j)
+      if (a.active_bounds[j]) to.numbers[j] = a.active_bounds[j] < 0 ? lower[j] : upper[j];
+    return found;
+  }
+
+  void begin_solvers() {
+    const int n = s.nv, L = s.L, h = s.h, m = s.m;
+    center.resize(n + 8);
+    if (s.scheme == WEIGHTED) {
+      const QPSizes of{m, n, s.p, s.max_iterations};
+      solver_space.resize(WeightedQP<Team>::bytes(of) / sizeof(double));
+      qp_bounds.resize(2 * (n + s.p)), diagonal.resize(n + 8), compliance.resize(s.p), multipliers.resize(s.p);
+      qp.emplace_back(of, reinterpret_cast<char*>(solver_space.data()));
+      certificate.emplace_back(of);
+      return;
+    }
+    level_rows.resize(L * m * n + 8), level_lower.assign(L * m, -INFINITE), level_upper.assign(L * m, INFINITE);
+    hard.resize((h - n) * n + 8), hard_lower.resize(h), hard_upper.resize(h), equality.resize(L * m), pinned.resize(h);
+    dampings.resize(3 * L), bends.resize(L * n), found_numbers.resize(L * h + 2 * L + 1);
+    found_labels.resize(n + L * h + L * m + L), hierarchy_space.resize(Hierarchy<Team>::bytes(sizes()));
+    dampings[3 * L - 3] = 1;  // the last level has no rows: the smallest velocity
+    hierarchy.emplace_back(sizes(), hierarchy_space.data());
+  }
+
+  // slack and error of each row, in the order of the tasks' names
+  void report(const StepResult& to, double residual) {
+    const int n = s.nv;
+    double *v = to.numbers, *slack = v + n + 2, *errors = slack + s.rows;
+    v[n] = residual, v[n + 1] = 0;
+    for (const Task& task : tasks)
+      for (int i = 0; i < task.m; ++i) {
+        const double a = task.rows.lower[i], b = task.bounded ? task.rows.upper[i] : a;
+        const double value = task.kind == POSTURE ? v[task.options[task.m + i]]
+                                                  : Team::own_dot(task.rows.jacobian + i * n, v, 0, n);
+        slack[task.out + i] = value - clip(value, a, b), errors[task.out + i] = task.rows.error[i];
+      }
+  }
+};
+}  // namespace osik

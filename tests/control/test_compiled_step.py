@@ -1,0 +1,360 @@
+"""A control step in one call of the core: beside plain JAX, its derivatives, certificates and what it leaves to it."""
+
+import re
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from core_checks import needs_core
+
+import osik_jax as osik
+from osik_jax.control import _compiled_step, _step
+from osik_jax.control._checks import checked_limits
+from osik_jax.core import _library
+from osik_jax.limits import with_own_limits
+from osik_jax.solvers.qp import _dispatch
+from osik_jax.solvers.qp._cost import LeastSquares
+from osik_jax.solvers.qp._problem import QP, pack
+from osik_jax.solvers.qp._search import initial_result
+
+pytestmark = needs_core
+DT, LANES = 0.005, 6
+UR5_LIKE = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <default><joint range="-3 3"/><geom size="0.05" mass="2"/></default>
+  <worldbody>
+    <body pos="0 0 0.09"><joint name="pan" axis="0 0 1"/><geom/>
+      <body pos="0 0.14 0"><joint name="lift" axis="0 1 0"/><geom/>
+        <body pos="0 -0.12 0.43"><joint name="elbow" axis="0 1 0"/><geom/>
+          <body pos="0 0 0.39"><joint name="wrist1" axis="0 1 0"/><geom/>
+            <body pos="0 0.09 0"><joint name="wrist2" axis="0 0 1"/><geom/>
+              <body name="tool" pos="0 0 0.09"><joint name="wrist3" axis="0 1 0"/><geom/></body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def robot_of(name: str) -> osik.Robot:
+    if name == "ur5":
+        return osik.Robot.from_mjcf(UR5_LIKE)
+    if name == "g1":
+        pytest.importorskip("example_robot_data")
+    return osik.load_robot(name)
+
+
+def frames_of(robot: osik.Robot) -> list[str]:
+    """Two frames at the ends of the tree."""
+    parents = set(np.asarray(robot.tree.body_parents).tolist())
+    ends = [name for body, name in enumerate(robot.tree.body_names) if body not in parents]
+    return [ends[-1], robot.tree.body_names[2]]
+
+
+def center_of(robot: osik.Robot) -> Any:
+    return osik.center_of_mass(robot, osik.forward_kinematics(robot, robot.q0))
+
+
+def mixed(robot: osik.Robot) -> dict[str, osik.Task]:
+    """Equalities of every supported kind, at three priorities."""
+    hand, root = frames_of(robot)
+    near = robot.joint_names[-1:]
+    return {
+        "hand": osik.FrameTask(robot, hand, rows=(1, 1, 0, 0, 1, 1), axes="frame", target_velocity=0.1 * np.ones(6)),
+        "turn": osik.FrameTask(robot, hand, rows="orientation", orientation_jacobian="geometric", priority=2),
+        "between": osik.RelativeFrameTask(robot, hand, root, position_weight=(1.0, 0.0, 2.0), gain=500.0, priority=2),
+        "com": osik.ComTask(robot, axes="yx", weight=(3.0, 4.0), priority=2),
+        "own": osik.PostureTask(robot, joints=near, weight=0.5, target_velocity=0.2, priority=2),
+        "all": osik.PostureTask(robot, weight=1e-2, priority=3),
+    }
+
+
+def bounded(robot: osik.Robot) -> dict[str, osik.Task]:
+    """Inequalities of every supported kind beside equalities."""
+    hand, root = frames_of(robot)
+    normals = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    offsets = normals @ center_of(robot)[:2] + 0.02
+    corners = jnp.zeros((4, 2))  # which no rows depend on
+    weight = np.array([1.0, 2.0, 0.0, 1.0])
+    polygon = osik.SupportPolygon(normals, offsets, corners)
+    return {
+        "com": osik.ComTask(robot, polygon=polygon, weight=weight, priority=1),
+        "height": osik.ComTask(robot, axes="z", lower=-0.1, upper=0.1, priority=2),
+        "box": osik.FrameTask(robot, root, rows="position", lower=(-0.01, -np.inf, -0.02), upper=0.01, priority=1),
+        "range": osik.PostureTask(robot, joints=robot.joint_names[-2:], lower=-0.05, upper=np.inf, priority=2),
+        "hand": osik.FrameTask(robot, hand, rows="position", priority=2),
+        "all": osik.PostureTask(robot, weight=1e-3, gain=1.0, priority=3),
+    }
+
+
+def standing(robot: osik.Robot) -> dict[str, osik.Task]:
+    hand, root = frames_of(robot)
+    return {"foot": osik.FrameTask(robot, root), "hand": osik.FrameTask(robot, hand, priority=2, weight=0.1)} | {
+        "posture": osik.PostureTask(robot, priority=3)
+    }
+
+
+SETS = {"mixed": mixed, "bounded": bounded, "standing": standing}
+SCHEMES = {"weighted": osik.WeightedQP, "hierarchy": osik.HierarchicalQP}
+
+
+def lanes_of(robot: osik.Robot, spread: float = 0.2, seed: int = 0) -> Any:
+    noise = np.random.default_rng(seed).normal(size=(LANES, robot.nv))
+    return jax.vmap(lambda v: osik.integrate(robot, robot.q0, v, spread))(jnp.asarray(noise, robot.q0.dtype))
+
+
+def arguments(robot: osik.Robot, tasks: dict[str, osik.Task], scheme: osik.Scheme) -> tuple[Any, ...]:
+    return tasks, scheme, with_own_limits(robot, None), jnp.asarray(DT, robot.q0.dtype), None
+
+
+def by_core(robot: osik.Robot, q: Any, *rest: Any) -> tuple[osik.Solution, np.ndarray]:
+    """The core's own answers for lanes of q, and which are certified."""
+    like = jax.eval_shape(lambda q: _step._plain_step(robot, q, *rest), q[0])
+    first, *others = jax.tree.map(lambda a: jnp.asarray(a)[None], (robot, *rest))
+    packed = _compiled_step._Arrays((first, q, *others))
+    numbers, integers, done = _compiled_step._by_core(packed, *packed.arrays)
+    return _compiled_step._unpacked(like, numbers, integers), np.asarray(done)
+
+
+def plain(robot: osik.Robot, q: Any, tasks: Any, scheme: Any, *rest: Any) -> osik.Solution:
+    """The step from its parts. Levels of a hierarchy are solved by its kernel, whose answers have roundoff of 1e-10."""
+    slow = scheme if isinstance(scheme, osik.HierarchicalQP) else osik.WeightedQP(backend="jax")
+    return jax.jit(jax.vmap(lambda q: _step._plain_step(robot, q, tasks, slow, *rest)))(q)
+
+
+def assert_close(found: Any, wanted: Any, tolerance: float) -> None:
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance)
+
+
+SLOW = [("nao", "bounded"), ("nao", "standing"), ("g1", "mixed"), ("g1", "bounded"), ("arm7", "mixed")]
+CASES = [("nao", "mixed"), ("arm7", "bounded"), ("ur5", "standing")]
+CASES += [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(("name", "tasks"), CASES)
+def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
+    robot = robot_of(name)
+    given = arguments(robot, SETS[tasks](robot), SCHEMES[scheme]())
+    q = lanes_of(robot)
+    assert _step.is_compiled(robot, q[0], *given)
+    found, done = by_core(robot, q, *given)
+    wanted = plain(robot, q, *given)
+    assert done.mean() > 0.8
+    assert (np.asarray(wanted.status)[done == 1] == 0).all()
+    for field in ("velocity", "slack", "error"):
+        a, b = (jax.tree.map(lambda x: x[done == 1], getattr(s, field)) for s in (found, wanted))
+        assert_close(a, b, 1e-12 * (1.0 + max(float(jnp.abs(x).max()) for x in jax.tree.leaves(b))))
+    assert float(jnp.abs(found.kkt_residual).max()) <= 1e-9
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
+    with jax.enable_x64(False):
+        robot = robot_of("nao")
+        given = arguments(robot, mixed(robot), SCHEMES[scheme]())
+        q = lanes_of(robot)
+        found, done = by_core(robot, q, *given)
+        assert found.velocity.dtype == jnp.float32 and done.all()
+    robot = robot_of("nao")
+    given = arguments(robot, mixed(robot), SCHEMES[scheme]())
+    wanted = plain(robot, jnp.asarray(q, float), *given)
+    np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_derivatives_are_those_of_plain_jax(scheme):
+    robot = robot_of("arm7")
+    q = lanes_of(robot)[0]
+
+    def cost(q: Any, point: Any, gain: Any, backend: Any) -> Any:
+        hand, _ = frames_of(robot)
+        tasks = {"hand": osik.FrameTask(robot, hand, rows="position", gain=gain).replace(target=point)}
+        tasks |= {"rest": osik.PostureTask(robot, weight=0.1, priority=2)}
+        chosen = SCHEMES[scheme](backend=backend)
+        return jnp.sum(osik.solve(robot, q, tasks, scheme=chosen, dt=DT).velocity ** 2)
+
+    given = q, jnp.array([0.4, 0.1, 0.5]), jnp.asarray(3.0)
+    found, wanted = (
+        jax.jit(jax.grad(cost, argnums=(0, 1, 2)), static_argnums=3)(*given, backend) for backend in ("core", "jax")
+    )
+    assert float(jnp.abs(wanted[0]).max()) > 1e-3
+    assert_close(found, wanted, 1e-9 * (1.0 + max(float(jnp.abs(a).max()) for a in wanted)))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_batch_is_a_loop_and_what_the_core_cannot_certify_is_left_to_plain_jax(scheme):
+    robot = robot_of("nao")
+    tasks = bounded(robot)
+    hand = tasks["hand"]
+    assert isinstance(hand, osik.FrameTask)
+    points = jnp.asarray(hand.target[0]) + jnp.linspace(0.0, 3.0, LANES)[:, None]  # the last ones are out of reach
+    points = points.at[2].set(jnp.nan)
+    q = lanes_of(robot).at[4, 7].set(jnp.nan)
+
+    def velocity(q: Any, point: Any) -> osik.Solution:
+        return _step.step(robot, q, tasks | {"hand": hand.replace(target=point)}, SCHEMES[scheme](), None, DT)
+
+    found = jax.jit(jax.vmap(velocity))(q, points)
+    program = jax.jit(velocity)
+    for lane in range(LANES):
+        alone = program(q[lane], points[lane])
+        assert int(alone.status) == int(found.status[lane]) == (3 if lane in (2, 4) else 0)
+        size = 1.0 + float(jnp.abs(alone.velocity).max())
+        np.testing.assert_allclose(found.velocity[lane] / size, alone.velocity / size, atol=1e-11)
+    assert all(np.isfinite(np.asarray(a)).all() for a in jax.tree.leaves(found))
+
+
+SMALL = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <default><geom size="0.05" mass="1"/></default>
+  <worldbody>
+    <body><joint name="hip" axis="0 0 1" range="-1 1"/><geom/>
+      <body pos="0 0 0.3"><joint name="lift" type="slide" axis="0 0 1" range="-0.2 0.2"/><geom/>
+        <body pos="0.2 0 0.1">{ball}<geom/>
+          <body name="tool" pos="0.3 0 0.1"><joint name="wrist" axis="0 1 0" range="-2 2"/><geom/>
+            <body pos="0.2 0.1 0"><joint name="tip" axis="1 0 0"/><geom/></body></body></body></body></body>
+  </worldbody>
+  {equality}
+</mujoco>
+"""
+MIMIC = '<equality><joint joint1="tip" joint2="wrist" polycoef="0.1 -2 0 0 0"/></equality>'
+
+
+def variants(robot: osik.Robot) -> dict[str, tuple[dict[str, osik.Task], Any]]:
+    """Tasks and limits at the edges of what is allowed."""
+    tool = osik.FrameTask(robot, "tool", rows="position")
+    rest = osik.PostureTask(robot, joints=["hip", "lift"], weight=0.1, priority=2)
+    far = tool.replace(target=np.asarray(tool.target[0]) + 0.05)
+    narrow = osik.ConfigurationLimit(robot, upper={"hip": -0.2}, gain=np.linspace(0.3, 1.0, robot.nv))
+    speed = osik.VelocityLimit(robot, velocity={"hip": 0.3, "lift": 0.0})
+    fast = osik.AccelerationLimit(robot, {"hip": 5.0, "lift": 2.0, "wrist": 3.0}, velocity={"hip": 0.1})
+    return {
+        "weight 0": ({"tool": far.replace(weight=0.0), "rest": rest}, osik.no_limits),
+        "gain above 1 / dt": ({"tool": far.replace(gain=1e3), "rest": rest.replace(gain=900.0)}, osik.no_limits),
+        "outside its range": ({"tool": far, "rest": rest}, [osik.no_limits, narrow, speed]),
+        "accelerations": ({"tool": far, "rest": rest}, [osik.no_limits, speed, fast]),
+        "one priority": ({"tool": far, "rest": eqx.tree_at(lambda t: t.weight, rest, rest.weight * 5)}, osik.no_limits),
+        "part of the robot": (
+            {"com": osik.ComTask(robot, subtree="tool", target=[0.5, 0.1, 0.5]), "rest": rest},
+            osik.no_limits,
+        ),
+    }
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("kind", ["mimic", "ball", "locked"])
+def test_edges_of_what_is_allowed_are_those_of_plain_jax(kind, scheme):
+    ball = '<joint name="ball" type="ball"/>' if kind == "ball" else ""
+    text = SMALL.format(ball=ball, equality=MIMIC if kind == "mimic" else "")
+    robot = osik.Robot.from_mjcf(text, locked_joints={"tip": 0.4} if kind == "locked" else ())
+    q = lanes_of(robot)
+    for name, (tasks, limits) in variants(robot).items():
+        given = tasks, SCHEMES[scheme](), with_own_limits(robot, checked_limits(robot, limits)), jnp.asarray(DT), None
+        if kind == "ball" and any(type(limit) is osik.ConfigurationLimit for limit in given[2]):
+            assert not _step.is_compiled(robot, q[0], *given), name
+            continue
+        assert _step.is_compiled(robot, q[0], *given), name
+        found, done = by_core(robot, q, *given)
+        wanted = plain(robot, q, *given)
+        assert done.all(), name
+        assert float(jnp.abs(wanted.velocity).max()) > 1e-3, name
+        for field in ("velocity", "slack", "error"):
+            assert_close(getattr(found, field), getattr(wanted, field), 1e-11)
+
+
+def test_a_step_is_one_call_with_few_operations_around_it():
+    robot = robot_of("nao")
+    tasks = standing(robot)
+    rotation = jnp.asarray(np.asarray(tasks["hand"].target[1]))
+
+    def velocity(q: Any, point: Any) -> Any:
+        aimed = tasks | {"hand": tasks["hand"].replace(target=(point, rotation))}
+        return osik.solve(robot, q, aimed, scheme=osik.HierarchicalQP(), dt=DT).velocity
+
+    text = jax.jit(velocity).lower(robot.q0, jnp.ones(3)).compile().as_text()
+    entry = text[text.index("ENTRY") :]
+    operations = re.findall(r"= .*? (fusion|custom-call|conditional|while|copy|broadcast|concatenate)\(", entry)
+    assert operations.count("custom-call") == 1 and len(operations) <= 6, operations
+
+
+def test_numbers_are_swept_without_compiling():
+    robot = robot_of("arm7")
+    hand, _ = frames_of(robot)
+    task = osik.FrameTask(robot, hand)
+    rest = osik.PostureTask(robot, weight=0.1)
+    before, found = _step.step._cache_size(), []
+    for number in (1.0, 2.0, 5.0):
+        tasks = {"hand": task.replace(weight=number, gain=number), "rest": rest.replace(gain=number)}
+        scheme = osik.WeightedQP(damping=1e-4 * number)
+        found.append(osik.solve(robot, robot.q0 + 0.1, tasks, scheme=scheme, dt=DT / number).velocity)
+    assert _step.step._cache_size() == before + 1
+    assert float(jnp.abs(found[0] - found[2]).max()) > 0.1
+
+
+def test_other_steps_take_the_plain_path():
+    robot = robot_of("arm7")
+    hand, _ = frames_of(robot)
+    own = {"hand": osik.FrameTask(robot, hand)}
+    q, limits = robot.q0, with_own_limits(robot, None)
+
+    def known(tasks: Any = own, scheme: Any = None, limits: Any = limits, warm: Any = None) -> bool:
+        return _step.is_compiled(robot, q, tasks, scheme or osik.WeightedQP(), limits, jnp.asarray(DT), warm)
+
+    assert known() and known(warm=jnp.zeros(7, int))
+    assert not known({"hand": osik.FrameTask(robot, hand, hard=True)})
+    assert not known({"hand": osik.FrameTask(robot, hand, error="se3")})
+    assert not known({"hand": osik.FrameTask(robot, hand, gain=osik.AdaptiveGain(2.0, 1.0, 3.0))})
+    assert not known(scheme=osik.NullSpace()) and not known(scheme=osik.WeightedQP(backend="jax"))
+    assert not known(limits=(*limits, osik.PositionBarrier(robot, hand, lower=0.0)))
+    assert not known(warm=jnp.zeros(8, int))
+
+
+def test_the_certificate_is_that_of_plain_jax(rng):
+    batch, m, n, p, tolerance = 200, 6, 9, 4, 1e-12
+
+    def problem(key: int) -> QP:
+        rng = np.random.default_rng(key)
+        cost = LeastSquares(
+            *map(jnp.asarray, (rng.normal(size=(m, n)), rng.normal(size=m), rng.uniform(0.1, 9.0, m))),
+            *map(jnp.asarray, (rng.uniform(0.01, 1.0, n), rng.normal(size=n))),
+        )
+        bounds = rng.uniform(0.05, 0.5, n + p)
+        compliance = jnp.asarray(rng.uniform(0.1, 1.0, p))
+        return QP(cost, jnp.asarray(rng.normal(size=(p, n))), compliance, jnp.asarray(-bounds), jnp.asarray(bounds))
+
+    problems = [problem(k) for k in range(batch)]
+    qp = jax.tree.map(lambda *a: jnp.stack(a), *problems)
+    matrix, packed = (jnp.stack(a) for a in zip(*map(pack, problems), strict=True))
+    solved = _dispatch._core.solve(qp, jnp.zeros((batch, n + p), int), jnp.full(batch, tolerance), 1000)
+    # errors of 1e-16 to 1 in x, in a multiplier or in a label of every second problem
+    size = 10.0 ** rng.uniform(-16.0, 0.0, batch) * (np.arange(batch) % 2)
+    x = solved.x + size[:, None] * rng.normal(size=(batch, n)) * (np.arange(batch) % 3 == 0)[:, None]
+    y = solved.row_multipliers + size[:, None] * rng.normal(size=(batch, p)) * (np.arange(batch) % 3 == 1)[:, None]
+    active = jnp.where((np.arange(batch) % 6 == 5)[:, None] & (np.arange(n + p) == 3), 1, solved.active)
+
+    def plain(qp: QP, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+        start = initial_result(jax.tree.map(lambda a: a[None], qp), active[None], jnp.full(1, tolerance))
+        end = jax.tree.map(lambda a: a[0], start)._replace(x=x, row_multipliers=y, active=active)
+        conditions = [_dispatch._is_certified(qp, end, jnp.asarray(tolerance)), _dispatch._is_stationary(qp, end)]
+        residual = _dispatch.kkt_residual(qp, x, y, active)
+        return jnp.concatenate(conditions).all() & (residual <= 1e-9), residual
+
+    wanted, residual = jax.vmap(plain)(qp, x, y, active)
+    holds, own = _library.call(
+        "weighted_qp_certificate",
+        [((batch,), int), ((batch,), float)],
+        *(matrix, packed, x, y, active, jnp.tile(jnp.array([tolerance, 1e-9]), (batch, 1))),
+    )
+    assert 0.3 < np.mean(np.asarray(wanted)) < 0.9
+    np.testing.assert_array_equal(np.asarray(holds, bool), wanted)
+    np.testing.assert_allclose(own, residual, rtol=1e-6, atol=1e-15)
