@@ -29,7 +29,7 @@ constexpr double VALUE_TOL = 30.0, SIGN_TOL = 2.0, GRADIENT_TOL = 4.0, ROW_MULTI
 
 // tasks of a step
 constexpr double DIAGONAL_RATIO = 30.0, BELOW_OTHERS = 2.0, LEVER_ROUNDOFF = 1e-6, UNHELD_PART = 0.04,
-                 NEAR_ERROR = 0.06, FARTHEST_ERROR = 1e6, RANGE_ROUNDOFF = 8.0;
+                 NEAR_ERROR = 0.06, NEAR_PART = 0.4, FARTHEST_ERROR = 1e6, RANGE_ROUNDOFF = 8.0;
 
 // rotations, collision
 constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2, SMALL_TURN_SQUARED = 1e-6, PARALLEL = 1e-6;

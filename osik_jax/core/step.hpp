@@ -98,7 +98,7 @@ class Step {
     q.resize(s.nq), poses.resize(12 * s.bodies + 9 * s.dofs), J.resize(R * nv + 8), frames.resize(12 * nv + 24);
     for (Numbers* v : {&error, &low, &high, &weight, &pull}) v->resize(R + 8);
     levers.resize(s.tasks * nv), curvature.resize(s.tasks), below.resize(4 * s.bodies), zeros.resize(R + 1);
-    bounds.resize(s.tasks), parts.resize(larger(R + s.tasks, s.bodies) + 8), lower.resize(nv), upper.resize(nv);
+    bounds.resize(s.tasks), parts.resize(larger(R + 3 * s.tasks, s.bodies) + 8), lower.resize(nv), upper.resize(nv);
     no_labels.resize(s.L * s.h + s.L * s.m + nv + s.p);
     double *body = poses.data(), *dof = body + 12 * s.bodies;
     placed = {body, body + 3 * s.bodies, dof, dof + 3 * s.dofs, dof + 6 * s.dofs};
@@ -258,40 +258,80 @@ class Step {
   }
 
   // ---- damping of some tasks (schemes/_scheme.py)
-  template <class Chosen> double curvature_of(Chosen chosen) {
-    int count = 0;
-    for (int k = 0; k < s.tasks; ++k)
-      if (chosen(tasks[k])) bounds[count++] = dt * curvature[k];
-    return safe_norm(bounds.data(), count);
-  }
-  // the part of the curvature that the tasks' own rows do not resist: fraction_to_damp in tasks/_curvature.py
-  template <class Chosen> double curvature_damping(Chosen chosen) {
+  struct Bending {
+    double bound, damping;  // of the curvature, and the part of it that is damped
+  };
+  // VelocityProblem.curvature, with near_part and fraction_to_damp of tasks/_curvature.py
+  template <class Chosen> Bending curvature_of(Chosen chosen) {
+    double *stiffness = parts.data(), *far = stiffness + s.tasks, *to_damp = far + s.tasks, farthest = 0;
     int count = 0;
     for (int k = 0; k < s.tasks; ++k) {
       const Task& task = tasks[k];
       if (!chosen(task) || (task.kind == POSTURE && !task.bounded)) continue;
-      const double bound = dt * curvature[k];
-      double distance = 0, stiffness = 0;
+      double distance = 0, held = 0;
       for (int i = 0; i < task.m && !task.bounded; ++i) {
         const double *row = task.rows.jacobian + i * s.nv, divisor = curvature[k] > 0 ? curvature[k] : 1;
         distance += task.rows.error[i] * (task.weight[i] * (task.rows.pull[i] / divisor));
-        stiffness += task.weight[i] * Team::own_dot(row, row, 0, s.nv);
+        held += task.weight[i] * Team::own_dot(row, row, 0, s.nv);
       }
-      const double far = square(clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR)), total = 0.5 * bound + stiffness;
-      bounds[count++] = bound * (1 - (1 - UNHELD_PART) * (far / (1 + far)) * (stiffness / (total > 0 ? total : 1)));
+      const double ratio = square(clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR));
+      bounds[count] = dt * curvature[k], stiffness[count] = held, far[count] = task.bounded ? -1 : ratio / (1 + ratio);
+      farthest = larger(farthest, bounds[count] > 0 ? far[count] : 0.0), ++count;
     }
-    return safe_norm(bounds.data(), count);
+    for (int i = 0; i < count; ++i) {
+      if (far[i] >= 0) bounds[i] *= NEAR_PART + (1 - NEAR_PART) * farthest;
+      const double total = 0.5 * bounds[i] + stiffness[i], resisted = stiffness[i] / (total > 0 ? total : 1);
+      to_damp[i] = bounds[i] * (far[i] >= 0 ? 1 - (1 - UNHELD_PART) * far[i] * resisted : 1.0);
+    }
+    return {safe_norm(bounds.data(), count), safe_norm(to_damp, count)};
+  }
+  // VelocityProblem.bends, with row_sums of tasks/_curvature.py; returns the largest
+  template <class Chosen> double find_bends(Chosen chosen, double* own) {
+    const int n = s.nv;
+    double *farthest = center.data(), largest = 0, sum = 0, most = 0;
+    int before = 0;
+    for (int j = 0; j < n; ++j) farthest[j] = 0;
+    for (int k = 0; k < s.tasks; ++k)
+      if (chosen(tasks[k]))
+        for (int j = 0; j < n; ++j) farthest[j] = turning[j] ? larger(farthest[j], levers[k * n + j]) : 0.0;
+    for (int j = 0; j < n; ++j) largest = larger(largest, farthest[j]);
+    for (int j = 0; j < n; ++j) {  // the lever of the one farther from the root
+      const bool moves = farthest[j] > LEVER_ROUNDOFF * largest;
+      farthest[j] = moves ? farthest[j] : 0.0, own[j] = farthest[j] * before, before += moves;
+    }
+    for (int j = n - 1; j >= 0; --j) {
+      sum += farthest[j], own[j] += farthest[j] > 0 ? sum : 0.0;
+      own[j] = scalar[j] >= 0 ? dt * own[j] : 0.0, most = larger(most, own[j]);
+    }
+    return most;
+  }
+  // VelocityProblem.curvature_above: what the postures of a level cannot meet, the rows above it balance
+  double curvature_above(int level) {
+    double* force = parts.data();
+    int count = 0;
+    for (const Task& task : tasks)
+      for (int i = 0; i < task.m && task.kind == POSTURE && task.level == level; ++i)
+        force[count++] = task.weight[i] * task.rows.pull[i];
+    if (!level || !count) return 0;
+    double squares = 0;
+    for (const Task& task : tasks)
+      for (int i = 0; i < task.m && task.level < level; ++i) {
+        const double* row = task.rows.jacobian + i * s.nv;
+        squares += task.weight[i] * Team::own_dot(row, row, 0, s.nv);
+      }
+    const double most = find_bends([&](const Task& task) { return task.level < level; }, above.data());
+    return safe_norm(force, count) * (most / (squares > 0 ? sqrt(squares) : 1.0));
   }
 
   // ---- the weighted scheme (schemes/_weighted.py)
-  Numbers solver_space, qp_bounds, diagonal, center, compliance, multipliers;
+  Numbers solver_space, qp_bounds, diagonal, center, compliance, multipliers, above;
   std::vector<WeightedQP<Team>> qp;
   std::vector<QPCertificate> certificate;
 
   Certificate solve_weighted(const StepData& d, const StepResult& to) {
     const int n = s.nv, N = n + s.p;
-    const double bound = kappa * curvature_of([](const Task&) { return true; });
-    const double rest = kappa * curvature_damping([](const Task&) { return true; });
+    const Bending bending = curvature_of([](const Task&) { return true; });
+    const double bound = kappa * bending.bound, rest = kappa * bending.damping;
     for (int j = 0; j < n; ++j) diagonal[j] = damping, center[j] = 0, qp_bounds[j] = lower[j], qp_bounds[N + j] = upper[j];
     for (const Task& task : tasks)
       for (int i = 0; i < task.m && task.diagonal; ++i) {
@@ -348,31 +388,20 @@ class Step {
       hard_lower[i] = level_lower[row], hard_upper[i] = level_upper[row], pinned[i] = equality[row];
     }
   }
-  // the damping of each level: dampings in schemes/_scheme.py
+  // the damping of each level: VelocityProblem.dampings
   void add_dampings() {
-    const int n = s.nv;
     for (int level = 0; level + 1 < s.L; ++level) {
       auto chosen = [&](const Task& task) { return task.level == level; };
       const double factor = (level ? BELOW_OTHERS : 1.0) * kappa;
-      double *farthest = center.data(), *own = &bends[level * n], largest = 0, sum = 0;
-      int count = 0, before = 0;
-      for (int j = 0; j < n; ++j) farthest[j] = 0;
-      for (int k = 0; k < s.tasks; ++k)
-        if (chosen(tasks[k])) {
-          for (int i = 0; i < tasks[k].m; ++i) parts[count++] = sqrt(tasks[k].weight[i]) * tasks[k].rows.pull[i];
-          for (int j = 0; j < n; ++j) farthest[j] = turning[j] ? larger(farthest[j], levers[k * n + j]) : 0.0;
-        }
-      dampings[3 * level] = damping, dampings[3 * level + 1] = factor * curvature_damping(chosen);
+      double* own = &bends[level * s.nv];
+      dampings[3 * level] = damping;
+      dampings[3 * level + 1] = factor * curvature_of(chosen).damping + kappa * curvature_above(level);
+      int count = 0;
+      for (const Task& task : tasks)
+        for (int i = 0; i < task.m && chosen(task); ++i) parts[count++] = sqrt(task.weight[i]) * task.rows.pull[i];
       dampings[3 * level + 2] = safe_norm(parts.data(), count);
-      for (int j = 0; j < n; ++j) largest = larger(largest, farthest[j]);
-      for (int j = 0; j < n; ++j) {  // row_sums in tasks/_curvature.py: the lever of the one farther from the root
-        const bool moves = farthest[j] > LEVER_ROUNDOFF * largest;
-        farthest[j] = moves ? farthest[j] : 0.0, own[j] = farthest[j] * before, before += moves;
-      }
-      for (int j = n - 1; j >= 0; --j) {
-        sum += farthest[j], own[j] += farthest[j] > 0 ? sum : 0.0;
-        own[j] = scalar[j] >= 0 ? factor * (dt * own[j]) : 0.0;
-      }
+      find_bends(chosen, own);
+      for (int j = 0; j < s.nv; ++j) own[j] *= factor;
     }
   }
   Certificate solve_hierarchy(const StepData& d, const StepResult& to) {
@@ -396,7 +425,7 @@ class Step {
 
   void begin_solvers() {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
-    center.resize(n + 8);
+    center.resize(n + 8), above.resize(n);
     if (s.scheme == WEIGHTED) {
       const QPSizes of{m, n, s.p, s.max_iterations};
       solver_space.resize(WeightedQP<Team>::bytes(of) / sizeof(double));
