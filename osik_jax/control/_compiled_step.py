@@ -1,7 +1,8 @@
 """A control step in one call of the compiled core (``core/step.hpp``), for the tasks and limits that it knows.
 
-``_step.py`` is the definition, the derivative, what solves steps whose answer the core cannot certify, and what runs
-for all other tasks, limits, schemes and platforms.
+``_step.py`` is the definition, the derivative, and what runs for all other tasks, limits, schemes and platforms. No
+search of plain JAX stands beside the call: XLA makes place for all of its numbers in every step, searched or not, which
+costs more than the call.
 """
 
 from __future__ import annotations
@@ -16,11 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core import _library
-from ..execution._backends import cuda_is_default, takes
-from ..execution._blocks import BLOCK
-from ..execution._candidates import Candidates, certified_or_searched
+from ..execution._backends import cuda_is_default, on_platforms, takes
 from ..execution._computed import in_shared_lanes, over_lanes, side_by_side
-from ..execution._lanes import lanes_of, with_the_rest
+from ..execution._lanes import lanes_of
 from ..execution._rules import custom_jvp
 from ..kinematics._kernels import dof_columns, tree_integers
 from ..limits import AccelerationLimit, ConfigurationLimit, Limit, NoLimits, VelocityLimit, limit_box
@@ -50,7 +49,7 @@ def is_compiled(
     warm_start: Any,
 ) -> bool:
     """Return whether the core knows steps of this kind and is there."""
-    if type(scheme) not in (WeightedQP, HierarchicalQP) or cuda_is_default():
+    if type(scheme) not in (WeightedQP, HierarchicalQP) or scheme.max_iterations is not None or cuda_is_default():
         return False
     kinds = {jnp.result_type(a) for a in jax.tree.leaves((robot, q, tasks, scheme, limits, dt))}
     one_precision = {kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)} == {jnp.result_type(float)}
@@ -165,13 +164,11 @@ class _Layout:
         robot, q, tasks, scheme, limits, dt, _ = given
         tree, nv, by_weight = self.robot.tree, self.robot.nv, isinstance(scheme, WeightedQP)
         of_limits = [] if box >= 0 else [_leaves_of_limit(limit) for limit in limits if type(limit) is not NoLimits]
-        *sizes, limit = self.sizes
-        limit = limit if scheme.max_iterations is None else scheme.max_iterations
         bodies, joints, full = len(tree.body_names), len(tree.joint_types), len(tree.dof_joint)
         nq, *of_tree = tree_integers(tree)
         scalar, place = scalar_layout(self.robot)
         numbers = [not by_weight, len(places), nq, self.robot.nq, bodies, joints, full, nv, len(tasks)]
-        numbers += [len(of_limits), self.rows, *sizes, limit]
+        numbers += [len(of_limits), self.rows, *self.sizes]
         numbers += [number for leaf in sorted(places) for number in places[leaf]]
         numbers += [q, dt, scheme.damping, scheme.curvature_damping, box, box + 1]
         numbers += [robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion]
@@ -198,7 +195,7 @@ class _Layout:
             tolerances = [FEASIBILITY, KKT_TOLERANCE[dtype]]
         else:
             tolerances = list(Tolerances(rank=HIERARCHY_RANK[dtype]))
-        return np.concatenate([tree.qpos_source[1], dof_columns(tree)[1], tolerances])
+        return np.concatenate([tree.qpos_source[1], dof_columns(tree)[1], [jnp.finfo(dtype).max, *tolerances]])
 
 
 def _leaves_of_limit(limit: Any) -> list[Any]:
@@ -251,7 +248,7 @@ def compiled(plain: Step) -> Step:
     """Return the step by the compiled core: of those arguments that ``is_compiled`` accepts.
 
     Args:
-        plain: the definition, which has the derivative too and solves what is not certified.
+        plain: the definition, which has the derivative too and runs on platforms without the core.
     """
     lanes = in_shared_lanes(partial(_steps, plain))
 
@@ -269,28 +266,19 @@ def compiled(plain: Step) -> Step:
 def _steps(plain: Step, *given: Any) -> Solution:
     """Return the steps of all lanes; every array has a leading axis, of the lanes or of length 1."""
     one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), given)
-    like, wide, packed = jax.eval_shape(plain, *one), over_lanes(plain), _Arrays(given)
+    like, packed = jax.eval_shape(plain, *one), _Arrays(given)
 
-    def search(*arrays: Array) -> tuple[Array, Array]:
-        # XLA would take the leaves apart before the branch, and make each one anew in every step, searched or not
-        return _packed(wide(*packed.leaves(jax.lax.optimization_barrier(arrays))))
+    def by_core(*arrays: Array) -> Solution:
+        return _unpacked(like, *_by_core(packed, *arrays))
 
-    def search_rest(state: tuple[Array, Array, Array], *arrays: Array) -> tuple[Array, Array]:
-        *found, done = state
+    def elsewhere(*arrays: Array) -> Solution:
+        return over_lanes(plain)(*packed.leaves(arrays))
 
-        def again(at: Array, _: Any) -> tuple[Array, Array]:
-            return search(*(a[at] if len(a) == len(done) > 1 else a for a in arrays))
-
-        return with_the_rest(tuple(found), done != 0, again, BLOCK)
-
-    def by_core(*arrays: Array) -> tuple[Array, Array, Array]:
-        return _by_core(packed, *arrays)
-
-    return _unpacked(like, *certified_or_searched({"core": Candidates(by_core, search_rest)}, search, *packed.arrays))
+    return on_platforms({"core": by_core}, elsewhere, *packed.arrays)
 
 
-def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array, Array]:
-    """Return all numbers and all integers of the solutions, as ``_packed`` has them, and which are certified."""
+def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
+    """Return all numbers and all integers of the solutions, those of a lane one after another."""
     robot, q, tasks, scheme, limits, dt, warm_start = packed.leaves(arrays)
     layout, numbered, places = _Layout(robot, tasks, scheme), packed.numbered(), dict(packed.places)
     guesses, box = jax.tree.leaves(warm_start), -1
@@ -304,22 +292,12 @@ def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array, Array]:
     integers = layout.integers(places, numbered, box)
     labels = sum(int(np.prod(shape)) for shape in layout.labels)
     shapes = ((packed.lanes, robot.tree.nv + 2 + 2 * layout.rows), float), ((packed.lanes, 3 + labels), int)
-    constants = layout.constants(q.dtype)
-    numbers, integers, done = _library.call(
-        "step", (*shapes, ((packed.lanes,), int)), integers, *guesses, *given, constants
-    )
-    return numbers, integers, done
-
-
-def _packed(solutions: Solution) -> tuple[Float[Array, "lanes k"], Array]:
-    """Return all numbers and all integers of each lane's solution as two arrays."""
-    leaves = [a.reshape(len(a), -1) for a in jax.tree.leaves(solutions)]
-    numbers, integers = ([a for a in leaves if jnp.issubdtype(a.dtype, jnp.floating) == kind] for kind in (True, False))
-    return jnp.concatenate(numbers, 1), jnp.concatenate([a.astype(jnp.int32) for a in integers], 1)
+    numbers, integers = _library.call("step", shapes, integers, *guesses, *given, layout.constants(q.dtype))
+    return numbers, integers
 
 
 def _unpacked(like: Solution, numbers: Float[Array, "lanes k"], integers: Array) -> Solution:
-    """Return the solutions of all lanes, from what ``_packed`` returns; ``like`` has the shapes of one."""
+    """Return the solutions of all lanes, from what ``_by_core`` returns; ``like`` has the shapes of one."""
     leaves, tree = jax.tree.flatten(like)
     at, found = {True: 0, False: 0}, []
     for leaf in leaves:

@@ -23,7 +23,8 @@ constexpr int KERNEL_REFINEMENTS = 10, SINGLE_REFINEMENTS = 6, MAX_EXCHANGES = 2
 constexpr double KERNEL_CORRECTION = 1e-10, SINGLE_CORRECTION = 1e-6, VIOLATION_TOL = 10.0, SINGLE_RIDGE = 1.0, MIN_DECREASE = 0.25, KERNEL_PIVOT = 1e2,
                  ZERO_TOL = 100.0, BOUND_MULTIPLIER = 1.0, KERNEL_DEPENDENCE = 1e-14, REDUNDANCY_TOL = 1e3;
 
-// certificates
+// certificates, and the point without one
+constexpr int GRADIENT_STEPS = 100;
 constexpr double VALUE_TOL = 30.0, SIGN_TOL = 2.0, GRADIENT_TOL = 4.0, ROW_MULTIPLIER = 1e-3, BOX_TOLERANCE = 10.0,
                  MAX_RESIDUAL = 10.0;
 

@@ -4,8 +4,9 @@
 //
 // The rows of task k are rows first .. first + m of the matrix of all rows. The weighted scheme has the equalities of
 // frames and of the centre of mass first (`dense` rows), then the inequalities (`intervals`), then the equalities of
-// single dofs, which are terms of its diagonal. A step whose answer is not certified is left to plain JAX.
+// single dofs, which are terms of its diagonal. Statuses, and what is returned with each, are those of the definition.
 #pragma once
+#include <algorithm>
 #include <vector>
 
 #include "certificates.hpp"
@@ -16,6 +17,7 @@ namespace osik {
 enum StepScheme { WEIGHTED = 0, HIERARCHICAL = 1 };
 enum StepTask { POSE = 0, CENTER = 1, POSTURE = 2 };
 enum StepLimit { SPEED = 0, RANGE = 1 };  // in the order in which they narrow the box
+enum StepStatus { SOLVED = 0, MAX_ITERATIONS = 1, INFEASIBLE = 2, NUMERICAL_ERROR = 3 };
 
 // Sizes of a step; m, p, L and h are those of QPSizes and Sizes.
 struct StepSizes {
@@ -31,15 +33,21 @@ struct Leaf {
 
 // What is given of one step, and what it returns.
 struct StepData {
-  const double* constants;        // factors of the configuration [nq] and of the dofs [dofs], then the tolerances
-  const double* const* arrays;    // of this lane; a leaf of the layout is in one of them
+  const double* constants;        // factors of the configuration [nq] and of the dofs [dofs], largest number, tolerances
+  const double* const* arrays;    // of this lane; a leaf of numbers is in one of them
+  int count;                      // of the arrays; leaves of integers are behind them
   const int *guess, *guess_own;   // labels of the warm start, those of a hierarchy's levels beside them; null for none
 };
 struct StepResult {
   double* numbers;  // velocity [nv], residual, violation of the box, slacks and errors of all rows
   int* integers;    // status, iterations, factorizations, labels for the next warm start
-  int* done;        // whether the answer is certified
 };
+
+// The point of [low, high] next to a; the upper end of an interval whose ends are the wrong way round.
+inline double nearest(double a, double low, double high) {
+  const double raised = a < low ? low : a;
+  return raised > high ? high : raised;
+}
 
 // The Euclidean norm, whose squares neither overflow nor underflow.
 inline double safe_norm(const double* v, int count) {
@@ -55,6 +63,7 @@ class Step {
   using Numbers = std::vector<double>;
   struct Task {
     int kind, m, first, out, level, bounded, diagonal;  // out: of its slack and error; diagonal: equality of single dofs
+    bool valid;
     const int *leaves, *options;                        // gain, weight, target velocity, bounds, then those of its kind
     Rows<double> rows;
     double* weight;
@@ -75,12 +84,13 @@ class Step {
   const int *source, *owner, *turning, *scalar;       // [nq] entry of the given q, [dofs] body, [nv], [nv] place in q or -1
   const int *limits;                                  // [limits, 5] kind and leaves of each
   const int *row_counts, *level_of_hard, *row_of_hard;
-  Numbers q, poses, J, error, low, high, weight, pull, levers, curvature, frames, below, bounds, parts, lower, upper, zeros;
+  Numbers q, poses, J, error, low, high, weight, pull, levers, curvature, frames, below, bounds, parts, lower, upper, low_speed, high_speed, zeros;
   std::vector<int> no_labels;
   Placed<double> placed;
   const double* const* arrays;  // of the step at hand
   const double* tolerances;
   double dt, damping, kappa;
+  bool ordered;  // whether no lower bound is above its upper one
 
  public:
   Step(const int* given, int count) : layout(given, given + count) {
@@ -98,14 +108,14 @@ class Step {
     q.resize(s.nq), poses.resize(12 * s.bodies + 9 * s.dofs), J.resize(R * nv + 8), frames.resize(12 * nv + 24);
     for (Numbers* v : {&error, &low, &high, &weight, &pull}) v->resize(R + 8);
     levers.resize(s.tasks * nv), curvature.resize(s.tasks), below.resize(4 * s.bodies), zeros.resize(R + 1);
-    bounds.resize(s.tasks), parts.resize(larger(R + 3 * s.tasks, s.bodies) + 8), lower.resize(nv), upper.resize(nv);
+    bounds.resize(s.tasks), parts.resize(larger(R + 3 * s.tasks, s.bodies) + 8), lower.resize(nv), upper.resize(nv), low_speed.resize(nv), high_speed.resize(nv);
     no_labels.resize(s.L * s.h + s.L * s.m + nv + s.p);
     double *body = poses.data(), *dof = body + 12 * s.bodies;
     placed = {body, body + 3 * s.bodies, dof, dof + 3 * s.dofs, dof + 6 * s.dofs};
     for (int k = 0; k < s.tasks; ++k) {
       const int *o = take(8), *leaves = take(9);
       const size_t i = o[2];
-      tasks.push_back({o[0], o[1], o[2], o[3], o[4], o[5], o[6], leaves, take(o[7]),
+      tasks.push_back({o[0], o[1], o[2], o[3], o[4], o[5], o[6], true, leaves, take(o[7]),
                        {&error[i], &J[i * nv], &low[i], &curvature[k], &pull[i], &levers[k * nv], o[5] ? &high[i] : nullptr},
                        &weight[i]});
     }
@@ -115,13 +125,21 @@ class Step {
     return size_t(count) == layout.size() && std::equal(given, given + count, layout.begin());
   }
 
-  // valid: whether no number of the arrays is NaN
-  void take(const StepData& d, const StepResult& to, bool valid) {
-    Certificate found{false, 0};
-    for (int j = 0; j < s.nv; ++j) to.numbers[j] = 0;
-    if (valid && find_rows(d)) found = s.scheme == WEIGHTED ? solve_weighted(d, to) : solve_hierarchy(d, to);
-    *to.done = found.holds;
-    report(to, found.residual);
+  // clean: whether no number of the arrays is NaN
+  void take(const StepData& d, const StepResult& to, bool clean) {
+    const int n = s.nv, labels = s.scheme == WEIGHTED ? n + s.p : s.L * (s.h + s.m);
+    const bool valid = find_rows(d, clean);
+    std::fill(to.integers, to.integers + 3 + labels, 0);
+    int status = NUMERICAL_ERROR;
+    Certificate found{false, d.constants[s.nq + s.dofs]};
+    if (valid) {
+      found = s.scheme == WEIGHTED ? solve_weighted(d, to) : solve_hierarchy(d, to);
+      status = !all_finite(to.numbers, n) ? NUMERICAL_ERROR : !ordered ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
+    }
+    for (int j = 0; j < n && status == NUMERICAL_ERROR; ++j)
+      to.numbers[j] = nearest(0, lower[j] < INFINITE ? lower[j] : -INFINITE, upper[j] > -INFINITE ? upper[j] : INFINITE);
+    to.integers[0] = status;
+    report(to, status == NUMERICAL_ERROR ? d.constants[s.nq + s.dofs] : found.residual);
   }
 
  private:
@@ -134,23 +152,44 @@ class Step {
     return finite;
   }
 
+  // Whether a number of these leaves is NaN.
+  bool spoiled(int from, int to, int count) const {
+    for (int k = from; k < to; ++k)
+      for (int i = 0; i < leaf(k).size && places[k].array < count; ++i)
+        if (leaf(k).at[i] != leaf(k).at[i]) return true;
+    return false;
+  }
+
   // ---- box, kinematics and rows of tasks; returns whether all numbers are valid
-  bool find_rows(const StepData& d) {
-    arrays = d.arrays;
+  bool find_rows(const StepData& d, bool clean) {
+    arrays = d.arrays, ordered = true;
     auto robot = [&](int k) { return leaf(of_robot[k]).at; };
     const double *given = leaf(of_step[0]).at, *factor = d.constants, *offset = robot(OFFSET);
     dt = *leaf(of_step[1]).at, damping = *leaf(of_step[2]).at, kappa = *leaf(of_step[3]).at;
-    tolerances = d.constants + s.nq + s.dofs;
-    if (!(dt > 0 && dt <= LARGEST_DOUBLE && damping >= 0) || !all_finite(given, s.given) || !find_box(given)) return false;
-    for (int i = 0; i < s.nq; ++i) q[i] = factor[i] * given[source[i]] + offset[i];
-    tree.reference = robot(REFERENCE), tree.position = robot(POSITION), tree.quaternion = robot(QUATERNION);
-    tree.joint_position = robot(ANCHOR), tree.joint_axis = robot(AXIS), columns.factor = d.constants + s.nq;
-    place_bodies(tree, q.data(), placed);
-    for (const Task& task : tasks)
-      if (!add_task(task, given)) return false;
-    return true;
+    tolerances = d.constants + s.nq + s.dofs + 1;
+    if (!(dt > 0)) dt = NAN;
+    const bool has_box = find_box(given), set_up = dt <= LARGEST_DOUBLE && (clean || !spoiled(of_step[2], of_step[1], d.count));
+    bool valid = has_box && set_up && damping >= 0 && damping <= LARGEST_DOUBLE && all_finite(given, s.given);
+    if (!(dt <= LARGEST_DOUBLE)) dt = 1;
+    const bool is_placed = all_finite(given, s.given) && (clean || !spoiled(0, of_step[0], d.count));
+    if (is_placed) {
+      for (int i = 0; i < s.nq; ++i) q[i] = factor[i] * given[source[i]] + offset[i];
+      tree.reference = robot(REFERENCE), tree.position = robot(POSITION), tree.quaternion = robot(QUATERNION);
+      tree.joint_position = robot(ANCHOR), tree.joint_axis = robot(AXIS), columns.factor = d.constants + s.nq;
+      place_bodies(tree, q.data(), placed);
+    }
+    for (Task& task : tasks) {
+      task.valid = is_placed;
+      for (int i = 0; i < 9 && !clean; ++i)
+        task.valid = task.valid && !(task.leaves[i] >= 0 && spoiled(task.leaves[i], task.leaves[i] + 1, d.count));
+      if (task.valid) valid = add_task(task, given) && valid;
+      valid = valid && task.valid;
+    }
+    return valid;
   }
-  // limits/_box.py: of ConfigurationLimit and VelocityLimit, or as it is given
+  // A bound of the solver's: where they are the wrong way round, both are in the middle (solvers/_box.py).
+  static double order(double low, double high, int side) { return low > high ? 0.5 * (low + high) : side < 0 ? low : high; }
+  // limits/_box.py: of ConfigurationLimit and VelocityLimit, or as it is given. What depends on NaN is NaN.
   bool find_box(const double* given) {
     const int nv = s.nv;
     for (int j = 0; j < nv; ++j) lower[j] = of_step[4] < 0 ? -INFINITE : leaf(of_step[4]).at[j];
@@ -171,28 +210,34 @@ class Step {
           a = reach(is_scalar ? low[j] : -INFINITE, at, 1, j), b = reach(is_scalar ? high[j] : INFINITE, at, -1, j);
           b = larger(b, -speed[j]), a = a < speed[j] ? a : speed[j], a = a < b ? a : b;
         }
-        const double first = lower[j];
-        lower[j] = clip(a, first, upper[j]), upper[j] = clip(b, first, upper[j]);
+        const double first = lower[j], last = upper[j];
+        if (a == a && b == b && first == first && last == last) lower[j] = clip(a, first, last), upper[j] = clip(b, first, last);
+        else lower[j] = upper[j] = NAN;
       }
     }
     bool valid = true;
-    for (int j = 0; j < nv; ++j) valid &= lower[j] <= upper[j];
+    for (int j = 0; j < nv; ++j) {
+      valid &= lower[j] < INFINITE && upper[j] > -INFINITE, ordered &= !(lower[j] > upper[j]);
+      low_speed[j] = order(lower[j], upper[j], -1), high_speed[j] = order(lower[j], upper[j], 1);
+    }
     return valid;
   }
-  // leaves of a task: gain, weight, target velocity (or none), bounds (or none), then those of its kind
-  bool add_task(const Task& task, const double* given) {
+  // The rows of a task, and whether a solver takes them. Leaves of a task: gain, weight, target velocity (or none), bounds
+  // (or none), then those of its kind.
+  bool add_task(Task& task, const double* given) {
     const int m = task.m, nv = s.nv, *options = task.options, *leaves = task.leaves;
     const double own_gain = *leaf(leaves[0]).at, gain = own_gain > 1 / dt ? 1 / dt : own_gain;
     const Leaf weights = leaf(leaves[1]);
     const double* velocity = leaf_or_zeros(leaves[2]);
     Bounds<double> interval;
-    bool valid = fabs(own_gain) <= LARGEST_DOUBLE;
+    bool takes = true;
+    task.valid = fabs(own_gain) <= LARGEST_DOUBLE;
     if (task.bounded) {
       for (int i = 0; i < m; ++i) high[task.first + i] = -INFINITE;  // a polygon has upper bounds alone
       interval = {leaves[3] < 0 ? &high[task.first] : leaf(leaves[3]).at, leaf(leaves[4]).at};
       for (int i = 0; i < m; ++i) {
         const double a = interval.lower[i], b = interval.upper[i];
-        valid &= a <= b && a < INFINITE && b > -INFINITE;
+        takes &= a < INFINITE && b > -INFINITE, ordered &= !(a > b);
       }
     }
     if (task.kind == POSE) {
@@ -201,7 +246,7 @@ class Step {
       PoseGoal<double> goal{position, rotation, velocity, task.weight, &gain, options + 2, options[0] != 0, options[1] != 0};
       for (int i = 0, row = 0; i < 6; ++i)
         if (goal.kept[i]) task.weight[row] = weights[row] * leaf(leaves[7 + i / 3])[i % 3], ++row;
-      valid &= all_finite(position, 3) && all_finite(rotation, 9) && all_finite(velocity, 6);
+      task.valid &= all_finite(position, 3) && all_finite(rotation, 9) && all_finite(velocity, 6);
       goal.bounds = interval;
       double *at = frames.data(), *turn = at + 6, *jacobian = at + 24;
       for (int f = 0; f < count; ++f) {
@@ -211,23 +256,22 @@ class Step {
                    jacobian + 6 * nv * f);
       }
       if (count == 2) see_from_root(at, turn, jacobian);
-      if (valid) pose_rows(Team(), goal, at, turn, jacobian, nv, task.rows);
+      if (task.valid) pose_rows(Team(), goal, at, turn, jacobian, nv, task.rows);
     } else if (task.kind == CENTER) {  // options: whether there is a polygon, axes, whether each body counts
       CenterGoal<double> goal{m, options + 1, turning, nullptr, velocity, task.weight, &gain};
       for (int i = 0; i < m; ++i) task.weight[i] = weights[i];
-      if (options[0]) goal.normals = leaf(leaves[5]).at, valid &= all_finite(goal.normals, 2 * m);
-      else if (!task.bounded) goal.target = leaf(leaves[5]).at, valid &= all_finite(goal.target, m);
-      valid &= all_finite(velocity, m);
+      if (options[0]) goal.normals = leaf(leaves[5]).at, takes &= all_finite(goal.normals, 2 * m);
+      else if (!task.bounded) goal.target = leaf(leaves[5]).at, task.valid &= all_finite(goal.target, m);
+      task.valid &= all_finite(velocity, m);
       goal.bounds = interval;
       const double* own = leaf(of_robot[MASS]).at;
       for (int b = 0; b < s.bodies; ++b) parts[b] = options[1 + m + b] ? own[b] : 0.0;
       move_center(columns, placed, s.bodies, tree.parents, owner, parts.data(), leaf(of_robot[CENTER_OF_MASS]).at,
                   below.data(), frames.data(), frames.data() + 3);
-      if (valid) center_rows(Team(), goal, frames.data(), frames.data() + 3, nv, task.rows);
+      if (task.valid) center_rows(Team(), goal, frames.data(), frames.data() + 3, nv, task.rows);
     } else {  // options: place in q and dof of each row
       const double* target = task.bounded ? nullptr : leaf(leaves[5]).at;
-      if (target) valid &= all_finite(target, s.given);
-      valid &= all_finite(velocity, m);
+      task.valid &= (!target || all_finite(target, s.given)) && all_finite(velocity, m);
       *task.rows.curvature = 0;
       for (int j = 0; j < nv; ++j) task.rows.levers[j] = 0;
       for (int i = 0; i < m; ++i) {
@@ -238,8 +282,8 @@ class Step {
         for (int j = 0; j < nv; ++j) task.rows.jacobian[i * nv + j] = j == options[m + i];
       }
     }
-    for (int i = 0; i < m; ++i) valid &= task.weight[i] >= 0 && task.weight[i] <= LARGEST_DOUBLE;
-    return valid;
+    for (int i = 0; i < m; ++i) task.valid &= fabs(task.weight[i]) <= LARGEST_DOUBLE, takes &= task.weight[i] >= 0;
+    return takes;
   }
   // the first frame's pose and Jacobian in the axes of the second (tasks/_relative_frame.py)
   void see_from_root(double* position, double* rotation, double* jacobian) {
@@ -332,7 +376,7 @@ class Step {
     const int n = s.nv, N = n + s.p;
     const Bending bending = curvature_of([](const Task&) { return true; });
     const double bound = kappa * bending.bound, rest = kappa * bending.damping;
-    for (int j = 0; j < n; ++j) diagonal[j] = damping, center[j] = 0, qp_bounds[j] = lower[j], qp_bounds[N + j] = upper[j];
+    for (int j = 0; j < n; ++j) diagonal[j] = damping, center[j] = 0, qp_bounds[j] = low_speed[j], qp_bounds[N + j] = high_speed[j];
     for (const Task& task : tasks)
       for (int i = 0; i < task.m && task.diagonal; ++i) {
         const int dof = task.options[task.m + i];
@@ -342,11 +386,13 @@ class Step {
       const double total = bound + DIAGONAL_RATIO * diagonal[j];
       diagonal[j] += rest * (bound / (total > 0 ? total : 1));
       center[j] /= diagonal[j] > 0 ? diagonal[j] : 1;
+      if (!(diagonal[j] >= 0 && diagonal[j] <= LARGEST_DOUBLE)) return {false, INFINITE};
     }
     for (int i = 0; i < s.p; ++i) {  // a row of weight 0 has no bounds
       const double own = weight[s.m + i];
       compliance[i] = 1 / (own > 0 ? own : 1);
-      qp_bounds[n + i] = own > 0 ? low[s.m + i] : -INFINITE, qp_bounds[N + n + i] = own > 0 ? high[s.m + i] : INFINITE;
+      qp_bounds[n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], -1) : -INFINITE;
+      qp_bounds[N + n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], 1) : INFINITE;
     }
     const QPData<double> data{J.data(),          low.data(),         weight.data(),    diagonal.data(),
                               center.data(),     J.data() + s.m * n, compliance.data(), qp_bounds.data(),
@@ -354,10 +400,38 @@ class Step {
     int report[3], *active = to.integers + 3;
     qp[0].solve(data, {to.numbers, multipliers.data(), active, report});
     to.integers[0] = 0, to.integers[1] = report[1], to.integers[2] = report[2];
-    if (!report[0] || report[1] > s.max_iterations) return {false, 0};
-    const Certificate found = certificate[0].judge(data, to.numbers, multipliers.data(), active, tolerances[1]);
-    for (int j = 0; j < n; ++j) to.numbers[j] = clip(to.numbers[j], lower[j], upper[j]);
+    Certificate found{false, 0};
+    if (report[0] && report[1] <= s.max_iterations)
+      found = certificate[0].judge(data, to.numbers, multipliers.data(), active, tolerances[1]);
+    if (!found.holds) {
+      move_downhill(data, to.numbers);
+      for (int i = 0; i < N; ++i) active[i] = i < n && data.lower[i] == data.upper[i] ? EQUALITY : INACTIVE;
+      found.residual = certificate[0].judge(data, to.numbers, zeros.data(), active, tolerances[1]).residual;
+    }
+    for (int j = 0; j < n; ++j) to.numbers[j] = nearest(to.numbers[j], lower[j], upper[j]);
     return found;
+  }
+  // A point of the box that is no worse than zero: solvers/qp/_projected_gradient.py. The rows are soft.
+  void move_downhill(const QPData<double>& d, double* x) {
+    const int n = s.nv, rows = s.m + s.p;
+    double *size = center.data() + n, *gradient = size + n;
+    auto stiffness = [&](int i) { return i < s.m ? d.weight[i] : 1 / d.compliance[i - s.m]; };
+    for (int j = 0; j < n; ++j) x[j] = nearest(0, d.lower[j], d.upper[j]), size[j] = d.damping[j];
+    for (int i = 0; i < rows; ++i) {
+      double length = 0;
+      for (int j = 0; j < n; ++j) length += fabs(J[i * n + j]);
+      for (int j = 0; j < n; ++j) size[j] += stiffness(i) * length * fabs(J[i * n + j]);
+    }
+    for (int step = 0; step < GRADIENT_STEPS; ++step) {
+      for (int j = 0; j < n; ++j) gradient[j] = d.damping[j] * (x[j] - d.center[j]);
+      for (int i = 0; i < rows; ++i) {
+        const int q = n + i - s.m;
+        const double value = Team::own_dot(&J[i * n], x, 0, n);
+        const double force = stiffness(i) * (value - (i < s.m ? d.target[i] : nearest(value, d.lower[q], d.upper[q])));
+        for (int j = 0; j < n; ++j) gradient[j] += force * J[i * n + j];
+      }
+      for (int j = 0; j < n; ++j) x[j] = nearest(x[j] - gradient[j] / (size[j] > 0 ? size[j] : 1), d.lower[j], d.upper[j]);
+    }
   }
 
   // ---- the hierarchy (schemes/_hierarchical.py)
@@ -372,11 +446,12 @@ class Step {
     const int n = s.nv;
     std::vector<int>& end = found_labels;  // rows of each level so far
     for (int k = 0; k < s.L; ++k) end[k] = 0;
-    for (int j = 0; j < n; ++j) hard_lower[j] = lower[j], hard_upper[j] = upper[j], pinned[j] = lower[j] >= upper[j];
+    for (int j = 0; j < n; ++j) hard_lower[j] = low_speed[j], hard_upper[j] = high_speed[j], pinned[j] = lower[j] >= upper[j];
     for (const Task& task : tasks)
       for (int i = 0; i < task.m; ++i) {
         const int row = task.level * s.m + end[task.level]++;
-        const double own = task.weight[i], root = sqrt(own), a = task.rows.lower[i], b = task.bounded ? task.rows.upper[i] : a;
+        const double own = task.weight[i], root = sqrt(own), low = task.rows.lower[i], high = task.bounded ? task.rows.upper[i] : low;
+        const double a = order(low, high, -1), b = order(low, high, 1);
         for (int j = 0; j < n; ++j) level_rows[row * n + j] = root * task.rows.jacobian[i * n + j];
         equality[row] = !task.bounded || (a >= b && own > 0);
         if (own > 0) level_lower[row] = fabs(a) < INFINITE ? root * a : a, level_upper[row] = fabs(b) < INFINITE ? root * b : b;
@@ -408,6 +483,7 @@ class Step {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
     add_levels();
     add_dampings();
+    if (!all_finite(dampings.data(), 3 * L) || !all_finite(bends.data(), L * n)) return {false, INFINITE};
     const Problem p{level_rows.data(), level_lower.data(), level_upper.data(), hard.data(),     hard_lower.data(),
                     hard_upper.data(), dampings.data(),    bends.data(),       tolerances,  equality.data(),
                     pinned.data(),     d.guess ? d.guess : no_labels.data(), d.guess ? d.guess_own : no_labels.data(),    n, 1, false};
@@ -419,13 +495,13 @@ class Step {
     to.integers[0] = 0, to.integers[1] = report[1], to.integers[2] = report[2];
     const Certificate found = judge(sizes(), p, a);
     for (int j = 0; j < n; ++j)
-      if (a.active_bounds[j]) to.numbers[j] = a.active_bounds[j] < 0 ? lower[j] : upper[j];
+      to.numbers[j] = nearest(a.active_bounds[j] ? a.active_bounds[j] < 0 ? lower[j] : upper[j] : to.numbers[j], lower[j], upper[j]);
     return found;
   }
 
   void begin_solvers() {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
-    center.resize(n + 8), above.resize(n);
+    center.resize(3 * n + 8), above.resize(n);
     if (s.scheme == WEIGHTED) {
       const QPSizes of{m, n, s.p, s.max_iterations};
       solver_space.resize(WeightedQP<Team>::bytes(of) / sizeof(double));
@@ -442,17 +518,22 @@ class Step {
     hierarchy.emplace_back(sizes(), hierarchy_space.data());
   }
 
-  // slack and error of each row, in the order of the tasks' names
+  // slack and error of each row, in the order of the tasks' names; what is not finite is 0
   void report(const StepResult& to, double residual) {
     const int n = s.nv;
-    double *v = to.numbers, *slack = v + n + 2, *errors = slack + s.rows;
-    v[n] = residual, v[n + 1] = 0;
+    double *v = to.numbers, *slack = v + n + 2, *errors = slack + s.rows, outside = 0;
+    auto finite = [](double a) { return fabs(a) <= LARGEST_DOUBLE ? a : 0.0; };
+    for (int j = 0; j < n; ++j) outside = larger(outside, larger(finite(lower[j] - v[j]), finite(v[j] - upper[j])));
+    v[n] = residual, v[n + 1] = outside;
     for (const Task& task : tasks)
       for (int i = 0; i < task.m; ++i) {
-        const double a = task.rows.lower[i], b = task.bounded ? task.rows.upper[i] : a;
-        const double value = task.kind == POSTURE ? v[task.options[task.m + i]]
-                                                  : Team::own_dot(task.rows.jacobian + i * n, v, 0, n);
-        slack[task.out + i] = value - clip(value, a, b), errors[task.out + i] = task.rows.error[i];
+        double off = 0;
+        if (task.valid) {
+          const double a = task.rows.lower[i], b = task.bounded ? task.rows.upper[i] : a;
+          off = task.kind == POSTURE ? v[task.options[task.m + i]] : Team::own_dot(task.rows.jacobian + i * n, v, 0, n);
+          off -= nearest(off, a, b);
+        }
+        slack[task.out + i] = finite(off), errors[task.out + i] = task.valid ? finite(task.rows.error[i]) : 0.0;
       }
   }
 };

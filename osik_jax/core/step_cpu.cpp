@@ -1,6 +1,5 @@
 // XLA's call of a control step on a CPU. Arguments: the layout of control/_compiled_step.py, labels of the warm start (two
 // arrays, empty for none), the arrays with all numbers, the constants. Results: those of StepResult.
-#include <algorithm>
 #include <memory>
 
 #include "step.hpp"
@@ -24,11 +23,11 @@ void take_steps(const xla::Call& call) {
   const int integers = int(call.result(1).dimensions[1]), given = int(call.frame->arguments.size) - FIRST - 1;
   std::vector<const double*> arrays(given);
   std::vector<size_t> sizes(given), strides(given);
-  bool shared_valid = true;
+  bool shared_clean = true;
   for (int k = 0; k < given; ++k) {
     arrays[k] = call.in<double>(FIRST + k), sizes[k] = xla::numbers_of_lane(call.argument(FIRST + k));
     strides[k] = call.size(FIRST + k, 0) > 1 ? sizes[k] : 0;
-    if (!strides[k]) shared_valid = shared_valid && has_no_nan(arrays[k], sizes[k]);
+    if (!strides[k]) shared_clean = shared_clean && has_no_nan(arrays[k], sizes[k]);
   }
   auto guess = [&](int k, int lane) -> const int* {
     const xla::Buffer& buffer = call.argument(k);
@@ -36,13 +35,11 @@ void take_steps(const xla::Call& call) {
     return labels ? call.in<int>(k) + (buffer.dimensions[0] > 1 ? labels * lane : 0) : nullptr;
   };
   for (int lane = 0; lane < lanes; ++lane) {
-    bool valid = shared_valid;
+    bool clean = shared_clean;
     for (int k = 0; k < given; ++k)
-      if (strides[k]) valid = valid && has_no_nan(arrays[k], sizes[k]);
-    step->take({call.in<double>(FIRST + given), arrays.data(), guess(GUESS, lane), guess(GUESS + 1, lane)},
-               {call.out<double>(0) + size_t(numbers) * lane, call.out<int>(1) + size_t(integers) * lane,
-                call.out<int>(2) + lane},
-               valid);
+      if (strides[k]) clean = clean && has_no_nan(arrays[k], sizes[k]);
+    step->take({call.in<double>(FIRST + given), arrays.data(), given, guess(GUESS, lane), guess(GUESS + 1, lane)},
+               {call.out<double>(0) + size_t(numbers) * lane, call.out<int>(1) + size_t(integers) * lane}, clean);
     for (int k = 0; k < given; ++k) arrays[k] += strides[k];
   }
 }
