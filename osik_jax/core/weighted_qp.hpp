@@ -200,11 +200,11 @@ template <class Team> struct WeightedQP {
       c.store(GRADIENT, total);
     });
   }
-  // Whether a correction is the last: it is roundoff (in single precision the next one is, for they shrink alike), or
-  // shrinks no more. `before`: the size of the one before it.
+  // Whether a correction is the last: the next one would be roundoff, for they shrink alike, or it shrinks no more.
+  // `before`: the size of the one before it.
   OSIK_FN bool is_last(Real& before) const {
     const Real moved = t.largest(STEP, ROOT, n), far = t.largest(X, ROOT, n);
-    const bool is_roundoff = IS_SINGLE ? moved * moved <= CORRECTION * far * before : moved <= CORRECTION * far;
+    const bool is_roundoff = moved * moved <= CORRECTION * far * before;
     const bool last = before < Real(INFINITE) && (is_roundoff || moved > Real(MIN_DECREASE) * before);
     before = moved;
     return last;

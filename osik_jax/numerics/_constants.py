@@ -196,9 +196,9 @@ GRADIENT_STEPS = 100
 
 KERNEL_REFINEMENTS = {jnp.dtype("float64"): 10, jnp.dtype("float32"): 6}
 """Largest number of corrections."""
-KERNEL_CORRECTION = 1e-10
-"""Correction relative to the answer, in double precision, below which it is the last. In single precision
-``LAST_CORRECTION`` applies to the predicted next one.
+KERNEL_CORRECTION = 1e-16
+"""Predicted next correction of a kernel, relative to the answer, below which none follows; in single precision it is
+``LAST_CORRECTION``.
 """
 MIN_DECREASE = 0.25
 """Ratio of two corrections above which the second one was roundoff."""
