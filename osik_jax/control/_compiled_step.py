@@ -208,7 +208,7 @@ def _leaves_of_task(task: Any) -> list[Any]:
     """Return the leaves of a task in the order of ``Step::add_task``, -1 for none."""
     lower, upper, own = task.lower, task.upper, task.target
     if _polygon(task):
-        upper, own = task.polygon.offsets, task.polygon.normals
+        upper, own = task.polygon.offsets, (task.polygon.normals, task.polygon.vertices)
     own = own if isinstance(own, tuple) else (own, None)
     weights = [task.position_weight, task.orientation_weight] if isinstance(task, FrameTask | RelativeFrameTask) else []
     leaves = [task.gain, task.weight, task.target_velocity, lower, upper, *own, *weights, None, None]

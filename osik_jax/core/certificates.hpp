@@ -10,7 +10,8 @@ namespace osik {
 
 struct Certificate {
   bool holds;
-  double residual;  // of the optimality conditions, without units
+  double residual;       // of the optimality conditions, without units
+  bool is_exact = true;  // whether the gradient is roundoff where it has to be 0, which no search needs to reach
 };
 
 // Of a weighted QP in double precision.
@@ -40,7 +41,7 @@ class QPCertificate {
     if (scaled <= ZERO_TOL * EPSILON * scaled_newton) scaled = scaled_newton, plain = plain_newton;
     for (int q = 0; q < p; ++q)
       for (int j = 0; j < n; ++j) GRADIENT[j] -= d.rows[q * n + j] * y[q], ROW_TERMS[j] += fabs(d.rows[q * n + j] * y[q]);
-    bool holds = true;
+    bool holds = true, exact = true;
     double dual = 0, primal = 0, terms = 0;
     for (int i = 0; i < n + p; ++i) {
       const int label = active[i], q = i - n;
@@ -67,8 +68,8 @@ class QPCertificate {
       holds = holds && (!one_side || sign <= SIGN_TOL * d.tolerance * force);
       if (i < n) {
         const double size = SCALE[i] + ROW_TERMS[i], roundoff = GRADIENT_TOL * EPSILON * size;
-        const bool free = !is_active && fabs(multiplier) <= VALUE_TOL * d.tolerance * force && fabs(multiplier) <= roundoff;
-        holds = holds && (free || label == EQUALITY || (one_side && sign <= roundoff));
+        holds = holds && (is_active || fabs(multiplier) <= VALUE_TOL * d.tolerance * force);
+        exact = exact && (label == EQUALITY || (is_active ? sign : fabs(multiplier)) <= roundoff);
         terms = larger(terms, size), dual = larger(dual, one_side ? sign : is_active ? 0.0 : fabs(multiplier));
       } else {
         const double missed = larger(gap > 0 ? gap : 0.0, y[q] != 0 ? off : 0.0);
@@ -77,7 +78,7 @@ class QPCertificate {
       }
     }
     const double residual = larger(dual / (terms > 0 ? terms : 1.0), primal);
-    return {holds && residual <= kkt_tol, residual};
+    return {holds && residual <= kkt_tol, residual, exact};
   }
 
  private:

@@ -49,6 +49,10 @@ inline double nearest(double a, double low, double high) {
   return raised > high ? high : raised;
 }
 
+inline double positive_root(double a) { return a > 0 ? sqrt(a) : 0; }
+// The smaller one; NaN if one is.
+inline double least(double a, double b) { return a != a || a < b ? a : b; }
+
 // The Euclidean norm, whose squares neither overflow nor underflow.
 inline double safe_norm(const double* v, int count) {
   double size = 0, squares = 0;
@@ -134,7 +138,7 @@ class Step {
     Certificate found{false, d.constants[s.nq + s.dofs]};
     if (valid) {
       found = s.scheme == WEIGHTED ? solve_weighted(d, to) : solve_hierarchy(d, to);
-      status = !all_finite(to.numbers, n) ? NUMERICAL_ERROR : !ordered ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
+      status = !(found.residual <= LARGEST_DOUBLE && all_finite(to.numbers, n)) ? NUMERICAL_ERROR : !ordered ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
     }
     for (int j = 0; j < n && status == NUMERICAL_ERROR; ++j)
       to.numbers[j] = nearest(0, lower[j] < INFINITE ? lower[j] : -INFINITE, upper[j] > -INFINITE ? upper[j] : INFINITE);
@@ -169,7 +173,7 @@ class Step {
     tolerances = d.constants + s.nq + s.dofs + 1;
     if (!(dt > 0)) dt = NAN;
     const bool has_box = find_box(given), set_up = dt <= LARGEST_DOUBLE && (clean || !spoiled(of_step[2], of_step[1], d.count));
-    bool valid = has_box && set_up && damping >= 0 && damping <= LARGEST_DOUBLE && all_finite(given, s.given);
+    bool valid = has_box && set_up && all_finite(given, s.given);
     if (!(dt <= LARGEST_DOUBLE)) dt = 1;
     const bool is_placed = all_finite(given, s.given) && (clean || !spoiled(0, of_step[0], d.count));
     if (is_placed) {
@@ -194,10 +198,12 @@ class Step {
     const int nv = s.nv;
     for (int j = 0; j < nv; ++j) lower[j] = of_step[4] < 0 ? -INFINITE : leaf(of_step[4]).at[j];
     for (int j = 0; j < nv; ++j) upper[j] = of_step[4] < 0 ? INFINITE : leaf(of_step[5]).at[j];
+    bool valid = true;
     for (int k = 0; k < s.limits; ++k) {
       const int* limit = limits + 5 * k;
       const bool of_speed = limit[0] == SPEED;
       const Leaf low = leaf(limit[1]), high = leaf(limit[2]), gain = leaf(limit[3]), speed = leaf(limit[4]);
+      valid &= of_speed || all_finite(gain.at, gain.size);
       auto reach = [&](double bound, double at, double inward, int j) {  // rounded inward
         const double way = bound - at;
         return fabs(bound) < INFINITE ? gain[j] * (way + inward * RANGE_ROUNDOFF * EPSILON * fabs(way)) / dt : bound;
@@ -206,18 +212,18 @@ class Step {
         double a = -high[j], b = high[j];
         if (!of_speed) {
           const bool is_scalar = scalar[j] >= 0;
-          const double at = is_scalar ? given[scalar[j]] : 0.0;
+          double at = is_scalar ? given[scalar[j]] : 0.0;
+          at = fabs(at) < INFINITE || at != at ? at : 1;
           a = reach(is_scalar ? low[j] : -INFINITE, at, 1, j), b = reach(is_scalar ? high[j] : INFINITE, at, -1, j);
-          b = larger(b, -speed[j]), a = a < speed[j] ? a : speed[j], a = a < b ? a : b;
+          b = -least(-b, speed[j]), a = least(least(a, speed[j]), b);
         }
         const double first = lower[j], last = upper[j];
-        if (a == a && b == b && first == first && last == last) lower[j] = clip(a, first, last), upper[j] = clip(b, first, last);
-        else lower[j] = upper[j] = NAN;
+        auto narrowed = [&](double bound) { return first == first && bound == bound ? nearest(bound, first, last) : NAN; };
+        lower[j] = narrowed(a), upper[j] = narrowed(b);
       }
     }
-    bool valid = true;
     for (int j = 0; j < nv; ++j) {
-      valid &= lower[j] < INFINITE && upper[j] > -INFINITE, ordered &= !(lower[j] > upper[j]);
+      valid &= lower[j] < INFINITE && upper[j] > -INFINITE, ordered &= lower[j] <= upper[j];
       low_speed[j] = order(lower[j], upper[j], -1), high_speed[j] = order(lower[j], upper[j], 1);
     }
     return valid;
@@ -237,7 +243,7 @@ class Step {
       interval = {leaves[3] < 0 ? &high[task.first] : leaf(leaves[3]).at, leaf(leaves[4]).at};
       for (int i = 0; i < m; ++i) {
         const double a = interval.lower[i], b = interval.upper[i];
-        takes &= a < INFINITE && b > -INFINITE, ordered &= !(a > b);
+        takes &= a < INFINITE && b > -INFINITE;
       }
     }
     if (task.kind == POSE) {
@@ -247,6 +253,7 @@ class Step {
       for (int i = 0, row = 0; i < 6; ++i)
         if (goal.kept[i]) task.weight[row] = weights[row] * leaf(leaves[7 + i / 3])[i % 3], ++row;
       task.valid &= all_finite(position, 3) && all_finite(rotation, 9) && all_finite(velocity, 6);
+      for (int k : {7, 8}) task.valid &= all_finite(leaf(leaves[k]).at, leaf(leaves[k]).size);
       goal.bounds = interval;
       double *at = frames.data(), *turn = at + 6, *jacobian = at + 24;
       for (int f = 0; f < count; ++f) {
@@ -282,8 +289,14 @@ class Step {
         for (int j = 0; j < nv; ++j) task.rows.jacobian[i * nv + j] = j == options[m + i];
       }
     }
-    for (int i = 0; i < m; ++i) task.valid &= fabs(task.weight[i]) <= LARGEST_DOUBLE, takes &= task.weight[i] >= 0;
-    return takes;
+    for (int i = 0; i < m; ++i) {
+      const bool counts = task.weight[i] > 0 || s.scheme == HIERARCHICAL;  // a row of weight 0 has no bounds
+      task.valid &= fabs(task.weight[i]) <= LARGEST_DOUBLE;
+      takes &= task.weight[i] >= 0 || counts || task.bounded || task.diagonal;
+      if (task.bounded && counts && task.rows.lower[i] > task.rows.upper[i]) ordered = false;
+    }
+    takes = takes && (task.bounded || all_finite(task.rows.lower, m));
+    return takes && (task.kind == POSTURE || all_finite(task.rows.jacobian, m * nv));
   }
   // the first frame's pose and Jacobian in the axes of the second (tasks/_relative_frame.py)
   void see_from_root(double* position, double* rotation, double* jacobian) {
@@ -385,8 +398,8 @@ class Step {
     for (int j = 0; j < n; ++j) {
       const double total = bound + DIAGONAL_RATIO * diagonal[j];
       diagonal[j] += rest * (bound / (total > 0 ? total : 1));
-      center[j] /= diagonal[j] > 0 ? diagonal[j] : 1;
-      if (!(diagonal[j] >= 0 && diagonal[j] <= LARGEST_DOUBLE)) return {false, INFINITE};
+      diagonal[j] = diagonal[j] < 0 ? 0 : diagonal[j], center[j] /= diagonal[j] > 0 ? diagonal[j] : 1;
+      if (!(diagonal[j] <= LARGEST_DOUBLE)) return {false, INFINITE};
     }
     for (int i = 0; i < s.p; ++i) {  // a row of weight 0 has no bounds
       const double own = weight[s.m + i];
@@ -450,7 +463,7 @@ class Step {
     for (const Task& task : tasks)
       for (int i = 0; i < task.m; ++i) {
         const int row = task.level * s.m + end[task.level]++;
-        const double own = task.weight[i], root = sqrt(own), low = task.rows.lower[i], high = task.bounded ? task.rows.upper[i] : low;
+        const double own = task.weight[i], root = positive_root(own), low = task.rows.lower[i], high = task.bounded ? task.rows.upper[i] : low;
         const double a = order(low, high, -1), b = order(low, high, 1);
         for (int j = 0; j < n; ++j) level_rows[row * n + j] = root * task.rows.jacobian[i * n + j];
         equality[row] = !task.bounded || (a >= b && own > 0);
@@ -473,7 +486,7 @@ class Step {
       dampings[3 * level + 1] = factor * curvature_of(chosen).damping + kappa * curvature_above(level);
       int count = 0;
       for (const Task& task : tasks)
-        for (int i = 0; i < task.m && chosen(task); ++i) parts[count++] = sqrt(task.weight[i]) * task.rows.pull[i];
+        for (int i = 0; i < task.m && chosen(task); ++i) parts[count++] = positive_root(task.weight[i]) * task.rows.pull[i];
       dampings[3 * level + 2] = safe_norm(parts.data(), count);
       find_bends(chosen, own);
       for (int j = 0; j < s.nv; ++j) own[j] *= factor;
@@ -483,7 +496,10 @@ class Step {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
     add_levels();
     add_dampings();
-    if (!all_finite(dampings.data(), 3 * L) || !all_finite(bends.data(), L * n)) return {false, INFINITE};
+    bool valid = true;
+    for (const Numbers* v : {&dampings, &bends})
+      for (double a : *v) valid &= a >= 0 && a <= LARGEST_DOUBLE;
+    if (!valid) return {false, INFINITE};
     const Problem p{level_rows.data(), level_lower.data(), level_upper.data(), hard.data(),     hard_lower.data(),
                     hard_upper.data(), dampings.data(),    bends.data(),       tolerances,  equality.data(),
                     pinned.data(),     d.guess ? d.guess : no_labels.data(), d.guess ? d.guess_own : no_labels.data(),    n, 1, false};

@@ -50,7 +50,7 @@ void judge_weighted_qps(const xla::Call& call) {
     packed = read(d, packed, s), d.tolerance = tolerances[0];
     const Certificate found = certificate.judge(d, call.in<double>(2) + k * n, call.in<double>(3) + k * p,
                                                 call.in<int>(4) + k * N, tolerances[1]);
-    call.out<int>(0)[k] = found.holds, call.out<double>(1)[k] = found.residual;
+    call.out<int>(0)[k] = found.holds && found.is_exact, call.out<double>(1)[k] = found.residual;
   }
 }
 }  // namespace

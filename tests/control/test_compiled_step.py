@@ -213,6 +213,32 @@ def test_a_batch_is_a_loop_and_what_the_core_cannot_certify_is_left_to_plain_jax
     assert all(np.isfinite(np.asarray(a)).all() for a in jax.tree.leaves(found))
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("tasks", [mixed, pytest.param(bounded, marks=pytest.mark.slow)])
+def test_numbers_that_are_not_valid_are_answered_as_by_plain_jax(tasks, scheme):
+    robot = robot_of("arm7")
+    given = robot, lanes_of(robot)[0], *arguments(robot, tasks(robot), SCHEMES[scheme]())
+    leaves, tree = jax.tree.flatten(given)
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(given)[0]]
+    cases = [(k, np.nan) for k, leaf in enumerate(leaves) if leaf.size]
+    # the core does not look at an infinite mass of the world, and a negative weight in a hierarchy means nothing
+    cases += [(k, np.inf) for k, _ in cases if not names[k].startswith("[0]")]
+    cases += [(k, -1.0) for k, value in cases if np.isnan(value) and not (scheme == "hierarchy" and "weight" in names[k])]
+    wide = [np.tile(np.asarray(leaf)[None], (len(cases), *[1] * leaf.ndim)) for leaf in leaves]
+    for lane, (k, value) in enumerate(cases):
+        wide[k].reshape(len(cases), -1)[lane, 0] = value
+    lanes = jax.tree.unflatten(tree, list(map(jnp.asarray, wide)))
+    found, wanted = (jax.jit(jax.vmap(step))(*lanes) for step in (_step._compiled_step, _step._plain_step))
+    np.testing.assert_array_equal(found.status, wanted.status)
+    assert set(np.asarray(wanted.status).tolist()) >= {0, 3}
+    fields = "velocity", "slack", "error", "box_violation"
+    for a, b in zip(*(jax.tree.leaves([getattr(s, field) for field in fields]) for s in (found, wanted)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-9)
+    failed = np.asarray(wanted.status) == 3
+    np.testing.assert_array_equal(found.kkt_residual[failed], wanted.kkt_residual[failed])
+    assert all(np.isfinite(np.asarray(a)).all() for a in jax.tree.leaves(found))
+
+
 SMALL = """
 <mujoco>
   <compiler angle="radian" autolimits="true"/>
