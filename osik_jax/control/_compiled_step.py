@@ -49,7 +49,9 @@ def is_compiled(
     warm_start: Any,
 ) -> bool:
     """Return whether the core knows steps of this kind and is there."""
-    if type(scheme) not in (WeightedQP, HierarchicalQP) or scheme.max_iterations is not None or cuda_is_default():
+    if type(scheme) not in (WeightedQP, HierarchicalQP) or cuda_is_default():
+        return False
+    if getattr(scheme, "max_iterations", None) is not None:  # what a search has then is its own
         return False
     kinds = {jnp.result_type(a) for a in jax.tree.leaves((robot, q, tasks, scheme, limits, dt))}
     one_precision = {kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)} == {jnp.result_type(float)}
@@ -67,7 +69,8 @@ def _is_known(robot: Robot, task: Task) -> bool:
         return False
     if type(task) is PostureTask:
         return all(is_scalar(robot, joint) for joint in task.joints)
-    return type(task) is ComTask or (type(task) in (FrameTask, RelativeFrameTask) and not task.coupled)
+    of_pose = type(task) in (FrameTask, RelativeFrameTask)
+    return type(task) is ComTask or (of_pose and not getattr(task, "coupled", False))
 
 
 class _Arrays:
@@ -135,7 +138,8 @@ class _Layout:
         self.parts = {name: _rows_of(robot, task) for name, task in tasks.items()}
         self.count = count = {name: rows for name, (_, rows, _) in self.parts.items()}
         self.rows = sum(count.values())
-        self.bounded = bounded = {name: task.lower is not None or _polygon(task) for name, task in tasks.items()}
+        bounds = {name: getattr(task, "lower", None) for name, task in tasks.items()}
+        self.bounded = bounded = {name: bounds[name] is not None or _polygon(task) for name, task in tasks.items()}
         self.single = single = {
             name: by_weight and isinstance(task, PostureTask) and not bounded[name] for name, task in tasks.items()
         }

@@ -65,9 +65,9 @@ def center_of(robot: osik.Robot) -> Any:
 def mixed(robot: osik.Robot) -> dict[str, osik.Task]:
     """Equalities of every supported kind, at three priorities."""
     hand, root = frames_of(robot)
-    near = robot.joint_names[-1:]
+    near, rows = robot.joint_names[-1:], (True, True, False, False, True, True)
     return {
-        "hand": osik.FrameTask(robot, hand, rows=(1, 1, 0, 0, 1, 1), axes="frame", target_velocity=0.1 * np.ones(6)),
+        "hand": osik.FrameTask(robot, hand, rows=rows, axes="frame", target_velocity=0.1 * np.ones(6)),
         "turn": osik.FrameTask(robot, hand, rows="orientation", orientation_jacobian="geometric", priority=2),
         "between": osik.RelativeFrameTask(robot, hand, root, position_weight=(1.0, 0.0, 2.0), gain=500.0, priority=2),
         "com": osik.ComTask(robot, axes="yx", weight=(3.0, 4.0), priority=2),
@@ -96,8 +96,10 @@ def bounded(robot: osik.Robot) -> dict[str, osik.Task]:
 
 def standing(robot: osik.Robot) -> dict[str, osik.Task]:
     hand, root = frames_of(robot)
-    return {"foot": osik.FrameTask(robot, root), "hand": osik.FrameTask(robot, hand, priority=2, weight=0.1)} | {
-        "posture": osik.PostureTask(robot, priority=3)
+    return {
+        "foot": osik.FrameTask(robot, root),
+        "hand": osik.FrameTask(robot, hand, priority=2, weight=0.1),
+        "posture": osik.PostureTask(robot, priority=3),
     }
 
 
@@ -223,7 +225,8 @@ def test_numbers_that_are_not_valid_are_answered_as_by_plain_jax(tasks, scheme):
     cases = [(k, np.nan) for k, leaf in enumerate(leaves) if leaf.size]
     # the core does not look at an infinite mass of the world, and a negative weight in a hierarchy means nothing
     cases += [(k, np.inf) for k, _ in cases if not names[k].startswith("[0]")]
-    cases += [(k, -1.0) for k, value in cases if np.isnan(value) and not (scheme == "hierarchy" and "weight" in names[k])]
+    negative = [k for k, name in enumerate(names) if scheme == "weighted" or "weight" not in name]
+    cases += [(k, -1.0) for k, value in cases if np.isnan(value) and k in negative]
     wide = [np.tile(np.asarray(leaf)[None], (len(cases), *[1] * leaf.ndim)) for leaf in leaves]
     for lane, (k, value) in enumerate(cases):
         wide[k].reshape(len(cases), -1)[lane, 0] = value
@@ -301,16 +304,20 @@ def test_edges_of_what_is_allowed_are_those_of_plain_jax(kind, scheme):
 def test_a_step_is_one_call_with_few_operations_around_it():
     robot = robot_of("nao")
     tasks = standing(robot)
-    rotation = jnp.asarray(np.asarray(tasks["hand"].target[1]))
+    hand = tasks["hand"]
+    assert isinstance(hand, osik.FrameTask)
+    rotation = jnp.asarray(np.asarray(hand.target[1]))
 
     def velocity(q: Any, point: Any) -> Any:
-        aimed = tasks | {"hand": tasks["hand"].replace(target=(point, rotation))}
+        aimed = tasks | {"hand": hand.replace(target=(point, rotation))}
         return osik.solve(robot, q, aimed, scheme=osik.HierarchicalQP(), dt=DT).velocity
 
-    text = jax.jit(velocity).lower(robot.q0, jnp.ones(3)).compile().as_text()
+    text = jax.jit(velocity).lower(robot.q0, jnp.ones(3)).compile().as_text() or ""
     entry = text[text.index("ENTRY") :]
     operations = re.findall(r"= .*? (fusion|custom-call|conditional|while|copy|broadcast|concatenate)\(", entry)
-    assert operations.count("custom-call") == 1 and len(operations) <= 6, operations
+    assert operations.count("custom-call") == 1 and len(operations) <= 4, operations
+    # XLA makes place for the numbers of branches in every step, taken or not
+    assert "conditional" not in text and "while" not in text and len(text.splitlines()) < 300
 
 
 def test_numbers_are_swept_without_compiling():
@@ -318,12 +325,13 @@ def test_numbers_are_swept_without_compiling():
     hand, _ = frames_of(robot)
     task = osik.FrameTask(robot, hand)
     rest = osik.PostureTask(robot, weight=0.1)
-    before, found = _step.step._cache_size(), []
+    compiled: Any = _step.step
+    before, found = compiled._cache_size(), []
     for number in (1.0, 2.0, 5.0):
         tasks = {"hand": task.replace(weight=number, gain=number), "rest": rest.replace(gain=number)}
         scheme = osik.WeightedQP(damping=1e-4 * number)
         found.append(osik.solve(robot, robot.q0 + 0.1, tasks, scheme=scheme, dt=DT / number).velocity)
-    assert _step.step._cache_size() == before + 1
+    assert compiled._cache_size() == before + 1
     assert float(jnp.abs(found[0] - found[2]).max()) > 0.1
 
 
