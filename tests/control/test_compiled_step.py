@@ -1,4 +1,4 @@
-"""A control step in one call of the core: beside plain JAX, its derivatives, certificates and what it leaves to it."""
+"""A control step in one call of the core: beside plain JAX, its derivatives and certificates, and steps without it."""
 
 import re
 from typing import Any
@@ -193,7 +193,7 @@ def test_derivatives_are_those_of_plain_jax(scheme):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_batch_is_a_loop_and_what_the_core_cannot_certify_is_left_to_plain_jax(scheme):
+def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
     robot = robot_of("nao")
     tasks = bounded(robot)
     hand = tasks["hand"]
