@@ -46,8 +46,6 @@ UR5_LIKE = """
 def robot_of(name: str) -> osik.Robot:
     if name == "ur5":
         return osik.Robot.from_mjcf(UR5_LIKE)
-    if name == "g1":
-        pytest.importorskip("example_robot_data")
     return osik.load_robot(name)
 
 
