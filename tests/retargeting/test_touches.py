@@ -1,7 +1,9 @@
 """Hands that hold objects or each other: distances by MuJoCo, the core beside plain JAX, files and errors."""
 
 import dataclasses
+from typing import Any
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -112,17 +114,21 @@ def test_arms_on_a_fixed_base_hold_beside_the_trunk():
 def test_the_core_holds_as_plain_jax_does(nao):
     retargeter, motion = Retargeter(nao), carrying(12)
     clip = retargeter._prepared(motion, None, None)
-    free = np.ones(len(clip.start))
+    free = jnp.ones(len(clip.start))
     given = _Clip(retargeter._body_that(clip.touching), clip.goals, retargeter.profile.weights, clip.bounds, free)
-    most, damping = np.asarray(6), np.asarray(1.0)
-    one, other = (f(given, clip.start, most, damping, until="mended") for f in (_descended, _descended_plain))
+    most, damping = jnp.asarray(6), jnp.asarray(1.0)
+    one, other = (
+        f(given, jnp.asarray(clip.start), most, damping, until="mended") for f in (_descended, _descended_plain)
+    )
     np.testing.assert_allclose(one.q, other.q, atol=1e-7)
     np.testing.assert_allclose(one.cost, other.cost, rtol=1e-8)
 
 
 def test_files_rates_and_axes(tmp_path):
     motion = carrying()
-    arrays = {"object.box": motion.objects["box"]} | {f"touch.{t.role}.box": t.held for t in motion.touches}
+    arrays: dict[str, Any] = {"object.box": motion.objects["box"]} | {
+        f"touch.{t.role}.box": t.held for t in motion.touches
+    }
     np.savez(tmp_path / "carry.npz", fps=30.0, positions=motion.positions, joint_names=motion.joint_names, **arrays)
     read = load_motion(tmp_path / "carry.npz")
     np.testing.assert_array_equal(read.objects["box"], motion.objects["box"])
