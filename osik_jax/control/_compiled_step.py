@@ -49,28 +49,40 @@ def is_compiled(
     warm_start: Any,
 ) -> bool:
     """Return whether the core knows steps of this kind and is there."""
-    if type(scheme) not in (WeightedQP, HierarchicalQP) or cuda_is_default():
-        return False
-    if getattr(scheme, "max_iterations", None) is not None:  # what a search has then is its own
+    if cuda_is_default() or unknown_part(robot, tasks, scheme, limits) is not None:
         return False
     kinds = {jnp.result_type(a) for a in jax.tree.leaves((robot, q, tasks, scheme, limits, dt))}
     one_precision = {kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)} == {jnp.result_type(float)}
-    has_rows = any(type(limit) is ConfigurationLimit for limit in limits) and bool(independent_balls(robot.tree))
-    fits = one_precision and not has_rows and all(type(limit) in _LIMITS for limit in limits)
-    if not fits or not all(_is_known(robot, task) for task in tasks.values()):
-        return False
-    labels = _Layout(robot, tasks, scheme).labels
+    labels = Layout(robot, tasks, scheme).labels
     same = warm_start is None or [jnp.shape(a) for a in jax.tree.leaves(warm_start)] == labels
-    return same and takes(getattr(scheme, "backend", "jax"), "core", fits=True)
+    return one_precision and same and takes(getattr(scheme, "backend", "jax"), "core", fits=True)
 
 
-def _is_known(robot: Robot, task: Task) -> bool:
-    if task.hard or isinstance(task.gain, AdaptiveGain):
-        return False
-    if type(task) is PostureTask:
-        return all(is_scalar(robot, joint) for joint in task.joints)
-    of_pose = type(task) in (FrameTask, RelativeFrameTask)
-    return type(task) is ComTask or (of_pose and not getattr(task, "coupled", False))
+def unknown_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> str | None:
+    """Return the first part of a step that the core does not know, in words; None if it knows all."""
+    if type(scheme) not in (WeightedQP, HierarchicalQP):
+        return f"the scheme {type(scheme).__name__}"
+    if getattr(scheme, "max_iterations", None) is not None:  # what a search has then is its own
+        return f"a {type(scheme).__name__} with max_iterations"
+    for limit in limits:
+        if type(limit) not in _LIMITS:
+            return f"the limit {type(limit).__name__}"
+        if type(limit) is ConfigurationLimit and independent_balls(robot.tree):
+            return "the limit ConfigurationLimit of a robot with ball joints"
+    reasons = ((name, _unknown(robot, task)) for name, task in tasks.items())
+    return next((f"the task {name!r}, which {reason}" for name, reason in reasons if reason), None)
+
+
+def _unknown(robot: Robot, task: Task) -> str | None:
+    if type(task) not in (FrameTask, RelativeFrameTask, ComTask, PostureTask):
+        return f"is of the class {type(task).__name__}"
+    if task.hard:
+        return "is hard"
+    if isinstance(task.gain, AdaptiveGain):
+        return "has an AdaptiveGain"
+    if isinstance(task, PostureTask):
+        return None if all(is_scalar(robot, joint) for joint in task.joints) else "has joints that turn as a ball"
+    return "has error='se3'" if isinstance(task, FrameTask | RelativeFrameTask) and task.coupled else None
 
 
 class _Arrays:
@@ -124,7 +136,7 @@ def _is_moving(given: tuple[Any, ...], path: tuple[Any, ...]) -> bool:
     return of_task and not isinstance(given[2][path[1].key], PostureTask)
 
 
-class _Layout:
+class Layout:
     """Sizes and indices of a step's rows, in the order of the core's ``StepSizes``.
 
     Attributes:
@@ -284,7 +296,7 @@ def _steps(plain: Step, *given: Any) -> Solution:
 def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
     """Return all numbers and all integers of the solutions, those of a lane one after another."""
     robot, q, tasks, scheme, limits, dt, warm_start = packed.leaves(arrays)
-    layout, numbered, places = _Layout(robot, tasks, scheme), packed.numbered(), dict(packed.places)
+    layout, numbered, places = Layout(robot, tasks, scheme), packed.numbered(), dict(packed.places)
     guesses, box = jax.tree.leaves(warm_start), -1
     given = [a for a in arrays if jnp.issubdtype(a.dtype, jnp.floating)]
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))

@@ -20,6 +20,7 @@ from ..batching._names import find_leaves, leaf_names, replace_named
 from ..control._checks import check_setting, check_tasks, checked_limits
 from ..control._rollout import move, remembering
 from ..control._step import aim, step
+from ..control._units import configuration_units, unit_of, velocity_units
 from ..limits import Limit, Limits
 from ..numerics._arguments import check_count
 from ..robot import Robot
@@ -28,7 +29,6 @@ from ..schemes._default import scheme_for
 from ..tasks import Task
 from . import _exported
 from ._exported import BATCH, FORMAT, Port
-from ._units import configuration_units, unit_of, velocity_units
 
 LAST_VELOCITY = "last_velocity"
 """Input of a controller whose tasks or limits remember the velocity of the last step."""

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import warnings
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ import numpy as np
 
 from .._errors import OsikValueError, OsikWarning
 from ..control._checks import check_setting, check_tasks, checked_limits
+from ..control._packed_step import packed_step
 from ..control._step import build_problem
 from ..kinematics import integrate
 from ..limits import Limit, Limits
@@ -66,6 +68,10 @@ def save_controller(
     Joints, frames and bodies are in the file by name. Without ``source``, the robot is written as MJCF and read again
     before the file is written: what a step asks for must be the same for both.
 
+    The file's last two entries are for programs without Python (``core/c``): the step of the controller that
+    ``load_controller`` returns, as numbers for the compiled core, and a checksum of the text before them.
+    ``load_controller`` ignores both: it still reads a file that was edited by hand, which those programs refuse.
+
     Args:
         path: of the file.
         robot: the robot.
@@ -95,9 +101,17 @@ def save_controller(
         "limits": [encode(limit, f"limits[{place}]", tree) for place, limit in enumerate(given)],
         "tasks": [[name, encode(task, f"tasks[{name!r}]", tree)] for name, task in tasks.items()],
     }
+    saved = Controller(robot, dict(tasks), used, given, content["dt"])
     if source is None:
-        _check_written(robot, dict(tasks), given, content)
-    Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        saved = _check_written(saved, content)
+    Path(path).write_text(_with_packed_step(json.dumps(content, indent=1), saved), encoding="utf-8")
+
+
+def _with_packed_step(text: str, saved: Controller) -> str:
+    """Return the file's text with its last two entries: the step for programs without Python, and a checksum."""
+    step = packed_step(saved.robot, saved.tasks, saved.scheme, saved.limits, saved.dt)
+    text = f'{text[:-2]},\n "core": {json.dumps(step, ensure_ascii=False)}'
+    return f'{text},\n "checksum": {zlib.crc32(text.encode())}\n}}\n'
 
 
 def load_controller(path: str | os.PathLike[str]) -> Controller:
@@ -144,26 +158,24 @@ def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, An
     return found | {"numbers": {name: encode(getattr(robot, name), name, robot.tree) for name in _numbers(robot)}}
 
 
-def _check_written(robot: Robot, tasks: dict[str, Task], limits: Limits, content: Mapping[str, Any]) -> None:
-    """Raise where a robot read from its MJCF, with tasks and limits read for it, asks for another step.
+def _check_written(saved: Controller, content: Mapping[str, Any]) -> Controller:
+    """Return the controller read from its content; raise where it asks for another step.
 
     Locked joints and fused bodies are written as one body, so masses, shapes and numbers of bodies may differ. What
     counts is what a step sees: it is compared at home and beside it.
     """
     try:
-        again = _made(content, _quietly_loaded(content["robot"]))
+        robot, again = saved.robot, _made(content, _quietly_loaded(content["robot"]))
         same = again.robot.tree.dof_owners == robot.tree.dof_owners
         aside = 0.1 * np.sin(1.0 + np.arange(robot.nv))
         for q in (robot.q0, integrate(robot, robot.q0, aside)) if same else ():
-            problems = (
-                build_problem(robot, q, tasks, limits=limits, dt=content["dt"]),
-                build_problem(again.robot, q, again.tasks, limits=again.limits, dt=content["dt"]),
-            )
+            problems = (build_problem(c.robot, q, c.tasks, limits=c.limits, dt=c.dt) for c in (saved, again))
             same &= _are_close(*problems)
     except (IndexError, KeyError, TypeError, ValueError) as problem:
         raise OsikValueError(f"the robot's MJCF does not make it again: {problem}. {_REMEDY}") from problem
     if not same:
         raise OsikValueError(f"the robot's MJCF gives another step: masses, shapes or joints differ. {_REMEDY}")
+    return again
 
 
 _REMEDY = "Give source= as the name or file that the robot was loaded from"

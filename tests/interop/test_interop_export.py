@@ -252,7 +252,7 @@ def test_a_fixed_batch_and_programs_for_cuda():
 
 def test_a_free_base_and_robots_of_every_joint_have_units():
     """The names and units of q and v, where joints have several entries."""
-    from osik_jax.interop._units import configuration_units, velocity_units
+    from osik_jax.control._units import configuration_units, velocity_units
 
     mjcf = """<mujoco><worldbody><body name="a"><freejoint name="base"/><geom size="0.1"/>
         <body><joint name="ball" type="ball"/><geom size="0.1"/>
