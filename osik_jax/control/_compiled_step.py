@@ -252,12 +252,12 @@ def _rows_of(robot: Robot, task: Any) -> tuple[int, int, list[int]]:
         axes = [0] * rows if _polygon(task) else axis_numbers(task.axes).tolist()
         below = tree.is_own if task.subtree is None else tree.descendants[tree.frame_bodies[tree.frame(task.subtree)]]
         counts = np.asarray(below) | (task.subtree is None and bool(np.asarray(tree.is_own)[1:].all()))
-        return _CENTER, rows, [_polygon(task), *axes, *counts]
+        return _CENTER, rows, [int(number) for number in (_polygon(task), *axes, *counts)]
     options = [task.axes == "frame", task.orientation_jacobian == "geometric", *task.kept, len(task.frames)]
     for frame in map(tree.frame, task.frames):
         carrier = tree.frame_bodies[frame]
         options += [frame, carrier, *tree.moves[carrier]]
-    return _POSE, sum(task.kept), options
+    return _POSE, sum(task.kept), [int(number) for number in options]
 
 
 def compiled(plain: Step) -> Step:
