@@ -18,7 +18,9 @@ from ._compiled_step import Layout, unknown_part
 from ._units import configuration_units, velocity_units
 
 VERSION = 1
-"""Of the section and of the layout in it: ``SECTION`` in ``core/c/controller.cpp``. It grows when either changes."""
+"""Version of a file's section ``core`` and of the layout in it; ``SECTION`` in ``core/c/controller.cpp`` is the same
+number. It grows when either changes.
+"""
 
 
 def packed_step(

@@ -292,7 +292,7 @@ class Build:
 
 
 class TouchGoal(NamedTuple):
-    """What a joint holds.
+    """Where a joint is while it holds an object or another joint.
 
     Attributes:
         first: another joint's role, or ``ORIGIN``.

@@ -28,8 +28,8 @@ hand's have two letters (``rh_FFJ4``).
 _BASE = r"palm|hand|wrist|base"
 _HAND = r"hand|palm|finger|thumb"
 _MOST_WRIST, _LEAST_FINGERS, _LEAST_JOINTS, _LARGEST = 2, 3, 2, 0.4
-"""What a hand is: at most two joints before the palm, at least three fingers of at least two joints, and joints within
-0.4 m of each other.
+"""Bounds of what counts as a hand: two joints before the palm at most, three fingers of two joints at least, and joints
+within 0.4 m of each other.
 """
 _SAME = 2e-3
 """Joints nearer to each other than this [m] are one knuckle."""

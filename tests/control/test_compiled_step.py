@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from core_checks import needs_core
+from made_up_arm import SIX_JOINTS
 
 import osik_jax as osik
 from osik_jax.control import _compiled_step, _step
@@ -22,30 +23,11 @@ from osik_jax.solvers.qp._search import initial_result
 
 pytestmark = needs_core
 DT, LANES = 0.005, 6
-UR5_LIKE = """
-<mujoco>
-  <compiler angle="radian" autolimits="true"/>
-  <default><joint range="-3 3"/><geom size="0.05" mass="2"/></default>
-  <worldbody>
-    <body pos="0 0 0.09"><joint name="pan" axis="0 0 1"/><geom/>
-      <body pos="0 0.14 0"><joint name="lift" axis="0 1 0"/><geom/>
-        <body pos="0 -0.12 0.43"><joint name="elbow" axis="0 1 0"/><geom/>
-          <body pos="0 0 0.39"><joint name="wrist1" axis="0 1 0"/><geom/>
-            <body pos="0 0.09 0"><joint name="wrist2" axis="0 0 1"/><geom/>
-              <body name="tool" pos="0 0 0.09"><joint name="wrist3" axis="0 1 0"/><geom/></body>
-            </body>
-          </body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 
 
 def robot_of(name: str) -> osik.Robot:
     if name == "ur5":
-        return osik.Robot.from_mjcf(UR5_LIKE)
+        return osik.Robot.from_mjcf(SIX_JOINTS)
     return osik.load_robot(name)
 
 

@@ -65,7 +65,6 @@ def test_runs_in_fast_mode(source: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert plt.get_fignums()
     finally:
         plt.close("all")
-        jax.config.update("jax_enable_x64", True)
         jax.config.update("jax_disable_most_optimizations", False)
         jax.clear_caches()
     assert sorted(source.parent.iterdir()) == files

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from made_up_arm import SIX_JOINTS
 
 import osik_jax as osik
 from osik_jax.core import _build
@@ -26,21 +27,6 @@ pytestmark = [
     pytest.mark.slow,  # half a minute of compiling
     pytest.mark.skipif(COMPILER is None, reason="THE C LIBRARY IS NOT TESTED: no C++ compiler"),
 ]
-ARM = """
-<mujoco>
-  <compiler angle="radian" autolimits="true"/>
-  <default><joint range="-3 3"/><geom size="0.05" mass="2"/></default>
-  <worldbody>
-    <body pos="0 0 0.09"><joint name="pan" axis="0 0 1"/><geom/>
-      <body pos="0 0.14 0"><joint name="lift" axis="0 1 0"/><geom/>
-        <body pos="0 -0.12 0.43"><joint name="elbow" axis="0 1 0"/><geom/>
-          <body pos="0 0 0.39"><joint name="wrist1" axis="0 1 0"/><geom/>
-            <body pos="0 0.09 0"><joint name="wrist2" axis="0 0 1"/><geom/>
-              <body name="tool" pos="0 0 0.09"><joint name="wrist3" axis="0 1 0"/><geom/></body>
-            </body></body></body></body></body>
-  </worldbody>
-</mujoco>
-"""
 SCHEMES = {"weighted": osik.WeightedQP, "hierarchy": osik.HierarchicalQP}
 
 
@@ -121,7 +107,9 @@ def at(array: np.ndarray) -> ctypes.c_void_p:
 
 
 def arm() -> tuple[osik.Robot, dict[str, osik.Task]]:
-    robot = osik.Robot.from_mjcf(ARM).with_home(np.array([0.3, -0.8, 1.2, -0.4, 1.2, 0.2]))  # away from singularities
+    robot = osik.Robot.from_mjcf(SIX_JOINTS).with_home(
+        np.array([0.3, -0.8, 1.2, -0.4, 1.2, 0.2])
+    )  # away from singularities
     hand = osik.FrameTask(robot, "tool", orientation_weight=0.3)
     return robot, {"hand": hand, "rest": osik.PostureTask(robot, priority=2)}
 
