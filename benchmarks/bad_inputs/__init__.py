@@ -1,7 +1,8 @@
-"""Wrong inputs and what each gets: the table in docs/dev/bad_inputs.md, made by ``python -m benchmarks.bad_inputs``."""
+"""Wrong inputs and the outcome of each: docs/dev/bad_inputs.csv, written by ``python -m benchmarks.bad_inputs``."""
 
-from ._page import PAGE as PAGE
-from ._page import Case as Case
-from ._page import cases as cases
-from ._page import outcome as outcome
-from ._page import page as page
+from ._table import HEAD as HEAD
+from ._table import TABLE as TABLE
+from ._table import Case as Case
+from ._table import cases as cases
+from ._table import outcome as outcome
+from ._table import table as table

@@ -1,10 +1,8 @@
-"""Wrong inputs and what each gets: the table in docs/dev/bad_inputs.md.
+"""Wrong inputs and the outcome of each: docs/dev/bad_inputs.csv.
 
     python -m benchmarks.bad_inputs [--write]
 
-Every case is run. What can be known outside a program raises an exception of ours that names what is wrong and what
-there is instead; what is seen only while a program runs ends in a status, with finite numbers. Inputs that look wrong
-and are not, or that nobody can tell from right ones, are in a table of their own.
+It runs every case. docs/dev/bad_inputs.md states the rules that the outcomes follow.
 """
 
 from __future__ import annotations
@@ -13,23 +11,24 @@ import argparse
 
 import jax
 
+from benchmarks.data_file import write_csv
 from osik_jax.runtime import configure_cpu
 
-from ._page import PAGE, cases, outcome, page
+from ._table import HEAD, TABLE, cases, outcome, table
 
 
 def main() -> None:
-    """Runs all cases; prints the page, or writes it."""
-    parser = argparse.ArgumentParser(description="Wrong inputs and what each gets.")
-    parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
+    """Run all cases; print the table, or write it."""
+    parser = argparse.ArgumentParser(description="Wrong inputs and the outcome of each.")
+    parser.add_argument("--write", action="store_true", help=f"write {TABLE.name}")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    text = page({case.given: outcome(case) for case in cases()})
+    rows = table({case.given: outcome(case) for case in cases()})
     if arguments.write:
-        PAGE.parent.mkdir(exist_ok=True)
-        PAGE.write_text(text, encoding="utf-8")
+        write_csv(TABLE, HEAD, rows)
     else:
-        print(text)
+        for row in rows:
+            print(" | ".join(row))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 //
 // The hard rows q are the box (q < n, rows of the identity) and, from q = n on, the rows of earlier levels that have
 // inequalities. The JAX functions that this file equals are solve_cascade (solvers/hqp/_cascade.py),
-// solve_on_working_set, primal_active_set and freeze (docs/derivations.md, "The freezing rule").
+// solve_on_working_set, primal_active_set and freeze (docs/dev/derivations.md, "The freezing rule").
 //
 // One orthonormal basis Z [h, n] goes through all levels. Row q is N_q Z, N_q the q-th hard row; the first n rows are
 // Z itself. Its columns are

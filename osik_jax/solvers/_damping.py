@@ -5,7 +5,7 @@ model leaves. Where a step meets the level's demand there is no residual, so not
 is out of reach, all of it is left. So the second part is ``unmet ratio`` with ``ratio = |residual| / |demand|``, and
 the residual is that of the damped step itself: a fixed point, found from ratio 1 downwards. In one dimension the
 damping is ``max(0, unmet - s^2)`` for a singular value s: a threshold on singular values, without an SVD
-(docs/derivations.md, "Curvature damping").
+(docs/dev/derivations.md, "Curvature damping").
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ The paper updates orthogonal factors; here the state is one matrix over the m co
 value s and no multiplier, active ones a multiplier y and a prescribed value. The unknown s and y are an affine function
 of the prescribed ones, and its matrix is the tableau T. Making constraint k active or inactive exchanges s_k and y_k:
 one principal pivot, a rank-1 update, whatever the active set. Shapes are static, and nothing is factored again
-(docs/derivations.md, "The dual active-set step").
+(docs/dev/derivations.md, "The dual active-set step").
 
 An iteration decides on a step and leaves it in the carry for the next one to apply. XLA's CPU compiler would otherwise
 inline the decision into every element of the tableau's update; so it finds two vectors there.

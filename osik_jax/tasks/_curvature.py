@@ -114,7 +114,7 @@ def fraction_to_damp(
 
     Rows resist a motion v with ``1/2 v'J'W J v`` and leave out ``1/2 dt p . (grad^2 e)[v, v]``, which is large where
     the frame moves across p. There it is up to b, the resistance up to g, and b / (b + 2 g) of the bound is enough.
-    What bends elsewhere is a small part of it (docs/derivations.md, "Curvature damping").
+    What bends elsewhere is a small part of it (docs/dev/derivations.md, "Curvature damping").
 
     Args:
         bound: dt times the curvature, b. (k,)

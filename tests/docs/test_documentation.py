@@ -184,7 +184,7 @@ def test_badges_open_every_notebook() -> None:
 
 
 def test_files_that_derivations_and_architecture_name_are_there() -> None:
-    for page in ("derivations.md", "dev/architecture.md"):
+    for page in ("dev/derivations.md", "dev/architecture.md"):
         text = (ROOT / "docs" / page).read_text()
         named = re.findall(r"`(osik_jax/[\w/.]+)`", text)
         assert len(named) >= 8

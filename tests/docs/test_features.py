@@ -11,21 +11,34 @@ from pathlib import Path
 import pytest
 
 import osik_jax as osik
+from benchmarks.data_file import DATA, read_csv
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "features.md").read_text(encoding="utf-8")
 NONE = "—"
-COLUMNS = 12
+COLUMNS = 11
 
 
-def rows(page: str) -> list[list[str]]:
-    """Cells of the tables of features, heads left out."""
-    lines = [line for line in page.splitlines() if line.startswith("|") and not line.startswith("|--")]
-    cells = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
-    return [row for row in cells if len(row) > 3 and row[1] != "osik-jax"]
+def rows(page: str) -> list[tuple[str, list[str]]]:
+    """Return the heading and the cells of each row of the tables of features, heads left out."""
+    found = []
+    for section in page.split("\n## ")[1:]:
+        title, *lines = section.splitlines()
+        cells = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines if line.startswith("|")]
+        found += [(title, row) for row in cells[2:]]
+    return found
+
+
+def tests_by_feature() -> dict[tuple[str, str], list[str]]:
+    """Return the tests that the data file names, by heading and feature."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for title, feature, test in read_csv(DATA / "features.csv")[1]:
+        found.setdefault((title, feature), []).append(test)
+    return found
 
 
 ROWS = rows(PAGE)
+TESTS = tests_by_feature()
 
 
 def _test_file(name: str) -> Path:
@@ -44,32 +57,37 @@ def functions_of(name: str) -> frozenset[str]:
     return frozenset(name for name in found if name.rpartition("::")[2].startswith("test_"))
 
 
-def missing_tests(cell: str) -> list[str]:
-    """Of the tests that a cell names, those that do not exist."""
-    named = [quoted.partition("::")[::2] for quoted in re.findall(r"`([^`]+)`", cell)]
-    return [f"{file}::{test}" for file, test in named if test not in functions_of(file)]
+def missing_tests(named: list[str]) -> list[str]:
+    """Return the tests of a list that do not exist."""
+    split = [test.partition("::")[::2] for test in named]
+    return [f"{file}::{test}" for file, test in split if test not in functions_of(file)]
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
-def test_what_is_said_of_us_is_shown_by_a_test(row: list[str]):
+@pytest.mark.parametrize(("title", "row"), ROWS, ids=lambda given: given[0] if isinstance(given, list) else None)
+def test_what_is_said_of_us_is_shown_by_a_test(title: str, row: list[str]):
     assert len(row) == COLUMNS
-    ours, shown = row[1:3]
-    if ours == NONE or not shown.startswith("`"):
-        assert shown == NONE
-        assert ours == NONE or "`" not in ours, "a name of ours without a test"
+    shown = TESTS.get((title, row[0]), [])
+    if row[1] == NONE or not shown:
+        assert not shown
+        assert "`" not in row[1], "a name of ours without a test"
     else:
         assert not missing_tests(shown)
 
 
+def test_every_feature_of_the_data_file_is_on_the_page():
+    assert len(TESTS) > 60
+    assert set(TESTS) <= {(title, row[0]) for title, row in ROWS}
+
+
 def test_a_test_that_does_not_exist_is_seen():
-    assert missing_tests("`test_features.py::test_a_test_that_does_not_exist_is_seen`") == []
-    assert missing_tests("`test_features.py::test_nothing`") == ["test_features.py::test_nothing"]
+    assert missing_tests(["test_features.py::test_a_test_that_does_not_exist_is_seen"]) == []
+    assert missing_tests(["test_features.py::test_nothing"]) == ["test_features.py::test_nothing"]
 
 
 def test_names_of_ours_exist():
     """Every name in backquotes in our column: ``Name``, ``Name(option=)``, ``object.name``, ``package.name``."""
     checked = 0
-    for row in ROWS:
+    for _, row in ROWS:
         for name in re.findall(r"`([\w.]+)(?:\([^`]*\))?`", row[1]):
             checked += 1
             first, *rest = name.split(".")
@@ -85,7 +103,7 @@ def test_names_of_ours_exist():
 
 
 def test_every_task_limit_and_scheme_of_ours_is_in_it():
-    ours = " ".join(row[1] for row in ROWS)
+    ours = " ".join(row[1] for _, row in ROWS)
     bases = osik.Task, osik.Limit, osik.Scheme
     public = [getattr(osik, name) for name in dir(osik) if not name.startswith("_")]
     kinds = [kind for kind in public if isinstance(kind, type) and issubclass(kind, bases) and kind not in bases]

@@ -1,4 +1,4 @@
-"""Constraints that a level at its optimum freezes for lower levels (docs/derivations.md, "The freezing rule").
+"""Constraints that a level at its optimum freezes for lower levels (docs/dev/derivations.md, "The freezing rule").
 
 Active hard rows with a nonzero multiplier and the level's own rows in its cost have the same values at all minimisers
 of the level. They become equalities, and their row space is taken out of the projector.

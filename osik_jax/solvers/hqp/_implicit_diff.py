@@ -2,9 +2,9 @@
 
 Where no active set is about to change, the solution map is that of a cascade of equality-constrained least squares: at
 each level the frozen hard rows stay at their bounds, and the rows in the cost come as near to theirs as the levels
-above allow (docs/derivations.md, "Implicit derivatives"). The cascade takes one pseudo-inverse for each block of rows,
-whose derivative at constant rank is known in closed form. The search is not differentiated, so memory does not grow
-with its iterations.
+above allow (docs/dev/derivations.md, "Implicit derivatives"). The cascade takes one pseudo-inverse for each block of
+rows, whose derivative at constant rank is known in closed form. The search is not differentiated, so memory does not
+grow with its iterations.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 over d in the frozen rows' null space, with the hard rows kept and the level's inequality rows kept up to t. The tableau
 over the rows alone costs one factorisation, and each change of the working set one update of rank 1
-(docs/derivations.md, "The dual active-set step"). The level is then solved on the guessed set without the extra damping
-(``solve_on_working_set``), which decides whether the guess is right.
+(docs/dev/derivations.md, "The dual active-set step"). The level is then solved on the guessed set without the extra
+damping (``solve_on_working_set``), which decides whether the guess is right.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def solve_on_working_set(
         x = x + apply(problem.projector, least_squares_step(x, slack))
     slack = jnp.where(in_cost, apply(level.matrix, x) - target, 0.0)
     gradient = problem.gradient(x, slack)
-    # stationarity, P (gradient + G' multiplier) = 0: the multiplier is minus the lambda of docs/derivations.md
+    # stationarity, P (gradient + G' multiplier) = 0: the multiplier is minus the lambda of docs/dev/derivations.md
     multiplier = multipliers(problem, rows, -apply(problem.projector, gradient))
     feasible = _is_feasible(problem, active, x, tolerances) & jnp.isfinite(x).all()
     roundoff = gradient_roundoff(problem, x, slack, tolerances)

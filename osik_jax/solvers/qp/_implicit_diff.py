@@ -2,7 +2,7 @@
 
 Where no constraint is about to enter or leave the active set, the answer solves the KKT system at that set, which is
 smooth in all data. By the implicit function theorem its derivative is one more solution of the same system
-(docs/derivations.md, "Implicit derivatives"); the search is not differentiated.
+(docs/dev/derivations.md, "Implicit derivatives"); the search is not differentiated.
 """
 
 from __future__ import annotations

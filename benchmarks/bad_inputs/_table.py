@@ -1,4 +1,4 @@
-"""The cases, what comes back, and the page of it."""
+"""The cases, their outcomes, and the table of both."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 import jax
 
 import osik_jax as osik
+from benchmarks.data_file import DOCS
 
 from ._accepted import accepted
 from ._files import files
@@ -20,24 +21,25 @@ from ._models import folder
 from ._problems import in_programs, limits, problems
 from ._tasks import configurations, targets, tasks
 
-PAGE = Path(__file__).parents[2] / "docs" / "dev" / "bad_inputs.md"
+TABLE = DOCS / "dev" / "bad_inputs.csv"
+HEAD = ["group", "given", "gets"]
 PACKAGE = str(Path(osik.__file__).parent)
 _SHOWN = 80
-"""Characters of a message that the page shows."""
+"""Most characters of a message in the table."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One input.
+    """One input and its expected outcome.
 
     Attributes:
-        group: heading that it stands under.
-        given: what is given, for people.
-        run: gives it.
-        error: exception or warning that comes back; None: none does.
-        words: what the message says among other things; of an input that is accepted, why.
-        status: that the answer has, of an input that raises nothing; None: it is no solution.
-        foreign: whether the message goes on in words that are not ours or may change, which the page leaves out.
+        group: group of the table.
+        given: description of the input.
+        run: function that passes the input to the library.
+        error: expected exception or warning; None: no exception.
+        words: text that the message contains; the reason if the input is accepted.
+        status: expected status of the answer; None: an exception, or an answer without a status.
+        foreign: whether the rest of the message is another library's or varies; the table cuts it.
     """
 
     group: str
@@ -49,10 +51,10 @@ class Case:
     foreign: bool = False
 
     def message(self) -> str:
-        """Of the exception, in one line; empty where there is none.
+        """Run the case; return the exception's message in one line, empty without an exception.
 
         Raises:
-            AssertionError: anything else than what the case says happens.
+            AssertionError: the outcome is not the expected one.
         """
         try:
             with warnings.catch_warnings():
@@ -87,7 +89,7 @@ _GROUPS = {
 
 @functools.cache
 def cases() -> tuple[Case, ...]:
-    """All of them, group by group."""
+    """Return all cases, group by group."""
     found: list[Case] = []
 
     def adder(group: str) -> Callable[..., None]:
@@ -99,7 +101,7 @@ def cases() -> tuple[Case, ...]:
 
 
 def outcome(case: Case) -> str:
-    """What the page says of it."""
+    """Run a case and return its outcome as the table shows it."""
     message = case.message().replace(str(folder()), "FOLDER")
     if case.error is None:
         return f"{case.status.name + ': ' if case.status is not None else ''}{case.words}".removesuffix(": ")
@@ -110,27 +112,6 @@ def outcome(case: Case) -> str:
     return f"{case.error.__name__}: {shown}"
 
 
-def page(outcomes: dict[str, str]) -> str:
-    """The page, of outcomes by what is given."""
-    out = [_HEAD.format(count=len(outcomes))]
-    for group in _GROUPS:
-        rows = [case for case in cases() if case.group == group]
-        column = "why" if group == "Accepted" else "gets"
-        out.append(f"\n## {group}\n\n{_BEFORE.get(group, '')}| given | {column} |\n|---|---|\n")
-        out += [f"| {_cell(case.given)} | {_cell(outcomes[case.given])} |\n" for case in rows]
-    return "".join(out)
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*").replace("[", "\\[")
-
-
-_HEAD = """# Wrong inputs
-
-{count} wrong inputs, and the exception or status of each. `python -m benchmarks.bad_inputs --write` writes this page.
-`pytest tests/cli/test_bad_inputs.py` compares it with what happens. Long messages are cut.
-
-An input that can be checked before a program runs raises an exception. Its message names what is wrong and what is
-allowed. An input that is known only inside a program gives a status, and all numbers of the answer are finite.
-"""
-_BEFORE = {"Accepted": "Inputs that look wrong, and are valid or cannot be distinguished from valid ones.\n\n"}
+def table(outcomes: dict[str, str]) -> list[list[str]]:
+    """Return the rows of the table, from the outcome of each input."""
+    return [[case.group, case.given, outcomes[case.given]] for case in cases()]
