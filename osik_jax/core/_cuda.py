@@ -97,7 +97,7 @@ def call(
 
 
 def problems_of_a_block(problems: int) -> int:
-    """Return the number of problems per block for a kernel with workspace in global memory, which keeps blocks few."""
+    """Return the problems per block that bound the number of blocks: each block has workspace in global memory."""
     return -(-problems // _MOST_SPACES)
 
 

@@ -292,7 +292,7 @@ class Build:
 
 
 class TouchGoal(NamedTuple):
-    """Where a joint is while it holds an object or another joint.
+    """Goal of a joint that holds an object or another joint: its vector from what it holds.
 
     Attributes:
         first: another joint's role, or ``ORIGIN``.
@@ -308,7 +308,7 @@ class TouchGoal(NamedTuple):
 
 
 def _pull(held: Bool[np.ndarray, " F"], fps: float) -> Float[np.ndarray, " F"]:
-    """Return the weight of what is held: full while it is, and growing before and falling after. (F,)."""
+    """Return the weight of a touch goal: full while it is held, rising before and falling after. (F,)."""
     if not held.any():
         return np.zeros(len(held))
     weight = _TOUCH * 10.0 ** (-distance_transform_edt(~held) / (_NEARS * fps))

@@ -145,7 +145,7 @@ def _fingers_found(profile: Profile) -> list[str]:
 
 
 def _facing_feet(robot: Robot) -> tuple[Robot, Kinematics, dict[str, str]]:
-    """Return the robot facing x with its home kinematics, and its feet by their names in a profile, if it has some.
+    """Return the robot turned to face x, its home kinematics, and its feet by their names in a profile (empty: none).
 
     Raises:
         ValueError: frames that look like feet are neither two nor four.

@@ -74,7 +74,7 @@ def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int], least: in
 
 
 def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain, foot: str, *, pointed: bool = False) -> Limb:
-    """Return where a leg bends and where it ends: at its foot, if that is ``pointed`` or no joint moves it.
+    """Return hip, knee and ankle of a leg; the foot is the ankle if it is ``pointed`` or no joint moves it.
 
     Raises:
         ValueError: no joint between the ends of the leg bends it.
@@ -92,7 +92,7 @@ def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain, foot: str, *, poi
 
 
 def find_arm(robot: Robot, kinematics: Kinematics, arm: Chain) -> Limb:
-    """Return where an arm bends and where it ends.
+    """Return shoulder, elbow and wrist of an arm.
 
     The elbow is the joint that bends the arm far from the shoulder and from the last joint of the hand, and the wrist
     is that last joint. Where no joint between them bends the arm, the arm has no wrist joint: the end of its last link

@@ -84,7 +84,7 @@ class Reader:
         return load_motion(path, unit=unit, up=self.up, trim=self.trim)
 
     def options(self) -> dict[str, Any]:
-        """Return the options that its results depend on, as numbers and strings."""
+        """Return the options that change what the reader returns, as numbers and strings."""
         if self.source is None:
             return {"unit": self.unit, "up": self.up, "trim": self.trim}
         profile = find_profile(self.source) if self.profile is None else self.profile

@@ -71,13 +71,13 @@ class OnRobot:
         self._build = Build.of(robot, self.profile)
 
     def _body_that(self, touching: tuple[Limb, ...]) -> Body:
-        """Return the body whose joints hold something."""
+        """Return the body data for motions that hold these pairs, made once for each set of pairs."""
         if touching not in self._bodies:
             self._bodies[touching] = Body.of(self.robot, self.profile, self._pairs, self.balance, touching)
         return self._bodies[touching]
 
     def _roles(self, motion: HumanMotion | SourceMotion, mapping: Mapping[str, str] | None) -> dict[str, str]:
-        """Return the clip's joint for each role, none of a robot; the ends of the limbs to follow have to be there."""
+        """Return the clip's joint for each role (empty for a robot's motion), or raise if a needed role is missing."""
         limbs = [chain(limb) if self.profile.is_hand else limb for limb in self.profile.followed]
         needed = tuple(dict.fromkeys(role for limb in limbs for role in limb))
         if isinstance(motion, HumanMotion):

@@ -143,7 +143,7 @@ class Profile:
 
     @property
     def standing(self) -> tuple[str, ...]:
-        """Return the four points of a person whose contact with the floor the feet share; none without feet."""
+        """Return the names of the contact points that the feet follow, such as heels and toes; none without feet."""
         return STANDING.get(tuple(sorted(self.feet)), ())
 
     @property

@@ -83,7 +83,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
-    """Figures of the feet; None of a robot whose base is fixed or has none, and no slip of wheels."""
+    """Return the figures of the feet; None without feet or with a fixed base, and no slip for wheels."""
     names = ("contact_share", "slip_mm_max", "float_mm_max", "below_floor_mm_max")
     if not result.profile.feet or not result.robot.floating_base:
         return dict.fromkeys(names)

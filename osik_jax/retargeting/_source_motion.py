@@ -67,7 +67,7 @@ class SourceMotion:
 
     @property
     def seen(self) -> Profile:
-        """The profile that it has, also where none was given."""
+        """Return the robot's profile: the given one, or the one found for it."""
         assert self.profile is not None  # since it was made
         return self.profile
 

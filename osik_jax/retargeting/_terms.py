@@ -350,7 +350,7 @@ def _heights(place: _Places, some: slice | np.ndarray) -> tuple[Array, Array]:
 
 
 def _soles(place: _Places, corners: slice, rises: Array, contact: Float[Array, "4"], weight: Float[Array, ""]) -> _Rows:
-    """Corners that stand are at height 0, the others not below a clearance.
+    """Return the rows of the sole corners: height 0 in contact, at least a clearance otherwise.
 
     Corners without contact weigh less, because their rows switch on and off between iterations; so a swinging foot may
     come a little nearer to the floor than the clearance.

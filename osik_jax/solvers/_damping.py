@@ -151,7 +151,7 @@ def level_damping(
 
 
 class HardRows(NamedTuple):
-    """Rows ``lower <= matrix x <= upper`` of the levels above; unbounded rows stop nothing."""
+    """Rows ``lower <= matrix x <= upper`` of the levels above; unused rows have infinite bounds."""
 
     matrix: Float[Array, "r n"]
     lower: Float[Array, " r"]
@@ -159,7 +159,7 @@ class HardRows(NamedTuple):
 
 
 class _Blocking(NamedTuple):
-    """Rows of the levels above, and the direction of unit gain in the projector's range that moves each."""
+    """Rows of the levels above, each with the direction in the projector's range that changes it at rate 1."""
 
     rows: HardRows
     direction: Float[Array, "r n"]
@@ -192,13 +192,12 @@ def narrow_box(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
-    """Return the trust region of the levels below one that ended at x: motion that costs a share of its progress.
+    """Return a narrower box for the levels below a level that ended at x with a residual.
 
-    A residual that a level cannot meet acts, through the rows of the levels above, on everything that supports it. A
-    motion d of the levels below, which none of those rows sees, costs it at second order up to
-    ``1/2 residual size sum_j c_j d_j^2``, with the size (Frobenius norm) of its rows and the curvatures c; its gain is
-    ``1/2 (demand^2 - residual^2)``. The cost stays under a fraction of the gain where each variable has an equal part
-    of that. What a level can meet narrows nothing.
+    A motion d of the levels below changes no row of this level at first order. At second order it costs the level up to
+    ``1/2 residual size sum_j c_j d_j^2``, with the size (Frobenius norm) of its rows and the curvatures c. The level's
+    gain is ``1/2 (demand^2 - residual^2)``. The box keeps the cost under a fraction of the gain, in equal parts for all
+    variables. Without a residual the box stays.
 
     Args:
         damping: of the level.

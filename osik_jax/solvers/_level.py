@@ -113,6 +113,6 @@ def positive_root(a: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _scaled_bound(bound: Float[Array, " m"], root: Float[Array, " m"], none: float) -> Float[Array, " m"]:
-    """Return root times bound, or ``none`` if root is 0; an infinite bound has derivative 0 by its weight."""
+    """Return root times bound, or ``none`` if root is 0; an infinite bound has the derivative 0 by the root."""
     finite = jnp.where(jnp.isinf(bound), 0.0, bound)
     return jnp.where(root > 0.0, jnp.where(jnp.isinf(bound), bound, root * finite), none)

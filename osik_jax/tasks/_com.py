@@ -178,7 +178,7 @@ def _fields(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array,
 
 
 def _fields_by_kernel(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
-    """Return the same fields for a batch, from a kernel."""
+    """Return the fields of ``_fields`` for a batch of robots, computed by the core."""
     assert task.target is not None and task.target_velocity is not None and not isinstance(task.gain, AdaptiveGain)
     given, integers, lanes = center_arguments(robot, kinematics)
     m, nv = len(task.axes), robot.tree.nv

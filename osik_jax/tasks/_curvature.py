@@ -85,7 +85,7 @@ def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"])
 
 
 def share_of_far(distance: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Return 0 for a task at its target, and 1 for a task whose error is many lever arms. (k,).
+    """Return 0 for a task at its target, rising to 1 for a task whose error is many lever arms. (k,).
 
     Args:
         distance: the errors, in lever arms: times their weighted pulls, over the curvatures. (k,)
@@ -95,11 +95,10 @@ def share_of_far(distance: Float[Array, " k"]) -> Float[Array, " k"]:
 
 
 def near_part(far: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the fraction of the curvature bounds that counts: less than 1 where all tasks are near their targets.
+    """Return the factor on the curvature bounds: ``NEAR_PART`` if all tasks are at their targets, 1 if one is far.
 
-    A step is stable from half of the greatest eigenvalue on, and near the target the directions that the rows hardly
-    resist bend by a quarter of it at most. More damping makes the frame lag behind a target that moves through
-    configurations in which some direction is weak.
+    Near the target, directions that the rows hardly resist have a quarter of the greatest eigenvalue at most, and half
+    of it as damping keeps a step stable. More damping makes a frame lag behind a moving target.
 
     Args:
         far: ``share_of_far`` of the farthest task.

@@ -157,7 +157,7 @@ class FunctionTask(Task):
         return tuple(name for name in names if name != "numbers") + own
 
     def _numbers(self, function: Any) -> Any:
-        """Return the numbers of another function of the same structure, with the dtypes of the present ones."""
+        """Return the numbers of a new function of the present structure, in the dtypes of the present numbers."""
         numbers, structure = taken_apart(function)
         if structure != self.structure:
             raise OsikTypeError(

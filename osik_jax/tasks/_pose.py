@@ -203,7 +203,7 @@ class PoseTask(FramedTask):
         return super()._convert(name, value)
 
     def _rest(self, pose: Pose) -> tuple[Any, Any]:
-        """Return the parts of a pose on which the rows do not depend, for targets that leave them out."""
+        """Return position and rotation if the rows do not depend on them, None otherwise: targets may omit them."""
         position, rotation = pose
         if self.coupled:
             return None, None
@@ -220,7 +220,7 @@ def _fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -
 
 
 def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
-    """Return the same fields for a batch, from a kernel."""
+    """Return the fields of ``_fields`` for a batch of frames, computed by the core."""
     assert not isinstance(task.gain, AdaptiveGain)
     kept = np.flatnonzero(task.kept)
     both = jnp.concatenate([task.position_weight, task.orientation_weight], 1) * task.weight[:, None]

@@ -72,7 +72,7 @@ def pose_array(value: Any, dtype: Any, accepted: str | None = None) -> Array:
     """Return the numbers of an array, or of an object that has a matrix.
 
     Raises:
-        TypeError: they are none; the message tells what is accepted, by default of one pose.
+        TypeError: the value is not numeric; the message lists the accepted forms, by default those of a pose.
     """
     if callable(getattr(value, "as_matrix", None)):
         value = value.as_matrix()

@@ -38,11 +38,11 @@ class Panel:
     Attributes:
         title: what is shown, with its unit.
         curves: name of a scheme to values over time. Each (T,)
-        floor: values are drawn on a logarithmic axis that ends here; ``None``: a linear axis.
-        bound: a line that should not be crossed, and
-        above: whether the good side is above it.
-        bound_label: what the line means.
-        span: a linear axis shows this much at least, so that rounding errors of a constant do not look like curves.
+        floor: lower end of a logarithmic axis; ``None``: a linear axis.
+        bound: value of a line that should not be crossed; ``None``: no line.
+        above: whether the allowed side is above the line.
+        bound_label: label of the line.
+        span: least range of a linear axis, so that rounding errors of a constant do not look like curves.
     """
 
     title: str

@@ -1,18 +1,17 @@
 """Scale of a damped level's motion with the least damped cost, if the full motion within bounds costs more.
 
 Of all x whose rows move by s times the motion of a level, the search finds the smallest, x(s), and the largest s. On
-a set of saturated joints x(s) is linear in s. Bounds may ask far larger motions of the other joints for the same motion
-of the rows: near the largest scale of a level that is out of reach nearly all joints are saturated, and which way
-they go there jumps from step to step. A damped level goes to the scale at which
+a set of saturated joints x(s) is linear in s. Near the largest scale of a level out of reach, nearly all joints are
+saturated, and the direction in which they saturate jumps from step to step. A damped level therefore stops at the scale
+at which
 
     1/2 |s A motion - error|^2 + 1/2 damping |x(s)|^2 - damping s start . motion
 
-is least along that path, and not to a part of the straight way to its end: where joints at the ends of their ranges
-leave nothing to gain, nothing moves, as in a hierarchy. Without bounds the optimum is the motion itself, s = 1; the
-last term is 0 but for joints that levels above have saturated. The cost is convex along the path, with a slope that
-does not jump where joints saturate, for x(s) is the smallest.
+is least along the path x(s). It does not take a part of the straight line to the path's end. Without bounds the optimum
+is the motion itself, s = 1. The last term is 0 unless levels above have saturated joints. The cost is convex along the
+path, and its slope is continuous, because x(s) is the smallest.
 
-With the saturated joints of the point where it ends, that scale is a quotient of two sums, and so are its derivatives.
+On the saturated joints of its optimum, the scale is a quotient of two sums, and so are its derivatives.
 """
 
 from __future__ import annotations
@@ -42,10 +41,10 @@ def least_cost(
     rank_tol: Float[Array, " B"],
     max_iterations: int,
 ) -> tuple[SaturationResult, Int[Array, " B"], Float[Array, " B"]]:
-    """Return where damped levels stop on the way to their largest scale: the answer, a kind and a fraction.
+    """Return the answers at the scales of least damped cost, how each was found (a kind), and a fraction.
 
-    ``WHOLE``: at the largest scale. ``PART``: at the scale of least damped cost. ``STRAIGHT``: no such scale was found,
-    and the answer is that fraction of the straight line to the largest scale. Otherwise the fraction is 1.
+    ``WHOLE``: that scale is the largest. ``PART``: it is smaller. ``STRAIGHT``: it was not found, and the answer is the
+    fraction of the straight line to the largest scale. For other kinds the fraction is 1.
 
     Args:
         problem: the motions; every array has a leading axis of problems, as have the following.

@@ -75,7 +75,7 @@ class ScaledMotion(NamedTuple):
         return self.start + self.unbounded_step(scale)
 
     def unbounded_step(self, scale: Array) -> Float[Array, " n"]:
-        """Return the step from the start to that answer."""
+        """Return the step from the start to the answer without bounds."""
         return scale * self.motion + apply(self.projector, self.target - self.start)
 
     def size(self, scale: Array) -> Float[Array, ""]:
@@ -185,10 +185,10 @@ class _ActiveSet(NamedTuple):
 
 
 def _active_set(problem: ScaledMotion, root: Float[Array, " n"], end: DualState) -> _ActiveSet:
-    """Return the saturated joints; of a dependent set, all but one.
+    """Return the saturated joints, without one joint of a linearly dependent set.
 
-    That is the one which the others determine best, if they block the motion; if the whole motion ends where they are,
-    the one without which all multipliers have their signs.
+    If the set blocks the motion, that joint is the one which the others determine best. If the whole motion ends on
+    its bounds, it is the joint whose removal leaves all multipliers with the right sign.
     """
     # the dual method's answer, back in the units of the joints
     active = jnp.where(end.active == INACTIVE, 0, jnp.where(end.active == AT_UPPER, 1, -1)).astype(jnp.int32)
@@ -288,7 +288,7 @@ def _result(problem: ScaledMotion, active_set: _ActiveSet, at: _Iterate, iterati
 
 
 def blocked_scale(problem: ScaledMotion, active: Int[Array, " n"], normal: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return the scale for active joints at their bounds, if their combination is not changed by the null space.
+    """Return the scale that puts the active joints at their bounds; no null-space motion changes ``normal . x``.
 
     ``normal . bound = normal . start + scale normal . motion``.
     """

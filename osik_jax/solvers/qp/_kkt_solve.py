@@ -142,7 +142,7 @@ def kkt_inverse(
 ) -> Callable[[Float[Array, " n_and_p"]], Float[Array, " n_and_p"]]:
     """Return the map from r and -g to dx and dy of ``solve_kkt``; 0 for fixed variables and inactive rows.
 
-    One refinement: products with A keep what the factor of A'WA has lost.
+    One step of iterative refinement: its residuals use products with A, which lose fewer digits than A'WA.
     """
     factor = factorize(qp, qp.cost.hessian(), active)
     n = len(factor.free)

@@ -1,15 +1,15 @@
 """Minimiser by a projected Newton method, for problems in which the dual method's tableau loses accuracy.
 
-The tableau is an inverse. Where a weak damping stands beside heavy rows, what bounds and rows leave of it is smaller
-than its roundoff, and feasible constraints seem infeasible. Here nothing is inverted and nothing is updated. A soft row
-makes the cost piecewise quadratic, so a problem whose rows are all soft has a box and nothing else, and a projected
-Newton method descends in it from any start (D. P. Bertsekas, "Projected Newton methods for optimization problems with
-simple constraints", SIAM J. Control and Optimization 20, 1982). Its factor is R of the QR factors of the rows
-themselves, whose condition is the root of the Hessian's.
+The tableau is an inverse. With weak damping beside heavy rows, its entries may be smaller than their roundoff, and
+feasible constraints then seem infeasible. This method inverts nothing and updates nothing. A soft row makes the cost
+piecewise quadratic. So a problem with soft rows alone is constrained by its box only, and a projected Newton method
+descends in the box from any start (D. P. Bertsekas, "Projected Newton methods for optimization problems with simple
+constraints", SIAM J. Control and Optimization 20, 1982). Its factor is R of the QR factors of the rows, whose condition
+number is the root of the Hessian's.
 
 Hard rows are softened and corrected by their multipliers: the method of multipliers, or augmented Lagrangian
-(D. P. Bertsekas, "Constrained Optimization and Lagrange Multiplier Methods", 1982). Where they are infeasible together
-or in the box, the multipliers grow along a Farkas certificate, and x goes to the least violation.
+(D. P. Bertsekas, "Constrained Optimization and Lagrange Multiplier Methods", 1982). If they are infeasible, the
+multipliers grow along a Farkas certificate, and x approaches the least violation.
 """
 
 from __future__ import annotations

@@ -57,15 +57,15 @@ class _Lease(NamedTuple):
 class ControlLoop:
     """Controller running at a fixed rate in its own thread.
 
-    All methods may be called from any thread. Numbers (targets, weights, gains, limits) count from the next step on.
-    Another structure (another task, scheme, priority or limit) is compiled in the background while the step before
-    goes on and follows new targets; then it takes over at the configuration that was reached.
+    All methods may be called from any thread. Numbers (targets, weights, gains, limits) take effect in the next step.
+    Another structure (another task, scheme, priority or limit) is compiled in the background, while the present
+    controller goes on and follows new targets. The new one then starts at the current configuration.
 
-    The robot stands still while nothing is compiled yet, while paused, and wherever an answer is not finite. A target
-    that somebody leads (``aim`` with an owner or a timeout) and then abandons becomes where the robot is.
+    The robot stands still while nothing is compiled yet, while paused, and after an answer that is not finite. If the
+    owner of a target (``aim``) leaves or its timeout passes, the target becomes the robot's current pose.
 
-    A batch of robots runs in one program: q0 is (B, nq) then, and each number of the controller has a leading axis B.
-    So have targets, what the snapshot tells and what is recorded.
+    A batch of B robots runs in one program: q0 is (B, nq), and each number of the controller has a leading axis B. So
+    have targets, snapshots and recordings.
 
     Attributes:
         robot: the robot.
@@ -170,7 +170,7 @@ class ControlLoop:
         return False
 
     def change(self, edit: Callable[[Controller], Controller]) -> None:
-        """Replace the requested controller by ``edit`` of it; concurrent changes are serialised.
+        """Replace the requested controller by ``edit(controller)``; concurrent changes run one after another.
 
         Raises:
             Whatever ``edit`` raises; the controller then stays.
@@ -261,7 +261,7 @@ class ControlLoop:
         return self._recorder.stop()
 
     def _refresh(self) -> None:
-        """Take over the requested numbers; the caller holds the lock."""
+        """Copy the requested numbers to the running program; the caller holds the lock."""
         if self._job is not None:
             self._job = self._job._replace(numbers=with_targets(self._running, self._targets).numbers())
 

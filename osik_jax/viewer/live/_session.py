@@ -56,7 +56,7 @@ class Session:
     source: RobotSource | None = None
 
     def __post_init__(self) -> None:
-        """Add the robot's own limits, as ``solve`` does, so that they can be switched off too; make a name a source."""
+        """Add the robot's own limits, so that they can be switched off too; convert a name to a ``RobotSource``."""
         object.__setattr__(self, "limits", with_own_limits(self.robot, self.limits))
         if isinstance(self.source, str):
             object.__setattr__(self, "source", RobotSource(self.source))
@@ -73,9 +73,9 @@ class Session:
         return (no_limits, *on) if self.limits_off else on
 
     def controller(self) -> Controller:
-        """Return the controller with weight 0 and infinite limits for everything switched off.
+        """Return the controller, in which switched-off tasks have weight 0 and switched-off limits are infinite.
 
-        So that switching compiles nothing; limits of other kinds are left out.
+        So a switch compiles nothing. A switched-off limit that cannot be infinite is left out.
         """
         tasks = {name: task.replace(weight=0.0) if name in self.off else task for name, task in self.tasks.items()}
         limits = [_loose(limit) if n in self.limits_off else limit for n, limit in enumerate(self.limits)]
