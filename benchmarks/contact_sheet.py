@@ -50,20 +50,19 @@ class Row(NamedTuple):
 
     def cells(self) -> tuple[str, ...]:
         """Return the texts of the columns in ``HEAD``."""
-        goal, limits, status = (self.figures[key] for key in ("goals", "limits", "solver"))
-        feet = [figures["position_mm"] for figures in self.figures["standing"].values()]
-        solved = status["status"]["SOLVED"]
+        figures, status = self.figures, self.figures["status"]
+        drift = figures.get("feet_drift_mm")
         return (
             self.name,
             "floating" if self.robot.floating_base else "fixed",
             str(self.robot.nv),
             SCHEME,
             self.goal,
-            f"{goal[self.goal]['position_mm']:.2g}",
-            f"{goal[self.goal]['settled_position_mm']:.2g}",
-            f"{max(feet):.1g}" if feet else "-",
-            str(limits["position_violations"] + limits["velocity_violations"]),
-            f"{solved}/{sum(status['status'].values())}",
+            f"{figures[f'{self.goal}_mm']:.2g}",
+            f"{figures[f'{self.goal}_once_there_mm']:.2g}",
+            "-" if drift is None else f"{drift:.1g}",
+            str(figures["position_limits_broken"] + figures["velocity_limits_broken"]),
+            f"{status['SOLVED']}/{sum(status.values())}",
             f"{self.seconds:.0f}",
         )
 
@@ -84,7 +83,7 @@ def demonstrate(name: str, folder: Path) -> Row:
     robot = load(name)
     if robot.nq != _path(name, folder).shape[1]:  # the command bolts down what floats but has no feet
         robot = osik.Robot.from_urdf(file_of(name), floating_base=False)
-    return Row(name, robot, next(iter(figures["goals"])), figures, seconds)
+    return Row(name, robot, "waist" if "waist_mm" in figures else "hand", figures, seconds)
 
 
 def _path(name: str, folder: Path) -> np.ndarray:

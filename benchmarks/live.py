@@ -23,13 +23,13 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax.cli import read_robot
-from osik_jax.demo._file import guess_feet
+from osik_jax.robot._feet import guess_feet
 from osik_jax.runtime import configure_cpu
-from osik_jax.viewer import LiveView
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live import _open
 from osik_jax.viewer.live._default import find_hands
+from osik_jax.viewer.live._page import LiveView
 from osik_jax.viewer.live._source import RobotSource
 from osik_jax.viewer.live._surfaces import part_triangles
 from osik_jax.viewer.live._timing import Stopwatch

@@ -29,6 +29,8 @@ import osik_jax as osik
 from osik_jax import tuning
 from osik_jax.runtime import configure_cpu
 from osik_jax.tuning._losses import LossFunction
+from osik_jax.tuning._parameters import ParameterSpace
+from osik_jax.tuning._tune import Tuning
 
 FEET = {"left_foot": "l_sole", "right_foot": "r_sole"}
 HANDS = {"left_hand": "l_gripper", "right_hand": "r_gripper"}
@@ -121,7 +123,7 @@ def reachable(
     return tuning.Scenarios(q0=start, values={f"{name}.target[0]": points[:, i] for i, name in enumerate(hands)})
 
 
-def by_gradient(experiment: Experiment, iterations: int, **options: Any) -> tuning.Tuning:
+def by_gradient(experiment: Experiment, iterations: int, **options: Any) -> Tuning:
     """``tune`` with its defaults."""
     loss, names, loop, training, held_out = experiment
     return tuning.tune(loss, names, training, loop=loop, held_out=held_out, iterations=iterations, **options)
@@ -132,7 +134,7 @@ def by_cma(
 ) -> tuple[np.ndarray, tuning.Loop]:
     """CMA-ES from the same start in the same space: the best training loss after each evaluation, and the best loop."""
     loss, names, loop, training, _ = experiment
-    space = tuning.ParameterSpace(loop, names)
+    space = ParameterSpace(loop, names)
     search = cma.CMAEvolutionStrategy(np.asarray(space.initial), sigma, {"seed": seed, "verbose": -9})
     best, found, curve = np.inf, loop, []
     while len(curve) < evaluations:

@@ -23,7 +23,6 @@ from .kinematics import com_jacobian as com_jacobian
 from .kinematics import difference as difference
 from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import frame_jacobian as frame_jacobian
-from .kinematics import frame_jacobians as frame_jacobians
 from .kinematics import frame_pose as frame_pose
 from .kinematics import integrate as integrate
 from .kinematics import mass_matrix as mass_matrix
@@ -37,7 +36,6 @@ from .limits import LinearLimit as LinearLimit
 from .limits import PositionBarrier as PositionBarrier
 from .limits import VelocityLimit as VelocityLimit
 from .limits import limit_box as limit_box
-from .limits import limit_rows as limit_rows
 from .limits import no_limits as no_limits
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot

@@ -56,32 +56,21 @@ class Demo:
         from rich.markup import escape
 
         from .._progress import spoken
-        from ..demo import _physics_demo, _run
+        from ..demo._demo import run_demo
         from ..demo._estimate import estimate_seconds
-        from ..demo._folder import needed_bytes, writable_folder
-        from ..demo._physics_report import physics_table
-        from ..demo._report import table
+        from ..demo._folder import writable_folder
 
         console = Console()
         motion, dt = _motion(self), 1.0 / self.frequency
         with told():
-            out = writable_folder(self.out, needed_bytes(motion, len(self.schemes), dt))
+            out = writable_folder(self.out, motion, schemes=len(self.schemes), dt=dt)
         for note in motion.notes:
             console.print(f"[yellow]note:[/yellow] {escape(note)}")
-        settings: Any = dict(schemes=self.schemes, dt=dt, animation=self.animation)
-        seconds = estimate_seconds(motion, physics=self.physics, **settings)
-        console.print(f"{escape(motion.title)}: this will take about {spoken(seconds)}")
-        settings["renderer"] = self.renderer
+        settings: Any = dict(schemes=self.schemes, dt=dt, animation=self.animation, physics=self.physics)
+        console.print(f"{escape(motion.title)}: this will take about {spoken(estimate_seconds(motion, **settings))}")
+        settings |= dict(picture=self.picture, renderer=self.renderer)
         with writing(out), progress(console) as announce:
-            if self.physics:
-                summary, simulated = _physics_demo.run_physics_demo(motion, out, announce=announce, **settings)
-                last, shown = simulated[-1].run, physics_table(summary)
-            else:
-                summary, runs = _run.run_demo(motion, out, announce=announce, **settings)
-                last, shown = runs[-1], table(summary)
-            if self.picture:
-                announce("drawing the picture", 1.0)
-                _run.draw_picture(motion, last, out / "picture.png")
+            _, shown, _ = run_demo(motion, out, announce=announce, **settings)
         console.print(shown)
         console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}")
         return 0

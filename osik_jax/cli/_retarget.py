@@ -133,13 +133,14 @@ def _reader(command: Retarget) -> Reader:
     """Return the function that reads a clip as the command says."""
     from .. import retargeting
     from ..retargeting._load import Reader
+    from ..retargeting._profile_file import find_profile
 
     if command.source is None:
         unit = None if command.unit is None else _number_or_name(command.unit)
         return Reader(unit=unit, up=command.up, trim=command.trim)
     profile = None if command.source_profile is None else retargeting.load_profile(command.source_profile)
     source = _robot_to_retarget(command.source)
-    return Reader(source=source, profile=profile or retargeting.find_profile(source), fps=command.source_fps)
+    return Reader(source=source, profile=profile or find_profile(source), fps=command.source_fps)
 
 
 def _fit(command: Retarget, file: Path) -> None:

@@ -78,6 +78,6 @@ class View:
 
 def _feet(robot: Robot) -> tuple[str, ...]:
     """Return frames on the ground, of a robot that moves freely."""
-    from ..demo._file import guess_feet
+    from ..robot._feet import guess_feet
 
     return guess_feet(robot) if robot.floating_base else ()

@@ -6,22 +6,20 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._errors import OsikValueError
 from ..kinematics._home import compiled_kinematics
-from ..limits import ConfigurationLimit, VelocityLimit
+from ..physics._world import contact_corners
 from ..robot import Robot
-from ..robot._feet import find_feet
-from ..tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
-from ..viewer import Look
+from ..robot._feet import guess_feet
+from ..tasks import ComTask, FrameTask, PostureTask, Task, support_polygon
+from ..viewer._look import Look
 from ..viewer._outline import robot_outline
-from ._motion import GAIN, Goal, Motion, Stance, along, contact_corners, tracking
-from ._start import Rows, raised, start
+from ._motion import GAIN, MARGIN, Motion, Rows, Stance, along, tracking
+from ._start import raised, start
 from ._sway import SWAY, sway, sway_of
 
-# margin of the centre of mass inside the support polygon [m], as in NAO's motions
-_MARGIN = 0.01
 _HANDS = (r"tcp|tool|gripper|end_?effector|\bee\b", r"hand", r"flange|wrist")
 
 
@@ -53,50 +51,67 @@ def file_motion(
     """
     moving = guess_moving_frame(robot) if frame is None else frame
     standing = tuple(support) or (guess_feet(robot) if robot.floating_base else ())
-    for chosen in (moving, *standing):
-        robot.tree.frame(chosen)
-    if robot.floating_base and not standing:
-        raise OsikValueError(
-            "the base floats and none of the frames looks like a foot: say which ones stand with --support NAME..., or "
-            "--base fixed; "
-            f"frames: {', '.join(robot.frame_names)}"
-        )
-    if moving in standing:
-        raise OsikValueError(f"frame {moving!r} cannot both move and stand; choose another --frame or --support")
+    _check_frames(robot, moving, standing)
+    # one or two feet are flat, more feet are points
+    rows: Rows = "pose" if len(standing) <= 2 else "position"
     outline = robot_outline(robot, robot.q0, look)
-    q0 = start(robot, outline, moving, standing, _foot_rows(standing))
+    q0 = start(robot, outline, moving, standing, rows)
     if robot.floating_base:
         q0 = raised(robot, q0, -robot_outline(robot, q0, look).lowest)
-    polygon, notes = _polygon(robot, q0, standing)
-    flat = _foot_rows(standing) == "pose"
-    stances = tuple(Stance(foot, _corners(robot, foot), flat=flat) for foot in standing)
+    kinematics = compiled_kinematics(robot, q0)
+    still: dict[str, Task] = {
+        foot: FrameTask(robot, foot, target=kinematics.frame_pose(robot, foot), rows=rows, weight=1e4, gain=GAIN)
+        for foot in standing
+    }
+    # weak and slow: the posture only decides between motions that serve the other tasks
+    still["posture"] = PostureTask(robot, target=q0, weight=1e-2, gain=1.0, priority=4)
+    corners, notes = {foot: _corners(robot, foot) for foot in standing}, []
+    balanced = sum(len(points) for points in corners.values()) >= 3
+    if balanced:
+        polygon = support_polygon(robot, q0, standing, margin=MARGIN, corners=corners)
+        still["com"] = ComTask(robot, polygon=polygon, weight=1e3, gain=GAIN, priority=2)
+    elif standing:
+        known = f"no contact corners are known of {', '.join(standing)} (sites NAME_corner_0, NAME_corner_1, ...)"
+        notes.append(f"{known}, so balance is neither asked for nor reported")
+    if look is not None and look.missing:
+        first, *others = look.missing
+        more = f" and {len(others)} more" if others else ""
+        notes.append(f"the pictures do without mesh files that cannot be read: {first}{more}")
     goal = sway(robot, q0, moving, size=outline.size, duration=duration)
-    still, follower = _tasks(robot, q0, goal, standing, polygon)
-    label = "waist" if robot.floating_base else "hand"
+    follower, label = tracking(robot, goal, weight=1e2, priority=3), "waist" if robot.floating_base else "hand"
     return Motion(
-        name="waist" if robot.floating_base else "hand",
+        name=label,
         title=f"{name}: {moving} sways",
         robot=robot,
         q0=q0,
         tasks=lambda t: still | {label: along(follower, goal, t)},
         duration=duration,
-        stances=stances,
+        stances=tuple(Stance(foot, points, flat=rows == "pose") for foot, points in corners.items()),
         goals={label: goal},
-        limits=(ConfigurationLimit(robot), VelocityLimit(robot)),
-        balanced=polygon is not None,
-        notes=(*notes, *_remarks(look)),
+        balanced=balanced,
+        notes=tuple(notes),
         look=look,
         scale=sway_of(outline.size) / SWAY,
     )
 
 
-def _remarks(look: Look | None) -> tuple[str, ...]:
-    """Return a remark on the meshes of a URDF that could not be drawn; empty if there are none."""
-    if look is None or not look.missing:
-        return ()
-    first, *others = look.missing
-    more = f" and {len(others)} more" if others else ""
-    return (f"the pictures do without mesh files that cannot be read: {first}{more}",)
+def _check_frames(robot: Robot, moving: str, standing: Sequence[str]) -> None:
+    """Raise an error if a frame does not exist, no frame stands, or the moving frame stands."""
+    for chosen in (moving, *standing):
+        robot.tree.frame(chosen)
+    if robot.floating_base and not standing:
+        raise OsikValueError(
+            "the base floats and none of the frames looks like a foot: say which ones stand with --support NAME..., or "
+            f"--base fixed; frames: {', '.join(robot.frame_names)}"
+        )
+    if moving in standing:
+        raise OsikValueError(f"frame {moving!r} cannot both move and stand; choose another --frame or --support")
+
+
+def _corners(robot: Robot, foot: str) -> Float[np.ndarray, "k 3"]:
+    """Return a foot's contact corners in its frame [m]; its origin if it has none."""
+    known = contact_corners(robot, foot)
+    return known if len(known) else np.zeros((1, 3))
 
 
 def guess_moving_frame(robot: Robot) -> str:
@@ -115,56 +130,3 @@ def guess_moving_frame(robot: Robot) -> str:
     own = [k for k, body in enumerate(tree.frame_bodies) if body == last]
     reach = np.linalg.norm(np.asarray(robot.frame_position)[own], axis=-1)
     return tree.frame_names[own[int(np.argmax(np.round(reach, 9)))]]
-
-
-def guess_feet(robot: Robot) -> tuple[str, ...]:
-    """Return the frames with contact corners, else childless frames of different bodies named like feet."""
-    tree = robot.tree
-    with_corners = tuple(
-        name.removesuffix("_corner_0")
-        for name in tree.frame_names
-        if name.endswith("_corner_0") and name.removesuffix("_corner_0") in tree.frame_names
-    )
-    if with_corners:
-        return with_corners
-    return find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
-
-
-def _corners(robot: Robot, foot: str) -> Float[np.ndarray, "k 3"]:
-    """Return a foot's contact corners in its frame [m]; its origin if it has none. (k, 3)."""
-    known = contact_corners(robot, foot)
-    return known if len(known) else np.zeros((1, 3))
-
-
-def _polygon(robot: Robot, q0: Array, standing: Sequence[str]) -> tuple[SupportPolygon | None, tuple[str, ...]]:
-    """Return the support polygon if the feet's corners span one, and a remark if they do not."""
-    if not standing:
-        return None, ()
-    corners = {foot: _corners(robot, foot) for foot in standing}
-    if sum(len(points) for points in corners.values()) < 3:
-        known = f"no contact corners are known of {', '.join(standing)} (sites NAME_corner_0, NAME_corner_1, ...)"
-        return None, (f"{known}, so balance is neither asked for nor reported",)
-    return support_polygon(robot, q0, standing, margin=_MARGIN, corners=corners), ()
-
-
-def _tasks(
-    robot: Robot, q0: Array, goal: Goal, standing: Sequence[str], polygon: SupportPolygon | None
-) -> tuple[dict[str, Task], FrameTask]:
-    """Return the tasks of standing feet, balance and posture, and the task that moves."""
-    kinematics = compiled_kinematics(robot, q0)
-    still: dict[str, Task] = {
-        foot: FrameTask(
-            robot, foot, target=kinematics.frame_pose(robot, foot), rows=_foot_rows(standing), weight=1e4, gain=GAIN
-        )
-        for foot in standing
-    }
-    if polygon is not None:
-        still["com"] = ComTask(robot, polygon=polygon, weight=1e3, gain=GAIN, priority=2)
-    # weak and slow: the posture only decides between motions that serve the other tasks
-    still["posture"] = PostureTask(robot, target=q0, weight=1e-2, gain=1.0, priority=4)
-    return still, tracking(robot, goal, weight=1e2, priority=3)
-
-
-def _foot_rows(standing: Sequence[str]) -> Rows:
-    """Return the rows of a foot task: pose for one or two feet, position for more feet, which stand on points."""
-    return "pose" if len(standing) <= 2 else "position"

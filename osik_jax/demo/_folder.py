@@ -12,18 +12,8 @@ _PICTURES = 12_000_000
 """Upper bound of the size of film, figure, picture and report [bytes]."""
 
 
-def needed_bytes(motion: Motion, schemes: int, dt: float) -> int:
-    """Return the disk space for all output files [bytes], with the motion uncompressed."""
-    steps = round(motion.duration / dt) + 1
-    return _PICTURES + 8 * steps * (1 + schemes * (motion.robot.nq + motion.robot.nv))
-
-
-def writable_folder(path: Path, room: int) -> Path:
-    """Create the folder and check that files can be written to it.
-
-    Args:
-        path: the folder.
-        room: how much has to fit [bytes].
+def writable_folder(path: Path, motion: Motion, *, schemes: int, dt: float) -> Path:
+    """Create the folder and check that the files can be written to it, the motion counted without compression.
 
     Raises:
         OSError: it cannot be made, nothing can be written to it, or too little room is left on its disk.
@@ -35,7 +25,8 @@ def writable_folder(path: Path, room: int) -> Path:
             file.flush()
     except OSError as error:
         raise OSError(f"cannot write to {path}: {error.strerror or error}") from error
-    free = shutil.disk_usage(path).free
-    if free < room:
-        raise OSError(f"{path} has {free / 1e6:.1f} MB of room left, and up to {room / 1e6:.0f} MB are needed")
+    entries = 1 + schemes * (motion.robot.nq + motion.robot.nv)
+    free, needed = shutil.disk_usage(path).free, _PICTURES + 8 * (round(motion.duration / dt) + 1) * entries
+    if free < needed:
+        raise OSError(f"{path} has {free / 1e6:.1f} MB of room left, and up to {needed / 1e6:.0f} MB are needed")
     return path

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..physics._world import contact_corners as contact_corners
 from ..robot import Robot
-from ..tasks import FrameTask, SupportPolygon, Task
-from ..viewer import Look
+from ..tasks import FrameTask, Task
+from ..viewer._look import Look
 from ._references import Path
 
 GAIN = 20.0
 """Gain of all tasks but the posture [1/s]: at 200 Hz a step removes a tenth of an error."""
+MARGIN = 0.01
+"""Margin of the centre of mass inside the support polygon [m]."""
+
+Rows = Literal["pose", "position"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Goal:
 
     frame: str
     path: Path
-    rows: Literal["pose", "position"] = "pose"
+    rows: Rows = "pose"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +73,6 @@ class Motion:
         duration: length of the motion [s].
         stances: frames that stand.
         goals: label to moving frame; pictures show the first one.
-        limits: limits given to the schemes.
         balanced: whether a task keeps the centre of mass over the support polygon.
         notes: remarks for the user.
         look: visual shapes for pictures; ``None``: those of the model.
@@ -86,36 +87,19 @@ class Motion:
     duration: float
     stances: tuple[Stance, ...]
     goals: Mapping[str, Goal]
-    limits: Sequence[Any]
     balanced: bool = True
     notes: tuple[str, ...] = ()
     look: Look | None = None
     scale: float = 1.0
 
 
-def tracking(robot: Robot, goal: Goal, *, weight: float, priority: int, gain: float = GAIN) -> FrameTask:
+def tracking(robot: Robot, goal: Goal, *, weight: float, priority: int) -> FrameTask:
     """Return the task that follows a goal, with its target at the start of the path."""
     pose = (goal.path.position, goal.path.rotation)
-    return FrameTask(robot, goal.frame, target=pose, rows=goal.rows, weight=weight, gain=gain, priority=priority)
+    return FrameTask(robot, goal.frame, target=pose, rows=goal.rows, weight=weight, gain=GAIN, priority=priority)
 
 
 def along(task: FrameTask, goal: Goal, t: Any) -> FrameTask:
     """Return the task with the target of the path at time t [s]."""
     pose, velocity = goal.path.at(t)
     return task.replace(target=pose, target_velocity=velocity)
-
-
-def circumscribed(normals: Float[Array, "m 2"], polygon: SupportPolygon) -> SupportPolygon:
-    """Return the smallest polygon with the given normals that contains another polygon."""
-    edges = np.asarray(normals)
-    offsets = (np.asarray(polygon.vertices) @ edges.T).max(0)
-    before = np.roll(edges, 1, 0)
-    pairs = np.stack([before, edges], 1)
-    vertices = np.linalg.solve(pairs, np.stack([np.roll(offsets, 1), offsets], 1)[..., None])[..., 0]
-    return SupportPolygon(jnp.asarray(edges), jnp.asarray(offsets), jnp.asarray(vertices))
-
-
-def blended(wide: SupportPolygon, tight: SupportPolygon, s: Any) -> SupportPolygon:
-    """Return the polygon between two with the same normals: ``wide`` at s = 0, ``tight`` at s = 1."""
-    offsets = (1.0 - s) * wide.offsets + s * tight.offsets
-    return SupportPolygon(tight.normals, offsets, (1.0 - s) * wide.vertices + s * tight.vertices)

@@ -1,4 +1,4 @@
-"""Smooth references: sums of minimum-jerk strokes and their velocities."""
+"""Smooth references: positions moved by minimum-jerk strokes, and their velocities."""
 
 from __future__ import annotations
 
@@ -45,34 +45,23 @@ def follow(strokes: Sequence[Stroke], t: ArrayLike | Array, size: int) -> tuple[
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """Reference of a frame over time: strokes of its position, and of its angle about one world axis.
+    """Reference of a frame over time: its position moves by strokes, its rotation stays.
 
     Attributes:
         position: at the start [m]. (3,)
-        rotation: at the start, frame axes to world axes. (3, 3)
-        moves: strokes of the position [m].
-        turns: strokes of the angle about ``axis`` [rad].
-        axis: unit vector in the world. (3,)
+        rotation: frame axes to world axes. (3, 3)
+        strokes: moves of the position [m].
     """
 
     position: np.ndarray
     rotation: np.ndarray
-    moves: tuple[Stroke, ...] = ()
-    turns: tuple[Stroke, ...] = ()
-    axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    strokes: tuple[Stroke, ...] = ()
 
     def at(self, t: ArrayLike | Array) -> tuple[tuple[Float[Array, "3"], Float[Array, "3 3"]], Float[Array, "6"]]:
         """Return pose (p, R) and velocity [linear; angular] in world axes at time t [s]."""
-        shift, velocity = follow(self.moves, t, 3)
-        angle, speed = follow(self.turns, t, 1)
-        axis = jnp.asarray(self.axis)
-        pose = (jnp.asarray(self.position) + shift, _rotation(axis, angle[0]) @ jnp.asarray(self.rotation))
-        return pose, jnp.concatenate([velocity, speed * axis])
-
-    @property
-    def strokes(self) -> tuple[Stroke, ...]:
-        """Return all strokes of position and angle."""
-        return (*self.moves, *self.turns)
+        shift, velocity = follow(self.strokes, t, 3)
+        pose = jnp.asarray(self.position) + shift, jnp.asarray(self.rotation)
+        return pose, jnp.concatenate([velocity, jnp.zeros(3)])
 
     def still(self, t: np.ndarray) -> np.ndarray:
         """Return whether the path has moved before and is at rest, for each time [s]. (T,)."""
@@ -82,10 +71,3 @@ class Path:
             begun |= t >= stroke.end
             moving |= (t > stroke.start) & (t < stroke.end)
         return begun & ~moving
-
-
-def _rotation(axis: Float[Array, "3"], angle: Array) -> Float[Array, "3 3"]:
-    """Return the rotation matrix about an axis by an angle [rad] (Rodrigues' formula)."""
-    x, y, z = axis
-    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * cross @ cross

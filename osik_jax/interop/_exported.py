@@ -41,17 +41,7 @@ class Port(NamedTuple):
 
 
 class ExportedController:
-    """A compiled control step that needs neither osik_jax nor the robot's file.
-
-    ``controller(q, {"hand.target[0]": position})`` returns the outputs by name. It may be called inside ``jax.jit``.
-
-    Attributes:
-        inputs: by name; ``"q"`` is the first.
-        outputs: by name.
-        dt: time of a step [s].
-        batch: None, a number of lanes or ``"symbolic"``.
-        platforms: the platforms that it was exported for.
-    """
+    """A compiled control step; ``load_controller`` says what it has."""
 
     inputs: dict[str, Port]
     outputs: dict[str, Port]
@@ -107,6 +97,16 @@ def load_controller(exported: bytes | str | os.PathLike[str]) -> ExportedControl
 
     Args:
         exported: the bytes, or the path of a file with these bytes.
+
+    Returns:
+        A compiled control step that needs neither osik_jax nor the robot's file. ``controller(q, {"hand.target[0]":
+        position})`` returns the outputs by name. It may be called inside ``jax.jit``.
+
+        - ``inputs``, ``outputs``: by name, each with ``shape``, ``dtype`` and ``unit``; ``"q"`` is the first input. An
+          input that is left out has its ``default`` in every lane.
+        - ``dt``: time of a step [s].
+        - ``batch``: None, a number of lanes or ``"symbolic"``.
+        - ``platforms``: the platforms that it was exported for.
 
     Raises:
         ModuleNotFoundError: ``flatbuffers`` is not installed.

@@ -27,15 +27,8 @@ from ..tasks import FrameTask, Task
 Mode = Literal["relative", "absolute"]
 
 
-class JointTargets(NamedTuple):
-    """Result of ``TaskSpaceAction``.
-
-    Attributes:
-        position: targets of ``TaskSpaceAction.joints`` in their order [rad or m]. (n,)
-        q: the whole configuration after the step. (nq,)
-        velocity: of the step [rad/s or m/s]. (nv,)
-        status: a ``Status`` code. With NUMERICAL_ERROR (a NaN in q or the action) the robot holds its configuration.
-    """
+class _JointTargets(NamedTuple):
+    """Joint targets; ``TaskSpaceAction`` says what the fields are."""
 
     position: Float[Array, " n"]
     q: Float[Array, " nq"]
@@ -46,7 +39,13 @@ class JointTargets(NamedTuple):
 class TaskSpaceAction(eqx.Module):
     """Action space of poses of frames: an action in [-1, 1] becomes joint targets within the robot's limits.
 
-    ``action(q, raw)`` moves the target of each commanded task, solves one step of ``dt`` and returns the joint targets.
+    ``action(q, raw)`` moves the target of each commanded task, solves one step of ``dt`` and returns
+
+    - ``position``: targets of the joints named in ``joints``, in their order [rad or m]. (n,)
+    - ``q``: the whole configuration after the step. (nq,)
+    - ``velocity``: of the step [rad/s or m/s]. (nv,)
+    - ``status``: a ``Status`` code. With NUMERICAL_ERROR (a NaN in q or the action) the robot holds its configuration.
+
     It is pure: use it in ``jit``, ``vmap`` and ``grad``, in an MJX environment, and by ``interop.torch.wrap`` in
     PyTorch. The joints stay within their ranges and speed limits whatever the action is (``WeightedQP`` and
     ``HierarchicalQP``).
@@ -78,7 +77,7 @@ class TaskSpaceAction(eqx.Module):
     Attributes:
         size: number of entries of an action.
         names: of the entries: ``"hand.x"``, ..., ``"hand.rz"``.
-        joints: names of the joints of ``JointTargets.position``.
+        joints: names of the joints of ``position``.
 
     Raises:
         KeyError: a task or joint that does not exist.
@@ -144,8 +143,8 @@ class TaskSpaceAction(eqx.Module):
             for entry in axes.split() * moved
         )
 
-    def __call__(self, q: Float[ArrayLike, " nq"], action: Float[ArrayLike, " size"]) -> JointTargets:
-        """Return joint targets for an action at a configuration.
+    def __call__(self, q: Float[ArrayLike, " nq"], action: Float[ArrayLike, " size"]) -> _JointTargets:
+        """Return joint targets for an action at a configuration: ``position``, ``q``, ``velocity`` and ``status``.
 
         Args:
             q: configuration (nq,): the measured one, or the ``q`` of the last result. From the last result, gravity and
@@ -164,7 +163,7 @@ class TaskSpaceAction(eqx.Module):
         targets = self.targets(q, raw)
         answer = solve(self.robot, q, self.tasks, scheme=self.scheme, limits=self.limits, dt=self.dt, targets=targets)
         after = move(self.robot, q, answer.velocity, self.dt)
-        return JointTargets(after[np.array(self.places, int)], after, answer.velocity, answer.status)
+        return _JointTargets(after[np.array(self.places, int)], after, answer.velocity, answer.status)
 
     def __hash__(self) -> int:
         """Return a hash by identity: ``jax.jit(action)`` keeps the numbers as constants."""

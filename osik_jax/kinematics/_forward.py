@@ -121,13 +121,20 @@ def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kin
     return Kinematics(*_bodies(robot, q), backend=backend)
 
 
-def frame_jacobians(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> Float[Array, "k 6 nv"]:
-    """Return the jacobians of several frames: rows [linear; angular] in world axes, linear at each frame's origin.
+def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str | Sequence[str]) -> Float[Array, "*k 6 nv"]:
+    """Return the jacobian of a frame: [linear; angular] velocity = J v, world axes, at the frame's origin.
+
+    Args:
+        robot: the robot.
+        kinematics: of its configuration.
+        name: of the frame; a sequence of k names gives (k, 6, nv).
 
     Raises:
         KeyError: no such frame.
     """
-    ids = np.array([robot.tree.frame(name) for name in names], int)
+    if isinstance(name, str):
+        return frame_jacobian(robot, kinematics, (name,))[0]
+    ids = np.array([robot.tree.frame(one) for one in name], int)
     bodies = np.asarray(robot.tree.frame_bodies, int)[ids]
     points = kinematics.body_position[bodies] + rotate(kinematics.body_rotation[bodies], robot.frame_position[ids])
     mask = robot.tree.moves[bodies][:, None, :]
@@ -144,19 +151,10 @@ def moving_frames(robot: Robot, kinematics: Kinematics, names: Sequence[str]) ->
         KeyError: no such frame.
     """
     if kinematics.backend == "jax":
-        return *kinematics.frame_poses(robot, names), frame_jacobians(robot, kinematics, names)
+        return *kinematics.frame_poses(robot, names), frame_jacobian(robot, kinematics, names)
     for name in names:
         robot.tree.frame(name)
     return _moving_frames(robot, replace(kinematics, backend="jax"), names=tuple(names))
-
-
-def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str) -> Float[Array, "6 nv"]:
-    """Return the jacobian of one frame: [linear; angular] velocity = J v, world axes, at the frame's origin.
-
-    Raises:
-        KeyError: no such frame.
-    """
-    return frame_jacobians(robot, kinematics, (name,))[0]
 
 
 def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3"]:

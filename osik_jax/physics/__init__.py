@@ -1,11 +1,8 @@
 """A robot with its dynamics: MuJoCo, a floor, position servos, and the loop around them. Import it by name."""
 
-from ._loop import Command as Command
 from ._loop import Integrated as Integrated
 from ._loop import Lookahead as Lookahead
-from ._loop import Recording as Recording
 from ._loop import simulate as simulate
 from ._servo import Servo as Servo
 from ._simulation import Simulation as Simulation
-from ._world import World as World
 from ._world import build_world as build_world

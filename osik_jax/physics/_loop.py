@@ -79,19 +79,7 @@ class Lookahead(Command):
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """MuJoCo data at the start and after every step; T is the number of steps plus one.
-
-    Attributes:
-        time: [s]. (T,)
-        q: sensed configurations. (T, nq)
-        command: configurations that the servos were sent to. (T - 1, nq)
-        effort: of each servo [N m or N]. (T, n)
-        com: centre of mass [m]. (T, 3)
-        contact_points: of all feet, foot after foot [m]. (T, k, 3)
-        contact_forces: of the floor on each of them [N]. (T, k, 3)
-        solution: of each step; every leaf has a leading axis. (T - 1, ...)
-        fell: whether the run ended by a fall, at ``time[-1]``.
-    """
+    """MuJoCo data at the start and after every step; ``simulate`` says what the fields are."""
 
     time: Float[np.ndarray, " T"]
     q: Float[np.ndarray, "T nq"]
@@ -130,8 +118,23 @@ def simulate(
         dt: control period [s], a whole number of the world's timesteps.
         steps: number of steps.
         targets: targets of some tasks at each step, by task name, as in ``rollout``.
-        command: ``Integrated()`` (the default) or ``Lookahead(time)``.
+        command: ``Integrated()`` (the default), ``Lookahead(time)``, or an ``equinox.Module`` of yours that is called
+            with (robot, last command, sensed configuration, velocity, dt) and returns the configuration to servo to.
         before_step: called with the time [s] since the start and the simulation, to push the robot, say.
+
+    Returns:
+        A recording with MuJoCo's data at the start and after every step, as NumPy arrays; T is the number of steps
+        plus one.
+
+        - ``time``: [s]. (T,)
+        - ``q``: sensed configurations. (T, nq)
+        - ``command``: configurations that the servos were sent to. (T - 1, nq)
+        - ``effort``: of each servo [N m or N]. (T, n)
+        - ``com``: centre of mass [m]. (T, 3)
+        - ``contact_points``: of all feet, foot after foot [m]. (T, k, 3)
+        - ``contact_forces``: of the floor on each of them [N]. (T, k, 3)
+        - ``solution``: of each step; every leaf has a leading axis. (T - 1, ...)
+        - ``fell``: whether the run ended by a fall, at ``time[-1]``.
 
     Raises:
         KeyError: ``targets`` names a task that does not exist.

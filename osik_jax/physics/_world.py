@@ -14,13 +14,15 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
 from ..robot import Robot
+from ..robot._feet import with_corners
 from ..robot._own_masses import own_masses
 from ..robot._tree import BALL, FREE
 from ._servo import Servo as Servo
 from ._servo import add_servo, choose_servos
 
 Feet = Mapping[str, ArrayLike] | Sequence[str]
-"""Frames that touch the floor: names with their contact points in the frame [m], or names alone (see ``World``)."""
+"""Frames that touch the floor: names with their contact points in the frame [m], or names alone (see ``build_world``).
+"""
 
 CONTACT_RADIUS = 0.004
 """Radius of the contact spheres [m]; each is placed so that it touches the floor at its contact point."""
@@ -46,16 +48,7 @@ _SHAPES = (
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """A robot on a floor, ready for MuJoCo.
-
-    Attributes:
-        robot: the robot.
-        model: the compiled world: bodies and joints of ``robot.mj_model`` in its order, a floor, spheres that touch it
-            at the contact points, an actuator a servo. Its timestep is that of the simulation.
-        servos: by joint; the actuators have the same names and order.
-        feet: frame to its contact points in the frame [m]. Each (k, 3)
-        floor: height of the floor [m].
-    """
+    """A robot on a floor, ready for MuJoCo; ``build_world`` says what the fields are."""
 
     robot: Robot
     model: mujoco.MjModel
@@ -98,6 +91,16 @@ def build_world(
         floor: its height [m]; default: that of the lowest contact point at ``robot.q0``.
         timestep: of the simulation [s].
 
+    Returns:
+        The world.
+
+        - ``robot``: the robot.
+        - ``model``: the compiled world: bodies and joints of ``robot.mj_model`` in its order, a floor, spheres that
+          touch it at the contact points, an actuator a servo. Its timestep is that of the simulation.
+        - ``servos``: by joint; the actuators have the same names and order.
+        - ``feet``: frame to its contact points in the frame [m]. Each (k, 3)
+        - ``floor``: height of the floor [m].
+
     Raises:
         KeyError: no such frame or joint; the message lists those that exist.
         ValueError: a floating robot without contact points, a joint without a servo, a joint that no servo can turn
@@ -126,10 +129,7 @@ def build_world(
 
 def _contact_points(robot: Robot, feet: Feet | None) -> dict[str, Float[np.ndarray, "k 3"]]:
     """Return the names of frames with their contact points."""
-    names = robot.frame_names
-    if feet is None:
-        feet = [n.removesuffix("_corner_0") for n in names if n.endswith("_corner_0")]
-        feet = [name for name in feet if name in names]
+    feet = with_corners(robot.frame_names) if feet is None else feet
     if isinstance(feet, str):
         raise OsikTypeError(f"feet is a sequence of names or a mapping, not one string: use ({feet!r},)")
     given = dict(feet) if isinstance(feet, Mapping) else {name: sole_points(robot, name) for name in feet}

@@ -7,8 +7,7 @@ from jaxtyping import Float
 
 from .._errors import OsikTypeError, OsikValueError
 from ..numerics._arguments import check_count
-from ..robot import Robot
-from ._frame import Frame, read_frame
+from ._frame import Frame
 
 Grid = tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " ny"], Float[np.ndarray, " nz"]]
 """Coordinates of the positions along x, y and z, world axes, increasing [m]."""
@@ -21,29 +20,19 @@ _FLAT = 1e-6
 """Share of the longest side below which a side is a rounding."""
 
 
-def grid_around(robot: Robot, frame: str, positions: int = 20_000) -> Grid:
+def around(frame: Frame, positions: int) -> Grid:
     """Return a grid with the same spacing along x, y and z, over the box of all that a frame gets to.
 
     The box is that of 4,096 configurations which fill the joints' ranges evenly, and a margin. A side along which the
     frame never moves, as a planar arm's, is a single coordinate.
 
     Args:
-        robot: the robot.
-        frame: name of a body, link, site or geom.
+        frame: the frame.
         positions: their number at most; it is nearly reached.
 
-    Returns:
-        Coordinates along x, y and z, world axes [m].
-
     Raises:
-        KeyError: no such frame.
-        ValueError: no positive number, or a frame that is not carried by hinges and slides alone.
+        ValueError: ``positions`` is no positive number.
     """
-    return around(read_frame(robot, frame, None, 0), positions)
-
-
-def around(frame: Frame, positions: int) -> Grid:
-    """Return a grid around a frame's workspace, as ``grid_around`` does."""
     check_count("positions", positions)
     places = frame.sampled_positions(_SAMPLES)
     low, high = places.min(0), places.max(0)

@@ -22,23 +22,7 @@ _FORMAT = 1
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReachabilityMap:
-    """Orientations that a frame can take at each position of a grid; NumPy arrays.
-
-    Attributes:
-        frame: its name.
-        x: coordinates of the positions along x, world axes [m]. (nx,)
-        y: along y [m]. (ny,)
-        z: along z [m]. (nz,)
-        rotations: orientations that were asked for, frame axes to world axes. (m, 3, 3)
-        reached: whether a configuration was found for each pose. (nx, ny, nz, m)
-        beyond_reach: how far the position is at least from all that the frame could ever reach, from the lengths of
-            the links alone [m]: more than 0 proves that nothing is reached there. (nx, ny, nz)
-        manipulability: the largest index of Yoshikawa's among the configurations found at the position, of the six rows
-            of the frame's Jacobian, or of its columns where there are fewer than six; NaN where none is found.
-            (nx, ny, nz)
-        q: the configuration that has it; NaN where there is none. (nx, ny, nz, nq)
-        links: points on the joints that carry the frame, and the frame's own, at the home configuration [m]. (k, 3)
-    """
+    """Orientations that a frame can take at each position of a grid; ``reachability_map`` says what the fields are."""
 
     frame: str
     x: Float[np.ndarray, " nx"]

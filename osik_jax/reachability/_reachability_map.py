@@ -54,8 +54,8 @@ def reachability_map(
         robot: the robot.
         frame: name of a body, link, site or geom that hinges and slides carry.
         grid: coordinates of the positions along x, y and z, world axes, increasing [m]; or about how many positions to
-            put around all that the frame gets to (``grid_around``).
-        orientations: how many, spread evenly (``spread_rotations``); or which: matrices (m, 3, 3), frame axes to world
+            put around all that the frame gets to, with one spacing and a margin.
+        orientations: how many, spread evenly; or which: matrices (m, 3, 3), frame axes to world
             axes, or quaternions w x y z (m, 4).
         limits: as in ``inverse_kinematics``; with a ``CollisionAvoidanceLimit`` a pose is reached where the robot keeps
             clear, and takes much longer.
@@ -67,6 +67,25 @@ def reachability_map(
             killed goes on where it was. Default: none.
         progress: whether to show a bar; or a function of the number of positions that are done and of all. Those that
             are proven out of reach are not counted.
+
+    Returns:
+        A map, as NumPy arrays.
+
+        - ``frame``: its name.
+        - ``x``, ``y``, ``z``: coordinates of the positions, world axes [m]. (nx,), (ny,), (nz,)
+        - ``positions``: the positions [m]. (nx, ny, nz, 3)
+        - ``rotations``: orientations that were asked for, frame axes to world axes. (m, 3, 3)
+        - ``reached``: whether a configuration was found for each pose. (nx, ny, nz, m)
+        - ``share``: share of the orientations that are reached at each position. (nx, ny, nz)
+        - ``beyond_reach``: how far the position is at least from all that the frame could ever reach, from the lengths
+          of the links alone [m]: more than 0 proves that nothing is reached there. (nx, ny, nz)
+        - ``manipulability``: the largest index of Yoshikawa's among the configurations found at the position, of the
+          six rows of the frame's Jacobian, or of its columns where there are fewer than six; NaN where none is found.
+          (nx, ny, nz)
+        - ``q``: the configuration that has it; NaN where there is none. (nx, ny, nz, nq)
+        - ``links``: points on the joints that carry the frame, and the frame's own, at home [m]. (k, 3)
+        - ``save(path)`` writes it for ``load_map``; ``figure(at=None)`` returns a matplotlib figure of slices across x,
+          y and z through a point, by default where most is reached.
 
     Raises:
         KeyError: no such frame; the message lists those that exist.

@@ -1,21 +1,16 @@
 """Motion retargeting: a recorded human motion becomes a motion of a legged robot."""
 
-from ._fit import Fit as Fit
 from ._fit import FitLoss as FitLoss
 from ._fit import fit as fit
 from ._goals import Weights as Weights
 from ._guess import describe_profile as describe_profile
 from ._guess import guess_profile as guess_profile
-from ._live import LiveFrame as LiveFrame
 from ._live import LiveRetargeter as LiveRetargeter
 from ._live import LiveStatus as LiveStatus
 from ._load import load_motion as load_motion
 from ._motion import HumanMotion as HumanMotion
 from ._motion import Touch as Touch
-from ._profile import Capsule as Capsule
-from ._profile import Foot as Foot
 from ._profile import Profile as Profile
-from ._profile_file import find_profile as find_profile
 from ._profile_file import load_profile as load_profile
 from ._profile_file import save_profile as save_profile
 from ._report import report as report

@@ -22,7 +22,7 @@ from ._robot_motion import write_csv
 from ._source_motion import SourceMotion
 
 if TYPE_CHECKING:
-    from ..viewer import Look
+    from ..viewer._look import Look
 
 _HELD_OUT = 4
 """Every fourth clip is held out of a fit: it selects the step that is kept but not its direction."""

@@ -63,14 +63,7 @@ class FitLoss:
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Result of ``fit``.
-
-    Attributes:
-        profile: the profile with scale, keypoints and weights of the best step.
-        step: index of the best step; 0 is the given profile.
-        losses: loss of each step relative to step 0, mean over the training clips. (steps + 1,)
-        held_out: the same for the held-out clips; empty without any. (steps + 1,)
-    """
+    """Result of ``fit``, which says what the fields are."""
 
     profile: Profile
     step: int
@@ -135,6 +128,14 @@ def fit(
         acceleration: as of ``retarget``.
         steps: number of steps of Adam.
         max_iterations: iterations of each plan as ``retarget`` computes it.
+
+    Returns:
+        The result.
+
+        - ``profile``: the profile with scale, keypoints and weights of the best step.
+        - ``step``: index of the best step; 0 is the given profile.
+        - ``losses``: loss of each step relative to step 0, mean over the training clips. (steps + 1,)
+        - ``held_out``: the same for the held-out clips; empty without any. (steps + 1,)
 
     Raises:
         ImportError: optax is not installed (the extra ``tuning``).

@@ -70,18 +70,7 @@ class LiveStatus(enum.IntEnum):
 
 
 class LiveFrame(NamedTuple):
-    """One frame of the robot's motion.
-
-    Attributes:
-        q: configuration. (nq,)
-        contact: whether left heel, left toe, right heel and right toe stand. (4,)
-        status: outcome of the frame.
-        off_plan: largest distance of a joint from the plan because of a limit [rad or m].
-        feet_off: largest distance of a contact point from its landing place or the floor, or of a sole below the floor
-            [m].
-        iterations: iterations of the plan.
-        seconds: computing time [s].
-    """
+    """One frame of the robot's motion; ``LiveRetargeter.step`` says what the fields are."""
 
     q: Float[np.ndarray, " nq"]
     contact: Bool[np.ndarray, "4"]
@@ -188,7 +177,16 @@ class LiveRetargeter(OnRobot):
                 it, or none.
 
         Returns:
-            None for the first ``frames_ahead`` frames.
+            None for the first ``frames_ahead`` frames, then a frame.
+
+            - ``q``: configuration. (nq,)
+            - ``contact``: whether left heel, left toe, right heel and right toe stand. (4,)
+            - ``status``: a ``LiveStatus``.
+            - ``off_plan``: largest distance of a joint from the plan because of a limit [rad or m].
+            - ``feet_off``: largest distance of a contact point from its landing place or the floor, or of a sole below
+              the floor [m].
+            - ``iterations``: iterations of the plan.
+            - ``seconds``: computing time [s].
 
         Raises:
             ValueError: another number of joints, or ``contact`` in some frames alone.

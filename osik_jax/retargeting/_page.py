@@ -14,7 +14,7 @@ from ._contact import stretches
 from ._retargeted import Retargeted
 
 if TYPE_CHECKING:
-    from ..viewer import Look
+    from ..viewer._look import Look
 
 _AT_END, _AT_SPEED, _OFF, _MOST_JOINTS = 0.01, 0.97, 1e-3, 8
 """Share of a joint's range within which it counts as at its end, share of its speed limit from which it counts as at

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
+from ._model import RobotModel
+
 _FEET = (r"sole(?!.*corner)", r"foot", r"ankle", r"toe")
 
 
@@ -25,3 +27,16 @@ def find_feet(frames: Iterable[tuple[str, int]], parents: Sequence[int]) -> tupl
         if len(found) > 1:
             return tuple(found.values())
     return ()
+
+
+def with_corners(frames: Sequence[str]) -> tuple[str, ...]:
+    """Return the frames NAME of which the contact corner ``NAME_corner_0`` is a frame too."""
+    names = (frame.removesuffix("_corner_0") for frame in frames if frame.endswith("_corner_0"))
+    return tuple(name for name in names if name in frames)
+
+
+def guess_feet(robot: RobotModel) -> tuple[str, ...]:
+    """Return the frames with contact corners, else childless frames of different bodies named like feet."""
+    tree = robot.tree
+    frames = zip(tree.frame_names, tree.frame_bodies, strict=True)
+    return with_corners(tree.frame_names) or find_feet(frames, tree.body_parents)

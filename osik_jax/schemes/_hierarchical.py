@@ -6,7 +6,8 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from ..execution._backends import Backend, check_backend
-from ..solvers import WorkingSet, solve_hqp
+from ..solvers import solve_hqp
+from ..solvers.hqp import WorkingSet
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iterations, status_with
 
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from .._errors import OsikValueError
 from ..execution._backends import Backend, check_backend
 from ..numerics._guarded import clipped
-from ..solvers import Level, NullSpaceSolution, solve_nullspace
+from ..solvers import Level, solve_nullspace
+from ..solvers.null_space import NullSpaceSolution
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
 NullSpaceMethod = Literal["classical", "reverse", "saturated"]

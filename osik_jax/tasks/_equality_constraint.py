@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name
-from ..kinematics import Kinematics, frame_jacobians
+from ..kinematics import Kinematics, frame_jacobian
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
 from ..robot import Robot
@@ -130,7 +130,7 @@ class EqualityConstraintTask(Task):
         frames = [frame for constraint in spatial for frame in constraint.ends]
         origins, turns = kinematics.frame_poses(robot, frames)
         arms = rotate(turns, self.anchors.reshape(-1, 3))
-        jacobians = frame_jacobians(robot, kinematics, frames)
+        jacobians = frame_jacobian(robot, kinematics, frames)
         linear = jacobians[:, :3] + cross(jacobians[:, 3:], arms[:, :, None], along=-2)
         points, linear, angular, turns = (
             a.reshape(len(spatial), 2, *a.shape[1:]) for a in (origins + arms, linear, jacobians[:, 3:], turns)

@@ -1,18 +1,12 @@
 """Tuning of weights, gains, damping and limits by the gradient through closed-loop rollouts."""
 
-from ._evaluate import Evaluation as Evaluation
 from ._evaluate import evaluate as evaluate
-from ._history import History as History
 from ._loop import Loop as Loop
 from ._losses import ComMargin as ComMargin
 from ._losses import Effort as Effort
 from ._losses import JointLimitDistance as JointLimitDistance
-from ._losses import Loss as Loss
 from ._losses import Smoothness as Smoothness
 from ._losses import Tracking as Tracking
-from ._losses import WeightedSum as WeightedSum
 from ._parameters import Parameter as Parameter
-from ._parameters import ParameterSpace as ParameterSpace
 from ._scenarios import Scenarios as Scenarios
-from ._tune import Tuning as Tuning
 from ._tune import tune as tune

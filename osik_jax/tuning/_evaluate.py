@@ -24,12 +24,7 @@ from ._scenarios import Scenarios, run_one
 
 
 class Evaluation(eqx.Module):
-    """Losses of a loop on scenarios.
-
-    Attributes:
-        losses: of each; of no meaning where it was dropped. (n,)
-        kept: false where the loss is not finite, or a step failed on a NaN. (n,)
-    """
+    """Losses of a loop on scenarios; ``evaluate`` says what the fields are."""
 
     losses: Float[Array, " n"]
     kept: Bool[Array, " n"]
@@ -170,6 +165,14 @@ def evaluate(
         scenarios: what it is run on.
         chunk: scenarios that run at a time; see ``tune``.
         mesh: devices that the scenarios are split over; see ``tune``.
+
+    Returns:
+        The losses.
+
+        - ``losses``: of each scenario; of no meaning where it was dropped. (n,)
+        - ``kept``: false where the loss is not finite, or a step failed on a NaN. (n,)
+        - ``loss``: mean over those that were kept; NaN if there are none.
+        - ``dropped``: number of dropped scenarios.
 
     Raises:
         KeyError, ValueError: scenarios that do not fit the loop.

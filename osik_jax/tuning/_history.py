@@ -21,17 +21,7 @@ _FORMAT = 1
 
 @dataclasses.dataclass(frozen=True)
 class History:
-    """One row for each iteration, of the parameters that it began with.
-
-    Attributes:
-        loss: mean over the training scenarios that were kept. (k,)
-        held_out: mean over those held out; NaN where there are none. (k,)
-        dropped: training scenarios that were not kept. (k,)
-        held_out_dropped: likewise of those held out. (k,)
-        gradient_norm: of the mean loss, in the space that the optimiser moves in. (k,)
-        seconds: that the iteration took; the first one compiles. (k,)
-        vectors: the parameters, in that space. (k, p)
-    """
+    """One row for each iteration, of the parameters that it began with; ``tune`` says what the fields are."""
 
     loss: Float[np.ndarray, " k"]
     held_out: Float[np.ndarray, " k"]

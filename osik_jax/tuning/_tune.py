@@ -36,19 +36,7 @@ LEARNING_RATE = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """Result of a tuning. The best iteration has the lowest training loss; held-out scenarios do not count.
-
-    Attributes:
-        loop: with the best parameters; ``loop.tasks``, ``loop.scheme``, ``loop.limits``.
-        parameters: the best ones, by name.
-        loss: the training loss of the best iteration.
-        held_out: the held-out loss of that iteration; NaN if nothing was held out.
-        iteration: which one it was.
-        history: of all iterations.
-        stopped: why there are no more.
-        space: of the parameters.
-        state: to go on from: ``tune(..., resume=tuning)``.
-    """
+    """Result of a tuning; ``tune`` says what the fields are."""
 
     loop: Loop
     parameters: dict[str, float]
@@ -107,7 +95,23 @@ def tune(
         callback: told the history after each iteration.
 
     Returns:
-        The best loop and what there was on the way. A scenario whose loss or gradient is not finite, or in which a
+        The best loop and the history. The best iteration has the lowest training loss; held-out scenarios do not
+        count.
+
+        - ``loop``: with the best parameters; ``loop.tasks``, ``loop.scheme``, ``loop.limits``.
+        - ``parameters``: the best ones, by name.
+        - ``loss``: the training loss of the best iteration.
+        - ``held_out``: the held-out loss of that iteration; NaN if nothing was held out.
+        - ``iteration``: which one it was.
+        - ``history``: of all k iterations, each at the parameters that it began with: ``loss`` and ``held_out``, means
+          over the scenarios kept (k,); ``dropped`` and ``held_out_dropped``, numbers of scenarios not kept (k,);
+          ``gradient_norm``, of the mean loss in the space that the optimiser moves in (k,); ``seconds``, the first
+          compiles (k,); ``vectors``, the parameters in that space (k, p); ``best``, the iteration.
+        - ``stopped``: ``"iterations"`` or ``"patience"``.
+        - ``space``: maps between parameters and the vector without bounds that the optimiser moves.
+        - ``state``: to go on from with ``tune(..., resume=tuned)``; ``save(path)`` writes it as .npz.
+
+        A scenario whose loss or gradient is not finite, or in which a
         step failed on a NaN, is left out of that iteration's mean, and counted in ``history.dropped``.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import shutil
 import subprocess
@@ -28,24 +27,8 @@ from ._parts import RobotParts, Style, robot_parts
 from ._raycast import RayCaster
 from ._stage import Stage, frame_camera
 
+Values = Mapping[str, Float[np.ndarray, " T"]]
 Polygons = Sequence[Float[np.ndarray, "m 2"]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Curves:
-    """Curves over time of one panel beside the robot.
-
-    Attributes:
-        title: its title, with the unit.
-        values: name to one value a configuration. Each (T,)
-        wanted: the same for what the controller was asked for, drawn dashed.
-        span: the axis shows this much at least.
-    """
-
-    title: str
-    values: Mapping[str, Float[np.ndarray, " T"]]
-    wanted: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
-    span: float = 1e-3
 
 
 def animate(
@@ -61,7 +44,9 @@ def animate(
     look: Look | None = None,
     support: Polygons | Float[np.ndarray, "m 2"] | None = None,
     trails: Sequence[str] = (),
-    curves: Curves | None = None,
+    curves: Values | None = None,
+    wanted: Values | None = None,
+    curves_title: str = "",
     caption: str = "",
     azimuth: float = 28.0,
     elevation: float = 13.0,
@@ -84,7 +69,9 @@ def animate(
         support: vertices of the support polygon [m], one (m, 2) for all times or one a configuration. With it, the
             centre of mass is drawn too, and a panel shows both from above.
         trails: frames whose paths are drawn.
-        curves: a second panel.
+        curves: values over time for a second panel, by name; one value a configuration. Each (T,)
+        wanted: the same for what the controller was asked for, drawn dashed.
+        curves_title: title of that panel, with the unit.
         caption: a line at the top.
         azimuth: of the camera about the vertical, 0 from +x [deg].
         elevation: of the camera above the horizon [deg].
@@ -113,6 +100,8 @@ def animate(
         _each(support, frames),
         trails,
         curves,
+        wanted or {},
+        curves_title,
         caption,
         azimuth,
         elevation,
@@ -155,7 +144,9 @@ class _Film:
         shape: RobotParts,
         support: Polygons | None,
         trails: Sequence[str],
-        curves: Curves | None,
+        curves: Values | None,
+        wanted: Values,
+        curves_title: str,
         caption: str,
         azimuth: float,
         elevation: float,
@@ -165,7 +156,7 @@ class _Film:
         self._support = support
         points, com, paths = self._survey(trails)
         self._com, self._paths = com, paths
-        panels = (support is not None) + (curves is not None)
+        panels = (support is not None) + bool(curves)
         self._floor = floor_height(robot, shape, mujoco_poses(robot, self._q))
         window = (0.04, 0.54 if panels else 0.96, 0.10 if caption else 0.04, 0.92)
         self._camera = frame_camera(np.concatenate([points, self._on_floor()]), size, azimuth, elevation, window)
@@ -174,7 +165,7 @@ class _Film:
         self._canvas = Canvas(size)
         self._add_text(caption)
         self._add_marks()
-        self._add_panels(curves, frames)
+        self._add_panels(curves, wanted, curves_title, frames)
         self._under: tuple[Float[np.ndarray, "m 2"], np.ndarray] | None = None
 
     def _survey(self, trails: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
@@ -208,17 +199,15 @@ class _Film:
             self._trail_lines.append((line, self._camera.project(path, self._size)))
         self._mark = None if self._support is None else ComMark(self._canvas, self._camera, floor=self._floor)
 
-    def _add_panels(self, curves: Curves | None, frames: np.ndarray) -> None:
+    def _add_panels(self, curves: Values | None, wanted: Values, title: str, frames: np.ndarray) -> None:
         self._panels: list[PlanPanel | CurvePanel] = []
         if self._support is not None:
             self._panels.append(PlanPanel(self._canvas, (0.60, 0.53, 0.38, 0.36), self._support, self._com))
-        if curves is not None:
-            values, wanted = ({k: v[frames] for k, v in group.items()} for group in (curves.values, curves.wanted))
+        if curves:
+            values, dashed = ({name: v[frames] for name, v in group.items()} for group in (curves, wanted))
             bottom = 0.115 if self._support is not None else 0.32
             place = (0.60, bottom, 0.38, 0.29)
-            self._panels.append(
-                CurvePanel(self._canvas, place, curves.title, self._time, values, wanted, span=curves.span)
-            )
+            self._panels.append(CurvePanel(self._canvas, place, title, self._time, values, dashed))
 
     def pictures(self, progress: Callable[[float], None]) -> Iterator[np.ndarray]:
         """Yield the pictures, (height, width, 3) uint8; the stage is drawn ahead, one picture per core."""

@@ -18,6 +18,8 @@ from ._stage import Camera
 GREEN, ORANGE, BLUE, INK = "#2a9d62", "#e8590c", "#1c6fb8", "#2b2f36"
 DPI = 100
 _CURVE_COLORS = (BLUE, GREEN, ORANGE)
+_LEAST_RANGE = 1e-3
+"""Range of a panel whose curves are constant, so that their rounding errors do not fill it."""
 _CARD = (1.0, 1.0, 1.0, 0.82)
 
 
@@ -165,14 +167,12 @@ class CurvePanel:
         time: Float[np.ndarray, " frames"],
         curves: Mapping[str, Float[np.ndarray, " frames"]],
         wanted: Mapping[str, Float[np.ndarray, " frames"]],
-        *,
-        span: float,
     ) -> None:
-        """Draw the static part; each curve has one value per frame, and the axis has a least range."""
+        """Draw the static part; each curve has one value per frame."""
         self._time, self._curves, self._lines = time, list(curves.values()), []
         axes = card(canvas, rectangle, title)
         values = np.concatenate([*curves.values(), *wanted.values()])
-        room = max(np.ptp(values), span)
+        room = max(np.ptp(values), _LEAST_RANGE)
         middle = 0.5 * (values.min() + values.max())
         axes.set_xlim(time[0], time[-1])
         axes.set_ylim(middle - 0.58 * room, middle + 0.92 * room)

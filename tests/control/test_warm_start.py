@@ -9,7 +9,8 @@ from recorded import QP_DAMPING, recorded_hierarchies, recorded_qps
 from task_checks import kinematics_at
 
 import osik_jax as osik
-from osik_jax.solvers import Level, Status, WorkingSet, solve_hqp, solve_least_squares_qp, solve_qp
+from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_qp
+from osik_jax.solvers.hqp import WorkingSet
 
 DT = 0.005
 

@@ -1,23 +1,27 @@
 """The demonstration: references, measurement by MuJoCo C, and the numbers that the motions have to reach."""
 
+import dataclasses
 import json
 
 import jax
 import mujoco
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull, Delaunay
+from PIL import Image
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax import demo
-from osik_jax.demo._file import guess_feet, guess_moving_frame
+from osik_jax.demo._comparison import comparison
+from osik_jax.demo._demo import run_demo
+from osik_jax.demo._figures import Figure, figures
+from osik_jax.demo._file import guess_moving_frame
 from osik_jax.demo._measure import measure
-from osik_jax.demo._motion import blended, circumscribed
 from osik_jax.demo._references import Path, Stroke, minimum_jerk
 from osik_jax.demo._report import table
-from osik_jax.demo._run import run_demo, run_scheme
-from osik_jax.demo._schemes import make_scheme
+from osik_jax.demo._run import make_scheme, run_scheme
+from osik_jax.robot._feet import guess_feet
 
 DT = 0.005
 
@@ -43,10 +47,10 @@ def lift():
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
-    """A demonstration of half a second: its folder, report and runs."""
-    folder = tmp_path_factory.mktemp("demo")
-    summary, runs = run_demo(demo.double_support(0.5), folder, schemes=("weighted",), dt=DT, renderer="raycast")
-    return folder, summary, runs
+    """A demonstration of half a second: its folder, report, motion and run."""
+    folder, motion = tmp_path_factory.mktemp("demo"), demo.double_support(0.5)
+    summary, _, (run,) = run_demo(motion, folder, schemes=("weighted",), dt=DT, renderer="raycast")
+    return folder, summary, motion, run
 
 
 def look(robot, q):
@@ -81,41 +85,34 @@ def test_minimum_jerk_starts_and_ends_at_rest():
     assert rate.max() == pytest.approx(1.875 / 2.0)
 
 
-def test_path_velocity_is_the_rate_of_its_pose():
-    path = Path(
-        np.array([0.1, 0.2, 0.3]),
-        Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_matrix(),
-        moves=(Stroke(0.0, 2.0, (0.1, -0.2, 0.3)), Stroke(1.0, 3.0, (0.0, 0.1, 0.0))),
-        turns=(Stroke(0.5, 2.5, (0.8,)),),
-        axis=(0.6, 0.0, 0.8),
-    )
-    h = 1e-5
+def test_path_velocity_is_the_rate_of_its_position():
+    rotation = Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_matrix()
+    strokes = (Stroke(0.0, 2.0, (0.1, -0.2, 0.3)), Stroke(1.0, 3.0, (0.0, 0.1, 0.0)))
+    path, h = Path(np.array([0.1, 0.2, 0.3]), rotation, strokes), 1e-5
     at = jax.jit(path.at)
     for t in (0.7, 1.5, 2.2):
-        (before, R0), _ = at(t - h)
-        (after, R1), _ = at(t + h)
-        _, velocity = at(t)
-        np.testing.assert_allclose(velocity[:3], (after - before) / (2 * h), atol=1e-8)
-        spin = Rotation.from_matrix(np.asarray(R1) @ np.asarray(R0).T).as_rotvec() / (2 * h)
-        np.testing.assert_allclose(velocity[3:], spin, atol=1e-8)
+        (_, R), velocity = at(t)
+        np.testing.assert_allclose(velocity[:3], (at(t + h)[0][0] - at(t - h)[0][0]) / (2 * h), atol=1e-8)
+        np.testing.assert_array_equal(velocity[3:], 0.0)
+        np.testing.assert_array_equal(R, rotation)
+    np.testing.assert_allclose(at(3.0)[0][0], [0.2, 0.1, 0.6], atol=1e-12)
     times = np.array([0.0, 1.0, 2.9, 3.0, 4.0])
     np.testing.assert_array_equal(path.still(times), [False, False, False, True, True])
 
 
-def test_polygons_blend_from_a_cover_to_the_foot(nao):
-    both = osik.support_polygon(nao, nao.q0, ("l_sole", "r_sole"))
-    foot = osik.support_polygon(nao, nao.q0, ("l_sole",))
-    cover = circumscribed(foot.normals, both)
-    inside = Delaunay(np.asarray(cover.vertices) * (1.0 + 1e-9)).find_simplex(np.asarray(both.vertices))
-    assert (inside >= 0).all()
-    np.testing.assert_allclose((np.asarray(both.vertices) @ np.asarray(foot.normals).T).max(0), cover.offsets)
-    half = blended(cover, foot, 0.5)
-    before, edge = np.roll(np.asarray(half.normals), 1, 0), np.asarray(half.normals)
-    np.testing.assert_allclose(np.sum(edge * np.asarray(half.vertices), -1), half.offsets, atol=1e-12)
-    np.testing.assert_allclose(
-        np.sum(before * np.asarray(half.vertices), -1), np.roll(np.asarray(half.offsets), 1), atol=1e-12
-    )
-    np.testing.assert_allclose(blended(cover, foot, 1.0).vertices, foot.vertices, atol=1e-12)
+def test_the_polygon_shrinks_from_both_feet_to_one(nao):
+    """At the ends it touches the polygon of both feet from outside; in the middle it is that of the left foot."""
+    both = osik.support_polygon(nao, nao.q0, ("l_sole", "r_sole"), margin=0.01)
+    foot = osik.support_polygon(nao, nao.q0, ("l_sole",), margin=0.01)
+    tasks = demo.single_support(8.0).tasks
+    for t in (0.0, 8.0):
+        polygon = tasks(t)["com"].polygon
+        beyond = np.asarray(both.vertices) @ np.asarray(polygon.normals).T - np.asarray(polygon.offsets)
+        np.testing.assert_allclose(beyond.max(0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(tasks(4.0)["com"].polygon.offsets, foot.offsets, atol=1e-12)
+    early = np.asarray(tasks(1.0)["com"].polygon.offsets)
+    assert (early <= np.asarray(tasks(0.0)["com"].polygon.offsets) + 1e-12).all()
+    assert (early >= np.asarray(foot.offsets) - 1e-12).all() and early.sum() > np.asarray(foot.offsets).sum() + 1e-3
 
 
 def test_measurement_of_a_motion_made_by_hand(nao):
@@ -166,8 +163,8 @@ def check_requirements(motion, run, lifted=None):
     joints = qpos[:, robot.mj_model.jnt_qposadr[limited]]
     low, high = robot.mj_model.jnt_range[limited].T
     assert (joints >= low - 1e-9).all() and (joints <= high + 1e-9).all()
-    assert (np.abs(run.v) <= np.asarray(robot.velocity_limit)).all()
-    assert (run.outcome.status == osik.solvers.Status.SOLVED).all()
+    assert (np.abs(run.solution.velocity) <= np.asarray(robot.velocity_limit)).all()
+    assert (run.solution.status == osik.solvers.Status.SOLVED).all()
 
 
 @pytest.mark.slow
@@ -184,7 +181,7 @@ def test_double_support_reaches_its_numbers(sway):
 def test_single_support_reaches_its_numbers(lift):
     motion, run = lift
     check_requirements(motion, run, lifted=motion.stances[1].lifted)
-    height = run.measurement.displacement["foot"][:, 2]
+    height = run.measurement.displacement["right_foot"][:, 2]
     assert height[780] == pytest.approx(0.055, abs=1e-3)
     assert run.measurement.displacement["left_hand"][780, 2] > 0.05
 
@@ -198,12 +195,12 @@ def test_own_figures_agree_with_the_measurement(sway):
         full = np.zeros(model.nv)
         a, b = (np.asarray(motion.robot.mujoco_qpos(run.q[i])) for i in (k, k + 1))
         mujoco.mj_differentiatePos(model, full, DT, a, b)
-        np.testing.assert_allclose(full[own], run.v[k], atol=1e-9)
+        np.testing.assert_allclose(full[own], run.solution.velocity[k], atol=1e-9)
 
 
 @pytest.mark.slow
 def test_demo_writes_every_file(short):
-    folder, summary, _ = short
+    folder, summary, _, _ = short
     assert {p.name for p in folder.iterdir()} >= {"motion.gif", "comparison.png", "motion.npz", "report.json"}
     assert json.loads((folder / "report.json").read_text()) == summary
     assert set(summary["files"]) <= {p.name for p in folder.iterdir()}
@@ -211,31 +208,69 @@ def test_demo_writes_every_file(short):
 
 
 def test_report_agrees_with_mujoco(short, nao):
-    folder, summary, _ = short
+    folder, summary, _, _ = short
     arrays = np.load(folder / "motion.npz")
     q, v = arrays["q_weighted"], arrays["v_weighted"]
     assert q.shape == (101, nao.nq) and v.shape == (100, nao.nv)
     data = list(look_all(nao, q))
-    figures = summary["schemes"]["weighted"]
-    for foot in ("l_sole", "r_sole"):
-        drift = max(np.linalg.norm(d.site(foot).xpos - data[0].site(foot).xpos) for d in data)
-        assert figures["standing"][foot]["position_mm"] == pytest.approx(1e3 * drift, rel=1e-9, abs=1e-12)
+    told = summary["schemes"]["weighted"]
+    first = {foot: (data[0].site(foot).xpos, data[0].site(foot).xmat) for foot in ("l_sole", "r_sole")}
+    drift = max(np.linalg.norm(d.site(foot).xpos - p) for d in data for foot, (p, _) in first.items())
+    assert told["feet_drift_mm"] == pytest.approx(1e3 * drift, rel=1e-9, abs=1e-12)
+    turned = max(turn(d.site(foot).xmat, R) for d in data for foot, (_, R) in first.items())
+    assert told["feet_turn_mrad"] == pytest.approx(1e3 * turned, rel=1e-6, abs=1e-9)
     hull = ConvexHull(corners(data[0], "l_sole", "r_sole")).equations
     margin = min(-np.max(hull[:, :2] @ d.subtree_com[1][:2] + hull[:, 2]) for d in data)
-    assert figures["balance"]["least_margin_mm"] == pytest.approx(1e3 * margin, rel=1e-9)
-    assert figures["balance"]["steps_outside"] == 0
-    assert figures["limits"]["position_violations"] == figures["limits"]["velocity_violations"] == 0
+    assert told["com_inside_mm"] == pytest.approx(1e3 * margin, rel=1e-9)
+    assert told["position_limits_broken"] == told["velocity_limits_broken"] == told["steps_not_solved"] == 0
     limit = np.asarray(nao.velocity_limit)
     margin = 1.0 - np.max(np.abs(v[:, np.isfinite(limit)]) / limit[np.isfinite(limit)])
-    assert figures["limits"]["least_velocity_margin"] == pytest.approx(margin, abs=1e-6)
+    assert told["velocity_margin"] == pytest.approx(margin, abs=1e-6)
+    assert told["status"]["SOLVED"] == summary["steps"] == 100
+    assert told["step_us"] > 0.0 and told["compile_s"] > 0.0
 
 
-def test_table_tells_violations(short):
-    _, summary, _ = short
-    broken = json.loads(json.dumps(summary))
-    broken["schemes"]["weighted"]["limits"]["position_violations"] = 7
-    cells = [cell for column in table(broken).columns for cell in column.cells]
-    assert "[red]7[/red]" in cells
+def test_table_and_report_tell_what_is_missed(short):
+    """Limits broken, and a drift over its requirement of 0.1 mm; the room to a limit is the least of all times."""
+    _, summary, motion, run = short
+    m = run.measurement
+    drift = dataclasses.replace(m.stances["l_sole"], position=np.linspace(0.0, 20.0, 101))
+    margin = np.linspace(0.5, -0.25, 101)
+    stances = m.stances | {"l_sole": drift}
+    broken = dataclasses.replace(m, position_violations=7, stances=stances, position_margin=margin)
+    rows = figures(motion, dataclasses.replace(run, measurement=broken))
+    missed, before = {row.name for row in rows if row.missed}, set(summary["schemes"]["weighted"]["missed"])
+    assert missed - before - {"feet_drift_mm"} == {"position_limits_broken", "position_margin"}
+    assert "feet_drift_mm" in missed
+    cells = [cell for column in table("x", {"weighted": rows}).columns for cell in column.cells]
+    assert {"[red]7[/red]", "[red]20000.0[/red]", "[red]-0.25[/red]"} <= set(cells)
+
+
+def test_comparison_draws_the_curves_it_gets(tmp_path):
+    """Schemes in one plot; what is only rounding about a constant, or 0 throughout, draws no curve."""
+    time = np.linspace(0.0, 1.0, 11)
+    curves = {"weighted": 1e-3 * (1.0 + time), "hierarchical": 1e-6 * (1.0 + time)}
+    rows = {
+        scheme: [
+            Figure("a", "drift [mm]", values, most=0.1, floor=1e-5),
+            Figure("b", "margin [mm]", values, least=0.0),
+            Figure("c", "steady", 0.5 + 1e-16 * np.sin(40.0 * time), span=0.1),
+            Figure("d", "zero", 0.0 * time, floor=1e-5),
+            Figure("e", "number", 3.0),
+        ]
+        for scheme, values in curves.items()
+    }
+    page = comparison("x", rows, 0.1)
+    page.savefig(tmp_path / "f.png")
+    log, linear, steady, zero = page.axes[:4]
+    assert [bool(axes.lines) for axes in page.axes] == [True] * 4 + [False] * 2
+    np.testing.assert_allclose(log.lines[0].get_xydata(), np.stack([time, curves["weighted"]], -1))
+    np.testing.assert_allclose(log.lines[1].get_ydata(), 1e-5)
+    np.testing.assert_allclose(linear.lines[1].get_ydata(), curves["hierarchical"])
+    assert log.get_yscale() == "log" and log.get_ylim()[1] > 0.1 and linear.get_ylim()[0] < 0.0
+    assert np.ptp(steady.get_ylim()) >= 0.1 and zero.get_ylim() == pytest.approx((1e-5, 1e-3))
+    with Image.open(tmp_path / "f.png") as picture:
+        assert picture.size == tuple(round(x) for x in page.get_size_inches() * page.dpi)
 
 
 def test_feet_and_hands_are_guessed(nao):

@@ -116,7 +116,7 @@ def test_a_ball_joint_turns_about_its_anchor(rng: np.random.Generator) -> None:
     q = configurations(robot, rng, 1)[0]
     ours = osik.forward_kinematics(robot, q)
     again = kinematics_from(
-        robot, ours.body_position[1:], ours.body_rotation[1:], osik.frame_jacobians(robot, ours, robot.body_names)
+        robot, ours.body_position[1:], ours.body_rotation[1:], osik.frame_jacobian(robot, ours, robot.body_names)
     )
     for name in ("body_position", "dof_linear", "dof_angular"):
         np.testing.assert_allclose(getattr(again, name), getattr(ours, name), atol=1e-14)
@@ -127,7 +127,7 @@ def test_wrong_arrays_are_named() -> None:
     robot = osik.load_robot("arm7")
     kinematics = osik.forward_kinematics(robot, robot.q0)
     position, rotation = kinematics.body_position[1:], kinematics.body_rotation[1:]
-    jacobian = osik.frame_jacobians(robot, kinematics, robot.body_names)
+    jacobian = osik.frame_jacobian(robot, kinematics, robot.body_names)
     with pytest.raises(ValueError, match=r"jacobian has shape \(6, 7\); expected \("):
         kinematics_from(robot, position, rotation, jacobian[0])
     with pytest.raises(ValueError, match="position has shape"):

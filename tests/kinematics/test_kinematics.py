@@ -90,7 +90,7 @@ def everything(robot: osik.Robot, subtree: str):
         kin = osik.forward_kinematics(robot, q)
         return {
             "poses": kin.frame_poses(robot, robot.frame_names),
-            "jacobians": osik.frame_jacobians(robot, kin, robot.frame_names),
+            "jacobians": osik.frame_jacobian(robot, kin, robot.frame_names),
             "com": osik.center_of_mass(robot, kin),
             "com_jacobian": osik.com_jacobian(robot, kin),
             "subtree_com": osik.center_of_mass(robot, kin, subtree),
@@ -411,7 +411,7 @@ def test_one_frame_equals_its_row_among_several(robots):
     @quick_jit
     def both(q):
         kin = osik.forward_kinematics(robot, q)
-        several = (*kin.frame_poses(robot, names), osik.frame_jacobians(robot, kin, names))
+        several = (*kin.frame_poses(robot, names), osik.frame_jacobian(robot, kin, names))
         single = [(*kin.frame_pose(robot, name), osik.frame_jacobian(robot, kin, name)) for name in names]
         return several, single
 

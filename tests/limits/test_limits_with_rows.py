@@ -15,6 +15,7 @@ from derivative_checks import assert_exact, check
 from task_checks import kinematics_at
 
 import osik_jax as osik
+from osik_jax.limits import limit_rows
 from osik_jax.solvers import Status
 
 MJCF = """
@@ -52,7 +53,7 @@ def model():
 def asked(robot, limit, q):
     """The limit's box and rows."""
     kinematics = osik.forward_kinematics(robot, q)
-    return osik.limit_box(robot, q, (limit,), DT), osik.limit_rows(robot, kinematics, q, (limit,), DT)
+    return osik.limit_box(robot, q, (limit,), DT), limit_rows(robot, kinematics, q, (limit,), DT)
 
 
 def anywhere(robot, rng):
@@ -208,7 +209,7 @@ def test_derivatives_of_rows(flying):
 
     def function(point):
         q, limits = point
-        rows = osik.limit_rows(flying, osik.forward_kinematics(flying, q), q, limits, DT)
+        rows = limit_rows(flying, osik.forward_kinematics(flying, q), q, limits, DT)
         assert rows is not None
         return (rows.jacobian, *(jnp.where(jnp.isinf(b), 0.0, b) for b in (rows.lower, rows.upper))), ()
 

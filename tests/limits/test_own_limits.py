@@ -10,7 +10,7 @@ import pytest
 
 import osik_jax as osik
 from osik_jax import physics, reachability, tuning
-from osik_jax.viewer import Session
+from osik_jax.viewer.live._session import Session
 
 ARM = """
 <mujoco>

@@ -8,6 +8,9 @@ import pytest
 import osik_jax as osik
 from osik_jax import cli, reachability
 from osik_jax.reachability import _reachability_map
+from osik_jax.reachability._frame import read_frame
+from osik_jax.reachability._grid import around
+from osik_jax.reachability._rotations import spread_rotations
 from osik_jax.viewer.live._open import is_map
 
 UPPER, FORE, HAND = 0.5, 0.4, 0.2
@@ -140,10 +143,10 @@ def test_an_obstacle_keeps_poses_from_being_reached(planar, planar_map):
 @pytest.mark.parametrize("count", [64, 512])
 def test_orientations_are_well_spread(rng, count):
     """No two are nearer than 0.4 times what balls of one size in SO(3) allow; holes are smaller than random ones'."""
-    spread = reachability.spread_rotations(count)
+    spread = spread_rotations(count)
     np.testing.assert_allclose(spread @ spread.mT, np.broadcast_to(np.eye(3), (count, 3, 3)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(spread), 1.0)
-    np.testing.assert_array_equal(spread, reachability.spread_rotations(count))
+    np.testing.assert_array_equal(spread, spread_rotations(count))
     radius = np.linspace(0.0, np.pi, 10_000)
     share = (radius - np.sin(radius)) / np.pi  # of all rotations, those within an angle of one
     assert nearest_pair(spread) > 0.4 * 2.0 * np.degrees(radius[np.searchsorted(share, 1.0 / count)])
@@ -242,7 +245,7 @@ def test_the_picture_shows_the_slice(planar_map, tmp_path):
 
 
 def test_grids_go_around_what_is_reached(planar):
-    x, y, z = reachability.grid_around(planar, "tip", 500)
+    x, y, z = around(read_frame(planar, "tip", None, 0), 500)
     assert 400 <= len(x) * len(y) <= 500 and z.tolist() == [0.0]
     np.testing.assert_allclose(np.concatenate([np.diff(x), np.diff(y)]), x[1] - x[0])
     assert x[-1] == pytest.approx(UPPER + FORE + HAND, abs=0.15)

@@ -125,7 +125,7 @@ def everything(links: tuple[str, ...]) -> Callable[[osik.Robot, jax.Array, jax.A
         return dict(
             position=position,
             rotation=rotation,
-            jacobian=osik.frame_jacobians(robot, kin, links),
+            jacobian=osik.frame_jacobian(robot, kin, links),
             com=osik.center_of_mass(robot, kin),
             com_jacobian=osik.com_jacobian(robot, kin),
             mass_matrix=osik.mass_matrix(robot, kin) / mass,

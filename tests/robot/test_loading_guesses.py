@@ -18,7 +18,7 @@ from task_checks import kinematics_at
 import osik_jax as osik
 from osik_jax import cli
 from osik_jax.cli._demo import read_demo_robot
-from osik_jax.demo._file import guess_feet
+from osik_jax.robot._feet import guess_feet
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'

@@ -17,6 +17,7 @@ from lexicographic import certificate, norms, reference
 from task_checks import kinematics_at
 
 import osik_jax as osik
+from osik_jax.limits import limit_rows
 from osik_jax.schemes import VelocityProblem
 from osik_jax.solvers import Status
 
@@ -282,7 +283,7 @@ class TestPrograms:
         tasks = {"posture": osik.PostureTask(arm, weight=1.0)}
         limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm)
         kinematics = kinematics_at(arm, arm.q0)
-        assert osik.limit_rows(arm, kinematics, arm.q0, limits, DT) is None
+        assert limit_rows(arm, kinematics, arm.q0, limits, DT) is None
         rows = {name: task.rows(arm, kinematics, arm.q0) for name, task in tasks.items()}
         free = jnp.full(arm.nv, jnp.inf)
         problem = VelocityProblem(rows, (("posture", 1),), -free, free, arm.q0, -free, free)

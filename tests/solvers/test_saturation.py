@@ -17,6 +17,7 @@ from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.solvers import Level, Status, solve_nullspace
+from osik_jax.solvers.null_space import NullSpaceSolution
 from osik_jax.solvers.null_space._scaled_motion import ScaledMotion, solve_scaled_motion
 
 N, ROWS, LANES = 10, (3, 2, 3), 200
@@ -36,7 +37,7 @@ class Answers(NamedTuple):
     """Of the first level alone, of the first two, of all, and of all with the secondary motion."""
 
     partial: list
-    full: osik.solvers.NullSpaceSolution
+    full: NullSpaceSolution
 
 
 def drawn(rng, count=LANES, spread=1.5, box=1.0, infinite=0.15):

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from osik_jax.execution._backends import Backend
-from osik_jax.solvers import Damping, Level, NullSpaceSolution, solve_nullspace
+from osik_jax.solvers import Damping, Level, solve_nullspace
+from osik_jax.solvers.null_space import NullSpaceSolution
 
 LANES = 12
 

@@ -19,6 +19,8 @@ import osik_jax as osik
 from osik_jax import tuning
 from osik_jax.schemes import SchemeAnswer
 from osik_jax.solvers import Status
+from osik_jax.tuning._history import History
+from osik_jax.tuning._parameters import ParameterSpace
 from osik_jax.viewer import mujoco_poses, robot_com
 
 DT, STEPS = 0.05, 6
@@ -146,14 +148,14 @@ BOUNDS = [
 
 class TestParameterSpace:
     def test_begins_at_the_loops_numbers(self, loop):
-        space = tuning.ParameterSpace(loop, BOUNDS)
+        space = ParameterSpace(loop, BOUNDS)
         for a, b in zip(jax.tree.leaves(space.apply(loop, space.initial)), jax.tree.leaves(loop), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
     @settings(max_examples=20, deadline=None)
     @given(seed=st.integers(0, 2**31), size=st.sampled_from([0.1, 1.0, 10.0]))
     def test_stays_between_the_bounds_and_comes_back(self, loop, seed, size):
-        space = tuning.ParameterSpace(loop, BOUNDS)
+        space = ParameterSpace(loop, BOUNDS)
         vector = space.initial + size * np.random.default_rng(seed).normal(size=len(space.names))
         values = np.asarray(space.numbers(vector))
         lower, upper = (np.where(space.log, np.exp(b), b) for b in (space.lower, space.upper))
@@ -164,13 +166,13 @@ class TestParameterSpace:
         np.testing.assert_allclose(back[inside & near], np.asarray(vector)[inside & near], atol=1e-6)
 
     def test_gradients_are_finite_far_away(self, loop):
-        space = tuning.ParameterSpace(loop, BOUNDS)
+        space = ParameterSpace(loop, BOUNDS)
         for far in (-300.0, 300.0):
             slope = jax.jacobian(space.numbers)(jnp.full(len(space.names), far))
             assert np.isfinite(slope).all()
 
     def test_a_step_in_log_space_is_a_factor(self, loop):
-        space = tuning.ParameterSpace(loop, ["posture.weight", tuning.Parameter("elbow.gain", lower=1.0, upper=9.0)])
+        space = ParameterSpace(loop, ["posture.weight", tuning.Parameter("elbow.gain", lower=1.0, upper=9.0)])
         step = jax.jacobian(lambda z: jnp.log(space.numbers(z)))(space.initial)
         np.testing.assert_allclose(step, np.eye(2), atol=1e-12)  # 3 is in the middle of 1 and 9
 
@@ -180,7 +182,7 @@ class TestParameterSpace:
         loop = tuning.Loop(
             nao, {"hand": hand}, scheme=osik.NullSpace(), limits=(osik.VelocityLimit(nao),), dt=0.01, steps=1
         )
-        space = tuning.ParameterSpace(loop, ["hand.position_weight", "limits[0].velocity"])
+        space = ParameterSpace(loop, ["hand.position_weight", "limits[0].velocity"])
         assert space.names[:3] == tuple(f"hand.position_weight[{i}]" for i in range(3))
         assert len(space.names) == 3 + nao.nv - 6 and "limits[0].velocity[5]" not in space.names
         moved: Any = space.apply(loop, space.initial + 1.0)
@@ -210,7 +212,7 @@ class TestParameterSpace:
     )
     def test_mistakes(self, loop, parameters, error, message):
         with pytest.raises(error, match=message):
-            tuning.ParameterSpace(loop, parameters)
+            ParameterSpace(loop, parameters)
 
 
 class TestScenarios:
@@ -361,7 +363,7 @@ class TestTune:
 
     def test_fewer_scenarios_are_not_better(self):
         rows = dict(held_out=np.nan, held_out_dropped=0, gradient_norm=1.0, seconds=0.0, vectors=np.zeros(2))
-        history = tuning.History.empty(2)
+        history = History.empty(2)
         for loss, dropped in ((3.0, 0), (1.0, 2), (2.0, 0), (np.nan, 4), (2.0, 0)):
             history = history.and_then(loss=loss, dropped=dropped, **rows)
         assert history.best == 2 and history.stale(1e-3) == 2
@@ -434,7 +436,7 @@ class TestTune:
         swing = Swing(osik.FrameTask(small, "hand", rows="position"), jnp.asarray(2.0))
         loop = tuning.Loop(small, swing, scheme=LeastSquares(), dt=DT, steps=STEPS, limits=osik.no_limits)
         start = tuning.Scenarios(q0=scenarios.q0)
-        space = tuning.ParameterSpace(loop, ["hand.gain", "speed"])
+        space = ParameterSpace(loop, ["hand.gain", "speed"])
         losses = [
             tuning.evaluate(tuning.Tracking("hand"), space.apply(loop, space.initial + i * step), start).loss
             for i in (0.0, 0.5)

@@ -17,11 +17,11 @@ from waiting import until
 
 import osik_jax as osik
 from osik_jax.cli import main
-from osik_jax.reachability import ReachabilityMap
-from osik_jax.viewer import ReachView, serve_reach
+from osik_jax.reachability._map import ReachabilityMap
+from osik_jax.viewer import serve_reach
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer.live._open import is_map, open_map
-from osik_jax.viewer.live._reach import _FAINT, slice_picture, slice_words
+from osik_jax.viewer.live._reach import _FAINT, ReachView, slice_picture, slice_words
 from osik_jax.viewer.live._source import RobotSource
 
 ARM = osik.load_robot("arm7")

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
-from osik_jax.viewer import Session, load_session
+from osik_jax.viewer import load_session
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live._default import default_session, find_hands
 from osik_jax.viewer.live._desk import Desk
+from osik_jax.viewer.live._session import Session
 from osik_jax.viewer.live._source import RobotSource
 
 ROBOT = osik.load_robot("nao")

@@ -14,7 +14,6 @@ from PIL import Image
 import osik_jax as osik
 from osik_jax import viewer
 from osik_jax.viewer import _animate, _opengl
-from osik_jax.viewer._figures import Panel, compare_figure
 from osik_jax.viewer._opengl import check_opengl
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raycast import RayCaster
@@ -242,7 +241,9 @@ def test_gif_has_its_frames(tmp_path, nao):
         renderer="raycast",
         support=support,
         trails=("l_gripper",),
-        curves=viewer.Curves("y [mm]", {"waist": 1e3 * q[:, 1]}, {"waist": 1e3 * q[:, 1]}),
+        curves={"waist": 1e3 * q[:, 1]},
+        wanted={"waist": 1e3 * q[:, 1]},
+        curves_title="y [mm]",
         caption="sways",
         progress=done.append,
     )
@@ -272,15 +273,6 @@ def test_what_ffmpeg_says_is_told(tmp_path, nao, monkeypatch):
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     with pytest.raises(OSError, match=r"ffmpeg could not write .*m\.mp4: no space left"):
         viewer.animate(tmp_path / "m.mp4", nao, np.asarray(nao.q0)[None], dt=0.1, size=(64, 36), renderer="raycast")
-
-
-def test_constants_do_not_look_like_curves():
-    """Rounding errors about a constant, and errors that are 0 throughout, on linear and on logarithmic axes."""
-    time = np.linspace(0.0, 1.0, 11)
-    noise = {"one": 0.5 + 1e-16 * np.sin(40.0 * time)}
-    panels = [Panel("margin", noise, span=0.1), Panel("error", {"one": 0.0 * time}, floor=1e-5)]
-    linear, log = compare_figure(time, panels).axes
-    assert np.ptp(linear.get_ylim()) >= 0.1 and log.get_ylim() == pytest.approx((1e-5, 1e-3))
 
 
 def test_without_opengl_rays_are_cast(nao, monkeypatch):
@@ -355,24 +347,6 @@ def test_with_opengl_mujocos_renderer_draws(nao, monkeypatch):
     picture = renderer.image(stage.pose([mujoco_data(nao, nao.q0)]), np.tile(np.array([1.0, 0.0, 0.0, 0.5]), (8, 6, 1)))
     np.testing.assert_allclose(picture[:4], np.broadcast_to([0.6, 0.1, 0.1], (4, 6, 3)), atol=1e-12)
     np.testing.assert_allclose(picture[4:], 0.2, atol=1e-12)
-
-
-def test_comparison_draws_the_curves_it_gets(tmp_path):
-    time = np.linspace(0.0, 1.0, 11)
-    curves = {"one": 1e-3 * (1.0 + time), "two": 1e-6 * (1.0 + time)}
-    figure = compare_figure(
-        time,
-        [Panel("drift [mm]", curves, floor=1e-5, bound=0.1), Panel("margin [mm]", curves, bound=0.0)],
-    )
-    log, linear = figure.axes
-    np.testing.assert_allclose(np.asarray(log.lines[0].get_ydata()), curves["one"])
-    np.testing.assert_allclose(np.asarray(log.lines[1].get_ydata()), 1e-5)
-    np.testing.assert_allclose(np.asarray(linear.lines[1].get_ydata()), curves["two"])
-    assert log.get_yscale() == "log" and log.get_ylim()[1] > 0.1
-    assert linear.get_ylim()[0] < 0.0
-    figure.savefig(tmp_path / "f.png")
-    with Image.open(tmp_path / "f.png") as picture:
-        assert picture.size == tuple(int(x) for x in figure.get_size_inches() * figure.dpi)
 
 
 def test_hero_picture_shows_shapes_and_trails_where_they_are(tmp_path):

@@ -13,12 +13,12 @@ from jaxtyping import Array
 
 from ..._errors import OsikValueError, unknown_name
 from ...control import solve
-from ...demo._file import guess_feet
 from ...kinematics import Kinematics, forward_kinematics, integrate
 from ...limits import AccelerationLimit, ConfigurationLimit, Limit, VelocityLimit, limit_box, with_own_limits
 from ...limits._own import keeps_own
 from ...numerics._guarded import clipped
 from ...robot import Robot
+from ...robot._feet import guess_feet
 from ...robot._joint_selection import scalar_layout
 from ...saving import load_controller
 from ...schemes import Scheme, WeightedQP

@@ -43,13 +43,7 @@ _WORDS = 6
 
 
 class BatchView(Served):
-    """Page that runs a batch of robots; made by ``serve_batch``.
-
-    Attributes:
-        url: address of the page.
-        names: of the robots, in the order of the batch.
-        loop: runs the controller; its numbers, targets and configurations have a leading axis.
-    """
+    """Page that runs a batch of robots; ``serve_batch`` says what it has."""
 
     def __init__(
         self,
@@ -230,7 +224,11 @@ def serve_batch(
         q0: configurations at the start [m, rad], of each or of all; default: ``robot.q0``. (B, nq) or (nq,)
 
     Returns:
-        The view.
+        The view, with ``url``, ``wait()`` and ``stop()`` as in ``serve``.
+
+        - ``names``: of the robots, in the order of the batch.
+        - ``aim(robot, task, target)``: sets the target of a task of one robot.
+        - ``loop``: runs the controller; its numbers, targets and configurations have a leading axis.
 
     Raises:
         TypeError, ValueError: no copies, or tasks that differ in more than numbers.

@@ -43,11 +43,7 @@ _WORDS = 6
 
 
 class LiveView(Served):
-    """Page that runs a session; made by ``serve``.
-
-    Attributes:
-        url: address of the page.
-    """
+    """Page that runs a session; ``serve`` says what it has."""
 
     def __init__(self, session: Session, *, look: Look | None, host: str, port: int, title: str) -> None:
         """Start the server and the loop."""
@@ -186,6 +182,14 @@ def serve(
 
     Returns:
         The view.
+
+        - ``url``: address of the page.
+        - ``aim(task, target, timeout=None)``: sets the target of a task, as ``replace(target=...)`` takes it; the robot
+          stops if no further call follows within the timeout [s].
+        - ``session``: the present controller. ``save(path)`` writes it for ``load_session``.
+        - ``loop``: the control loop. ``wait_until_ready()`` returns when the controller is compiled;
+          ``snapshot`` has the last step's ``q`` and ``status``, ``timing`` the loop's times.
+        - ``wait()`` keeps a program going until Ctrl-C; ``stop()`` ends page and loop, as the end of ``with`` does.
 
     Raises:
         ImportError: viser is not installed (the extra ``viewer``).

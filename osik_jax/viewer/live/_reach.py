@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..._errors import OsikTypeError, OsikValueError, unknown_name
-from ...reachability import ReachabilityMap
+from ...reachability._map import ReachabilityMap
 from ...reachability._slices import NOTHING, cell_edges, nearest, share_colors, slice_colors
 from ...robot import Robot
 from .._look import Look
@@ -51,12 +51,7 @@ class Slice(NamedTuple):
 
 
 class ReachView(Served):
-    """Page that shows a slice of a map; made by ``serve_reach``.
-
-    Attributes:
-        url: address of the page.
-        map: what is shown.
-    """
+    """Page that shows a slice of a map; ``serve_reach`` says what it has."""
 
     def __init__(
         self, robot: Robot, found: ReachabilityMap, *, look: Look | None, host: str, port: int, title: str
@@ -262,7 +257,13 @@ def serve_reach(
         found: from ``reachability_map`` or ``load_map``.
 
     Returns:
-        The view.
+        The view, with ``url``, ``wait()`` and ``stop()`` as in ``serve``.
+
+        - ``show(across, at)``: shows the slice across an axis, ``"x"``, ``"y"`` or ``"z"``, at the nearest coordinate
+          [m].
+        - ``stand(position)``: shows the map's most manipulable configuration at the nearest grid position [m]; None:
+          home. Returns whether the map has one.
+        - ``map``: what is shown.
 
     Raises:
         TypeError: ``found`` is no map.

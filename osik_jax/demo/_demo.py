@@ -1,0 +1,138 @@
+"""Run of a motion with each scheme, and its output files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from ..viewer import animate, hero_picture
+from ..viewer._opengl import RendererName
+from ._comparison import comparison
+from ._figures import figures
+from ._motion import Motion
+from ._physics import PhysicsRun, run_physics
+from ._report import report, table
+from ._run import TITLES, Run, run_scheme
+
+_DIRECTIONS = ("forward", "to the left", "up")
+
+
+def run_demo(
+    motion: Motion,
+    folder: Path,
+    *,
+    schemes: Sequence[str],
+    dt: float = 0.005,
+    physics: bool = False,
+    animation: bool = True,
+    picture: bool = False,
+    renderer: RendererName = "auto",
+    announce: Callable[[str, float], None] = lambda stage, done: None,
+) -> tuple[dict[str, Any], Table, Sequence[Run]]:
+    """Run the schemes in turn and write ``comparison.png``, ``motion.npz``, ``report.json`` and a film.
+
+    Args:
+        motion: what to do.
+        folder: to write to; made if need be.
+        schemes: ``"weighted"``, ``"null-space"``, ``"hierarchical"``.
+        dt: control period [s].
+        physics: whether the loop is closed with MuJoCo; ``motion`` is then one of NAO.
+        animation: whether to write ``motion.gif`` (and ``motion.mp4`` where the program ffmpeg is installed) of the
+            last scheme.
+        picture: whether to write ``picture.png``: three instants side by side.
+        renderer: for the film, as in ``viewer.animate``.
+        announce: called with the current stage and the finished share, 0 to 1.
+
+    Returns:
+        The report, as it is in ``report.json``, the table and the runs.
+
+    Raises:
+        KeyError: no such scheme.
+        RuntimeError: ``renderer="mujoco"`` where OpenGL does not work.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    run, doing = run_scheme, "compiling and running"
+    if physics:
+        run, doing = run_physics, "planning, then simulating"
+        motion = dataclasses.replace(motion, title=f"{motion.title}, with dynamics")
+    share, runs = (0.6 if animation else 0.9) / len(schemes), []
+    for scheme in schemes:
+        announce(f"{TITLES.get(scheme, scheme)}: {doing}", share * len(runs))
+        runs.append(run(motion, scheme, dt=dt))
+    start, files = share * len(runs), ["comparison.png", "motion.npz", "report.json"]
+    announce("drawing the comparison", start)
+    found = {run.scheme: figures(motion, run) for run in runs}
+    comparison(motion.title, found, dt).savefig(folder / "comparison.png")
+    np.savez_compressed(folder / "motion.npz", allow_pickle=False, **_arrays(runs))
+    if animation:
+        names = ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]
+        for name in names:
+            _film(folder / name, motion, runs[-1], dt, renderer, lambda x: announce("filming", start + 0.35 * x))
+        files += names
+    if picture:
+        announce("drawing the picture", 0.97)
+        _draw_picture(folder / "picture.png", motion, runs[-1])
+        files.append("picture.png")
+    summary = report(motion, runs, found, dt=dt, files=files)
+    text = json.dumps(summary, indent=2, allow_nan=False)
+    (folder / "report.json").write_text(text + "\n", encoding="utf-8")
+    announce("done", 1.0)
+    return summary, table(motion.title, found), runs
+
+
+def _arrays(runs: Sequence[Run]) -> dict[str, np.ndarray]:
+    """Return the arrays of ``motion.npz``: time, and of each scheme q_SCHEME (steps + 1, nq) and v_SCHEME (steps, nv).
+
+    With dynamics, of each scheme: time, q (sensed), plan, command, effort, com, contact_points and contact_forces.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    for run in runs:
+        if isinstance(run, PhysicsRun):
+            names = ("time", "q", "command", "effort", "com", "contact_points", "contact_forces")
+            parts = {name: getattr(run.recording, name) for name in names} | {"plan": run.plan.q}
+        else:
+            arrays["time"] = run.measurement.time
+            parts = {"q": run.q, "v": run.solution.velocity}
+        arrays |= {f"{name}_{run.scheme.replace('-', '_')}": np.asarray(value) for name, value in parts.items()}
+    return arrays
+
+
+def _film(
+    path: Path, motion: Motion, run: Run, dt: float, renderer: RendererName, progress: Callable[[float], None]
+) -> None:
+    """Write a film of a scheme's motion, with a curve of the largest component of up to two goals [mm]."""
+    m, values, wanted = run.measurement, {}, {}
+    for label in list(m.goals)[:2]:
+        axis = int(np.argmax(np.ptp(m.wanted[label], axis=0)))
+        name = f"{label.replace('_', ' ')} {_DIRECTIONS[axis]}"
+        values[name], wanted[name] = 1e3 * m.displacement[label][:, axis], 1e3 * m.wanted[label][:, axis]
+    animate(
+        path,
+        motion.robot,
+        run.q,
+        dt=dt,
+        renderer=renderer,
+        look=motion.look,
+        support=m.support or None,
+        trails=[goal.frame for label, goal in motion.goals.items() if label != "waist"],
+        curves=values,
+        wanted=wanted,
+        curves_title="moved from the start [mm], dashed: wanted",
+        caption=f"{motion.title}: {TITLES[run.scheme]}",
+        progress=progress,
+    )
+
+
+def _draw_picture(path: Path, motion: Motion, run: Run) -> None:
+    """Write a PNG with three instants of a motion side by side."""
+    shown = [round(part * (len(run.q) - 1)) for part in (0.0, 0.26, 0.45)]
+    support = [run.measurement.support[k] for k in shown] if run.measurement.support else None
+    labels = [f"{run.measurement.time[k]:.1f} s" for k in shown]
+    hero_picture(path, motion.robot, [run.q[k] for k in shown], support=support, labels=labels, look=motion.look)
