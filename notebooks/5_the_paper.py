@@ -97,7 +97,7 @@ def snapshots(robot, q, support, instants, size=(400, 200) if FAST else (1200, 4
 name, run = list(runs.items())[-1]
 motion = motions[name]
 figure, rows = plt.subplots(2, 1, figsize=(9, 6.8), layout="compressed")
-for axes, title, part in ((rows[0], "kinematic", run.plan), (rows[1], "dynamic (MuJoCo, sensed)", run.run)):
+for axes, title, part in ((rows[0], "kinematic", run.plan), (rows[1], "dynamic (MuJoCo, sensed)", run)):
     picture = snapshots(motion.robot, part.q, part.measurement.support, INSTANTS)
     axes.imshow(picture)
     axes.set_axis_off()
@@ -135,7 +135,7 @@ def draw_tasks(column, part, title):
 
 figure, grid = plt.subplots(4, 2, figsize=(10, 11), sharey="row", layout="constrained")
 draw_tasks(grid[:, 0], runs["waist"].plan, "kinematic")
-draw_tasks(grid[:, 1], runs["waist"].run, "dynamic")
+draw_tasks(grid[:, 1], runs["waist"], "dynamic")
 for axes in grid[:, 1]:
     axes.legend(loc="best", fontsize=8.5)
 
@@ -150,13 +150,13 @@ def worst(part):
 
 print(f"{'worst, in mm':24}{'waist off path':>16}{'feet off place':>16}{'mass inside by':>16}")
 for name, run in runs.items():
-    for kind, part in (("kinematic", run.plan), ("dynamic", run.run)):
+    for kind, part in (("kinematic", run.plan), ("dynamic", run)):
         print(f"{name + ', ' + kind:24}" + "".join(f"{value:16.3f}" for value in worst(part)))
 
 for name, run in runs.items():
     waist, feet, margin = worst(run.plan)
     assert waist < 1.0 and feet < 0.1 and margin > 0.0  # on the screen
-    assert worst(run.run)[1] < 5.0 and worst(run.run)[2] > 0.0  # on the floor: feet within 5 mm, balanced
+    assert worst(run)[1] < 5.0 and worst(run)[2] > 0.0  # on the floor: feet within 5 mm, balanced
     height, turn = 1e3 * run.physics.height_error.max(), np.degrees(run.physics.tilt_error.max())
     slip = 1e3 * max(float(np.nanmax(feet)) for feet in run.physics.slip.values())
     beyond = np.degrees(run.physics.beyond_limits.max())
