@@ -30,7 +30,6 @@ from osik_jax import Robot, load_robot
 from osik_jax.execution._workers import cores
 from osik_jax.retargeting import (
     HumanMotion,
-    LiveFrame,
     LiveRetargeter,
     Profile,
     Retargeted,
@@ -41,6 +40,7 @@ from osik_jax.retargeting import (
     report,
 )
 from osik_jax.retargeting._lanes import as_lane, solve_lanes
+from osik_jax.retargeting._live import LiveFrame
 from osik_jax.retargeting._live_command import replay
 from osik_jax.robot.loading import NAMES
 from osik_jax.runtime import configure_cpu

@@ -9,6 +9,7 @@ from ._look import read_look as read_look
 from ._mujoco import mujoco_frame_pose as mujoco_frame_pose
 from ._mujoco import mujoco_poses as mujoco_poses
 from ._mujoco import robot_com as robot_com
+from .live import Session as Session
 from .live import export_html as export_html
 from .live import load_session as load_session
 from .live import serve as serve

@@ -24,7 +24,6 @@ from osik_jax.retargeting import (
     HumanMotion,
     Retargeter,
     _plan,
-    find_profile,
     find_roles,
     fit,
     guess_profile,
@@ -47,6 +46,7 @@ from osik_jax.retargeting._link_shapes import shrunk
 from osik_jax.retargeting._notes import notes
 from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._plan import _Clip, _improved, _State, make_plan
+from osik_jax.retargeting._profile_file import find_profile
 from osik_jax.retargeting._roles import NEEDED, SIDES
 from osik_jax.retargeting._terms import Body, frame_rows
 from osik_jax.robot.loading import example_urdf

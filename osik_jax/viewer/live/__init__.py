@@ -5,4 +5,5 @@ from ._export import export_html as export_html
 from ._page import serve as serve
 from ._page import serve_session as serve_session
 from ._reach import serve_reach as serve_reach
+from ._session import Session as Session
 from ._session import load_session as load_session

@@ -27,10 +27,22 @@ _FORMAT = "osik-jax session 1"
 
 @dataclasses.dataclass(frozen=True)
 class Session:
-    """Controller of a live view with its switches; ``load_session`` says what the fields are.
+    """Controller of a live view with its switches.
 
-    ``source`` is where the robot comes from, a ``RobotSource``, or its name or file alone. None: not known, so that the
-    session cannot be saved.
+    ``osik_jax.solve(session.robot, q, session.active_tasks, scheme=session.scheme, limits=session.active_limits,
+    dt=session.dt)`` is a step of it.
+
+    Attributes:
+        robot: the robot.
+        tasks: all tasks by name, switched off or not.
+        scheme: how they share the robot.
+        limits: all limits, switched off or not: those given, then the robot's own that they do not replace.
+        dt: time of a step [s].
+        q: where the robot starts. (nq,)
+        off: names of the tasks that are switched off.
+        limits_off: numbers of the limits that are switched off, in the order of ``limits``.
+        source: where the robot comes from, a ``RobotSource``, or its name or file alone; None: not known, so that the
+            session cannot be saved.
     """
 
     robot: Robot
@@ -130,21 +142,10 @@ class Session:
 
 
 def load_session(path: str | os.PathLike[str]) -> Session:
-    """Read a session that the page of a live view, or ``view.session.save``, has written.
+    """Read a session written by a live view or ``Session.save``.
 
     Args:
         path: of the file.
-
-    Returns:
-        The session: a controller of a live view with its switches.
-
-        - ``robot``, ``tasks``, ``scheme``, ``limits``, ``dt``: as in ``solve``, switched off or not. ``limits`` has the
-          robot's own that the given ones do not replace.
-        - ``q``: where the robot starts. (nq,)
-        - ``off``: names of the tasks that are switched off; ``limits_off``: numbers of such limits, in their order.
-        - ``active_tasks``, ``active_limits``: those switched on, as ``solve`` takes them.
-        - ``save(path)`` writes it, ``serve_session`` runs and shows it, ``to_python()`` returns a program that makes
-          the same controller.
 
     Raises:
         FileNotFoundError: no such file, or the robot's file is no longer where it was.
