@@ -8,7 +8,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class CoreHook(BuildHookInterface):
-    """Compiles ``osik_jax/core`` in place and puts the libraries into the wheel."""
+    """Compiles ``osik_jax/core`` in place, where it has changed, and puts the libraries into the wheel."""
 
     def initialize(self, version, build_data):
         """Compile before the wheel is written; a failure is a warning."""
@@ -18,7 +18,7 @@ class CoreHook(BuildHookInterface):
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
         try:
-            libraries = module.build()
+            libraries = module.build_if_changed()
         except RuntimeError as problem:
             self.app.display_warning(f"osik_jax is installed without its compiled core, which is slower: {problem}")
             return

@@ -25,6 +25,13 @@ os.environ.setdefault(
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="osik-tests-")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+# So are Python's own compiled files, where none may be written beside the sources.
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(
+        Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) / "python"
+    )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # programs without the lines that they come from
@@ -65,12 +72,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile the core of a checkout whose C++ files have changed since its library was built."""
     if hasattr(config, "workerinput") or "OSIK_CORE_LIBRARY" in os.environ or "site-packages" in str(_build.FOLDER):
         return
-    mark = _build.FOLDER / "built.part"
-    built = all(_build.library_path(level).exists() for level in _build.levels())
-    if not built or not mark.exists() or mark.read_text() != _build.fingerprint():
-        with contextlib.suppress(RuntimeError):  # no compiler: tests of the core are skipped
-            _build.build()
-            mark.write_text(_build.fingerprint())
+    with contextlib.suppress(RuntimeError):  # no compiler: tests of the core are skipped
+        _build.build_if_changed()
 
 
 def pytest_report_header() -> list[str]:

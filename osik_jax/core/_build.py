@@ -5,6 +5,7 @@ Only the standard library is imported, because nothing else is available during 
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import os
 import platform
@@ -40,6 +41,29 @@ def fingerprint() -> str:
     for path in sources():
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def build_if_changed() -> list[Path]:
+    """Compile the library if it is missing, cannot be loaded here, or its sources have changed since it was built.
+
+    Returns:
+        Paths of the libraries.
+
+    Raises:
+        RuntimeError: as ``build``.
+    """
+    paths, mark = [library_path(level) for level in levels()], fingerprint()
+    return paths if all(_sources_of(path) == mark for path in paths) else build()
+
+
+def _sources_of(path: Path) -> str | None:
+    """Return the fingerprint that a library was built with, None where it cannot be loaded."""
+    try:
+        sources = ctypes.CDLL(str(path)).osik_sources
+    except (OSError, AttributeError):  # of another platform, or no library of ours
+        return None
+    sources.restype = ctypes.c_char_p
+    return sources().decode()
 
 
 def build(flags: tuple[str, ...] = ()) -> list[Path]:

@@ -33,6 +33,21 @@ def test_a_library_of_other_sources_is_refused(tmp_path, monkeypatch):
     assert core.library is None and "built from other sources" in core.reason and "_build" in core.reason
 
 
+@needs_core
+def test_a_library_is_built_again_where_its_sources_changed_or_it_cannot_be_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr(_build, "build", lambda: "built")
+    there = _build.build_if_changed()
+    assert there == [_build.library_path(level) for level in _build.levels()]
+    with monkeypatch.context() as patch:
+        patch.setattr(_build, "fingerprint", lambda: "another state")
+        assert _build.build_if_changed() == "built"
+    broken = tmp_path / "core.so"
+    broken.write_text("no library")
+    for path in (broken, tmp_path / "none.so"):
+        monkeypatch.setattr(_build, "library_path", lambda level, path=path: path)
+        assert _build.build_if_changed() == "built"
+
+
 def test_without_the_core_a_warning_says_what_to_do():
     code = "import jax, osik_jax; from osik_jax.solvers import Level, solve_hqp; import jax.numpy as jnp, numpy as np;"
     code += "one = jnp.ones(2); print(solve_hqp([Level(jnp.eye(2), one)], -one, one).x)"
