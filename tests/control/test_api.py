@@ -151,6 +151,7 @@ class TestDefaultScheme:
         assert float(jnp.abs(found.slack["hand"]).max()) > 0.1
         np.testing.assert_array_equal(found.velocity, osik.solve(arm, arm.q0, level, scheme=osik.WeightedQP()).velocity)
 
+    @pytest.mark.slow
     def test_counts_no_hard_task(self, arm, make):
         hard = make(1, 2, hard=True)
         np.testing.assert_array_equal(

@@ -1,6 +1,7 @@
 """A control step in one call of the core: beside plain JAX, its derivatives and certificates, and steps without it."""
 
 import re
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -96,19 +97,30 @@ def arguments(robot: osik.Robot, tasks: dict[str, osik.Task], scheme: osik.Schem
     return tasks, scheme, with_own_limits(robot, None), jnp.asarray(DT, robot.q0.dtype), None
 
 
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, *[None] * 5))
+def in_plain_jax(robot: osik.Robot, q: Any, *rest: Any) -> osik.Solution:
+    return _step._plain_step(robot, q, *rest)
+
+
+def plainly(tasks: Any, scheme: Any, *rest: Any) -> tuple[Any, ...]:
+    """Levels of a hierarchy are solved by its kernel, whose answers have roundoff of 1e-10."""
+    return tasks, scheme if isinstance(scheme, osik.HierarchicalQP) else osik.WeightedQP(backend="jax"), *rest
+
+
 def by_core(robot: osik.Robot, q: Any, *rest: Any) -> tuple[osik.Solution, np.ndarray]:
     """The core's answers for lanes of q, and which are certified."""
-    like = jax.eval_shape(lambda q: _step._plain_step(robot, q, *rest), q[0])
+    lanes = in_plain_jax.eval_shape(robot, q, *plainly(*rest))
+    like = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), lanes)
     first, *others = jax.tree.map(lambda a: jnp.asarray(a)[None], (robot, *rest))
     packed = _compiled_step._Arrays((first, q, *others))
     found = _compiled_step._unpacked(like, *_compiled_step._by_core(packed, *packed.arrays))
     return found, np.asarray(found.status) == 0
 
 
-def plain(robot: osik.Robot, q: Any, tasks: Any, scheme: Any, *rest: Any) -> osik.Solution:
-    """The step from its parts. Levels of a hierarchy are solved by its kernel, whose answers have roundoff of 1e-10."""
-    slow = scheme if isinstance(scheme, osik.HierarchicalQP) else osik.WeightedQP(backend="jax")
-    return jax.jit(jax.vmap(lambda q: _step._plain_step(robot, q, tasks, slow, *rest)))(q)
+def plain(robot: osik.Robot, q: Any, *rest: Any) -> osik.Solution:
+    """The step from its parts."""
+    return in_plain_jax(robot, q, *plainly(*rest))
 
 
 def assert_close(found: Any, wanted: Any, tolerance: float) -> None:
@@ -116,11 +128,14 @@ def assert_close(found: Any, wanted: Any, tolerance: float) -> None:
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance)
 
 
-SLOW = [("nao", "bounded"), ("nao", "standing"), ("g1", "mixed"), ("g1", "bounded"), ("arm7", "mixed")]
-CASES = [("nao", "mixed"), ("arm7", "bounded"), ("ur5", "standing")]
-CASES += [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW]
+CASES = [("ur5", "standing"), *((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded"))]
+CASES += [("nao", "standing")]
+ORDINARY = ["arm7-bounded-weighted", "ur5-standing-weighted", "nao-mixed-hierarchy"]
+IN_THE_GATE = ["arm7-bounded-hierarchy", "nao-mixed-weighted", "g1-mixed-hierarchy"]
+AT_NIGHT = [f"{name}-{tasks}-{scheme}" for name, tasks in CASES for scheme in SCHEMES]
 
 
+@pytest.mark.variants(slow=IN_THE_GATE, release=[c for c in AT_NIGHT if c not in (*ORDINARY, *IN_THE_GATE)])
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize(("name", "tasks"), CASES)
 def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
@@ -138,6 +153,7 @@ def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
     assert float(jnp.abs(found.kkt_residual).max()) <= 1e-9
 
 
+@pytest.mark.variants(slow=["weighted"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
     with jax.enable_x64(False):
@@ -152,6 +168,7 @@ def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
     np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
 
 
+@pytest.mark.variants(slow=["hierarchy"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_derivatives_are_those_of_plain_jax(scheme):
     robot = robot_of("arm7")
@@ -172,6 +189,7 @@ def test_derivatives_are_those_of_plain_jax(scheme):
     assert_close(found, wanted, 1e-9 * (1.0 + max(float(jnp.abs(a).max()) for a in wanted)))
 
 
+@pytest.mark.variants(slow=["weighted"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
     robot = robot_of("nao")
@@ -195,8 +213,9 @@ def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
     assert all(np.isfinite(np.asarray(a)).all() for a in jax.tree.leaves(found))
 
 
+@pytest.mark.variants(slow=["mixed-hierarchy"], release=["bounded-weighted", "bounded-hierarchy"])
 @pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("tasks", [mixed, pytest.param(bounded, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("tasks", [mixed, bounded])
 def test_numbers_that_are_not_valid_are_answered_as_by_plain_jax(tasks, scheme):
     robot = robot_of("arm7")
     given = robot, lanes_of(robot)[0], *arguments(robot, tasks(robot), SCHEMES[scheme]())
@@ -260,6 +279,9 @@ def variants(robot: osik.Robot) -> dict[str, tuple[dict[str, osik.Task], Any]]:
     }
 
 
+@pytest.mark.variants(
+    slow=["ball-weighted", "locked-weighted"], release=["mimic-weighted", "ball-hierarchy", "locked-hierarchy"]
+)
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("kind", ["mimic", "ball", "locked"])
 def test_edges_of_what_is_allowed_are_those_of_plain_jax(kind, scheme):
@@ -336,19 +358,14 @@ def test_other_steps_take_the_plain_path():
 def test_the_certificate_is_that_of_plain_jax(rng):
     batch, m, n, p, tolerance = 200, 6, 9, 4, 1e-12
 
-    def problem(key: int) -> QP:
-        rng = np.random.default_rng(key)
-        cost = LeastSquares(
-            *map(jnp.asarray, (rng.normal(size=(m, n)), rng.normal(size=m), rng.uniform(0.1, 9.0, m))),
-            *map(jnp.asarray, (rng.uniform(0.01, 1.0, n), rng.normal(size=n))),
-        )
-        bounds = rng.uniform(0.05, 0.5, n + p)
-        compliance = jnp.asarray(rng.uniform(0.1, 1.0, p))
-        return QP(cost, jnp.asarray(rng.normal(size=(p, n))), compliance, jnp.asarray(-bounds), jnp.asarray(bounds))
-
-    problems = [problem(k) for k in range(batch)]
-    qp = jax.tree.map(lambda *a: jnp.stack(a), *problems)
-    matrix, packed = (jnp.stack(a) for a in zip(*map(pack, problems), strict=True))
+    cost = LeastSquares(
+        *(rng.normal(size=(batch, m, n)), rng.normal(size=(batch, m)), rng.uniform(0.1, 9.0, (batch, m))),
+        *(rng.uniform(0.01, 1.0, (batch, n)), rng.normal(size=(batch, n))),
+    )
+    bounds = rng.uniform(0.05, 0.5, (batch, n + p))
+    qp = QP(cost, rng.normal(size=(batch, p, n)), rng.uniform(0.1, 1.0, (batch, p)), -bounds, bounds)
+    qp = jax.tree.map(jnp.asarray, qp)
+    matrix, packed = jax.jit(jax.vmap(pack))(qp)
     solved = _dispatch._core.solve(qp, jnp.zeros((batch, n + p), int), jnp.full(batch, tolerance), 1000)
     # errors of 1e-16 to 1 in x, in a multiplier or in a label of every second problem
     size = 10.0 ** rng.uniform(-16.0, 0.0, batch) * (np.arange(batch) % 2)
@@ -363,7 +380,7 @@ def test_the_certificate_is_that_of_plain_jax(rng):
         residual = _dispatch.kkt_residual(qp, x, y, active)
         return jnp.concatenate(conditions).all() & (residual <= 1e-9), residual
 
-    wanted, residual = jax.vmap(plain)(qp, x, y, active)
+    wanted, residual = jax.jit(jax.vmap(plain))(qp, x, y, active)
     holds, own = _library.call(
         "weighted_qp_certificate",
         [((batch,), int), ((batch,), float)],

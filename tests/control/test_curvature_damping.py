@@ -50,6 +50,7 @@ def second_derivative(model, q, pull, body, h=1e-5):
     return np.array(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["0.0001-0.4"])
 @pytest.mark.parametrize(("away", "part"), [(1e-4, 0.4), (10.0, 1.0)])
 def test_near_all_targets_the_bound_counts_in_part(arm, away, part):
@@ -260,7 +261,7 @@ def test_its_share_is_traced(arm):
     assert len(traces) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_products_as_a_gpu_takes_them_are_the_same(arm, monkeypatch):
     """Small products are written out where JAX's default is a GPU; here that is only said."""
     q = bent(arm)

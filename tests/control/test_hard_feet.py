@@ -38,7 +38,7 @@ def solve(robot, q, tasks, scheme, limits):
     return jax.vmap(lambda q: osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt=0.005))(q)
 
 
-@pytest.mark.variants(slow=["hierarchical", "null-space"])
+@pytest.mark.variants(slow=["hierarchical"], release=["null-space"])
 @pytest.mark.parametrize("name", SCHEMES)
 def test_stay_to_rounding(setting, name):
     robot, q, tasks, limits = setting

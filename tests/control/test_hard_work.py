@@ -159,6 +159,7 @@ class TestOutOfReach:
                 assert np.linalg.norm(places_of(g1, lane[LATE::50], foot) - start, axis=1).max() < 1e-4
 
 
+@pytest.mark.variants(release=["weighted"])
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
 def test_a_hand_follows_a_curve_within_reach_while_the_feet_are_hard(nao, scheme):

@@ -89,7 +89,7 @@ def test_collision_pairs_made_inside_are_of_the_robot_that_is_given():
         distances(second(), Q)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_stack_of_robots_of_different_files_has_no_model():
     one, other = first(), second()
     both = osik.stack([one, other])

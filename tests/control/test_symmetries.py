@@ -45,7 +45,7 @@ METHODS = {
 }
 
 
-@pytest.mark.variants(release=["saturated"], slow=["hierarchical", "forward"])
+@pytest.mark.variants(release=["saturated", "hierarchical", "forward"])
 @pytest.mark.parametrize(
     "method", [pytest.param(name, marks=pytest.mark.slow if name == "saturated" else ()) for name in METHODS]
 )

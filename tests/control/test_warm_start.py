@@ -45,7 +45,7 @@ def test_a_random_active_set_costs_time_only(qps, rng):
     np.testing.assert_array_equal(warm.active, cold.active)
 
 
-@pytest.mark.variants(release=["mixed", "duplicated_rows"])
+@pytest.mark.variants(slow=["pinned"], release=["mixed", "duplicated_rows"])
 @pytest.mark.parametrize("family", ["mixed", "duplicated_rows", "pinned", "scaled_altogether"])
 def test_random_active_sets_with_rows(family, rng):
     p = PLANTED[family](rng, 500)

@@ -97,7 +97,7 @@ WRONG = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_right_answers_are_taken(batch):
     end, taken = completed(batch, batch.answers)
     assert taken.all()
@@ -106,7 +106,7 @@ def test_right_answers_are_taken(batch):
     np.testing.assert_array_equal(end.x, inside)
 
 
-@pytest.mark.variants(release=["infinite residual", "NaN multipliers", "not done"])
+@pytest.mark.variants(slow=["outside", "a level lost"], release=["infinite residual", "NaN multipliers", "not done"])
 @pytest.mark.parametrize("wrong", WRONG)
 def test_wrong_answers_are_not(batch, wrong, monkeypatch):
     """They are wrong in every third lane; blocks of 3, so that the last one is not full."""
@@ -117,7 +117,7 @@ def test_wrong_answers_are_not(batch, wrong, monkeypatch):
     np.testing.assert_allclose(end.x, batch.answers.x, rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @needs_core
 def test_when_the_kernel_is_asked(monkeypatch):
     asked = []

@@ -81,7 +81,7 @@ def assert_right(batch: Batch, end: _search.SearchResult) -> None:
     assert (np.abs(off).max(1) / np.abs(np.asarray(cost.target)).max(1)).max() < 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_right_candidates_are_taken(batch):
     end, taken = completed(batch, candidate_of(batch.answers))
     assert taken.all() and (end.factorizations == 1).all()
@@ -213,6 +213,7 @@ def test_when_the_kernel_is_not_asked(beside_a_gpu, monkeypatch, why):
     assert beside_a_gpu == []
 
 
+@pytest.mark.variants(release=["hard-float64", "soft-float64", "soft-float32", "none-float32"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("rows", ["none", "soft", "hard"])
 def test_when_the_kernel_is_asked(beside_a_gpu, rows, dtype):

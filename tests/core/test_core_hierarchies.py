@@ -72,7 +72,7 @@ def test_every_level_is_certified_and_nothing_is_left_to_the_search(families, no
         assert max(certificate(families, i, x[i]).max() for i in range(0, len(x), 3)) < 1e-10
 
 
-@pytest.mark.variants(slow=["False"])
+@pytest.mark.variants(release=["False"])
 @pytest.mark.parametrize("damped", [False, True])
 def test_answers_are_those_of_the_search(families, damped):
     mine, search = (solved(*given(families), backend=b, damped=damped) for b in ("core", "jax"))
@@ -81,6 +81,7 @@ def test_answers_are_those_of_the_search(families, damped):
     assert agree.mean() > 0.99  # what is left: rows whose rank is at the tolerance
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["False"])
 @pytest.mark.parametrize("damped", [False, True])
 def test_foreign_warm_starts_change_no_answer(families, damped, rng):
@@ -117,7 +118,7 @@ def test_recorded_hierarchies(precision, nothing_is_searched):
     assert np.mean(warm.factorizations) < 0.3 * np.mean(cold.factorizations)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_vmap_is_a_loop_and_a_bad_lane_leaves_its_neighbours_alone(families):
     p = jax.tree.map(lambda a: a[:5].copy(), families)
     p.levels[1].A[3, 0, 0] = np.nan
@@ -131,7 +132,7 @@ def test_vmap_is_a_loop_and_a_bad_lane_leaves_its_neighbours_alone(families):
         np.testing.assert_array_equal(alone.x[0], s.x[i])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_what_the_kernel_leaves_over_is_searched(families, monkeypatch):
     """A kernel that gives wrong answers in every third lane."""
     p = jax.tree.map(lambda a: a[:6], families)

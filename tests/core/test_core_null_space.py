@@ -61,6 +61,7 @@ def test_lane_by_lane_as_the_plain_method(p):
     assert np.abs(found.x - expected.x).max() < 1e-10 * (1.0 + np.abs(expected.x).max())
 
 
+@pytest.mark.variants(slow=["a humanoid's", "damped, more rows", "nothing left"])
 @every_family
 def test_the_projector_is_one(p):
     P = np.asarray(solved(p).projector)
@@ -95,6 +96,7 @@ def test_as_numpy(name):
         np.testing.assert_allclose(found[lane], expected, rtol=0, atol=1e-9 * (1.0 + np.abs(expected).max()))
 
 
+@pytest.mark.variants(slow=["a humanoid's"])
 @pytest.mark.parametrize("name", ["damped inequalities", "a humanoid's", "level without rows"])
 def test_single_precision_is_double_inside(name):
     """As near to the answer in double precision as rounded data can be, and nearer than single arithmetic."""
@@ -108,6 +110,7 @@ def test_single_precision_is_double_inside(name):
     assert np.abs(found.x - expected.x).max() < 1e-5 * (1.0 + np.abs(expected.x).max())
 
 
+@pytest.mark.variants(release=["repeated", "damped"])
 @pytest.mark.parametrize("name", ["damped", "damped inequalities", "dependent and damped", "repeated"])
 def test_the_reverse_order_with_the_factors_of_the_kernel(name):
     p = FAMILIES[name]
@@ -118,7 +121,14 @@ def test_the_reverse_order_with_the_factors_of_the_kernel(name):
 
 
 @pytest.mark.variants(
-    release=["level without rows", "repeated and damped", "nothing left", "more rows than variables", "dependent"]
+    release=[
+        "level without rows",
+        "repeated and damped",
+        "nothing left",
+        "more rows than variables",
+        "dependent",
+        "a humanoid's",
+    ]
 )
 @pytest.mark.parametrize(
     "name",
@@ -241,6 +251,7 @@ def test_second_derivatives_and_loops():
     np.testing.assert_allclose(second(0.2), (first(0.2 + step) - first(0.2 - step)) / (2.0 * step), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop_however_it_is_nested(rng):
     p = random_problems(20, 8, (3, 4, 2), inequalities=True, damped=True, lanes=40)
     together = solved(p)
@@ -299,12 +310,9 @@ def in_used_memory(request):
 
 
 @pytest.mark.variants(
-    slow=["{method}-{name}"],
+    slow=["saturated-dependent and damped"],
     release=[
-        "forward-damped, more rows",
-        "forward-dependent and damped",
-        "reverse-damped, more rows",
-        "forward-a humanoid's",
+        f"{m}-{name}" for name in IN_USED_MEMORY for m in METHODS if (m, name) != ("saturated", IN_USED_MEMORY[0])
     ],
 )
 @pytest.mark.parametrize("in_used_memory", IN_USED_MEMORY, indirect=True)

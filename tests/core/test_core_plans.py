@@ -52,6 +52,7 @@ def nao():
     return osik.load_robot("nao")
 
 
+@pytest.mark.slow
 @pytest.mark.variants(slow=["settled"], release=["mended"])
 @pytest.mark.parametrize("until", ["ready", "settled", "mended"])
 def test_a_plan_is_improved_as_by_the_plain_method(until, nao, motion):
@@ -73,7 +74,7 @@ def test_a_plan_ends_with_the_same_step_as_by_the_plain_method(nao, motion):
     assert by_kernel.iterations == plainly.iterations < 100
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_centre_of_mass_is_kept_as_by_the_plain_method(nao, motion):
     clip, q = clip_of(nao, motion, 0.02)
     by_kernel, plainly = compiled("mended")
@@ -95,6 +96,7 @@ def test_locked_joints_and_rows_of_whole_blocks(motion):
     agree(by_kernel(clip, q, jnp.array(2)), plainly(clip, q, jnp.array(2)))
 
 
+@pytest.mark.slow
 def test_a_batch_is_what_each_clip_is_alone(nao, motion):
     clip, q = clip_of(nao, motion)
     starts, stiffer = jnp.stack([q, q[::-1]]), jnp.array([1.0, 2.0])

@@ -91,7 +91,7 @@ def test_as_daqp():
         np.testing.assert_allclose(found.x[i], x, atol=1e-6)
 
 
-@pytest.mark.variants(release=["g1-float64"])
+@pytest.mark.variants(release=["g1-float64", "nao-float64", "g1-float32"])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("robot", ["nao", "g1"])
 def test_recorded_problems(robot, dtype):
@@ -117,6 +117,7 @@ def test_a_warm_start_costs_one_factorization():
     np.testing.assert_allclose(warm.x, cold.x, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_lanes_that_are_left_to_the_search():
     """Rows that cannot hold, numbers that are none, unordered bounds, beside lanes that are as they were alone."""
     p = problems(seed=4)

@@ -167,7 +167,7 @@ def check_requirements(motion, run, lifted=None):
     assert (run.solution.status == osik.solvers.Status.SOLVED).all()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_double_support_reaches_its_numbers(sway):
     motion, run = sway
     assert len(run.q) == 1601

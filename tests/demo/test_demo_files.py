@@ -62,6 +62,7 @@ def test_one_joint_takes_its_tip_along_its_arc():
     assert path.still(np.array([0.0, 0.5, 0.9, 1.5, 1.9])).tolist() == [False, False, True, False, True]
 
 
+@pytest.mark.slow
 def test_a_joint_that_turns_its_tip_in_place_turns_it():
     motion = motion_of(chain(0.3, (Z,)))
     (start, R0), (there, R1) = (joint_path(motion).at(t)[0] for t in (0.0, 1.0))
@@ -127,7 +128,7 @@ def urdf(ending):
     return Path(str(found.locate()))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_walker_stands_on_the_floor():
     """Its lowest point is at height 0, and all its feet are within a millimetre of it."""
     path = urdf("solo_description/robots/solo12.urdf")

@@ -88,42 +88,24 @@ def heading_anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
 
-LONG = {
-    f"docs/{name}.md"
-    for name in (
-        "batches",
-        "inverse_kinematics",
-        "porting",
-        "retargeting",
-        "scaling",
-        "solvers",
-        "tasks_and_limits",
-        "the_loop",
-        "tuning",
-        "tutorial",
-        "viewer",
-    )
-}
-
-
-@pytest.mark.variants(
-    slow=[
-        "docs/conventions.md",
-        "docs/robots.md",
-        "docs/ros2.md",
-        "docs/choosing_a_scheme.md",
-        "docs/deploying.md",
-        "docs/pytorch.md",
-        "docs/reinforcement_learning.md",
-    ]
+IN_THE_GATE = ("tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch")
+IN_THE_GATE += ("reinforcement_learning", "interop", "porting")
+AT_NIGHT = (
+    "batches",
+    "inverse_kinematics",
+    "retargeting",
+    "scaling",
+    "solvers",
+    "tasks_and_limits",
+    "tuning",
+    "viewer",
 )
+
+
+@pytest.mark.variants(**{t: [f"docs/{p}.md" for p in ps] for t, ps in (("slow", IN_THE_GATE), ("release", AT_NIGHT))})
 @pytest.mark.parametrize(
     "page",
-    [
-        pytest.param(page, id=relative(page), marks=[pytest.mark.slow] if relative(page) in LONG else [])
-        for page in PAGES
-        if BLOCK.search(page.read_text())
-    ],
+    [pytest.param(page, id=relative(page)) for page in PAGES if BLOCK.search(page.read_text())],
 )
 def test_code_runs(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

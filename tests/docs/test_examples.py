@@ -134,21 +134,11 @@ CHECKS: list[Callable[[Names], None]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.variants(
-    slow=[
-        "so101_pose",
-        "nao_one_foot",
-        "ur5_keeps_off_a_post",
-        "tiago_drives",
-        "panda_thousand_targets",
-        "so101_teleoperation",
-        "ur5_pose",
-        "allegro_grasp",
-        "g1_reaches",
-        "carry_a_box",
-    ],
-    release=["panda_draws", "baxter_two_arms", "xarm_elbow", "go2_body", "tune_a_weight"],
-)
+IN_THE_GATE = [so101_teleoperation, allegro_grasp]
+AT_NIGHT = [check for check in CHECKS if check not in (*IN_THE_GATE, retarget_a_person)]
+
+
+@pytest.mark.variants(slow=[check.__name__ for check in IN_THE_GATE], release=[check.__name__ for check in AT_NIGHT])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.filterwarnings("error::osik_jax.OsikWarning")
 def test_runs(

@@ -47,6 +47,7 @@ def test_an_open_clutch_lets_the_device_move_freely():
     np.testing.assert_allclose(target[0], frame[0] + step, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["True-position", "False-position", "False-pose"])
 @pytest.mark.parametrize("rows", ["pose", "position"])
 @pytest.mark.parametrize("reachable", [True, False])

@@ -65,6 +65,7 @@ def test_a_symbolic_batch_is_exported(name, step):
         np.testing.assert_allclose(exported.call(batch), many(batch), atol=1e-9)
 
 
+@pytest.mark.variants(release=["False-NullSpace"])
 @pytest.mark.parametrize("scheme", [osik.NullSpace, osik.WeightedQP])
 @pytest.mark.parametrize("is_symbolic", [False, True])
 def test_a_program_with_a_kernel_is_refused_in_our_words(scheme, is_symbolic):

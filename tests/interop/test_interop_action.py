@@ -33,6 +33,7 @@ def arm():
     return robot, tasks
 
 
+@pytest.mark.variants(slow=["relative"])
 @pytest.mark.parametrize("mode", ["relative", "absolute"])
 def test_the_frame_goes_where_the_action_says(arm, mode):
     """A pose in the world, by MuJoCo: moved by scale times action from where it is, or from the task's own target."""
@@ -72,7 +73,7 @@ def test_joints_stay_within_their_limits_whatever_the_action(arm):
     assert near < 1e-6 and np.isclose(np.abs(path.velocity), robot.velocity_limit).any()  # both are reached
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_several_frames_and_the_joints_of_actuators():
     robot = osik.load_robot("nao")
     tasks = {
@@ -96,7 +97,7 @@ def test_several_frames_and_the_joints_of_actuators():
     np.testing.assert_array_equal(out.position, np.asarray(out.q)[7:][::-1])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_nan_holds_the_robot_and_gradients_are_finite(arm):
     robot, tasks = arm
     action = TaskSpaceAction(robot, tasks, dt=DT)

@@ -124,7 +124,7 @@ def test_a_batch_of_any_size_without_osik_jax(tmp_path):
 
 
 @pytest.mark.variants(release=["float32-0.002"])
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(("precision", "atol"), [("float64", 1e-9), ("float32", 2e-3)])
 def test_every_scheme_and_4096_lanes_without_osik_jax(tmp_path, precision, atol):
     run_elsewhere(tmp_path, list(SCHEMES), precision, [1, 7, 4096], atol)

@@ -70,6 +70,7 @@ def configurations(robot: osik.Robot, rng: np.random.Generator, count: int) -> j
     return jax.vmap(lambda v: osik.integrate(robot, robot.q0, v))(v)
 
 
+@pytest.mark.variants(slow=["solo"])
 def test_poses_and_jacobians_are_mjx_s(other: Any, rng: np.random.Generator) -> None:
     robot, kinematics, frame = other
 
@@ -88,7 +89,9 @@ def test_poses_and_jacobians_are_mjx_s(other: Any, rng: np.random.Generator) -> 
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
-@pytest.mark.variants(slow=["solo-WeightedQP", "ur5-WeightedQP", "ur5-HierarchicalQP", "solo-NullSpace"])
+@pytest.mark.variants(
+    slow=["ur5-WeightedQP", "solo-HierarchicalQP"], release=["solo-WeightedQP", "ur5-HierarchicalQP", "solo-NullSpace"]
+)
 @pytest.mark.parametrize(
     "scheme", [osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace()], ids=lambda s: type(s).__name__
 )
@@ -107,6 +110,7 @@ def test_a_step_is_that_with_mjx(other: Any, scheme: Any, rng: np.random.Generat
     np.testing.assert_allclose(theirs, ours, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_ball_joint_turns_about_its_anchor(rng: np.random.Generator) -> None:
     robot = osik.Robot.from_mjcf(
         "<mujoco><worldbody><body name='a' pos='0.1 0.2 0.3'><joint name='b' type='ball' pos='0.05 -0.02 0.01'/>"
@@ -123,6 +127,7 @@ def test_a_ball_joint_turns_about_its_anchor(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(again.dof_anchor[:3], ours.dof_anchor[:3], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_wrong_arrays_are_named() -> None:
     robot = osik.load_robot("arm7")
     kinematics = osik.forward_kinematics(robot, robot.q0)

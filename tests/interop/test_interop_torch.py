@@ -42,7 +42,7 @@ def test_numbers_and_pytrees_are_those_of_jax(arm):
     np.testing.assert_array_equal(out["status"].numpy(), wanted["status"])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_gradcheck_of_a_step(arm):
     """PyTorch's own check by central differences in float64, of the targets and the configurations."""
     step, q, p = arm
@@ -147,7 +147,7 @@ def test_what_cannot_be_is_told():
         torch.autograd.grad(wrap(jnp.sin)(x).sum(), x, create_graph=True)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_last_layer_of_a_policy(arm):
     """A network learns through the step which target gives a velocity; the layer has no parameters of its own."""
     step, q, p = arm

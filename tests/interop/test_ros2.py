@@ -111,7 +111,7 @@ class TestNames:
         assert output.phase == "moving" and output.level == 1 and "unknown joints: gripper_finger" in output.message
         assert "gripper_finger" not in output.command.names
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_followers_are_known(self, nao):
         run = Run(nao, {"RHipYawPitch": 0.0})
         assert "RHipYawPitch" not in nao.joints.names

@@ -91,6 +91,7 @@ def test_ranges_that_stand_for_none_do_not_spread_the_searches(rng, limit, dtype
     assert max(np.linalg.norm(place(one) - p) for one, p in zip(q, positions, strict=True)) < 1.1e-3
 
 
+@pytest.mark.slow
 def test_finds_all_analytic_solutions_of_a_ur10e():
     """Joints within two turns: eight branches, some of them 0.02 rad apart."""
     robot = arm_of(LINKS, AXES, 'range="-6.2832 6.2832"')
@@ -104,6 +105,7 @@ def test_finds_all_analytic_solutions_of_a_ur10e():
     assert complete >= 0.95 * len(given["solutions"])
 
 
+@pytest.mark.slow
 def test_a_follower_of_half_the_angle_has_no_copies():
     """A turn of the joint brings its follower to another place."""
     robot = osik.Robot.from_mjcf(

@@ -111,6 +111,7 @@ def test_limbs_that_share_no_joint_stay_on_their_targets():
         assert off["a"] == pytest.approx(straight, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["rows0"])
 @pytest.mark.parametrize("rows", [(True,) * 6, (True,) * 3 + (False,) * 3])
 def test_hessian_of_the_error_by_central_differences(rng, rows):

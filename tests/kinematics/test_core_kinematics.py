@@ -195,8 +195,9 @@ def pose_tasks(robot: osik.Robot, **options) -> dict[str, osik.Task]:
     return tasks | {"relative": osik.RelativeFrameTask(robot, one, other, **given)}
 
 
+@pytest.mark.slow
 @pytest.mark.variants(
-    slow=["pose"], release=["twist", "adaptive", "geometric", "frame's axes", "some", "geometric, frame's", "position"]
+    release=["twist", "adaptive", "geometric", "frame's axes", "some", "geometric, frame's", "position", "pose"]
 )
 @pytest.mark.parametrize("case", OPTIONS)
 def test_rows_of_poses(robots, case):
@@ -217,7 +218,7 @@ def test_rows_of_poses(robots, case):
     assert_near(ours, theirs, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_of_rows(robots):
     robot = robots["toy"]
     tasks = pose_tasks(robot)
@@ -233,7 +234,7 @@ def test_derivatives_of_rows(robots):
     assert_near(*map(jax.tree.leaves, (ours, theirs)), atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_step_that_says_jax_has_no_kernel(robots):
     """``jax.export`` takes no calls of kernels: a step of ``backend="jax"`` is exported, and gives the same."""
     robot = robots["arm7"]

@@ -313,7 +313,7 @@ def test_jacobians_equal_central_differences_along_the_tangent(robots, evaluator
         np.testing.assert_allclose(here[f"{point}_jacobian"], numeric, atol=1e-8, rtol=0)
 
 
-@pytest.mark.variants(release=["toy"])
+@pytest.mark.variants(slow=["nao"], release=["toy"])
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_of_poses_equal_central_differences(robots, evaluators, name):
     robot, step = robots[name], 1e-6
@@ -389,6 +389,7 @@ def test_a_follower_adds_its_column_to_its_leaders(robots, evaluators):
         np.testing.assert_allclose(jacobians[robot.frame_names.index(foot), :, column], expected, atol=1e-9)
 
 
+@pytest.mark.variants(slow=["locked1"])
 @pytest.mark.parametrize("locked", [("root", "ball", "second"), {"slide": 0.3, "slid*": 0.1}])
 def test_locked_joints_stay_where_they_are(locked):
     robot = toy_robot(locked_joints=locked)

@@ -35,7 +35,7 @@ def nearest_in_cap(target: np.ndarray, angle: float) -> np.ndarray:
     return CENTER + LENGTH * np.array([*(np.sin(tilt) * across), np.cos(tilt)])
 
 
-@pytest.mark.variants(release=["HierarchicalQP-12.0", "WeightedQP-12.0"])
+@pytest.mark.variants(slow=["WeightedQP-75.0"], release=["HierarchicalQP-12.0", "WeightedQP-12.0"])
 @pytest.mark.parametrize("degrees", [12.0, 75.0])
 @pytest.mark.parametrize("scheme", [osik.WeightedQP, osik.HierarchicalQP])
 def test_no_step_leaves_the_range_and_the_nearest_point_is_reached(degrees: float, scheme: type):
@@ -53,7 +53,7 @@ def test_no_step_leaves_the_range_and_the_nearest_point_is_reached(degrees: floa
         assert np.linalg.norm(tip - nearest_in_cap(target, most)) < 0.003 * most * LENGTH + 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_random_steps_at_the_end_of_the_range_stay_inside():
     """Any velocity that box and row allow, of joints anywhere in the range, ends inside: corners of the box too."""
     robot = osik.Robot.from_mjcf(mjcf(40.0))
@@ -136,7 +136,7 @@ def test_ranges_are_written():
     np.testing.assert_array_equal(again.position_lower, robot.position_lower)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_are_finite_where_the_axis_is_not_known():
     robot = osik.Robot.from_mjcf(mjcf(25.0))
     limit = osik.ConfigurationLimit(robot)

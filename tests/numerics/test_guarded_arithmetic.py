@@ -145,6 +145,7 @@ def _rates_of_limits_by_dt(precision, angle):
         return [np.asarray(a, float) for a in jax.jit(jax.vmap(rates))(jnp.asarray(TIMES, precision))]
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["0.1"])
 @pytest.mark.parametrize("angle", [0.1, 1.04, 1.2])
 def test_rates_of_limits_by_tiny_times_in_single_precision(angle):

@@ -275,6 +275,7 @@ def test_mistakes(planar, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_map_and_a_picture_and_goes_on(planar, tmp_path, capsys, monkeypatch):
     model, out = tmp_path / "planar.xml", tmp_path / "map.npz"
     model.write_text(PLANAR)

@@ -132,6 +132,7 @@ def off(robot, profile, result, motion, factor):
     return np.stack(errors, 1), np.stack(goals, 1)
 
 
+@pytest.mark.slow
 def test_fingertips_are_those_of_a_smaller_hand_that_is_carried(hand, profile, tmp_path):
     clip, points = grasping(hand, profile)
     result = Retargeter(hand, profile=profile).retarget(clip)
@@ -160,6 +161,7 @@ SHADOW = dict(thumb="rh_TH", index="rh_FF", middle="rh_MF", ring="rh_RF", little
 WRIST = '<joint name="WRJ2" axis="0 1 0" range="-30 10"/><joint name="WRJ1" axis="1 0 0" range="-40 28"/>'
 
 
+@pytest.mark.variants(slow=["coupled"], release=["two letters and a wrist"])
 @pytest.mark.parametrize(
     ("names", "options", "axes"),
     [

@@ -132,6 +132,7 @@ def products_of(jaxpr):
                 yield from products_of(inner)
 
 
+@pytest.mark.slow
 def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
     profile = find_profile(nao)
     person = read_person(load_motion(dance), find_roles(load_motion(dance).joint_names))
@@ -159,6 +160,7 @@ def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
     np.testing.assert_allclose(slopes, jacobian, atol=2e-8)
 
 
+@pytest.mark.slow
 def test_nao_dances_with_its_feet_where_they_are(nao, danced):
     figures = report(danced)
     assert figures["feet"]["contact_share"] == 1.0
@@ -553,6 +555,7 @@ def test_trunk_and_feet_are_turned_as_the_person_is(dance):
     assert person.contact.all() and person.leg == pytest.approx(0.83)
 
 
+@pytest.mark.variants(slow=["90.0", "180.0"])
 @pytest.mark.parametrize("degrees", [180.0, 90.0, -90.0])
 def test_a_robot_may_face_any_way_at_home(nao, degrees):
     q = np.array(nao.q0)
@@ -584,6 +587,7 @@ def test_what_stands_for_long_does_not_creep(nao, tmp_path):
     assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.01
 
 
+@pytest.mark.slow
 def test_a_step_that_is_damped_does_not_end_a_plan_whose_bounds_are_broken(nao, dance):
     own = Retargeter(nao)
     asked = own._prepared(load_motion(dance), None, None)
@@ -661,7 +665,7 @@ def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
         np.testing.assert_allclose(made[role], guessed[role], atol=0.02 * np.sqrt(3.0))  # what a fit may move it by
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_talos_dances_with_its_feet_where_they_are(dance):
     talos = osik.Robot.from_urdf(example_urdf("talos"), floating_base=True)
     figures = report(retarget(talos, load_motion(dance)))
@@ -728,6 +732,7 @@ def test_links_without_a_size_get_no_capsule():
     assert "l_ankle_2" not in capsules and min(capsules.values()) > 1e-3
 
 
+@pytest.mark.variants(slow=["romeo_description/urdf/romeo.urdf-LHipPitchLink-ends1"])
 @pytest.mark.parametrize(
     ("urdf", "link", "ends"),
     [
@@ -784,6 +789,7 @@ def test_robots_that_cannot_walk_are_refused():
         guess_profile(arm)
 
 
+@pytest.mark.slow
 def test_a_plan_that_begins_on_its_side_ends_on_its_soles(nao, dance):
     """On their backs, feet have their corners on the floor too, which is what bounds ask for."""
     own = Retargeter(nao)
@@ -868,7 +874,7 @@ def test_the_gradient_of_a_fit_is_the_slope_of_its_loss(nao, dance):
     assert float(slope.weights["smooth"]) == pytest.approx((loss_at(step) - loss_at(-step)) / (2.0 * step), rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_fit_lowers_the_loss_of_what_it_learns_from_and_of_what_it_does_not(nao, dance, tmp_path, capsys):
     """From a profile that smooths too much; the file is what the command writes."""
     start = load_profile("nao")

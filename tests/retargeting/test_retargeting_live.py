@@ -104,6 +104,7 @@ def test_feet_hold_exactly_at_any_rate_with_few_iterations(nao, motion):
     assert_limits_hold(nao, frames, 120.0)
 
 
+@pytest.mark.slow
 def test_a_step_whose_bounds_let_no_foot_hold_is_no_worse_than_planned(nao, live, rng):
     """A free base, as after a jump of the plan, and three joints in four that are hardly free; soles by MuJoCo."""
     cases, base = 60, 6
@@ -156,7 +157,7 @@ def test_feet_hold_where_a_frame_has_hardly_any_time(nao, motion):
     assert_limits_hold(nao, frames, 120.0)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_foot_that_cannot_land_in_time_is_told(nao, motion):
     """A foot that was lifted is said to stand from one frame to the next; heights are MuJoCo's."""
     live = LiveRetargeter(nao, motion, look_ahead=1 / FPS, acceleration=20.0, budget=1.0)

@@ -41,7 +41,7 @@ def angle(a, b):
     return np.degrees(np.arctan2(across, along))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_robot_that_follows_itself_does_the_same(nao, danced):
     first, file, retargeter = danced
     source = load_source(file, nao)
@@ -55,7 +55,7 @@ def test_a_robot_that_follows_itself_does_the_same(nao, danced):
     assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_motion_goes_to_another_robot_and_comes_back(nao, danced):
     g1 = osik.load_robot("g1")
     first, file, retargeter = danced

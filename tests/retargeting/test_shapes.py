@@ -129,7 +129,7 @@ def judged(result):
     return figures
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_arms_on_a_fixed_base_follow_beside_the_trunk(motion, tmp_path):
     """Wherever the person goes and however the trunk is turned, the arms are the same; the robot faces y."""
     robot = robot_of("arms", free=False, turn=90.0)
@@ -188,7 +188,7 @@ def test_legs_without_arms_and_arms_that_end_at_the_elbow_walk_as_the_person(mot
         assert figures["feet"]["contact_share"] == 1.0 and figures["tracking"]["segment_angle_deg_mean"] < 2.0
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_base_on_wheels_takes_heading_and_path_and_stays_level(motion):
     robot = robot_of("arms", "wheels")
     retargeter = quietly(Retargeter, robot)
@@ -212,7 +212,7 @@ def test_a_base_on_wheels_takes_heading_and_path_and_stays_level(motion):
     assert figures["tracking"]["segment_angle_deg_mean"] < 2.0
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_four_feet_follow_a_dog(tmp_path):
     robot = on_four()
     retargeter = quietly(Retargeter, robot)
@@ -243,7 +243,7 @@ def test_four_feet_follow_a_dog(tmp_path):
     assert load_profile(tmp_path / "robot.toml") == profile
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_four_feet_stay_where_an_arm_follows(motion):
     """The feet stand all the time, and the trunk leans as the person's does beside the heading."""
     arm = ARM.format(s="right", y=0, dy=-0.05, forearm=FOREARM.format(s="right"))
@@ -264,6 +264,7 @@ def test_four_feet_stay_where_an_arm_follows(motion):
     np.testing.assert_allclose(result.q[:, 2], 0.42, atol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["wheels", "four feet"])
 @needs_core
 @pytest.mark.parametrize("shape", ["four feet", "wheels", "fixed"])
@@ -292,7 +293,7 @@ def own_cost(clip, q):
     return jax.jit(partial(_descended_plain, until="mended"))(clip, q, jnp.array(0)).cost.sum()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_stream_drives_a_fixed_base(motion):
     robot = robot_of("arms", free=False)
     live = quietly(LiveRetargeter, robot, motion, look_ahead=0.1)
@@ -321,7 +322,7 @@ def test_profiles_of_other_shapes_say_what_is_wrong():
         Retargeter(fixed, profile=quietly(guess_profile, fixed), balance=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_robot_follows_one_with_the_limbs_that_it_has(motion):
     """Arms of a humanoid on a fixed base; no arms, and other feet, are refused."""
     walker = robot_of("legs", "arms")

@@ -70,6 +70,7 @@ def nao():
     return osik.load_robot("nao")
 
 
+@pytest.mark.slow
 def test_wrists_stay_where_they_hold_the_box(nao):
     motion = carrying()
     retargeter = Retargeter(nao)
@@ -94,6 +95,7 @@ def test_wrists_stay_where_they_hold_the_box(nao):
     np.testing.assert_allclose(other[0].q, loose.q, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_hand_holds_the_other(nao):
     motion = carrying()
     touch = Touch("left_wrist", "right_wrist", motion.touches[0].held)
@@ -104,12 +106,14 @@ def test_a_hand_holds_the_other(nao):
     np.testing.assert_allclose((left - right)[goal.held], goal.goal[goal.held], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_arms_on_a_fixed_base_hold_beside_the_trunk():
     robot = osik.load_robot("g1", floating_base=False)
     result = Retargeter(robot).retarget(carrying())
     assert report(result)["touches"]["off_mm_max"] < 1.0
 
 
+@pytest.mark.release
 @needs_core
 def test_the_core_holds_as_plain_jax_does(nao):
     retargeter, motion = Retargeter(nao), carrying(12)

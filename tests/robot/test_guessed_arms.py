@@ -113,7 +113,7 @@ def test_arms_that_do_not_bend_end_at_the_elbow():
         assert np.linalg.norm(elbow - shoulder) == pytest.approx(np.hypot(UPPER, 0.02), abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_elbows_without_wrists_follow_the_person(tmp_path):
     motion = load_motion(write_bvh(tmp_path / "dance.bvh", dancer(20), 0.01))
     result = retarget(stick_robot(CAPSULE, CAPSULE), motion)

@@ -241,6 +241,7 @@ def test_double_precision_agrees_with_pinocchio(case: Case, key: str):
     np.testing.assert_allclose(case.ours[key], case.theirs[key], rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.variants(release=["tiago_pro", "romeo", "talos", "solo12", "tiago", "panda"])
 def test_single_precision_agrees_with_pinocchio(case: Case):
     with jax.enable_x64(False):
         robot = load(case.name)

@@ -159,7 +159,7 @@ TABLE = osik.CollisionShape.box((0.5, 0.5, 0.02), (0.6, 0.0, -0.1))
 TOOL = osik.CollisionShape.sphere(0.03, frame="hand")
 
 
-@pytest.mark.variants(release=["locked0"])
+@pytest.mark.variants(slow=["locked1"], release=["locked0"])
 @pytest.mark.parametrize("locked", [{}, {"joint3": 0.4, "joint5": -0.3}])
 def test_a_robot_of_no_source_keeps_what_is_numbered(tmp_path, locked):
     """Fused links come after the others in the file, and locked joints are gone: numbers of frames and joints move."""

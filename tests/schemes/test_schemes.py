@@ -226,6 +226,7 @@ class TestWeightedQP:
         np.testing.assert_allclose(ours.velocity, 0.0, rtol=0, atol=1e-12)
         assert int(ours.status) == osik.Status.SOLVED
 
+    @pytest.mark.slow
     def test_the_closed_loop_is_minks(self, g1):
         """Error and Jacobian of a FrameTask are mink's to second order in the error: the feet stay, the rest moves."""
         robot, gain, count = g1.robot, 8.0, 60

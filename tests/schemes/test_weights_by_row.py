@@ -172,6 +172,7 @@ class TestRows:
         with pytest.raises(ValueError, match="a scalar or a vector"):
             Level(weight=np.ones((2, 2)))
 
+    @pytest.mark.slow
     def test_a_gradient_by_joint_against_differences(self, arm, rng):
         q = jnp.asarray(np.asarray(arm.q0) + rng.uniform(-0.3, 0.3, 7))
         hand = osik.FrameTask(arm, "hand", rows="position")

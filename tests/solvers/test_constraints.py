@@ -163,6 +163,7 @@ class TestAgainstOthers:
         for name in hard:
             assert np.abs(ours.slack[name]).max() < 1e-13
 
+    @pytest.mark.slow
     def test_hierarchical(self, arm, lanes):
         some = cases(arm, lanes)
         ours = solve_lanes(some, SCHEMES["hierarchical"])
@@ -290,6 +291,7 @@ class TestPrograms:
         assert problem.constraints() is None
         assert len(problem.levels(None)) == 1
 
+    @pytest.mark.slow
     def test_single_precision(self, arm, lanes):
         wide = cases(arm, lanes)
         wide = Case(wide.robot, wide.q, {name: wide.tasks[name] for name in ("elbow", "posture")}, wide.limits)

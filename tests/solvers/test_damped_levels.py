@@ -73,6 +73,7 @@ def test_a_bounded_level_is_the_damped_least_squares(levels):
         np.testing.assert_allclose(A @ x, A @ best, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["jax"])
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 def test_a_level_that_rows_above_stop_is_damped_as_out_of_reach(backend):

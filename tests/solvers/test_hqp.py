@@ -116,6 +116,7 @@ def test_equalities_without_active_bounds_are_the_null_space_cascade(rng):
             np.testing.assert_allclose(w, A @ s.x - b, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_no_feasible_step_improves_a_level_without_hurting_a_higher_one(rng, recorded):
     r, s = recorded
 

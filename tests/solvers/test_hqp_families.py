@@ -48,7 +48,7 @@ def answers():
     return answer
 
 
-@pytest.mark.variants(release=["many_levels", "conflicting", "stretched"])
+@pytest.mark.variants(slow=["inequality_levels"], release=["many_levels", "conflicting", "stretched"])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_level_is_certified(family, answers):
     """Each level's gradient is held by multipliers of the levels above; so is x, the gradient of |x|^2 / 2."""
@@ -63,6 +63,7 @@ def test_every_level_is_certified(family, answers):
         assert (np.abs(w - expected) <= 1e-13 * size).all()
 
 
+@pytest.mark.variants(slow=["many_levels"])
 @pytest.mark.parametrize("family", COMPARED)
 def test_level_norms_and_answer_by_quadprog(family, answers):
     p, _, x = answers(family)

@@ -293,7 +293,7 @@ class TestDerivativesWhereNothingIsAskedFor:
 
     METHODS = (dict(), dict(order="reverse"), dict(lower=-jnp.ones(N), upper=jnp.ones(N)))
 
-    @pytest.mark.variants(slow=["saturated"], release=["forward"])
+    @pytest.mark.release
     @pytest.mark.parametrize("method", METHODS, ids=("forward", "reverse", "saturated"))
     def test_they_are_central_differences_in_both_modes(self, rng, method):
         """In the targets, along which the errors move away from 0, and in the matrices, along which they do not."""

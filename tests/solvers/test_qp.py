@@ -97,6 +97,7 @@ def planted(rng, n, p, equalities):
     return H, g, lower, upper, C, row_lower, row_upper, x
 
 
+@pytest.mark.slow
 def test_planted_solutions_with_equalities_and_two_sided_rows(rng):
     n, p = 12, 8
     problems = [planted(rng, n, p, equalities=3) for _ in range(300)]
@@ -212,7 +213,7 @@ def test_shapes_that_do_not_fit_are_named():
         solve_qp(jnp.eye(2), jnp.zeros(2), -jnp.ones(3), jnp.ones(2))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_damping_towards_a_centre(rng):
     """The centre's pull written as rows of the matrix, one for each variable: the same answer and derivatives."""
     lanes, m, n = 20, 4, 9

@@ -116,7 +116,7 @@ def test_the_verdict_is_that_of_a_linear_program(rng):
     assert len(np.unique(s.status)) == 2
 
 
-@pytest.mark.variants(release=["1"])
+@pytest.mark.variants(slow=["2"], release=["1"])
 @pytest.mark.parametrize("most", [0, 1, 2])
 def test_a_failed_step_is_safe(rng, most):
     data = problems(rng, soft=True)
@@ -154,6 +154,7 @@ def reach(robot, name):
     return tasks | {"balance": osik.ComTask(robot, polygon=polygon, priority=2)}
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["hard_feet_and_posture", "hard_contacts_and_balance"])
 @pytest.mark.parametrize("name", REACHES)
 def test_a_reach_is_solved_at_either_precision(name):

@@ -143,7 +143,7 @@ def largest_scale(above, A, x, d, lower, upper, unit):
 
 
 class TestProperties:
-    @pytest.mark.variants(slow=["easy"], release=["tight"])
+    @pytest.mark.variants(release=["easy", "tight"])
     @every_family
     def test_every_answer_is_in_its_box_to_the_last_bit(self, solved, name):
         p, answers = solved[name]
@@ -305,6 +305,7 @@ class TestByHand:
         answer = solve_nullspace([Level(A, wanted)], -bound, bound)
         np.testing.assert_array_equal(answer.x, [1.0, 1.0, float(moves)])
 
+    @pytest.mark.slow
     def test_saturated_joints_are_released_for_a_larger_scale(self):
         """A search that only saturates, the most critical joint first, ends at a scale of 0.75 here."""
         rows, wanted = np.array([[0.0, 1.0, -2.0, -2.0], [-2.0, 1.0, 0.0, 1.0]]), np.array([4.0, 2.0])
@@ -335,7 +336,7 @@ class TestByHand:
         answer = solve_nullspace([Level([[1.0, 1.0]], [0.0])], jnp.array([0.4, -1.0]), jnp.array([1.0, 1.0]))
         np.testing.assert_allclose(answer.x, [0.4, -0.4], rtol=0, atol=1e-15)
 
-    @pytest.mark.variants(release=["jax"])
+    @pytest.mark.variants(slow=["auto"], release=["jax"])
     @pytest.mark.parametrize("backend", ["jax", "auto"])
     def test_joints_at_their_bounds_in_zero_stop_a_level_at_the_scale_0(self, backend):
         """x is 0 and nothing moves: the numbers that x is made of have no size that roundoff is small beside."""
@@ -348,7 +349,7 @@ class TestByHand:
         np.testing.assert_array_equal(answer.status, Status.SOLVED)
         assert ((np.abs(answer.x).max(1) == 0.0) & (np.asarray(answer.scales)[:, 0] == 0.0)).any()
 
-    @pytest.mark.variants(slow=["jax"])
+    @pytest.mark.variants(slow=["auto"], release=["jax"])
     @pytest.mark.parametrize("backend", ["jax", "auto"])
     def test_levels_without_a_null_space_keep_those_above_to_rounding(self, backend):
         """Ten rows in ten variables; joints at their bounds then stop the second level, and nothing is left to move."""
@@ -373,6 +374,7 @@ class TestByHand:
         for bound in (dict(lower=np.array([-1.0, -9.0])), dict(upper=np.array([1.0, -3.0]))):
             np.testing.assert_allclose(solve_nullspace(level, **bound).x, [-1.0, -3.0], rtol=0, atol=1e-14)
 
+    @pytest.mark.slow
     def test_the_secondary_motion_goes_as_far_as_bounds_and_levels_allow(self):
         answer = solve_nullspace(
             [Level([[1.0, 1.0, 1.0]], [0.0])], -jnp.ones(3), jnp.ones(3), secondary=jnp.array([3.0, 1.0, -1.0])
@@ -422,6 +424,7 @@ class TestSearch:
 
 
 class TestBatchesAndFailures:
+    @pytest.mark.slow
     def test_vmap_equals_a_loop(self, solved):
         p, answers = solved["pinned"]
         one = jax.jit(lambda q: solve_nullspace(as_levels(q.levels), q.lower, q.upper, secondary=q.secondary))
@@ -451,6 +454,7 @@ class TestBatchesAndFailures:
         np.testing.assert_array_equal(got.status[others], Status.SOLVED)
         np.testing.assert_array_equal(got.x[others], answers.full.x[others])
 
+    @pytest.mark.slow
     def test_a_search_that_is_cut_short_says_so_and_keeps_box_and_levels_above(self, solved):
         """Levels that were not finished do nothing; those before them stay."""
         p, answers = solved["tight"]
@@ -464,6 +468,7 @@ class TestBatchesAndFailures:
         assert second.any()
         np.testing.assert_allclose(cut.x[second], answers.partial[0].x[second], rtol=0, atol=1e-12)
 
+    @pytest.mark.slow
     def test_single_precision(self, solved):
         """In its box to the last bit there too; the first level's rows within 1e-3 of the largest (median 1e-6)."""
         for name in ("easy", "tight", "small targets", "pinned"):
@@ -559,6 +564,7 @@ class TestDerivatives:
         assert np.max((np.abs(ahead - expected) / size)[smooth]) < 1e-6
         assert np.max(np.abs(ahead - back) / size) < 1e-8
 
+    @pytest.mark.release
     def test_they_are_finite_where_there_is_none(self, data, gradient):
         """Zero targets, rows of zeros, everything pinned, weights of 0, dependent levels, edges, failed lanes."""
         p, weights, damping = jax.tree.map(np.copy, data[0])
@@ -596,7 +602,7 @@ class TestScheme:
         limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": speed})
         return osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=limits)
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_saturation_keeps_limits_and_priorities(self, arm, tasks):
         plain, hard = (osik.NullSpace(method=method, curvature_damping=0.0) for method in ("classical", "saturated"))
         loose, tight, far = (self.answer(arm, tasks, s, v) for s, v in ((plain, 0.1), (hard, 0.1), (hard, 1e6)))
@@ -636,7 +642,7 @@ def one_row_with_its_derivative(wanted, lower, upper, *, backend):
     return answer, derivative
 
 
-@pytest.mark.variants(release=["core-0.1", "jax-0.1"])
+@pytest.mark.variants(slow=["jax-1e-07"], release=["core-0.1", "jax-0.1"])
 @pytest.mark.parametrize("excess", [0.1, 1e-7])
 @pytest.mark.parametrize("backend", ["jax", pytest.param("core", marks=needs_core)])
 def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend, excess):

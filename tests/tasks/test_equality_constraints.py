@@ -226,7 +226,16 @@ def linkage():
 
 
 class TestFourBar:
-    @pytest.mark.variants(release=["hard-angle-scheme0", "hard-point-scheme2"])
+    @pytest.mark.variants(
+        slow=["first-angle-scheme1"],
+        release=[
+            "hard-angle-scheme0",
+            "hard-point-scheme2",
+            "hard-angle-scheme6",
+            "first-point-scheme4",
+            "hard-point-scheme5",
+        ],
+    )
     @pytest.mark.parametrize(
         ("form", "pull", "scheme"),
         [

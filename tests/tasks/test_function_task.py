@@ -254,6 +254,7 @@ class TestClosedLoop:
         np.testing.assert_allclose(error[0], 0.1**2 + 0.05**2 - 0.2**2, rtol=1e-12)
         assert abs(error[-1]) < 0.01 * abs(error[0])
 
+    @pytest.mark.slow
     def test_rows_differentiate_exactly(self, robot, tasks, configurations):
         """The Jacobian has the function's second derivatives: with respect to its numbers and to q, by differences."""
         q, mix = configurations[0], jnp.cos(jnp.arange(2.0 * robot.nv)).reshape(2, robot.nv)

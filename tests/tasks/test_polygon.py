@@ -59,6 +59,7 @@ def test_hull_against_delaunay_and_brute_force(arm, points, seed):
     assert abs(ConvexHull(np.asarray(polygon.vertices)).volume - ConvexHull(points).volume) < 1e-6
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(points=points_strategy, seed=st.integers(0, 1000))
 def test_a_margin_leaves_the_points_that_are_that_far_inside(arm, points, seed):

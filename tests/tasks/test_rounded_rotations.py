@@ -81,6 +81,7 @@ def test_outside_jit_they_are_refused(arm):
         osik.CollisionShape.box((0.1, 0.1, 0.1), rotation=np.zeros((3, 3)))
 
 
+@pytest.mark.slow
 def test_inverse_kinematics_takes_what_is_rounded(arm):
     """The answer is that of the exact rotation, for one, many and traced targets; a traced zero is not found."""
     pose = osik.forward_kinematics(arm, arm.q0).frame_pose(arm, "hand")

@@ -78,7 +78,7 @@ class TestWeights:
         np.testing.assert_allclose(weights, [1e-5, 0.25e-3, 1e-3], rtol=1e-9)
 
 
-@pytest.mark.variants(release=["0.05"])
+@pytest.mark.variants(slow=["0.2"], release=["0.05"])
 @pytest.mark.parametrize("k", [0.05, 0.2, 0.5])
 def test_a_small_arm_rests_near_its_target(arm, k):
     """As near as one of half a metre, for its size: at a reach of 5 cm it was 13 mm off."""

@@ -317,6 +317,7 @@ class TestMistakes:
             osik.FrameTask(arm, "hand").replace(target=np.diag([2.0, 2.0, 2.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_rows_of_all_tasks_together_are_those_of_each():
     """Frames of several manners, one alone in its own, a subclass that goes its own way, and other kinds of tasks."""
     robot = osik.load_robot("nao")

@@ -120,6 +120,7 @@ class TestContacts:
         np.testing.assert_allclose(rows["held"].error, [0.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.3)], atol=1e-14)
         np.testing.assert_allclose(rows["free"].error, 0.0, atol=1e-14)
 
+    @pytest.mark.slow
     def test_a_sole_lands_flat_and_stays(self, walker):
         """From a tilt, a turn and a height to the anchor's pose in MuJoCo, while a push moves the rest of the robot."""
         anchor = np.array([0.3, 0.1, 0.2]), np.eye(3)
@@ -240,6 +241,7 @@ class TestWheels:
         for name in tasks:
             np.testing.assert_allclose(rows[name].jacobian[:, -1], slopes[name][:, -1], atol=1e-8)
 
+    @pytest.mark.slow
     def test_a_cart_is_a_unicycle(self, cart):
         """Wheels at given speeds: at each step its equations, over many the arc of a circle, to the steps' error."""
         speeds, dt, steps = np.array([3.0, 5.0]), 0.002, 500

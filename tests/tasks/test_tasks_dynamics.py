@@ -162,7 +162,7 @@ class TestAngularMomentum:
         np.testing.assert_array_equal((rows["bounds"].lower[0], rows["bounds"].upper[0]), ([-0.1], [0.2]))
         assert all(not np.asarray(r.error).any() for r in rows.values())
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_a_reach_turns_the_floating_robot_by_as_much(self, robot, states):
         """With no momentum, MuJoCo's is 0 at the answer, though the arm moves."""
         rate = np.array([0.3, -0.2, 0.1, 0.0, 0.0, 0.0])

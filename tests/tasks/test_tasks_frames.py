@@ -126,7 +126,7 @@ class TestJacobians:
                 np.testing.assert_allclose(row.jacobian[..., :6], 0.0, atol=1e-13, err_msg=name)
                 assert np.abs(row.jacobian[..., 6:]).max() > 0.1
 
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_rows_of_all_tasks_together_are_those_of_each(self, robot, tasks, q):
         """Two of each kind, so that each is worked on with another of its manner."""
         others = {k: task.replace(weight=2.0, target_velocity=0.1) for k, task in tasks.items()}
@@ -280,6 +280,7 @@ def test_feed_forward_is_the_rate_of_the_target(robot, tasks, q, rng):
 
 
 class TestGradients:
+    @pytest.mark.slow
     @pytest.mark.variants(release=["True"])
     @pytest.mark.parametrize("x64", [True, False])
     def test_finite_wherever_an_angle_has_none(self, x64):

@@ -146,6 +146,7 @@ class TestCappedByTheStep:
         )
         np.testing.assert_allclose(many, one, atol=1e-9)
 
+    @pytest.mark.slow
     @pytest.mark.variants(release=["scheme0", "scheme2"])
     @pytest.mark.parametrize("scheme", [osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace(method="saturated")])
     def test_errors_fall_at_every_step_however_long_the_step_is(self, arm, goal, scheme):

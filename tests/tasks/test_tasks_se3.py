@@ -73,6 +73,7 @@ class TestLogarithm:
 
 
 class TestRows:
+    @pytest.mark.slow
     def test_against_central_differences(self, arm, tasks, rng):
         configurations = jnp.stack([anywhere(arm, rng) for _ in range(5)])
         assert_jacobians(*at_each(arm, tasks, configurations))
@@ -185,6 +186,7 @@ class TestClosedLoop:
 
 
 class TestGradients:
+    @pytest.mark.slow
     @pytest.mark.variants(release=["True"])
     @pytest.mark.parametrize("x64", [True, False])
     def test_finite_at_zero_error_and_near_pi_in_both_modes(self, x64):

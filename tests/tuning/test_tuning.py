@@ -322,7 +322,7 @@ class TestLosses:
 
 
 class TestTune:
-    @pytest.mark.slow
+    @pytest.mark.release
     def test_reports_what_it_returns(self, loop, scenarios):
         seen = []
         tuned = run(loop, scenarios[:3], held_out=scenarios[3:], iterations=6, callback=seen.append)
@@ -368,6 +368,7 @@ class TestTune:
             history = history.and_then(loss=loss, dropped=dropped, **rows)
         assert history.best == 2 and history.stale(1e-3) == 2
 
+    @pytest.mark.slow
     def test_stops_without_progress(self, loop, scenarios):
         tuned = run(loop, scenarios, iterations=50, patience=3, improvement=0.99)
         assert tuned.stopped == "patience" and len(tuned.history) == 4
@@ -410,6 +411,7 @@ class TestTune:
         run(other, make_scenarios(other.robot, 4, seed=1), iterations=1)
         assert count > 0 and len(TRACES) == count
 
+    @pytest.mark.slow
     def test_robots_and_targets_that_move(self, small, loop):
         """Scenarios with masses, lengths and targets of their own: their loss is that of a loop over them."""
         robots = [small.scaled(length={"lower": s}) for s in (0.9, 1.2)]

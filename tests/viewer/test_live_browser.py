@@ -236,6 +236,7 @@ def test_an_exported_page_plays_without_a_server(visit: Visit, tmp_path: Path) -
     visit.check()
 
 
+@pytest.mark.release
 def test_a_retargeted_motion_plays_beside_the_person(visit: Visit, tmp_path: Path) -> None:
     clip = write_bvh(tmp_path / "dance.bvh", dancer(40), 0.01)
     assert Retarget(clip=str(clip), out=tmp_path / "out", report=True, animation=False).run() == 0

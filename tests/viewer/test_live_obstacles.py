@@ -107,7 +107,7 @@ def test_a_ball_on_the_way_is_kept_off_and_pushes_the_robot(desk: Desk) -> None:
     assert program is not None and desk.loop._job is not None and desk.loop._job.program is program.program
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_hand_sent_into_its_own_arm(desk: Desk) -> None:
     desk.move_obstacle("ball 1", position=np.array([0.0, 2.0, 0.5]))
     home = osik.forward_kinematics(ARM, ARM.q0)

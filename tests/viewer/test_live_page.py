@@ -134,7 +134,7 @@ def test_a_page_is_served_and_a_visitor_who_goes_leaves_the_robot_at_rest() -> N
             serve(ARM, tasks, port=taken)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_robots_side_by_side_each_with_its_own_numbers() -> None:
     robots = {f"gain {gain}": arm_tasks(gain) for gain in (2.0, 40.0)}
     with serve_batch(ARM, robots, port=0) as view:

@@ -294,7 +294,7 @@ def test_without_opengl_rays_are_cast(nao, monkeypatch):
     assert len(tries) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_without_a_screen_asking_twice_is_safe():
     """MuJoCo's own renderer aborts the process at its second failure."""
     code = """
