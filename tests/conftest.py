@@ -2,6 +2,7 @@
 
 import atexit
 import contextlib
+import ctypes
 import gc
 import os
 import shutil
@@ -17,6 +18,7 @@ from pathlib import Path
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    " --xla_cpu_parallel_codegen_split_count=1"  # both cores are in use: parts of a program compile no sooner
     # jaxlib 0.11 does not know this one, and unknown flags end the process
     + (" --xla_cpu_use_fusion_emitters=false" if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11) else ""),
 )
@@ -107,6 +109,8 @@ def forget_programs() -> Iterator[None]:
     yield
     if memory_in_use() > MOST_MEMORY:
         jax.clear_caches()
+        with contextlib.suppress(AttributeError, OSError, TypeError):  # only glibc keeps what was freed
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def memory_in_use() -> int:

@@ -493,7 +493,7 @@ def test_no_step_of_a_closed_loop_penetrates(arm, among):
     assert (np.asarray(status) == osik.Status.SOLVED).all()
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_pairs_that_start_too_near_come_apart(arm, among):
     """From inside the ball at the speed of recovery, until the distance is kept."""
     around = among.moved("ball", position=np.array([0.55, 0.02, 0.4]), size=np.array([0.05, 0.0, 0.0]))

@@ -89,7 +89,7 @@ def heading_anchors(page: Path) -> set[str]:
 
 
 IN_THE_GATE = ("tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch")
-IN_THE_GATE += ("reinforcement_learning", "interop", "porting")
+IN_THE_GATE += ("reinforcement_learning", "porting")
 AT_NIGHT = (
     "batches",
     "inverse_kinematics",

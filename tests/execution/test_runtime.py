@@ -23,22 +23,24 @@ def state():
     pools = {p["filepath"]: p["num_threads"] for p in blas}
     return [dict(os.environ), dict(jax.config.values), pools]
 """
-IMPORT = STATE + "before = state(); import osik_jax, osik_jax.cli; print(json.dumps([before, state()], default=str))"
+IMPORT = f"""{STATE}
+import importlib, pkgutil, warnings
+before = state()
+import osik_jax, osik_jax.cli
+after = state()
+from osik_jax.runtime import configure_cpu
+warnings.simplefilter("ignore")
+for module in pkgutil.iter_modules(osik_jax.__path__):
+    if module.ispkg:
+        importlib.import_module(f"osik_jax.{{module.name}}")
+configure_cpu()
+print(json.dumps([before, after], default=str))
+"""
 CONFIGURE = (
     STATE + "from osik_jax.runtime import configure_cpu; configure_cpu(); configure_cpu(); "
     "import jax.numpy as jnp; jnp.zeros(3).block_until_ready(); configure_cpu(); "
     "print(json.dumps(state(), default=str))"
 )
-
-
-IMPORT_ALL = """
-import importlib, pkgutil, osik_jax
-from osik_jax.runtime import configure_cpu
-for module in pkgutil.iter_modules(osik_jax.__path__):
-    if module.ispkg:
-        importlib.import_module(f"osik_jax.{module.name}")
-configure_cpu()
-"""
 
 
 def in_a_process(script, **settings):
@@ -54,16 +56,11 @@ def configured(**settings):
 
 
 @pytest.mark.slow
-def test_an_import_changes_nothing_and_prints_nothing():
-    done = in_a_process(IMPORT, PYTHONWARNINGS="error")
+def test_an_import_changes_nothing_prints_nothing_and_no_import_computes():
+    done = in_a_process(IMPORT, PYTHONWARNINGS="error")  # settings are refused once JAX has made its client
     before, after = json.loads(done.stdout)
     assert before == after
     assert done.stderr == ""
-
-
-@pytest.mark.slow
-def test_no_import_computes():
-    in_a_process(IMPORT_ALL)  # the settings are refused once JAX has made its client
 
 
 @pytest.mark.slow
@@ -87,25 +84,21 @@ def test_the_users_settings_stay():
 
 
 @pytest.mark.slow
-def test_other_flags_stay_beside_ours():
-    other = "--xla_cpu_enable_fast_min_max=true"
-    assert configured(XLA_FLAGS=other)[0]["XLA_FLAGS"] == f"{other} {SERIAL}"
-
-
-@pytest.mark.slow
-def test_older_fusions_are_a_flag_where_jaxlib_has_them():
+def test_other_flags_stay_beside_ours_and_older_fusions_are_one_where_jaxlib_has_them():
     script = (
         STATE + "from osik_jax.runtime import configure_cpu\n"
         "try: configure_cpu(older_fusions=True)\n"
-        "except ValueError as error: print(json.dumps(str(error))); raise SystemExit\n"
+        "except ValueError as error: told = str(error); configure_cpu()\n"
+        "else: told = ''\n"
         "import jax.numpy as jnp; jnp.zeros(3).block_until_ready()\n"  # XLA ends a process whose flags it does not know
-        "print(json.dumps(os.environ['XLA_FLAGS']))"
+        "print(json.dumps([told, os.environ['XLA_FLAGS']]))"
     )
-    told = json.loads(in_a_process(script).stdout)
+    other = "--xla_cpu_enable_fast_min_max=true"
+    told, flags = json.loads(in_a_process(script, XLA_FLAGS=other).stdout)
     if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
-        assert told == f"{SERIAL} --xla_cpu_use_fusion_emitters=false"
+        assert not told and flags == f"{other} {SERIAL} --xla_cpu_use_fusion_emitters=false"
     else:
-        assert "before 0.11" in told
+        assert "before 0.11" in told and flags == f"{other} {SERIAL}"
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ def test_numbers_and_pytrees_are_those_of_jax(arm):
     np.testing.assert_array_equal(out["status"].numpy(), wanted["status"])
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_gradcheck_of_a_step(arm):
     """PyTorch's own check by central differences in float64, of the targets and the configurations."""
     step, q, p = arm

@@ -53,7 +53,7 @@ def test_recorded_hierarchies(unit_rows, backend):
         np.testing.assert_allclose(norms[IMPROVED, 1], second_level_by_quadprog(r, IMPROVED, x), atol=2e-8)
 
 
-@pytest.mark.variants(release=["False-auto", "False-jax"])
+@pytest.mark.variants(release=["False-auto", "False-jax", "True-jax"])
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 @pytest.mark.parametrize("unit_rows", [False, True])
 def test_recorded_hierarchies_in_single_precision(unit_rows, backend):

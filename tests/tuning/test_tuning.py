@@ -322,7 +322,7 @@ class TestLosses:
 
 
 class TestTune:
-    @pytest.mark.release
+    @pytest.mark.slow
     def test_reports_what_it_returns(self, loop, scenarios):
         seen = []
         tuned = run(loop, scenarios[:3], held_out=scenarios[3:], iterations=6, callback=seen.append)
