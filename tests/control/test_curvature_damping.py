@@ -151,10 +151,8 @@ def test_inside_it_is_as_exact_as_without(scheme, arm):
     assert damped.max() < 1e-3
 
 
-@pytest.mark.variants(release=["null-space", "reverse", "hierarchical"])
-@pytest.mark.parametrize(
-    "scheme", ["weighted", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SCHEMES)[1:])]
-)
+@pytest.mark.variants(slow=["weighted"], release=["null-space", "reverse", "hierarchical"])
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_derivatives_with_the_damping_on(scheme, arm):
     """By target, gain, configuration and the damping's own share, against central differences; second ones too."""
     q0 = bent(arm)

@@ -25,8 +25,6 @@ pytestmark = needs_core
 
 LANES = 40
 SHAPES = ["6-5", "1-0", "1-3", "6-0", "24-30", "60-40"]
-SLOW = SHAPES[1:]
-RARE = [shape for shape in SLOW if shape != "24-30"]
 NULL_SPACES = ["nullspace", "reverse", "saturated"]
 
 
@@ -86,7 +84,7 @@ def in_double(p):
     return jax.tree.map(lambda a: np.asarray(a, float), p)
 
 
-@pytest.mark.variants(release=["24-30"])
+@pytest.mark.variants(release=SHAPES[1:])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_weighted(shape):
     n, m = map(int, shape.split("-"))

@@ -189,8 +189,8 @@ def certify(problem: Numbers, damping: float, v: np.ndarray) -> None:
 
 
 class TestWeightedQP:
-    @pytest.mark.variants(release=["g1"])
-    @pytest.mark.parametrize("name", ["nao", pytest.param("g1", marks=pytest.mark.slow)])
+    @pytest.mark.variants(slow=["nao"], release=["g1"])
+    @pytest.mark.parametrize("name", ["nao", "g1"])
     def test_agrees_with_the_textbook_qp(self, name, request, rng):
         case = request.getfixturevalue(name)
         q = configurations(case, rng)

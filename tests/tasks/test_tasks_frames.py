@@ -339,8 +339,8 @@ class TestClosedLoop:
         task = osik.AxisAlignTask(robot, "hand", axis=(1.0, 0.0, 0.0), gain=5.0)
         np.testing.assert_allclose(_turned(task, jnp.array(direction)), angle * 0.9 ** np.arange(100), atol=1e-9)
 
-    @pytest.mark.variants(release=["scheme1"])
-    @pytest.mark.parametrize("scheme", [osik.WeightedQP(), pytest.param(osik.HierarchicalQP(), marks=pytest.mark.slow)])
+    @pytest.mark.variants(slow=["scheme0"], release=["scheme1"])
+    @pytest.mark.parametrize("scheme", [osik.WeightedQP(), osik.HierarchicalQP()])
     def test_the_visual_field_is_kept(self, head, scheme):
         """The posture turns the head away by 1.5 and 0.7 rad; the point stays within 0.4 rad of its axis."""
         ahead, behind = [1.0, 0.0, 0.1], [-1.0, 0.01, 0.1]
