@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from core_checks import needs_core
-from hierarchy_families import SMALL, Hierarchies, Rows
+from hierarchy_families import SMALL, Hierarchies
 from lexicographic import certificate
 from recorded import recorded_hierarchies
-from stretched_hierarchies import stretched
 
 from osik_jax import HierarchicalQP, OsikWarning
 from osik_jax.core import _library
@@ -192,18 +191,3 @@ def test_programs_for_other_machines():
     traced = jax.jit(solve).trace(np.ones(1))
     assert "osik_hierarchy" in traced.lower(lowering_platforms=("cpu",)).as_text()
     assert "osik_hierarchy" not in traced.lower(lowering_platforms=("cuda",)).as_text()
-
-
-@pytest.mark.release
-def test_ten_thousand_problems(rng):
-    """Lane by lane, level by level; ``python -m benchmarks.agreement`` goes on."""
-    p = stretched(rng, 2048)
-    batches = [p] + [draw(rng, 1024) for draw in SMALL.values()]
-    for p in batches:
-        mine, search = (solved(*given(p), backend=backend) for backend in ("core", "jax"))
-        np.testing.assert_array_equal(mine.status, search.status)
-        for mine_k, search_k, level in zip(mine.slacks, search.slacks, p.levels, strict=True):
-            assert isinstance(level, Rows)
-            size = np.linalg.norm(level.A, axis=2).max(1, initial=0.0) * (1.0 + np.abs(search.x).max(1))
-            off = np.abs(np.linalg.norm(mine_k, axis=1) - np.linalg.norm(search_k, axis=1))
-            assert (off <= 1e-7 * size).mean() > 0.999

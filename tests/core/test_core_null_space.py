@@ -232,25 +232,6 @@ def test_derivatives_in_both_modes_are_those_of_the_plain_method_and_of_differen
     assert (np.abs(rates["core"] - narrow).max(1) < 1e-4 * size)[smooth].all()
 
 
-@pytest.mark.release
-def test_second_derivatives_and_loops():
-    """Through a scan, whose body is linearised apart from it."""
-    A = np.random.default_rng(3).normal(size=(7, 5))
-
-    def last(t, backend):
-        def step(x, _):
-            levels = [Level(A[:2], jnp.array([0.3, -0.2]) + t), Level(A[2:] + x, A[2:, 0] * t + 0.5)]
-            return jnp.sin(solve_nullspace(levels, damping=0.1, backend=backend).x), None
-
-        return jnp.sum(jax.lax.scan(step, jnp.zeros(5) + t, length=3)[0] ** 2)
-
-    by_kernel, step = partial(last, backend="core"), 1e-5
-    value, first, second = (jax.jit(f) for f in (by_kernel, jax.grad(by_kernel), jax.grad(jax.grad(by_kernel))))
-    np.testing.assert_allclose(value(0.2), jax.jit(partial(last, backend="jax"))(0.2), rtol=1e-10)
-    np.testing.assert_allclose(first(0.2), (value(0.2 + step) - value(0.2 - step)) / (2.0 * step), rtol=1e-6)
-    np.testing.assert_allclose(second(0.2), (first(0.2 + step) - first(0.2 - step)) / (2.0 * step), rtol=1e-5)
-
-
 @pytest.mark.slow
 def test_vmap_is_a_loop_however_it_is_nested(rng):
     p = random_problems(20, 8, (3, 4, 2), inequalities=True, damped=True, lanes=40)
@@ -346,32 +327,6 @@ def test_a_backend_that_is_not_there(monkeypatch):
     monkeypatch.setattr(_library, "core", lambda: _library.Core(None, None, "no compiled core: install g++"))
     with pytest.raises(ModuleNotFoundError, match=r"backend='core': no compiled core: install g\+\+"):
         osik.NullSpace(backend="core")
-
-
-@pytest.mark.release
-def test_the_scheme():
-    """A step of an arm by both backends, in each order."""
-    arm = osik.load_robot("arm7")
-    tasks = {
-        "hand": osik.FrameTask(arm, arm.frame_names[-1], rows="position", priority=1),
-        "posture": osik.PostureTask(arm, priority=2),
-    }
-    hand = tasks["hand"].target
-    null_space = osik.NullSpace
-    for scheme in (null_space, partial(null_space, method="reverse"), partial(null_space, method="saturated")):
-        found, expected = (
-            osik.solve(
-                arm,
-                arm.q0,
-                tasks,
-                scheme=scheme(backend=backend),
-                targets={"hand": (hand[0] + 0.1, hand[1])},
-                dt=0.005,
-            )
-            for backend in ("core", "jax")
-        )
-        assert found.status == expected.status
-        np.testing.assert_allclose(found.velocity, expected.velocity, rtol=0, atol=1e-9)
 
 
 @pytest.mark.variants(release=["float64"])

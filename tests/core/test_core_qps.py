@@ -68,14 +68,6 @@ def test_lane_by_lane_as_the_plain_method(m):
     assert found.factorizations.max() > 3 and found.iterations.max() > 5
 
 
-@pytest.mark.variants(release=["16", "7"])
-@pytest.mark.slow
-@pytest.mark.parametrize("m", [M, MANY])
-def test_many_lanes_as_the_plain_method(m):
-    p = problems(20_000, m, seed=1)
-    assert_same(p, solved(p), solved(p, "jax"))
-
-
 def test_as_daqp():
     """Hard rows alone, which daqp has too."""
     p = problems(seed=2, weakest=1e-2)._replace(rows_compliance=np.zeros((COUNT, P)))
