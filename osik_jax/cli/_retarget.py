@@ -80,8 +80,8 @@ class Retarget:
     animation: bool = True
     """Write the film (motion.gif); of a folder none is written."""
     report: bool = False
-    """Write a page as well (report.html) that plays person and robot without network, with contacts, limits and notes.
-    Needs the extra viewer; of a folder none is written."""
+    """Write a page as well (report.html) that plays person and robot without network, with contacts, limits and notes;
+    for a folder also index.html, with links to the pages of its clips. Needs the extra viewer."""
     fit: Path | None = None
     """Fit a profile (weights, scale, keypoints) to the clips of a folder and write it to this TOML file, instead of
     motions. Every fourth clip is held out and selects the step that is kept."""
@@ -201,6 +201,7 @@ def _retarget_folder(command: Retarget) -> int:
             _reader(command),
             mapping=_mapping(command.mapping),
             fps=command.fps,
+            **_page(command),
         )
     failed: dict[str, str] = summary["failed"]
     noted = [f"{name}: {note}" for name, notes in summary["notes"].items() for note in notes]

@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError
 from ._motion import HumanMotion
-from ._rotations import continuous
+from ._rotations import UNTURNED, continuous, forward
 
 # an inch [m]; an ASF unit is an inch over the file's ``length``
 _INCH = 0.0254
 _FPS = 120.0
 """Frame rate of the CMU database [1/s]; the AMC format does not store a rate."""
+_AXES = ("x", "y", "z")
 
 
 @dataclasses.dataclass
@@ -29,55 +30,34 @@ class _Bone:
     dofs: tuple[str, ...] = ()
 
 
-def read_amc(path: Path, skeleton: Path | None = None, fps: float = _FPS) -> HumanMotion:
+def read_amc(path: Path) -> HumanMotion:
     """Return the motion in an AMC file. Each joint is placed at the start of the bone of the same name; y points up.
 
-    Args:
-        path: the AMC file.
-        skeleton: the ASF file. None: the one beside it with whose name its own begins, or the only one.
-        fps: frames a second, which the file does not say.
+    Its skeleton is the ASF file beside it with whose name its own begins, or the only one.
 
     Raises:
         ValueError: no skeleton is found, or a file is broken; the message says which line and what is wrong.
     """
-    asf = _skeleton_beside(path) if skeleton is None else skeleton
-    bones, scale, degrees = _read_asf(asf)
-    frames = _read_frames(path, bones)
-    values = {name: np.array([frame[name] for frame in frames]) for name in bones if bones[name].dofs}
-    count = len(frames)
-    turns: dict[str, Rotation] = {}
-    starts: dict[str, np.ndarray] = {}
-    for name, bone in bones.items():
-        own = dict(zip(bone.dofs, values[name].T, strict=True)) if bone.dofs else {}
-        angles = np.stack([own.get(f"r{axis}", np.zeros(count)) for axis in "xyz"], 1)
-        # angles are about the bone's own axes: conjugation turns them into the world's
-        local = bone.axes * Rotation.from_euler("xyz", angles, degrees=degrees) * bone.axes.inv()
-        if not bone.parent:
-            moves = np.stack([own.get(f"t{axis}", np.zeros(count)) for axis in "xyz"], 1)
-            starts[name], turns[name] = moves + bone.offset, local
-            continue
-        parent = bones[bone.parent]
-        reach = parent.offset if parent.parent else np.zeros(3)
-        starts[name] = starts[bone.parent] + turns[bone.parent].apply(reach)
-        turns[name] = turns[bone.parent] * local
-    return HumanMotion(
-        path.stem,
-        fps,
-        tuple(bones),
-        scale * np.stack(list(starts.values()), 1),
-        continuous(np.stack([turn.as_quat(scalar_first=True) for turn in turns.values()], 1)),
-        scale * _rest(bones),
-    )
-
-
-def _rest(bones: dict[str, _Bone]) -> np.ndarray:
-    """Return the positions of the bones' starts in the rest pose, root at the origin, in file units. (J, 3)."""
-    starts: dict[str, np.ndarray] = {}
-    for name, bone in bones.items():
-        parent = bones.get(bone.parent)
-        reach = parent.offset if parent is not None and parent.parent else np.zeros(3)
-        starts[name] = np.zeros(3) if parent is None else starts[bone.parent] + reach
-    return np.array(list(starts.values()))
+    bones, scale, degrees = _read_asf(_skeleton_beside(path))
+    frames, names = _read_frames(path, bones), list(bones)
+    angles, moves = (np.zeros((len(frames), len(bones), 3)) for _ in range(2))
+    for i, (name, bone) in enumerate(bones.items()):
+        for k, dof in enumerate(bone.dofs):
+            if dof[1:] in _AXES:
+                (angles if dof[0] == "r" else moves)[:, i, _AXES.index(dof[1:])] = [frame[name][k] for frame in frames]
+    # angles are about the bone's own axes: conjugation turns them into the world's
+    turns = [
+        bone.axes * Rotation.from_euler("xyz", angles[:, i], degrees=degrees) * bone.axes.inv()
+        for i, bone in enumerate(bones.values())
+    ]
+    local = np.stack([turn.as_quat(scalar_first=True) for turn in turns], 1)
+    parents = [names.index(bone.parent) if bone.parent else -1 for bone in bones.values()]
+    # a bone starts where its parent ends; bones of the root start at the root
+    starts = np.array([bones[names[k]].offset if k > 0 else np.zeros(3) for k in parents])
+    moves[:, 1:], moves[:, 0] = starts[1:], moves[:, 0] + bones["root"].offset
+    positions, rotations = forward(parents, moves, local)
+    rest = forward(parents, starts, np.tile(UNTURNED, (1, len(bones), 1)))[0][0]
+    return HumanMotion(path.stem, _FPS, tuple(bones), scale * positions, continuous(rotations), scale * rest)
 
 
 def _skeleton_beside(path: Path) -> Path:

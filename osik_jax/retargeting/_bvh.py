@@ -17,7 +17,7 @@ from .._errors import OsikKeyError, OsikValueError, warn
 from ._bvh_lines import Lines
 from ._motion import HumanMotion
 from ._rest_frames import rest_frames
-from ._rotations import about, continuous, multiply, rotate
+from ._rotations import UNTURNED, about, continuous, forward, multiply
 from ._up import UPS, Up, checked_up, find_up, named, standing_up
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "cmu": 0.0254 / 0.45}
@@ -71,8 +71,10 @@ def read_bvh(
     lines = Lines(source, _text(Path(path)))
     joints = _hierarchy(lines)
     fps, values = _frames(lines, sum(len(joint.channels) for joint in joints))
-    positions, rotations = _forward(joints, values)
-    rest, names = _rest(joints), tuple(joint.name for joint in joints)
+    parents, names = [joint.parent for joint in joints], tuple(joint.name for joint in joints)
+    positions, rotations = forward(parents, *_moves(joints, values))
+    rest = forward(parents, np.array([joint.offset for joint in joints]), np.tile(UNTURNED, (1, len(joints), 1)))[0][0]
+    rest = rest - rest[0]
     heads, feet = named(names, "head"), named(names, "foot", "ankle", "toe")
     way = _way(joints, heads[-1], feet[-1]) if heads and feet else 0.0
     rest_up = _axis_up(rest[heads[-1]] - rest[feet].mean(0), way) if way else None
@@ -202,35 +204,21 @@ def _frames(lines: Lines, channels: int) -> tuple[float, Float[np.ndarray, "F C"
     return (float(round(fps)) if abs(fps - round(fps)) < 1e-2 else fps), np.array(rows)
 
 
-def _rest(joints: list[_Joint]) -> Float[np.ndarray, "J 3"]:
-    rest = np.zeros((len(joints), 3))
-    for i, joint in enumerate(joints):
-        if joint.parent >= 0:
-            rest[i] = rest[joint.parent] + joint.offset
-    return rest
+def _moves(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (F, J, 3) and rotations (F, J, 4; w x y z) relative to the parents, in the file's unit.
 
-
-def _forward(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (F, J, 3) and rotations (F, J, 4; w x y z) of all joints in the file's axes and unit."""
-    frames, column = len(values), 0
-    positions, rotations = np.zeros((frames, len(joints), 3)), np.zeros((frames, len(joints), 4))
+    A position channel replaces the OFFSET along its axis.
+    """
+    column, offsets = 0, np.tile([joint.offset for joint in joints], (len(values), 1, 1))
+    local = np.tile(UNTURNED, (*offsets.shape[:2], 1))
     for i, joint in enumerate(joints):
-        offset, turn = np.tile(joint.offset, (frames, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (frames, 1))
-        if any(kind == "position" for kind, _ in joint.channels):
-            offset = np.where([("position", axis) in joint.channels for axis in "xyz"], 0.0, offset)
         for kind, axis in joint.channels:
             if kind == "position":
-                offset[:, "xyz".index(axis)] += values[:, column]
+                offsets[:, i, "xyz".index(axis)] = values[:, column]
             else:
-                turn = multiply(turn, about(axis, np.radians(values[:, column])))
+                local[:, i] = multiply(local[:, i], about(axis, np.radians(values[:, column])))
             column += 1
-        if joint.parent < 0:
-            positions[:, i], rotations[:, i] = offset, turn
-            continue
-        parent = rotations[:, joint.parent]
-        positions[:, i] = positions[:, joint.parent] + rotate(parent, offset)
-        rotations[:, i] = multiply(parent, turn)
-    return positions, rotations
+    return offsets, local
 
 
 def _axis_up(feet_to_head: Float[np.ndarray, "3"], way: float) -> Up | None:

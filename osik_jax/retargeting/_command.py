@@ -92,19 +92,21 @@ def write_folder(
 ) -> dict[str, Any]:
     """Write the files of ``retarget_to_folder`` and return the report; ``look`` is that of the page."""
     figures = {"clip": name, **report(result)}
-    write_motion(result, figures, out)
+    write_motion(result, figures, out, page, look)
     save_profile(result.profile, out / "profile.toml")
     if animation:
         film(result, out / "motion.gif")
-    if page:
-        write_report(result, figures, out / "motion.npz", out / "report.html", look=look)
     return figures
 
 
-def write_motion(result: Retargeted, figures: dict[str, Any], out: Path) -> None:
-    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to an existing folder."""
+def write_motion(
+    result: Retargeted, figures: dict[str, Any], out: Path, page: bool = False, look: Look | None = None
+) -> None:
+    """Write ``motion.npz``, ``motion.csv``, the page and, last of all, ``report.json`` to an existing folder."""
     result.save(out / "motion.npz")
     write_csv(result.motion, out / "motion.csv")
+    if page:
+        write_report(result, figures, out / "motion.npz", out / "report.html", look=look)
     write_json(figures, out / "report.json")
 
 

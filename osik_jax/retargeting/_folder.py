@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,10 +21,14 @@ from ..scaling._progress import Progress, reported
 from ._command import write_json, write_motion
 from ._lanes import Clip, one_a_core, shared_length
 from ._load import Reader, clips_in
+from ._page import write_index
 from ._profile import Limb
 from ._profile_file import profile_text, save_profile
 from ._report import report
 from ._retarget import Retargeter, Source
+
+if TYPE_CHECKING:
+    from ..viewer import Look
 
 FIGURES = {
     "off_plan_rad": ("off_plan_rad",),
@@ -56,6 +60,8 @@ def retarget_folder(
     fps: float | None = None,
     chunk: int = 32,
     progress: Progress = True,
+    page: bool = False,
+    look: Look | None = None,
 ) -> dict[str, Any]:
     """Retarget every ``.bvh``, ``.amc``, ``.npz`` and ``.csv`` file directly inside a folder.
 
@@ -73,6 +79,8 @@ def retarget_folder(
         fps: as of ``Retargeter.retarget``, the same for all clips.
         chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
         progress: whether to show a bar; or a function of the numbers of finished clips and of all clips.
+        page: whether each clip gets a page, ``report.html``, and ``out`` an ``index.html`` with links to them.
+        look: that of the pages.
 
     Returns:
         the summary: ``clips`` (number finished), ``frames``, ``worst`` (the largest value of each figure), ``failed``
@@ -88,7 +96,8 @@ def retarget_folder(
     with only_job(out):
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
-        work = _Work(retargeter, out, {name: _source(path, job) for name, path in files.items()}, chunk)
+        sources = {name: _source(path, job) for name, path in files.items()}
+        work = _Work(retargeter, out, sources, chunk, page, look)
         with reported(len(files), len(work.found), progress, "clips") as advance:
             # longest first: shorter clips can then use the program compiled for longer ones
             todo = [name for name in files if name not in work.found]
@@ -98,7 +107,11 @@ def retarget_folder(
                 advance(done)
         summary = _summary(work.found, work.failed, [*files])
         write_json(summary, out / "report.json")
-        _write_index(summary, out / "index.csv")
+        rows = _index(summary)
+        with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows(rows)
+        if page:
+            write_index(rows, out / "index.html")
     return summary
 
 
@@ -110,9 +123,18 @@ class _Work:
         failed: error messages of failed clips by name.
     """
 
-    def __init__(self, retargeter: Retargeter, out: Path, sources: Mapping[str, dict[str, str]], chunk: int):
-        self._retargeter, self._out, self._sources = retargeter, out, sources
-        self.found = {name: own for name, of in sources.items() if (own := _finished(out / name, of)) is not None}
+    def __init__(
+        self,
+        retargeter: Retargeter,
+        out: Path,
+        sources: Mapping[str, dict[str, str]],
+        chunk: int,
+        page: bool,
+        look: Look | None,
+    ):
+        self._retargeter, self._out, self._sources, self._page = retargeter, out, sources, (page, look)
+        found = {name: _finished(out / name, of, page) for name, of in sources.items()}
+        self.found = {name: own for name, own in found.items() if own is not None}
         self.failed: dict[str, str] = {}
         self._lanes = cores() if one_a_core() else min(chunk, max(1, len(sources) - len(self.found)))
         self._lengths = _Lengths()
@@ -152,7 +174,7 @@ class _Work:
                 continue
             self.found[name] = {"clip": name, **self._sources[name], **report(result)}
             (self._out / name).mkdir(exist_ok=True)
-            write_motion(result, self.found[name], self._out / name)
+            write_motion(result, self.found[name], self._out / name, *self._page)
         return len(clips)
 
 
@@ -213,14 +235,15 @@ def _source(path: Path, job: dict[str, Any]) -> dict[str, str]:
     return {"source": path.name, "sha256": content, "job": identifier(job)}
 
 
-def _finished(folder: Path, source: dict[str, str]) -> dict[str, Any] | None:
-    """Return the report of a finished clip, or None if there is none for this file and job."""
+def _finished(folder: Path, source: dict[str, str], page: bool) -> dict[str, Any] | None:
+    """Return the report of a finished clip, or None if there is none for this file and job, or lacks its ``page``."""
     figures = _read(folder / "report.json") or {}
     try:
         _picked(figures)
     except (KeyError, TypeError):
         return None
-    return figures if source.items() <= figures.items() else None
+    whole = source.items() <= figures.items() and ((folder / "report.html").exists() or not page)
+    return figures if whole else None
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -253,16 +276,14 @@ def _summary(found: Mapping[str, dict[str, Any]], failed: Mapping[str, str], ord
     }
 
 
-def _write_index(summary: dict[str, Any], path: Path) -> None:
-    """Write one CSV line per clip with its figures and notes; clips with notes come first."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(["clip", "look at", "frames", "fps", *FIGURES])
-        table.writerows([name, reason] for name, reason in summary["failed"].items())
-        notes: dict[str, list[str]] = summary["notes"]
-        for name in sorted(summary["figures"], key=lambda name: name not in notes):
-            row = summary["figures"][name]
-            table.writerow([name, "; ".join(notes.get(name, ())), *(row[key] for key in ("frames", "fps", *FIGURES))])
+def _index(summary: dict[str, Any]) -> list[list[Any]]:
+    """Return a row of headings, and one row per clip with its figures and notes; clips with notes come first."""
+    notes: dict[str, list[str]] = summary["notes"]
+    rows: list[list[Any]] = [["clip", "look at", "frames", "fps", *FIGURES]]
+    rows += [[name, reason] for name, reason in summary["failed"].items()]
+    for name in sorted(summary["figures"], key=lambda name: name not in notes):
+        rows.append([name, "; ".join(notes.get(name, ())), *summary["figures"][name].values()])
+    return rows
 
 
 def _picked(figures: Any) -> dict[str, float | None]:

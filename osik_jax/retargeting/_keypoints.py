@@ -14,7 +14,7 @@ from .._npz import open_npz
 from ._motion import CONTACT_POINTS, LARGEST, HumanMotion, Touch
 from ._optitrack import is_optitrack, read_optitrack
 from ._rotations import continuous
-from ._smpl import is_smpl, read_smpl
+from ._smpl import arrays_to_read, is_smpl, read_smpl
 from ._up import Up, checked_up, find_rest_up, standing_up
 
 _AXES = ("x", "y", "z")
@@ -52,7 +52,7 @@ def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> Hum
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return all arrays of a ``.npz`` file; nothing is unpickled.
+    """Return the arrays of a ``.npz`` file that have a use (``arrays_to_read``); nothing is unpickled.
 
     Raises:
         FileNotFoundError: no such file.
@@ -61,7 +61,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")
     with open_npz(path) as data:
-        return {name: data[name] for name in data.files}
+        return {name: data[name] for name in arrays_to_read(data.files)}
 
 
 def _from_npz(path: Path) -> HumanMotion:

@@ -38,6 +38,8 @@ def read_optitrack(path: Path, rows: Rows) -> HumanMotion:
     unit, rate = head.get("Length Units", "Meters"), head.get("Export Frame Rate", "")
     if unit.lower() not in _UNITS:
         raise OsikValueError(f"{path}, line 1: Length Units is {unit}; it is Meters, Centimeters or Millimeters")
+    if head.get("Coordinate Space", "Global") != "Global":
+        raise OsikValueError(f"{path}, line 1: Coordinate Space is {head['Coordinate Space']}; export it as Global")
     first = next((i for i, (_, row) in enumerate(rows) if row[0].strip() == "Frame"), None)
     if first is None or first < 4:
         raise OsikValueError(f"{path}: there is no line of headings that begins with Frame, below those of the bones")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import Bool
@@ -41,6 +42,10 @@ font:13px/1.4 system-ui,sans-serif;color:#1f2933;background:#fff;border-left:1px
 #osik svg{display:block;width:100%;height:12px;background:#eef1f5;margin-bottom:4px}
 #osik .lines{position:relative}#osik .now{position:absolute;top:0;bottom:0;width:1px;background:#1c6fb8}
 </style>"""
+_INDEX_STYLE = """<style>
+body{font:13px/1.4 system-ui,sans-serif;color:#1f2933}table{border-collapse:collapse}
+td,th{padding:2px 8px;text-align:right;border-bottom:1px solid #d9dfe7}td:nth-child(-n+2){text-align:left}
+</style>"""
 _SCRIPT = """<script>
 setInterval(()=>{const s=document.querySelector('#root [role=slider]');if(!s)return;
 const now=Number(s.getAttribute('aria-valuenow'))/Math.max(Number(s.getAttribute('aria-valuemax')),1e-9);
@@ -69,6 +74,22 @@ def write_report(
     panel = _STYLE + _panel(result, figures) + _SCRIPT
     title = str(figures.get("clip", motion.stem))
     write_page(result.robot, read_motion(motion, result.robot), out, look=look, title=title, beside=panel)
+
+
+def write_index(rows: Sequence[Sequence[Any]], out: Path) -> None:
+    """Write a table as HTML; a clip's name, in the first column, is a link to its page.
+
+    Args:
+        rows: of headings, then of each clip.
+        out: the HTML file, in the folder of the clips' folders.
+    """
+    lines = [f"<!doctype html><meta charset=utf-8><title>Retargeted clips</title>{_INDEX_STYLE}<table>"]
+    for tag, row in zip(["th", *["td"] * len(rows)], rows, strict=False):
+        name, *cells = (_text(f"{cell:.4g}" if isinstance(cell, float) else cell) for cell in row)
+        if (out.parent / str(row[0]) / "report.html").exists():
+            name = f'<a href="{quote(str(row[0]))}/report.html">{name}</a>'
+        lines.append("<tr>" + "".join(f"<{tag}>{cell}" for cell in (name, *cells)))
+    out.write_text("\n".join([*lines, "</table>"]), encoding="utf-8")
 
 
 def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
@@ -142,5 +163,5 @@ def _items(texts: Iterable[str], attributes: str) -> str:
     return f"<ul{attributes}>" + "".join(f"<li>{_text(text)}" for text in texts) + "</ul>"
 
 
-def _text(text: str) -> str:
-    return html.escape(str(text))
+def _text(text: object) -> str:
+    return html.escape("-" if text is None else str(text))

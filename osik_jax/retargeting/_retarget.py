@@ -35,6 +35,7 @@ from ._lanes import (
 )
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
+from ._path import with_path
 from ._person import read_person
 from ._plan import make_plan
 from ._profile import Limb, Profile
@@ -170,7 +171,7 @@ class Retargeter(OnRobot):
         if isinstance(motion, SourceMotion):
             own = motion.person()
         else:
-            own = read_person(motion, roles, standing=self.profile.standing)
+            own = read_person(with_path(motion, roles), roles, standing=self.profile.standing)
         person = self._build.seen(own)
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 Axis = str
 _UNIT = {"x": 0, "y": 1, "z": 2}
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+"""Quaternion of no rotation."""
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -22,6 +26,24 @@ def rotate(quaternion: np.ndarray, point: np.ndarray) -> np.ndarray:
     w, v = quaternion[..., :1], quaternion[..., 1:]
     t = 2.0 * np.cross(v, point)
     return point + w * t + np.cross(v, t)
+
+
+def forward(
+    parents: Sequence[int], offsets: Float[np.ndarray, "*F J 3"], local: Float[np.ndarray, "F J 4"]
+) -> tuple[Float[np.ndarray, "F J 3"], Float[np.ndarray, "F J 4"]]:
+    """Return the positions and rotations of a tree's joints in the world from those relative to their parents.
+
+    Args:
+        parents: index of each joint's parent, which comes before it; -1 for the root.
+        offsets: positions in the parent's frame, in any unit. (J, 3) or (F, J, 3)
+        local: rotations relative to the parent.
+    """
+    positions, rotations = np.array(np.broadcast_to(offsets, (*local.shape[:2], 3))), local.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            positions[:, joint] = positions[:, parent] + rotate(rotations[:, parent], positions[:, joint])
+            rotations[:, joint] = multiply(rotations[:, parent], rotations[:, joint])
+    return positions, rotations
 
 
 def about(axis: Axis, angle: np.ndarray) -> np.ndarray:

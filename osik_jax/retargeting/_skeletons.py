@@ -29,7 +29,7 @@ meanings goes to the lower joint if a more specific word names the upper one: ``
 _TRUNK_WORDS = {
     "pelvis": "pelvis hips hip hipcenter midhip spinebase root 下半身",
     "chest": "spine001 spine03 spine2 spine chest spine01 spine1 spinemid t12 torso upperback thorax spine05 上半身",
-    "neck": "neck neck01 neck1 lowerneck shouldercenter spineshoulder necknose 首",
+    "neck": "neck neck01 neck1 lowerneck shouldercenter spineshoulder thorax necknose 首",
     "head": "head 頭",
 }
 """Words for each joint of the trunk, the preferred one first; ``_trunk`` handles exceptions."""
@@ -154,7 +154,11 @@ def _trunk(parts: Mapping[str, str]) -> dict[str, str]:
         words["chest"].remove("spine03")
     if "spine" in parts:  # SMPL has spine1 to spine3, Mixamo spine, spine1 and spine2
         words["chest"].remove("spine2")
-    return {role: parts[there[0]] for role, own in words.items() if (there := [word for word in own if word in parts])}
+    roles: dict[str, str] = {}
+    for role, own in words.items():
+        found = [parts[word] for word in own if word in parts and parts[word] not in roles.values()]
+        roles |= {role: found[0]} if found else {}
+    return roles
 
 
 def _checked(joint_names: tuple[str, ...], mapping: Mapping[str, str], needed: Sequence[str]) -> dict[str, str]:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError
 from ._motion import HumanMotion
-from ._rotations import continuous, multiply, rotate
+from ._rotations import UNTURNED, continuous, forward
 
 _TREE = (
     ("pelvis", -1, (0.0, 0.0, 0.0)),
@@ -42,11 +41,20 @@ are round numbers for a person of 1.7 m, not those of SMPL's mesh. Hand joints f
 """
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 _REST = ("rest_joints", "J")
+_ARRAYS = ("poses", "root_orient", "pose_body", "trans", *_RATES, *_REST)
 
 
-def is_smpl(arrays: Mapping[str, np.ndarray]) -> bool:
-    """Return whether a file holds poses of SMPL joints."""
-    return "trans" in arrays and ("poses" in arrays or {"root_orient", "pose_body"} <= set(arrays))
+def arrays_to_read(names: Collection[str]) -> Collection[str]:
+    """Return those arrays of a file that its reader uses: of SMPL poses some, of other files all.
+
+    AMASS's files for SMPL-X contain an array of objects, which cannot be read without unpickling it.
+    """
+    return [name for name in names if name in _ARRAYS] if is_smpl(names) else names
+
+
+def is_smpl(names: Collection[str]) -> bool:
+    """Return whether a file with arrays of these names holds poses of SMPL joints."""
+    return "trans" in names and ("poses" in names or {"root_orient", "pose_body"} <= set(names))
 
 
 def read_smpl(path: Path, arrays: Mapping[str, np.ndarray]) -> HumanMotion:
@@ -88,20 +96,8 @@ def read_smpl(path: Path, arrays: Mapping[str, np.ndarray]) -> HumanMotion:
             raise OsikValueError(f"{path}: {name} has numbers that are not finite")
     vectors = np.asarray(poses[:, : 3 * count], float).reshape(-1, 3)
     local = Rotation.from_rotvec(vectors).as_quat(scalar_first=True).reshape(-1, count, 4)
-    positions, rotations = _forward(parents, offsets, root, local)
-    rest, _ = _forward(parents, offsets, np.zeros((1, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (1, count, 1)))
+    positions, rotations = forward(parents, offsets, local)
+    positions += root[:, None]
+    rest, _ = forward(parents, offsets, np.tile(UNTURNED, (1, count, 1)))
     names = tuple(name for name, _, _ in _TREE)
     return HumanMotion(path.stem, float(np.ravel(rate)[0]), names, positions, continuous(rotations), rest[0])
-
-
-def _forward(
-    parents: list[int], offsets: Float[np.ndarray, "J 3"], root: Float[np.ndarray, "F 3"], local: np.ndarray
-) -> tuple[Float[np.ndarray, "F J 3"], Float[np.ndarray, "F J 4"]]:
-    """Return positions (F, J, 3) and rotations (F, J, 4) in the world from rotations relative to the parents."""
-    positions, rotations = np.zeros((*local.shape[:2], 3)), local.copy()
-    positions[:, 0] = root
-    for joint, parent in enumerate(parents[1:], 1):
-        turn = rotations[:, parent]
-        positions[:, joint] = positions[:, parent] + rotate(turn, np.tile(offsets[joint], (len(root), 1)))
-        rotations[:, joint] = multiply(turn, local[:, joint])
-    return positions, rotations

@@ -59,6 +59,21 @@ def test_split_poses_and_bones_of_the_file(tmp_path):
     np.testing.assert_allclose(motion.positions, expected_joints(moved, offsets), atol=1e-12)
 
 
+def test_files_of_smplx_hold_an_array_of_objects(tmp_path):
+    """AMASS's ``_stageii.npz``: the indices of markers are a dictionary, and poses are there twice."""
+    arrays = smpl_arrays(joints=55)
+    poses, rate = arrays["poses"], arrays.pop("mocap_framerate")
+    parts = {"root_orient": poses[:, :3], "pose_body": poses[:, 3:66], "pose_jaw": poses[:, 66:69],
+             "pose_eye": poses[:, 69:75], "pose_hand": poses[:, 75:], "mocap_frame_rate": rate}  # fmt: skip
+    marks = {"surface_model_type": "smplx", "num_betas": 16, "markers_latent": np.zeros((2, 3)),
+             "markers_latent_vids": np.array({"C7": 3832, "CLAV": 5533})}  # fmt: skip
+    np.savez(tmp_path / "walk_stageii.npz", **arrays, **parts, **marks)
+    motion = load_motion(tmp_path / "walk_stageii.npz")
+    offsets = np.array([offset for _, _, offset in _TREE])
+    np.testing.assert_allclose(motion.positions, expected_joints(arrays, offsets), atol=1e-12)
+    assert motion.fps == 120.0
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -134,6 +149,7 @@ def test_gaps_and_wrong_headings_of_motive_are_told(tmp_path):
     for changed, message in (
         ([*lines[:8], ",".join(cells), *lines[9:]], "line 9, column 7: no finite number; fill gaps"),
         ([lines[0].replace("Millimeters", "Feet"), *lines[1:]], "line 1: Length Units is Feet"),
+        ([lines[0].replace("Global", "Local"), *lines[1:]], "line 1: Coordinate Space is Local; export it as Global"),
         ([line.replace("Bone", "Marker") for line in lines], "has no bones; export a skeleton's bones"),
         ([line for line in lines if not line.startswith("Frame")], "no line of headings that begins with Frame"),
     ):

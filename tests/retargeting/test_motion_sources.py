@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from motion_files import FIGURE, Figure, dancer, write_bvh
+from motion_files import FIGURE, Figure, along_x, dancer, renamed, turned_up, with_rest, write_bvh
 from scipy.spatial.transform import Rotation
 
 from osik_jax.retargeting import HumanMotion, find_roles, load_motion
@@ -23,21 +23,6 @@ def figure():
     return dataclasses.replace(own, angles=angles)
 
 
-def with_rest(own, turns, orders="ZXY"):
-    """The same motion of a skeleton whose joints are turned by constant rotations in its rest pose."""
-    _, global_turns = own.forward()
-    joints, local = [], np.zeros_like(global_turns)
-    for i, (name, parent, offset) in enumerate(own.joints):
-        before = turns[parent] if parent >= 0 else np.eye(3)
-        joints.append((name, parent, tuple(before.T @ np.array(offset))))
-        own_local = (
-            global_turns[:, i] if parent < 0 else np.swapaxes(global_turns[:, parent], 1, 2) @ global_turns[:, i]
-        )
-        local[:, i] = before.T @ own_local @ turns[i]
-    angles = np.stack([Rotation.from_matrix(t).as_euler(orders, degrees=True) for t in local.swapaxes(0, 1)], 1)
-    return Figure(tuple(joints), own.root, angles, (orders,) * len(joints), own.fps)
-
-
 def no_turns():
     return np.tile(np.eye(3), (len(FIGURE), 1, 1))
 
@@ -51,30 +36,11 @@ def a_pose():
     return turns
 
 
-def along_x():
+def turned_along_x():
     """All bones along x in the rest pose, as they are in files of programs with axes on their bones."""
-    turns = no_turns()
-    for i in range(len(FIGURE)):
-        ends = [np.array(offset) for _, parent, offset in FIGURE if parent == i]
-        if ends and i:
-            turns[i] = Rotation.align_vectors(ends[:1], [[np.linalg.norm(ends[0]), 0.0, 0.0]])[0].as_matrix()
+    turns = along_x(figure())
     turns[0] = Rotation.from_euler("zx", [90.0, 30.0], degrees=True).as_matrix()
     return turns
-
-
-def renamed(own, names):
-    return dataclasses.replace(own, joints=tuple((names(name), parent, offset) for name, parent, offset in own.joints))
-
-
-def turned_up(own, up):
-    """The same in axes with another one up: a rotation of all axes, forward stays the one after it."""
-    shift = {"y": 0, "z": 1, "x": 2}[up]
-    if not shift:
-        return own
-    change = np.roll(np.eye(3), shift, axis=0)
-    joints = tuple((name, parent, tuple(change @ np.array(offset))) for name, parent, offset in own.joints)
-    orders = "".join("XYZ"[("XYZ".index(axis) + shift) % 3] for axis in own.orders[0])
-    return Figure(joints, own.root @ change.T, own.angles, (orders,) * len(joints), own.fps)
 
 
 def with_more(own):
@@ -107,8 +73,10 @@ WRITTEN = {
     ),
     "XYZ, inch, z up": lambda path: write_bvh(path, turned_up(with_rest(figure(), no_turns(), "XYZ"), "z"), 0.0254),
     "YXZ, m, x up": lambda path: write_bvh(path, turned_up(with_rest(figure(), a_pose(), "YXZ"), "x"), 1.0),
-    "bones along x, cm": lambda path: write_bvh(path, with_rest(figure(), along_x(), "ZYX"), 0.01),
-    "bones along x, cm, z up": lambda path: write_bvh(path, turned_up(with_rest(figure(), along_x()), "z"), 0.01),
+    "bones along x, cm": lambda path: write_bvh(path, with_rest(figure(), turned_along_x(), "ZYX"), 0.01),
+    "bones along x, cm, z up": lambda path: write_bvh(
+        path, turned_up(with_rest(figure(), turned_along_x()), "z"), 0.01
+    ),
     "toes called LeftToe": lambda path: write_bvh(path, renamed(figure(), lambda name: name.replace("ToeBase", "Toe"))),
     "Blender": lambda path: write_bvh(path, turned_up(renamed(figure(), RIGIFY.__getitem__), "z")),
     "Unreal, cm": lambda path: write_bvh(path, turned_up(renamed(figure(), UNREAL.__getitem__), "z"), 0.01),

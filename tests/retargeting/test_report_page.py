@@ -1,5 +1,6 @@
 """The page of ``osik retarget --report``: what it says is what MuJoCo and the contacts say, and it needs no network."""
 
+import csv
 import re
 from pathlib import Path
 
@@ -82,3 +83,36 @@ def test_what_gave_way_is_told(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert notes and all(f"<li>{note}" in page for note in notes)
     assert load_profile(tmp_path / "profile.toml") == load_profile("nao")
+
+
+def test_a_folder_has_a_page_per_clip_and_an_index_with_links(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    clips, out = tmp_path / "clips", tmp_path / "out"
+    clips.mkdir()
+    write_bvh(clips / "dance <1>.bvh", dancer(FRAMES), 0.01)
+    write_bvh(clips / "dance 2.bvh", dancer(FRAMES), 0.01)
+    (clips / "broken.csv").write_text("time,Hips.x\n0,1\n1,2\n")
+
+    def run() -> int:
+        return Retarget(clip=str(clips), robot="nao", out=out, report=True).run()
+
+    assert run() == 1
+    index = (out / "index.html").read_text(encoding="utf-8")
+    links = re.findall(r'<td><a href="(.*?)">(.*?)</a><td>', index)
+    assert links == [("dance%202/report.html", "dance 2"), ("dance%20%3C1%3E/report.html", "dance &lt;1&gt;")]
+    rows = re.findall(r"<tr>(.*)", index)
+    assert (
+        rows[0].startswith("<th>clip<th>look at<th>frames") and rows[1].startswith("<td>broken<td>") and len(rows) == 4
+    )
+    assert "NAME.x, NAME.y and NAME.z" in rows[1] and " src=" not in index
+    with (out / "index.csv").open(newline="", encoding="utf-8") as file:
+        table = list(csv.reader(file))
+    assert [row[0] for row in table[2:]] == ["dance 2", "dance <1>"]
+    slip = float(table[2][table[0].index("slip_mm_max")])
+    assert f"<td>{slip:.4g}" in rows[2]
+    page = out / "dance 2" / "report.html"
+    assert "<h1>dance 2</h1>" in page.read_text(encoding="utf-8")
+    # the same command makes what is missing, and nothing else
+    page.unlink()
+    kept = (out / "dance <1>" / "report.json").stat().st_mtime_ns
+    assert run() == 1 and page.exists() and (out / "dance <1>" / "report.json").stat().st_mtime_ns == kept
+    capsys.readouterr()

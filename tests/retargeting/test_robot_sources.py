@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from motion_files import dancer, write_bvh
+from small_robots import quietly, robot_of
 
 import osik_jax as osik
 from osik_jax import cli
@@ -68,6 +69,26 @@ def test_a_motion_goes_to_another_robot_and_comes_back(nao, danced):
         assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["jump_frames"] == 0
     own, returned = (SourceMotion(nao, result.motion).person().points for result in (first, back))
     assert np.mean([angle(own[b] - own[a], returned[b] - returned[a]) for a, b in LIMBS]) < 1.0
+
+
+@pytest.mark.slow
+def test_robots_of_other_builds_lead_a_g1(tmp_path):
+    """A Talos, and a robot whose forearms end without a wrist joint as an H1's: segments, contacts and limits."""
+    dance = load_motion(write_bvh(tmp_path / "dance.bvh", dancer(32), 0.01))
+    g1 = Retargeter(osik.load_robot("g1"))
+    for robot in (osik.load_robot("talos"), robot_of("legs", "arms")):
+        first = quietly(Retargeter, robot)
+        danced = first.retarget(dance)
+        source = SourceMotion(robot, dataclasses.replace(danced.motion, contact=danced.contact), first.profile)
+        led = g1.retarget(source)
+        figures, joints = report(led), report(led)["joints"]
+        np.testing.assert_array_equal(led.contact, danced.contact)
+        assert joints["beyond_range_max"] == 0.0 and joints["speed_over_limit_max"] <= 1.0 + 1e-6
+        assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
+        own, seen = (SourceMotion(r, m, p).person().points for r, m, p in (
+            (robot, danced.motion, first.profile), (g1.robot, led.motion, g1.profile)))  # fmt: skip
+        off = {(a, b): angle(own[b] - own[a], seen[b] - seen[a]).mean() for a, b in LIMBS}
+        assert max(off.values()) < 3.0 and np.mean(list(off.values())) < 1.5, off
 
 
 def test_feet_of_a_source_without_labels_are_found(nao, danced):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +87,62 @@ def dancer(frames: int = 24, fps: float = 30.0) -> Figure:
     return Figure(FIGURE, root, angles, ("ZXY",) * len(FIGURE), fps)
 
 
+def with_rest(own: Figure, turns: np.ndarray, orders: str = "ZXY") -> Figure:
+    """The same motion of a skeleton whose joints are turned by constant rotations in its rest pose."""
+    _, global_turns = own.forward()
+    joints, local = [], np.zeros_like(global_turns)
+    for i, (name, parent, offset) in enumerate(own.joints):
+        before = turns[parent] if parent >= 0 else np.eye(3)
+        joints.append((name, parent, tuple(before.T @ np.array(offset))))
+        own_local = (
+            global_turns[:, i] if parent < 0 else np.swapaxes(global_turns[:, parent], 1, 2) @ global_turns[:, i]
+        )
+        local[:, i] = before.T @ own_local @ turns[i]
+    with warnings.catch_warnings():  # at gimbal lock SciPy chooses one of the equal triples
+        warnings.simplefilter("ignore", UserWarning)
+        angles = np.stack([Rotation.from_matrix(t).as_euler(orders, degrees=True) for t in local.swapaxes(0, 1)], 1)
+    return Figure(tuple(joints), own.root, angles, (orders,) * len(joints), own.fps)
+
+
+def renamed(own: Figure, names: Callable[[str], str]) -> Figure:
+    """The same with other names."""
+    return dataclasses.replace(own, joints=tuple((names(name), parent, offset) for name, parent, offset in own.joints))
+
+
+def turned_up(own: Figure, up: str) -> Figure:
+    """The same in axes with another one up: a rotation of all axes, forward stays the one after it."""
+    shift = {"y": 0, "z": 1, "x": 2}[up]
+    if not shift:
+        return own
+    change = np.roll(np.eye(3), shift, axis=0)
+    joints = tuple((name, parent, tuple(change @ np.array(offset))) for name, parent, offset in own.joints)
+    orders = "".join("XYZ"[("XYZ".index(axis) + shift) % 3] for axis in own.orders[0])
+    return Figure(joints, own.root @ change.T, own.angles, (orders,) * len(joints), own.fps)
+
+
+def with_between(own: Figure, name: str, child: str, share: float) -> Figure:
+    """The same with another joint, which does not turn, at some share of the way to ``child``."""
+    at = [joint for joint, _, _ in own.joints].index(child)
+    joints = [(joint, parent + (parent >= at), offset) for joint, parent, offset in own.joints]
+    _, parent, (x, y, z) = joints[at]
+    first, rest = share, 1.0 - share
+    joints[at] = (name, parent, (first * x, first * y, first * z))
+    joints.insert(at + 1, (child, at, (rest * x, rest * y, rest * z)))
+    orders = (*own.orders[:at], own.orders[at], *own.orders[at:])
+    return Figure(tuple(joints), own.root, np.insert(own.angles, at, 0.0, 1), orders, own.fps)
+
+
+def along_x(own: Figure, backwards: str = "none") -> np.ndarray:
+    """Turns of a rest pose with each bone along x, or against it where the joint's name has ``backwards`` in it."""
+    turns = np.tile(np.eye(3), (len(own.joints), 1, 1))
+    for i, (name, _, _) in enumerate(own.joints):
+        ends = [np.array(offset) for _, parent, offset in own.joints if parent == i]
+        if ends and i:
+            along = [np.linalg.norm(ends[0]) * (-1.0 if backwards in name else 1.0), 0.0, 0.0]
+            turns[i] = Rotation.align_vectors(ends[:1], [along])[0].as_matrix()
+    return turns
+
+
 def bent_forward(motion: HumanMotion, most: float = 70.0) -> HumanMotion:
     """The same, with all above the hips turned forward about them, by so many degrees in the middle of the clip."""
     names, positions = motion.joint_names, motion.positions.copy()
@@ -107,8 +165,18 @@ def with_first(frames: int, own: Figure | None = None) -> Figure:
     return dataclasses.replace(own, angles=np.concatenate([pose, own.angles]), root=np.concatenate([root, own.root]))
 
 
-def write_bvh(path: Path, figure: Figure, unit: float = 1.0) -> Path:
-    """A BVH file of a figure, lengths in ``unit`` metres; a joint without children gets an End Site."""
+def write_bvh(
+    path: Path, figure: Figure, unit: float = 1.0, *, floor: str | None = None, all_move: bool = False
+) -> Path:
+    """A BVH file of a figure, lengths in ``unit`` metres; a joint without children gets an End Site.
+
+    Args:
+        path: the file.
+        figure: the figure.
+        unit: [m]
+        floor: name of a root at rest on the floor, above the figure's own; None: there is none.
+        all_move: whether all joints have position channels, which repeat their offsets.
+    """
     children = [[j for j, (_, parent, _) in enumerate(figure.joints) if parent == i] for i in range(len(figure.joints))]
     lines, order = ["HIERARCHY"], []
 
@@ -117,8 +185,8 @@ def write_bvh(path: Path, figure: Figure, unit: float = 1.0) -> Path:
         indent, order_of = "\t" * depth, figure.orders[i]
         order.append(i)
         turns = " ".join(f"{axis}rotation" for axis in order_of)
-        moves = "Xposition Yposition Zposition " if parent < 0 else ""
-        lines.extend([f"{indent}{'ROOT' if parent < 0 else 'JOINT'} {name}", f"{indent}{{"])
+        moves = "Xposition Yposition Zposition " if parent < 0 or all_move else ""
+        lines.extend([f"{indent}{'JOINT' if depth else 'ROOT'} {name}", f"{indent}{{"])
         lines.append(f"{indent}\tOFFSET {' '.join(repr(float(x) / unit) for x in offset)}")
         lines.append(f"{indent}\tCHANNELS {6 if moves else 3} {moves}{turns}")
         for child in children[i]:
@@ -127,10 +195,19 @@ def write_bvh(path: Path, figure: Figure, unit: float = 1.0) -> Path:
             lines.extend([f"{indent}\tEnd Site", f"{indent}\t{{", f"{indent}\t\tOFFSET 0 0 0", f"{indent}\t}}"])
         lines.append(f"{indent}}}")
 
-    write(0, 0)
+    if floor is not None:
+        turns = " ".join(f"{axis}rotation" for axis in figure.orders[0])
+        lines += [f"ROOT {floor}", "{", "\tOFFSET 0 0 0", f"\tCHANNELS 6 Xposition Yposition Zposition {turns}"]
+    write(0, int(floor is not None))
+    lines += ["}"] * (floor is not None)
     lines += ["MOTION", f"Frames: {len(figure.root)}", f"Frame Time: {1.0 / figure.fps:.9f}"]
     for root, angles in zip(figure.root, figure.angles, strict=True):
-        numbers = [*(root / unit), *(angle for i in order for angle in angles[i])]
+        numbers = [0.0] * 6 * (floor is not None)
+        for i in order:
+            _, parent, offset = figure.joints[i]
+            if parent < 0 or all_move:
+                numbers += [x / unit for x in (root if parent < 0 else offset)]
+            numbers += [*angles[i]]
         lines.append(" ".join(repr(float(x)) for x in numbers))
     path.write_text("\n".join(lines) + "\n")
     return path

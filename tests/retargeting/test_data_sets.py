@@ -1,0 +1,340 @@
+"""Files as data sets have them, made here: names, tree, units, axes, rest poses and rates of each.
+
+The conventions are those of: LAFAN1 (ubisoft-laforge-animation-dataset), Bandai-Namco-Research-Motiondataset 1 and 2
+(their BVH files), SOMA (NVIDIA's soma-retargeter and its BVH files), the CMU database (mocap.cs.cmu.edu, ASF and AMC),
+MediaPipe (guide of the pose landmarker, "world landmarks"), Human3.6M (17 joints of VideoPose3D) and Kinect for Windows
+v1 and v2 (documentation of JointType and CameraSpacePoint).
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from motion_files import FIGURE, Figure, along_x, dancer, renamed, with_between, with_rest, write_bvh
+from scipy.spatial.transform import Rotation
+from small_robots import quietly, robot_of
+
+import osik_jax as osik
+from osik_jax.retargeting import HumanMotion, Retargeter, find_roles, load_motion, report
+from osik_jax.retargeting._person import read_person
+
+SAME = ("directions", "pelvis", "torso", "feet", "root", "contact")
+SIDES = {"Left": "left", "Right": "right"}
+
+
+def figure(frames=24, fps=30.0):
+    """The dancer, turned by 25 degrees about the vertical."""
+    own = dancer(frames, fps)
+    angles = own.angles.copy()
+    angles[:, 0, 2] = 25.0
+    return dataclasses.replace(own, angles=angles)
+
+
+def seen(motion):
+    return read_person(motion, find_roles(motion.joint_names))
+
+
+def is_figure(motion, own):
+    """The clip shows the person of a figure, whatever its file looks like."""
+    positions, _ = own.forward()
+    z_up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    names = tuple(name for name, _, _ in FIGURE)
+    truth, person = seen(HumanMotion("truth", own.fps, names, positions @ z_up.T)), seen(motion)
+    for name in SAME:
+        np.testing.assert_allclose(getattr(person, name), getattr(truth, name), atol=2e-8, err_msg=name)
+    assert person.fps == own.fps and person.contact.all()
+    across = person.points["left_shoulder"] - person.points["right_shoulder"]
+    assert (np.cross(across, [0.0, 0.0, 1.0]) @ [np.cos(np.radians(25)), np.sin(np.radians(25)), 0.0] > 0.3).all()
+
+
+def elsewhere(own, place):
+    """The same, with the place of the root in its OFFSET; its channels replace that."""
+    (name, parent, _), *others = own.joints
+    return dataclasses.replace(own, joints=((name, parent, place), *others))
+
+
+def with_shoulders(own, share=0.3):
+    return with_between(with_between(own, "LeftShoulder", "LeftArm", share), "RightShoulder", "RightArm", share)
+
+
+def rounded(path, digits):
+    """A file with its frame time to so many digits."""
+    head, rest = path.read_text().split("Frame Time: ")
+    time, frames = rest.split("\n", 1)
+    path.write_text(f"{head}Frame Time: {float(time):.{digits}f} \n{frames}")
+    return path
+
+
+def test_lafan1(tmp_path):
+    """Bones along x on both sides, channels z y x, centimetres, 22 joints; OFFSET of the root is its first place."""
+    own = with_shoulders(with_between(with_between(figure(), "Spine1", "Neck", 0.3), "Spine2", "Neck", 0.5))
+    own = renamed(elsewhere(own, (-2.2, 0.9, -4.3)), lambda name: name.replace("ToeBase", "Toe"))
+    file = write_bvh(tmp_path / "dance1_subject1.bvh", with_rest(own, along_x(own), "ZYX"), 0.01)
+    motion = load_motion(rounded(file, 6))
+    is_figure(motion, figure())
+    assert len(motion.joint_names) == 22 and motion.rest_positions is None
+
+
+def test_bandai_namco(tmp_path):
+    """A root that rests on the floor, six channels in every joint, bones of the right against x, centimetres."""
+    own = with_shoulders(with_between(figure(), "Chest", "Neck", 0.4))
+    parts = dict(Arm="UpperArm", ForeArm="LowerArm", Hand="Hand", UpLeg="UpperLeg", Leg="LowerLeg", Foot="Foot",
+                 ToeBase="Toes", Shoulder="Shoulder")  # fmt: skip
+    turns = along_x(own, "Right")
+    names = {side + part: f"{theirs}_{side[0]}" for side in SIDES for part, theirs in parts.items()}
+    own = renamed(elsewhere(own, (0.01, 0.94, -4.5)), lambda name: names.get(name, name))
+    file = tmp_path / "dataset-1_bow_normal_001.bvh"
+    write_bvh(file, with_rest(own, turns), 0.01, floor="joint_Root", all_move=True)
+    is_figure(load_motion(rounded(file, 7)), figure())
+
+
+def test_soma(tmp_path):
+    """Thighs called Leg, a root on the floor above Hips, fingers, eyes and ends as joints, 120 frames a second."""
+    own = with_between(with_between(figure(40, 120.0), "Spine1", "Spine", 0.5), "Chest", "Neck", 0.3)
+    own = with_shoulders(with_between(own, "Neck2", "Head", 0.4))
+    names = dict(Spine="Spine2", Neck="Neck1")
+    names |= {side + part: side + theirs for side in SIDES for part, theirs in (("UpLeg", "Leg"), ("Leg", "Shin"))}
+    own, joints = renamed(own, lambda name: names.get(name, name)), []
+    at = {name: i for i, (name, _, _) in enumerate(own.joints)}
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        joints += [(f"{side}HandIndex1", at[f"{side}Hand"], (0.08 * sign, 0.0, 0.03)),
+                   (f"{side}HandThumbEnd", at[f"{side}Hand"], (0.03 * sign, 0.0, 0.06)),
+                   (f"{side}ToeEnd", at[f"{side}ToeBase"], (0.0, 0.0, 0.06)),
+                   (f"{side}Eye", at["Head"], (0.03 * sign, 0.05, 0.1))]  # fmt: skip
+    joints += [("Jaw", at["Head"], (0.0, 0.02, 0.05)), ("HeadEnd", at["Head"], (0.0, 0.2, 0.0))]
+    angles = np.concatenate([own.angles, np.zeros((len(own.root), len(joints), 3))], 1)
+    own = Figure((*own.joints, *joints), own.root, angles, own.orders[:1] * (len(own.joints) + len(joints)), 120.0)
+    for which, turns in (("bones along x", along_x(own)), ("T pose", np.tile(np.eye(3), (len(own.joints), 1, 1)))):
+        file = write_bvh(tmp_path / f"{which}.bvh", with_rest(own, turns, "ZYX"), 0.01, floor="Root")
+        is_figure(load_motion(rounded(file, 6)), figure(40, 120.0))
+
+
+JOINTS = {
+    name: text.split()
+    for name, text in {
+        "MediaPipe": """
+        nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear
+        mouth_left mouth_right left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist left_pinky
+        right_pinky left_index right_index left_thumb right_thumb left_hip right_hip left_knee right_knee left_ankle
+        right_ankle left_heel right_heel left_foot_index right_foot_index""",
+        "Kinect v1": """
+        HipCenter Spine ShoulderCenter Head ShoulderLeft ElbowLeft WristLeft HandLeft ShoulderRight ElbowRight
+        WristRight HandRight HipLeft KneeLeft AnkleLeft FootLeft HipRight KneeRight AnkleRight FootRight""",
+        "Kinect v2": """
+        SpineBase SpineMid Neck Head ShoulderLeft ElbowLeft WristLeft HandLeft ShoulderRight ElbowRight WristRight
+        HandRight HipLeft KneeLeft AnkleLeft FootLeft HipRight KneeRight AnkleRight FootRight SpineShoulder
+        HandTipLeft ThumbLeft HandTipRight ThumbRight""",
+        "Human3.6M": """
+        Hip RHip RKnee RFoot LHip LKnee LFoot Spine Thorax Neck/Nose Head LShoulder LElbow LWrist RShoulder RElbow
+        RWrist""",
+    }.items()
+}
+"""Joints of each data set, in its order."""
+_PARTS = dict(hip="Hip", knee="Knee", ankle="Ankle", toe="Foot", shoulder="Shoulder", elbow="Elbow", wrist="Wrist")
+ROLES = {
+    "MediaPipe": {f"{side}_{part}": f"{side}_{'foot_index' if part == 'toe' else part}"
+                  for side in SIDES.values() for part in (*_PARTS, "heel")},
+    "Kinect v1": {f"{side.lower()}_{part}": name + side for side in SIDES for part, name in _PARTS.items()}
+    | dict(pelvis="HipCenter", chest="Spine", neck="ShoulderCenter", head="Head"),
+    "Kinect v2": {f"{side.lower()}_{part}": name + side for side in SIDES for part, name in _PARTS.items()}
+    | dict(pelvis="SpineBase", chest="SpineMid", neck="Neck", head="Head"),
+    "Human3.6M": {f"{side.lower()}_{part}": side[0] + (name if part != "ankle" else "Foot") for side in SIDES
+                  for part, name in _PARTS.items() if part != "toe"}
+    | dict(pelvis="Hip", chest="Spine", neck="Thorax", head="Head"),
+}  # fmt: skip
+
+
+def beside(track, x, y, z):
+    """Points at a constant distance from a track."""
+    return track + np.array([x, y, z])
+
+
+def walk(frames=60, fps=30.0, speed=0.8, period=1.2):
+    """Points of a person who walks along x: each foot swings for 0.4 of the period, one after the other; z up."""
+    time, points = np.arange(frames) / fps, {}
+    path = np.stack([speed * time, 0.0 * time, 0.01 * np.cos(4.0 * np.pi * time / period)], 1)
+    for side, sign, phase in (("left", 1.0, 0.0), ("right", -1.0, 0.5)):
+        steps, part = np.divmod(time / period + phase, 1.0)
+        swing = np.clip((part - 0.6) / 0.4, 0.0, 1.0)
+        at = (steps - phase + 0.3 + swing**2 * (3.0 - 2.0 * swing)) * period * speed
+        foot = np.stack([at, np.full(frames, 0.09 * sign), 0.08 * np.sin(np.pi * swing) ** 2], 1)
+        top, arm = beside(path, 0.0, 0.09 * sign, 0.86), beside(path, 0.0, 0.19 * sign, 1.36)
+        reach = 0.1 * np.sin(2.0 * np.pi * (time / period + phase))[:, None] * [1.0, 0.0, 0.0]
+        parts = {"heel": beside(foot, -0.05, 0.0, 0.0), "toe": beside(foot, 0.15, 0.0, 0.0)}
+        parts |= {"ankle": beside(foot, 0.0, 0.0, 0.08), "hip": top, "shoulder": arm}
+        parts |= {"knee": beside(0.5 * (top + parts["ankle"]), 0.08, 0.0, 0.0)}
+        parts |= {"elbow": beside(arm, 0.0, 0.03 * sign, -0.28) + reach}
+        parts |= {"wrist": beside(parts["elbow"], 0.12, 0.0, -0.2) + reach}
+        points |= {f"{side}_{name}": track for name, track in parts.items()}
+    middle = {"pelvis": 0.87, "chest": 1.1, "neck": 1.38, "head": 1.55}
+    points |= {name: beside(path, 0.0, 0.0, height) for name, height in middle.items()}
+    return HumanMotion("walk", fps, tuple(points), np.stack(list(points.values()), 1))
+
+
+def as_joints(motion, kind):
+    """Positions of all joints of a data set (F, J, 3), z up; those that are no role of retargeting are at the nose."""
+    roles = {name: role for role, name in ROLES[kind].items()}
+    nose = beside(motion.track("neck"), 0.1, 0.0, 0.08)
+    return np.stack([motion.track(roles[name]) if name in roles else nose for name in JOINTS[kind]], 1)
+
+
+def by_camera(positions, down):
+    """The same as a camera in front of the person sees it: x to the person's left, y down and z away; or y up."""
+    x, y, z = np.moveaxis(positions, -1, 0)
+    return np.stack([y, -z, -x] if down else [-y, z, -x], -1)
+
+
+def turned_back(positions):
+    """Positions of a person who faces -x."""
+    return positions * [-1.0, -1.0, 1.0]
+
+
+def write_table(path, names, positions, fps):
+    headings = ["time", *(f"{name}.{axis}" for name in names for axis in "xyz")]
+    rows = np.column_stack([np.arange(len(positions)) / fps, positions.reshape(len(positions), -1)])
+    path.write_text("\n".join([",".join(headings), *(",".join(map(repr, row.tolist())) for row in rows)]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["Kinect v1", "Kinect v2"])
+def test_kinect(tmp_path, kind):
+    """Metres, y up, z away from a sensor that is 0.9 m above the floor and 2.5 m in front of the person."""
+    own = walk()
+    positions = beside(by_camera(as_joints(own, kind), False), 0.0, -0.9, 2.5)
+    table = write_table(tmp_path / "body.csv", JOINTS[kind], positions, 30)
+    with pytest.warns(osik.OsikWarning, match="the person stands along y and not along z"):
+        motion = load_motion(table)
+    roles = find_roles(motion.joint_names)
+    assert roles == ROLES[kind]
+    for role, name in ROLES[kind].items():
+        np.testing.assert_allclose(motion.track(name), beside(turned_back(own.track(role)), 2.5, 0.0, -0.9), atol=1e-9)
+    person = seen(motion)
+    np.testing.assert_allclose(person.root[:, 2], own.track("left_hip")[:, 2], atol=0.02)  # above the floor
+
+
+def test_human36m(tmp_path):
+    """17 joints; Neck/Nose is in the face, so the thorax is where the neck begins. World positions are millimetres."""
+    own, names = walk(), np.array(JOINTS["Human3.6M"])
+    positions = beside(as_joints(own, "Human3.6M"), 0.3, -1.2, 0.0)
+    np.savez(tmp_path / "walking.npz", fps=50.0, joint_names=names, positions=positions)
+    motion = load_motion(tmp_path / "walking.npz")
+    assert find_roles(motion.joint_names) == ROLES["Human3.6M"]
+    np.testing.assert_allclose(seen(motion).torso[..., 2], np.tile([0.0, 0.0, 1.0], (own.frames, 1)), atol=1e-9)
+    np.savez(tmp_path / "walking.npz", fps=50.0, joint_names=names, positions=1000.0 * positions)
+    large = load_motion(tmp_path / "walking.npz")
+    with pytest.raises(ValueError, match="the legs of walking are .* m long; positions are metres"):
+        seen(large)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["MediaPipe", "Human3.6M"])
+def test_poses_about_the_hips_walk(tmp_path, kind):
+    """MediaPipe's world landmarks, and poses of Human3.6M as networks estimate them: y down, the hips at the origin."""
+    own = walk()
+    positions = by_camera(as_joints(own, kind), True)
+    positions -= positions[:, [JOINTS[kind].index(ROLES[kind][f"{side}_hip"]) for side in SIDES.values()]].mean(1)[
+        :, None
+    ]
+    np.savez(tmp_path / "webcam.npz", fps=30.0, joint_names=JOINTS[kind], positions=positions)
+    with pytest.warns(osik.OsikWarning, match="the person stands along -y and not along z"):
+        motion = load_motion(tmp_path / "webcam.npz")
+    assert find_roles(motion.joint_names) == ROLES[kind]
+    retargeter = quietly(Retargeter, robot_of("legs", "arms"))
+    with pytest.warns(osik.OsikWarning, match="webcam has the hips at the origin in all frames; its path is inferred"):
+        result = retargeter.retarget(motion)
+    figures, points = report(result), {name: result.human[:, k] for k, name in enumerate(result.human_names)}
+    middle = turned_back(0.5 * (own.track("left_hip") + own.track("right_hip")))
+    off = points["root"] - middle
+    np.testing.assert_allclose(off - off[:1], 0.0, atol=0.015)
+    assert np.abs(points["left_ankle"][:, 2] - own.track("left_ankle")[:, 2] - off[:1, 2]).max() < 0.02
+    assert result.contact.any(1).all() and 0.5 < result.contact[:, 0].mean() < 0.8
+    assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
+    assert figures["tracking"]["segment_angle_deg_mean"] < 3.0
+
+
+CMU_TREE = {  # bones of the CMU database's skeletons: parent and degrees of freedom
+    "lhipjoint": ("root", ""), "lfemur": ("lhipjoint", "rx ry rz"),
+    "ltibia": ("lfemur", "rx"),
+    "lfoot": ("ltibia", "rx rz"), "ltoes": ("lfoot", "rx"),
+    "rhipjoint": ("root", ""), "rfemur": ("rhipjoint", "rx ry rz"),
+    "rtibia": ("rfemur", "rx"), "rfoot": ("rtibia", "rx rz"),
+    "rtoes": ("rfoot", "rx"), "lowerback": ("root", "rx ry rz"),
+    "upperback": ("lowerback", "rx ry rz"), "thorax": ("upperback", "rx ry rz"),
+    "lowerneck": ("thorax", "rx ry rz"), "upperneck": ("lowerneck", "rx ry rz"),
+    "head": ("upperneck", "rx ry rz"), "lclavicle": ("thorax", "ry rz"),
+    "lhumerus": ("lclavicle", "rx ry rz"), "lradius": ("lhumerus", "rx"),
+    "lwrist": ("lradius", "ry"), "lhand": ("lwrist", "rx rz"), "lfingers": ("lhand", "rx"),
+    "lthumb": ("lhand", "rx rz"), "rclavicle": ("thorax", "ry rz"),
+    "rhumerus": ("rclavicle", "rx ry rz"), "rradius": ("rhumerus", "rx"),
+    "rwrist": ("rradius", "ry"), "rhand": ("rwrist", "rx rz"), "rfingers": ("rhand", "rx"),
+    "rthumb": ("rhand", "rx rz"),
+}  # fmt: skip
+CMU_BONES = {  # of a person of the same height as the figure: vector to the end of the bone [m], axes [deg]
+    "lhipjoint": ((0.09, -0.08, 0.03), (0, 0, 0)), "lfemur": ((0.14, -0.39, 0.0), (0, 0, 20)),
+    "ltibia": ((0.13, -0.36, 0.0), (0, 0, 20)), "lfoot": ((0.01, -0.03, 0.13), (-90, 7, 20)),
+    "ltoes": ((0.0, 0.0, 0.06), (-90, 7, 20)), "lowerback": ((0.0, 0.11, 0.0), (0, 0, 0)),
+    "upperback": ((0.0, 0.11, 0.01), (0, 0, 0)), "thorax": ((0.0, 0.11, 0.0), (0, 0, 0)),
+    "lowerneck": ((0.0, 0.08, 0.0), (0, 0, 0)), "upperneck": ((0.0, 0.08, 0.01), (0, 0, 0)),
+    "head": ((0.0, 0.08, 0.0), (0, 0, 0)), "lclavicle": ((0.17, 0.04, 0.0), (0, 0, 0)),
+    "lhumerus": ((0.27, 0.0, 0.0), (180, 30, 90)), "lradius": ((0.16, 0.0, 0.0), (180, 30, 90)),
+    "lwrist": ((0.09, 0.0, 0.0), (180, 30, 90)), "lhand": ((0.04, 0.0, 0.0), (180, 30, 90)),
+    "lfingers": ((0.04, 0.0, 0.0), (180, 30, 90)), "lthumb": ((0.03, 0.0, 0.03), (-90, 60, 0)),
+}  # fmt: skip
+
+
+def cmu_bone(name):
+    if name in CMU_BONES:
+        return CMU_BONES[name]
+    (x, y, z), (a, b, c) = CMU_BONES["l" + name[1:]]
+    return (-x, y, z), (a, -b, -c)
+
+
+def test_cmu(tmp_path):
+    """A walk-like motion in ASF and AMC as the database has them, beside SciPy's rotations bone by bone."""
+    unit, rng, frames = 0.0254 / 0.45, np.random.default_rng(5), 6
+    asf = ["# AST/ASF file", ":version 1.10", ":name VICON", ":units", "  mass 1.0", "  length 0.45", "  angle deg",
+           ":documentation", "   made for a test", ":root", "   order TX TY TZ RX RY RZ", "   axis XYZ",
+           "   position 0 0 0", "   orientation 0 0 0", ":bonedata"]  # fmt: skip
+    for number, name in enumerate(CMU_TREE, 1):
+        along, axes = cmu_bone(name)
+        length = np.linalg.norm(along)
+        asf += ["  begin", f"     id {number}", f"     name {name}",
+                f"     direction {' '.join(repr(float(x / length)) for x in along)}",
+                f"     length {float(length) / unit!r}", f"     axis {' '.join(map(str, axes))}  XYZ"]  # fmt: skip
+        dofs = CMU_TREE[name][1].split()
+        if dofs:
+            asf += [
+                f"    dof {' '.join(dofs)}",
+                f"    limits {'(-160.0 20.0)'}",
+                *["           (-70.0 70.0)"] * (len(dofs) - 1),
+            ]
+        asf += ["  end"]
+    asf += [":hierarchy", "  begin"]
+    for parent in dict.fromkeys(("root", *(parent for parent, _ in CMU_TREE.values()))):
+        asf.append(" ".join(["    " + parent, *(name for name, own in CMU_TREE.items() if own[0] == parent)]))
+    (tmp_path / "07.asf").write_text("\n".join([*asf, "  end"]) + "\n")
+    amc, truth = ["#!OML:ASF F:\\VICON\\07.ASF", ":FULLY-SPECIFIED", ":DEGREES"], {name: [] for name in CMU_TREE}
+    for frame in range(frames):
+        place, hips = np.array([0.0, 0.95, 0.1 * frame]), rng.uniform(-8, 8, 3)
+        amc += [str(frame + 1), " ".join(["root", *map(repr, (place / unit).tolist()), *map(repr, hips.tolist())])]
+        turns, ends = {"root": Rotation.from_euler("xyz", hips, degrees=True)}, {"root": place}
+        for name, (parent, dofs) in CMU_TREE.items():
+            values = dict(zip(dofs.split(), rng.uniform(-15, 15, 3), strict=False))
+            along, axes = cmu_bone(name)
+            own = Rotation.from_euler("xyz", axes, degrees=True)
+            local = Rotation.from_euler("xyz", [values.get(f"r{axis}", 0.0) for axis in "xyz"], degrees=True)
+            turns[name] = turns[parent] * own * local * own.inv()
+            truth[name].append(ends[parent])
+            ends[name] = ends[parent] + turns[name].apply(along)
+            amc += [" ".join([name, *map(repr, map(float, values.values()))])] if dofs else []
+    (tmp_path / "07_01.amc").write_text("\n".join(amc) + "\n")
+    motion = load_motion(tmp_path / "07_01.amc")
+    for name, track in truth.items():
+        np.testing.assert_allclose(motion.track(name), np.array(track)[:, [2, 0, 1]], atol=1e-9, err_msg=name)
+    roles = find_roles(motion.joint_names)
+    parts = dict(hip="femur", knee="tibia", ankle="foot", toe="toes", shoulder="humerus", elbow="radius", wrist="wrist")
+    expected = {f"{side}_{part}": side[0] + name for side in SIDES.values() for part, name in parts.items()}
+    assert roles == expected | dict(pelvis="root", chest="upperback", neck="lowerneck", head="head")
+    person = seen(motion)
+    assert 1.2 < person.points["head"][:, 2].max() < 1.7 and (person.pelvis[:, 2, 2] > 0.9).all()
+    assert (person.points["left_hip"] - person.points["right_hip"] > 0.1)[:, 1].all()
