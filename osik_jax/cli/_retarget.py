@@ -108,7 +108,7 @@ class Retarget:
         from rich.console import Console
         from rich.markup import escape
 
-        from ..retargeting._command import retarget_to_folder
+        from ..retargeting._command import write_folder
 
         console = Console()
         with told():
@@ -116,15 +116,9 @@ class Retarget:
             retargeter, page = _retargeter(self), _page(self)
             mapping = _mapping(self.mapping)
             console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
-            _, figures = retarget_to_folder(
-                retargeter,
-                motion,
-                self.out,
-                mapping=mapping,
-                fps=self.fps,
-                animation=self.animation,
-                **page,
-            )
+            self.out.mkdir(parents=True, exist_ok=True)
+            result = retargeter.retarget(motion, mapping=mapping, fps=self.fps)
+            figures = write_folder(result, motion.name, self.out, animation=self.animation, **page)
         _print_retargeted(console, figures, self)
         return 0
 

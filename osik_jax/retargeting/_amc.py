@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError
-from ._motion import HumanMotion
+from ._motion import HumanMotion, finite_numbers
 from ._rotations import UNTURNED, continuous, forward
 
 # an inch [m]; an ASF unit is an inch over the file's ``length``
@@ -78,16 +78,6 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     return [(number, words) for number, words in rows if words]
 
 
-def _numbers(path: Path, number: int, words: list[str]) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = [np.nan]
-    if not np.isfinite(values).all():
-        raise OsikValueError(f"{path}, line {number}: not finite numbers: {' '.join(words)[:60]}")
-    return values
-
-
 def _read_asf(path: Path) -> tuple[dict[str, _Bone], float, bool]:
     """Return the bones (parents first), the length of one file unit [m], and whether angles are in degrees."""
     bones, section, children = {"root": _Bone("root")}, "", []
@@ -97,25 +87,25 @@ def _read_asf(path: Path) -> tuple[dict[str, _Bone], float, bool]:
         if key.startswith(":"):
             section = key
         elif section == ":units" and key == "length":
-            scale = _INCH / _numbers(path, number, rest[:1])[0]
+            scale = _INCH / finite_numbers(path, number, rest[:1])[0]
         elif section == ":units" and key == "angle":
             degrees = rest[:1] != ["rad"]
         elif section == ":root" and key == "order":
             bones["root"].dofs = tuple(word.lower() for word in rest)
         elif section == ":root" and key == "position":
-            bones["root"].offset = np.array(_numbers(path, number, rest[:3]))
+            bones["root"].offset = np.array(finite_numbers(path, number, rest[:3]))
         elif section == ":root" and key == "orientation":
-            bones["root"].axes = Rotation.from_euler("xyz", _numbers(path, number, rest[:3]), degrees=degrees)
+            bones["root"].axes = Rotation.from_euler("xyz", finite_numbers(path, number, rest[:3]), degrees=degrees)
         elif section == ":bonedata" and key == "name":
             name = rest[0]
             bones[name] = _Bone(name)
         elif section == ":bonedata" and key == "direction":
-            along = np.array(_numbers(path, number, rest[:3]))
+            along = np.array(finite_numbers(path, number, rest[:3]))
         elif section == ":bonedata" and key == "length":
-            length = _numbers(path, number, rest[:1])[0]
+            length = finite_numbers(path, number, rest[:1])[0]
         elif section == ":bonedata" and key == "axis":
             order = rest[3].lower() if len(rest) > 3 else "xyz"
-            bones[name].axes = Rotation.from_euler(order, _numbers(path, number, rest[:3]), degrees=degrees)
+            bones[name].axes = Rotation.from_euler(order, finite_numbers(path, number, rest[:3]), degrees=degrees)
         elif section == ":bonedata" and key == "dof":
             bones[name].dofs = tuple(word.lower() for word in rest)
         elif section == ":bonedata" and key == "end":
@@ -149,7 +139,7 @@ def _read_frames(path: Path, bones: dict[str, _Bone]) -> list[dict[str, list[flo
                 f"{path}, line {number}: {words[0]} with {len(words) - 1} numbers is not expected here"
             )
         else:
-            frames[-1][words[0]] = _numbers(path, number, words[1:])
+            frames[-1][words[0]] = finite_numbers(path, number, words[1:])
     for number, frame in enumerate(frames, 1):
         missing = [name for name in moving if name not in frame]
         if missing:

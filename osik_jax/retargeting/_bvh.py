@@ -52,20 +52,8 @@ def read_bvh(
     rotations 0 and the root at the origin; None if nobody stands in it, as in files with all bones along one axis.
     Facing z with y up becomes facing x with z up.
 
-    Args:
-        path: the file.
-        unit: length of one file unit [m], or ``"m"``, ``"cm"``, ``"mm"``, ``"inch"``, ``"cmu"``. None: the one of
-            these in which the rest pose is 1 to 2.3 m large. If nobody stands in the rest pose, the path from a foot
-            to the head along the joints counts instead.
-        up: the file's axis that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. None: the axis
-            along which the person stands in the motion, else that of the rest pose, else y. An ``OsikWarning`` is given
-            if the motion and the rest pose disagree.
-        trim: leave out rest-pose frames at the start of the clip (``rest_frames``), with an ``OsikWarning``.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: the file is broken; the message says which line and what is wrong. Or the unit cannot be told.
-        KeyError: no such unit.
+    ``unit``, ``up``, ``trim`` and errors are those of ``load_motion``. If nobody stands in the rest pose, the
+    length of the joints from a foot to the head gives the unit.
     """
     source, up = str(path), checked_up(up)
     lines = Lines(source, _text(Path(path)))

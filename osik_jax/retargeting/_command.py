@@ -1,4 +1,4 @@
-"""Implementation of ``osik retarget`` for one clip, and of ``osik retarget --fit`` for a folder of clips."""
+"""Files of ``osik retarget``, and the implementation of ``osik retarget --fit`` for a folder of clips."""
 
 from __future__ import annotations
 
@@ -11,46 +11,18 @@ from ..robot import Robot
 from ._film import film
 from ._fit import Fit, fit
 from ._load import Reader, clips_in
-from ._motion import HumanMotion
 from ._page import write_report
 from ._profile import Profile
 from ._profile_file import save_profile
 from ._report import report
-from ._retarget import Retargeter
 from ._retargeted import Retargeted
 from ._robot_motion import write_csv
-from ._source_motion import SourceMotion
 
 if TYPE_CHECKING:
     from ..viewer._look import Look
 
 _HELD_OUT = 4
 """Every fourth clip is held out of a fit: it selects the step that is kept but not its direction."""
-
-
-def retarget_to_folder(
-    retargeter: Retargeter,
-    motion: HumanMotion | SourceMotion,
-    out: Path,
-    *,
-    mapping: dict[str, str] | None,
-    fps: float | None,
-    animation: bool,
-    page: bool = False,
-    look: Look | None = None,
-) -> tuple[Retargeted, dict[str, Any]]:
-    """Retarget a clip and write motion (.npz and .csv), report, profile and optionally a GIF and a page to a folder.
-
-    Returns:
-        the retargeted motion and its report.
-
-    Raises:
-        OSError: the folder cannot be written to.
-        ValueError, KeyError: as of ``retarget``.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    result = retargeter.retarget(motion, mapping=mapping, fps=fps)
-    return result, write_folder(result, motion.name, out, animation=animation, page=page, look=look)
 
 
 def fit_to_file(
@@ -90,7 +62,7 @@ def fit_to_file(
 def write_folder(
     result: Retargeted, name: str, out: Path, *, animation: bool, page: bool = False, look: Look | None = None
 ) -> dict[str, Any]:
-    """Write the files of ``retarget_to_folder`` and return the report; ``look`` is that of the page."""
+    """Write motion (.npz and .csv), report, profile and optionally GIF and page (with ``look``); return the report."""
     figures = {"clip": name, **report(result)}
     write_motion(result, figures, out, page, look)
     save_profile(result.profile, out / "profile.toml")

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ._retargeted import Retargeted
+from ._robot_motion import in_model
 from ._roles import bones
 
 _AZIMUTH, _ELEVATION = np.radians(50.0), np.radians(12.0)
@@ -67,11 +68,10 @@ def _robot_sticks(result: Retargeted) -> Float[np.ndarray, "F k 2 3"]:
     """Return the segment from each moving body to its parent, by MuJoCo's kinematics [m]."""
     model = result.robot.mj_model
     data, sticks = mujoco.MjData(model), []
-    index, coefficient = result.robot.tree.qpos_source
     children = [b for b in range(1, model.nbody) if model.body_parentid[b] != 0]
     parents = [model.body_parentid[b] for b in children]
-    for q in result.q:
-        data.qpos[:] = q[index] * coefficient + np.asarray(result.robot.qpos_offset)
+    for qpos in in_model(result.robot, result.q):
+        data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         sticks.append(np.stack([data.xpos[children], data.xpos[parents]], 1))
     return np.array(sticks)

@@ -34,14 +34,7 @@ def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> Hum
     A ``.npz`` with ``poses`` and ``trans`` is read as in AMASS (SMPL, SMPL-H or SMPL-X). A ``.csv`` that starts with
     ``Format Version`` is read as an export of OptiTrack Motive, whose default is y up.
 
-    Args:
-        path: the file.
-        up: the file's axis that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. None: z, unless
-            the person stands along another axis; an ``OsikWarning`` reports that.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: the file is broken; the message says which array, or which line and column, and what is wrong.
+    ``up`` and errors are those of ``load_motion``.
     """
     up, source = checked_up(up), Path(path)
     if str(path).lower().endswith(".csv"):
@@ -52,12 +45,7 @@ def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> Hum
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a ``.npz`` file that have a use (``arrays_to_read``); nothing is unpickled.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: it is none, or holds objects.
-    """
+    """Return the arrays of a ``.npz`` file that have a use (``arrays_to_read``); nothing is unpickled."""
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")
     with open_npz(path) as data:

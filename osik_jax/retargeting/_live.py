@@ -108,10 +108,8 @@ class LiveRetargeter(OnRobot):
         robot: with limbs of a person, see ``guess_profile``; z up at home.
         standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
             height and floor.
-        profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
         mapping: role to joint name of the stream, see ``find_roles``. None: by common names.
-        acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
-        balance: as of ``Retargeter``.
+        profile, acceleration, balance: as of ``Retargeter``.
         look_ahead: delay of the robot behind the person, one frame to 2 s [s].
         iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
         budget: computing time per frame [s]. An iteration that would exceed it is not started, except the first five

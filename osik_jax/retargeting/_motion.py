@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -135,14 +136,11 @@ class HumanMotion:
         if check_rate(fps) == self.fps or self.frames == 1:
             return dataclasses.replace(self, fps=float(fps))
         before, part = instants(self.frames, self.fps, fps)
-        rotations, contact = self.rotations, self.contact
+        rotations, nearer = self.rotations, before + (part >= 0.5)
         if rotations is not None:
             share = np.broadcast_to(part[:, None], (len(part), rotations.shape[1]))
             rotations = continuous(slerp(rotations[before], rotations[before + 1], share))
-        if contact is not None:
-            contact = np.where((part < 0.5)[:, None], contact[before], contact[before + 1])
         low, high = self.positions[before], self.positions[before + 1]
-        nearer = np.where(part < 0.5, before, before + 1)
         objects = {}
         for name, poses in self.objects.items():
             at = poses[before, :3] + part[:, None] * (poses[before + 1, :3] - poses[before, :3])
@@ -154,7 +152,7 @@ class HumanMotion:
             fps=float(fps),
             positions=low + part[:, None, None] * (high - low),
             rotations=rotations,
-            contact=contact,
+            contact=None if self.contact is None else self.contact[nearer],
         )
 
 
@@ -163,6 +161,17 @@ def check_rate(fps: float) -> float:
     if not (np.isfinite(fps) and fps > 0.0):
         raise OsikValueError(f"fps is {fps}; it is frames a second, more than 0")
     return fps
+
+
+def finite_numbers(path: Path, number: int, words: list[str]) -> list[float]:
+    """Return words of a line of a file as numbers, or raise ValueError that names the line."""
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = [np.nan]
+    if not np.isfinite(values).all():
+        raise OsikValueError(f"{path}, line {number}: not finite numbers: {' '.join(words)[:60]}")
+    return values
 
 
 def instants(frames: int, fps: float, wanted: float) -> tuple[np.ndarray, np.ndarray]:

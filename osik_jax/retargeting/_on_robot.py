@@ -26,11 +26,7 @@ ACCELERATION = 240.0
 class OnRobot:
     """Robot with profile, limits and derived data, computed once for all clips.
 
-    Args:
-        robot: the robot.
-        profile: the robot's profile. None: a bundled one or a guess (``find_profile``).
-        acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
-        balance: as of ``Retargeter``.
+    Arguments are those of ``Retargeter``.
 
     Attributes:
         robot: the robot, with its home turned to face x if necessary.

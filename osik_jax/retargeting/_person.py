@@ -315,15 +315,13 @@ def _with_soles(
 
 
 def _toes(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
-    return {} if f"{side}_toe" in points else {f"{side}_toe": _toe(points, side)}
-
-
-def _toe(points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
-    """Return a toe below and in front of the ankle, at right angles to the shank, sized after the shank [m]. (F, 3)."""
+    """Return a missing toe: below and in front of the ankle, at right angles to the shank and sized after it [m]."""
+    if f"{side}_toe" in points:
+        return {}
     shank = points[f"{side}_ankle"] - points[f"{side}_knee"]
     forward = _cross(points["left_hip"] - points["right_hip"], -shank)
     length = np.linalg.norm(shank, axis=-1, keepdims=True)
-    return points[f"{side}_ankle"] + length * (_TOE * unit(forward) + _SOLE * unit(shank))
+    return {f"{side}_toe": points[f"{side}_ankle"] + length * (_TOE * unit(forward) + _SOLE * unit(shank))}
 
 
 def _flat(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:

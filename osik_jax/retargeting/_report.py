@@ -17,6 +17,7 @@ from ._notes import notes
 from ._places import Places, find_places
 from ._profile import Profile
 from ._retargeted import Retargeted
+from ._robot_motion import in_model
 from ._roles import CHAINS, SIDES
 
 JUMP = 15.0
@@ -35,7 +36,7 @@ def report(result: Retargeted) -> dict[str, Any]:
     ``touches``: distance of joints from their place on what they hold. ``notes``: sentences on violated bounds and on
     clips whose feet stand in less than 20 % of the frames.
     """
-    places = find_places(result.robot, result.profile, _in_model(result))
+    places = find_places(result.robot, result.profile, in_model(result.robot, result.q))
     figures = {
         "frames": len(result.q),
         "fps": result.motion.fps,
@@ -49,12 +50,6 @@ def report(result: Retargeted) -> dict[str, Any]:
         "touches": {"off_mm_max": _off_touch(result, places.keypoints)},
     }
     return {**figures, "notes": notes(figures)}
-
-
-def _in_model(result: Retargeted) -> Float[np.ndarray, "F nq"]:
-    """Return the motion as configurations of the robot's MuJoCo model. (F, nq of the model)."""
-    index, coefficient = result.robot.tree.qpos_source
-    return result.q[:, index] * coefficient + np.asarray(result.robot.qpos_offset)
 
 
 def _joints(result: Retargeted) -> dict[str, Any]:

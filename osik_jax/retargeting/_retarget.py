@@ -240,14 +240,9 @@ def retarget(
     Args:
         robot: robot with limbs of a person (``guess_profile``), z up at home.
         motion: clip of a person, or of another robot (``SourceMotion``).
-        profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
         mapping: role to joint name of the clip, see ``find_roles``. None: by common names.
         fps: frame rate of the result [1/s]; None: that of the clip.
-        acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
-        smoothness: time below which motion is smoothed out [s]; 0: none (see ``Retargeter``).
-        balance: margin of the centre of mass inside the support polygon in double support [m]; None: not bounded (see
-            ``Retargeter``).
-        max_iterations: largest number of iterations of the plan.
+        profile, acceleration, smoothness, balance, max_iterations: as of ``Retargeter``.
 
     Raises:
         ValueError: the clip has fewer than three frames or lacks a needed joint, or the robot has no limbs of a

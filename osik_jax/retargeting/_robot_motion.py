@@ -14,7 +14,7 @@ from .._errors import OsikValueError
 from ..robot import Robot
 from ..robot._tree import FREE
 from ._keypoints import load_arrays
-from ._motion import check_rate, instants
+from ._motion import check_rate, finite_numbers, instants
 from ._rotations import slerp
 
 
@@ -75,9 +75,7 @@ class RobotMotion:
         qpos = low + part[:, None] * (high - low)
         if self.is_free:
             qpos[:, 3:7] = slerp(low[:, 3:7], high[:, 3:7], part)
-        contact = self.contact
-        if contact is not None:
-            contact = np.where((part < 0.5)[:, None], contact[before], contact[before + 1])
+        contact = None if self.contact is None else self.contact[before + (part >= 0.5)]
         return RobotMotion(float(fps), self.joint_names, qpos, contact)
 
 
@@ -87,11 +85,15 @@ def joints_in_mujoco_order(robot: Robot) -> tuple[str, ...]:
     return tuple(name for name, kind in zip(tree.joint_names, tree.joint_types, strict=True) if kind != FREE)
 
 
+def in_model(robot: Robot, q: Float[np.ndarray, "F nq"]) -> Float[np.ndarray, "F full"]:
+    """Return configurations of the robot's MuJoCo model, with locked and coupled joints."""
+    index, coefficient = robot.tree.qpos_source
+    return q[:, index] * coefficient + np.asarray(robot.qpos_offset)
+
+
 def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
     """Return a motion with all joints of the robot's model, locked and coupled joints included."""
-    tree = robot.tree
-    index, coefficient = tree.qpos_source
-    qpos = q[:, index] * coefficient + np.asarray(robot.qpos_offset)
+    tree, qpos = robot.tree, in_model(robot, q)
     joints = [int(tree.full_qpos_address[j]) for j, kind in enumerate(tree.joint_types) if kind != FREE]
     return RobotMotion(float(fps), joints_in_mujoco_order(robot), qpos[:, [*base_columns(robot), *joints]])
 
@@ -129,7 +131,8 @@ def load_robot_motion(
         raise OsikValueError(f"{source}: a CSV holds numbers alone; say joint_names and fps")
     if not source.is_file():
         raise FileNotFoundError(f"no such file: {source}")
-    rows = [_numbers(source, number, line) for number, line in enumerate(source.read_text().splitlines(), 1) if line]
+    lines = enumerate(source.read_text().splitlines(), 1)
+    rows = [finite_numbers(source, number, line.split(",")) for number, line in lines if line]
     joints = len(joint_names)
     fixed = bool(rows) and len(rows[0]) == joints
     ragged = [number for number, row in enumerate(rows, 1) if len(row) != joints + 7 * (not fixed)]
@@ -145,10 +148,3 @@ def write_csv(motion: RobotMotion, path: str | os.PathLike[str]) -> None:
     base = [0, 1, 2, 4, 5, 6, 3] if motion.is_free else []
     columns = [*base, *range(len(base), motion.qpos.shape[1])]
     np.savetxt(path, motion.qpos[:, columns], fmt="%.9g", delimiter=",")
-
-
-def _numbers(path: Path, number: int, line: str) -> list[float]:
-    try:
-        return [float(word) for word in line.split(",")]
-    except ValueError:
-        raise OsikValueError(f"{path}, line {number}: not numbers between commas: {line[:60]!r}") from None

@@ -168,11 +168,7 @@ def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMo
 
 
 def checked_up(up: str | None) -> Up | None:
-    """Return a given axis, or raise ValueError if there is no such axis.
-
-    Raises:
-        ValueError: no such axis.
-    """
+    """Return a given axis, or raise ValueError if there is no such axis."""
     if up is not None and up not in UPS:
         raise OsikValueError(f"up is {up!r}; it is one of {', '.join(UPS)}")
     return up
