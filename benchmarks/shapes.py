@@ -137,7 +137,7 @@ class Judge:
     def _overlaps(self) -> dict[tuple[int, int], float]:
         """Depth [m] by pair of bodies with ``APART`` joints or more between them."""
         out: dict[tuple[int, int], float] = {}
-        for contact in self.data.contact[: self.data.ncon]:
+        for contact in (self.data.contact[k] for k in range(self.data.ncon)):
             a, b = sorted(int(self.model.body_weldid[self.model.geom_bodyid[geom]]) for geom in contact.geom)
             if contact.dist < 0.0 and a != b and self._joints_between(a, b) >= APART:
                 out[a, b] = max(out.get((a, b), 0.0), -float(contact.dist))
@@ -153,13 +153,11 @@ class Judge:
 
     def _corners(self) -> np.ndarray:
         """Lowest points of the soles' corners: heel and toe of two feet, all of one on four. (4, corners, 3)."""
-        rows = []
-        for name in sorted(self.profile.feet):
-            foot = self.profile.feet[name]
-            heel, toe = ([self.place(foot.frame, p) for p in part] for part in (foot.heel, foot.toe))
-            rows += [heel, toe] if len(self.profile.feet) == 2 else [[*heel, *toe]]
-            for row in rows[-2:] if len(self.profile.feet) == 2 else rows[-1:]:
-                row[:] = [at - [0.0, 0.0, foot.radius] for at in row]
+        rows, feet = [], self.profile.feet
+        for foot in (feet[name] for name in sorted(feet)):
+            down = np.array([0.0, 0.0, foot.radius])
+            heel, toe = ([self.place(foot.frame, p) - down for p in part] for part in (foot.heel, foot.toe))
+            rows += [heel, toe] if len(feet) == 2 else [[*heel, *toe]]
         return np.array(rows)
 
     def _angle(self, limb: tuple[str, str], human: dict[str, np.ndarray], frame: int) -> float:
@@ -227,8 +225,8 @@ def judged(source: Source, people: list[HumanMotion], dogs: list[HumanMotion]) -
         profile = retargeter.profile
         judge = Judge(source, profile, robot.floating_base)
         clips = grasps() if profile.is_hand else dogs if len(profile.feet) == 4 and profile.walks else people
-        for motion in clips:
-            yield motion.name, judge.figures(retargeter.retarget(motion))
+        for motion, result in zip(clips, retargeter.retarget_all(clips, progress=False), strict=True):
+            yield motion.name, judge.figures(result)
 
 
 def main() -> int:
