@@ -85,7 +85,7 @@ class Fingertips:
 
     def __init__(self, urdf: str, profile: Profile):
         spec = mujoco.MjSpec.from_string(urdf)
-        spec.compiler.fusestatic = False
+        spec.compiler.fusestatic, spec.compiler.balanceinertia = False, True
         self.model, self.profile = spec.compile(), profile
         self.data = mujoco.MjData(self.model)
         self.tips = [role for role in profile.keypoints if role.endswith("_4")]

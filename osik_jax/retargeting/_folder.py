@@ -28,7 +28,7 @@ from ._report import report
 from ._retarget import Retargeter, Source
 
 if TYPE_CHECKING:
-    from ..viewer import Look
+    from ..viewer._look import Look
 
 FIGURES = {
     "off_plan_rad": ("off_plan_rad",),
