@@ -72,6 +72,7 @@ def call(
     shared: int,
     per_block: int = 1,
     warps: int = 1,
+    lanes_last: Sequence[bool] = (),
 ) -> list[Array]:
     """Launch a compiled kernel named ``osik_kernel`` through XLA.
 
@@ -83,6 +84,7 @@ def call(
         shared: bytes of shared memory that one problem takes.
         per_block: how many problems a block solves.
         warps: how many warps of 32 threads a block has.
+        lanes_last: for the inputs and then the results, whether the leading axis is the fastest in memory. Default: no.
 
     Returns:
         The results.
@@ -92,8 +94,94 @@ def call(
     key = hashlib.sha256(source.encode()).hexdigest()[:24]
     numbers = dict(problems=problems, per_block=per_block, threads=32 * warps, shared=shared)
     with jax.enable_x64(True):
-        run = jax.ffi.ffi_call("osik_cuda", shapes)
+        arrays, count = (*inputs, *shapes), len(inputs)
+        orders = [_order(a.ndim, last) for a, last in zip(arrays, lanes_last or [False] * len(arrays), strict=True)]
+        run = jax.ffi.ffi_call("osik_cuda", shapes, input_layouts=orders[:count], output_layouts=orders[count:])
         return list(run(*inputs, source=source, key=key, **{name: np.int32(n) for name, n in numbers.items()}))
+
+
+def call_lanes(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any) -> list[Array]:
+    """Call a method of ``core/kinematic_calls.hpp`` on a GPU, with one thread for each lane.
+
+    Args:
+        method: name of its handler on a CPU without "osik_".
+        outputs: shape and type of each result, as for ``_library.call``; all are floats.
+        inputs: floats of one precision with a leading axis of lanes, or of length 1; flat arrays of integers.
+
+    Returns:
+        The results, in the precision of the inputs.
+    """
+    arrays = [jnp.asarray(a) for a in inputs]
+    real = next(a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating))
+    arrays = [a.astype(real if jnp.issubdtype(a.dtype, jnp.floating) else jnp.int32) for a in arrays]
+    lanes = outputs[0][0][0]
+    given = tuple((2 if len(a) > 1 else 1, *a.shape[1:]) if _is_real(a) else a.shape for a in arrays)
+    integers = tuple(k for k, a in enumerate(arrays) if not _is_real(a))
+    source = _lanes_source(method, real == jnp.float32, given, integers, tuple(shape[1:] for shape, _ in outputs))
+    shapes, last = [(shape, real) for shape, _ in outputs], [_is_real(a) and len(a) > 1 for a in arrays]
+    last += [lanes > 1] * len(shapes)
+    return call(source, shapes, *arrays, problems=lanes, shared=0, per_block=64, warps=2, lanes_last=last)
+
+
+_METHODS = {
+    "kinematics": "place",
+    "moving_frames": "move_frames",
+    "center_of_mass": "move_centers",
+    "center_rows": "find_center_rows",
+    "pose_rows": "find_pose_rows",
+}
+
+
+@cache
+def _lanes_source(
+    method: str,
+    single: bool,
+    given: tuple[tuple[int, ...], ...],
+    integers: tuple[int, ...],
+    results: tuple[tuple[int, ...], ...],
+) -> str:
+    """Return CUDA text that runs a method for one lane a thread.
+
+    Args:
+        method: as in ``call_lanes``.
+        single: whether floats are of single precision.
+        given: shape of each argument; the leading axis of floats is 1 if all lanes share it.
+        integers: which arguments are integers.
+        results: shape of each result without the axis of lanes.
+    """
+
+    def table(name: str, shapes: Sequence[tuple[int, ...]]) -> str:
+        rows = ", ".join("{" + ", ".join(map(str, shape)) + "}" for shape in shapes)
+        head = f"static constexpr int {name}(int k, int axis)"
+        return f"{head} {{ constexpr int sizes[][4] = {{{rows}}}; return sizes[k][axis]; }}\n"
+
+    def names(letter: str, count: int) -> str:
+        return ", ".join(f"{letter}{k}" for k in range(count))
+
+    parameters = [f"const {'int' if k in integers else 'Real'}* a{k}" for k in range(len(given))]
+    parameters += [f"Real* r{k}" for k in range(len(results))]
+    widest = max(shape[-1] for shape in results if shape)
+    space = max(4 * given[0][1], 3 * widest)  # of the centre of mass: numbers of bodies, and of dofs
+    return (
+        text_of("lanes_cuda.hpp")
+        + f"using namespace osik;\nusing Real = {'float' if single else 'double'};\nstruct Sizes {{\n"
+        + f"static constexpr int SPACE = {space};\n"
+        + table("argument", given)
+        + table("result", [(2, *shape) for shape in results])
+        + f'}};\nextern "C" __global__ void osik_kernel({", ".join(parameters)}, int problems) {{\n'
+        + f"const void* arguments[] = {{{names('a', len(given))}}};\n"
+        + f"void* results[] = {{{names('r', len(results))}}};\n"
+        + f"{_METHODS[method]}(ThreadCall<Real, Sizes>{{arguments, results, problems}});\n}}\n"
+    )
+
+
+def _is_real(a: Any) -> bool:
+    return jnp.issubdtype(a.dtype, jnp.floating)
+
+
+def _order(axes: int, lanes_last: bool) -> tuple[int, ...]:
+    """Return the axes of an array from the slowest in memory to the fastest."""
+    return (*range(1, axes), 0) if lanes_last else tuple(range(axes))
 
 
 def problems_of_a_block(problems: int) -> int:

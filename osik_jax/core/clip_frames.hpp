@@ -114,9 +114,9 @@ template <class Team> struct ClipFrames {
   void place(const double* q) {
     const R::Counts& c = robot.c;
     for (int i = 0; i < c.values; ++i) value[i] = robot.coefficient[i] * q[robot.source[i]] + robot.offset[i];
-    const Tree<double> tree{c.bodies, c.joints, c.full, robot.parents, robot.types, robot.owners, robot.reference,
+    const Tree<const double*> tree{c.bodies, c.joints, c.full, robot.parents, robot.types, robot.owners, robot.reference,
                             robot.body_position, robot.body_quaternion, robot.joint_position, robot.joint_axis};
-    place_bodies(tree, value, Placed<double>{position, rotation, linear, angular, anchor});
+    place_bodies(tree, value, Placed<double*>{position, rotation, linear, angular, anchor});
     for (int dof = 0; dof < c.full; ++dof) {
       const V turn = V::of(angular + 3 * dof);
       const V speed = V::of(linear + 3 * dof) + cross(V::of(anchor + 3 * dof) - root(), turn);

@@ -9,29 +9,31 @@ namespace osik {
 
 enum JointType { FREE_JOINT = 0, BALL_JOINT = 1, SLIDE_JOINT = 2, HINGE_JOINT = 3 };  // MuJoCo's
 
-// The robot's kinematic tree.
-template <class Real> struct Tree {
+// The robot's kinematic tree. In and Out, here and below: where numbers are, pointers or Strided (lanes_cuda.hpp).
+template <class In> struct Tree {
   int bodies, joints, dofs;                        // dofs: full ones
   const int *parents, *types, *owners;             // [bodies]; [joints] type and body; joints of a body are neighbours
-  const Real *reference;                           // [full nq] configuration at which bodies are where they are described
-  const Real *position, *quaternion;               // [bodies, 3], [bodies, 4] of each body in its parent
-  const Real *joint_position, *joint_axis;         // [joints, 3] in the joint's body
+  In reference;                                    // [full nq] configuration at which bodies are where they are described
+  In position, quaternion;                         // [bodies, 3], [bodies, 4] of each body in its parent
+  In joint_position, joint_axis;                   // [joints, 3] in the joint's body
 };
 
 // Where everything is, in world axes.
-template <class Real> struct Placed {
-  Real *position, *rotation;          // [bodies, 3], [bodies, 9]
-  Real *linear, *angular, *anchor;    // [dofs, 3] direction, axis, and a point on the axis of each full dof
+template <class Out> struct Placed {
+  Out position, rotation;          // [bodies, 3], [bodies, 9]
+  Out linear, angular, anchor;     // [dofs, 3] direction, axis, and a point on the axis of each full dof
 };
 
 // Place the bodies at configuration q: [full nq].
-template <class Real> void place_bodies(const Tree<Real>& tree, const Real* q, const Placed<Real>& to) {
+template <class In, class Q, class Out>
+void place_bodies(const Tree<In>& tree, Q q, const Placed<Out>& to) {
+  using Real = NumberAt<Out>;
   using V = Vec3<Real>;
-  using Q = Quaternion<Real>;
+  using Turn = Quaternion<Real>;
   const V zero{0, 0, 0};
   zero.put(to.position), Mat3<Real>::identity().put(to.rotation);
-  const Real* reference = tree.reference;
-  Real *linear = to.linear, *angular = to.angular, *anchor = to.anchor;
+  In reference = tree.reference;
+  Out linear = to.linear, angular = to.angular, anchor = to.anchor;
   auto add_dof = [&](V direction, V axis, V point) {
     direction.put(linear), axis.put(angular), point.put(anchor);
     linear += 3, angular += 3, anchor += 3;
@@ -40,13 +42,13 @@ template <class Real> void place_bodies(const Tree<Real>& tree, const Real* q, c
     const V origin = V::of(to.position + 3 * tree.parents[body]);
     const Mat3<Real> frame = Mat3<Real>::of(to.rotation + 9 * tree.parents[body]);
     V position = V::of(tree.position + 3 * body);
-    Q turn = Q::of(tree.quaternion + 4 * body);
+    Turn turn = Turn::of(tree.quaternion + 4 * body);
     const int first = joint;
-    Real* first_axis = angular;
+    Out first_axis = angular;
     for (; joint < tree.joints && tree.owners[joint] == body; ++joint) {
       const int type = tree.types[joint];
       if (type == FREE_JOINT) {
-        position = V::of(q), turn = Q::of(q + 3).normalized();
+        position = V::of(q), turn = Turn::of(q + 3).normalized();
         const V at = origin + frame * position;
         add_dof({1, 0, 0}, zero, at), add_dof({0, 1, 0}, zero, at), add_dof({0, 0, 1}, zero, at);
         for (int k = 0; k < 3; ++k) add_dof(zero, zero, at);
@@ -56,19 +58,20 @@ template <class Real> void place_bodies(const Tree<Real>& tree, const Real* q, c
       const V fixed = V::of(tree.joint_position + 3 * joint), given = V::of(tree.joint_axis + 3 * joint);
       const V own = turn.carry(fixed) + position, axis = turn.carry(given), at = origin + frame * own;
       if (type == BALL_JOINT) {
-        turn = turn * Q::of(q).normalized();
+        turn = turn * Turn::of(q).normalized();
         position = own - turn.carry(fixed);
         for (int k = 0; k < 3; ++k) add_dof(zero, zero, at);
         q += 4, reference += 4;
         continue;
       }
-      const Real displacement = *q++ - *reference++;
+      const Real displacement = q[0] - reference[0];
+      q += 1, reference += 1;
       if (type == SLIDE_JOINT) {
         position = position + displacement * axis;
         add_dof(frame * axis, zero, at);
       } else {
         const Real half = Real(0.5) * displacement, sine = sin(half);
-        turn = turn * Q{Real(cos(half)), sine * given.x, sine * given.y, sine * given.z};
+        turn = turn * Turn{Real(cos(half)), sine * given.x, sine * given.y, sine * given.z};
         position = own - turn.carry(fixed);
         add_dof(zero, frame * axis, at);
       }
@@ -87,38 +90,42 @@ template <class Real> void place_bodies(const Tree<Real>& tree, const Real* q, c
 }
 
 // What each full dof does to the velocity: its column of v, -1 for none, and the factor.
-template <class Real> struct DofColumns {
+template <class In> struct DofColumns {
   int dofs, nv;
-  const int* column;   // [dofs]
-  const Real* factor;  // [dofs]
+  const int* column;  // [dofs]
+  In factor;          // [dofs]
 };
 
 // A point and a frame that go along with a body, and the Jacobian J [6, nv] of the point: rows [linear; angular].
 // body_position: [3], body_rotation: [9]; offset: [3] and turn: [9] of the frame in its body; moved: [dofs] flags
-template <class Real>
-void move_frame(const DofColumns<Real>& d, const Placed<Real>& placed, int body, const Real* offset, const Real* turn,
-                const int* moved, Real* position, Real* rotation, Real* J) {
+template <class In, class From, class Out>
+void move_frame(const DofColumns<In>& d, const Placed<From>& placed, int body, In offset, In turn, const int* moved,
+                Out position, Out rotation, Out J) {
+  using Real = NumberAt<Out>;
   using V = Vec3<Real>;
   const Mat3<Real> carrier = Mat3<Real>::of(placed.rotation + 9 * body);
   const V at = V::of(placed.position + 3 * body) + carrier * V::of(offset);
   at.put(position), (carrier * Mat3<Real>::of(turn)).put(rotation);
-  for (int e = 0; e < 6 * d.nv; ++e) J[e] = 0;
+  const bool alone = d.dofs == d.nv;  // each dof has a column of its own
+  for (int e = 0; e < 6 * d.nv && !alone; ++e) J[e] = 0;
   for (int dof = 0; dof < d.dofs; ++dof) {
     const int column = d.column[dof];
-    if (column < 0 || !moved[dof]) continue;
+    if (column < 0 || !(moved[dof] || alone)) continue;
     const V axis = V::of(placed.angular + 3 * dof);
     const V speed = V::of(placed.linear + 3 * dof) + cross(axis, at - V::of(placed.anchor + 3 * dof));
     const Real factor = d.factor[dof];
-    Real* to = J + column;
-    for (Real v : {speed.x, speed.y, speed.z, axis.x, axis.y, axis.z}) *to += factor * v, to += d.nv;
+    Out to = J + column;
+    auto add = [&](Real v) { to[0] = alone ? (moved[dof] ? factor * v : Real(0)) : to[0] + factor * v, to += d.nv; };
+    add(speed.x), add(speed.y), add(speed.z), add(axis.x), add(axis.y), add(axis.z);
   }
 }
 
 // The centre of mass and its Jacobian J [3, nv]: the mass that each dof moves, at its centre, over the whole mass.
 // mass: [bodies], center: [bodies, 3] in the body; owner: [dofs] body of each full dof; below: [bodies, 4] space
-template <class Real>
-void move_center(const DofColumns<Real>& d, const Placed<Real>& placed, int bodies, const int* parents, const int* owner,
-                 const Real* mass, const Real* center, Real* below, Real* point, Real* J) {
+template <class In, class From, class Mass, class Out>
+void move_center(const DofColumns<In>& d, const Placed<From>& placed, int bodies, const int* parents, const int* owner,
+                 Mass mass, In center, NumberAt<Out>* below, Out point, Out J) {
+  using Real = NumberAt<Out>;
   using V = Vec3<Real>;
   for (int body = 0; body < bodies; ++body) {
     const V at = V::of(placed.position + 3 * body) + Mat3<Real>::of(placed.rotation + 9 * body) * V::of(center + 3 * body);

@@ -1,4 +1,4 @@
-// Vectors, rotations and quaternions (w, x, y, z) of one thread.
+// Vectors, rotations and quaternions (w, x, y, z) of one thread. At: where numbers are, a pointer or Strided (lanes_cuda.hpp).
 #pragma once
 #include <cmath>
 
@@ -9,8 +9,8 @@ namespace osik {
 
 template <class Real> struct Vec3 {
   Real x, y, z;
-  OSIK_FN static Vec3 of(const Real* a) { return {a[0], a[1], a[2]}; }
-  OSIK_FN void put(Real* a) const { a[0] = x, a[1] = y, a[2] = z; }
+  template <class At> OSIK_FN static Vec3 of(At a) { return {a[0], a[1], a[2]}; }
+  template <class At> OSIK_FN void put(At a) const { a[0] = x, a[1] = y, a[2] = z; }
   OSIK_FN Vec3 operator+(Vec3 b) const { return {x + b.x, y + b.y, z + b.z}; }
   OSIK_FN Vec3 operator-(Vec3 b) const { return {x - b.x, y - b.y, z - b.z}; }
 };
@@ -24,8 +24,8 @@ template <class Real> struct Mat3 {
   using V = Vec3<Real>;
   V a, b, c;  // rows
   OSIK_FN static Mat3 identity() { return {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}; }
-  OSIK_FN static Mat3 of(const Real* m) { return {V::of(m), V::of(m + 3), V::of(m + 6)}; }
-  OSIK_FN void put(Real* m) const { a.put(m), b.put(m + 3), c.put(m + 6); }
+  template <class At> OSIK_FN static Mat3 of(At m) { return {V::of(m), V::of(m + 3), V::of(m + 6)}; }
+  template <class At> OSIK_FN void put(At m) const { a.put(m), b.put(m + 3), c.put(m + 6); }
   OSIK_FN Mat3 transposed() const { return {{a.x, b.x, c.x}, {a.y, b.y, c.y}, {a.z, b.z, c.z}}; }
   OSIK_FN V operator*(V v) const { return {inner(a, v), inner(b, v), inner(c, v)}; }
   OSIK_FN Mat3 operator*(const Mat3& m) const {
@@ -37,7 +37,7 @@ template <class Real> struct Mat3 {
 template <class Real> struct Quaternion {
   using V = Vec3<Real>;
   Real w, x, y, z;
-  OSIK_FN static Quaternion of(const Real* a) { return {a[0], a[1], a[2], a[3]}; }
+  template <class At> OSIK_FN static Quaternion of(At a) { return {a[0], a[1], a[2], a[3]}; }
   OSIK_FN V vector() const { return {x, y, z}; }
   OSIK_FN Quaternion operator*(const Quaternion& q) const {
     const V v = w * q.vector() + q.w * vector() + cross(vector(), q.vector());

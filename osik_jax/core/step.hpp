@@ -69,7 +69,7 @@ class Step {
     int kind, m, first, out, level, bounded, diagonal;  // out: of its slack and error; diagonal: equality of single dofs
     bool valid;
     const int *leaves, *options;                        // gain, weight, target velocity, bounds, then those of its kind
-    Rows<double> rows;
+    Rows<double*> rows;
     double* weight;
   };
   struct Place {  // of a leaf
@@ -81,8 +81,8 @@ class Step {
   StepSizes s;
   std::vector<int> layout;
   std::vector<Task> tasks;
-  Tree<double> tree;
-  DofColumns<double> columns;
+  Tree<const double*> tree;
+  DofColumns<const double*> columns;
   const Place* places;
   const int *of_step, *of_robot;                      // leaves: q, dt, damping, curvature damping, box; those of the robot
   const int *source, *owner, *turning, *scalar;       // [nq] entry of the given q, [dofs] body, [nv], [nv] place in q or -1
@@ -90,7 +90,7 @@ class Step {
   const int *row_counts, *level_of_hard, *row_of_hard;
   Numbers q, poses, J, error, low, high, weight, pull, levers, curvature, frames, below, bounds, parts, lower, upper, low_speed, high_speed, zeros;
   std::vector<int> no_labels;
-  Placed<double> placed;
+  Placed<double*> placed;
   const double* const* arrays;  // of the step at hand
   const double* tolerances;
   double dt, damping, kappa;
@@ -235,7 +235,7 @@ class Step {
     const double own_gain = *leaf(leaves[0]).at, gain = own_gain > 1 / dt ? 1 / dt : own_gain;
     const Leaf weights = leaf(leaves[1]);
     const double* velocity = leaf_or_zeros(leaves[2]);
-    Bounds<double> interval;
+    Bounds<const double*> interval;
     bool takes = true;
     task.valid = fabs(own_gain) <= LARGEST_DOUBLE;
     if (task.bounded) {
@@ -249,7 +249,7 @@ class Step {
     if (task.kind == POSE) {
       const double *position = leaf(leaves[5]).at, *rotation = leaf(leaves[6]).at;
       const int count = options[8];
-      PoseGoal<double> goal{position, rotation, velocity, task.weight, &gain, options + 2, options[0] != 0, options[1] != 0};
+      PoseGoal<const double*> goal{position, rotation, velocity, task.weight, &gain, options + 2, options[0] != 0, options[1] != 0};
       for (int i = 0, row = 0; i < 6; ++i)
         if (goal.kept[i]) task.weight[row] = weights[row] * leaf(leaves[7 + i / 3])[i % 3], ++row;
       task.valid &= all_finite(position, 3) && all_finite(rotation, 9) && all_finite(velocity, 6);
@@ -263,9 +263,9 @@ class Step {
                    jacobian + 6 * nv * f);
       }
       if (count == 2) see_from_root(at, turn, jacobian);
-      if (task.valid) pose_rows(Team(), goal, at, turn, jacobian, nv, task.rows);
+      if (task.valid) pose_rows(goal, at, turn, jacobian, nv, task.rows);
     } else if (task.kind == CENTER) {  // options: whether there is a polygon, axes, whether each body counts
-      CenterGoal<double> goal{m, options + 1, turning, nullptr, velocity, task.weight, &gain};
+      CenterGoal<const double*> goal{m, options + 1, turning, nullptr, velocity, task.weight, &gain};
       for (int i = 0; i < m; ++i) task.weight[i] = weights[i];
       if (options[0]) goal.normals = leaf(leaves[5]).at, takes &= all_finite(goal.normals, 2 * m);
       else if (!task.bounded) goal.target = leaf(leaves[5]).at, task.valid &= all_finite(goal.target, m);
@@ -275,7 +275,7 @@ class Step {
       for (int b = 0; b < s.bodies; ++b) parts[b] = options[1 + m + b] ? own[b] : 0.0;
       move_center(columns, placed, s.bodies, tree.parents, owner, parts.data(), leaf(of_robot[CENTER_OF_MASS]).at,
                   below.data(), frames.data(), frames.data() + 3);
-      if (task.valid) center_rows(Team(), goal, frames.data(), frames.data() + 3, nv, task.rows);
+      if (task.valid) center_rows(goal, frames.data(), frames.data() + 3, nv, task.rows);
     } else {  // options: place in q and dof of each row
       const double* target = task.bounded ? nullptr : leaf(leaves[5]).at;
       task.valid &= (!target || all_finite(target, s.given)) && all_finite(velocity, m);

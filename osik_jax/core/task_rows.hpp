@@ -5,19 +5,19 @@
 namespace osik {
 
 // The rows of one task with m rows; fields of TaskRows (tasks/_task.py). An equality has no upper bounds (null).
-template <class Real> struct Rows {
-  Real *error, *jacobian, *lower, *curvature, *pull, *levers;  // [m], [m, nv], [m], [1], [m], [nv]
-  Real* upper = nullptr;                                       // [m]
+template <class Out> struct Rows {
+  Out error, jacobian, lower, curvature, pull, levers;  // [m], [m, nv], [m], [1], [m], [nv]
+  Out upper{}, squares{};  // [m] and, unless null, the squared length of each row [m]
 };
 
 // An interval of the error, [m] each; null for an equality.
-template <class Real> struct Bounds {
-  const Real *lower = nullptr, *upper = nullptr;
+template <class In> struct Bounds {
+  In lower{}, upper{};
 };
 
 // The bounds on the rate of row i, and its pull: tasks/_task.py, task_rows.
-template <class Real>
-OSIK_FN void ask(const Rows<Real>& to, const Bounds<Real>& bounds, int i, Real error, Real forward, Real gain) {
+template <class Real, class In, class Out>
+OSIK_FN void ask(const Rows<Out>& to, const Bounds<In>& bounds, int i, Real error, Real forward, Real gain) {
   to.error[i] = error;
   if (!bounds.lower) {
     to.pull[i] = gain * error, to.lower[i] = forward - to.pull[i];
@@ -30,12 +30,12 @@ OSIK_FN void ask(const Rows<Real>& to, const Bounds<Real>& bounds, int i, Real e
 }
 
 // The pose that a task asks for, and how.
-template <class Real> struct PoseGoal {
-  const Real *position, *rotation, *velocity;  // [3], [9], [6] of the target, [linear; angular]
-  const Real *weight, *gain;                   // [m] of the rows that are kept, [1]
-  const int* kept;                             // [6] flags
-  bool in_frame, geometric;                    // rows along the frame's axes; without the inverse left Jacobian
-  Bounds<Real> bounds;
+template <class In> struct PoseGoal {
+  In position, rotation, velocity;  // [3], [9], [6] of the target, [linear; angular]
+  In weight, gain;                  // [m] of the rows that are kept, [1]
+  const int* kept;                  // [6] flags
+  bool in_frame, geometric;         // rows along the frame's axes; without the inverse left Jacobian
+  Bounds<In> bounds;
 };
 
 // The Frobenius norm of the matrix with entries pull . (axis_i x arm_j), from the sums of products of axes and of arms:
@@ -57,7 +57,7 @@ template <class Real> Real paired(Vec3<Real> pull, const Real* axes, const Real*
 }
 
 // A bound on the curvature of a pose's error along force and torque on the frame: tasks/_curvature.py, pose_curvature.
-template <class Real> Real pose_curvature(Vec3<Real> force, Vec3<Real> torque, const Real* J, int nv) {
+template <class Real, class In> Real pose_curvature(Vec3<Real> force, Vec3<Real> torque, In J, int nv) {
   Real axes[6] = {}, arms[6] = {};
   auto add = [](Real* sums, Real x, Real y, Real z) {
     sums[0] += x * x, sums[1] += x * y, sums[2] += x * z, sums[3] += y * y, sums[4] += y * z, sums[5] += z * z;
@@ -74,9 +74,9 @@ template <class Real> Real pose_curvature(Vec3<Real> force, Vec3<Real> torque, c
 //
 // The error of the position is p - p*; that of the rotation R is the logarithm e of R R*', or of R*'R in the frame's
 // axes. Its rate is E w: E the inverse left Jacobian of SO(3) at e, w the angular velocity; in the frame's axes E'R' w.
-template <class Team, class Real>
-void pose_rows(const Team& t, const PoseGoal<Real>& goal, const Real* position, const Real* rotation, const Real* J, int nv,
-               const Rows<Real>& to) {
+template <class In, class From, class Out>
+void pose_rows(const PoseGoal<In>& goal, From position, From rotation, From J, int nv, const Rows<Out>& to) {
+  using Real = NumberAt<Out>;
   using V = Vec3<Real>;
   using M = Mat3<Real>;
   const M R = M::of(rotation), own = R.transposed(), wanted = M::of(goal.rotation);
@@ -89,71 +89,75 @@ void pose_rows(const Team& t, const PoseGoal<Real>& goal, const Real* position, 
   const V angular = factor * (goal.in_frame ? target_turn : between * target_turn), distance = outer * offset;
   const Real error[6] = {distance.x, distance.y, distance.z, turn.x, turn.y, turn.z};
   const Real forward[6] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
-  t.each(0, nv, [&](int j) {
+  Real squares[6] = {};
+  for (int j = 0; j < nv; ++j) {
     const V moves{J[j], J[nv + j], J[2 * nv + j]}, axis{J[3 * nv + j], J[4 * nv + j], J[5 * nv + j]};
     const V v = goal.in_frame ? own * (moves + cross(offset, axis)) : moves, w = factor * axis;
     const Real column[6] = {v.x, v.y, v.z, w.x, w.y, w.z};
-    Real square = 0;
-    for (int i = 0, row = 0; i < 6; ++i)
-      if (goal.kept[i]) {
-        to.jacobian[row * nv + j] = column[i];
-        square += goal.weight[row++] * column[i] * column[i];
-      }
-    to.levers[j] = sqrt(square);
-  });
-  t.once([&] {
-    Real pull[6] = {};
-    for (int i = 0, row = 0; i < 6; ++i)
-      if (goal.kept[i]) {
-        ask(to, goal.bounds, row, error[i], forward[i], *goal.gain);
-        pull[i] = goal.weight[row] * to.pull[row];
-        ++row;
-      }
-    const V force = V::of(pull), torque = V::of(pull + 3);
-    *to.curvature = goal.in_frame ? pose_curvature(R * force, R * torque, J, nv) : pose_curvature(force, torque, J, nv);
-  });
+    Real lever = 0;
+    for (int i = 0, row = 0; i < 6; ++i) {
+      const Real square = column[i] * column[i];
+      squares[i] += square;
+      if (!goal.kept[i]) continue;
+      to.jacobian[row * nv + j] = column[i], lever += goal.weight[row] * square, ++row;
+    }
+    to.levers[j] = sqrt(lever);
+  }
+  Real pull[6] = {};
+  for (int i = 0, row = 0; i < 6; ++i)
+    if (goal.kept[i]) {
+      ask(to, goal.bounds, row, error[i], forward[i], goal.gain[0]);
+      pull[i] = goal.weight[row] * to.pull[row];
+      if (to.squares) to.squares[row] = squares[i];
+      ++row;
+    }
+  const V force = V::of(pull + 0), torque = V::of(pull + 3);
+  to.curvature[0] = goal.in_frame ? pose_curvature(R * force, R * torque, J, nv) : pose_curvature(force, torque, J, nv);
 }
 
 // Where a task asks the centre of mass to be, along `m` of the world's axes or normals of edges on the ground.
-template <class Real> struct CenterGoal {
+template <class In> struct CenterGoal {
   int m;
-  const int *axes, *turning;                       // [m] 0 for x, 1 for y, 2 for z; [nv] whether a dof turns something
-  const Real *target, *velocity, *weight, *gain;   // [m] or null for 0, [m] or null for 0, [m], [1]
-  const Real* normals = nullptr;                   // [m, 2] in place of axes
-  Bounds<Real> bounds = {};
+  const int *axes, *turning;            // [m] 0 for x, 1 for y, 2 for z; [nv] whether a dof turns something
+  In target, velocity, weight, gain;    // [m] or null for 0, [m] or null for 0, [m], [1]
+  In normals{};                         // [m, 2] in place of axes
+  Bounds<In> bounds = {};
 };
 
 // Rows of a task on the centre of mass `point` [3] with Jacobian J [3, nv].
-template <class Team, class Real>
-void center_rows(const Team& t, const CenterGoal<Real>& goal, const Real* point, const Real* J, int nv,
-                 const Rows<Real>& to) {
+template <class In, class From, class Out>
+void center_rows(const CenterGoal<In>& goal, From point, From J, int nv, const Rows<Out>& to) {
+  using Real = NumberAt<Out>;
   auto along = [&](int i, Real x, Real y, Real z) {
     if (goal.normals) return goal.normals[2 * i] * x + goal.normals[2 * i + 1] * y;
     return goal.axes[i] == 0 ? x : goal.axes[i] == 1 ? y : z;
   };
-  t.each(0, nv, [&](int j) {
-    Real square = 0;
+  Real turning = 0, largest = 0, square = 0;
+  for (int j = 0; j < nv; ++j) {
+    const Real x = J[j], y = J[nv + j], z = J[2 * nv + j];
+    Real lever = 0;
     for (int i = 0; i < goal.m; ++i) {
-      const Real entry = along(i, J[j], J[nv + j], J[2 * nv + j]);
-      to.jacobian[i * nv + j] = entry, square += goal.weight[i] * entry * entry;
+      const Real entry = along(i, x, y, z);
+      to.jacobian[i * nv + j] = entry, lever += goal.weight[i] * entry * entry;
     }
-    to.levers[j] = sqrt(square);
-  });
-  t.each(0, goal.m, [&](int i) {
+    to.levers[j] = sqrt(lever), turning += goal.turning[j] ? x * x + y * y + z * z : Real(0);
+  }
+  for (int i = 0; i < goal.m; ++i) {
     const Real value = along(i, point[0], point[1], point[2]);
     ask(to, goal.bounds, i, goal.target ? value - goal.target[i] : value, goal.velocity ? goal.velocity[i] : Real(0),
-        *goal.gain);
-  });
+        goal.gain[0]);
+    const Real pull = fabs(goal.weight[i] * to.pull[i]);
+    largest = pull > largest || pull != pull ? pull : largest;
+    Real length = 0;
+    for (int j = 0; j < nv && to.squares; ++j) length += to.jacobian[i * nv + j] * to.jacobian[i * nv + j];
+    if (to.squares) to.squares[i] = length;
+  }
   // the length of the weighted pull times the Frobenius norm of the columns of dofs that turn something
-  const Real largest = t.most(Real(0), 0, goal.m, [&](int i, Real) { return fabs(goal.weight[i] * to.pull[i]); });
   const Real unit = largest > 0 ? Real(1) / largest : Real(0);
-  const Real square = t.sum(0, goal.m, [&](int i) {
+  for (int i = 0; i < goal.m; ++i) {
     const Real part = goal.weight[i] * to.pull[i] * unit;
-    return part * part;
-  });
-  const Real turning = t.sum(0, nv, [&](int j) {
-    return goal.turning[j] ? J[j] * J[j] + J[nv + j] * J[nv + j] + J[2 * nv + j] * J[2 * nv + j] : Real(0);
-  });
-  t.once([&] { *to.curvature = largest * sqrt(square) * sqrt(turning); });
+    square += part * part;
+  }
+  to.curvature[0] = largest * sqrt(square) * sqrt(turning);
 }
 }  // namespace osik

@@ -33,6 +33,18 @@
 
 namespace osik {
 
+// The type of the numbers that a pointer, or what stands for one, leads to.
+template <class At> struct NumberOf {
+  using Type = typename At::Number;
+};
+template <class T> struct NumberOf<T*> {
+  using Type = T;
+};
+template <class T> struct NumberOf<const T*> {
+  using Type = T;
+};
+template <class At> using NumberAt = typename NumberOf<At>::Type;
+
 template <class Real> struct Best {
   Real value;
   int which;  // -1 where no value is larger than the start

@@ -127,12 +127,6 @@ struct Call {
   template <class T> T* out(int k) const { return static_cast<T*>(result(k).data); }
 };
 
-// Hands out one array after another of a buffer.
-template <class T> struct Reader {
-  const T* at;
-  const T* take(int count) { return (at += count) - count; }
-};
-
 // How many numbers one lane of a buffer has. Its leading axis is that of the lanes, or has length 1 where all share it.
 inline size_t numbers_of_lane(const Buffer& buffer) {
   size_t count = 1;

@@ -15,7 +15,7 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
     "jax"     none: plain JAX alone, on any platform
 
     of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks
-    "core"    where JAX's default is a CPU: any robot, any precision
+    "core"    CPUs and CUDA: any robot, any precision
 
     of retargeting                            iterations of a plan                a plan's banded systems
     "core"                                    CPUs: any robot, any precision      CPUs: inside the former

@@ -1,4 +1,4 @@
-"""Functions that a kernel computes on CPUs, where it computes what plain JAX would.
+"""Functions that a kernel of the core computes, where it computes what plain JAX would.
 
 Nothing is proposed and nothing certified: the kernel's answer is that of the plain function to rounding, which is what
 runs elsewhere, and the derivative.
@@ -15,24 +15,36 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, ArrayLike, Float
 
+from ..core import _cuda, _library
 from ._backends import on_platforms
 from ._blocks import first_axes_as_one
 from ._lanes import lanes_of, no_lanes
+from ._platform import cuda_is_default
 from ._rules import custom_jvp
 
 
-def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the plain function, on CPUs by a kernel of a batch. What is given by name is static.
+def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], *, on_gpu: bool = True) -> Callable[..., Any]:
+    """Return the plain function, by a kernel of a batch where the core is. What is given by name is static.
 
     Args:
         plain: of one problem: pytrees of arrays by position.
-        kernel: the same for arrays with a leading axis, of the lanes or of length 1 where all lanes share one.
+        kernel: the same for arrays with a leading axis, of the lanes or of length 1 where all lanes share one. Its
+            first argument calls a method of the core: ``_library.call``, or on a GPU ``_cuda.call_lanes``.
+        on_gpu: whether there is a kernel for GPUs.
     """
 
     @cache
     def anywhere(**options: Any) -> Callable[..., Any]:
         wide = over_lanes(partial(plain, **options))
-        return in_shared_lanes(partial(on_platforms, {"core": partial(kernel, **options)}, wide))
+
+        def computed(*args: Any) -> Any:
+            calls = {"core": _library.call}
+            if on_gpu and cuda_is_default() and _cuda.installed():
+                calls["core-cuda"] = _cuda.call_lanes
+            kernels = {name: partial(kernel, call, **options) for name, call in calls.items()}
+            return on_platforms(kernels, wide, *args)
+
+        return in_shared_lanes(computed)
 
     @custom_jvp
     def computed(*args: Any, **options: Any) -> Any:

@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
+from ..core import _cuda
 from ..execution._backends import Backend, takes
 from ..execution._computed import by_kernel
 from ..execution._platform import cuda_is_default
@@ -115,7 +116,7 @@ def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kin
     Raises:
         ModuleNotFoundError: the backend's package is not installed.
     """
-    if not takes(backend, "core", fits=True) or cuda_is_default():
+    if not takes(backend, "core", fits=True) or (cuda_is_default() and not _cuda.installed()):
         return forward_kinematics(robot, q)
     robot.check_configuration(q)
     return Kinematics(*_bodies(robot, q), backend=backend)
@@ -269,8 +270,10 @@ def _frames(robot: Robot, kinematics: Kinematics, *, names: tuple[str, ...]) -> 
     return moving_frames(robot, kinematics, names)
 
 
-def _frames_by_kernel(robot: Robot, kinematics: Kinematics, *, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
-    return _kernels.moving_frames(robot, kinematics, [robot.tree.frame(name) for name in names])
+def _frames_by_kernel(
+    call: _kernels.Call, robot: Robot, kinematics: Kinematics, *, names: tuple[str, ...]
+) -> tuple[Array, Array, Array]:
+    return _kernels.moving_frames(call, robot, kinematics, [robot.tree.frame(name) for name in names])
 
 
 _bodies = by_kernel(_fields, _kernels.bodies)

@@ -1,4 +1,4 @@
-"""Kinematics on a CPU by the compiled core (``core/kinematics.hpp``), called from JAX.
+"""Kinematics by the compiled core (``core/kinematics.hpp``), called from JAX.
 
 ``_forward.py`` is the definition, what runs elsewhere, and the derivative. The core computes in double precision.
 Arguments have a leading axis of lanes, or one of length 1 where all lanes share them: robots are seldom many.
@@ -6,7 +6,7 @@ Arguments have a leading axis of lanes, or one of length 1 where all lanes share
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core import _library
 from ..execution._computed import side_by_side
 from ..robot import Robot
 from ..robot._tree import KinematicTree
 
+Call = Callable[..., list[Array]]
 
-def bodies(robot: Robot, q: Float[Array, "lanes nq"]) -> tuple[Array, ...]:
+
+def bodies(call: Call, robot: Robot, q: Float[Array, "lanes nq"]) -> tuple[Array, ...]:
     """Return the fields of ``Kinematics``."""
     tree, integers = robot.tree, tree_integers(robot.tree)
     numbers = side_by_side(
@@ -30,7 +31,7 @@ def bodies(robot: Robot, q: Float[Array, "lanes nq"]) -> tuple[Array, ...]:
     lanes, count, full = max(len(q), len(numbers)), len(tree.body_parents), len(tree.dof_joint)
     shapes = (count, 3), (count, 3, 3), (full, 3), (full, 3), (full, 3)
     outputs = [((lanes, *shape), float) for shape in shapes]
-    return tuple(_library.call("kinematics", outputs, q, numbers, integers.astype(np.int32)))
+    return tuple(call("kinematics", outputs, q, numbers, integers.astype(np.int32)))
 
 
 def tree_integers(tree: KinematicTree) -> np.ndarray:
@@ -39,7 +40,7 @@ def tree_integers(tree: KinematicTree) -> np.ndarray:
     return np.concatenate([[len(index)], tree.body_parents, tree.joint_types, tree.joint_bodies, index])
 
 
-def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Array, Array, Array]:
+def moving_frames(call: Call, robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Array, Array, Array]:
     """Return positions, rotations and Jacobians of frames."""
     tree, chosen = robot.tree, np.asarray(ids, int)
     carriers = np.asarray(tree.frame_bodies, int)[chosen]
@@ -48,7 +49,7 @@ def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Ar
     numbers = side_by_side(factors[None], robot.frame_position[:, chosen], robot.frame_rotation[:, chosen])
     given = _arrays(kinematics)
     lanes, k = max(len(a) for a in (*given, numbers)), len(chosen)
-    positions, rotations, jacobians = _library.call(
+    positions, rotations, jacobians = call(
         "moving_frames",
         [((lanes, *shape), float) for shape in ((k, 3), (k, 3, 3), (k, 6, tree.nv))],
         *(*given, numbers, integers.astype(np.int32)),
@@ -56,11 +57,11 @@ def moving_frames(robot: Robot, kinematics: Any, ids: Sequence[int]) -> tuple[Ar
     return positions, rotations, jacobians
 
 
-def center_of_mass(robot: Robot, kinematics: Any) -> tuple[Array, Array]:
+def center_of_mass(call: Call, robot: Robot, kinematics: Any) -> tuple[Array, Array]:
     """Return the centre of the masses of the bodies, and its Jacobian."""
     given, integers, lanes = center_arguments(robot, kinematics)
     outputs = [((lanes, 3), float), ((lanes, 3, robot.tree.nv), float)]
-    center, jacobian = _library.call("center_of_mass", outputs, *given, integers)
+    center, jacobian = call("center_of_mass", outputs, *given, integers)
     return center, jacobian
 
 

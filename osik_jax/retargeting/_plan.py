@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..execution._backends import takes
 from ..execution._computed import by_kernel
 from ..kinematics import difference, integrate
+from ..kinematics._kernels import Call
 from ..numerics._dense import product
 from ..robot._joint_selection import scalar_layout
 from . import _plan_kernel
@@ -263,6 +264,7 @@ def _descended_plain(
 
 
 def _descended_by_core(
+    call: Call,
     clip: _Clip,
     q: Float[Array, "lanes F nq"],
     most: Int[Array, " lanes"],
@@ -278,10 +280,10 @@ def _descended_by_core(
     stiffness, _, little = _START[until]
     rules = (_LARGEST_STEP, _STIFFENING, _SLOWING, _FIXED, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING, _CALMER)
     rules += (_CAREFUL, little, float(_SETTLED), stiffness)
-    return Plan(*_plan_kernel.descended(*clip, q, rules, damping, most, endings))
+    return Plan(*_plan_kernel.descended(call, *clip, q, rules, damping, most, endings))
 
 
-_by_kernel = by_kernel(_descended_plain, _descended_by_core)
+_by_kernel = by_kernel(_descended_plain, _descended_by_core, on_gpu=False)
 
 
 def _improved(clip: _Clip, state: _State, little: float = _LITTLE) -> _State:

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..core import _library
 from ..execution._computed import side_by_side
-from ..kinematics._kernels import dof_columns
+from ..kinematics._kernels import Call, dof_columns
 from ..kinematics._manifold import layout
 from ..numerics._dense import product
 from ..robot._joint_selection import scalar_layout
@@ -21,6 +20,7 @@ from ._terms import CLEARANCE, PAIRS, SHORTEST, SWINGING, Body, Bounds
 
 
 def descended(
+    call: Call,
     body: Body,
     goals: Goals,
     weights: Weights,
@@ -35,6 +35,7 @@ def descended(
     """Return configurations, costs and iteration counts of a batch of clips.
 
     Args:
+        call: calls a method of the core.
         body: the robot.
         goals: goals of the frames.
         weights: weights of the cost terms.
@@ -53,7 +54,7 @@ def descended(
     method = side_by_side(np.array([rules]), damping, most.astype(q.dtype), np.array([endings]))
     given = [q, *wishes, free, _numbers(body, weights, bounds), method]
     lanes = max(len(a) for a in given)
-    found, cost, count = _library.call(
+    found, cost, count = call(
         "clip_plan",
         [((lanes, frames, nq), float), ((lanes, 2), float), ((lanes,), float)],
         *(jnp.reshape(a, (len(a), -1)) for a in given),

@@ -16,7 +16,7 @@ from .._errors import OsikValueError
 from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
 from ..numerics._constants import BELOW_OTHERS, CONSTRAINT_TOL, STANDING_SPEED
-from ..numerics._dense import apply, short_sum
+from ..numerics._dense import apply
 from ..numerics._guarded import greatest, quotient, safe_norm
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
@@ -93,10 +93,8 @@ class VelocityProblem(eqx.Module):
                 [own.pull for own in equal],
             )
         )
-        weight, error, jacobian = (
-            jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "error", "jacobian")
-        )
-        squared = short_sum(jacobian**2)
+        weight, error = (jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "error"))
+        squared = jnp.concatenate([own.squared_lengths() for own in equal])
         weight, squared = (jnp.where(jnp.isnan(a), 0.0, a) for a in (weight, squared))
         # both terms of the quotient have the weight as a factor: that of the pull alone is infinite for a small weight
         parts = jnp.stack([error * quotient(weight * pull, divisor), weight * squared])
@@ -169,8 +167,10 @@ class VelocityProblem(eqx.Module):
     def _bending(self, names: Sequence[str]) -> Float[Array, ""]:
         """Return the curvature of tasks for a unit force in the joints: that for a unit residual, over their size."""
         rows = [self.rows[name] for name in names]
-        weight, jacobian = (jnp.concatenate([getattr(own, field) for own in rows]) for field in ("weight", "jacobian"))
-        squared = weight * short_sum(jacobian**2)
+        weight, squared = (
+            jnp.concatenate(of_each) for of_each in ([r.weight for r in rows], [r.squared_lengths() for r in rows])
+        )
+        squared = weight * squared
         # NaN where the step is not valid, and times NaN a derivative of 0 is NaN
         size = positive_root(jnp.sum(jnp.where(jnp.isnan(squared), 0.0, squared)))
         return quotient(greatest(self.bends(names)), jnp.where(size > 0.0, size, 1.0))

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float, Int
 from .._errors import OsikValueError
 from ..core import _cuda
 from ..execution._backends import Backend, check_backend, takes
+from ..execution._platform import cuda_is_default
 from ..numerics._arguments import concrete
 from ..numerics._constants import DIAGONAL_RATIO, SINGLE_DAMPING
-from ..numerics._dense import short_sum
 from ..numerics._guarded import quotient
 from ..solvers import Level, solve_least_squares_qp
 from ..tasks import TaskRows
@@ -89,7 +89,7 @@ def _least_damping(problem: VelocityProblem, backend: Backend) -> Float[Array, "
     if dtype != jnp.float32 or not rows or not takes(backend, "core-cuda", fits=_cuda.installed()):
         return jnp.zeros((), dtype)
     # a row on one dof is a row of the identity, of length 1
-    squared = [1.0 if r.dofs is not None else short_sum(r.jacobian**2) for r in rows]
+    squared = [1.0 if r.dofs is not None else r.squared_lengths() for r in rows]
     largest = [jnp.max(r.weight * length, initial=0.0) for r, length in zip(rows, squared, strict=True)]
     return jax.lax.stop_gradient(SINGLE_DAMPING * float(jnp.finfo(dtype).eps) * jnp.max(jnp.stack(largest)))
 
@@ -138,8 +138,10 @@ def _stack(equalities: list[TaskRows], problem: VelocityProblem) -> tuple[Array,
     """Return matrix, target and weight of equality rows."""
     no_rows = jnp.zeros((0, problem.lower.shape[0]), problem.lower.dtype)
     no_numbers = no_rows[:, 0]
+    matrix = jnp.concatenate([no_rows, *(r.jacobian for r in equalities)])
     return (
-        jnp.concatenate([no_rows, *(r.jacobian for r in equalities)]),
+        # on a GPU, kernels keep lanes last in memory: XLA would join and turn the rows anew for each use
+        jax.lax.optimization_barrier(matrix) if cuda_is_default() else matrix,
         jnp.concatenate([no_numbers, *(r.lower for r in equalities)]),
         jnp.concatenate([no_numbers, *(r.weight for r in equalities)]),
     )

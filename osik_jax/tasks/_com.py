@@ -15,11 +15,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..core import _library
 from ..execution._computed import by_kernel, side_by_side
 from ..kinematics import Kinematics, center_of_mass
 from ..kinematics._forward import body_masses, moving_center
-from ..kinematics._kernels import center_arguments
+from ..kinematics._kernels import Call, center_arguments
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
@@ -105,8 +104,9 @@ class ComTask(Task):
         if kinematics.backend != "jax" and self.target is not None and not isinstance(self.gain, AdaptiveGain):
             mass = body_masses(robot, self.subtree)
             alike = eqx.tree_at(lambda robot: robot.body_mass, robot, mass), replace(kinematics, backend="jax")
-            error, rows, wanted, weight, bound, pull, arms = _by_kernel(self, *alike)
-            return TaskRows(error, rows, wanted, wanted, weight, bound, pull, arms, is_equality=True)
+            error, rows, wanted, weight, bound, pull, arms, squares = _by_kernel(self, *alike)
+            fields = error, rows, wanted, wanted, weight, bound, pull, arms
+            return TaskRows(*fields, is_equality=True, squares=squares)
         return self._plain_rows(robot, kinematics)
 
     def _plain_rows(self, robot: Robot, kinematics: Kinematics) -> TaskRows:
@@ -174,10 +174,11 @@ class ComTask(Task):
 def _fields(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
     """Return the fields of ``TaskRows`` for a task with a target; ``lower`` is used for both bounds."""
     rows = task._plain_rows(robot, kinematics)
-    return rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
+    fields = rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
+    return *fields, rows.squared_lengths()
 
 
-def _fields_by_kernel(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
+def _fields_by_kernel(call: Call, task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
     """Return the fields of ``_fields`` for a batch of robots, computed by the core."""
     assert task.target is not None and task.target_velocity is not None and not isinstance(task.gain, AdaptiveGain)
     given, integers, lanes = center_arguments(robot, kinematics)
@@ -187,11 +188,11 @@ def _fields_by_kernel(task: ComTask, robot: Robot, kinematics: Kinematics) -> tu
     numbers = side_by_side(task.target, task.target_velocity, weight, task.gain)
     lanes = max(lanes, len(numbers))
     options = np.concatenate([integers, axis_numbers(task.axes), robot.tree.turning]).astype(np.int32)
-    shapes = (lanes, m), (lanes, m, nv), (lanes, m), (lanes,), (lanes, m), (lanes, nv)
-    error, rows, wanted, curvature, pull, levers = _library.call(
+    shapes = (lanes, m), (lanes, m, nv), (lanes, m), (lanes,), (lanes, m), (lanes, nv), (lanes, m)
+    error, rows, wanted, curvature, pull, levers, squares = call(
         "center_rows", [(shape, float) for shape in shapes], *given, options, numbers
     )
-    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers
+    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers, squares
 
 
 _by_kernel = by_kernel(_fields, _fields_by_kernel)

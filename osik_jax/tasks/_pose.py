@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError, unknown_name
-from ..core import _library
 from ..execution._backends import Backend
 from ..execution._computed import by_kernel, side_by_side
+from ..kinematics._kernels import Call
 from ..robot import Robot
 from ._curvature import pose_curvature
 from ._framed import FramedTask
@@ -118,8 +118,9 @@ class PoseTask(FramedTask):
         Pose, target and Jacobian are in the outer axes: the world's, or those of the frame that the pose is in.
         """
         if backend != "jax" and not (self.coupled or self.bounded or isinstance(self.gain, AdaptiveGain)):
-            error, rows, wanted, weight, curvature, pull, arms = _by_kernel(self, position, rotation, jacobian)
-            return TaskRows(error, rows, wanted, wanted, weight, curvature, pull, arms, is_equality=True)
+            error, rows, wanted, weight, curvature, pull, arms, squares = _by_kernel(self, position, rotation, jacobian)
+            fields = error, rows, wanted, wanted, weight, curvature, pull, arms
+            return TaskRows(*fields, is_equality=True, squares=squares)
         return self._plain_rows(position, rotation, jacobian)
 
     def _plain_rows(
@@ -216,10 +217,13 @@ class PoseTask(FramedTask):
 def _fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
     """Return the fields of ``TaskRows`` for an equality pose task; ``lower`` is used for both bounds."""
     rows = task._plain_rows(position, rotation, jacobian)
-    return rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
+    fields = rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
+    return *fields, rows.squared_lengths()
 
 
-def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
+def _fields_by_kernel(
+    call: Call, task: PoseTask, position: Array, rotation: Array, jacobian: Array
+) -> tuple[Array, ...]:
     """Return the fields of ``_fields`` for a batch of frames, computed by the core."""
     assert not isinstance(task.gain, AdaptiveGain)
     kept = np.flatnonzero(task.kept)
@@ -229,11 +233,11 @@ def _fields_by_kernel(task: PoseTask, position: Array, rotation: Array, jacobian
     given = (position, rotation, jacobian, numbers)
     lanes, count, nv = max(len(a) for a in given), len(kept), jacobian.shape[-1]
     options = np.array([*task.kept, task.axes == "frame", task.orientation_jacobian == "geometric"], np.int32)
-    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv)
-    error, rows, wanted, curvature, pull, levers = _library.call(
+    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (lanes, count)
+    error, rows, wanted, curvature, pull, levers, squares = call(
         "pose_rows", [(shape, float) for shape in shapes], *given, options
     )
-    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers
+    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers, squares
 
 
 _by_kernel = by_kernel(_fields, _fields_by_kernel)

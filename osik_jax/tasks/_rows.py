@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..execution._platform import cuda_is_default
 from ..kinematics import Kinematics
 from ..kinematics._forward import moving_frames
 from ..robot import Robot
@@ -64,6 +65,8 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
     def rows_at(task: FramedTask, *frames: Array) -> TaskRows:
         return task.rows_at(*frames, backend=kinematics.backend)
 
+    if kinematics.backend != "jax" and cuda_is_default():  # the kernels keep lanes last in memory, tasks apart
+        return {name: rows_at(task, *(a[i] for a in by_task)) for i, (name, task) in enumerate(tasks.items())}
     rows = jax.vmap(rows_at)(together, *by_task)
     apart = [jax.tree.map(partial(_of_task, i), rows) for i in np.arange(len(tasks))]
     if not first.bounded:  # one array for both bounds

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics import Kinematics
 from ..kinematics._home import compiled_kinematics
+from ..numerics._dense import short_sum
 from ..numerics._replace import Replaceable
 from ..robot import Robot
 from ..robot._made_for import MadeForRobot
@@ -53,6 +54,7 @@ class TaskRows(eqx.Module):
             for the curvature damping, of which inequality rows get all.
         closes_loop: whether the rows are a constraint of the mechanism, which carries whatever force the tasks below it
             need (static).
+        squares: the squared length of each row of the Jacobian, or None (``squared_lengths`` computes it). (m,)
     """
 
     error: Float[Array, " m"]
@@ -66,10 +68,15 @@ class TaskRows(eqx.Module):
     dofs: tuple[int, ...] | None = eqx.field(default=None, static=True)
     is_equality: bool = eqx.field(default=None, static=True)  # pyright: ignore[reportAssignmentType]  # None: not said
     closes_loop: bool = eqx.field(default=False, static=True)
+    squares: Float[Array, "..."] | None = None
 
     def __post_init__(self) -> None:
         if self.is_equality is None:
             self.is_equality = self.lower is self.upper
+
+    def squared_lengths(self) -> Float[Array, " m"]:
+        """Return the squared length of each row of the Jacobian."""
+        return short_sum(self.jacobian**2) if self.squares is None else self.squares
 
 
 class Task(MadeForRobot, Replaceable):

@@ -17,6 +17,12 @@ from osik_jax.solvers.qp import _single as single_qp
 NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
 """Two levels of three variables; the second has one inequality row."""
 
+PLACED = (2, 3, 3), (2, 3, 3, 3), (2, 7, 3), (2, 7, 3), (2, 7, 3)
+"""Kinematics of three bodies and seven dofs."""
+POSE = (2, 3), (2, 3, 3), (2, 6, 7), (1, 25), (8,)
+ROWS = (6,), (6, 7), (6,), (), (6,), (7,), (6,)
+"""Rows of a pose task or of one on the centre of mass, for seven dofs."""
+
 
 def test_headers_become_one_text_whose_loops_stay_loops():
     text = _cuda.text_of("hierarchy.hpp")
@@ -34,6 +40,10 @@ TEXTS = {
     "more rows than variables": lambda: weighted_qp._source(40, 33, 3, False, 100, 1),
     "weighted QP without rows, single": lambda: single_qp._source(single_qp.Shape(7, 5), 100),
     "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
+    "bodies": lambda: _cuda._lanes_source("kinematics", True, ((2, 8), (1, 90), (40,)), (2,), ((3, 3), *[(2, 3)] * 4)),
+    "frames": lambda: _cuda._lanes_source("moving_frames", False, (*PLACED, (1, 50), (9,)), (6,), ((1, 3), (1, 6, 7))),
+    "centre of mass": lambda: _cuda._lanes_source("center_rows", True, (*PLACED, (1, 50), (9,), (2, 9)), (6,), ROWS),
+    "rows of a pose": lambda: _cuda._lanes_source("pose_rows", True, POSE, (4,), ROWS),
     "banded": lambda: banded.kernel_source(13, 2),
 }
 

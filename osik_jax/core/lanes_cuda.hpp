@@ -1,0 +1,47 @@
+// A call of kinematic_calls.hpp on a GPU: one thread for each lane.
+//
+// The lanes are the fastest axis of every array that is not shared, so that the threads of a warp read neighbours. The
+// text that includes this file defines Real, the sizes, and SPACE (core/_cuda.py: call_lanes).
+#pragma once
+#include "kinematic_calls.hpp"
+
+namespace osik {
+
+// The numbers of one lane, `step` apart.
+template <class T> struct Strided {
+  using Number = T;
+  T* at = nullptr;
+  int step = 1;
+  T& operator[](int i) const { return at[size_t(i) * step]; }
+  Strided operator+(int i) const { return {at + size_t(i) * step, step}; }
+  Strided& operator+=(int i) { return at += size_t(i) * step, *this; }
+  explicit operator bool() const { return at; }
+};
+
+// Given: the sizes of arguments and results as functions, whether an argument is shared, and the numbers of `Space`.
+template <class R, class Sizes> struct ThreadCall {
+  using Real = R;
+  using In = Strided<R>;
+  using Out = Strided<R>;
+  struct Space {
+    R numbers[Sizes::SPACE];
+    Space(int) {}
+    R* data() { return numbers; }
+  };
+  const void* const* arguments;
+  void* const* results;
+  int lanes;
+  int size(int k, int axis) const { return Sizes::argument(k, axis); }
+  int result_size(int k, int axis) const { return Sizes::result(k, axis); }
+  const int* integers(int k) const { return static_cast<const int*>(arguments[k]); }
+  In in(int k, int lane) const {
+    R* first = static_cast<R*>(const_cast<void*>(arguments[k]));
+    return Sizes::argument(k, 0) > 1 ? In{first + lane, lanes} : In{first, 1};
+  }
+  Out out(int k, int lane) const { return {static_cast<R*>(results[k]) + lane, lanes}; }
+  template <class F> void each_lane(F f) const {
+    const int lane = blockIdx.x * blockDim.x + threadIdx.x;
+    if (lane < lanes) f(lane);
+  }
+};
+}  // namespace osik
